@@ -34,24 +34,64 @@ if TYPE_CHECKING:
 
     __version__: str
 
-#: Public name -> the module that has it, loaded at first use, so that `rigidmd --help` need not wait for Numba.
+#: Public name -> the module that has it, loaded at first use, so that `rigidmd --help` need not
+#: wait for Numba.
 _HOMES = {
-    "BodyScene": "scene", "MolecularScene": "scene", "Scene": "scene",
-    "Every": "run", "Moment": "run", "Observer": "run", "Results": "run", "Simulation": "run", "run_together": "run",
-    "resolve": "assemble.scenes", "atoms_of": "assemble.scenes", "scene_from_atoms": "assemble.scenes",
-    "Force": "assemble.user_code.force", "trust": "assemble.user_code.trust",
-    "PairLaw": "assemble.user_code.pair_potential", "pair_law": "assemble.user_code.pair_potential",
+    "BodyScene": "scene",
+    "MolecularScene": "scene",
+    "Scene": "scene",
+    "Every": "run",
+    "Moment": "run",
+    "Observer": "run",
+    "Results": "run",
+    "Simulation": "run",
+    "run_together": "run",
+    "resolve": "assemble.scenes",
+    "atoms_of": "assemble.scenes",
+    "scene_from_atoms": "assemble.scenes",
+    "Force": "assemble.user_code.force",
+    "trust": "assemble.user_code.trust",
+    "PairLaw": "assemble.user_code.pair_potential",
+    "pair_law": "assemble.user_code.pair_potential",
     "integrator": "scene.integrators",
-    "compiled_force": "dynamics.user_kernels", "compiled_thermostat": "dynamics.user_kernels",
-    "LivePlot": "view.plots", "read_run": "studies.stored_runs", "sweep": "studies.sweep.sweeping",
-    "normal_modes": "studies.normal_modes", "pmf": "studies.sweep.windows",
-    "analysis": "", "view": "",
-}  # fmt: skip
+    "compiled_force": "dynamics.user_kernels",
+    "compiled_thermostat": "dynamics.user_kernels",
+    "LivePlot": "view.plots",
+    "read_run": "studies.stored_runs",
+    "sweep": "studies.sweep.sweeping",
+    "normal_modes": "studies.normal_modes",
+    "pmf": "studies.sweep.windows",
+    "analysis": "",
+    "view": "",
+}
 __all__ = [
-    "BodyScene", "Every", "Force", "LivePlot", "MolecularScene", "Moment", "Observer", "PairLaw", "Results", "Scene",
-    "Simulation", "analysis", "atoms_of", "compiled_force", "compiled_thermostat", "integrator", "normal_modes",
-    "pair_law", "pmf", "read_run", "resolve", "run_together", "scene_from_atoms", "sweep", "trust", "view",
-]  # fmt: skip
+    "BodyScene",
+    "Every",
+    "Force",
+    "LivePlot",
+    "MolecularScene",
+    "Moment",
+    "Observer",
+    "PairLaw",
+    "Results",
+    "Scene",
+    "Simulation",
+    "analysis",
+    "atoms_of",
+    "compiled_force",
+    "compiled_thermostat",
+    "integrator",
+    "normal_modes",
+    "pair_law",
+    "pmf",
+    "read_run",
+    "resolve",
+    "run_together",
+    "scene_from_atoms",
+    "sweep",
+    "trust",
+    "view",
+]
 
 PROVIDERS += ["rigidmd.view.notebook", "rigidmd.studies.sweep.notebook"]
 
@@ -64,7 +104,11 @@ def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module 'rigidmd' has no attribute {name!r}")
     home = _HOMES[name]
-    return getattr(import_module(f"rigidmd.{home}"), name) if home else import_module(f"rigidmd.{name}")
+    return (
+        getattr(import_module(f"rigidmd.{home}"), name)
+        if home
+        else import_module(f"rigidmd.{name}")
+    )
 
 
 def __dir__() -> list[str]:

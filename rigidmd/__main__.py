@@ -1,4 +1,5 @@
-"""`python -m rigidmd`. Python has put the working directory on the search path, with whatever modules are there."""
+"""`python -m rigidmd`. Python has put the working directory on the search path, with whatever
+modules are there."""
 
 import sys
 

@@ -21,7 +21,12 @@ from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 from rigidmd.assemble.assignment import massive_sites
 from rigidmd.assemble.build import build
 from rigidmd.assemble.matching import CLEARLY_BETTER, CLOSE_FIT, MatchedMolecules, match, refit
-from rigidmd.assemble.scenes import SOURCE, atoms_errors, models_with_absolute_paths, scene_from_atoms
+from rigidmd.assemble.scenes import (
+    SOURCE,
+    atoms_errors,
+    models_with_absolute_paths,
+    scene_from_atoms,
+)
 from rigidmd.assemble.species import species_of
 from rigidmd.assemble.user_code.force import Force, UserForceError, real_numbers
 from rigidmd.core.state import NOW, State, state_of
@@ -57,41 +62,56 @@ TABLES = ("forces", "fields", "precision")
 class RigidMD(Calculator):
     """Energy, forces and stress of rigid molecules, for the atoms that it is attached to.
 
-    Each call fits rigid molecules to the atoms, by least squares with masses. Massless sites (M of TIP4P) are not among
-    the atoms. All axes are periodic or none. The page `ase` (`rigidmd help ase`) defines energy (eV), forces (eV/Å) and
-    stress (eV/Å³), and describes what happens when ASE bends molecules.
+    Each call fits rigid molecules to the atoms, by least squares with masses. Massless sites (M of
+    TIP4P) are not among the atoms. All axes are periodic or none. The page `ase` (`rigidmd help
+    ase`) defines energy (eV), forces (eV/Å) and stress (eV/Å³), and describes what happens when ASE
+    bends molecules.
 
     Parameters
     ----------
-    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene file; or a scene,
-        whose species, [forces], [fields], precision and forces from Python (`with_user_code`) are used
-    atom_forces : "gradient" of the energy of the fitted molecules, or of "sites": each atom has the forces of its site
-    bend, tolerance : largest distance of an atom from its rigid position without a warning, and without an error,
-        over the molecule's radius
+    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a
+        scene file; or a scene, whose species, [forces], [fields], precision and forces from Python
+        (`with_user_code`) are used
+    atom_forces : "gradient" of the energy of the fitted molecules, or of "sites": each atom has the
+        forces of its site
+    bend, tolerance : largest distance of an atom from its rigid position without a warning, and
+        without an error, over the molecule's radius
     precision : "double", the default, or "mixed"
-    fields, forces : the table [fields] of a scene file, and keys of its table [forces]: cutoff_A, electrostatics, ...
+    fields, forces : the table [fields] of a scene file, and keys of its table [forces]: cutoff_A,
+        electrostatics, ...
 
     Raises SceneError or StructureError if atoms and models do not match.
     """
 
-    implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012  (ASE has it so)
+    # ASE has it so
+    implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012
     nolabel = True
 
     def __init__(
-        self, models: MolecularScene | str | Sequence[str | Mapping[str, Any]], *, atom_forces: Form = "gradient",
-        bend: float = 0.05, tolerance: float = 0.15, precision: str | None = None,
-        fields: Mapping[str, Any] | None = None, **forces: Any,
-    ):  # fmt: skip
+        self,
+        models: MolecularScene | str | Sequence[str | Mapping[str, Any]],
+        *,
+        atom_forces: Form = "gradient",
+        bend: float = 0.05,
+        tolerance: float = 0.15,
+        precision: str | None = None,
+        fields: Mapping[str, Any] | None = None,
+        **forces: Any,
+    ):
         super().__init__()
         faults = []
         if atom_forces not in ("gradient", "sites"):
             faults.append(f"atom_forces is {atom_forces!r}, must be 'gradient' or 'sites'")
         if not 0 < bend <= tolerance < 1:
-            faults.append(f"bend = {bend} and tolerance = {tolerance}: must be 0 < bend <= tolerance < 1")
+            faults.append(
+                f"bend = {bend} and tolerance = {tolerance}: must be 0 < bend <= tolerance < 1"
+            )
         tables = (("precision", precision), ("fields", fields), ("forces", forces or None))
         given = {key: value for key, value in tables if value is not None}
         known = list(Forces.model_fields)
-        faults += [f"unknown keyword {key}{did_you_mean(key, known)}" for key in forces if key not in known]
+        faults += [
+            f"unknown keyword {key}{did_you_mean(key, known)}" for key in forces if key not in known
+        ]
         self._user_forces: tuple[Any, ...] = ()
         if isinstance(models, Scene):
             if not isinstance(models, MolecularScene):
@@ -112,20 +132,25 @@ class RigidMD(Calculator):
         self._bent = 0.0  # of the molecules seen last
         not_none(self.parameters).update(models=models, atom_forces=atom_forces, **given)
 
-    def calculate(self, atoms: Atoms | None = None, properties=("energy",), system_changes=all_changes) -> None:
+    def calculate(
+        self, atoms: Atoms | None = None, properties=("energy",), system_changes=all_changes
+    ) -> None:
         """Energy, forces and, in a box, stress; called by ASE."""
         super().calculate(atoms, properties, system_changes)
         fitted = self._fit_atoms(not_none(self.atoms))
         if not self._warned and fitted.bent > self._bend:
             self._warned = True
             message = (
-                f"an atom is {fitted.largest:.3f} Å from its position in a rigid molecule, {fitted.bent:.0%} of the "
-                "molecule's radius: energy and forces are computed for rigid molecules fitted to the atoms. make_rigid "
-                "corrects the atoms, minimise moves rigid molecules, ase.constraints.FixBondLengths keeps distances"
+                f"an atom is {fitted.largest:.3f} Å from its position in a rigid molecule,"
+                f" {fitted.bent:.0%} of the molecule's radius: energy and forces are computed for"
+                " rigid molecules fitted to the atoms. make_rigid corrects the atoms, minimise"
+                " moves rigid molecules, ase.constraints.FixBondLengths keeps distances"
             )
             warnings.warn(message, RigidMDWarning, stacklevel=2)
         assembly, rotation = fitted.assembly, fitted.rotation
-        found = ase_results(assembly.system, assembly.engine, fitted.state, self._form, fitted.atoms)
+        found = ase_results(
+            assembly.system, assembly.engine, fitted.state, self._form, fitted.atoms
+        )
         forces = np.zeros((len(not_none(self.atoms)), 3))
         forces[assembly.order] = found["forces"] @ rotation
         self.results = {"energy": found["energy"], "free_energy": found["energy"], "forces": forces}
@@ -134,19 +159,23 @@ class RigidMD(Calculator):
             self.results["stress"] = full_3x3_to_voigt_6_stress(full)
 
     def make_rigid(self, atoms: Atoms) -> float:
-        """Move atoms to their positions in the fitted rigid molecules; returns the largest displacement, Å."""
+        """Move atoms to their positions in the fitted rigid molecules; returns the largest
+        displacement, Å."""
         fitted = self._fit_atoms(atoms)
         before = atoms.get_positions()
         self._put(atoms, fitted, fitted.state)
         return float(np.linalg.norm(atoms.positions - before, axis=1).max())
 
     def minimise(self, atoms: Atoms, **stage_keys: Any) -> dict[str, Any]:
-        """Move rigid molecules to a near minimum of the energy, or of the enthalpy with pressure_bar.
+        """Move rigid molecules to a near minimum of the energy, or of the enthalpy with
+        pressure_bar.
 
-        stage_keys : keys of a stage with ensemble = "minimise": force_limit_kJ_mol_A, pressure_bar, ...
+        stage_keys : keys of a stage with ensemble = "minimise": force_limit_kJ_mol_A, pressure_bar,
+            ...
 
-        Sets positions, and the cell with pressure_bar. Constraints of the atoms are ignored; models set what is frozen.
-        Returns the values of the minimum, as in summary.json. Raises SceneError, SimulationError.
+        Sets positions, and the cell with pressure_bar. Constraints of the atoms are ignored; models
+        set what is frozen. Returns the values of the minimum, as in summary.json. Raises
+        SceneError, SimulationError.
         """
         assembly = self._assemble(atoms, stage_keys)
         fitted = assembly.fit(atoms)
@@ -161,12 +190,17 @@ class RigidMD(Calculator):
         return self.__dict__ | {"_assembly": None}  # machine code cannot be pickled
 
     def _fit_atoms(self, atoms: Atoms) -> "_FittedAtoms":
-        """Rigid molecules fitted to the atoms, as matched before if this still fits. If they deviate much more than
-        before, other atoms may be at the positions of these: then they are matched anew, and the better match counts,
-        so that an energy does not depend on the atoms that were seen before."""
+        """Rigid molecules fitted to the atoms, as matched before if this still fits. If they
+        deviate much more than before, other atoms may be at the positions of these: then they are
+        matched anew, and the better match counts, so that an energy does not depend on the atoms
+        that were seen before."""
         if faults := atoms_errors(atoms):
             raise SceneError(SOURCE, faults)
-        known = self._assembly if self._assembly is not None and self._assembly.applies_to(atoms) else None
+        known = (
+            self._assembly
+            if self._assembly is not None and self._assembly.applies_to(atoms)
+            else None
+        )
         before = known.fit(atoms) if known is not None else None
         usual = min(max(JUMP * self._bent, CLOSE_FIT), self._tolerance)
         if before is not None and before.bent <= usual:
@@ -177,7 +211,10 @@ class RigidMD(Calculator):
         except StructureError as error:
             if known is None:
                 raise
-            hint = "They matched before: keep the molecules rigid by constraints, or move them by RigidMD.minimise"
+            hint = (
+                "They matched before: keep the molecules rigid by constraints, or move them by"
+                " RigidMD.minimise"
+            )
             raise StructureError(SOURCE, [*error.errors, hint]) from None
         fitted = found.fit(atoms)
         if before is not None and before.bent <= min(self._tolerance, fitted.bent / CLEARLY_BETTER):
@@ -191,7 +228,9 @@ class RigidMD(Calculator):
         bare.set_constraint()
         bare.arrays.pop("momenta", None)
         tables: dict[str, Any] = {"structure": {"tolerance": self._tolerance}} | self._settings
-        scene = scene_from_atoms(bare, self._models, stages=[{"ensemble": "minimise", **stage_keys}], **tables)
+        scene = scene_from_atoms(
+            bare, self._models, stages=[{"ensemble": "minimise", **stage_keys}], **tables
+        )
         if self._user_forces:
             scene = scene.with_user_code(self._user_forces)
         system, species = build(scene), species_of(scene)
@@ -206,7 +245,14 @@ class RigidMD(Calculator):
             other, rotation = least_skewed_cell(upright)
             basis = basis_of(other @ rotation, upright)
         return _Assembly(
-            system, system.engine(), species, matched, bare.numbers, bare.pbc.copy(), bare.cell.array.copy(), basis
+            system,
+            system.engine(),
+            species,
+            matched,
+            bare.numbers,
+            bare.pbc.copy(),
+            bare.cell.array.copy(),
+            basis,
         )
 
     @staticmethod
@@ -220,7 +266,9 @@ class RigidMD(Calculator):
             after = after + image @ state.cell
             if not np.array_equal(state.cell, fitted.state.cell):
                 given = np.linalg.inv(assembly.basis) @ state.cell @ rotation
-                atoms.set_cell(given * np.array([1, 1, np.sign(np.linalg.det(atoms.cell.array))])[:, None])
+                atoms.set_cell(
+                    given * np.array([1, 1, np.sign(np.linalg.det(atoms.cell.array))])[:, None]
+                )
         positions[assembly.order] = after @ rotation
         atoms.set_positions(positions, apply_constraint=False)
 
@@ -247,7 +295,9 @@ class _Assembly(NamedTuple):
     numbers: np.ndarray
     pbc: np.ndarray
     cell: np.ndarray  # (3, 3) for which numbers such as the grid of PME were chosen
-    basis: np.ndarray  # (3, 3) integers: edges of the engine's cell in terms of the edges of the atoms' cell
+    basis: (
+        np.ndarray
+    )  # (3, 3) integers: edges of the engine's cell in terms of the edges of the atoms' cell
 
     @property
     def order(self) -> np.ndarray:
@@ -256,7 +306,9 @@ class _Assembly(NamedTuple):
 
     def applies_to(self, atoms: Atoms) -> bool:
         """Whether atoms have the elements and periodicity of the system, and a similar cell."""
-        is_same = np.array_equal(atoms.numbers, self.numbers) and np.array_equal(atoms.pbc, self.pbc)
+        is_same = np.array_equal(atoms.numbers, self.numbers) and np.array_equal(
+            atoms.pbc, self.pbc
+        )
         if not is_same or not atoms.pbc.all():
             return is_same
         strain = np.linalg.solve(self.cell, atoms.cell.array) - np.eye(3)
@@ -276,9 +328,13 @@ class _Assembly(NamedTuple):
         whole = given = position[self.order]
         if cell is not None:
             whole = given - np.rint((given - self.rigid(state)) @ np.linalg.inv(cell)) @ cell
-        radius = np.array([m.radius if len(massive_sites(m)) > 1 else np.inf for m in self.species])[found.species]
+        radius = np.array(
+            [m.radius if len(massive_sites(m)) > 1 else np.inf for m in self.species]
+        )[found.species]
         bent = found.fit.deviation / radius
-        return _FittedAtoms(self, state, rotation, whole, given, float(found.fit.deviation.max()), float(bent.max()))
+        return _FittedAtoms(
+            self, state, rotation, whole, given, float(found.fit.deviation.max()), float(bent.max())
+        )
 
     def rigid(self, state: State) -> np.ndarray:
         """Positions (a, 3) of the sites with mass."""
@@ -288,31 +344,40 @@ class _Assembly(NamedTuple):
 class CalculatorForce(Force):
     """Forces on the atoms of rigid molecules from a calculator of ASE.
 
-    The calculator is called once for each new set of positions, with one `ase.Atoms` of all sites with mass, molecules
-    whole, in the order of `system.sites`. Forces within molecules have no effect. Its stress gives the molecular virial
-    W = -V sigma - sum_i f_i (x) (r_i - R); the page `calculators` (`rigidmd help calculators`) has the derivation.
+    The calculator is called once for each new set of positions, with one `ase.Atoms` of all sites
+    with mass, molecules whole, in the order of `system.sites`. Forces within molecules have no
+    effect. Its stress gives the molecular virial W = -V sigma - sum_i f_i (x) (r_i - R); the page
+    `calculators` (`rigidmd help calculators`) has the derivation.
 
     Parameters
     ----------
-    calculator : with energies (eV) and forces (eV/Å) of periodic or free atoms, as the scene has them, and for a
-        barostat or the pressure with a stress (eV/Å³)
+    calculator : with energies (eV) and forces (eV/Å) of periodic or free atoms, as the scene has
+        them, and for a barostat or the pressure with a stress (eV/Å³)
     name : in logs and messages; default: the name of the calculator's class
-    energy_noise_eV : random error of its energies, as of self-consistent iterations or of single precision; larger
-        differences between forces and differences of the energy are refused at the start of a run
-    changes_momentum : which components of the total momentum it may change: True for external fields and restraints
+    energy_noise_eV : random error of its energies, as of self-consistent iterations or of single
+        precision; larger differences between forces and differences of the energy are refused at
+        the start of a run
+    changes_momentum : which components of the total momentum it may change: True for external
+        fields and restraints
 
-    Raises SceneError where a calculator without stress is used with a barostat, and SimulationError with the step and
-    the closest atoms if the calculator fails.
+    Raises SceneError where a calculator without stress is used with a barostat, and SimulationError
+    with the step and the closest atoms if the calculator fails.
     """
 
     def __init__(
-        self, calculator: Any, *, name: str | None = None, energy_noise_eV: float = 0.0,
+        self,
+        calculator: Any,
+        *,
+        name: str | None = None,
+        energy_noise_eV: float = 0.0,
         changes_momentum: bool | Sequence[bool] = False,
-    ):  # fmt: skip
+    ):
         if not (hasattr(calculator, "calculate") and hasattr(calculator, "implemented_properties")):
             raise ValueError(f"calculator is {calculator!r:.60}, must be a calculator of ASE")
         if not 0 <= energy_noise_eV < np.inf:
-            raise ValueError(f"energy_noise_eV is {energy_noise_eV!r}, must be a finite number, not negative")
+            raise ValueError(
+                f"energy_noise_eV is {energy_noise_eV!r}, must be a finite number, not negative"
+            )
         self.calculator = calculator
         self.name = name or type(calculator).__name__  # type: ignore[misc]  # of each object here
         self.energy_noise = energy_noise_eV * EV / KJ_PER_MOL  # type: ignore[misc]
@@ -320,18 +385,25 @@ class CalculatorForce(Force):
 
     def begin(self, system: System) -> None:
         """Make the atoms, and choose the properties that the calculator computes."""
-        can, periodic = self.calculator.implemented_properties, bool(np.isfinite(system.state.cell).all())
+        can, periodic = (
+            self.calculator.implemented_properties,
+            bool(np.isfinite(system.state.cell).all()),
+        )
         if missing := [name for name in ("energy", "forces") if name not in can]:
             raise UserForceError(f"the calculator has no {' and no '.join(missing)}")
         self._has_virial = periodic and "stress" in can
         stages = [stage.label for stage in system.scene.stages if stage.changes_box]
         if stages and not self._has_virial:
-            raise UserForceError(f"the stage {stages[0]} changes the box, and the calculator has no stress")
+            raise UserForceError(
+                f"the stage {stages[0]} changes the box, and the calculator has no stress"
+            )
         if periodic and not self._has_virial:
             system.notes.append(f"{self.name} has no stress: the pressure does not include it")
         self.tied_to_places = periodic and not self._has_virial  # type: ignore[misc]
         self._sites = system.sites
-        self.atoms = atoms_of_sites(system, system.site_positions(system.state), None, system.state.cell, 0.0)
+        self.atoms = atoms_of_sites(
+            system, system.site_positions(system.state), None, system.state.cell, 0.0
+        )
 
     def on_sites(self, position: np.ndarray, state: State) -> tuple:
         """Energy, forces on all sites, and the molecular virial where there is a stress."""
@@ -343,14 +415,18 @@ class CalculatorForce(Force):
         try:
             if changes := calculator.check_state(self.atoms):
                 calculator.reset()
-                wanted = ["energy", "forces", "stress"] if self._has_virial else ["energy", "forces"]
+                wanted = (
+                    ["energy", "forces", "stress"] if self._has_virial else ["energy", "forces"]
+                )
                 calculator.calculate(self.atoms, wanted, changes)
             found = calculator.results
             energy = (found["free_energy"] if "free_energy" in found else found["energy"]) * unit
             forces, stress = found["forces"], found["stress"] if self._has_virial else None
         except Exception as error:  # calculators raise anything
             where = f"at step {state.step[NOW]}; {self._closest_atoms()}"
-            raise UserForceError(f"the calculator {self.name} raised {describe_error(error)} {where}") from error
+            raise UserForceError(
+                f"the calculator {self.name} raised {describe_error(error)} {where}"
+            ) from error
         on_sites = np.zeros(position.shape)
         on_sites[atom] = unit * self._checked("forces", forces, (len(self.atoms), 3))
         if stress is None:
@@ -361,7 +437,8 @@ class CalculatorForce(Force):
         return energy, on_sites, -unit * state.volume * stress - on_sites.T @ arm
 
     def _checked(self, what: str, given: Any, *shapes: tuple[int, ...]) -> np.ndarray:
-        """Values of the calculator as an array of real numbers in one of these shapes. Raises UserForceError."""
+        """Values of the calculator as an array of real numbers in one of these shapes. Raises
+        UserForceError."""
         array, wanted = real_numbers(given), " or ".join(map(str, shapes))
         if array is None:
             kind = "masked or complex values" if hasattr(given, "dtype") else f"{given!r:.60}"
@@ -374,28 +451,48 @@ class CalculatorForce(Force):
 
     def _closest_atoms(self) -> str:
         """A message with the two atoms of different molecules that are closest."""
-        owner, best, words = self._sites.molecule[self._sites.mass > 0], np.inf, "there is one molecule"
+        owner, best, words = (
+            self._sites.molecule[self._sites.mass > 0],
+            np.inf,
+            "there is one molecule",
+        )
         for k in range(len(owner) - 1):
             others = np.flatnonzero(owner[k + 1 :] != owner[k]) + k + 1
-            if len(others) and (distances := self.atoms.get_distances(k, others, mic=True)).min() < best:
+            if (
+                len(others)
+                and (distances := self.atoms.get_distances(k, others, mic=True)).min() < best
+            ):
                 best, other = distances.min(), others[distances.argmin()]
-                one, two = (f"{self.atoms.symbols[i]} of molecule {owner[i] + 1}" for i in (k, other))
-                words = f"the closest atoms of different molecules, {one} and {two}, are at {best:.3g} Å"
+                one, two = (
+                    f"{self.atoms.symbols[i]} of molecule {owner[i] + 1}" for i in (k, other)
+                )
+                words = (
+                    f"the closest atoms of different molecules, {one} and {two}, are at"
+                    f" {best:.3g} Å"
+                )
         return words
 
 
 def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:
-    """Frames of a run for `ase.io.read`; `name` is its folder, or the trajectory in it. Raises OutputError."""
+    """Frames of a run for `ase.io.read`; `name` is its folder, or the trajectory in it. Raises
+    OutputError."""
     record = read_record(Path(name) if Path(name).is_dir() else Path(name).parent)
     if record.is_body:
         raise TypeError("this is a run of a single body, which has no atoms")
     found = read_frames(record.trajectory, record.system.site_count, most=1 << 60)
-    arrays = [[None] * len(found.time) if a is None else a for a in (found.positions, found.velocities, found.cells)]
-    return [atoms_of_sites(record.system, *frame) for frame in zip(*arrays, found.time.tolist(), strict=True)][index]
+    arrays = [
+        [None] * len(found.time) if a is None else a
+        for a in (found.positions, found.velocities, found.cells)
+    ]
+    return [
+        atoms_of_sites(record.system, *frame)
+        for frame in zip(*arrays, found.time.tolist(), strict=True)
+    ][index]
 
 
 def _parts_of(scene: MolecularScene) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The tables of a scene's species without numbers of molecules, and the other TABLES; paths are absolute."""
+    """The tables of a scene's species without numbers of molecules, and the other TABLES; paths are
+    absolute."""
     tables = with_absolute_paths(scene.model_dump(exclude_defaults=True), scene.path(""))
     for table in tables["molecules"]:
         table.pop("count", None)

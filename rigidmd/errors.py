@@ -1,7 +1,7 @@
 """The exceptions of rigidmd. Every refusal raises one of them, with an explanation.
 
-The command line prints the message and exits with 2 for bad input and 1 for a failed run. Python code gets the
-exception.
+The command line prints the message and exits with 2 for bad input and 1 for a failed run. Python
+code gets the exception.
 """
 
 import re
@@ -9,9 +9,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-#: Characters that a terminal interprets instead of showing: control characters except tab and line ends, and changes of
-#: the direction of writing; and surrogates, which cannot be encoded.
-UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+#: Characters that a terminal interprets instead of showing: control characters except tab and line
+#: ends, and changes of the direction of writing; and surrogates, which cannot be encoded.
+UNPRINTABLE = re.compile(
+    "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 MOST_SHOWN = 50  # errors in one message
 
 
@@ -21,7 +23,8 @@ def visible(text: str) -> str:
 
 
 class Wording:
-    """How messages name what a user may do, for users of Python. The command line has a subclass with its options."""
+    """How messages name what a user may do, for users of Python. The command line has a subclass
+    with its options."""
 
     #: Keyword of an argument -> what to write for it.
     arguments = {"force": "force=True", "folder": "folder=...", "file": "another path"}  # noqa: RUF012
@@ -49,7 +52,8 @@ def worded_by(wording: Wording) -> Iterator[None]:
 
 
 def option(name: str) -> str:
-    """An argument in a message, as its user writes it: force=True in Python, --force on the command line."""
+    """An argument in a message, as its user writes it: force=True in Python, --force on the command
+    line."""
     return _WORDING[-1].option(name)
 
 
@@ -63,7 +67,8 @@ class RigidMDWarning(UserWarning):
 
 
 class RigidMDError(Exception):
-    """Base of all errors of this package. Messages may quote untrusted input; they are safe to print."""
+    """Base of all errors of this package. Messages may quote untrusted input; they are safe to
+    print."""
 
     def __init__(self, message: str):
         super().__init__(visible(message))
@@ -82,7 +87,11 @@ class InputError(RigidMDError):
         if len(self.errors) == 1:
             super().__init__(f"{where}: {self.errors[0]}")
         else:
-            more = [f"and {len(self.errors) - MOST_SHOWN} more"] if len(self.errors) > MOST_SHOWN else []
+            more = (
+                [f"and {len(self.errors) - MOST_SHOWN} more"]
+                if len(self.errors) > MOST_SHOWN
+                else []
+            )
             shown = "\n".join(f"  {error}" for error in [*self.errors[:MOST_SHOWN], *more])
             super().__init__(f"{where}: {len(self.errors)} errors\n{shown}")
 

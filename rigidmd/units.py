@@ -1,7 +1,7 @@
 """Units: Å, ps, u, e, K inside, energies in u Å²/ps². Other units appear only in input and output.
 
-`1 kJ/mol = 100 u Å²/ps²` exactly in the limit where the molar mass constant is 1 g/mol (it is to 3e-10, CODATA 2018).
-Constants: CODATA 2018; N_A, k_B and e are exact since 2019.
+`1 kJ/mol = 100 u Å²/ps²` exactly in the limit where the molar mass constant is 1 g/mol (it is to
+3e-10, CODATA 2018). Constants: CODATA 2018; N_A, k_B and e are exact since 2019.
 """
 
 from math import pi, sqrt
@@ -13,7 +13,9 @@ VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
 
 KJ_PER_MOL = 100.0  # u Å²/ps²
 BOLTZMANN = BOLTZMANN_SI * AVOGADRO * 1e-3 * KJ_PER_MOL  # u Å²/ps² per K
-COULOMB = ELEMENTARY_CHARGE**2 * AVOGADRO / (4 * pi * VACUUM_PERMITTIVITY) * 1e10 * 1e-3 * KJ_PER_MOL  # u Å³/ps² per e²
+COULOMB = (
+    ELEMENTARY_CHARGE**2 * AVOGADRO / (4 * pi * VACUUM_PERMITTIVITY) * 1e10 * 1e-3 * KJ_PER_MOL
+)  # u Å³/ps² per e²
 COULOMB_CHARGE = sqrt(COULOMB)  # one e, in units where q²/r is an energy in u Å²/ps²
 
 #: One debye in e Å: 1e-21 C m²/s over the speed of light and e (1 e Å = 4.80320471 D).

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
-# Tests run on all cores: a second process for each that compiles would only take time from the others.
+# Tests run on all cores: a second process for each that compiles would only take time from the
+# others.
 os.environ.setdefault("RIGIDMD_COMPILERS", "1")
-# A worker holds a million objects of Numba. To search them for cycles as often as Python does took 15 % of its time.
+# A worker holds a million objects of Numba. To search them for cycles as often as Python does took
+# 15 % of its time.
 gc.set_threshold(50_000, 20, 20)
 
 pytest.register_assert_rewrite("support")
@@ -37,5 +39,7 @@ def no_analysis_outlives_its_test():
     """Examples of the documentation register analyses, and a worker runs many files."""
     yield
     registry = sys.modules.get(f"rigidmd.{MODULES['registry']}")
-    for name in [name for name, entry in registry.KNOWN.items() if entry.is_user] if registry else ():
+    for name in (
+        [name for name, entry in registry.KNOWN.items() if entry.is_user] if registry else ()
+    ):
         del registry.KNOWN[name]

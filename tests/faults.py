@@ -1,15 +1,18 @@
-"""A driver of mixed faults: runs of small random scenes are disturbed, resumed and compared with an undisturbed run.
+"""A driver of mixed faults: runs of small random scenes are disturbed, resumed and compared with an
+undisturbed run.
 
     python tests/faults.py --minutes 1             random cases, one after another, for a minute
     python tests/faults.py --seed 7                one case, with each of its actions: replays a failure
     python tests/faults.py --minutes 600 --wide    also barostats, minimisation, PME, mixed precision
 
-A case is a scene and a few actions, all drawn from one seed. Each attempt to run the scene is a forked process, which
-shares the compiled kernels. A fault comes at the n-th call of a C function, or at the n-th one that works on a file: the
-attempt is killed, stopped, signalled, or finds no room on the disk or in memory. Between attempts files are damaged,
-replaced by links, pipes and folders, or a checkpoint is forged. What must hold:
+A case is a scene and a few actions, all drawn from one seed. Each attempt to run the scene is a
+forked process, which shares the compiled kernels. A fault comes at the n-th call of a C function,
+or at the n-th one that works on a file: the attempt is killed, stopped, signalled, or finds no room
+on the disk or in memory. Between attempts files are damaged, replaced by links, pipes and folders,
+or a checkpoint is forged. What must hold:
 
-- An attempt ends with a documented exit code, with a sentence where it fails, without a traceback, and it ends.
+- An attempt ends with a documented exit code, with a sentence where it fails, without a traceback,
+  and it ends.
 - What is refused changes no file. Files that a run did not write stay.
 - A run that ends has the bits of an undisturbed run. A run whose files are whole can be resumed.
 """
@@ -51,13 +54,36 @@ except ImportError:  # not every Python has it
 CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint_previous.npz"
 #: How a process without memory may end besides: no stack can grow, or LLVM and C libraries give up.
 CRASHES = (-signal.SIGSEGV, -signal.SIGABRT, -signal.SIGBUS)
-FAULTS = ("kill", "kill", "timer", "stop", "signal", "disk", "failing", "memory", "allocation", "limit")
+FAULTS = (
+    "kill",
+    "kill",
+    "timer",
+    "stop",
+    "signal",
+    "disk",
+    "failing",
+    "memory",
+    "allocation",
+    "limit",
+)
 HANGS = 300.0  # s, after which an attempt has hung, however busy the machine is
 #: Functions that work on files, by the name that a C function has.
-FILE_CALLS = ("write", "open", "replace", "rename", "fsync", "truncate", "ftruncate", "mkdir", "unlink", "flock")
+FILE_CALLS = (
+    "write",
+    "open",
+    "replace",
+    "rename",
+    "fsync",
+    "truncate",
+    "ftruncate",
+    "mkdir",
+    "unlink",
+    "flock",
+)
 #: Of these, functions that may fail where a disk is full or broken.
 FAILING = ("write", "open", "replace", "fsync", "truncate", "mkdir")
-#: Arrays that nothing else in a checkpoint decides: with other values the run is another one, which must end by itself.
+#: Arrays that nothing else in a checkpoint decides: with other values the run is another one, which
+#: must end by itself.
 FREE = re.compile(
     r"state/(velocity|angular_momentum_body|books|bath|position|rotation)|Sampler/|engine/load|engine/\w+.times"
 )
@@ -66,13 +92,22 @@ FREE = re.compile(
 
 
 def scene_of(rng: random.Random, wide: bool) -> tuple[str, dict]:
-    """Name of the kind and data of a random small scene; all narrow scenes of a kind share their kernels."""
+    """Name of the kind and data of a random small scene; all narrow scenes of a kind share their
+    kernels."""
     kind = rng.choice(["water", "water", "argon", "top"])
     if kind == "top":
         integrator = rng.choice(["velocity_verlet", "rk4", "dop853"])
-        body = {"mass_kg": 0.15, "inertia_kg_m2": [3e-4, 3.1e-4, 1.2e-4], "pinned": True, "inertia_about": "pivot",
-                "centre_of_mass_m": [0.0, 0.0, 0.04]}  # fmt: skip
-        start = {"euler_angles_deg": [0.0, rng.uniform(5, 170), 0.0], "euler_rates_rad_s": [0.0, 0.0, 60.0]}
+        body = {
+            "mass_kg": 0.15,
+            "inertia_kg_m2": [3e-4, 3.1e-4, 1.2e-4],
+            "pinned": True,
+            "inertia_about": "pivot",
+            "centre_of_mass_m": [0.0, 0.0, 0.04],
+        }
+        start = {
+            "euler_angles_deg": [0.0, rng.uniform(5, 170), 0.0],
+            "euler_rates_rad_s": [0.0, 0.0, 60.0],
+        }
         run = {"duration_s": rng.choice([0.1, 0.2]), "timestep_s": 0.005, "integrator": integrator}
         output = {"interval_s": rng.choice([0.005, 0.02]), "figures": wide and rng.random() < 0.1}
         data = {"body": body, "gravity": {}, "start": start, "run": run}
@@ -87,7 +122,10 @@ def scene_of(rng: random.Random, wide: bool) -> tuple[str, dict]:
     chosen = [dict(rng.choice(stages)) for _ in range(rng.randint(1, 3))]
     for stage in chosen:
         if stage["ensemble"] != "minimise":
-            stage |= {"duration_ps": rng.choice([0.01, 0.02, 0.03]), "timestep_fs": rng.choice([1.0, 2.0])}
+            stage |= {
+                "duration_ps": rng.choice([0.01, 0.02, 0.03]),
+                "timestep_fs": rng.choice([1.0, 2.0]),
+            }
     output = {
         "log_interval_ps": rng.choice([0.002, 0.005, 0.007]),
         "trajectory_interval_ps": rng.choice([0.004, 0.01, 0.014]),
@@ -102,17 +140,27 @@ def scene_of(rng: random.Random, wide: bool) -> tuple[str, dict]:
     if wide:
         data["precision"] = rng.choice(["double", "mixed"])
     if kind == "water":
-        data |= {"box": {"density_g_cm3": 0.9}, "molecules": [{"model": "spce", "count": rng.randint(40, 60)}]}
+        data |= {
+            "box": {"density_g_cm3": 0.9},
+            "molecules": [{"model": "spce", "count": rng.randint(40, 60)}],
+        }
         data["forces"] = {"cutoff_A": 5.0, "truncation": "smooth_switch"}
         if wide and rng.random() < 0.3:
             data["forces"] = {"cutoff_A": 5.0, "truncation": "shift", "electrostatics": "pme"}
     else:
-        data |= {"box": {"lengths_A": 30.0}, "molecules": [{"model": "argon", "count": rng.randint(10, 40)}]}
-    return f"{kind} {','.join(stage['ensemble'] for stage in chosen)} {output['trajectory'][10:]}", data
+        data |= {
+            "box": {"lengths_A": 30.0},
+            "molecules": [{"model": "argon", "count": rng.randint(10, 40)}],
+        }
+    return (
+        f"{kind} {','.join(stage['ensemble'] for stage in chosen)} {output['trajectory'][10:]}",
+        data,
+    )
 
 
 def checkpoints(rng: random.Random) -> dict[str, float]:
-    """After every observation, at times that the clock decides, or only where a stage begins and ends."""
+    """After every observation, at times that the clock decides, or only where a stage begins and
+    ends."""
     return {"checkpoint_minutes": rng.choice([1e-9, 1e-9, 0.001, 60.0])}
 
 
@@ -120,7 +168,8 @@ def checkpoints(rng: random.Random) -> dict[str, float]:
 
 
 class Ended(NamedTuple):
-    """How a process ended: its exit code, negative of a signal; what it printed; whether it was stopped meanwhile."""
+    """How a process ended: its exit code, negative of a signal; what it printed; whether it was
+    stopped meanwhile."""
 
     code: int
     said: str
@@ -131,12 +180,17 @@ class Found(Exception):
 
 
 def is_in_memory(owner: Any) -> bool:
-    """Whether a method of this object works on no file: it is a text, or the stream on which an attempt prints."""
-    return isinstance(owner, str | bytes | io.StringIO | io.BytesIO) or owner in (sys.__stdout__, sys.__stderr__)
+    """Whether a method of this object works on no file: it is a text, or the stream on which an
+    attempt prints."""
+    return isinstance(owner, str | bytes | io.StringIO | io.BytesIO) or owner in (
+        sys.__stdout__,
+        sys.__stderr__,
+    )
 
 
 def is_elsewhere(frame: Any) -> bool:
-    """Whether NumPy's polynomials are at work, which turn any error into a TypeError, or Python reads a version."""
+    """Whether NumPy's polynomials are at work, which turn any error into a TypeError, or Python
+    reads a version."""
     while frame is not None:
         if re.search("/numpy/polynomial/|/importlib/metadata/", frame.f_code.co_filename):
             return True
@@ -145,7 +199,8 @@ def is_elsewhere(frame: Any) -> bool:
 
 
 class AtCall:
-    """A profile function that acts once: at the n-th call of a C function, or of one of some names."""
+    """A profile function that acts once: at the n-th call of a C function, or of one of some
+    names."""
 
     def __init__(self, names: Sequence[str], count: int, act: Callable[[], None]):
         self._names, self._left, self._act = names, count, act
@@ -155,7 +210,9 @@ class AtCall:
         self._begun |= event == "call" and frame.f_code.co_name in ("_run", "_resume")
         if event != "c_call" or not self._begun or frame.f_code.co_filename == __file__:
             return
-        if self._names and (called.__name__ not in self._names or is_in_memory(getattr(called, "__self__", None))):
+        if self._names and (
+            called.__name__ not in self._names or is_in_memory(getattr(called, "__self__", None))
+        ):
             return
         self._left -= 1
         if self._left <= 0 and not is_elsewhere(frame):
@@ -226,7 +283,9 @@ def contents(folder: Path) -> dict[str, bytes]:
     """The results of a run, which must be the same to the bit."""
     names = ("trajectory", "log", "topology", "motion")
     found = {
-        path.name: path.read_bytes() for path in folder.iterdir() if path.name.startswith(names) and path.is_file()
+        path.name: path.read_bytes()
+        for path in folder.iterdir()
+        if path.name.startswith(names) and path.is_file()
     }
     if not (folder / "final.npz").exists():  # of a body
         return found
@@ -235,7 +294,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def everything(folder: Path) -> dict[str, object]:
-    """All that is in a folder but for its lock: bytes of files, targets of links, kinds of others."""
+    """All that is in a folder but for its lock: bytes of files, targets of links, kinds of
+    others."""
     return {
         path.name: os.readlink(path)
         if path.is_symlink()
@@ -249,7 +309,13 @@ def everything(folder: Path) -> dict[str, object]:
 
 def leaves(value: object, path: tuple = ()) -> list[tuple]:
     """The paths of all values in nested lists and dictionaries."""
-    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    inner = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     return [path, *(leaf for key, part in inner for leaf in leaves(part, (*path, key)))]
 
 
@@ -261,7 +327,9 @@ def forge(folder: Path, rng: random.Random) -> str:
         *way, last = path = rng.choice(leaves(told)[1:])
         holder = functools.reduce(lambda part, key: part[key], way, told)
         numbers = [holder[last] + 1, -holder[last]] if isinstance(holder[last], int | float) else []
-        holder[last] = rng.choice([None, "x", [], {}, -1.5, float("nan"), float("inf"), 10**30, 7, -1, True, *numbers])
+        holder[last] = rng.choice(
+            [None, "x", [], {}, -1.5, float("nan"), float("inf"), 10**30, 7, -1, True, *numbers]
+        )
         name = f"{'.'.join(map(str, path))}: {holder[last]!r:.20}"
     else:
         name = rng.choice(sorted(arrays))
@@ -269,12 +337,18 @@ def forge(folder: Path, rng: random.Random) -> str:
         flat = array.reshape(-1)
         with np.errstate(all="ignore"):
             changes: dict[str, Callable] = {
-                "left out": lambda: None, "longer": lambda: np.concatenate([flat, flat[:1]]), "shorter": lambda: flat[:-1],
-                "text": lambda: array.astype(str), "another type": lambda: array.astype(np.float32),
-                "plus one": lambda: array + array.dtype.type(1), "zero": lambda: 0 * array,
-                "huge": lambda: array + array.dtype.type(1e300 if array.dtype.kind == "f" else 1 << 6),
+                "left out": lambda: None,
+                "longer": lambda: np.concatenate([flat, flat[:1]]),
+                "shorter": lambda: flat[:-1],
+                "text": lambda: array.astype(str),
+                "another type": lambda: array.astype(np.float32),
+                "plus one": lambda: array + array.dtype.type(1),
+                "zero": lambda: 0 * array,
+                "huge": lambda: (
+                    array + array.dtype.type(1e300 if array.dtype.kind == "f" else 1 << 6)
+                ),
                 "not a number": lambda: array * np.nan if array.dtype.kind == "f" else -array,
-            }  # fmt: skip
+            }
             how = rng.choice(sorted(changes))
             changed = changes[how]()
         if changed is None:
@@ -306,7 +380,9 @@ class Case:
         self.damage: list[str] = []  # names of files that are not as the run left them
         self.is_external = False  # a checkpoint was forged that may be of another run
         self.has_failed = False  # an attempt
-        self.has_previous = False  # a whole checkpoint before the damaged one, so that the run must be resumed
+        self.has_previous = (
+            False  # a whole checkpoint before the damaged one, so that the run must be resumed
+        )
         self.said = ""
 
     def run(self) -> None:
@@ -319,7 +395,10 @@ class Case:
             "-o",
             str(self.root / "whole"),
         ]
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(io.StringIO()) as said,
+        ):
             code = cli.main(arguments)  # in this process, whose kernels the forked ones will share
         if code != 0:
             raise Found(f"undisturbed run: exit code {code}: {said.getvalue()}")
@@ -335,13 +414,18 @@ class Case:
 
     def _command(self) -> list[str]:
         """One of the commands that begin or resume the run, with random threads."""
-        threads = [] if self.is_body or self.rng.random() < 0.2 else ["--threads", str(self.rng.choice([1, 2]))]
+        threads = (
+            []
+            if self.is_body or self.rng.random() < 0.2
+            else ["--threads", str(self.rng.choice([1, 2]))]
+        )
         if (self.folder / "scene.toml").is_file() and self.rng.random() < 0.5:
             return ["resume", str(self.folder), *threads]
         return ["run", str(self.scene), "-o", str(self.folder), "--resume", *threads]
 
     def _attempt(self, fault: str | None) -> bool:
-        """Run or resume, with a fault at a random call, and check how it ends; whether the run has to be resumed."""
+        """Run or resume, with a fault at a random call, and check how it ends; whether the run has
+        to be resumed."""
         command = self._command()
         names = FAILING if fault == "failing" else self.rng.choice([(), FILE_CALLS])
         count = int(10 ** (self.rng.uniform(0, 3.3) if names else self.rng.uniform(1, 5.6)))
@@ -358,31 +442,53 @@ class Case:
         return self._check(code, codes, fault, before)
 
     def _fault(self, fault: str | None) -> tuple[Callable[[], None] | None, str, set[int]]:
-        """What happens at the call, in words, and the exit codes that are right if nothing is damaged."""
+        """What happens at the call, in words, and the exit codes that are right if nothing is
+        damaged."""
         rng = self.rng
-        own = lambda sent: lambda: os.kill(os.getpid(), sent)  # noqa: E731
+
+        def own(sent):
+            return lambda: os.kill(os.getpid(), sent)
+
         if fault == "kill":
             return own(signal.SIGKILL), "kill", {0, -signal.SIGKILL}
         if fault == "timer":  # a moment after the call, also within compiled code
             seconds = rng.uniform(1e-4, 0.02)
-            return lambda: signal.setitimer(signal.ITIMER_PROF, seconds), "kill by a timer", {0, -signal.SIGPROF}
+            return (
+                lambda: signal.setitimer(signal.ITIMER_PROF, seconds),
+                "kill by a timer",
+                {0, -signal.SIGPROF},
+            )
         if fault == "stop":
             return own(signal.SIGSTOP), "stop", {0, 2, -signal.SIGKILL}
         if fault == "signal":
             sent = rng.choice([signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
-            ends = {signal.SIGTERM: {143, -sent}, signal.SIGINT: {130}, signal.SIGUSR1: {-sent}}[sent]
+            ends = {signal.SIGTERM: {143, -sent}, signal.SIGINT: {130}, signal.SIGUSR1: {-sent}}[
+                sent
+            ]
             return own(sent), f"signal: {sent.name}", {0, *ends}
         if fault == "disk":
             size = rng.choice([0, 0, 100, 3000, 20_000])
-            return lambda: limited(resource.RLIMIT_FSIZE, size), f"full disk: files of {size} bytes", {0, 2}
+            return (
+                lambda: limited(resource.RLIMIT_FSIZE, size),
+                f"full disk: files of {size} bytes",
+                {0, 2},
+            )
         if fault == "failing":
             number = rng.choice([errno.ENOSPC, errno.EIO, errno.EDQUOT])
-            return functools.partial(failing, number), f"failing call: {errno.errorcode[number]}", {0, 2}
+            return (
+                functools.partial(failing, number),
+                f"failing call: {errno.errorcode[number]}",
+                {0, 2},
+            )
         if fault == "memory":
             return functools.partial(_raise, MemoryError), "memory error", {0, 2}
         if fault == "allocation" and set_nomemory is not None:
             skipped = rng.choice([0, 1, 3, 10, 30, 100])
-            return lambda: set_nomemory(skipped, skipped + 1), f"allocation: {skipped} later", {0, 2, *CRASHES}
+            return (
+                lambda: set_nomemory(skipped, skipped + 1),
+                f"allocation: {skipped} later",
+                {0, 2, *CRASHES},
+            )
         if fault == "limit":
             free = rng.choice([0, 100_000, 1_000_000, 10_000_000])
             return (
@@ -393,7 +499,8 @@ class Case:
         return None, "no fault", {0}
 
     def _while_stopped(self, number: int, has_begun: bool) -> int:
-        """Try to run in the folder of a process that is stopped; its exit code when it has continued, or been killed.
+        """Try to run in the folder of a process that is stopped; its exit code when it has
+        continued, or been killed.
 
         has_begun : whether it has changed files, so that the other one must be refused
         """
@@ -411,7 +518,8 @@ class Case:
         return everything(self.folder) if self.folder.is_dir() else {}
 
     def _check(self, code: int, codes: set[int], fault: str | None, before: dict) -> bool:
-        """Whether an attempt ended as it must. Restores damaged files where it was right to refuse them."""
+        """Whether an attempt ended as it must. Restores damaged files where it was right to refuse
+        them."""
         if fault == "allocation":  # within CPython and libraries a failed one may become any error
             code = CRASHES[0] if code == 1 else code
         elif "Traceback" in self.said or "Exception ignored" in self.said:
@@ -422,7 +530,9 @@ class Case:
             and "holds no checkpoint" in self.said
             and not {CHECKPOINT, PREVIOUS} & {*before}
         ):
-            shutil.rmtree(self.folder)  # a run that failed before its first checkpoint has to be begun again
+            shutil.rmtree(
+                self.folder
+            )  # a run that failed before its first checkpoint has to be begun again
             self.damage = []
             return True
         self.has_failed |= code == 2 and fault is not None
@@ -435,7 +545,9 @@ class Case:
             raise Found("no sentence tells why it ended")
         after = self._files()
         if code in (0, 2) and (
-            left := [name for name in after.keys() - before if re.match(r"\..*\.[0-9a-f]{16}", name)]
+            left := [
+                name for name in after.keys() - before if re.match(r"\..*\.[0-9a-f]{16}", name)
+            ]
         ):
             raise Found(f"temporary files stay: {left}")
         if code == 2 and fault is None and after != before and "stopped at step" not in self.said:
@@ -457,10 +569,15 @@ class Case:
         return False
 
     def _compare(self) -> None:
-        """Raise Found if results differ from those of the undisturbed run, or files of others have changed."""
+        """Raise Found if results differ from those of the undisturbed run, or files of others have
+        changed."""
         found = contents(self.folder)
         unread = {name for name in self.damage if name.startswith("topology")}
-        differ = [name for name in self.whole | found if self.whole.get(name) != found.get(name) and name not in unread]
+        differ = [
+            name
+            for name in self.whole | found
+            if self.whole.get(name) != found.get(name) and name not in unread
+        ]
         if differ:
             raise Found(f"other bits: {differ}")
         if self.victim.exists() and self.victim.read_bytes() != b"precious":
@@ -474,7 +591,10 @@ class Case:
         names = sorted(path.name for path in self.folder.iterdir() if path.name != "notes.txt")
         growing = [name for name in names if name.startswith(("log", "trajectory"))]
         name = rng.choice([CHECKPOINT, CHECKPOINT, PREVIOUS, *growing, *growing, *names])
-        path, how = self.folder / name, rng.choice(["flip", "flip", "cut", "link", "pipe", "forge", "forge", "remove"])
+        path, how = (
+            self.folder / name,
+            rng.choice(["flip", "flip", "cut", "link", "pipe", "forge", "forge", "remove"]),
+        )
         words = name
         if how == "forge":
             name = CHECKPOINT
@@ -493,16 +613,24 @@ class Case:
         else:
             path.unlink()
             if how == "link":
-                how = rng.choice(["link to a file", "link to nothing", "link to a device", "link to a copy"])
+                how = rng.choice(
+                    ["link to a file", "link to nothing", "link to a device", "link to a copy"]
+                )
                 self.victim.write_bytes(b"precious")
                 (self.root / "copy").write_bytes((self.kept / name).read_bytes())
-                targets = {"file": self.victim, "nothing": self.root / "nothing", "device": "/dev/zero"}
+                targets = {
+                    "file": self.victim,
+                    "nothing": self.root / "nothing",
+                    "device": "/dev/zero",
+                }
                 path.symlink_to(targets.get(how.split()[-1], self.root / "copy"))
             elif how == "pipe":
                 os.mkfifo(path) if rng.random() < 0.7 else path.mkdir()
         self.damage = [name]
         self.has_previous = (
-            name == CHECKPOINT and how in ("flip", "cut", "remove") and (self.folder / PREVIOUS).is_file()
+            name == CHECKPOINT
+            and how in ("flip", "cut", "remove")
+            and (self.folder / PREVIOUS).is_file()
         )
         self.actions[how] += 1
         self.show(f"{how}: {words}")
@@ -539,14 +667,26 @@ def main() -> int:
     """Run cases until the time is up; 1 if something was found."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--minutes", type=float, default=1.0, help="how long (default: 1)")
-    parser.add_argument("--seed", type=int, help="only the case of this seed, with each of its actions")
-    parser.add_argument("--first", type=int, help="the seed of the first case (default: by the clock)")
-    parser.add_argument("--wide", action="store_true", help="more ensembles, thermostats, precisions; compiles more")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the files of the last case there")
+    parser.add_argument(
+        "--seed", type=int, help="only the case of this seed, with each of its actions"
+    )
+    parser.add_argument(
+        "--first", type=int, help="the seed of the first case (default: by the clock)"
+    )
+    parser.add_argument(
+        "--wide", action="store_true", help="more ensembles, thermostats, precisions; compiles more"
+    )
+    parser.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="keep the files of the last case there"
+    )
     options = parser.parse_args()
     began, cases, actions, failures = time.monotonic(), 0, Counter[str](), 0
     seed = (
-        options.seed if options.seed is not None else options.first if options.first is not None else int(time.time())
+        options.seed
+        if options.seed is not None
+        else options.first
+        if options.first is not None
+        else int(time.time())
     )
     replay = f"python tests/faults.py{' --wide' if options.wide else ''} --seed"
     with tempfile.TemporaryDirectory() as temporary:
@@ -555,10 +695,14 @@ def main() -> int:
             shutil.rmtree(root, ignore_errors=True)
             root.mkdir(parents=True)
             story: list[str] = []
-            case = Case(seed, root, options.wide, print if options.seed is not None else story.append)
+            case = Case(
+                seed, root, options.wide, print if options.seed is not None else story.append
+            )
             try:
                 case.run()
-            except Exception as error:  # also of the driver: what an attempt has left may be anything
+            except (
+                Exception
+            ) as error:  # also of the driver: what an attempt has left may be anything
                 failures += 1
                 found = f"FOUND: {error}" if isinstance(error, Found) else traceback.format_exc()
                 print(*story, case.said, found, f"replay: {replay} {seed}", sep="\n", flush=True)

@@ -1,7 +1,9 @@
-"""What a session of these tests adds to pytest: the order of files, limits of time, and in CI the skips that are allowed.
+"""What a session of these tests adds to pytest: the order of files, limits of time, and in CI the
+skips that are allowed.
 
-`CI=true` in the environment makes a skipped test that is not in `ALLOWED` a failure of the session. `RIGIDMD_CI_WITHOUT`
-names what could not be installed, separated by spaces (`chromium gromacs ffmpeg`): .ci/run sets both.
+`CI=true` in the environment makes a skipped test that is not in `ALLOWED` a failure of the session.
+`RIGIDMD_CI_WITHOUT` names what could not be installed, separated by spaces (`chromium gromacs
+ffmpeg`): .ci/run sets both.
 """
 
 import os
@@ -10,14 +12,33 @@ from pathlib import Path
 
 import pytest
 
-#: Files that take longest with cold kernels, the longest first: a file is run by one worker, so they begin first. By CPU
-#: seconds of a cold run on two cores: 223 of forces, 232 of docs, 200 of run, 196 of ewald, 25 of notebook. The first two
-#: have no kernels in common, which both workers would compile.
+#: Files that take longest with cold kernels, the longest first: a file is run by one worker, so
+#: they begin first. By CPU seconds of a cold run on two cores: 223 of forces, 232 of docs, 200 of
+#: run, 196 of ewald, 25 of notebook. The first two have no kernels in common, which both workers
+#: would compile.
 LONGEST = (
-    "forces", "body_engine", "ewald", "docs", "run", "dynamics", "resume", "user_code", "compile", "view", "minimise",
-    "sweep", "ase", "simd", "python", "bodies", "threads", "fuzz", "trajectory_structures", "engine_settings",
+    "forces",
+    "body_engine",
+    "ewald",
+    "docs",
+    "run",
+    "dynamics",
+    "resume",
+    "user_code",
+    "compile",
+    "view",
+    "minimise",
+    "sweep",
+    "ase",
+    "simd",
+    "python",
+    "bodies",
+    "threads",
+    "fuzz",
+    "trajectory_structures",
+    "engine_settings",
     "notebook",
-)  # fmt: skip
+)
 RANKS = {f"test_{name}.py": rank for rank, name in enumerate(LONGEST)}
 
 #: Reasons to skip that are properties of a machine, which CI cannot install.
@@ -42,9 +63,15 @@ PROGRAMS = {
 
 IN_CI = os.environ.get("CI", "").lower() in ("1", "true", "yes")
 ALLOWED = [re.escape(reason) for reason in MACHINE]
-ALLOWED += [r"no .*/spce_monoclinic_sample_periodic4\.txt"]  # a file of NIST that the shared folder does not have
-ALLOWED += ["could not import 'tblite.ase'"]  # a semi-empirical method, which no extra of the project installs
-ALLOWED += [PROGRAMS[name] for name in os.environ.get("RIGIDMD_CI_WITHOUT", "").split() if name in PROGRAMS]
+ALLOWED += [
+    r"no .*/spce_monoclinic_sample_periodic4\.txt"
+]  # a file of NIST that the shared folder does not have
+ALLOWED += [
+    "could not import 'tblite.ase'"
+]  # a semi-empirical method, which no extra of the project installs
+ALLOWED += [
+    PROGRAMS[name] for name in os.environ.get("RIGIDMD_CI_WITHOUT", "").split() if name in PROGRAMS
+]
 
 _skipped: list[str] = []
 

@@ -1,10 +1,13 @@
-"""Single rigid bodies whose motion is known in closed form: plain NumPy and SciPy, nothing of the package.
+"""Single rigid bodies whose motion is known in closed form: plain NumPy and SciPy, nothing of the
+package.
 
-The oracle for the dynamics of one body. Q takes body to lab; omega and L are in the body frame unless the name
-says `_lab`; Euler angles are 3-1-3, Q = Rz(phi) Rx(theta) Rz(psi); gravity points along -z; the axis of a symmetric
-top is body axis 3 and I1 = I2, about the pivot where there is one. Any coherent units.
+The oracle for the dynamics of one body. Q takes body to lab; omega and L are in the body frame
+unless the name says `_lab`; Euler angles are 3-1-3, Q = Rz(phi) Rx(theta) Rz(psi); gravity points
+along -z; the axis of a symmetric top is body axis 3 and I1 = I2, about the pivot where there is
+one. Any coherent units.
 
-Elliptic functions are kept in the complementary parameter m1 = 1 - m, which is formed without a difference,
+Elliptic functions are kept in the complementary parameter m1 = 1 - m, which is formed without a
+difference,
 so that motions near a separatrix lose nothing (scipy.special.ellipj does lose there).
 """
 
@@ -22,10 +25,12 @@ def quarter_period(m1: float) -> float:
 
 
 def amplitude(u, m1: float):
-    """(half turns, s, c): am(u | m) = pi half_turns + an angle of sine s and cosine c >= 0, each good to its own size.
+    """(half turns, s, c): am(u | m) = pi half_turns + an angle of sine s and cosine c >= 0, each
+    good to its own size.
 
-    So sn = (-1)^half_turns s, cn = (-1)^half_turns c. Gauss's transformation by the arithmetic-geometric mean, in
-    cotangents, of terms of one sign (Bulirsch, Numer. Math. 7 (1965) 78: sncndn). At m = 1 tanh and 1/cosh.
+    So sn = (-1)^half_turns s, cn = (-1)^half_turns c. Gauss's transformation by the
+    arithmetic-geometric mean, in cotangents, of terms of one sign (Bulirsch, Numer. Math. 7 (1965)
+    78: sncndn). At m = 1 tanh and 1/cosh.
     """
     u = np.asarray(u, float)
     if m1 <= 0:
@@ -41,7 +46,9 @@ def amplitude(u, m1: float):
             break
         a, b = mean, np.sqrt(a * b)
     size = np.maximum(np.abs(v), 1e-100)
-    ratio = np.where(size < k / 2, 1 / np.tan(mean * size), np.tan(mean * np.maximum(k - size, 0.0)))
+    ratio = np.where(
+        size < k / 2, 1 / np.tan(mean * size), np.tan(mean * np.maximum(k - size, 0.0))
+    )
     c, dn = mean * ratio, 1.0
     for a, b in reversed(means):
         ratio = ratio * c
@@ -58,9 +65,11 @@ def first_kind(s, c, m1: float):
 
 
 def third_kind(n: float, one_minus_n: float, s, c, m: float, m1: float):
-    """Pi(n; angle | m) for n < 1 and an angle in [-pi/2, pi/2], in Carlson's integrals without cancellation.
+    """Pi(n; angle | m) for n < 1 and an angle in [-pi/2, pi/2], in Carlson's integrals without
+    cancellation.
 
-    DLMF 19.25.14; for n < -sqrt(m) through the change of parameter n -> m/n (DLMF 19.21.12), both terms positive.
+    DLMF 19.25.14; for n < -sqrt(m) through the change of parameter n -> m/n (DLMF 19.21.12), both
+    terms positive.
     """
     x, y, p = c * c, c * c + m1 * s * s, c * c + one_minus_n * s * s
     if n >= -np.sqrt(m):
@@ -91,8 +100,8 @@ def euler_rotation(phi, theta, psi) -> np.ndarray:
 def free_symmetric_top(i1, i3, omega0, times, rotation0=None):
     """(omega (n, 3), Q (n, 3, 3)) of a body with moments (i1, i1, i3) under no torque.
 
-    Q(t) = R(L_lab, |L| t / I1) Q0 Rz((I1 - I3) omega3 t / I1); omega turns about axis 3 at (I3 - I1) omega3 / I1.
-    Landau & Lifshitz, Mechanics, sections 33 and 36.
+    Q(t) = R(L_lab, |L| t / I1) Q0 Rz((I1 - I3) omega3 t / I1); omega turns about axis 3 at (I3 -
+    I1) omega3 / I1. Landau & Lifshitz, Mechanics, sections 33 and 36.
     """
     omega0, times = np.asarray(omega0, float), np.asarray(times, float)
     rotation0 = np.eye(3) if rotation0 is None else np.asarray(rotation0, float)
@@ -108,7 +117,8 @@ def free_symmetric_top(i1, i3, omega0, times, rotation0=None):
 class _FreeRotor:
     """The constants of a free asymmetric top, axes so ordered that omega3 keeps its sign.
 
-    With L^2 and 2T of the start, every difference L^2 - 2T Ik is summed as sum_j Ij (Ij - Ik) omega_j^2.
+    With L^2 and 2T of the start, every difference L^2 - 2T Ik is summed as sum_j Ij (Ij - Ik)
+    omega_j^2.
     """
 
     def __init__(self, inertia, omega0):
@@ -131,7 +141,11 @@ class _FreeRotor:
                 np.copysign(np.sqrt(from1 / (i3 * (i3 - i1))), self.omega0[2]),
             ]
         )
-        self.rate = -np.sign(i3 - i1) * np.sign(self.omega0[2]) * np.sqrt(from1 * (i3 - i2) / (i1 * i2 * i3))
+        self.rate = (
+            -np.sign(i3 - i1)
+            * np.sign(self.omega0[2])
+            * np.sqrt(from1 * (i3 - i2) / (i1 * i2 * i3))
+        )
         self.m = from3 * (i1 - i2) / (from1 * (i3 - i2))
         self.m1 = (i3 - i1) * from2 / (from1 * (i3 - i2))
 
@@ -154,9 +168,10 @@ class _FreeRotor:
 def free_asymmetric_top(inertia, rotation0, omega0, times):
     """(omega (n, 3), Q (n, 3, 3)) of a body under no torque, moments in any order, equal ones too.
 
-    omega = (w1 cn, w2 sn, w3 dn)(u0 + rate t | m), the axes in the order that keeps omega3 from zero; the angle about L
-    psi = |L| t / I3 + |L| (1/I1 - 1/I3) / rate [Pi(n; phi | m) - Pi(n; phi0 | m)], n = I3 (I1 - I2) / (I1 (I3 - I2)) <= 0.
-    Landau & Lifshitz, Mechanics, section 37; van Zon & Schofield, J. Comput. Phys. 225 (2007) 145.
+    omega = (w1 cn, w2 sn, w3 dn)(u0 + rate t | m), the axes in the order that keeps omega3 from
+    zero; the angle about L psi = |L| t / I3 + |L| (1/I1 - 1/I3) / rate [Pi(n; phi | m) - Pi(n; phi0
+    | m)], n = I3 (I1 - I2) / (I1 (I3 - I2)) <= 0. Landau & Lifshitz, Mechanics, section 37; van Zon
+    & Schofield, J. Comput. Phys. 225 (2007) 145.
     """
     times, rotation0 = np.asarray(times, float), np.asarray(rotation0, float)
     top = _FreeRotor(inertia, omega0)
@@ -192,7 +207,8 @@ def free_asymmetric_top(inertia, rotation0, omega0, times):
 
 
 def free_asymmetric_period(inertia, omega0) -> float:
-    """Period of omega (body frame), 4 K(m) / rate; about a stable axis the limit of a small wobble; inf if none."""
+    """Period of omega (body frame), 4 K(m) / rate; about a stable axis the limit of a small wobble;
+    inf if none."""
     return 4 * _FreeRotor(inertia, omega0).quarter()
 
 
@@ -218,15 +234,18 @@ def _decimal_sin_cos(x: Decimal):
 
 
 class LagrangeTop:
-    """A symmetric top pinned on its axis: closed form in Jacobi functions, from its Euler angles and rates at t = 0.
+    """A symmetric top pinned on its axis: closed form in Jacobi functions, from its Euler angles
+    and rates at t = 0.
 
     With u = cos theta, M = m g l > 0 (centre of mass at +l on axis 3), E' = E - L3^2 / (2 I3):
     u'^2 = (1 - u^2)(2 E' - 2 M u) / I1 - ((Lz - L3 u) / I1)^2 = (2 M / I1)(u - u1)(u - u2)(u - u3),
     u = u1 + (u2 - u1) sn^2(p t + d | m), p^2 = M (u3 - u1) / (2 I1), m = (u2 - u1) / (u3 - u1);
-    phi' = ((Lz - L3)/(1 - u) + (Lz + L3)/(1 + u)) / (2 I1), each an elliptic integral of the third kind;
-    psi' = L3 / I3 - phi' u. Whittaker, Analytical Dynamics, sections 71-72; Landau & Lifshitz, Mechanics, section 35.
-    The constants are formed in 80 digits from the doubles given, so that near misses of the vertical keep theirs.
-    Where the path goes through the vertical exactly, phi and psi jump by pi there, and Q is right on both sides.
+    phi' = ((Lz - L3)/(1 - u) + (Lz + L3)/(1 + u)) / (2 I1), each an elliptic integral of the third
+    kind;
+    psi' = L3 / I3 - phi' u. Whittaker, Analytical Dynamics, sections 71-72; Landau & Lifshitz,
+    Mechanics, section 35. The constants are formed in 80 digits from the doubles given, so that
+    near misses of the vertical keep theirs. Where the path goes through the vertical exactly, phi
+    and psi jump by pi there, and Q is right on both sides.
     """
 
     def __init__(self, i1, i3, mgl, theta0, phi_rate0, theta_rate0, psi_rate0):
@@ -283,16 +302,25 @@ class LagrangeTop:
             else:
                 one = minus / (above - v1) / (2 * i1) if high else Decimal(0)
                 two = plus / low / (2 * i1)
-                self._phi_base, self._psi_base = float(one + two), float(l3 / i3 - l3 / i1 - one + two)
+                self._phi_base, self._psi_base = (
+                    float(one + two),
+                    float(l3 / i3 - l3 / i1 - one + two),
+                )
             self.roots = np.array([float(u0 + v) for v in (v1, v2, v3)])
             self.energy, self.l_3, self.l_z = float(e), float(l3), float(kick + l3 * u0)
-            s, c = (max(-v1, v1 * 0) / width).sqrt() if width else 0, (max(v2, v1 * 0) / width).sqrt() if width else 1
+            s, c = (
+                (max(-v1, v1 * 0) / width).sqrt() if width else 0,
+                (max(v2, v1 * 0) / width).sqrt() if width else 1,
+            )
             self._s0, self._c0 = (-float(s) if theta_rate0 > 0 else float(s)), float(c)
-        self._d = float(first_kind(self._s0, self._c0, self._m1)) if self._m1 or self._c0 else np.inf
+        self._d = (
+            float(first_kind(self._s0, self._c0, self._m1)) if self._m1 or self._c0 else np.inf
+        )
 
     @property
     def period(self) -> float:
-        """Of the nutation, 2 K(m) / p; in steady precession the limit of a small nutation; inf on the separatrix."""
+        """Of the nutation, 2 K(m) / p; in steady precession the limit of a small nutation; inf on
+        the separatrix."""
         return 2 * quarter_period(self._m1) / self._p
 
     @property
@@ -311,10 +339,11 @@ class LagrangeTop:
         return amplitude(self._p * np.asarray(times, float) + self._d, self._m1)
 
     def _parts(self, half, s, c):
-        """The terms of phi in 1 - u and in 1 + u, from sn = 0 onward, without the rates `_phi_base`, `_psi_base`.
+        """The terms of phi in 1 - u and in 1 + u, from sn = 0 onward, without the rates
+        `_phi_base`, `_psi_base`.
 
-        Unless the path comes near the downward vertical, F is taken out of both Pi and put into those rates (the
-        ones at u1), so that a slow precession is no difference of two large terms.
+        Unless the path comes near the downward vertical, F is taken out of both Pi and put into
+        those rates (the ones at u1), so that a slow precession is no difference of two large terms.
         """
         m, m1, scale = self._m, self._m1, 2 * self.i1 * self._p
 
@@ -355,7 +384,8 @@ class LagrangeTop:
         return self._phi_base * np.asarray(times, float) + above + below
 
     def psi(self, times) -> np.ndarray:
-        """From 0 at t = 0: psi' = L3/I3 - L3/I1 - (Lz - L3)/(2 I1 (1 - u)) + (Lz + L3)/(2 I1 (1 + u))."""
+        """From 0 at t = 0: psi' = L3/I3 - L3/I1 - (Lz - L3)/(2 I1 (1 - u)) + (Lz + L3)/(2 I1 (1 +
+        u))."""
         above, below = self._turned(times)
         return self._psi_base * np.asarray(times, float) - above + below
 
@@ -364,15 +394,20 @@ class LagrangeTop:
         return euler_rotation(self.phi(times), self.theta(times), self.psi(times))
 
     def axis(self, times) -> np.ndarray:
-        """The symmetry axis in the lab (n, 3): (sin theta sin phi, -sin theta cos phi, cos theta)."""
+        """The symmetry axis in the lab (n, 3): (sin theta sin phi, -sin theta cos phi, cos
+        theta)."""
         theta, phi = self.theta(times), self.phi(times)
-        return np.stack([np.sin(theta) * np.sin(phi), -np.sin(theta) * np.cos(phi), np.cos(theta)], axis=-1)
+        return np.stack(
+            [np.sin(theta) * np.sin(phi), -np.sin(theta) * np.cos(phi), np.cos(theta)], axis=-1
+        )
 
 
 def steady_precession_rates(i1, l3, mgl, theta) -> tuple[float, float]:
-    """(slow, fast) roots of I1 cos(theta) x^2 - L3 x + M = 0; nan if there are none, fast inf at 90 degrees.
+    """(slow, fast) roots of I1 cos(theta) x^2 - L3 x + M = 0; nan if there are none, fast inf at 90
+    degrees.
 
-    Of sin(theta) (I1 cos(theta) x^2 - L3 x + M) = I1 theta'' at theta'' = 0. Landau & Lifshitz, Mechanics, section 35.
+    Of sin(theta) (I1 cos(theta) x^2 - L3 x + M) = I1 theta'' at theta'' = 0. Landau & Lifshitz,
+    Mechanics, section 35.
     """
     lead = i1 * np.cos(theta)
     inside = l3 * l3 - 4 * lead * mgl
@@ -391,10 +426,12 @@ def sleeping_limit(i1, mgl) -> float:
 
 
 def rotating_fall(omega_frame, gravity, x0, v0, times):
-    """(x, v), each (n, 3), of a point in a frame that turns at a constant rate, relative to the frame.
+    """(x, v), each (n, 3), of a point in a frame that turns at a constant rate, relative to the
+    frame.
 
-    x'' = g - 2 W x x' - W x (W x x), g and W constant in the frame. In axes at rest X = R(t) x has X'' = R(t) g, so
-    X = x0 + (v0 + W x x0) t + t^2 [g_par / 2 + g_perp (1 - cos z)/z^2 + (n x g)(z - sin z)/z^2], z = |W| t.
+    x'' = g - 2 W x x' - W x (W x x), g and W constant in the frame. In axes at rest X = R(t) x has
+    X'' = R(t) g, so X = x0 + (v0 + W x x0) t + t^2 [g_par / 2 + g_perp (1 - cos z)/z^2 + (n x g)(z
+    - sin z)/z^2], z = |W| t.
     """
     spin, g = np.asarray(omega_frame, float), np.asarray(gravity, float)
     x0, v0, t = np.asarray(x0, float), np.asarray(v0, float), np.asarray(times, float)[:, None]
@@ -410,7 +447,10 @@ def rotating_fall(omega_frame, gravity, x0, v0, times):
         term = -term * zs**2 / ((2 * k) * (2 * k + 1))
         series = series + term
     late = np.where(small, series, (zl - np.sin(zl)) / zl**2)
-    sinc, versine = np.sinc(z / np.pi), np.sinc(z / (2 * np.pi)) ** 2 / 2  # sin z / z, (1 - cos z) / z^2
+    sinc, versine = (
+        np.sinc(z / np.pi),
+        np.sinc(z / (2 * np.pi)) ** 2 / 2,
+    )  # sin z / z, (1 - cos z) / z^2
     start = v0 + np.cross(spin, x0)
     x_rest = x0 + start * t + t**2 * (along / 2 + aside * versine + across * late)
     v_rest = start + t * (along + aside * sinc + across * z * versine)
@@ -420,17 +460,20 @@ def rotating_fall(omega_frame, gravity, x0, v0, times):
 
 
 def gyrocompass_period(h, mgl, omega, latitude) -> float:
-    """2 pi sqrt(h / (m g l W cos(latitude))): the rotor's own inertia and the frame's rate beside the weight neglected.
+    """2 pi sqrt(h / (m g l W cos(latitude))): the rotor's own inertia and the frame's rate beside
+    the weight neglected.
 
-    The axis at azimuth a east of north and elevation e: the frame's vertical rate apart, the horizon under an axis
-    that points east sinks, e' = W cos(latitude) a; the pendulum's torque m g l e turns the axis, a' = -m g l e / h.
-    Together a'' = -(m g l W cos(latitude) / h) a. Period of the undamped gyrocompass.
+    The axis at azimuth a east of north and elevation e: the frame's vertical rate apart, the
+    horizon under an axis that points east sinks, e' = W cos(latitude) a; the pendulum's torque m g
+    l e turns the axis, a' = -m g l e / h. Together a'' = -(m g l W cos(latitude) / h) a. Period of
+    the undamped gyrocompass.
     """
     return float(2 * np.pi * np.sqrt(h / (mgl * omega * np.cos(latitude))))
 
 
 def gyrocompass_rest(inertia, h, mgl, omega, latitude) -> float:
-    """Elevation of axis 1 above the horizon at rest in the meridian, from -torque = (I W + h) x W about the pivot.
+    """Elevation of axis 1 above the horizon at rest in the meridian, from -torque = (I W + h) x W
+    about the pivot.
 
     m g l sin(a) = h W sin(b) + (I1 - I3) W^2 sin(b) cos(b), b = latitude - a.
     """
@@ -447,14 +490,19 @@ def gyrocompass_rest(inertia, h, mgl, omega, latitude) -> float:
 
 
 def gyrocompass_period_linear(inertia, h, mgl, omega, latitude) -> float:
-    """Slowest period of the pendulous gyrostat's small motions about rest in the meridian, nothing neglected.
+    """Slowest period of the pendulous gyrostat's small motions about rest in the meridian, nothing
+    neglected.
 
-    Body: principal moments about the pivot, rotor momentum h along axis 1 (north at rest), centre of mass at
-    -l along axis 3. At rest the axes point north, west and up, tilted by the elevation a (`gyrocompass_rest`), and
-    the frame's rate is W (A, 0, B) = omega (cos b, 0, sin b), b = latitude - a, in the body. With Q = Q_rest exp(hat(e)),
-    I w' = (I w + h) x w + torque becomes I e'' + G e' + K e = 0,
-    G12 = -(I1 + I2 - I3) B, G23 = h - (I2 + I3 - I1) A, antisymmetric; K11 = M cos a + (I3 - I2) B^2,
-    K22 = M cos a + h A + (I1 - I3)(A^2 - B^2), K33 = h A + (I1 - I2) A^2, K13 = K31 = (I2 - I3) A B - M sin a.
+    Body: principal moments about the pivot, rotor momentum h along axis 1 (north at rest), centre
+    of mass at
+    -l along axis 3. At rest the axes point north, west and up, tilted by the elevation a
+    (`gyrocompass_rest`), and the frame's rate is W (A, 0, B) = omega (cos b, 0, sin b), b =
+    latitude - a, in the body. With Q = Q_rest exp(hat(e)), I w' = (I w + h) x w + torque becomes I
+    e'' + G e' + K e = 0,
+    G12 = -(I1 + I2 - I3) B, G23 = h - (I2 + I3 - I1) A, antisymmetric; K11 = M cos a + (I3 - I2)
+    B^2,
+    K22 = M cos a + h A + (I1 - I3)(A^2 - B^2), K33 = h A + (I1 - I2) A^2, K13 = K31 = (I2 - I3) A B
+    - M sin a.
     The determinant is a cubic in s^2, whose least root is found by Newton's method. To first order
     T^2 = T0^2 (1 + I3 M / h^2) / (1 + h W cos(latitude) / M).
     """
@@ -465,7 +513,10 @@ def gyrocompass_period_linear(inertia, h, mgl, omega, latitude) -> float:
     weight = mgl * np.cos(tilt)
     g12, g23 = -(j1 + j2 - j3) * b, h - (j2 + j3 - j1) * a
     k13 = (j2 - j3) * a * b - mgl * np.sin(tilt)
-    first, second = i1 + weight + (j3 - j2) * b * b, i2 + weight + h * a + (j1 - j3) * (a * a - b * b)
+    first, second = (
+        i1 + weight + (j3 - j2) * b * b,
+        i2 + weight + h * a + (j1 - j3) * (a * a - b * b),
+    )
     k33 = h * a + (j1 - j2) * a * a
     square = np.polynomial.Polynomial([0.0, 1.0])
     det = first * second * (i3 + k33) - second * k13**2
@@ -483,11 +534,14 @@ def gyrocompass_period_linear(inertia, h, mgl, omega, latitude) -> float:
 
 def terminal_speed(weight_in_fluid, linear, quadratic) -> float:
     """The speed at which linear v + quadratic v^2 carries the weight left after buoyancy."""
-    return float(2 * weight_in_fluid / (linear + np.sqrt(linear**2 + 4 * quadratic * weight_in_fluid)))
+    return float(
+        2 * weight_in_fluid / (linear + np.sqrt(linear**2 + 4 * quadratic * weight_in_fluid))
+    )
 
 
 def coasting_stop(i, viscous, dry, omega0) -> float:
-    """When dry friction brings the spin to rest: (I / c) log(1 + c |omega0| / d); inf without it."""
+    """When dry friction brings the spin to rest: (I / c) log(1 + c |omega0| / d); inf without
+    it."""
     if not dry:
         return np.inf
     x = viscous * abs(omega0) / dry
@@ -507,10 +561,12 @@ def coasting_spin(i, viscous, dry, omega0, times) -> np.ndarray:
 
 
 def wheel_turn(i_body, torque, t_on, times) -> np.ndarray:
-    """Angle of a satellite at rest while the momentum of its wheel on the same axis grows by `torque` a second.
+    """Angle of a satellite at rest while the momentum of its wheel on the same axis grows by
+    `torque` a second.
 
-    L = I omega + h = 0, h = torque min(t, t_on): angle = -torque t^2 / (2 I), later -torque t_on (t - t_on / 2) / I.
-    If h is the wheel's whole momentum, `torque` is the motor's and I is the body's without the wheel;
+    L = I omega + h = 0, h = torque min(t, t_on): angle = -torque t^2 / (2 I), later -torque t_on (t
+    - t_on / 2) / I. If h is the wheel's whole momentum, `torque` is the motor's and I is the body's
+    without the wheel;
     if h counts from the body (relative spin), I is that of the two locked together.
     """
     times = np.asarray(times, float)

@@ -1,6 +1,8 @@
-"""The slow, obvious NumPy version of the forces: every pair of sites, no list, no cells, formulas as on paper.
+"""The slow, obvious NumPy version of the forces: every pair of sites, no list, no cells, formulas
+as on paper.
 
-The oracle against which kernels are checked. It shares no code with them, not even the endings at the cut-off.
+The oracle against which kernels are checked. It shares no code with them, not even the endings at
+the cut-off.
 """
 
 import numpy as np
@@ -13,7 +15,8 @@ AROUND = np.array(list(np.ndindex(5, 5, 5))) - 2
 
 
 def nearest(d, cell):
-    """Shortest image of a displacement (3,) in a cell (3, 3), rows a, b, c: brought near, then two cells around."""
+    """Shortest image of a displacement (3,) in a cell (3, 3), rows a, b, c: brought near, then two
+    cells around."""
     if cell is None:
         return d
     images = d - np.round(d @ np.linalg.inv(cell)) @ cell + AROUND @ cell
@@ -84,7 +87,8 @@ def reaction_field(r, cutoff, start, name, permittivity):
 
 
 class Oracle:
-    """Energy of a system by all pairs of sites; forces, torques and virial by central differences of it."""
+    """Energy of a system by all pairs of sites; forces, torques and virial by central differences
+    of it."""
 
     def __init__(self, system):
         scene = system.scene
@@ -95,7 +99,9 @@ class Oracle:
             self.cell[[1, 2, 2], [0, 0, 1]] = system.space[3:] or 0.0
         self.cutoff = system.cutoff
         usual = (
-            0.6 * self.cutoff if scene.forces.truncation == "smooth_switch" else max(0.9 * self.cutoff, self.cutoff - 1)
+            0.6 * self.cutoff
+            if scene.forces.truncation == "smooth_switch"
+            else max(0.9 * self.cutoff, self.cutoff - 1)
         )
         self.start = scene.forces.switch_start_A or usual
         self.forces = scene.forces
@@ -134,20 +140,29 @@ class Oracle:
                         six = inverse_power(r, 6, self.cutoff, self.start, f.truncation)
                     lj += 4 * e * (s**12 * twelve - s**6 * six)
                 if f.electrostatics != "none" and self.charge[i] != 0 and self.charge[j] != 0:
-                    u = reaction_field(r, self.cutoff, self.start, f.truncation, f.reaction_field_permittivity)
+                    u = reaction_field(
+                        r, self.cutoff, self.start, f.truncation, f.reaction_field_permittivity
+                    )
                     coulomb += KE * self.charge[i] * self.charge[j] * u
         return lj, coulomb
 
 
 class EwaldOracle:
-    """Ewald sums term by term: all pairs of sites by scipy's erfc, all waves by complex exponentials, any cell.
+    """Ewald sums term by term: all pairs of sites by scipy's erfc, all waves by complex
+    exponentials, any cell.
 
-    x (s, 3) sites with molecules whole, q (s,) in e, owner (s,), cell (3, 3) rows a, b, c; energies in u Å²/ps².
+    x (s, 3) sites with molecules whole, q (s,) in e, owner (s,), cell (3, 3) rows a, b, c; energies
+    in u Å²/ps².
     """
 
     def __init__(self, x, q, owner, cell, alpha, cutoff, inside):
         """inside(n) says which integer vectors n (..., 3), up to 20 on each axis, are summed."""
-        self.x, self.q, self.owner, self.cell = np.array(x), np.array(q) * np.sqrt(KE), np.array(owner), np.array(cell)
+        self.x, self.q, self.owner, self.cell = (
+            np.array(x),
+            np.array(q) * np.sqrt(KE),
+            np.array(owner),
+            np.array(cell),
+        )
         self.alpha, self.cutoff, self.inside = alpha, cutoff, inside
         self.volume = abs(np.linalg.det(cell))
 
@@ -174,7 +189,12 @@ class EwaldOracle:
         k = 2 * np.pi * n @ np.linalg.inv(self.cell).T
         k2 = (k**2).sum(axis=1)
         s = np.exp(1j * k @ self.x.T) @ self.q
-        return 2 * np.pi / self.volume * np.sum(np.exp(-k2 / (4 * self.alpha**2)) / k2 * np.abs(s) ** 2)
+        return (
+            2
+            * np.pi
+            / self.volume
+            * np.sum(np.exp(-k2 / (4 * self.alpha**2)) / k2 * np.abs(s) ** 2)
+        )
 
     @property
     def self(self):
@@ -182,7 +202,11 @@ class EwaldOracle:
 
     @property
     def intramolecular(self):
-        return -sum(self.q[i] * self.q[j] * erf(self.alpha * r) / r for i, j, r, same in self.pairs() if same)
+        return -sum(
+            self.q[i] * self.q[j] * erf(self.alpha * r) / r
+            for i, j, r, same in self.pairs()
+            if same
+        )
 
     @property
     def background(self):

@@ -1,18 +1,21 @@
 """Scenes that several test files use, as tables and as text. What is made of them is in `support`.
 
-Kernels are compiled for the types of the force terms, which takes 95 % of the time of all tests. What makes a type: how
-a potential ends (truncation), the electrostatics with the number of coefficients that its accuracy needs, the precision,
-whether the cell is slanted, open or neither, and whether all molecules are single sites. Which models are in the scene,
-how many, the cutoff and the time steps make none. A test that needs nothing special takes `support.small_scene` with its
-settings (truncation "switch" of all forces, reaction field), {"truncation": "smooth_switch"}, or PME with its default
-accuracy, in double precision, or the defaults of a scene (PME in mixed precision): these are compiled in any case.
+Kernels are compiled for the types of the force terms, which takes 95 % of the time of all tests.
+What makes a type: how a potential ends (truncation), the electrostatics with the number of
+coefficients that its accuracy needs, the precision, whether the cell is slanted, open or neither,
+and whether all molecules are single sites. Which models are in the scene, how many, the cutoff and
+the time steps make none. A test that needs nothing special takes `support.small_scene` with its
+settings (truncation "switch" of all forces, reaction field), {"truncation": "smooth_switch"}, or
+PME with its default accuracy, in double precision, or the defaults of a scene (PME in mixed
+precision): these are compiled in any case.
 """
 
 import numpy as np
 
 PME = {"electrostatics": "pme", "cutoff_A": 7.0}
 WALL = [{"model": "argon", "count": 20, "frozen": True}, {"model": "spce", "count": 30}]
-#: Ten systems of every kind, in a cube of 15 Å unless they say otherwise: name -> models and counts, tables of the scene.
+#: Ten systems of every kind, in a cube of 15 Å unless they say otherwise: name -> models and
+#: counts, tables of the scene.
 SCENES = {
     "three sites": ({"spce": 30}, {"forces": PME}),
     "four sites": ({"tip4p2005": 30}, {"forces": PME}),
@@ -44,7 +47,12 @@ FORTY_WATERS = {
     "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figures": False},
 }
 NVT = {"ensemble": "nvt", "temperature_K": 298.0, "duration_ps": 0.1, "timestep_fs": 1.0}
-NPT = NVT | {"ensemble": "npt", "pressure_bar": 1.0, "barostat_interval_ps": 0.007, "temperature_K": [298.0, 320.0]}
+NPT = NVT | {
+    "ensemble": "npt",
+    "pressure_bar": 1.0,
+    "barostat_interval_ps": 0.007,
+    "temperature_K": [298.0, 320.0],
+}
 NVE = {"duration_ps": 0.1, "timestep_fs": 2.0}
 NPH = NVE | {"ensemble": "nph", "pressure_bar": 1.0}
 MINIMISE = {"ensemble": "minimise", "most_iterations": 5}
@@ -111,10 +119,18 @@ def forty_waters(*stages: dict, **changes) -> dict:
 
 def structures() -> dict[str, str]:
     """Two waters in each format that is read."""
-    names, one = ("O", "H", "H"), np.array([[0, 0, 0], [0.8164904, 0.577359, 0], [-0.8164904, 0.577359, 0]])
-    atoms = [(m, name, *(at + 2 + 6 * m)) for m in range(2) for name, at in zip(names, one, strict=True)]
+    names, one = (
+        ("O", "H", "H"),
+        np.array([[0, 0, 0], [0.8164904, 0.577359, 0], [-0.8164904, 0.577359, 0]]),
+    )
+    atoms = [
+        (m, name, *(at + 2 + 6 * m)) for m in range(2) for name, at in zip(names, one, strict=True)
+    ]
     rows = list(enumerate(atoms, 1))
-    gro = "".join(f"{m + 1:5}SOL  {n:>5}{k:5}{x / 10:8.3f}{y / 10:8.3f}{z / 10:8.3f}\n" for k, (m, n, x, y, z) in rows)
+    gro = "".join(
+        f"{m + 1:5}SOL  {n:>5}{k:5}{x / 10:8.3f}{y / 10:8.3f}{z / 10:8.3f}\n"
+        for k, (m, n, x, y, z) in rows
+    )
     xyz = "".join(f"{n} {x} {y} {z}\n" for _, (_, n, x, y, z) in rows)
     lattice = 'Lattice="18.0 0.0 0.0 0.0 18.0 0.0 0.0 0.0 18.0" Properties=species:S:1:pos:R:3'
     pdb = "".join(
@@ -122,10 +138,13 @@ def structures() -> dict[str, str]:
         for k, (m, n, x, y, z) in rows
     )
     cif = "".join(f"{n}{k} {n} {x / 18} {y / 18} {z / 18} 1.0\n" for k, (_, n, x, y, z) in rows)
-    data = "".join(f"{k} {m + 1} {1 if n == 'O' else 2} 0.0 {x} {y} {z}\n" for k, (m, n, x, y, z) in rows)
+    data = "".join(
+        f"{k} {m + 1} {1 if n == 'O' else 2} 0.0 {x} {y} {z}\n" for k, (m, n, x, y, z) in rows
+    )
     dump = "".join(f"{k} {n} {x} {y} {z}\n" for k, (_, n, x, y, z) in rows)
     columns = "".join(
-        f"_atom_site_{key}\n" for key in ("label", "type_symbol", "fract_x", "fract_y", "fract_z", "occupancy")
+        f"_atom_site_{key}\n"
+        for key in ("label", "type_symbol", "fract_x", "fract_y", "fract_z", "occupancy")
     )
     edges = "".join(f"_cell_length_{axis} 18\n" for axis in "abc")
     angles = "".join(f"_cell_angle_{angle} 90\n" for angle in ("alpha", "beta", "gamma"))

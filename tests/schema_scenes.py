@@ -1,4 +1,5 @@
-"""Small scenes that together set every key of the schema that holds a number; tests/test_schema_walk.py changes them."""
+"""Small scenes that together set every key of the schema that holds a number;
+tests/test_schema_walk.py changes them."""
 
 ARGON = """
 seed = 5
@@ -250,41 +251,96 @@ trajectory = false
 """
 #: Changes of these scenes for keys that exclude others; None removes a key.
 VARIANTS = {
-    "grids": (MESH, {
-        "box.vacuum_A": None, "forces.ewald_slab": None, "forces.dispersion_accuracy": None,
-        "forces.dispersion_beta_per_A": 0.4, "forces.dispersion_order": 5, "forces.dispersion_grid": [20, 20, 20],
-        "forces.ewald_accuracy": None, "forces.ewald_alpha_per_A": 0.4, "forces.pme_grid": [20, 20, 20],
-    }),
-    "sphere": (IONS, {
-        "forces.ewald_k_max": None, "forces.ewald_k2_max": None, "forces.ewald_k_radius_per_A": 2.5,
-    }),
-    "damped": (FIELDS, {
-        "forces.electrostatics": "damped_shifted_force", "forces.reaction_field_permittivity": None,
-        "forces.damping_per_A": 0.2, "stages.1.thermostat": None,
-        "stages.1.trajectory_steps": None, "stages.1.momentum_refreshment": None,
-        "fields.electric_frequency_per_ps": 0.5, "fields.electric_phase_deg": 30.0,
-    }),
-    "energy": (ARGON, {
-        "stages.0.integrator": "auto", "stages.0.timestep_fs": None, "stages.0.energy_error_kT": 1e-3,
-    }),
-    "trajectory": (ARGON, {
-        "stages.0.integrator": "auto", "stages.0.timestep_fs": None, "stages.0.trajectory_error": 1e-3,
-    }),
-    "bias": (ARGON, {
-        "stages.0.ensemble": "nvt", "stages.0.integrator": "auto", "stages.0.timestep_fs": None,
-        "stages.0.temperature_K": 90.0, "stages.0.bias_kT": 1e-2,
-    }),
-    "cell": (FIELDS, {
-        "fields": None, "stages.0.pressure_bar": 1.0, "stages.0.pressure_limit_bar": 1e5,
-        "forces.reaction_field_permittivity": 78.0,
-    }),
-    "ranks": (ARGON, {"run": None, "engine": {"name": "lammps", "ranks": 1}, "stages.0.integrator": "velocity_verlet",
-                      "integrators": None, "watch": None, "forces.skin_A": None}),
-    "file": (ARGON, {
-        "box": None, "molecules.0.count": None,
-        "structure": {"file": "argon.xyz", "frame": 1, "repeat": [2, 2, 2], "tolerance": 0.1},
-    }),
-}  # fmt: skip
+    "grids": (
+        MESH,
+        {
+            "box.vacuum_A": None,
+            "forces.ewald_slab": None,
+            "forces.dispersion_accuracy": None,
+            "forces.dispersion_beta_per_A": 0.4,
+            "forces.dispersion_order": 5,
+            "forces.dispersion_grid": [20, 20, 20],
+            "forces.ewald_accuracy": None,
+            "forces.ewald_alpha_per_A": 0.4,
+            "forces.pme_grid": [20, 20, 20],
+        },
+    ),
+    "sphere": (
+        IONS,
+        {
+            "forces.ewald_k_max": None,
+            "forces.ewald_k2_max": None,
+            "forces.ewald_k_radius_per_A": 2.5,
+        },
+    ),
+    "damped": (
+        FIELDS,
+        {
+            "forces.electrostatics": "damped_shifted_force",
+            "forces.reaction_field_permittivity": None,
+            "forces.damping_per_A": 0.2,
+            "stages.1.thermostat": None,
+            "stages.1.trajectory_steps": None,
+            "stages.1.momentum_refreshment": None,
+            "fields.electric_frequency_per_ps": 0.5,
+            "fields.electric_phase_deg": 30.0,
+        },
+    ),
+    "energy": (
+        ARGON,
+        {
+            "stages.0.integrator": "auto",
+            "stages.0.timestep_fs": None,
+            "stages.0.energy_error_kT": 1e-3,
+        },
+    ),
+    "trajectory": (
+        ARGON,
+        {
+            "stages.0.integrator": "auto",
+            "stages.0.timestep_fs": None,
+            "stages.0.trajectory_error": 1e-3,
+        },
+    ),
+    "bias": (
+        ARGON,
+        {
+            "stages.0.ensemble": "nvt",
+            "stages.0.integrator": "auto",
+            "stages.0.timestep_fs": None,
+            "stages.0.temperature_K": 90.0,
+            "stages.0.bias_kT": 1e-2,
+        },
+    ),
+    "cell": (
+        FIELDS,
+        {
+            "fields": None,
+            "stages.0.pressure_bar": 1.0,
+            "stages.0.pressure_limit_bar": 1e5,
+            "forces.reaction_field_permittivity": 78.0,
+        },
+    ),
+    "ranks": (
+        ARGON,
+        {
+            "run": None,
+            "engine": {"name": "lammps", "ranks": 1},
+            "stages.0.integrator": "velocity_verlet",
+            "integrators": None,
+            "watch": None,
+            "forces.skin_A": None,
+        },
+    ),
+    "file": (
+        ARGON,
+        {
+            "box": None,
+            "molecules.0.count": None,
+            "structure": {"file": "argon.xyz", "frame": 1, "repeat": [2, 2, 2], "tolerance": 0.1},
+        },
+    ),
+}
 MOLECULES = {"argon": ARGON, "barostats": BAROSTATS, "ions": IONS, "fields": FIELDS, "mesh": MESH}
 
 TOP = """
@@ -404,30 +460,64 @@ figures = false
 """
 BODIES = {"top": TOP, "swimmer": SWIMMER, "satellite": SATELLITE, "skater": SKATER}
 BODY_VARIANTS = {
-    "points": (SKATER, {
-        "changing_inertia": None, "wheels": None, "body": {"points": [
-            {"mass_kg": 1.0, "position_m": [0.0, 0.0, 0.0]}, {"mass_kg": 2.0, "position_m": [1.0, 0.0, 0.0]},
-            {"mass_kg": 3.0, "position_m": [0.0, 1.0, 0.2]},
-        ]},
-        "start.rotation": None, "start.project": None,
-        "start.attitude_matrix": [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
-    }),
-    "rod": (SKATER, {
-        "changing_inertia": None, "wheels": None, "body.solid": {"shape": "rod", "length_m": 1.0},
-        "frame": {"times_s": [0.0, 1.0], "angular_velocity_rad_s": [[0.0, 0.0, 0.1], [0.0, 0.1, 0.1]]},
-        "start.angular_velocity_body_rad_s": [0.1, 0.2, 0.0],
-    }),
-    "cylinder": (SKATER, {
-        "wheels": None, "changing_inertia": None, "body.solid": {"shape": "cylinder", "radius_m": 0.1, "height_m": 0.3},
-    }),
-    "cuboid": (SKATER, {
-        "wheels": None, "changing_inertia": None, "body.solid": {"shape": "cuboid", "lengths_m": [0.4, 0.3, 1.7]},
-    }),
-    "submerged": (SWIMMER, {
-        "fluid": {"density_kg_m3": 1000.0},
-    }),
-    "auto energy": (TOP, {"friction": None, "applied": None, "run.integrator": "auto", 
-                          "run.energy_error": 1e-6}),
-    "auto trajectory": (TOP, {"friction": None, "applied": None, "run.integrator": "auto", 
-                              "run.trajectory_error": 1e-6}),
-}  # fmt: skip
+    "points": (
+        SKATER,
+        {
+            "changing_inertia": None,
+            "wheels": None,
+            "body": {
+                "points": [
+                    {"mass_kg": 1.0, "position_m": [0.0, 0.0, 0.0]},
+                    {"mass_kg": 2.0, "position_m": [1.0, 0.0, 0.0]},
+                    {"mass_kg": 3.0, "position_m": [0.0, 1.0, 0.2]},
+                ]
+            },
+            "start.rotation": None,
+            "start.project": None,
+            "start.attitude_matrix": [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
+        },
+    ),
+    "rod": (
+        SKATER,
+        {
+            "changing_inertia": None,
+            "wheels": None,
+            "body.solid": {"shape": "rod", "length_m": 1.0},
+            "frame": {
+                "times_s": [0.0, 1.0],
+                "angular_velocity_rad_s": [[0.0, 0.0, 0.1], [0.0, 0.1, 0.1]],
+            },
+            "start.angular_velocity_body_rad_s": [0.1, 0.2, 0.0],
+        },
+    ),
+    "cylinder": (
+        SKATER,
+        {
+            "wheels": None,
+            "changing_inertia": None,
+            "body.solid": {"shape": "cylinder", "radius_m": 0.1, "height_m": 0.3},
+        },
+    ),
+    "cuboid": (
+        SKATER,
+        {
+            "wheels": None,
+            "changing_inertia": None,
+            "body.solid": {"shape": "cuboid", "lengths_m": [0.4, 0.3, 1.7]},
+        },
+    ),
+    "submerged": (
+        SWIMMER,
+        {
+            "fluid": {"density_kg_m3": 1000.0},
+        },
+    ),
+    "auto energy": (
+        TOP,
+        {"friction": None, "applied": None, "run.integrator": "auto", "run.energy_error": 1e-6},
+    ),
+    "auto trajectory": (
+        TOP,
+        {"friction": None, "applied": None, "run.integrator": "auto", "run.trajectory_error": 1e-6},
+    ),
+}

@@ -5,8 +5,9 @@
     python tests/soak.py faults --minutes 600     so long for the fault driver
     python tests/soak.py --when                   when each part last ran and last passed, and at which commit
 
-Each run of a part adds a line to the record, a file of JSON lines (default: .soak/record.jsonl in the checkout, which git
-ignores), and its output is beside it. Exit code: 0 if every part passed, 1 if one did not.
+Each run of a part adds a line to the record, a file of JSON lines (default: .soak/record.jsonl in
+the checkout, which git ignores), and its output is beside it. Exit code: 0 if every part passed, 1
+if one did not.
 """
 
 import argparse
@@ -27,7 +28,16 @@ def command_of(part: str, minutes: float) -> list[str]:
     """What a part runs."""
     tests = str(ROOT / "tests")
     return {
-        "statistics": [sys.executable, "-m", "pytest", "-m", "soak", "-rP", "--durations=25", tests],
+        "statistics": [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-m",
+            "soak",
+            "-rP",
+            "--durations=25",
+            tests,
+        ],
         "faults": [sys.executable, f"{tests}/faults.py", "--minutes", str(minutes), "--wide"],
         "mutations": [sys.executable, f"{tests}/mutations.py"],
     }[part]
@@ -37,9 +47,13 @@ def commit() -> str:
     """The commit that is checked out, with a + if a file that git knows has changed since."""
 
     def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+        return subprocess.run(
+            ["git", *arguments], cwd=ROOT, capture_output=True, text=True
+        ).stdout.strip()
 
-    return git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+    return git("rev-parse", "--short=12", "HEAD") + (
+        "+" if git("status", "--porcelain", "-uno") else ""
+    )
 
 
 def run(part: str, command: Sequence[str], record: Path) -> bool:
@@ -51,9 +65,13 @@ def run(part: str, command: Sequence[str], record: Path) -> bool:
         code = subprocess.run(command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT).returncode
     last = (output.read_text(encoding="utf-8", errors="replace").strip().splitlines() or [""])[-1]
     entry = {
-        "part": part, "date": began.isoformat(timespec="seconds"), "commit": what,
-        "minutes": round((time.monotonic() - at) / 60, 1), "passed": code == 0, "said": last.strip("= ")[:200],
-    }  # fmt: skip
+        "part": part,
+        "date": began.isoformat(timespec="seconds"),
+        "commit": what,
+        "minutes": round((time.monotonic() - at) / 60, 1),
+        "passed": code == 0,
+        "said": last.strip("= ")[:200],
+    }
     with record.open("a", encoding="utf-8") as file:
         file.write(json.dumps(entry) + "\n")
     print(line_of(entry), flush=True)
@@ -68,7 +86,11 @@ def line_of(entry: dict[str, Any]) -> str:
 
 def when(record: Path) -> str:
     """For each part its last run and, if that failed, the last one that passed."""
-    entries = [json.loads(line) for line in record.read_text(encoding="utf-8").splitlines()] if record.exists() else []
+    entries = (
+        [json.loads(line) for line in record.read_text(encoding="utf-8").splitlines()]
+        if record.exists()
+        else []
+    )
     lines = []
     for part in PARTS:
         own = [entry for entry in entries if entry["part"] == part]
@@ -81,19 +103,34 @@ def when(record: Path) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the parts that are named, or print the record."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)} (default: all)")
-    parser.add_argument("--minutes", type=float, default=240.0, help="for the fault driver (default: 240)")
-    parser.add_argument("--record", type=Path, default=ROOT / ".soak" / "record.jsonl", help="file of results")
-    parser.add_argument("--when", action="store_true", help="print when each part last passed, and end")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)} (default: all)"
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=240.0, help="for the fault driver (default: 240)"
+    )
+    parser.add_argument(
+        "--record", type=Path, default=ROOT / ".soak" / "record.jsonl", help="file of results"
+    )
+    parser.add_argument(
+        "--when", action="store_true", help="print when each part last passed, and end"
+    )
     options = parser.parse_args(arguments)
     if unknown := set(options.parts) - set(PARTS):
-        parser.error(f"there is no part {', '.join(sorted(unknown))}; the parts are {', '.join(PARTS)}")
+        parser.error(
+            f"there is no part {', '.join(sorted(unknown))}; the parts are {', '.join(PARTS)}"
+        )
     if options.when:
         print(when(options.record))
         return 0
     options.record.parent.mkdir(parents=True, exist_ok=True)
-    results = [run(part, command_of(part, options.minutes), options.record) for part in options.parts or PARTS]
+    results = [
+        run(part, command_of(part, options.minutes), options.record)
+        for part in options.parts or PARTS
+    ]
     return 0 if all(results) else 1
 
 

@@ -1,9 +1,10 @@
 """The one door from the tests to the inside of rigidmd, and helpers that several test files use.
 
-A test takes what is public from `rigidmd` itself, and the rest from here: `from support import build, random_rotations`.
-Where a name is, HOMES says, below: a module that moves or is renamed changes a line there and no test. A name is
-looked up when it is asked for, so that a file which wants little loads little. Names that several modules have are
-told apart in RENAMED; modules of which a test patches something are in MODULES.
+A test takes what is public from `rigidmd` itself, and the rest from here: `from support import
+build, random_rotations`. Where a name is, HOMES says, below: a module that moves or is renamed
+changes a line there and no test. A name is looked up when it is asked for, so that a file which
+wants little loads little. Names that several modules have are told apart in RENAMED; modules of
+which a test patches something are in MODULES.
 
 test_support.py checks that no test file goes past this door but those it lists with a reason.
 """
@@ -38,7 +39,8 @@ SYSTEMS = sorted((ROOT / "systems").glob("*.toml"))
 BODIES = [path for path in SYSTEMS if isinstance(Scene.read(path), BodyScene)]
 MOLECULES = [path for path in SYSTEMS if path not in BODIES]
 
-#: Argon atoms on springs, so far apart that nothing else acts on them: m w² in u/ps², and w dt = 1 at 36 fs.
+#: Argon atoms on springs, so far apart that nothing else acts on them: m w² in u/ps², and w dt = 1
+#: at 36 fs.
 SPRING = 30_000.0
 
 
@@ -46,9 +48,9 @@ SPRING = 30_000.0
 
 
 def pinned(tables: dict) -> dict:
-    """Tables of a scene of molecules with a reaction field, one truncation for all forces, no tail correction and double
-    precision, unless they say otherwise: one set of kernels for most tests. The defaults of users have tests of their
-    own."""
+    """Tables of a scene of molecules with a reaction field, one truncation for all forces, no tail
+    correction and double precision, unless they say otherwise: one set of kernels for most tests.
+    The defaults of users have tests of their own."""
     forces = {"electrostatics": "reaction_field", "tail_correction": False, "truncation": "switch"}
     forces |= tables.get("forces", {})
     if forces["electrostatics"] == "reaction_field":
@@ -114,14 +116,23 @@ def spin(rotor, rotation, angular_momentum, h: float, steps: int) -> None:
 
 
 def springs(**stage) -> Scene:
-    """64 argon atoms, each an isotropic oscillator, under Langevin's thermostat at 300 K unless the stage says otherwise."""
-    whole = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 20.0, "thermostat": "langevin",
-             "friction_translation_per_ps": 15.0} | stage  # fmt: skip
+    """64 argon atoms, each an isotropic oscillator, under Langevin's thermostat at 300 K unless the
+    stage says otherwise."""
+    whole = {
+        "ensemble": "nvt",
+        "temperature_K": 300.0,
+        "duration_ps": 20.0,
+        "thermostat": "langevin",
+        "friction_translation_per_ps": 15.0,
+    } | stage
     return small_scene(
-        {"argon": 64}, 80.0, forces={"cutoff_A": 8.0}, stages=[{k: v for k, v in whole.items() if v is not None}],
+        {"argon": 64},
+        80.0,
+        forces={"cutoff_A": 8.0},
+        stages=[{k: v for k, v in whole.items() if v is not None}],
         fields={"restraints": [{"stiffness_kJ_mol_A2": SPRING / 100}]},
         output={"trajectory": False, "figures": False},
-    )  # fmt: skip
+    )
 
 
 # runs: other programs, stops
@@ -151,17 +162,22 @@ sys.path.insert(0, {tests!r})
 
 
 def run_with_files(folder: Path, files: dict[str, str], script: str) -> str:
-    """What a script prints in a process in which the package has these files, new ones or others of the same name.
-    Classes of terms are named by the text, because compiled code is found by their names."""
+    """What a script prints in a process in which the package has these files, new ones or others of
+    the same name. Classes of terms are named by the text, because compiled code is found by their
+    names."""
     found = {}
     for k, (name, text) in enumerate(files.items()):
-        for term in re.findall(r"^class (\w+)\(NamedTuple\)", "" if (ROOT / "rigidmd" / name).exists() else text, re.M):
+        for term in re.findall(
+            r"^class (\w+)\(NamedTuple\)", "" if (ROOT / "rigidmd" / name).exists() else text, re.M
+        ):
             text = re.sub(rf"\b{term}\b", f"{term}_{zlib.crc32(text.encode()):x}", text)
         path = folder / f"{k}_{Path(name).name}"
         path.write_text(text)
         found["rigidmd." + name.removesuffix(".py").replace("/", ".")] = str(path)
     prelude = OTHER_MODULES.format(modules=found, tests=str(ROOT / "tests"))
-    done = subprocess.run([sys.executable, "-c", prelude + script], capture_output=True, text=True, cwd=folder)
+    done = subprocess.run(
+        [sys.executable, "-c", prelude + script], capture_output=True, text=True, cwd=folder
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
@@ -179,8 +195,12 @@ def gmx(folder: Path, *arguments, text: str = "") -> str:
     """What a command of GROMACS prints; it has to succeed."""
     done = subprocess.run(
         [shutil.which("gmx"), "-quiet", "-nobackup", *arguments],
-        cwd=folder, input=text, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
+        cwd=folder,
+        input=text,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-1500:]
     return done.stdout
 
@@ -211,9 +231,14 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def same_after_stops(data: dict, steps: list[int], folder: Path) -> None:
-    """Run once without a stop, once with stops after these steps, each time with another number of threads."""
-    observers = rigidmd.Every(0.001, lambda moment: None)  # observes at the same steps as those that stop
-    rigidmd.Simulation(Scene.from_dict(data | {"threads": 1}), folder / "whole", observers=observers).run()
+    """Run once without a stop, once with stops after these steps, each time with another number of
+    threads."""
+    observers = rigidmd.Every(
+        0.001, lambda moment: None
+    )  # observes at the same steps as those that stop
+    rigidmd.Simulation(
+        Scene.from_dict(data | {"threads": 1}), folder / "whole", observers=observers
+    ).run()
     left, runs = set(steps), 0
     while True:
         simulation = rigidmd.Simulation(
@@ -253,9 +278,17 @@ def history(
     if positions is None:
         positions = np.zeros((f, n, 3))
     return RigidFrames(
-        system, system.scene.stages[-1], np.asarray(time), np.broadcast_to(cell, (f, 3, 3)), positions,
-        np.empty((f, 0, 3, 3)) if Q is None else Q, velocities, L, {"temperature": np.full(f, temperature)}, tensor,
-    )  # fmt: skip
+        system,
+        system.scene.stages[-1],
+        np.asarray(time),
+        np.broadcast_to(cell, (f, 3, 3)),
+        positions,
+        np.empty((f, 0, 3, 3)) if Q is None else Q,
+        velocities,
+        L,
+        {"temperature": np.full(f, temperature)},
+        tensor,
+    )
 
 
 def noise_with_memory(rng, frames, shape, variance, time, interval):
@@ -407,7 +440,9 @@ HOMES = {
     "run.resume": "Arrays state_from",
     "run.body": "BodyRecord BodyRun",
     "run.molecular": "MolecularRecord MolecularRun",
-    "studies.accuracy.averages": ("AverageRun AveragedQuantity Averages UNSEEN measure_averages start_of_last_stage "),
+    "studies.accuracy.averages": (
+        "AverageRun AveragedQuantity Averages UNSEEN measure_averages start_of_last_stage "
+    ),
     "studies.extrapolation": "MeanAtStep Together extrapolate means_of_runs",
     "studies.compare": "compare describe_run_comparison",
     "studies.gamma_point": "periodic_basis",
@@ -494,9 +529,13 @@ def __getattr__(name: str) -> object:
     if name in MODULES:
         return import_module(f"rigidmd.{MODULES[name]}")
     if name not in _HOME:
-        raise AttributeError(f"tests/support.py has no {name!r}: add it to HOMES, which says where names are")
+        raise AttributeError(
+            f"tests/support.py has no {name!r}: add it to HOMES, which says where names are"
+        )
     module, inner = _HOME[name].split(":")
     return getattr(import_module(f"rigidmd.{module}"), inner)
 
 
-_HOME = {name: f"{module}:{name}" for module, names in HOMES.items() for name in names.split()} | RENAMED
+_HOME = {
+    name: f"{module}:{name}" for module, names in HOMES.items() for name in names.split()
+} | RENAMED

@@ -61,7 +61,9 @@ def short_timings():
 
 @pytest.fixture(scope="module")
 def top(short_timings):
-    return measure_accuracy(Scene.read(TOP), ["velocity_verlet", "srkn_4", "srkn_6"], span=0.4, repeats=3)
+    return measure_accuracy(
+        Scene.read(TOP), ["velocity_verlet", "srkn_4", "srkn_6"], span=0.4, repeats=3
+    )
 
 
 def trials(found, name):
@@ -69,7 +71,10 @@ def trials(found, name):
 
 
 def test_errors_fall_with_the_order_at_equal_cost(top):
-    costs = [[trial.forces for trial in trials(top, name)] for name in ("velocity_verlet", "srkn_4", "srkn_6")]
+    costs = [
+        [trial.forces for trial in trials(top, name)]
+        for name in ("velocity_verlet", "srkn_4", "srkn_6")
+    ]
     shared = min(map(len, costs))  # besides the longer steps that are tried until one fails
     assert shared >= 6
     for other in costs[1:]:
@@ -78,7 +83,9 @@ def test_errors_fall_with_the_order_at_equal_cost(top):
         own = trials(top, name)[-2:]
         for error in ("rotation_error", "energy_rms"):
             a, b = (getattr(trial, error) for trial in own)
-            assert np.log(a / b) / np.log(own[1].steps / own[0].steps) == pytest.approx(order, abs=0.25)
+            assert np.log(a / b) / np.log(own[1].steps / own[0].steps) == pytest.approx(
+                order, abs=0.25
+            )
     assert top.reference_error < 1e-11
     assert min(trial.rotation_error for trial in trials(top, "srkn_6")) < 100 * top.reference_error
 
@@ -91,7 +98,8 @@ def test_every_trial_is_timed_as_often_as_asked(top):
 
 
 class Clockwork:
-    """An engine, and the clock: steps take 1 ms, a call 5 ms, and the first three steps of a new engine 30 ms more."""
+    """An engine, and the clock: steps take 1 ms, a call 5 ms, and the first three steps of a new
+    engine 30 ms more."""
 
     now = 0.0
 
@@ -125,7 +133,9 @@ def clockwork(monkeypatch):
         made = []
         method = Method(lambda timestep: Clockwork(made, lasts), SCHEMES["velocity_verlet"])
         own, _ = body_trial_system(Scene.read(TOP), 0.1)
-        return dataclasses.replace(own, methods={"velocity_verlet": method}, can_continue=can_continue), made
+        return dataclasses.replace(
+            own, methods={"velocity_verlet": method}, can_continue=can_continue
+        ), made
 
     return trial_system
 
@@ -133,7 +143,8 @@ def clockwork(monkeypatch):
 @pytest.mark.parametrize("steps", [1, 25, 1000])
 @pytest.mark.parametrize("can_continue", [False, True])
 def test_a_timing_is_of_warm_steps_and_of_nothing_else(clockwork, steps, can_continue):
-    """25 steps of 216 waters took 40 ms where a new engine began with them, and 20 ms after that."""
+    """25 steps of 216 waters took 40 ms where a new engine began with them, and 20 ms after
+    that."""
     trial_system, made = clockwork(can_continue)
     began = Clockwork.now
     seconds = time_span(trial_system, Trial("velocity_verlet", 1e-3, steps, steps))
@@ -156,7 +167,9 @@ def test_a_step_that_is_good_for_the_span_only_is_timed_on_the_span(clockwork):
 def test_timings_alternate_between_trials(monkeypatch):
     order = []
     monkeypatch.setattr(
-        measuring, "time_span", lambda trial_system, trial: order.append(trial.steps) or 1e-3 * len(order)
+        measuring,
+        "time_span",
+        lambda trial_system, trial: order.append(trial.steps) or 1e-3 * len(order),
     )
     trial_system, _ = body_trial_system(Scene.read(TOP), 0.01)
     trials = [Trial("velocity_verlet", 0.01 / n, n, n) for n in (2, 3, 4)]
@@ -167,7 +180,9 @@ def test_timings_alternate_between_trials(monkeypatch):
     assert fractions == pytest.approx(np.arange(1, 7) / 6)
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning:matplotlib")  # an axis on which all points have one value
+@pytest.mark.filterwarnings(
+    "ignore::RuntimeWarning:matplotlib"
+)  # an axis on which all points have one value
 def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_path):
     trial_system, _ = body_trial_system(Scene.read(TOP), 0.1)
 
@@ -177,7 +192,9 @@ def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_p
         return found, "\n".join(recommendations(found))
 
     found, words = told((1.0, 1.1, 1.19), (1.0, 1.0, 1.0))
-    assert [trial_table(found).values(trial)[4] for trial in found.trials] == pytest.approx([100 * 0.19 / 1.1, 0])
+    assert [trial_table(found).values(trial)[4] for trial in found.trials] == pytest.approx(
+        [100 * 0.19 / 1.1, 0]
+    )
     assert "warning" not in words
     found, words = told((1.0, 1.1, 1.15), (1.0, 1.1, 1.4), (1.0, 2.0, 1.5))
     assert "warning: repeated timings of 2 of 3 trials differ by more than 20%" in words
@@ -194,7 +211,9 @@ def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_p
 def test_the_front_and_the_advice_follow_from_the_numbers(top):
     front = top.front("energy_rms")
     for trial in top.trials:
-        assert any(better.time <= trial.time and better.energy_rms <= trial.energy_rms for better in front)
+        assert any(
+            better.time <= trial.time and better.energy_rms <= trial.energy_rms for better in front
+        )
     own = trials(top, "velocity_verlet")
     target = np.sqrt(own[0].energy_rms * own[1].energy_rms)
     at = top.time_for("velocity_verlet", "energy_rms", target)
@@ -203,14 +222,17 @@ def test_the_front_and_the_advice_follow_from_the_numbers(top):
     assert top.time_for("velocity_verlet", "energy_rms", 1e-30) is None
     timed = [dataclasses.replace(trial, seconds=[float(trial.forces)] * 3) for trial in top.trials]
     said = "\n".join(recommendations(dataclasses.replace(top, trials=timed)))
-    assert re.search("for an error of Q of (1e-0[024] to )?1e-0[46] over 0.4 s the cheapest is srkn_", said)
+    assert re.search(
+        "for an error of Q of (1e-0[024] to )?1e-0[46] over 0.4 s the cheapest is srkn_", said
+    )
     assert "times faster than velocity_verlet" in said
     assert "within the spread" not in said
     assert table_text(top).count("srkn_4") == len(trials(top, "srkn_4")) > 6
 
 
 def made(*rows, span=0.1):
-    """A body's trials (integrator, step, seconds of three timings or a reason to fail, energy and Q error)."""
+    """A body's trials (integrator, step, seconds of three timings or a reason to fail, energy and Q
+    error)."""
     trial_system, _ = body_trial_system(Scene.read(TOP), span)
     trials = []
     for name, step, seconds, error in rows:
@@ -226,24 +248,34 @@ def made(*rows, span=0.1):
 
 def test_advice_comes_first_names_its_span_and_is_one_line_for_all_errors_that_a_longest_step_keeps():
     found = made(
-        ("velocity_verlet", 1e-3, (2.0, 2.0, 2.0), 2e-9), ("srkn_4", 5e-3, (1.0, 1.0, 1.0), 5e-7),
-        ("srkn_4", 2.5e-3, (1.9, 1.9, 1.9), 5e-9), ("pefrl", 2e-3, (9.0, 9.0, 9.0), 1e-1),
-    )  # fmt: skip
-    said, most = recommendations(found), "times the largest kinetic energy over 0.1 s the cheapest is srkn_4 at"
+        ("velocity_verlet", 1e-3, (2.0, 2.0, 2.0), 2e-9),
+        ("srkn_4", 5e-3, (1.0, 1.0, 1.0), 5e-7),
+        ("srkn_4", 2.5e-3, (1.9, 1.9, 1.9), 5e-9),
+        ("pefrl", 2e-3, (9.0, 9.0, 9.0), 1e-1),
+    )
+    said, most = (
+        recommendations(found),
+        "times the largest kinetic energy over 0.1 s the cheapest is srkn_4 at",
+    )
     assert said[0] == (
         f"for an energy error of 1e-02 to 1e-06 {most} 0.005 s (its longest step tried): 2.0 times faster than "
         "velocity_verlet at 0.001 s"
     )
-    assert said[1].startswith(f"for an energy error of 1e-08 {most} 0.0028 s: 1.2 times faster than velocity_verlet")
+    assert said[1].startswith(
+        f"for an energy error of 1e-08 {most} 0.0028 s: 1.2 times faster than velocity_verlet"
+    )
     assert [line.startswith("for an error of Q") for line in said[2:5]] == [True, True, False]
 
 
 def test_energy_without_a_rotation_is_no_accuracy():
-    """A solver that keeps the energy while Q becomes no rotation, or another invariant changes, is not advised for it."""
+    """A solver that keeps the energy while Q becomes no rotation, or another invariant changes, is
+    not advised for it."""
     found = made(
-        ("rk4", 1e-2, (1.0, 1.0, 1.0), 1e-3), ("rk4", 2e-3, (5.0, 5.0, 5.0), 1e-9),
-        ("velocity_verlet", 1e-3, (9.0, 9.0, 9.0), 3e-2), ("velocity_verlet", 1e-4, (90.0, 90.0, 90.0), 3e-4),
-    )  # fmt: skip
+        ("rk4", 1e-2, (1.0, 1.0, 1.0), 1e-3),
+        ("rk4", 2e-3, (5.0, 5.0, 5.0), 1e-9),
+        ("velocity_verlet", 1e-3, (9.0, 9.0, 9.0), 3e-2),
+        ("velocity_verlet", 1e-4, (90.0, 90.0, 90.0), 3e-4),
+    )
     (advice, *_) = recommendations(found)
     assert "for an energy error of 1e-02" in advice and "rk4 at 0.01 s" in advice
     for worse in ({"orthogonality_error": 0.33}, {"conserved_errors": {"L_z": 0.04}}):
@@ -252,13 +284,16 @@ def test_energy_without_a_rotation_is_no_accuracy():
         assert "rk4 at 0.01 s" not in advice
 
 
-@pytest.mark.parametrize(("next_step", "step", "limit"), [("diverges", 4e-3, "kept from its longest stable step"),
-                                                          ((0.5,) * 3, 5e-3, "")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("next_step", "step", "limit"),
+    [("diverges", 4e-3, "kept from its longest stable step"), ((0.5,) * 3, 5e-3, "")],
+)
 def test_no_step_at_the_edge_of_stability_is_recommended(next_step, step, limit):
     found = made(
-        ("kahan_li_6", 1e-2, next_step, 1.0), ("kahan_li_6", 5e-3, (1.0, 1.0, 1.0), 1e-6),
+        ("kahan_li_6", 1e-2, next_step, 1.0),
+        ("kahan_li_6", 5e-3, (1.0, 1.0, 1.0), 1e-6),
         ("kahan_li_6", 2.5e-3, (2.0, 2.0, 2.0), 1e-8),
-    )  # fmt: skip
+    )
     at = found.time_for("kahan_li_6", "energy_rms", 1e-6)
     assert at.step == pytest.approx(step)
     assert at.seconds == pytest.approx(5e-3 / step, rel=1e-6)
@@ -267,15 +302,22 @@ def test_no_step_at_the_edge_of_stability_is_recommended(next_step, step, limit)
 
 @pytest.mark.parametrize(("slow", "fast"), [((1.0, 1.2, 1.4), False), ((1.19, 1.2, 1.21), True)])
 def test_no_advantage_is_claimed_within_the_spread_of_the_timings(slow, fast):
-    found = made(("velocity_verlet", 1e-3, slow, 1e-5), ("srkn_4", 5e-3, (0.99, 1.0, 1.01), 1e-5),
-                 ("pefrl", 2e-3, (1.0, 1.0, 1.0), 1e-1))  # fmt: skip
+    found = made(
+        ("velocity_verlet", 1e-3, slow, 1e-5),
+        ("srkn_4", 5e-3, (0.99, 1.0, 1.01), 1e-5),
+        ("pefrl", 2e-3, (1.0, 1.0, 1.0), 1e-1),
+    )
     (line,) = (line for line in recommendations(found) if line.startswith("for an energy error"))
     assert ("1.2 times faster than velocity_verlet" in line) == fast
     assert ("as fast within the spread of the timings: velocity_verlet at 0.001 s" in line) != fast
 
 
-@pytest.mark.parametrize(("longest", "steps"), [(0.05, [12, 25, 50, 100]), (1.0, [6, 12, 25, 50, 100])])
-def test_ladders_continue_to_longer_steps_until_one_fails_or_is_too_long_for_the_span(longest, steps, monkeypatch):
+@pytest.mark.parametrize(
+    ("longest", "steps"), [(0.05, [12, 25, 50, 100]), (1.0, [6, 12, 25, 50, 100])]
+)
+def test_ladders_continue_to_longer_steps_until_one_fails_or_is_too_long_for_the_span(
+    longest, steps, monkeypatch
+):
     def measure_errors(trial_system, trial, exact):
         trial.energy_rms = 1e-9
         trial.failure = "diverges" if trial.timestep > longest else ""
@@ -318,9 +360,13 @@ def test_mixed_precision_says_what_its_forces_lose():
     found = measure_accuracy(scene, ["velocity_verlet"], [2.0], span=0.01, repeats=1)
     force, torque = found.trial_system.rounding
     assert 1e-8 < force < 1e-5 and 1e-8 < torque < 1e-5
-    assert f"forces differ from double ones by {force:.1e} of their rms" in "\n".join(recommendations(found))
+    assert f"forces differ from double ones by {force:.1e} of their rms" in "\n".join(
+        recommendations(found)
+    )
     assert (
-        measure_accuracy(small_scene({"argon": 8}, 18.5), ["velocity_verlet"], [2.0], repeats=1).trial_system.rounding
+        measure_accuracy(
+            small_scene({"argon": 8}, 18.5), ["velocity_verlet"], [2.0], repeats=1
+        ).trial_system.rounding
         is None
     )
 
@@ -332,15 +378,22 @@ def test_only_what_keeps_its_order_is_tried():
     assert "suzuki_4" in names
     assert "srkn_6" not in names
     said = "\n".join(recommendations(found))
-    assert "srkn_6: the free motion of a body with wheels has no exact flow: it would be of order 2\n" in said
-    with pytest.raises(SceneError, match=r"srkn_6 does not suit this scene: .* wheels .*: it would be of order 2$"):
+    assert (
+        "srkn_6: the free motion of a body with wheels has no exact flow: it would be of order 2\n"
+        in said
+    )
+    with pytest.raises(
+        SceneError, match=r"srkn_6 does not suit this scene: .* wheels .*: it would be of order 2$"
+    ):
         measure_accuracy(wheel, ["srkn_6"])
     with pytest.raises(SceneError, match="unknown integrator rk5"):
         measure_accuracy(wheel, ["rk5"])
 
 
 def test_steps_suit_what_is_fast_in_a_body():
-    compass = measure_accuracy(Scene.read(ROOT / "systems" / "gyrocompass.toml"), ["kahan_li_6"], span=60.0, repeats=1)
+    compass = measure_accuracy(
+        Scene.read(ROOT / "systems" / "gyrocompass.toml"), ["kahan_li_6"], span=60.0, repeats=1
+    )
     # the wheel's nutation, 20 rad/s, sets the steps, not the Earth's turning
     assert not any(trial.diverged for trial in compass.trials[-3:])
     assert compass.trials[-1].rotation_error < 1e-6
@@ -348,8 +401,20 @@ def test_steps_suit_what_is_fast_in_a_body():
 
 def test_the_command_writes_a_table_a_figure_and_a_page(tmp_path, capsys):
     folder = tmp_path / "p"
-    command = ["accuracy", str(TOP), "--integrators", "velocity_verlet,srkn_6", "--timesteps", "0.002,0.001",
-               "--span", "0.1", "--repeats", "1", "-o", str(folder)]  # fmt: skip
+    command = [
+        "accuracy",
+        str(TOP),
+        "--integrators",
+        "velocity_verlet,srkn_6",
+        "--timesteps",
+        "0.002,0.001",
+        "--span",
+        "0.1",
+        "--repeats",
+        "1",
+        "-o",
+        str(folder),
+    ]
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "velocity_verlet" in said
@@ -371,16 +436,26 @@ def test_the_command_writes_a_table_a_figure_and_a_page(tmp_path, capsys):
     capsys.readouterr()
 
 
-@pytest.mark.parametrize(("arguments", "error"), [
-    (["--integrators", "rk5"], "unknown integrator rk5"),
-    (["--integrators", "rk4"], "rk4 does not suit this scene: it is for single bodies"),
-    (["--span", "inf"], "must be finite"),
-    (["--timesteps", "nan"], "must be finite"),
-    (["--averages", "--integrators", "rk5"], "unknown integrator rk5"),
-])  # fmt: skip
-def test_arguments_are_refused_before_anything_is_compiled_or_run(arguments, error, capsys, tmp_path):
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["--integrators", "rk5"], "unknown integrator rk5"),
+        (["--integrators", "rk4"], "rk4 does not suit this scene: it is for single bodies"),
+        (["--span", "inf"], "must be finite"),
+        (["--timesteps", "nan"], "must be finite"),
+        (["--averages", "--integrators", "rk5"], "unknown integrator rk5"),
+    ],
+)
+def test_arguments_are_refused_before_anything_is_compiled_or_run(
+    arguments, error, capsys, tmp_path
+):
     water = ["accuracy", str(ROOT / "systems" / "water.toml"), "-o", str(tmp_path / "p")]
-    thermal = ["--set", "stages.production.ensemble=nvt", "--set", "stages.production.temperature_K=298.15"]
+    thermal = [
+        "--set",
+        "stages.production.ensemble=nvt",
+        "--set",
+        "stages.production.temperature_K=298.15",
+    ]
     assert main([*water, *thermal, *arguments]) == 2
     said = capsys.readouterr()
     assert error in said.err
@@ -398,11 +473,16 @@ def water():
 
 
 def at_constant_energy(scene: Scene, integrator: str, step: float, duration: float):
-    """Temperatures of rotation less those of translation, biased and unbiased, and the bias of rotation, K."""
+    """Temperatures of rotation less those of translation, biased and unbiased, and the bias of
+    rotation, K."""
     *before, last = scene.stages
-    changed = last.model_copy(update={"integrator": integrator, "timestep_fs": step, "duration_ps": duration})
+    changed = last.model_copy(
+        update={"integrator": integrator, "timestep_fs": step, "duration_ps": duration}
+    )
     output = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": 0.02})
-    results = Simulation(scene.model_copy(update={"stages": (*before, changed), "output": output})).run()
+    results = Simulation(
+        scene.model_copy(update={"stages": (*before, changed), "output": output})
+    ).run()
     late = results["stage"] == len(before)
     on, unbiased = (
         [results[f"temperature_{motion}{kind}"][late] for motion in ("rotation", "translation")]
@@ -420,17 +500,25 @@ def test_the_step_takes_from_the_temperature_of_rotation(water):
 
 
 def test_comparators_stand_beside_the_schemes_and_fail_in_words():
-    upright = tomllib.loads(TOP.read_text()) | {"start": {"angular_velocity_body_rad_s": [3.0, 0.0, 60.0]}}
+    upright = tomllib.loads(TOP.read_text()) | {
+        "start": {"angular_velocity_body_rad_s": [3.0, 0.0, 60.0]}
+    }
     names = ["velocity_verlet", "rk4", "rk4_quaternion", "rk4_euler_angles", "dop853"]
     found = measure_accuracy(Scene.from_dict(upright), names, [1e-3, 5e-4], span=0.2, repeats=1)
     assert {trial.integrator for trial in found.trials if trial.diverged} == {"rk4_euler_angles"}
     assert "rk4_euler_angles: the Euler angles became singular" in "\n".join(recommendations(found))
-    drift = {trial.integrator: trial.orthogonality_error for trial in found.trials if not trial.diverged}
+    drift = {
+        trial.integrator: trial.orthogonality_error for trial in found.trials if not trial.diverged
+    }
     assert drift["velocity_verlet"] < 1e-13
     assert drift["rk4"] > 1e-11  # nothing keeps Q a rotation there
     adaptive = trials(found, "dop853")
-    assert [trial.tolerance for trial in adaptive] == sorted((t.tolerance for t in adaptive), reverse=True)
-    assert all(b.forces > a.forces and b.timestep < a.timestep for a, b in itertools.pairwise(adaptive))
+    assert [trial.tolerance for trial in adaptive] == sorted(
+        (t.tolerance for t in adaptive), reverse=True
+    )
+    assert all(
+        b.forces > a.forces and b.timestep < a.timestep for a, b in itertools.pairwise(adaptive)
+    )
     assert adaptive[-1].rotation_error < 1e-8
 
 
@@ -459,7 +547,9 @@ def planned(monkeypatch):
     monkeypatch.setattr(
         choosing,
         "measure",
-        lambda trial_system, trials, *_, **options: IntegratorAccuracy(trial_system, trials, 1, 0.0),
+        lambda trial_system, trials, *_, **options: IntegratorAccuracy(
+            trial_system, trials, 1, 0.0
+        ),
     )
 
     def plan(scene):
@@ -470,18 +560,26 @@ def planned(monkeypatch):
 
 
 def test_textbook_solvers_in_all_formulations_are_measured_by_default(planned):
-    textbook = {f"{solver}{form}" for solver in ("rk4", "dop853") for form in ("", "_quaternion", "_euler_angles")}
+    textbook = {
+        f"{solver}{form}"
+        for solver in ("rk4", "dop853")
+        for form in ("", "_quaternion", "_euler_angles")
+    }
     names, left_out = planned(Scene.read(TOP))
     assert textbook | {"velocity_verlet", "srkn_6"} <= names
     assert left_out == {}
     assert "vefrl" not in names
     assert "vefrl" in planned(changed(integrator="vefrl"))[0]
     assert "rk4_quaternion" in planned(changed(integrator="rk4", formulation="quaternion"))[0]
-    assert "radau_euler_angles" in planned(changed(integrator="radau", formulation="euler_angles"))[0]
+    assert (
+        "radau_euler_angles" in planned(changed(integrator="radau", formulation="euler_angles"))[0]
+    )
 
 
 def test_what_cannot_be_measured_is_left_out_in_words(planned):
-    upright = tomllib.loads(TOP.read_text()) | {"start": {"angular_velocity_body_rad_s": [3.0, 0.0, 60.0]}}
+    upright = tomllib.loads(TOP.read_text()) | {
+        "start": {"angular_velocity_body_rad_s": [3.0, 0.0, 60.0]}
+    }
     names, left_out = planned(Scene.from_dict(upright))
     assert set(left_out) == {"rk4_euler_angles", "dop853_euler_angles"}
     assert "theta = 0" in left_out["rk4_euler_angles"]
@@ -490,8 +588,13 @@ def test_what_cannot_be_measured_is_left_out_in_words(planned):
     assert "rk4" in names
     assert "a point does not rotate" in left_out["rk4_quaternion"]
     _, left_out = planned(Scene.read(ROOT / "systems" / "gyroscope_friction.toml"))
-    assert left_out["rk4"] == "dry friction is discontinuous where a body stops, which it cannot resolve"
-    with pytest.raises(SceneError, match="rk4_quaternion does not suit this scene: it is for single bodies"):
+    assert (
+        left_out["rk4"]
+        == "dry friction is discontinuous where a body stops, which it cannot resolve"
+    )
+    with pytest.raises(
+        SceneError, match="rk4_quaternion does not suit this scene: it is for single bodies"
+    ):
         measure_accuracy(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["rk4_quaternion"])
 
 
@@ -520,7 +623,11 @@ def test_what_else_is_kept_is_shown(top):
 
 def test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out():
     slopes, error = {"a": 0.3, "b": -0.1}, 0.01
-    points = [MeanAtStep(name, dt, 5 + b * dt**2, error) for name, b in slopes.items() for dt in (1.0, 2.0, 3.0)]
+    points = [
+        MeanAtStep(name, dt, 5 + b * dt**2, error)
+        for name, b in slopes.items()
+        for dt in (1.0, 2.0, 3.0)
+    ]
     fit = extrapolate(points)
     assert fit.limit == pytest.approx(5)
     assert fit.longest == 3
@@ -556,7 +663,9 @@ def test_errors_of_a_limit_and_of_biases_are_those_of_repeated_measurements():
     assert np.std([limit for limit, _ in limits]) == pytest.approx(limits[0][1], rel=0.08)
     found = np.array(biases)
     assert np.allclose(found[:, :, 0].std(axis=0), found[0, :, 1], rtol=0.08)
-    assert np.mean([limit for limit, _ in limits]) == pytest.approx(2, abs=4 * limits[0][1] / np.sqrt(len(limits)))
+    assert np.mean([limit for limit, _ in limits]) == pytest.approx(
+        2, abs=4 * limits[0][1] / np.sqrt(len(limits))
+    )
 
 
 def test_a_fit_has_its_chi2_and_the_order_of_the_integrator():
@@ -572,7 +681,8 @@ def test_a_fit_has_its_chi2_and_the_order_of_the_integrator():
 
 
 def test_points_that_no_fit_describes_make_the_error_of_the_limit_larger():
-    """By the root of chi² over its degrees of freedom: two methods at three steps, and then at two."""
+    """By the root of chi² over its degrees of freedom: two methods at three steps, and then at
+    two."""
     off = {"a": (0.2, -0.2, 0.3), "b": (-0.1, 0.3, 0.1)}
     for count, freedom in ((3, 1), (2, 1)):
         points = [
@@ -582,10 +692,14 @@ def test_points_that_no_fit_describes_make_the_error_of_the_limit_larger():
         ]
         fit = extrapolate(points)
         used = [point for point in points if point.timestep <= 2]
-        design = np.array([[1.0, *(point.timestep**2 * (point.method == name) for name in off)] for point in used])
+        design = np.array(
+            [[1.0, *(point.timestep**2 * (point.method == name) for name in off)] for point in used]
+        )
         errors = np.array([point.error for point in used])
         weighted = design / errors[:, None]
-        found, (chi2,), _, _ = np.linalg.lstsq(weighted, np.array([point.mean for point in used]) / errors, rcond=None)
+        found, (chi2,), _, _ = np.linalg.lstsq(
+            weighted, np.array([point.mean for point in used]) / errors, rcond=None
+        )
         assert (fit.longest, fit.freedom) == (2.0, freedom)
         assert fit.chi2 == pytest.approx(chi2) and chi2 > 10
         assert fit.limit == pytest.approx(found[0])
@@ -593,12 +707,17 @@ def test_points_that_no_fit_describes_make_the_error_of_the_limit_larger():
         assert fit.limit_error == pytest.approx(plain * np.sqrt(chi2 / freedom))
 
 
-@pytest.mark.parametrize(("slope", "error", "seen"), [(0.1, 1.0, False), (-0.1, 0.5, False), (2.0, 0.1, True)])
+@pytest.mark.parametrize(
+    ("slope", "error", "seen"), [(0.1, 1.0, False), (-0.1, 0.5, False), (2.0, 0.1, True)]
+)
 def test_the_step_of_a_bias_that_is_not_seen_allows_for_its_error(slope, error, seen):
     """Means 5 + slope dt² of two steps whose errors give the slope this error."""
     steps = np.array([1.0, 2.0])
     of_mean = error * (steps[1] ** 2 - steps[0] ** 2) / np.sqrt(2)
-    runs = [AverageRun("baoab", "langevin", dt, 1.0, averages={"U": (5 + slope * dt**2, of_mean)}) for dt in steps]
+    runs = [
+        AverageRun("baoab", "langevin", dt, 1.0, averages={"U": (5 + slope * dt**2, of_mean)})
+        for dt in steps
+    ]
     quantity = AveragedQuantity("U", "kJ/mol", 2.5)
     found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, [quantity], runs)
     fit = found.fit(quantity)
@@ -606,7 +725,9 @@ def test_the_step_of_a_bias_that_is_not_seen_allows_for_its_error(slope, error, 
     steepest = abs(slope) + (0.0 if seen else UNSEEN * error)
     step, was_seen = found.step_at_limit("baoab + langevin", quantity)
     assert was_seen is seen
-    assert step == pytest.approx(np.sqrt(found.bias_limit(quantity) * quantity.bias_size / steepest))
+    assert step == pytest.approx(
+        np.sqrt(found.bias_limit(quantity) * quantity.bias_size / steepest)
+    )
 
 
 @pytest.mark.parametrize(
@@ -614,20 +735,37 @@ def test_the_step_of_a_bias_that_is_not_seen_allows_for_its_error(slope, error, 
     [
         ((2.0, 4.0), 1, 0.0, 1.0, 4.0),  # errors of single runs
         ((1.0, 2.0, 4.0), 2, 0.0, 1.0, 4.0),
-        ((1.0, 2.0, 4.0), 4, 0.0, 0.6, 4.0),  # errors of single runs that are too small: the scatter counts
+        (
+            (1.0, 2.0, 4.0),
+            4,
+            0.0,
+            0.6,
+            4.0,
+        ),  # errors of single runs that are too small: the scatter counts
         ((1.0, 2.0, 4.0), 8, 0.0, 1.6, 4.0),
         ((2.0, 4.0), 8, 0.0, None, 4.0),  # runs that are too short for an error
-        ((1.0, 2.0, 3.0, 4.0, 6.0), 8, 6.0, 1.0, 4.0),  # the longest step has more than dt², and is left out
+        (
+            (1.0, 2.0, 3.0, 4.0, 6.0),
+            8,
+            6.0,
+            1.0,
+            4.0,
+        ),  # the longest step has more than dt², and is left out
     ],
 )
 def test_pulls_of_limits_have_unit_width(steps, runs, more, errors, longest):
-    """(limit - truth)/error of 1000 extrapolations, of which chi² leaves out a sound step of some by chance."""
+    """(limit - truth)/error of 1000 extrapolations, of which chi² leaves out a sound step of some
+    by chance."""
     rng, pulls, longests = np.random.default_rng(3), [], []
     for _ in range(1000):
         sampled = {}
         for dt in steps:
             values = 5 + 0.1 * dt**2 + more * (dt == steps[-1]) + rng.standard_normal(runs)
-            within = [None] * runs if errors is None else errors * np.exp(0.2 * rng.standard_normal(runs))
+            within = (
+                [None] * runs
+                if errors is None
+                else errors * np.exp(0.2 * rng.standard_normal(runs))
+            )
             sampled[dt] = list(zip(values, within, strict=True))
         fit = extrapolate(means_of_runs(sampled))
         pulls.append((fit.limit - 5) / fit.limit_error)
@@ -661,7 +799,9 @@ def test_a_value_of_runs_together_takes_the_place_of_the_mean_of_their_values():
                 together[dt] = Together(means.mean() ** 2 - means.var(ddof=1) / count, error, count)
             points = means_of_runs(runs, together)
             assert [point.mean for point in points] == [value.value for value in together.values()]
-            fit = extrapolate([point._replace(mean=point.mean - 0.01 * point.timestep**4) for point in points])
+            fit = extrapolate(
+                [point._replace(mean=point.mean - 0.01 * point.timestep**4) for point in points]
+            )
             pulls.append((fit.limit - 9) / fit.limit_error)
         assert abs(np.mean(pulls)) < 0.15
         assert 0.85 < np.std(pulls) < 1.2
@@ -681,7 +821,11 @@ def oscillators():
     unit = 1e3 * np.sqrt(39.948 / SPRING)  # fs of a radian
     fractions = []
     found = measure_averages(
-        springs(), ["velocity_verlet", "baoab"], [0.4 * unit, 0.7 * unit, unit], sample=60.0, progress=fractions.append
+        springs(),
+        ["velocity_verlet", "baoab"],
+        [0.4 * unit, 0.7 * unit, unit],
+        sample=60.0,
+        progress=fractions.append,
     )
     assert fractions == sorted(fractions)
     assert fractions[-1] == pytest.approx(1)
@@ -713,7 +857,12 @@ def test_averages_of_oscillators_are_off_by_what_theory_says(oscillators):
 @pytest.mark.soak
 def test_what_is_said_of_averages_follows_from_them(oscillators):
     quantities = {quantity.name: quantity for quantity in oscillators.quantities}
-    assert {quantity.name for quantity in oscillators.main} == {"U", "T_trans", "T_trans unbiased", "pressure"}
+    assert {quantity.name for quantity in oscillators.main} == {
+        "U",
+        "T_trans",
+        "T_trans unbiased",
+        "pressure",
+    }
     assert "Kinetic Energy (kJ/mole)" in quantities
     potential = quantities["U"]
     limit = oscillators.fit(potential)
@@ -728,15 +877,22 @@ def test_what_is_said_of_averages_follows_from_them(oscillators):
     assert step == pytest.approx(1e3 * np.sqrt(0.08 * 39.948 / SPRING), rel=0.1)
     assert not oscillators.step_at_limit("velocity_verlet + langevin", quantities["T_trans"])[1]
     said = "\n".join(averages_report.bias_conclusions(oscillators))
-    assert f"U is off by 1% of kT per degree of freedom at: velocity_verlet + langevin {step:.2g} fs; baoab" in said
-    assert "T_trans is off by 1% of its value at: velocity_verlet + langevin none seen, more than" in said
+    assert (
+        f"U is off by 1% of kT per degree of freedom at: velocity_verlet + langevin {step:.2g} fs; baoab"
+        in said
+    )
+    assert (
+        "T_trans is off by 1% of its value at: velocity_verlet + langevin none seen, more than"
+        in said
+    )
     assert "temperatures are compared with 300 K" in said
     assert coarse.forces_per_ps == pytest.approx(1e3 / coarse.timestep)
     assert coarse.seconds_per_ns > 0
 
 
 def test_averages_leave_out_what_comes_before_equilibrium():
-    """A fifth of the time sampled comes before it: the means are those of the same run without its first part."""
+    """A fifth of the time sampled comes before it: the means are those of the same run without its
+    first part."""
     (run,) = measure_averages(springs(), ["baoab"], [10.0], sample=2.0).runs
     again = springs(integrator="baoab", timestep_fs=10.0, duration_ps=2.4)
     looked = again.output.model_copy(update={"log_interval_ps": 0.02})
@@ -744,16 +900,37 @@ def test_averages_leave_out_what_comes_before_equilibrium():
     late = results["time"] > 0.4
     assert (late.sum(), len(late)) == (100, 121)
     for name, column, share in (("U", "potential", 64), ("T_trans", "temperature_translation", 1)):
-        assert run.averages[name][0] == pytest.approx(results[column][late].mean() / share, rel=1e-9)
+        assert run.averages[name][0] == pytest.approx(
+            results[column][late].mean() / share, rel=1e-9
+        )
 
 
 def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypatch):
-    stage = {"ensemble": "npt", "temperature_K": 90.0, "pressure_bar": 1.0, "duration_ps": 1.0, "timestep_fs": 5.0}
-    scene = small_scene({"argon": 40}, 18.5, start={"temperature_K": 90.0}, stages=[{"duration_ps": 0.1}, stage])
+    stage = {
+        "ensemble": "npt",
+        "temperature_K": 90.0,
+        "pressure_bar": 1.0,
+        "duration_ps": 1.0,
+        "timestep_fs": 5.0,
+    }
+    scene = small_scene(
+        {"argon": 40}, 18.5, start={"temperature_K": 90.0}, stages=[{"duration_ps": 0.1}, stage]
+    )
     monkeypatch.setattr(Scene, "read", lambda path, overrides: scene)
     folder = tmp_path / "p"
-    command = ["accuracy", "liquid.toml", "--averages", "--sample-ps", "20", "--timesteps", "5,10,400",
-               "--integrators", "velocity_verlet", "-o", str(folder)]  # fmt: skip
+    command = [
+        "accuracy",
+        "liquid.toml",
+        "--averages",
+        "--sample-ps",
+        "20",
+        "--timesteps",
+        "5,10,400",
+        "--integrators",
+        "velocity_verlet",
+        "-o",
+        str(folder),
+    ]
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "bias of averages over 20 ps of npt" in said
@@ -802,8 +979,10 @@ def test_methods_and_steps_that_are_averaged_by_default(monkeypatch):
     monkeypatch.setattr(sampling, "_sample", lambda *_: None)
     found = measure_averages(springs(thermostat="nose_hoover", friction_translation_per_ps=None))
     assert list(dict.fromkeys((run.integrator, run.thermostat) for run in found.runs)) == [
-        ("velocity_verlet", "nose_hoover"), ("baoab", "langevin"), ("velocity_verlet", "velocity_rescaling")
-    ]  # fmt: skip
+        ("velocity_verlet", "nose_hoover"),
+        ("baoab", "langevin"),
+        ("velocity_verlet", "velocity_rescaling"),
+    ]
     longest = 2e3 * np.sqrt(39.948 / SPRING)
     steps = [run.timestep for run in found.runs if run.integrator == "baoab"]
     assert steps == pytest.approx([share * longest for share in sampling.LADDER], rel=0.05)
@@ -813,14 +992,20 @@ def test_methods_and_steps_that_are_averaged_by_default(monkeypatch):
 def test_orders_cost_and_temperatures_of_512_waters():
     """Slopes over a decade, the best scheme at 1e-5 kJ/mol, and both temperatures at 2 and 4 fs."""
     changes = {
-        "molecules.0.count": 512, "forces.truncation": "smooth_switch", "forces.switch_start_A": 5.0,
+        "molecules.0.count": 512,
+        "forces.truncation": "smooth_switch",
+        "forces.switch_start_A": 5.0,
         "stages.equilibration.duration_ps": 10.0,
-    }  # fmt: skip
+    }
     scene = Scene.read(ROOT / "systems" / "water.toml", changes)
-    found = measure_accuracy(scene, ["velocity_verlet", "two_stage", "chin_4a", "srkn_4", "srkn_6"], repeats=1)
+    found = measure_accuracy(
+        scene, ["velocity_verlet", "two_stage", "chin_4a", "srkn_4", "srkn_6"], repeats=1
+    )
     for name, order, margin, most in (
-        ("velocity_verlet", 2, 0.1, 0.1), ("chin_4a", 4, 0.2, 1e-3), ("srkn_4", 4, 0.2, 1e-3)
-    ):  # fmt: skip
+        ("velocity_verlet", 2, 0.1, 0.1),
+        ("chin_4a", 4, 0.2, 1e-3),
+        ("srkn_4", 4, 0.2, 1e-3),
+    ):
         own = [trial for trial in trials(found, name) if trial.rotation_error < most]
         a, b = own[0], own[-1]
         slope = np.log(a.rotation_error / b.rotation_error) / np.log(a.timestep / b.timestep)
@@ -831,11 +1016,16 @@ def test_orders_cost_and_temperatures_of_512_waters():
         trial.seconds = [float(trial.forces)]  # in forces, which no noise can touch
     target = 1e-5 / unit
     verlet = found.time_for("velocity_verlet", "energy_rms", target).seconds
-    best = min(at.seconds for name in ("two_stage", "chin_4a", "srkn_4", "srkn_6")
-               if (at := found.time_for(name, "energy_rms", target)))  # fmt: skip
+    best = min(
+        at.seconds
+        for name in ("two_stage", "chin_4a", "srkn_4", "srkn_6")
+        if (at := found.time_for(name, "energy_rms", target))
+    )
     assert verlet / best > 2
     for step in (4.0, 2.0):
-        on, unbiased = map(mean_and_error, at_constant_energy(scene, "velocity_verlet", step, 40.0)[:2])
+        on, unbiased = map(
+            mean_and_error, at_constant_energy(scene, "velocity_verlet", step, 40.0)[:2]
+        )
         assert abs(unbiased[0]) < 2.5 * unbiased[1]
         if step == 4.0:
             assert on[0] < -3 * on[1]

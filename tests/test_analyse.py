@@ -1,4 +1,5 @@
-"""Analyses of frames that are made up: rigid molecules rebuilt, and values that are known beforehand."""
+"""Analyses of frames that are made up: rigid molecules rebuilt, and values that are known
+beforehand."""
 
 import re
 from math import inf
@@ -65,7 +66,11 @@ def rotations_about(turns):
     x, y, z = np.moveaxis(turns, -1, 0)
     none = np.zeros_like(x)
     cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*turns.shape, 3)
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * cross @ cross
+    return (
+        np.eye(3)
+        + np.sinc(angle / np.pi) * cross
+        + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * cross @ cross
+    )
 
 
 # rebuilding
@@ -137,24 +142,33 @@ def test_wrapped_paths_become_continuous(mixture):
         moved.append(now)
     cells = np.array([now.cell for now in moved])
     whole, wrapped = (
-        fit_frames(mixture, np.array([mixture.site_positions(now, put) for now in moved]), None, cells, put)
+        fit_frames(
+            mixture, np.array([mixture.site_positions(now, put) for now in moved]), None, cells, put
+        )
         for put in (False, True)
     )
-    assert np.abs(np.diff(whole[0].position, axis=0) - np.diff(wrapped[0].position, axis=0)).max() < 1e-10
+    assert (
+        np.abs(np.diff(whole[0].position, axis=0) - np.diff(wrapped[0].position, axis=0)).max()
+        < 1e-10
+    )
     assert np.ptp(whole[0].position, axis=0).max() > 30.0
     assert wrapped[1] == ["molecules are wrapped in the frames; their paths were made continuous"]
     assert wrapped[0].velocity is None and wrapped[0].L is None
     far = np.array([mixture.site_positions(now, True) for now in moved[::12]])
-    with pytest.raises(OutputError, match=r"move by 0\.\d\d of the box between two frames, .* wrapped"):
+    with pytest.raises(
+        OutputError, match=r"move by 0\.\d\d of the box between two frames, .* wrapped"
+    ):
         fit_frames(mixture, far, None, cells[:4], True)
 
 
 def test_paths_are_unwrapped_by_the_cell_of_each_frame(mixture):
-    """Molecules that move with a cell which grows by a half, and are wrapped into it, go through no wall."""
+    """Molecules that move with a cell which grows by a half, and are wrapped into it, go through no
+    wall."""
     (state,) = states(mixture, 1)
     state.position[:] += 5 * mixture.state.cell[0]
     moved = [
-        state._replace(position=growth * state.position, cell=growth * state.cell) for growth in np.linspace(1, 1.5, 9)
+        state._replace(position=growth * state.position, cell=growth * state.cell)
+        for growth in np.linspace(1, 1.5, 9)
     ]
     cells = np.array([now.cell for now in moved])
     sites = np.array([mixture.site_positions(now, True) for now in moved])
@@ -170,7 +184,8 @@ def test_torn_molecules_are_found(mixture):
     torn = int(np.flatnonzero(mixture.sites.molecule == 15)[1])
     sites[1, torn, 0] += 40.0
     with pytest.raises(
-        OutputError, match=r"frame 2: a site of molecule 16 is \d+ Å away from its position in the rigid spce"
+        OutputError,
+        match=r"frame 2: a site of molecule 16 is \d+ Å away from its position in the rigid spce",
     ):
         fit_frames(mixture, sites, None, np.array([state.cell] * 2), wrapped=False)
 
@@ -226,7 +241,9 @@ def test_correlations_are_those_of_the_definition():
 
 def pairs_by_hand(first, owner, second, owner_2, cell, edge, bins):
     """Distances to the nearest image, from all 27 of them."""
-    images = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]) @ cell
+    images = (
+        np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]) @ cell
+    )
     fold = np.linalg.inv(cell)
     first, second = ((at @ fold % 1.0) @ cell for at in (first, second))
     ways = second[None, :, None] - first[:, None, None] + images
@@ -240,25 +257,36 @@ def pairs_by_hand(first, owner, second, owner_2, cell, edge, bins):
     "cell", [np.eye(3) * 20.0, SLANTED, np.diag([9.0, 31.0, 70.0])], ids=["cube", "slanted", "long"]
 )
 def test_pairs_are_counted_once(cell, part):
-    """Grids of 1 to many cells; sites outside the box and on its faces; ordered pairs of different molecules."""
+    """Grids of 1 to many cells; sites outside the box and on its faces; ordered pairs of different
+    molecules."""
     rng = np.random.default_rng(5)
     at = rng.normal(0.5, 1.5, (80, 3)) @ cell
     at[:4] = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1, 0], [-1e-17, 0.3, 1]]) @ cell
-    other, owner, owner_2 = rng.random((30, 3)) @ cell, rng.integers(0, 25, 80), rng.integers(0, 25, 30)
+    other, owner, owner_2 = (
+        rng.random((30, 3)) @ cell,
+        rng.integers(0, 25, 80),
+        rng.integers(0, 25, 30),
+    )
     bins = 12
     edge = part * 0.5 * heights(cell).min() / bins
     for second, second_owner in ((at, owner), (other, owner_2)):
         counted = count_pairs(at, owner, second, second_owner, cell, edge, bins)
-        assert counted.tolist() == pairs_by_hand(at, owner, second, second_owner, cell, edge, bins).tolist()
+        assert (
+            counted.tolist()
+            == pairs_by_hand(at, owner, second, second_owner, cell, edge, bins).tolist()
+        )
 
 
 @pytest.mark.parametrize("n", [2, 3, 8, 60])
 def test_an_ideal_gas_has_no_structure(n):
-    """In a slanted cell that breathes, g = 1 also for two molecules; each has n - 1 others; S = 1."""
+    """In a slanted cell that breathes, g = 1 also for two molecules; each has n - 1 others; S =
+    1."""
     system = system_of({"argon": n}, 25.0)
     rng = np.random.default_rng(n)
     cells = SLANTED * (1 + 0.05 * rng.standard_normal(200))[:, None, None]
-    gas = history(system, np.arange(200.0), np.einsum("fni,fij->fnj", rng.random((200, n, 3)), cells), cells)
+    gas = history(
+        system, np.arange(200.0), np.einsum("fni,fij->fnj", rng.random((200, n, 3)), cells), cells
+    )
     found = rdf(gas, "Ar", width=0.5)
     r, g, error = (found[name] for name in ("r (A)", "g Ar-Ar", "g Ar-Ar error"))
     shells = 4 / 3 * np.pi * ((r + 0.25) ** 3 - (r - 0.25) ** 3)
@@ -272,7 +300,9 @@ def test_an_ideal_gas_has_no_structure(n):
     density = (n - 1) / gas.volume.mean()
     each = g * shells * density
     assert found["n Ar-Ar"] == pytest.approx(np.cumsum(each) - 0.5 * each, rel=0.01, abs=1e-9)
-    assert found["n Ar-Ar"][-1] == pytest.approx(density * 4 / 3 * np.pi * r[-1] ** 3, rel=0.35 if n < 8 else 0.1)
+    assert found["n Ar-Ar"][-1] == pytest.approx(
+        density * 4 / 3 * np.pi * r[-1] ** 3, rel=0.35 if n < 8 else 0.1
+    )
     waves = structure_factor(gas, largest=3.0)
     assert np.mean(waves["S centres"]) == pytest.approx(1.0, abs=0.05)
     pulls = (waves["S centres"] - 1) / waves["S centres error"]
@@ -286,7 +316,9 @@ def test_two_atoms_at_a_distance_have_one_neighbour():
     found = rdf(history(system, np.arange(10.0), positions, np.eye(3) * 25.0), "Ar", width=0.1)
     assert found["n Ar-Ar"][-1] == pytest.approx(1.0, abs=1e-12)
     assert np.flatnonzero(found["g Ar-Ar"]).tolist() == [40]
-    waves = structure_factor(history(system, np.arange(10.0), positions, np.eye(3) * 25.0), largest=1.0)
+    waves = structure_factor(
+        history(system, np.arange(10.0), positions, np.eye(3) * 25.0), largest=1.0
+    )
     assert waves["S centres"].max() <= 2.0
 
 
@@ -295,7 +327,9 @@ def test_the_profile_of_a_density_is_where_the_mass_is():
     positions = np.zeros((10, 4, 3))
     positions[..., 2] = np.array([0.1, 0.1, 0.6, -24.4])
     Q = np.broadcast_to(np.eye(3), (10, 4, 3, 3))
-    found = density_profile(history(system, np.arange(10.0), positions, np.eye(3) * 25.0, Q), "z", bins=50)
+    found = density_profile(
+        history(system, np.arange(10.0), positions, np.eye(3) * 25.0, Q), "z", bins=50
+    )
     rho = found["density spce (g/cm3)"]
     assert np.flatnonzero(rho).tolist() == [0, 1]
     assert rho[0] == pytest.approx(rho[1])
@@ -305,12 +339,18 @@ def test_the_profile_of_a_density_is_where_the_mass_is():
 
 
 def test_hydrogen_bonds_are_those_of_the_geometry():
-    """A bond that points at its neighbour through the wall; one that is 25° off, and one that is 35° off."""
+    """A bond that points at its neighbour through the wall; one that is 25° off, and one that is
+    35° off."""
     system = system_of({"spce": 2}, 25.0)
     body = system.species[0].positions_body
     arm = body[1] - body[0]
     arm = arm / np.linalg.norm(arm)
-    for off, gap, expected in ((0.0, 2.8, 1.0), (25.0, 2.8, 1.0), (35.0, 2.8, 0.0), (0.0, 3.6, 0.0)):
+    for off, gap, expected in (
+        (0.0, 2.8, 1.0),
+        (25.0, 2.8, 1.0),
+        (35.0, 2.8, 0.0),
+        (0.0, 3.6, 0.0),
+    ):
         way = rotations_about(np.array([0.0, 0.0, np.radians(off)])) @ arm
         positions = np.zeros((4, 2, 3))
         positions[:, 1] = gap * way + np.array([25.0, -50.0, 0.0])
@@ -323,35 +363,53 @@ def test_hydrogen_bonds_are_those_of_the_geometry():
 
 def pairs_of(rng, edge, gaps):
     """Molecules (f, 60, 3) in pairs far apart from each other, at distances (f, 30)."""
-    centres = 25.0 * np.array([[i, j, k] for i in range(4) for j in range(4) for k in range(2)][:30], float)
+    centres = 25.0 * np.array(
+        [[i, j, k] for i in range(4) for j in range(4) for k in range(2)][:30], float
+    )
     away = rng.standard_normal((*gaps.shape, 3))
     second = centres + away * (gaps / np.linalg.norm(away, axis=2))[..., None]
     return np.concatenate([np.broadcast_to(centres, second.shape), second], axis=1)
 
 
 def test_neighbours_up_to_the_first_minimum_follow_it_and_have_an_honest_error():
-    """Distances of two peaks: exactly so, with the minimum anywhere between two bins; then drawn at random."""
+    """Distances of two peaks: exactly so, with the minimum anywhere between two bins; then drawn at
+    random."""
     system, edge, frames = system_of({"argon": 60}, 100.0), 100.0, 250
-    r, rng, name = np.linspace(2.0, 7.5, 5501), np.random.default_rng(0), "g AR-AR: neighbours up to the first minimum"
+    r, rng, name = (
+        np.linspace(2.0, 7.5, 5501),
+        np.random.default_rng(0),
+        "g AR-AR: neighbours up to the first minimum",
+    )
 
     def seen(gaps):
         at = pairs_of(rng, edge, gaps.reshape(-1, 30))
-        return rdf(history(system, np.arange(float(len(at))), at, np.eye(3) * edge), "AR").value(name)
+        return rdf(history(system, np.arange(float(len(at))), at, np.eye(3) * edge), "AR").value(
+            name
+        )
 
     def distances(moved, level):
         """Of fractions of all pairs; and the fraction within the minimum."""
-        g = sum(h * np.exp(-0.5 * ((r - moved - at) / wide) ** 2) for h, at, wide in ((2, 3.2, 0.25), (0.8, 5.2, 0.7)))
+        g = sum(
+            h * np.exp(-0.5 * ((r - moved - at) / wide) ** 2)
+            for h, at, wide in ((2, 3.2, 0.25), (0.8, 5.2, 0.7))
+        )
         partners = r**2 * (g + 0.4 * (r > 2.5))
         partners /= np.trapezoid(partners, r)
         between = (r > 3.5) & (r < 4.5)
         minimum = r[between][np.argmin((partners / r**2)[between])]
         inside = float(np.trapezoid(partners[r <= minimum], r[r <= minimum]))
-        return np.interp(level, np.cumsum(partners) / partners.sum(), r), inside, np.interp(minimum, r, partners)
+        return (
+            np.interp(level, np.cumsum(partners) / partners.sum(), r),
+            inside,
+            np.interp(minimum, r, partners),
+        )
 
     even = rng.permutation((np.arange(frames * 30) + 0.5) / (frames * 30))
     for moved in (0.0, 0.01, 0.02, 0.03, 0.04):
         gaps, inside, rate = distances(moved, even)
-        assert seen(gaps).value == pytest.approx(inside, abs=0.3 * 0.05 * rate)  # a third of what is in a bin
+        assert seen(gaps).value == pytest.approx(
+            inside, abs=0.3 * 0.05 * rate
+        )  # a third of what is in a bin
     found = []
     for _ in range(20):
         gaps, inside, _ = distances(0.02, rng.random(frames * 30))
@@ -371,7 +429,9 @@ def test_diffusion_is_that_of_a_random_walk_and_its_error_honest():
     D, found = 0.25, []
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        walk = history(system, 4.0 * np.arange(400), brownian(rng, 400, 16, D, 4.0), np.eye(3) * 25.0)
+        walk = history(
+            system, 4.0 * np.arange(400), brownian(rng, 400, 16, D, 4.0), np.eye(3) * 25.0
+        )
         told = diffusion(walk, viscosity_mPa_s=0.85).value("D of argon")
         found += [] if told.value is None else [(told.value, told.error)]
     assert len(found) >= 55  # few are refused for what is chance
@@ -385,7 +445,9 @@ def test_the_correction_for_the_size_of_the_box_is_that_of_yeh_and_hummer():
     system = system_of({"argon": 16}, 24.86)
     rng = np.random.default_rng(0)
     time, path = 4.0 * np.arange(400), brownian(rng, 400, 16, 0.25, 4.0)
-    found = diffusion(history(system, time, path, np.eye(3) * 24.86, temperature=298.15), viscosity_mPa_s=0.896)
+    found = diffusion(
+        history(system, time, path, np.eye(3) * 24.86, temperature=298.15), viscosity_mPa_s=0.896
+    )
     own, infinite = found.value("D of argon"), found.value("D of argon in an infinite box")
     by_hand = 2.837297 * 1.380649e-23 * 298.15 / (6 * np.pi * 0.896e-3 * 24.86e-10) / 1e-9
     assert infinite.value - own.value == pytest.approx(by_hand, rel=1e-6)
@@ -400,7 +462,8 @@ def test_the_correction_for_the_size_of_the_box_is_that_of_yeh_and_hummer():
 
 
 def test_what_does_not_diffuse_gives_no_value():
-    """Free flight bends upwards, a cage downwards; a walk too short for neighbours to change is told as that."""
+    """Free flight bends upwards, a cage downwards; a walk too short for neighbours to change is
+    told as that."""
     system = system_of({"argon": 16}, 25.0)
     rng = np.random.default_rng(0)
     time, box = 0.5 * np.arange(400), np.eye(3) * 25.0
@@ -408,7 +471,9 @@ def test_what_does_not_diffuse_gives_no_value():
     cage = noise_with_memory(rng, 400, (16, 3), 1.0, 5.0, 0.5)
     for path in (flight, cage):
         (told,) = diffusion(history(system, time, path, SLANTED)).values
-        assert told.value is None and "too short for a value; a run of 798 ps follows it" in told.note
+        assert (
+            told.value is None and "too short for a value; a run of 798 ps follows it" in told.note
+        )
         assert re.search(r"So far: -?\d.* 1e-9 m²/s$", told.note)
     (told,) = diffusion(history(system, time, brownian(rng, 400, 16, 0.25, 0.5), SLANTED)).values
     assert told.value is None and "correlation times" in told.note
@@ -433,7 +498,10 @@ def test_free_rotational_diffusion_decays_as_it_must():
     found = orientation(history(system, interval * np.arange(frames), None, np.eye(3) * 60, Q))
     # mean cosine and P2 of one turn, exact for steps of a finite size
     angle = np.linalg.norm(np.sqrt(2 * D * interval) * rng.standard_normal((400_000, 3)), axis=1)
-    once = [(1 + 2 * np.cos(angle)).mean() / 3, (1 + 2 * np.cos(angle) + 2 * np.cos(2 * angle)).mean() / 5]
+    once = [
+        (1 + 2 * np.cos(angle)).mean() / 3,
+        (1 + 2 * np.cos(angle) + 2 * np.cos(2 * angle)).mean() / 5,
+    ]
     time = found["Time (ps)"]
     for axis in (1, 2, 3):
         for l in (1, 2):  # noqa: E741
@@ -451,7 +519,8 @@ def test_free_rotational_diffusion_decays_as_it_must():
 
 
 def test_errors_of_a_gas_are_those_of_its_molecules():
-    """Free rotors in free flight: all blocks of a run are alike, and tell nothing of the scatter over molecules."""
+    """Free rotors in free flight: all blocks of a run are alike, and tell nothing of the scatter
+    over molecules."""
     system, n, time = system_of({"nitrogen": 100}, 60.0), 100, 0.01 * np.arange(200)
     rate, speed = np.sqrt(BOLTZMANN * 300 / system.species[0].inertia[1]), 3.0
     many = rate * np.hypot(*np.random.default_rng(0).standard_normal((2, 200_000)))
@@ -462,7 +531,8 @@ def test_errors_of_a_gas_are_those_of_its_molecules():
         angle = omega * time[:, None]
         plane = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         along, beside = (
-            np.einsum("fni,nij->fnj", plane @ turn, frame[:, :2]) for turn in ([[1, 0], [0, 1]], [[0, 1], [-1, 0]])
+            np.einsum("fni,nij->fnj", plane @ turn, frame[:, :2])
+            for turn in ([[1, 0], [0, 1]], [[0, 1], [-1, 0]])
         )
         Q = np.stack([along, beside, np.broadcast_to(frame[:, 2], along.shape)], axis=-1)
         flight = speed * time[:, None, None] * rng.standard_normal((n, 3))
@@ -475,7 +545,11 @@ def test_errors_of_a_gas_are_those_of_its_molecules():
             (moved, "MSD nitrogen (A^2)", 3 * (speed * lag) ** 2),
         ):
             pulls.append((found[title][late] - truth) / found[f"{title} error"][late])
-        doubts.append(turned["C1 nitrogen axis 1 error"][late][-1] / np.std(np.cos(many * lag[-1])) * np.sqrt(n))
+        doubts.append(
+            turned["C1 nitrogen axis 1 error"][late][-1]
+            / np.std(np.cos(many * lag[-1]))
+            * np.sqrt(n)
+        )
     for which in (0, 1):
         assert 0.6 < np.sqrt(np.mean(np.array(pulls[which::2]) ** 2)) < 1.3
     assert np.mean(doubts) == pytest.approx(1.0, abs=0.25)
@@ -485,12 +559,16 @@ def test_what_hardly_turns_or_turns_too_fast_gives_no_time():
     system = system_of({"ccl4": 8}, 40.0, 9.0)
     rng, time = np.random.default_rng(0), np.arange(100.0)
     still = np.broadcast_to(random_rotations(rng, 8), (100, 8, 3, 3))
-    told = orientation(history(system, time, None, np.eye(3) * 40, still)).value("tau1 of ccl4, axis 1")
+    told = orientation(history(system, time, None, np.eye(3) * 40, still)).value(
+        "tau1 of ccl4, axis 1"
+    )
     assert told.value is None and told.note == (
         "C1 is still 1.00 after 10 ps, too short for a value; it needs more than 8e+03 ps. So far: 10 ps"
     )
     wild = random_rotations(rng, 800).reshape(100, 8, 3, 3)
-    told = orientation(history(system, time, None, np.eye(3) * 40, wild)).value("D_rot of ccl4, axis 1")
+    told = orientation(history(system, time, None, np.eye(3) * 40, wild)).value(
+        "D_rot of ccl4, axis 1"
+    )
     assert told.value is None and "between frames, every 1 ps: write more of them" in told.note
     with pytest.raises(OutputError, match="no molecule of this run rotates"):
         orientation(history(system_of({"argon": 2}), time, None, np.eye(3) * 40))
@@ -500,7 +578,9 @@ def test_one_sentence_tells_what_is_too_short():
     assert converged_value("x", "D", 1.0, 0.1, 11.0, 1.0).note == (
         "11 ps are 11 correlation times of 1 ps, too short for a value; 20 of them are 20 ps. So far: 1.00 ± 0.10 D"
     )
-    assert converged_value("x", "", 1.0, None, 40.0, 1.0).note == "too short for an error. So far: 1"
+    assert (
+        converged_value("x", "", 1.0, None, 40.0, 1.0).note == "too short for an error. So far: 1"
+    )
     assert converged_value("x", "", 1.0, 0.1, 20.0, 1.0).value == 1.0
     assert converged_value("x", "", 1.0, 0.1, 5.0, 1.0, least=5.0).value == 1.0
     assert converged_value("x", "", 1.0, 0.1, 4.9, 1.0, least=5.0).value is None
@@ -509,7 +589,8 @@ def test_one_sentence_tells_what_is_too_short():
 
 
 def test_an_oscillation_has_its_wave_number_and_its_degrees_of_freedom():
-    """Springs at 120/cm and librations at 300, 500 and 700/cm, with energies of kT each on the average."""
+    """Springs at 120/cm and librations at 300, 500 and 700/cm, with energies of kT each on the
+    average."""
     system = system_of({"spce": 40}, 30.0)
     rng, frames, interval = np.random.default_rng(0), 2000, 0.004
     time, m = interval * np.arange(frames), system.species[0]
@@ -517,35 +598,53 @@ def test_an_oscillation_has_its_wave_number_and_its_degrees_of_freedom():
     def swing(wave_number, weight, shape):
         size = np.sqrt(rng.exponential(2 * BOLTZMANN * 300 / weight, shape))
         size *= np.sqrt(2 * BOLTZMANN * 300 / weight / np.mean(size**2))
-        return size * np.cos(2 * np.pi * PER_CM * wave_number * time[:, None, None] + 2 * np.pi * rng.random(shape))
+        return size * np.cos(
+            2 * np.pi * PER_CM * wave_number * time[:, None, None] + 2 * np.pi * rng.random(shape)
+        )
 
     velocities = swing(120.0, m.mass, (40, 3))
-    L = np.concatenate([swing(c, i, (40, 1)) * i for c, i in zip((300, 500, 700), m.inertia, strict=True)], axis=2)
+    L = np.concatenate(
+        [swing(c, i, (40, 1)) * i for c, i in zip((300, 500, 700), m.inertia, strict=True)], axis=2
+    )
     Q = np.broadcast_to(random_rotations(rng, 40), (frames, 40, 3, 3))
     found = spectrum(history(system, time, None, np.eye(3) * 30, Q, velocities, L))
     step = found["wave number (1/cm)"][1]
-    expected = {"V spce": (120, 3), **{f"omega spce axis {k}": (200 + 100 * k + 100 * (k - 1), 1) for k in (1, 2, 3)}}
+    expected = {
+        "V spce": (120, 3),
+        **{f"omega spce axis {k}": (200 + 100 * k + 100 * (k - 1), 1) for k in (1, 2, 3)},
+    }
     for title, (wave_number, freedom) in expected.items():
-        assert found.value(f"highest peak of {title}").value == pytest.approx(wave_number, abs=0.6 * step)
+        assert found.value(f"highest peak of {title}").value == pytest.approx(
+            wave_number, abs=0.6 * step
+        )
         assert np.sum(found[title]) * step == pytest.approx(freedom, rel=0.03)
         memory = found[f"correlation {title}"]
         assert memory[0] == pytest.approx(1.0)
-        assert memory[5] == pytest.approx(np.cos(2 * np.pi * PER_CM * wave_number * 5 * interval), abs=0.02)
+        assert memory[5] == pytest.approx(
+            np.cos(2 * np.pi * PER_CM * wave_number * 5 * interval), abs=0.02
+        )
     with pytest.raises(OutputError, match="needs velocities"):
         spectrum(history(system, time, None, np.eye(3) * 30, Q))
     with pytest.raises(OutputError, match=r"frames every 0\.016 ps .* spce axis 2 decays"):
         every = slice(None, None, 4)  # V and one of three angular velocities would do
-        spectrum(history(system, time[every], None, np.eye(3) * 30, Q[every], velocities[every], L[every]))
+        spectrum(
+            history(
+                system, time[every], None, np.eye(3) * 30, Q[every], velocities[every], L[every]
+            )
+        )
 
 
 # electric
 
 
 def dipoles(rng, system, frames, time, interval):
-    """Q (f, n, 3, 3) of molecules that keep their dipoles along or against the axes of the lab, each a telegraph."""
+    """Q (f, n, 3, 3) of molecules that keep their dipoles along or against the axes of the lab,
+    each a telegraph."""
     n = len(system.model.species)
     change = 0.5 * (1 - np.exp(-interval / time))
-    signs = np.cumprod(np.where(rng.random((frames, n)) < change, -1, 1), axis=0) * rng.choice([-1, 1], n)
+    signs = np.cumprod(np.where(rng.random((frames, n)) < change, -1, 1), axis=0) * rng.choice(
+        [-1, 1], n
+    )
     dipole = system.species[0].charges @ system.species[0].positions_body
     along = int(np.abs(dipole).argmax())
     Q = np.zeros((frames, n, 3, 3))
@@ -567,7 +666,8 @@ FORCES = {
 
 @pytest.mark.parametrize("name", FORCES)
 def test_the_dielectric_constant_of_independent_dipoles(name):
-    """<M²> = n mu², in a box that makes epsilon 2.3 with tin foil and 3.2 in vacuum; time of the dipole 2 ps."""
+    """<M²> = n mu², in a box that makes epsilon 2.3 with tin foil and 3.2 in vacuum; time of the
+    dipole 2 ps."""
     scene = {"forces": {"cutoff_A": 7.0} | FORCES[name]}
     system = build(small_scene({"spce": 30}, 24.0, **scene))
     Q, mu = dipoles(np.random.default_rng(4), system, 4000, 2.0, 0.5)
@@ -589,7 +689,9 @@ def test_the_dielectric_constant_of_independent_dipoles(name):
 
 
 def test_the_error_of_a_dielectric_constant_is_honest():
-    system = build(small_scene({"spce": 30}, 14.5, forces={"cutoff_A": 7.0, "electrostatics": "pme"}))
+    system = build(
+        small_scene({"spce": 30}, 14.5, forces={"cutoff_A": 7.0, "electrostatics": "pme"})
+    )
     found = []
     for seed in range(60):
         Q, _ = dipoles(np.random.default_rng(seed), system, 600, 2.0, 0.5)
@@ -601,9 +703,11 @@ def test_the_error_of_a_dielectric_constant_is_honest():
 
 @pytest.mark.parametrize(("runs", "frames"), [(1, 300), (8, 60)])
 def test_a_dielectric_constant_has_no_bias_of_short_runs(runs, frames):
-    """Runs of 15 correlation times, and eight of three that are too short by themselves: <M> is 0, and is not subtracted
-    as a mean of each run would be."""
-    system = build(small_scene({"spce": 30}, 14.5, forces={"cutoff_A": 7.0, "electrostatics": "pme"}))
+    """Runs of 15 correlation times, and eight of three that are too short by themselves: <M> is 0,
+    and is not subtracted as a mean of each run would be."""
+    system = build(
+        small_scene({"spce": 30}, 14.5, forces={"cutoff_A": 7.0, "electrostatics": "pme"})
+    )
     found, time, box = [], 0.5 * np.arange(frames), np.eye(3) * 14.5
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -612,7 +716,9 @@ def test_a_dielectric_constant_has_no_bias_of_short_runs(runs, frames):
         value = told.value()
         if runs == 1:
             so_far = re.search(r"too short for a value; .* So far: ([\d.]+) ± ([\d.]+)", value.note)
-            found.append([float(text) for text in so_far.groups()] if so_far else value[2:4])  # 15 of 20 are
+            found.append(
+                [float(text) for text in so_far.groups()] if so_far else value[2:4]
+            )  # 15 of 20 are
         else:
             found.append((value.value, value.error))
     mu = every[0][1]
@@ -626,14 +732,21 @@ def test_a_dielectric_constant_has_no_bias_of_short_runs(runs, frames):
 
 
 def test_the_error_of_a_dielectric_constant_in_a_reaction_field_follows_its_slope():
-    """By differences of the formula, from the error that the same dipoles have with tin foil, which is that of y."""
+    """By differences of the formula, from the error that the same dipoles have with tin foil, which
+    is that of y."""
     around, found = 4.0, {}
     fields = {"tin foil": inf, "field": around}
     for name, permittivity in fields.items():
-        forces = {"cutoff_A": 7.0, "electrostatics": "reaction_field", "reaction_field_permittivity": permittivity}
+        forces = {
+            "cutoff_A": 7.0,
+            "electrostatics": "reaction_field",
+            "reaction_field_permittivity": permittivity,
+        }
         system = build(small_scene({"spce": 30}, 21.0, forces=forces))
         Q, _ = dipoles(np.random.default_rng(4), system, 4000, 2.0, 0.5)
-        found[name] = dielectric(history(system, 0.5 * np.arange(4000), None, np.eye(3) * 21.0, Q)).value()
+        found[name] = dielectric(
+            history(system, 0.5 * np.arange(4000), None, np.eye(3) * 21.0, Q)
+        ).value()
 
     def epsilon(y: float) -> float:
         """The root of (epsilon - 1)(2 around + 1) = y (2 around + epsilon)."""
@@ -664,26 +777,39 @@ def test_dipoles_without_a_dielectric_constant():
         system = build(small_scene(scene, 14.5, **{"forces": forces} | more))
         n = len(system.model.species)
         with pytest.raises(OutputError, match=words):
-            dielectric(history(system, time, None, box, still[:, :n] if len(system.state.rotation) else None))
+            dielectric(
+                history(
+                    system, time, None, box, still[:, :n] if len(system.state.rotation) else None
+                )
+            )
     system = build(small_scene({"spce": 30}, 14.5, forces=forces | {"electrostatics": "pme"}))
     Q, _ = dipoles(np.random.default_rng(0), system, 100, 10.0, 0.5)
     told = dielectric(history(system, 0.5 * time, None, box, Q)).value()
     vacuum = build(small_scene({"spce": 30}, 14.5, forces=forces | FORCES["vacuum"]))
-    with pytest.raises(OutputError, match="fluctuates more than it can with a permittivity of 1 around"):
+    with pytest.raises(
+        OutputError, match="fluctuates more than it can with a permittivity of 1 around"
+    ):
         dielectric(
             history(
-                vacuum, 0.5 * np.arange(4000), None, box, dipoles(np.random.default_rng(4), vacuum, 4000, 2.0, 0.5)[0]
+                vacuum,
+                0.5 * np.arange(4000),
+                None,
+                box,
+                dipoles(np.random.default_rng(4), vacuum, 4000, 2.0, 0.5)[0],
             )
         )
     assert told.value is None
-    assert re.search(r"too short for a value; 20 of them are [\d.]+ ps. So far: [\d.]+ ± [\d.]+$", told.note)
+    assert re.search(
+        r"too short for a value; 20 of them are [\d.]+ ps. So far: [\d.]+ ± [\d.]+$", told.note
+    )
 
 
 # flow
 
 
 def stresses(rng, frames, eta, forget, interval, volume):
-    """A pressure tensor (f, 7), bar, whose five components decay within `forget` ps to a viscosity eta (mPa s)."""
+    """A pressure tensor (f, 7), bar, whose five components decay within `forget` ps to a viscosity
+    eta (mPa s)."""
     variance = eta * MPA_S * BOLTZMANN * 300 / volume / forget / BAR**2
     tensor = noise_with_memory(rng, frames, (6,), variance, forget, interval)
     tensor[:, :3] *= np.sqrt(2)  # so that half the difference of two has that variance
@@ -702,7 +828,8 @@ def relaxing(rng, frames, interval, parts):
 
 
 def tensor_of(stress, eta, interval, volume):
-    """A pressure tensor (f, 7), bar, with these five components, for a viscosity eta (mPa s) at 300 K."""
+    """A pressure tensor (f, 7), bar, with these five components, for a viscosity eta (mPa s) at 300
+    K."""
     unit = np.sqrt(eta * MPA_S * BOLTZMANN * 300 / volume) / BAR
     tensor = np.zeros((len(stress), 7))
     tensor[:, 0] = interval * np.arange(len(stress))
@@ -720,16 +847,27 @@ FEW, MANY = 10, pytest.param(60, marks=pytest.mark.soak)
 
 
 @pytest.mark.parametrize("seeds", [FEW, MANY])
-@pytest.mark.parametrize(("name", "runs", "length"), [("one", 1, 100.0), ("water", 1, 100.0), ("slow", 8, 40.0)])
-def test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest(name, runs, length, seeds):
-    """Also where a part of it relaxes slowly, beyond the time at which an integral is lost in noise."""
+@pytest.mark.parametrize(
+    ("name", "runs", "length"), [("one", 1, 100.0), ("water", 1, 100.0), ("slow", 8, 40.0)]
+)
+def test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest(
+    name, runs, length, seeds
+):
+    """Also where a part of it relaxes slowly, beyond the time at which an integral is lost in
+    noise."""
     system, found, interval = system_of({"argon": 8}, 25.0), [], 0.02
     frames = int(length / interval)
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
         series = [relaxing(rng, frames, interval, RELAXATIONS[name]) for _ in range(runs)]
         members = [
-            history(system, [0.0, length], None, np.eye(3) * 25.0, tensor=tensor_of(x, 0.85, interval, 25.0**3))
+            history(
+                system,
+                [0.0, length],
+                None,
+                np.eye(3) * 25.0,
+                tensor=tensor_of(x, 0.85, interval, 25.0**3),
+            )
             for x in series
         ]
         told = viscosity(Runs(tuple(members))).value()
@@ -778,7 +916,8 @@ def test_a_viscosity_needs_stresses_long_enough_and_close_enough():
 
 
 def test_analyses_of_several_runs_are_over_their_sum():
-    """Four short runs of a liquid: the limits apply to all of them, the means are those of all frames."""
+    """Four short runs of a liquid: the limits apply to all of them, the means are those of all
+    frames."""
     system, rng, box = system_of({"spce": 40}, 20.0), np.random.default_rng(0), np.eye(3) * 20.0
     members = []
     for _ in range(4):
@@ -786,10 +925,16 @@ def test_analyses_of_several_runs_are_over_their_sum():
         paths = brownian(rng, 60, 40, 0.25, 4.0) + 20.0 * rng.random((40, 3))
         members.append(history(system, 4.0 * np.arange(60), paths, box, Q))
     together = Runs(tuple(members))
-    for analysis, title in ((rdf, "g O-O"), (structure_factor, "S centres"), (density_profile, "density spce (g/cm3)")):
+    for analysis, title in (
+        (rdf, "g O-O"),
+        (structure_factor, "S centres"),
+        (density_profile, "density spce (g/cm3)"),
+    ):
         each, both = [analysis(run)[title] for run in members], analysis(together)
         assert both[title] == pytest.approx(np.mean(each, axis=0), abs=1e-12), title
-        assert both[f"{title} error"] == pytest.approx(np.std(each, axis=0, ddof=1) / 2, abs=1e-12), title
+        assert both[f"{title} error"] == pytest.approx(
+            np.std(each, axis=0, ddof=1) / 2, abs=1e-12
+        ), title
     each, both = [hydrogen_bonds(run).value() for run in members], hydrogen_bonds(together).value()
     assert both.value == pytest.approx(np.mean([value.value for value in each]))
     assert both.error == pytest.approx(np.std([value.value for value in each], ddof=1) / 2)
@@ -804,7 +949,10 @@ def test_analyses_of_several_runs_are_over_their_sum():
 
 def test_runs_that_are_too_short_alone_have_a_value_together():
     system, rng, box = system_of({"argon": 16}, 25.0), np.random.default_rng(1), np.eye(3) * 25.0
-    members = [history(system, 0.5 * np.arange(400), brownian(rng, 400, 16, 0.25, 0.5), box) for _ in range(8)]
+    members = [
+        history(system, 0.5 * np.arange(400), brownian(rng, 400, 16, 0.25, 0.5), box)
+        for _ in range(8)
+    ]
     alone = [diffusion(run, 0.85).value("D of argon") for run in members]
     assert all(value.value is None and "too short" in value.note for value in alone)
     together = diffusion(Runs(tuple(members)), 0.85).value("D of argon")
@@ -813,7 +961,8 @@ def test_runs_that_are_too_short_alone_have_a_value_together():
 
 @pytest.mark.parametrize("counts", [(50, 50, 50), (20, 60, 100)])
 def test_the_error_over_runs_is_that_of_leaving_one_out(counts):
-    """Of the mean it is the standard error; of a function of it the same times the slope; long runs count more."""
+    """Of the mean it is the standard error; of a function of it the same times the slope; long runs
+    count more."""
     system, rng = system_of({"argon": 2}, 25.0), np.random.default_rng(4)
     runs = Runs(tuple(history(system, np.arange(float(count)), None) for count in counts))
     found, told = [], []

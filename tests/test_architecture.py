@@ -1,4 +1,5 @@
-"""The architecture: packages import in one direction, and each heavy library is used in few of them."""
+"""The architecture: packages import in one direction, and each heavy library is used in few of
+them."""
 
 import ast
 import functools
@@ -13,11 +14,31 @@ from support import BY_EXTENSION, ROOT
 
 PACKAGE = ROOT / "rigidmd"
 
-#: From the bottom up: a package imports from those before it and from itself. A subpackage may have a layer of its own.
+#: From the bottom up: a package imports from those before it and from itself. A subpackage may have
+#: a layer of its own.
 LAYERS = (
-    "errors", "units", "core", "engines.registry", "engines.*.options", "compile", "mechanics", "forces", "dynamics",
-    "io.formats", "scene", "engines", "io", "figures", "assemble", "run", "analysis", "view", "studies", "ase", "commands",
-)  # fmt: skip
+    "errors",
+    "units",
+    "core",
+    "engines.registry",
+    "engines.*.options",
+    "compile",
+    "mechanics",
+    "forces",
+    "dynamics",
+    "io.formats",
+    "scene",
+    "engines",
+    "io",
+    "figures",
+    "assemble",
+    "run",
+    "analysis",
+    "view",
+    "studies",
+    "ase",
+    "commands",
+)
 #: `rigidmd` itself and `python -m rigidmd` are above all packages.
 ABOVE_ALL = ("__init__", "__main__")
 RANK = {name: rank for rank, name in enumerate((*LAYERS, *ABOVE_ALL))}
@@ -40,9 +61,11 @@ LIBRARIES = {
     "rocket_fft": {"forces/ewald/pme.py"},
     "sympy": {"forces/potentials/text_formulas.py", "engines/force_field.py"},
     "tomli_w": {"io/scene_file.py"},
-}  # fmt: skip
+}
 
-FILES = sorted(path for path in PACKAGE.rglob("*.py") if "docs" not in path.parts)  # docs: hooks of the site
+FILES = sorted(
+    path for path in PACKAGE.rglob("*.py") if "docs" not in path.parts
+)  # docs: hooks of the site
 
 
 def name_of(path):
@@ -60,7 +83,8 @@ def package_of(path):
 
 
 def imports_in(source):
-    """(line, module) of all imports of a Python text: at the top, inside functions, and for type checkers only."""
+    """(line, module) of all imports of a Python text: at the top, inside functions, and for type
+    checkers only."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -70,7 +94,9 @@ def imports_in(source):
             for alias in node.names:
                 inner = ROOT.joinpath(*node.module.split("."), alias.name)
                 is_module = inner.with_suffix(".py").is_file() or inner.is_dir()
-                found.append((node.lineno, f"{node.module}.{alias.name}" if is_module else node.module))
+                found.append(
+                    (node.lineno, f"{node.module}.{alias.name}" if is_module else node.module)
+                )
     return found
 
 
@@ -80,7 +106,8 @@ def imports(path):
 
 
 def upward(package, found):
-    """'line: imports module, ...' for imports (line, module) from packages above, and from the package rigidmd itself."""
+    """'line: imports module, ...' for imports (line, module) from packages above, and from the
+    package rigidmd itself."""
     for line, module in found:
         root, _, rest = module.partition(".")
         other = layer_of(rest)
@@ -90,7 +117,8 @@ def upward(package, found):
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_imports_point_down(path):
-    """Imports inside functions and for type checkers count. The order of layers excludes circles of packages."""
+    """Imports inside functions and for type checkers count. The order of layers excludes circles of
+    packages."""
     assert package_of(path) in RANK, f"{name_of(path)} is in no layer"
     found = [f"{name_of(path)}:{message}" for message in upward(package_of(path), imports(path))]
     assert not found, "\n".join(found)
@@ -108,16 +136,30 @@ def build():
     import PACKAGE.assemble.build
     from PACKAGE import Scene
 """.replace("PACKAGE", "rigidmd")  # test_support.py would take these imports for ours
-    assert [message.split(":")[0] for message in upward("scene", imports_in(source))] == ["6", "8", "9", "10"]
+    assert [message.split(":")[0] for message in upward("scene", imports_in(source))] == [
+        "6",
+        "8",
+        "9",
+        "10",
+    ]
     assert not list(upward("__init__", imports_in(source)))
-    inner = [(1, "rigidmd.io.formats.gro"), (2, "rigidmd.io.formats"), (3, "rigidmd.io.trajectory"), (4, "rigidmd.io")]
+    inner = [
+        (1, "rigidmd.io.formats.gro"),
+        (2, "rigidmd.io.formats"),
+        (3, "rigidmd.io.trajectory"),
+        (4, "rigidmd.io"),
+    ]
     assert [message.split(":")[0] for message in upward("scene", inner)] == ["3", "4"]
     assert [message.split(":")[0] for message in upward("dynamics", inner)] == ["1", "2", "3", "4"]
 
 
 def test_a_part_of_a_package_can_be_below_it():
-    light = imports_in("from PACKAGE.engines.lammps.options import PROGRAM".replace("PACKAGE", "rigidmd"))
-    heavy = imports_in("from PACKAGE.engines.lammps.files import fixes".replace("PACKAGE", "rigidmd"))
+    light = imports_in(
+        "from PACKAGE.engines.lammps.options import PROGRAM".replace("PACKAGE", "rigidmd")
+    )
+    heavy = imports_in(
+        "from PACKAGE.engines.lammps.files import fixes".replace("PACKAGE", "rigidmd")
+    )
     assert not list(upward("scene", light)) and len(list(upward("scene", heavy))) == 1
     assert len(list(upward("engines.*.options", heavy))) == 1
 
@@ -174,7 +216,11 @@ def test_only_a_format_names_its_extensions():
     for path in FILES:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-        texts = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and id(n) not in docstrings]
+        texts = [
+            n.value
+            for n in ast.walk(tree)
+            if isinstance(n, ast.Constant) and id(n) not in docstrings
+        ]
         if found := [text for text in texts if isinstance(text, str) and extension.search(text)]:
             naming[name_of(path)] = found
     strange = {name: texts for name, texts in naming.items() if not name.startswith("io/formats/")}
@@ -190,22 +236,32 @@ def test_core_compiles_nothing():
 def loaded_by(script):
     """The modules that a Python process has loaded after a script."""
     script += "\nimport sys\nprint(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     return set(done.stdout.splitlines()[-1].split())
 
 
 def test_a_scene_needs_neither_scipy_nor_numba():
-    assert not {"scipy", "numba", "ase", "MDAnalysis", "matplotlib"} & loaded_by("import rigidmd.scene")
+    assert not {"scipy", "numba", "ase", "MDAnalysis", "matplotlib"} & loaded_by(
+        "import rigidmd.scene"
+    )
 
 
 def test_ase_loads_little_of_rigidmd():
-    (point,) = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["ase.ioformats"].items()
-    found = loaded_by(f"from importlib.metadata import EntryPoint\nEntryPoint(*{point}, 'ase.ioformats').load()")
+    (point,) = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][
+        "ase.ioformats"
+    ].items()
+    found = loaded_by(
+        f"from importlib.metadata import EntryPoint\nEntryPoint(*{point}, 'ase.ioformats').load()"
+    )
     assert "rigidmd.io.ase_plugin" in found
     assert not {"numba", "MDAnalysis", "matplotlib", "rigidmd.io.formats"} & found
 
 
-@pytest.mark.parametrize("output", [{"trajectory": False, "figures": False}, {}], ids=["no output", "trajectory"])
+@pytest.mark.parametrize(
+    "output", [{"trajectory": False, "figures": False}, {}], ids=["no output", "trajectory"]
+)
 def test_a_run_of_a_top_loads_what_its_output_needs(output, tmp_path):
     run = (
         "import rigidmd\n"
@@ -213,14 +269,25 @@ def test_a_run_of_a_top_loads_what_its_output_needs(output, tmp_path):
         f"rigidmd.Simulation(scene, {str(tmp_path / 'run')!r}).run()"
     )
     found = loaded_by(run)
-    assert not {"ase", "MDAnalysis.analysis", "lammps", "openmm", "rigidmd.view", "rigidmd.analysis"} & found
+    assert (
+        not {"ase", "MDAnalysis.analysis", "lammps", "openmm", "rigidmd.view", "rigidmd.analysis"}
+        & found
+    )
     assert ("MDAnalysis" in found) == ("matplotlib" in found) == (output == {})
-    molecular = {"run.molecular", "run.molecular_observers", "run.minimise", "run.force_errors", "assemble.build"}
+    molecular = {
+        "run.molecular",
+        "run.molecular_observers",
+        "run.minimise",
+        "run.force_errors",
+        "assemble.build",
+    }
     assert not {f"rigidmd.{name}" for name in molecular} & found
 
 
 def test_a_run_of_molecules_loads_no_module_of_bodies(tmp_path):
-    found = loaded_by("import rigidmd\nscene = rigidmd.Scene.read('systems/water.toml')\nrigidmd.Simulation(scene)")
+    found = loaded_by(
+        "import rigidmd\nscene = rigidmd.Scene.read('systems/water.toml')\nrigidmd.Simulation(scene)"
+    )
     assert "rigidmd.run.molecular" in found
     assert not {"rigidmd.run.body", "rigidmd.assemble.body"} & found
 
@@ -234,7 +301,9 @@ def test_every_folder_of_code_is_a_package_that_is_installed():
 
 def test_the_top_level_holds_what_it_should():
     allowed = {"pyproject.toml", "rigidmd", "tests", "systems", "README.md", "LICENSE"}
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     if listed.returncode:
         pytest.skip("not a git checkout")
     found = {line.split("/")[0] for line in listed.stdout.splitlines()}

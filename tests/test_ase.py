@@ -72,7 +72,9 @@ def same_state(first, second) -> None:
     for name in ("position", "rotation", "velocity", "angular_momentum_body", "cell"):
         one, other = getattr(first, name), getattr(second, name)
         if name != "cell" or np.isfinite(one).all():
-            assert np.abs(one - other).max(initial=0.0) <= 4e-14 * max(1.0, np.abs(one).max(initial=0.0)), name
+            assert np.abs(one - other).max(initial=0.0) <= 4e-14 * max(
+                1.0, np.abs(one).max(initial=0.0)
+            ), name
 
 
 def test_atoms_of_a_run_are_its_scene_again(results, waters):
@@ -84,10 +86,15 @@ def test_atoms_of_a_run_are_its_scene_again(results, waters):
 
 @pytest.mark.parametrize(
     "counts",
-    [{"tip4p2005": 4, "nitrogen": 3, "argon": 2}, {"tip5p": 3, "ethane_trappe": 3}, {"acetonitrile_trappe": 4, "hf_jorgensen": 3}],
-)  # fmt: skip
+    [
+        {"tip4p2005": 4, "nitrogen": 3, "argon": 2},
+        {"tip5p": 3, "ethane_trappe": 3},
+        {"acetonitrile_trappe": 4, "hf_jorgensen": 3},
+    ],
+)
 def test_any_molecules_come_back(counts, tmp_path):
-    """Massless sites, united atoms, points, linear molecules, in a slanted cell; from memory and from ASE's files."""
+    """Massless sites, united atoms, points, linear molecules, in a slanted cell; from memory and
+    from ASE's files."""
     box = {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 100.0, 75.0]}
     system = build(small_scene(counts, None, box=box))
     atoms = rigidmd.atoms_of(system.scene)
@@ -101,19 +108,31 @@ def test_any_molecules_come_back(counts, tmp_path):
         again = build(rigidmd.scene_from_atoms(found, list(counts), **settings))
         assert [m.name for m in again.species] == list(counts)
         assert (again.model.species == system.model.species).all()
-        digits = 2e-8 if "atomtypes" in found.arrays and found is not atoms else 1e-12  # those of .extxyz
-        assert np.abs(again.site_positions(again.state) - system.site_positions(system.state)).max() < digits
+        digits = (
+            2e-8 if "atomtypes" in found.arrays and found is not atoms else 1e-12
+        )  # those of .extxyz
+        assert (
+            np.abs(again.site_positions(again.state) - system.site_positions(system.state)).max()
+            < digits
+        )
         turning = system.model.inertia[system.model.species].all(axis=1)
-        assert np.abs((again.state.rotation - system.state.rotation)[turning]).max(initial=0.0) < 10 * digits
+        assert (
+            np.abs((again.state.rotation - system.state.rotation)[turning]).max(initial=0.0)
+            < 10 * digits
+        )
 
 
 @pytest.mark.parametrize("formula", ["SF6", "C6H6", "CH3CN", "isobutane"])
 def test_sites_of_a_geometry_share_names(formula, tmp_path):
-    """Atoms of ASE have no names but their elements: as template, as .cif, and as atoms, in any order."""
+    """Atoms of ASE have no names but their elements: as template, as .cif, and as atoms, in any
+    order."""
     octahedron = 1.56 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
     one = Atoms(formula, octahedron) if formula == "SF6" else molecule(formula)
     ase.io.write(tmp_path / "m.xyz", one, plain=True)
-    species = {"file": str(tmp_path / "m.xyz"), "sites": [{"name": e, "charge_e": 0.0} for e in set(one.symbols)]}
+    species = {
+        "file": str(tmp_path / "m.xyz"),
+        "sites": [{"name": e, "charge_e": 0.0} for e in set(one.symbols)],
+    }
     rng, atoms = np.random.default_rng(3), Atoms(cell=[20, 20, 40], pbc=True)
     for k, turn in enumerate(random_rotations(rng, 3)):
         order = rng.permutation(len(one))
@@ -122,13 +141,17 @@ def test_sites_of_a_geometry_share_names(formula, tmp_path):
     for found in (atoms, ase.io.read(tmp_path / "crystal.cif")):
         system = build(rigidmd.scene_from_atoms(found, [species], forces={"cutoff_A": 6.0}))
         assert len(system.state.position) == 3
-        assert np.sort(rigidmd.atoms_of(system.scene).positions, axis=0) == pytest.approx(np.sort(atoms.positions, axis=0), abs=1e-6)  # fmt: skip
+        assert np.sort(rigidmd.atoms_of(system.scene).positions, axis=0) == pytest.approx(
+            np.sort(atoms.positions, axis=0), abs=1e-6
+        )
         assert any("largest 0.0000 Å" in note for note in system.notes)
 
 
 def test_a_scene_holds_its_atoms(waters, tmp_path):
     """No file is needed; a run in a folder has one, and repeats to the bit."""
-    made = rigidmd.scene_from_atoms(waters, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT, seed=3, name="mine")
+    made = rigidmd.scene_from_atoms(
+        waters, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT, seed=3, name="mine"
+    )
     assert isinstance(made, MolecularScene)
     assert made.seed == 3
     assert made.name == "mine"
@@ -152,7 +175,10 @@ def test_a_run_of_held_atoms_goes_on(waters, tmp_path):
     looks = Every(0.001, lambda moment: None)
     Simulation(made, tmp_path / "whole", observers=looks).run()
     Simulation(made, tmp_path / "parts", observers=stopped_at({13})).run()
-    assert Simulation(made, tmp_path / "parts", observers=[looks], resume=True).run().interrupted is False
+    assert (
+        Simulation(made, tmp_path / "parts", observers=[looks], resume=True).run().interrupted
+        is False
+    )
     assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
     other = waters.copy()
     other.positions[0, 0] += 1e-12
@@ -188,7 +214,9 @@ def test_models_may_be_files_and_tables(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.toml").write_text((ROOT / "rigidmd" / "models" / "tip3p.toml").read_text())
     from_file = rigidmd.scene_from_atoms(molecule("H2O"), ["mine.toml"])
-    heavy = rigidmd.scene_from_atoms(molecule("H2O"), [{"model": "tip3p", "masses_u": {"H": 2.014}}])
+    heavy = rigidmd.scene_from_atoms(
+        molecule("H2O"), [{"model": "tip3p", "masses_u": {"H": 2.014}}]
+    )
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path / "other")
     light = load_model("tip3p").mass
@@ -196,7 +224,10 @@ def test_models_may_be_files_and_tables(tmp_path, monkeypatch):
     (tmp_path / "run").mkdir()
     Simulation(from_file).write_scene(tmp_path / "run")
     (tmp_path / "mine.toml").unlink()
-    assert rigidmd.resolve(Scene.read(tmp_path / "run" / "scene.toml")).molecules[0].file == "input_0_mine.toml"
+    assert (
+        rigidmd.resolve(Scene.read(tmp_path / "run" / "scene.toml")).molecules[0].file
+        == "input_0_mine.toml"
+    )
     assert build(heavy).species[0].mass == pytest.approx(light + 2 * (2.014 - 1.008))
 
 
@@ -234,10 +265,16 @@ def broken(what: str) -> Atoms:
         ("nan", r"atoms\[4\] has a position that is not a finite number"),
         ("inf", r"atoms\[0\] has a momentum that is not a finite number"),
         ("mixed", "they are periodic along a, b only: set pbc along all three axes or none"),
-        ("flat", "they are periodic, but their cell is invalid: with its edges of 20, 20, 0 Å it is 0 Å thick"),
+        (
+            "flat",
+            "they are periodic, but their cell is invalid: with its edges of 20, 20, 0 Å it is 0 Å thick",
+        ),
         ("nan cell", "it has an edge that is not a finite number"),
         ("empty", "there are no atoms"),
-        ("missing", r"molecule 2 \(atoms 4 to 5, by bonding distance\) has atoms O H, expected spce \(O H2\)"),
+        (
+            "missing",
+            r"molecule 2 \(atoms 4 to 5, by bonding distance\) has atoms O H, expected spce \(O H2\)",
+        ),
         ("other", r"has atoms named S, which are in no molecule of the scene: spce \(O H2\)"),
         ("bent", r"molecule 1 .* is not spce: an atom is .* Å from the rigid template"),
     ],
@@ -264,7 +301,10 @@ def test_atoms_that_cannot_be_used_are_told(what, said):
         ({"start": 3}, "start is a int, must be a dictionary"),
         ({"structure": {"file": "x.gro"}}, r"structure\.file is given by the atoms"),
         ({"molecules": []}, "molecules is given by the atoms and models"),
-        ({"atoms": [molecule("H2O")]}, "are of the type list, must be one ase.Atoms; ase.io.read returns a list"),
+        (
+            {"atoms": [molecule("H2O")]},
+            "are of the type list, must be one ase.Atoms; ase.io.read returns a list",
+        ),
         ({"stages": [{"duration_ps": 1.0}]}, r"start\.temperature_K is missing"),
     ],
 )
@@ -274,9 +314,12 @@ def test_settings_that_cannot_be_used_are_told(settings, said):
 
 
 def test_energies_do_not_depend_on_the_atoms_before():
-    """Two ends of a molecule exchange places, which the earlier assignment of atoms fits within the tolerance."""
+    """Two ends of a molecule exchange places, which the earlier assignment of atoms fits within the
+    tolerance."""
     angle, charges = np.radians(124.0), (0.2, -0.3, 0.1)
-    x = np.array([(1.54, 0.0, 0.0), (0.0, 0.0, 0.0), (1.33 * np.cos(angle), 1.33 * np.sin(angle), 0.0)])
+    x = np.array(
+        [(1.54, 0.0, 0.0), (0.0, 0.0, 0.0), (1.33 * np.cos(angle), 1.33 * np.sin(angle), 0.0)]
+    )
     sites = [
         {
             "name": name,
@@ -287,7 +330,9 @@ def test_energies_do_not_depend_on_the_atoms_before():
             "sigma_A": 3.7,
             "epsilon_K": 90.0,
         }
-        for name, mass, at, q in zip(("A", "B", "C"), (15.0, 13.0, 14.0), x.tolist(), charges, strict=True)
+        for name, mass, at, q in zip(
+            ("A", "B", "C"), (15.0, 13.0, 14.0), x.tolist(), charges, strict=True
+        )
     ]
     pair = ase.Atoms("C6", [*x, *(x @ [[0, 1, 0], [0, 0, 1], [1, 0, 0]] + [0.0, 3.0, 4.5])])
     exchanged = pair[[2, 1, 0, 5, 4, 3]]
@@ -300,7 +345,9 @@ def test_energies_do_not_depend_on_the_atoms_before():
     for _ in range(4):
         bent.positions[0, 2] += 0.02
         calc.get_potential_energy(bent)
-    assert calc.get_potential_energy(bent) == RigidMD([{"name": "propene", "sites": sites}]).get_potential_energy(bent)
+    assert calc.get_potential_energy(bent) == RigidMD(
+        [{"name": "propene", "sites": sites}]
+    ).get_potential_energy(bent)
 
 
 def test_two_models_that_fit_are_not_chosen_from():
@@ -312,12 +359,18 @@ def test_frames_of_a_run(results):
     atoms, frames = results.atoms(), results.atoms(":")
     assert [frame.info["time_ps"] for frame in frames] == pytest.approx([0.0, 0.02, 0.04, 0.06])
     assert len(results.atoms(slice(1, 3))) == len(results.atoms("1:3")) == 2
-    assert results.atoms("-2").info["time_ps"] == results.atoms(2).info["time_ps"] == frames[2].info["time_ps"]
+    assert (
+        results.atoms("-2").info["time_ps"]
+        == results.atoms(2).info["time_ps"]
+        == frames[2].info["time_ps"]
+    )
     for frame, energy in zip(frames, results["potential"], strict=True):
         assert frame.get_potential_energy() * EV / KJ_PER_MOL == pytest.approx(energy, rel=1e-12)
     assert (results.atoms(-1).positions == atoms.positions).all()
     kinetic = atoms.get_kinetic_energy() * EV / KJ_PER_MOL
-    assert kinetic == pytest.approx(results["kinetic"][-1], rel=2e-8)  # ASE's u and eV are of CODATA 2014
+    assert kinetic == pytest.approx(
+        results["kinetic"][-1], rel=2e-8
+    )  # ASE's u and eV are of CODATA 2014
     state, model = results.state, results.system.model
     ideal = model.mass[model.species] @ (state.velocity**2).sum(axis=1) / (3 * state.volume)
     pressure = (ideal / EV - atoms.get_stress()[:3].mean()) / units.bar
@@ -339,18 +392,24 @@ def ase_sites(model: str) -> dict:
     for site in own:
         site["charge_e"] *= SAME_COULOMB
         if "sigma_A" in site:
-            site |= {"sigma_A": float(told.sigma0), "epsilon_kJ_mol": float(told.epsilon0 * EV / KJ_PER_MOL)}
+            site |= {
+                "sigma_A": float(told.sigma0),
+                "epsilon_kJ_mol": float(told.epsilon0 * EV / KJ_PER_MOL),
+            }
     return {"name": model, "sites": own}
 
 
 def held_rigid(n: int) -> FixBondLengths:
     """All distances within n waters."""
-    return FixBondLengths([(3 * m + i, 3 * m + j) for m in range(n) for i, j in ((0, 1), (0, 2), (1, 2))])
+    return FixBondLengths(
+        [(3 * m + i, 3 * m + j) for m in range(n) for i, j in ((0, 1), (0, 2), (1, 2))]
+    )
 
 
 @pytest.mark.parametrize(("model", "theirs"), [("tip3p", tip3p.TIP3P), ("tip4p", tip4p.TIP4P)])
 def test_energies_and_forces_are_those_of_ase(model, theirs):
-    """Without a box and cut-off: to rounding with ASE's constants, to the difference of constants with ours."""
+    """Without a box and cut-off: to rounding with ASE's constants, to the difference of constants
+    with ours."""
     atoms = cluster(model, 6)
     other = atoms.copy()
     other.calc = theirs(rc=1e4)
@@ -359,8 +418,12 @@ def test_energies_and_forces_are_those_of_ase(model, theirs):
         other.set_constraint()
         atoms.calc = RigidMD([entry], atom_forces="sites")
         scale = np.abs(other.get_forces()).max()
-        assert atoms.get_potential_energy() == pytest.approx(other.get_potential_energy(), rel=energy)
-        if model == "tip3p":  # the forces of each atom; ASE spreads those of M in another way with the same totals
+        assert atoms.get_potential_energy() == pytest.approx(
+            other.get_potential_energy(), rel=energy
+        )
+        if (
+            model == "tip3p"
+        ):  # the forces of each atom; ASE spreads those of M in another way with the same totals
             assert np.abs(atoms.get_forces() - other.get_forces()).max() < force * scale
         by_molecule = (atoms.get_forces() - other.get_forces()).reshape(6, 3, 3).sum(axis=1)
         assert np.abs(by_molecule).max() < force * scale
@@ -395,7 +458,10 @@ def test_both_forms_have_the_force_and_torque_of_each_molecule(model):
         load, _ = placed.assembly.engine.evaluate(placed.state)
         torque = np.einsum("nij,nj->ni", placed.state.rotation, load.torque_body)
         arm = atoms.positions.reshape(4, 3, 3) - placed.state.position[:, None]
-        assert np.abs(forces.reshape(4, 3, 3).sum(axis=1) - load.force).max() < 1e-12 * np.abs(load.force).max()
+        assert (
+            np.abs(forces.reshape(4, 3, 3).sum(axis=1) - load.force).max()
+            < 1e-12 * np.abs(load.force).max()
+        )
         found = np.cross(arm, forces.reshape(4, 3, 3)).sum(axis=1)
         assert np.abs(found - torque).max() < 1e-12 * np.abs(torque).max()
 
@@ -412,7 +478,9 @@ def test_a_force_on_a_massless_site_is_spread_with_its_torque(model):
         assert np.cross(heavy, spread).sum(axis=0) == pytest.approx(torque, abs=1e-12)
     if model == "tip4p":  # M is 0.15 Å from O along the bisector, H 0.5859 Å
         share = 0.15 / 0.585882276618295 / 2
-        assert _transfer_matrices(found, 3)[:, 0, 0] == pytest.approx([1 - 2 * share, share, share], abs=1e-12)
+        assert _transfer_matrices(found, 3)[:, 0, 0] == pytest.approx(
+            [1 - 2 * share, share, share], abs=1e-12
+        )
 
 
 def strained(atoms: Atoms, strain: np.ndarray) -> float:
@@ -422,7 +490,9 @@ def strained(atoms: Atoms, strain: np.ndarray) -> float:
     owner = system.sites.molecule[system.sites.mass > 0]
     centre = placed.state.position @ placed.rotation
     other.set_cell(atoms.cell.array @ (np.eye(3) + strain))
-    other.positions[placed.assembly.order] = placed.atoms @ placed.rotation + (centre @ strain)[owner]
+    other.positions[placed.assembly.order] = (
+        placed.atoms @ placed.rotation + (centre @ strain)[owner]
+    )
     other.calc = atoms.calc
     return other.get_potential_energy()
 
@@ -434,7 +504,9 @@ def check_stress(atoms: Atoms) -> None:
         strain = np.zeros((3, 3))
         strain[i, j] += step / 2
         strain[j, i] += step / 2
-        slope = (strained(atoms, strain) - strained(atoms, -strain)) / (2 * step) / atoms.get_volume()
+        slope = (
+            (strained(atoms, strain) - strained(atoms, -strain)) / (2 * step) / atoms.get_volume()
+        )
         assert found[i, j] == pytest.approx(slope, abs=1e-5 * np.abs(found).max())
 
 
@@ -472,7 +544,9 @@ def test_rigid_molecules_are_minimised(waters):
     assert atoms.get_potential_energy() < before - 0.5
     assert np.abs(atoms.get_forces()).max() < 1e-4
     assert atoms.calc.make_rigid(atoms) < 1e-12
-    with pytest.raises(SceneError, match=r"stages\.0\.force_limit_kJ_mol_A: is -1, must be greater than 0"):
+    with pytest.raises(
+        SceneError, match=r"stages\.0\.force_limit_kJ_mol_A: is -1, must be greater than 0"
+    ):
         atoms.calc.minimise(atoms, force_limit_kJ_mol_A=-1)
     with pytest.warns(RigidMDWarning, match="has not converged after 1 iterations"):
         cold = cluster("tip4p", 4)
@@ -486,7 +560,9 @@ def test_rigid_molecules_are_minimised(waters):
         boxed.calc.minimise(boxed, pressure_bar=1000.0, most_iterations=8)
     assert boxed.get_volume() != volume
     moved = boxed.get_all_distances(mic=True)
-    assert np.abs(boxed.positions - before).max() < 2.0  # each atom stays in its image, across the faces of the box
+    assert (
+        np.abs(boxed.positions - before).max() < 2.0
+    )  # each atom stays in its image, across the faces of the box
     within = np.kron(np.eye(40), np.ones((3, 3))) > 0
     assert np.abs(moved - distances)[within].max() < 1e-10
     assert np.abs(moved - distances).max() > 0.1
@@ -495,7 +571,9 @@ def test_rigid_molecules_are_minimised(waters):
 def test_bent_molecules_are_told_once():
     atoms = molecule("H2O")
     atoms.calc = RigidMD("spce")
-    with pytest.warns(RigidMDWarning, match=r"an atom is 0\.056 Å from its position in a rigid molecule, 6% of"):
+    with pytest.warns(
+        RigidMDWarning, match=r"an atom is 0\.056 Å from its position in a rigid molecule, 6% of"
+    ):
         atoms.get_potential_energy()
     atoms.rattle(0.001)
     with warnings.catch_warnings():
@@ -506,7 +584,9 @@ def test_bent_molecules_are_told_once():
         fresh = RigidMD("spce")
         fresh.get_potential_energy(atoms)
     atoms.positions[1] += 0.3
-    with pytest.raises(StructureError, match=r"is not spce(.|\n)*They matched before: keep the molecules rigid"):
+    with pytest.raises(
+        StructureError, match=r"is not spce(.|\n)*They matched before: keep the molecules rigid"
+    ):
         atoms.get_potential_energy()
     atoms.positions[1] -= 0.3
     assert atoms.get_potential_energy() == pytest.approx(0.0, abs=1e-12)
@@ -523,13 +603,19 @@ def test_a_calculator_serves_other_atoms(waters):
     assert "stress" not in calc.results
     larger = waters.copy()
     larger.set_cell(waters.cell.array * 1.5, scale_atoms=False)
-    assert calc.get_potential_energy(larger) == pytest.approx(RigidMD("spce", cutoff_A=4.0, truncation="smooth_switch").get_potential_energy(larger), rel=1e-12)  # fmt: skip
+    assert calc.get_potential_energy(larger) == pytest.approx(
+        RigidMD("spce", cutoff_A=4.0, truncation="smooth_switch").get_potential_energy(larger),
+        rel=1e-12,
+    )
 
 
 def test_a_calculator_of_sites_that_share_names(waters):
     sites = [site | {"name": site["element"]} for site in load_model("spce").sites()]
     for atoms in (waters, waters[::-1]):
-        energies = [RigidMD(models, **FORCES).get_potential_energy(atoms) for models in ("spce", [{"name": "w", "sites": sites}])]  # fmt: skip
+        energies = [
+            RigidMD(models, **FORCES).get_potential_energy(atoms)
+            for models in ("spce", [{"name": "w", "sites": sites}])
+        ]
         assert energies[1] == pytest.approx(energies[0], rel=1e-12)
 
 
@@ -575,7 +661,9 @@ def traj(tmp_path_factory):
     """A run whose trajectory is ASE's: the folder, its results and the states of its frames."""
     folder, states, present = tmp_path_factory.mktemp("traj") / "run", [], []
     output = OUTPUT | {"trajectory": "trajectory.traj"}
-    made = small_scene({"tip4p2005": 4}, 14.0, forces=FORCES, stages=[{"duration_ps": 0.06}], output=output)
+    made = small_scene(
+        {"tip4p2005": 4}, 14.0, forces=FORCES, stages=[{"duration_ps": 0.06}], output=output
+    )
     seen = []
 
     def look(moment):
@@ -605,7 +693,9 @@ def test_a_trajectory_of_ase_holds_every_digit(traj):
     assert (positions == system.site_positions(states[2])).all()
     assert np.abs(velocities - system.site_velocities(states[2])).max() < 1e-12
     assert np.abs(results.rotation[3] - states[3].rotation).max() < 1e-5
-    assert all((now.positions == frame.positions).all() for now, frame in zip(present, frames, strict=True))
+    assert all(
+        (now.positions == frame.positions).all() for now, frame in zip(present, frames, strict=True)
+    )
     again = build(rigidmd.scene_from_atoms(frames[3], "tip4p2005", forces=FORCES, stages=[NVE]))
     same_state(again.state, results.state)
     data = {"structure": {"file": "trajectory.traj", "velocities": True}, "stages": [NVE]}
@@ -616,7 +706,9 @@ def test_a_trajectory_of_ase_holds_every_digit(traj):
 def test_ase_opens_it(traj, tmp_path):
     folder, results, *_ = traj
     command = [sys.executable, "-m", "ase", "gui", "--terminal", "-n", ":", "-g", "i,d(0,1),ekin"]
-    told = subprocess.run([*command, str(folder / "trajectory.traj")], capture_output=True, text=True, check=True)
+    told = subprocess.run(
+        [*command, str(folder / "trajectory.traj")], capture_output=True, text=True, check=True
+    )
     rows = np.array([line.split() for line in told.stdout.strip().splitlines()], float)
     assert rows[:, 1] == pytest.approx(0.9572, abs=1e-12)
     assert rows[-1, 2] == pytest.approx(results.atoms().get_kinetic_energy(), rel=1e-9)
@@ -625,20 +717,30 @@ def test_ase_opens_it(traj, tmp_path):
     with connect(tmp_path / "runs.db") as base:
         for frame in results.atoms(":"):
             base.write(frame, time_ps=frame.info["time_ps"])
-    assert [row.energy for row in base.select()] == pytest.approx(results["potential"] * KJ_PER_MOL / EV)
+    assert [row.energy for row in base.select()] == pytest.approx(
+        results["potential"] * KJ_PER_MOL / EV
+    )
     ase.io.write(tmp_path / "all.traj", results.atoms(":"))
-    assert ase.io.read(tmp_path / "all.traj", -1).get_stress() == pytest.approx(results.atoms().get_stress())
+    assert ase.io.read(tmp_path / "all.traj", -1).get_stress() == pytest.approx(
+        results.atoms().get_stress()
+    )
 
 
 @pytest.mark.parametrize("name", ["trajectory.xtc", "trajectory.trr", "trajectory.gsd"])
 def test_ase_reads_a_run(name, tmp_path, monkeypatch):
     """By the entry point of pyproject.toml, as ASE does when it is imported."""
-    ((group, names),) = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"].items()
-    monkeypatch.delitem(ase.io.formats.ioformats, "rigidmd", raising=False)  # of an installed package
+    ((group, names),) = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "entry-points"
+    ].items()
+    monkeypatch.delitem(
+        ase.io.formats.ioformats, "rigidmd", raising=False
+    )  # of an installed package
     (point,) = (EntryPoint(key, value, group) for key, value in names.items())
     assert (point.name, point.group) == ("rigidmd", "ase.ioformats")
     ase.io.formats.define_external_io_format(point)
-    made = small_scene({"tip4p2005": 4}, 14.0, forces=FORCES, stages=[NVE], output=OUTPUT | {"trajectory": name})
+    made = small_scene(
+        {"tip4p2005": 4}, 14.0, forces=FORCES, stages=[NVE], output=OUTPUT | {"trajectory": name}
+    )
     results = Simulation(made, tmp_path / "run").run()
     frames, expected = ase.io.read(tmp_path / "run" / name, ":"), results.atoms(":")
     assert len(frames) == len(expected) == 4
@@ -646,11 +748,18 @@ def test_ase_reads_a_run(name, tmp_path, monkeypatch):
     assert ase.io.read(tmp_path / "run" / name, 1) == frames[1]
     for frame, other in zip(frames, expected, strict=True):
         assert frame.info["time_ps"] == pytest.approx(other.info["time_ps"])
-        assert frame.positions == pytest.approx(other.positions, abs=0.02 if name.endswith("xtc") else 1e-5)
+        assert frame.positions == pytest.approx(
+            other.positions, abs=0.02 if name.endswith("xtc") else 1e-5
+        )
         assert frame.has("momenta") == (name != "trajectory.xtc")
         assert frame.cell.array == pytest.approx(other.cell.array) and frame.pbc.all()
-        assert (frame.get_masses() == other.get_masses()).all() and str(frame.symbols) == "OH2OH2OH2OH2"
-    Simulation(Scene.read(ROOT / "systems" / "heavy_top_1.toml", {"run.duration_s": 0.01}), tmp_path / "top").run()
+        assert (frame.get_masses() == other.get_masses()).all() and str(
+            frame.symbols
+        ) == "OH2OH2OH2OH2"
+    Simulation(
+        Scene.read(ROOT / "systems" / "heavy_top_1.toml", {"run.duration_s": 0.01}),
+        tmp_path / "top",
+    ).run()
     with pytest.raises(TypeError, match="a run of a single body"):
         ase.io.read(tmp_path / "top" / "trajectory.xtc")
     with pytest.raises(OutputError, match="is not the folder of a run"):
@@ -658,7 +767,10 @@ def test_ase_reads_a_run(name, tmp_path, monkeypatch):
 
 
 def test_a_run_with_it_goes_on_to_the_same_bytes(tmp_path):
-    output = FORTY_WATERS["output"] | {"trajectory": "trajectory.traj", "trajectory_interval_ps": 0.001}
+    output = FORTY_WATERS["output"] | {
+        "trajectory": "trajectory.traj",
+        "trajectory_interval_ps": 0.001,
+    }
     same_after_stops(forty_waters(NVE | {"duration_ps": 0.1}, output=output), [3, 41, 43], tmp_path)
 
 
@@ -706,7 +818,9 @@ def test_one_that_changed_is_not_gone_on_with(fault, said, traj, tmp_path):
         short.write(states[0], 0.0, 0)
         short.close()
     elif fault == "changed":
-        at = content.index(results.system.site_positions(states[1])[results.system.sites.mass > 0].tobytes())
+        at = content.index(
+            results.system.site_positions(states[1])[results.system.sites.mass > 0].tobytes()
+        )
         path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
     else:
         path.write_bytes(np.random.default_rng(1).bytes(5000))
@@ -719,15 +833,25 @@ def test_one_that_changed_is_not_gone_on_with(fault, said, traj, tmp_path):
 @pytest.mark.soak
 def test_acetonitrile_is_that_of_ase():
     sites = [
-        {"name": name, "element": element, "mass_u": float(mass), "position_A": [x, 0.0, 0.0], "charge_e": charge * SAME_COULOMB,
-         "sigma_A": sigma, "epsilon_kJ_mol": float(epsilon * EV / KJ_PER_MOL)}
+        {
+            "name": name,
+            "element": element,
+            "mass_u": float(mass),
+            "position_A": [x, 0.0, 0.0],
+            "charge_e": charge * SAME_COULOMB,
+            "sigma_A": sigma,
+            "epsilon_kJ_mol": float(epsilon * EV / KJ_PER_MOL),
+        }
         for name, element, mass, x, charge, sigma, epsilon in (
             ("Me", "C", acn.m_me, 0.0, acn.q_me, acn.sigma_me, acn.epsilon_me),
             ("C", "C", acn.m_c, acn.r_mec, acn.q_c, acn.sigma_c, acn.epsilon_c),
             ("N", "N", acn.m_n, acn.r_men, acn.q_n, acn.sigma_n, acn.epsilon_n),
         )
-    ]  # fmt: skip
-    data = {"molecules": [{"name": "acn", "sites": sites, "count": 4}], "box": {"lengths_A": 12.0, "periodic": False}}
+    ]
+    data = {
+        "molecules": [{"name": "acn", "sites": sites, "count": 4}],
+        "box": {"lengths_A": 12.0, "periodic": False},
+    }
     atoms = rigidmd.atoms_of(Scene.from_dict(data | {"stages": [{"ensemble": "minimise"}]}))
     other = atoms.copy()
     other.calc = acn.ACN(rc=1e4)
@@ -740,7 +864,12 @@ def test_pme_in_a_slanted_cell():
     counts = {"spce": 12, "nitrogen": 4, "argon": 3}
     box = {"lengths_A": [11.0, 12.0, 13.0], "angles_deg": [80.0, 100.0, 75.0]}
     atoms = turned(rigidmd.atoms_of(small_scene(counts, None, box=box, forces={"cutoff_A": 4.5})))
-    keywords = {"cutoff_A": 4.5, "electrostatics": "pme", "truncation": "shift", "ewald_accuracy": 1e-6}
+    keywords = {
+        "cutoff_A": 4.5,
+        "electrostatics": "pme",
+        "truncation": "shift",
+        "ewald_accuracy": 1e-6,
+    }
     atoms.calc = RigidMD(list(counts), **keywords)
     check_stress(atoms)
     chosen = [0, 1, 2, 40, 44, 46]
@@ -749,7 +878,9 @@ def test_pme_in_a_slanted_cell():
     assert np.abs(forces[chosen] - numerical).max() < 1e-5 * np.abs(forces).max()
     plain = atoms.copy()
     plain.calc = RigidMD(
-        list(counts), atom_forces="sites", **keywords | {"electrostatics": "ewald", "ewald_accuracy": 1e-8}
+        list(counts),
+        atom_forces="sites",
+        **keywords | {"electrostatics": "ewald", "ewald_accuracy": 1e-8},
     )
     atoms.calc = RigidMD(list(counts), atom_forces="sites", **keywords)
     assert np.abs(plain.get_forces() - atoms.get_forces()).max() < 1e-3 * np.abs(forces).max()
@@ -758,7 +889,10 @@ def test_pme_in_a_slanted_cell():
 def test_paths_of_a_scene_begin_at_its_folder_however_it_is_used(tmp_path, monkeypatch):
     """In another folder, a table of the same name has three times the energies."""
     r = np.arange(2.6, 10.0, 0.02)
-    energy, folders = 4.0 * ((3.4 / r) ** 12 - (3.4 / r) ** 6), (tmp_path / "sub", tmp_path / "other")
+    energy, folders = (
+        4.0 * ((3.4 / r) ** 12 - (3.4 / r) ** 6),
+        (tmp_path / "sub", tmp_path / "other"),
+    )
     for folder, factor in zip(folders, (1, 3), strict=True):
         folder.mkdir()
         np.savetxt(folder / "t.csv", np.c_[r, factor * energy])
@@ -770,11 +904,17 @@ def test_paths_of_a_scene_begin_at_its_folder_however_it_is_used(tmp_path, monke
     )
     (folders[0] / "s.toml").write_text(text)
     atoms = Atoms("Ar2", positions=[[0, 0, 0], [0, 0, 3.8]], cell=[20] * 3, pbc=True)
-    table = {"custom": [{"name": "mine", "table": "t.csv"}], "lennard_jones": False, "cutoff_A": 9.0}
+    table = {
+        "custom": [{"name": "mine", "table": "t.csv"}],
+        "lennard_jones": False,
+        "cutoff_A": 9.0,
+    }
     monkeypatch.chdir(folders[0])
     scenes = [Scene.read("s.toml"), Scene.from_dict(tomllib.loads(text))]
     calculators = [RigidMD(scenes[0]), RigidMD("argon", **table)]
-    from_atoms = rigidmd.scene_from_atoms(atoms, "mine.toml", forces=table, start={"temperature_K": 90.0})
+    from_atoms = rigidmd.scene_from_atoms(
+        atoms, "mine.toml", forces=table, start={"temperature_K": 90.0}
+    )
     expected = Simulation(scenes[0]).observation.potential
     monkeypatch.chdir(tmp_path)
     scenes += [Scene.read("sub/s.toml"), Scene.read("other/../sub/s.toml")]

@@ -1,8 +1,10 @@
-"""Extreme scenes, atoms and sweeps: each ends in finite numbers or in one sentence and an exit code for it.
+"""Extreme scenes, atoms and sweeps: each ends in finite numbers or in one sentence and an exit code
+for it.
 
-Kinds of scenes and counts follow a trial from outside with about 760 attacks. What that trial attacked besides is
-repeated elsewhere: texts of energies, damaged files and arbitrary input in test_fuzz.py, disks, signals and streams in
-test_faults.py, checkpoints in test_resume.py, names in generated files in test_names.py.
+Kinds of scenes and counts follow a trial from outside with about 760 attacks. What that trial
+attacked besides is repeated elsewhere: texts of energies, damaged files and arbitrary input in
+test_fuzz.py, disks, signals and streams in test_faults.py, checkpoints in test_resume.py, names in
+generated files in test_names.py.
 """
 
 import json
@@ -31,7 +33,11 @@ count = 20
 ensemble = "nve"
 duration_ps = 0.04
 """
-WATER = ARGON.replace('"argon"', '"spce"').replace("= 90.0", "= 300.0").replace("count = 20", "count = 12")
+WATER = (
+    ARGON.replace('"argon"', '"spce"')
+    .replace("= 90.0", "= 300.0")
+    .replace("count = 20", "count = 12")
+)
 TOP = """
 [body]
 mass_kg = 0.5
@@ -61,11 +67,22 @@ MOLECULES = {
     "two atoms": (ARGON, "molecules.0.count=2"),
     "one atom, Langevin": (ARGON, "molecules.0.count=1", *THERMAL, "stages.0.thermostat=langevin"),
     "one atom, Andersen": (ARGON, "molecules.0.count=1", *THERMAL, "stages.0.thermostat=andersen"),
-    "one atom, Nose-Hoover": (ARGON, "molecules.0.count=1", *THERMAL, "stages.0.thermostat=nose_hoover"),
+    "one atom, Nose-Hoover": (
+        ARGON,
+        "molecules.0.count=1",
+        *THERMAL,
+        "stages.0.thermostat=nose_hoover",
+    ),
     "one atom, a barostat": (ARGON, "molecules.0.count=1", *PRESSED),
     "one water": (WATER, "molecules.0.count=1"),
     "one water, PME": (WATER, "molecules.0.count=1", *PME),
-    "two waters, PME, Langevin": (WATER, "molecules.0.count=2", *PME, *THERMAL, "stages.0.thermostat=langevin"),
+    "two waters, PME, Langevin": (
+        WATER,
+        "molecules.0.count=2",
+        *PME,
+        *THERMAL,
+        "stages.0.thermostat=langevin",
+    ),
     "two waters, a barostat": (WATER, "molecules.0.count=2", *PRESSED),
     "a negative seed": (ARGON, "seed=-1"),
     "the largest seed": (ARGON, "seed=18446744073709551615"),
@@ -84,7 +101,7 @@ MOLECULES = {
     "a million kelvin": (ARGON, "start.temperature_K=1e6"),
     "a nanokelvin": (ARGON, "start.temperature_K=1e-9"),
     "no motion": (ARGON, "start.temperature_K=0"),
-    "all frozen": (ARGON, 'molecules.0.frozen=true'),
+    "all frozen": (ARGON, "molecules.0.frozen=true"),
     "all frozen, a thermostat": (ARGON, "molecules.0.frozen=true", *THERMAL),
     "light atoms": (ARGON, "molecules.0.masses_u.Ar=1e-6"),
     "heavy atoms": (ARGON, "molecules.0.masses_u.Ar=1e6"),
@@ -93,7 +110,7 @@ MOLECULES = {
     "too dense": (ARGON, "box.lengths_A=", "box.density_g_cm3=12"),
     "very thin gas": (ARGON, "box.lengths_A=", "box.density_g_cm3=1e-9"),
     "no interaction": (ARGON, "molecules.0.epsilon_K.Ar=0"),
-}  # fmt: skip
+}
 BODIES = {
     "tiny moments": ("body.inertia_kg_m2=[1e-30, 1e-30, 1e-30]",),
     "huge moments": ("body.inertia_kg_m2=[1e90, 1e90, 1e90]",),
@@ -129,7 +146,8 @@ BODIES = {
 
 
 def outcome(command: list[str], capsys) -> tuple[int, str]:
-    """Exit code and standard error of a command: 0; 1 if the run stopped; 2 if the input was refused; 75 out of time."""
+    """Exit code and standard error of a command: 0; 1 if the run stopped; 2 if the input was
+    refused; 75 out of time."""
     code = main(command)
     said = capsys.readouterr()
     assert code in (0, 1, 2, 75), said.err
@@ -154,7 +172,9 @@ def run_of(text: str, overrides: tuple[str, ...], folder, capsys) -> None:
     scene.write_text(text)
     sets = [word for override in overrides for word in ("--set", override)]
     checked, _ = outcome(["check", str(scene), *sets], capsys)
-    code, said = outcome(["run", str(scene), *sets, "-o", str(folder / "run"), "--walltime", "0:00:40"], capsys)
+    code, said = outcome(
+        ["run", str(scene), *sets, "-o", str(folder / "run"), "--walltime", "0:00:40"], capsys
+    )
     assert code == 2 or checked == 0, said  # what `check` refuses does not run
     if code in (0, 75):
         assert is_finite(json.loads((folder / "run" / "summary.json").read_text()))
@@ -185,7 +205,9 @@ def test_extreme_scenes_of_bodies(attack, capsys, tmp_path):
 def waters() -> ase.Atoms:
     """Two waters of SPC/E in a box."""
     half = math.radians(109.47) / 2
-    arm = np.array([[0.0, 0, 0], [math.sin(half), math.cos(half), 0], [-math.sin(half), math.cos(half), 0]])
+    arm = np.array(
+        [[0.0, 0, 0], [math.sin(half), math.cos(half), 0], [-math.sin(half), math.cos(half), 0]]
+    )
     second = arm + np.array([10.0, 10.0, 9.0])
     places = np.concatenate([arm + 5.0, second])
     return ase.Atoms("OHHOHH", places, cell=[15.0] * 3, pbc=True)
@@ -257,9 +279,27 @@ def test_extreme_atoms_of_the_calculator(attack):
         assert np.isfinite(found).all()
 
 
-AXES = ["seed", "seed=", "seed=1", "seed=1..", "seed=..3", "seed=3..1", "seed=1..1e9", "seed=1,1", "seed=1.5,2",
-        "seed=a,b", "nowhere=1,2", "stages.9.duration_ps=0.01,0.02", "stages=1,2", "box.lengths_A=[1, 2", "=1,2",
-        "seed=-1,2", "start.temperature_K=nan,90", "start.temperature_K=inf,90", "molecules.0.model=argon,nothing"]  # fmt: skip
+AXES = [
+    "seed",
+    "seed=",
+    "seed=1",
+    "seed=1..",
+    "seed=..3",
+    "seed=3..1",
+    "seed=1..1e9",
+    "seed=1,1",
+    "seed=1.5,2",
+    "seed=a,b",
+    "nowhere=1,2",
+    "stages.9.duration_ps=0.01,0.02",
+    "stages=1,2",
+    "box.lengths_A=[1, 2",
+    "=1,2",
+    "seed=-1,2",
+    "start.temperature_K=nan,90",
+    "start.temperature_K=inf,90",
+    "molecules.0.model=argon,nothing",
+]
 
 
 @pytest.mark.soak
@@ -268,7 +308,9 @@ def test_odd_axes_of_a_sweep(axis, capsys, tmp_path):
     """Refused before the first point with nothing written, or every point ends."""
     (tmp_path / "scene.toml").write_text(ARGON)
     folder = tmp_path / "sweep"
-    code, said = outcome(["sweep", str(tmp_path / "scene.toml"), "--set", axis, "-o", str(folder)], capsys)
+    code, said = outcome(
+        ["sweep", str(tmp_path / "scene.toml"), "--set", axis, "-o", str(folder)], capsys
+    )
     if code:
         assert not folder.exists() and axis.partition("=")[0] in said
     else:

@@ -36,9 +36,17 @@ TOP = ROOT / "systems" / "heavy_top_3.toml"
 
 def liquid(**last):
     """27 waters, warmed up, then 0.3 ps of NVE as told."""
-    stages = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.5}, {"duration_ps": 0.3} | last]
-    return small_scene({"spce": 27}, 9.4, forces={"cutoff_A": 4.69, "switch_start_A": 3.0}, stages=stages,
-                       output={"trajectory": False, "log_interval_ps": 0.01, "figures": False})  # fmt: skip
+    stages = [
+        {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.5},
+        {"duration_ps": 0.3} | last,
+    ]
+    return small_scene(
+        {"spce": 27},
+        9.4,
+        forces={"cutoff_A": 4.69, "switch_start_A": 3.0},
+        stages=stages,
+        output={"trajectory": False, "log_interval_ps": 0.01, "figures": False},
+    )
 
 
 def energy_error(results):
@@ -86,12 +94,20 @@ KEPT = {
 @pytest.mark.parametrize("target", [1e-3, 1e-4, 1e-5, 1e-6])
 @pytest.mark.parametrize("kind", KEPT)
 def test_the_error_asked_for_is_kept_over_a_long_stage(kind, target):
-    """Walks scatter: one in ten is 1.5 times its expected size, which is at most 0.83 of the target."""
+    """Walks scatter: one in ten is 1.5 times its expected size, which is at most 0.83 of the
+    target."""
     counts, edge, forces, temperature = KEPT[kind]
     warm = {"ensemble": "nvt", "temperature_K": temperature, "duration_ps": 2.0}
     stages = [warm, {"duration_ps": 10.0, "integrator": "auto", "energy_error_kT": target}]
     output = {"trajectory": False, "log_interval_ps": 0.05, "figures": False}
-    scene = small_scene(counts, edge, forces=forces, start={"temperature_K": temperature}, stages=stages, output=output)
+    scene = small_scene(
+        counts,
+        edge,
+        forces=forces,
+        start={"temperature_K": temperature},
+        stages=stages,
+        output=output,
+    )
     results = Simulation(scene).run()
     assert target / 30 < energy_error(results) < 1.7 * target
     assert "over 10 ps for a target of" in results.summary["stages"][1]["choice"]
@@ -107,15 +123,22 @@ def test_a_crude_error_is_kept_crudely():
     assert "over 0.3 ps for a target of 0.003 (expected, from" in coarse["choice"]
     assert "ps that ran it was" in coarse["choice"]
     second = simulation.run().summary["stages"][1]  # a simulation chooses anew, and the same
-    assert (second["integrator"], second["timestep_fs"]) == (coarse["integrator"], coarse["timestep_fs"])
+    assert (second["integrator"], second["timestep_fs"]) == (
+        coarse["integrator"],
+        coarse["timestep_fs"],
+    )
 
 
 @pytest.mark.parametrize("jump", [0, 1, 2, 4])
 @pytest.mark.parametrize(("one", "other"), [("velocity_verlet", "two_stage"), ("srkn_4", "srkn_6")])
 def test_the_walk_of_integrators_is_that_of_their_kicks_in_a_force_that_jumps(jump, one, other):
-    """Work on a body at constant speed in the (jump + 1)-th spline, whose jump-th derivative jumps at its knots."""
+    """Work on a body at constant speed in the (jump + 1)-th spline, whose jump-th derivative jumps
+    at its knots."""
     rng = np.random.default_rng(jump)
-    first, width = rng.uniform(0, 1, (4000, 1)), rng.uniform(6, 9, (4000, 1))  # of the knots, in steps
+    first, width = (
+        rng.uniform(0, 1, (4000, 1)),
+        rng.uniform(6, 9, (4000, 1)),
+    )  # of the knots, in steps
     work = {}
     for name in (one, other):
         at, sums = 0.0, np.zeros((4000, 1))
@@ -123,9 +146,13 @@ def test_the_walk_of_integrators_is_that_of_their_kicks_in_a_force_that_jumps(ju
             at += flow.fraction if flow.kind == DRIFT else 0.0
             if flow.kind == KICK:
                 time = (np.arange(-1, 60) + at - first) / width
-                parts = [(-1) ** k * comb(jump + 1, k) * np.maximum(time - k, 0) ** jump * (time > k)
-                         for k in range(jump + 2)]  # fmt: skip
-                sums += flow.fraction * np.where(time < jump + 1, sum(parts), 0).sum(axis=1, keepdims=True)
+                parts = [
+                    (-1) ** k * comb(jump + 1, k) * np.maximum(time - k, 0) ** jump * (time > k)
+                    for k in range(jump + 2)
+                ]
+                sums += flow.fraction * np.where(time < jump + 1, sum(parts), 0).sum(
+                    axis=1, keepdims=True
+                )
         work[name] = float((sums / width).var())
     expected = weight(SCHEMES[one], jump) / weight(SCHEMES[other], jump)
     assert work[one] / work[other] == pytest.approx(expected, rel=0.15)
@@ -133,7 +160,8 @@ def test_the_walk_of_integrators_is_that_of_their_kicks_in_a_force_that_jumps(ju
 
 @pytest.fixture
 def known(monkeypatch):
-    """(subject, longest steps, expected error of a choice) of known energy errors: c dt^p, and a walk of truncated forces.
+    """(subject, longest steps, expected error of a choice) of known energy errors: c dt^p, and a
+    walk of truncated forces.
 
     Over 20 ps the walk of srkn_4 at 5 fs is 1e-4.
     """
@@ -151,7 +179,10 @@ def known(monkeypatch):
             scheme, dt = SCHEMES[trial.integrator], 1e-3 * trial.timestep
             trial.failure = "diverges" if dt > 5e-3 * scheme.force_evaluations else ""
             walked = true.rate(scheme, dt) * trial.steps * dt
-            trial.energies = [0.0, *np.cumsum(rng.standard_normal(observations) * np.sqrt(walked / observations))]
+            trial.energies = [
+                0.0,
+                *np.cumsum(rng.standard_normal(observations) * np.sqrt(walked / observations)),
+            ]
             trial.energy_rms = float(np.hypot(regular(scheme, dt), np.sqrt(walked / 2)))
 
         def error(found):
@@ -161,9 +192,28 @@ def known(monkeypatch):
         monkeypatch.setattr(choice, "measure_errors", measure_errors)
         methods = {name: Method(None, scheme) for name, scheme in SCHEMES.items()}
         trial_system = TrialSystem(
-            "", None, methods, None, "", "", 1.0, 1.0, 0.1, "fs", 1e-3, "", "", None, True, freedom=600
+            "",
+            None,
+            methods,
+            None,
+            "",
+            "",
+            1.0,
+            1.0,
+            0.1,
+            "fs",
+            1e-3,
+            "",
+            "",
+            None,
+            True,
+            freedom=600,
         )
-        return trial_system, {name: 5.0 * scheme.force_evaluations for name, scheme in SCHEMES.items()}, error
+        return (
+            trial_system,
+            {name: 5.0 * scheme.force_evaluations for name, scheme in SCHEMES.items()},
+            error,
+        )
 
     return make
 
@@ -184,7 +234,10 @@ def test_a_walk_that_no_step_makes_smaller_is_reported_with_what_helps(known):
     found = choose(trial_system, longest, 2e-5, duration=20.0)
     assert found.error == pytest.approx(error(found), rel=0.5)
     assert found.error > 2e-5
-    assert "no step tried keeps the target over that time: truncation = 'smooth_switch', a longer" in found.reason
+    assert (
+        "no step tried keeps the target over that time: truncation = 'smooth_switch', a longer"
+        in found.reason
+    )
 
 
 @pytest.mark.parametrize("target", [1e-8, pytest.param(1e-3, marks=pytest.mark.soak)])
@@ -201,7 +254,16 @@ def test_the_error_of_a_top_is_what_was_asked_for(target):
 
 @pytest.mark.soak
 def test_what_cannot_be_kept_is_said(capsys, tmp_path):
-    command = ["run", str(TOP), "--set", "run.integrator=auto", "--set", "run.energy_error=1e-30", "-o", str(tmp_path)]
+    command = [
+        "run",
+        str(TOP),
+        "--set",
+        "run.integrator=auto",
+        "--set",
+        "run.energy_error=1e-30",
+        "-o",
+        str(tmp_path),
+    ]
     assert main(command) != 0
     assert "no integrator keeps its error below 1e-30" in capsys.readouterr().err
 
@@ -209,11 +271,20 @@ def test_what_cannot_be_kept_is_said(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("stage", "fault"),
     [
-        ({"integrator": "auto"}, "integrator = 'auto' needs one of energy_error_kT, trajectory_error"),
+        (
+            {"integrator": "auto"},
+            "integrator = 'auto' needs one of energy_error_kT, trajectory_error",
+        ),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "trajectory_error": 1e-3}, "needs one of"),
         ({"energy_error_kT": 1e-3}, "energy_error_kT would do nothing without integrator = 'auto'"),
-        ({"integrator": "auto", "energy_error_kT": 1e-3, "timestep_fs": 1.0}, "timestep_fs would do nothing with"),
-        ({"integrator": "auto", "energy_error_kT": 1e-3, "rotor": "split"}, "rotor would do nothing with"),
+        (
+            {"integrator": "auto", "energy_error_kT": 1e-3, "timestep_fs": 1.0},
+            "timestep_fs would do nothing with",
+        ),
+        (
+            {"integrator": "auto", "energy_error_kT": 1e-3, "rotor": "split"},
+            "rotor would do nothing with",
+        ),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "bias_kT": 1e-3}, "needs one of"),
         (
             {"integrator": "auto", "bias_kT": 1e-3},
@@ -228,18 +299,32 @@ def test_contradictions_are_refused(stage, fault):
 
 
 def test_check_says_that_it_is_open(capsys):
-    assert main(["check", str(TOP), "--set", "run.integrator=auto", "--set", "run.energy_error=1e-6"]) == 0
+    assert (
+        main(["check", str(TOP), "--set", "run.integrator=auto", "--set", "run.energy_error=1e-6"])
+        == 0
+    )
     assert "are chosen before the run" in capsys.readouterr().out
     water = str(ROOT / "systems" / "water.toml")
-    more = ["--set", "stages.production.integrator=auto", "--set", "stages.production.energy_error_kT=1e-4"]
+    more = [
+        "--set",
+        "stages.production.integrator=auto",
+        "--set",
+        "stages.production.energy_error_kT=1e-4",
+    ]
     assert main(["check", water, *more, "--set", "stages.production.timestep_fs=2.0"]) == 0
-    assert "integrator and step chosen at its start for an error of 0.0001 kT" in capsys.readouterr().out
+    assert (
+        "integrator and step chosen at its start for an error of 0.0001 kT"
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.soak
 def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
     stages = [{"duration_ps": 0.1, "integrator": "auto", "energy_error_kT": 1e-30}]
-    with pytest.raises(SimulationError, match=r"stopped at step 0 \(0 ps\): no integrator keeps its error below 1e-30"):
+    with pytest.raises(
+        SimulationError,
+        match=r"stopped at step 0 \(0 ps\): no integrator keeps its error below 1e-30",
+    ):
         Simulation(small_scene({"argon": 40}, 18.5, stages=stages)).run()
 
 
@@ -259,8 +344,13 @@ def test_the_bias_asked_for_sets_the_step(thermostat, integrator, part, tmp_path
     results = Simulation(springs(**stage), tmp_path / "a").run()
     found = results.summary["stages"][0]
     assert found["integrator"] == integrator
-    assert found["timestep_fs"] == pytest.approx(1e3 * np.sqrt(1e-3 / part * 39.948 / SPRING), rel=0.1)
-    assert f"{integrator} at {found['timestep_fs']:g} fs chosen: bias of U below about" in found["choice"]
+    assert found["timestep_fs"] == pytest.approx(
+        1e3 * np.sqrt(1e-3 / part * 39.948 / SPRING), rel=0.1
+    )
+    assert (
+        f"{integrator} at {found['timestep_fs']:g} fs chosen: bias of U below about"
+        in found["choice"]
+    )
     assert "not sampled" in found["choice"]
     again = Scene.read(tmp_path / "a" / "scene.toml")
     assert again.stages[0].bias_kT is None
@@ -272,14 +362,24 @@ def test_the_bias_asked_for_sets_the_step(thermostat, integrator, part, tmp_path
 
 def test_a_large_bias_is_no_reason_for_an_unstable_step():
     results = Simulation(springs(integrator="auto", bias_kT=10.0, duration_ps=0.2)).run()
-    assert results.summary["stages"][0]["timestep_fs"] == pytest.approx(1e3 * np.sqrt(39.948 / SPRING), rel=0.03)
+    assert results.summary["stages"][0]["timestep_fs"] == pytest.approx(
+        1e3 * np.sqrt(39.948 / SPRING), rel=0.03
+    )
 
 
 def test_check_says_which_bias_is_asked_for(capsys):
     water = str(ROOT / "systems" / "water.toml")
-    more = ["--set", "stages.equilibration.integrator=auto", "--set", "stages.equilibration.bias_kT=1e-3"]
+    more = [
+        "--set",
+        "stages.equilibration.integrator=auto",
+        "--set",
+        "stages.equilibration.bias_kT=1e-3",
+    ]
     assert main(["check", water, *more]) == 0
-    assert "for an error of 0.001 kT per degree of freedom of the average potential energy" in capsys.readouterr().out
+    assert (
+        "for an error of 0.001 kT per degree of freedom of the average potential energy"
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.soak
@@ -309,14 +409,26 @@ def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
         (0.5, 50.0, 0.3, 0.1),  # their common measure
         (0.5, 50.0, 1.0, 0.5),
         (0.4, 50.0, 1.0, 1 / 3),
-        (0.0011, 1.0, None, 1 / 910),  # a default of samples that is shorter than the step does not bind it
+        (
+            0.0011,
+            1.0,
+            None,
+            1 / 910,
+        ),  # a default of samples that is shorter than the step does not bind it
         (0.0003, 1.0, None, 0.00025),
         (0.3, 1.0, 0.7390851, 0.25),  # no common measure
         (3.0, 1.0, None, 1.0),
-        (0.021, 1.7, 5e-4, 0.0209876543209876543),  # nor does an interval much shorter than the step
+        (
+            0.021,
+            1.7,
+            5e-4,
+            0.0209876543209876543,
+        ),  # nor does an interval much shorter than the step
     ],
 )
-def test_a_chosen_step_of_a_body_fits_its_duration_and_samples(timestep, duration, interval, wanted):
+def test_a_chosen_step_of_a_body_fits_its_duration_and_samples(
+    timestep, duration, interval, wanted
+):
     found = _fit_step(timestep, duration, interval)
     assert found == pytest.approx(wanted, rel=1e-12)
     assert round(duration / found) * found == pytest.approx(duration, rel=1e-12)

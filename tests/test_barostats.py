@@ -1,4 +1,5 @@
-"""Barostats: the driving force is the slope of enthalpy, moves are in balance, ideal gases have their volume."""
+"""Barostats: the driving force is the slope of enthalpy, moves are in balance, ideal gases have
+their volume."""
 
 import numba
 import numpy as np
@@ -63,10 +64,18 @@ def strain_state(box, state, room):
     boxes.apply_strain(box, state, room)
 
 
-@pytest.fixture(scope="module", params=["reaction_field", pytest.param("pme", marks=pytest.mark.soak)])
+@pytest.fixture(
+    scope="module", params=["reaction_field", pytest.param("pme", marks=pytest.mark.soak)]
+)
 def liquid(request):
-    """20 waters and 12 nitrogens in a slanted box under a stress, with a tail: system, engine, state."""
-    forces = {"cutoff_A": 5.5, "truncation": "smooth_switch", "electrostatics": request.param, "tail_correction": True}
+    """20 waters and 12 nitrogens in a slanted box under a stress, with a tail: system, engine,
+    state."""
+    forces = {
+        "cutoff_A": 5.5,
+        "truncation": "smooth_switch",
+        "electrostatics": request.param,
+        "tail_correction": True,
+    }
     if request.param == "pme":
         forces |= {"ewald_accuracy": 1e-8}
     stress = [100.0, -200.0, 400.0, 250.0, -150.0, 350.0]
@@ -124,7 +133,8 @@ def test_what_drives_a_strain_is_minus_the_slope_of_the_enthalpy(liquid, k):
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_move_and_its_reverse_are_in_balance(liquid, coupling):
-    """The chance of a move times that of its reverse is 1: log ratios of opposite moves are opposite."""
+    """The chance of a move times that of its reverse is 1: log ratios of opposite moves are
+    opposite."""
     system, engine, state = liquid
     box = barostat_of(system, 0)._replace(coordinate=COUPLINGS[coupling])
     if coupling not in ("anisotropic", "flexible"):
@@ -165,17 +175,29 @@ def prepared(system, engine, box, before, after, room, h):
 
 def gas(count, thermostat, box_for, samples=800, steps=30):
     """Volumes of an ideal gas in units of kT/p, every `steps` steps."""
-    site = {"name": "A", "element": "Ar", "sigma_A": 0.005, "epsilon_kJ_mol": 1e-6, "mass_u": 40.0,
-            "position_A": [0.0, 0.0, 0.0]}  # fmt: skip
-    scene = Scene.from_dict({
-        "box": {"lengths_A": 10.0}, "molecules": [{"name": "point", "sites": [site], "count": count}],
-        "start": {"temperature_K": 300.0}, "stages": [{"duration_ps": 0.01}],
-        "forces": {"cutoff_A": 0.02, "skin_A": 0.01, "electrostatics": "none"},
-    })  # fmt: skip
+    site = {
+        "name": "A",
+        "element": "Ar",
+        "sigma_A": 0.005,
+        "epsilon_kJ_mol": 1e-6,
+        "mass_u": 40.0,
+        "position_A": [0.0, 0.0, 0.0],
+    }
+    scene = Scene.from_dict(
+        {
+            "box": {"lengths_A": 10.0},
+            "molecules": [{"name": "point", "sites": [site], "count": count}],
+            "start": {"temperature_K": 300.0},
+            "stages": [{"duration_ps": 0.01}],
+            "forces": {"cutoff_A": 0.02, "skin_A": 0.01, "electrostatics": "none"},
+        }
+    )
     system = build(scene)
     pressure = (count + 1) * THERMAL / system.state.volume
     asked = Pressure((pressure,) * 3 + (0.0,) * 3, (pressure,) * 3 + (0.0,) * 3, 1.0)
-    bath = VelocityRescaling(constant_ramp(THERMAL), 0.05, system.freedom.total, key_of(1, THERMOSTAT))
+    bath = VelocityRescaling(
+        constant_ramp(THERMAL), 0.05, system.freedom.total, key_of(1, THERMOSTAT)
+    )
     if thermostat == "langevin":
         bath = Langevin(constant_ramp(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
     row = VERLET.with_thermostat(bath).with_barostat(box_for(asked, pressure), 2)
@@ -188,12 +210,17 @@ def gas(count, thermostat, box_for, samples=800, steps=30):
     return np.array(found), engine.moves
 
 
-@pytest.mark.parametrize(("barostat", "thermostat"), [
-    ("cell_rescaling", "velocity_rescaling"), pytest.param("cell_rescaling", "langevin", marks=pytest.mark.soak),
-    ("monte_carlo", "langevin"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("barostat", "thermostat"),
+    [
+        ("cell_rescaling", "velocity_rescaling"),
+        pytest.param("cell_rescaling", "langevin", marks=pytest.mark.soak),
+        ("monte_carlo", "langevin"),
+    ],
+)
 def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
-    """p(V) ~ V^N exp(-p V/kT): a Gamma distribution, whatever the thermostat does to the total momentum."""
+    """p(V) ~ V^N exp(-p V/kT): a Gamma distribution, whatever the thermostat does to the total
+    momentum."""
     n, key = 8, key_of(3, BAROSTAT)
 
     def box_for(asked, pressure):
@@ -201,7 +228,13 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
             return VolumeMoves(constant_ramp(THERMAL), asked, 600.0, float(n), (0.0, 0.0), key)
         at_rest = (1.0,) * 3 if thermostat == "velocity_rescaling" else (0.0,) * 3
         return CellRescaling(
-            constant_ramp(THERMAL), asked, 10.0 / pressure, COUPLINGS["isotropic"], at_rest, (0.0, 0.0), key
+            constant_ramp(THERMAL),
+            asked,
+            10.0 / pressure,
+            COUPLINGS["isotropic"],
+            at_rest,
+            (0.0, 0.0),
+            key,
         )
 
     volumes, moves = gas(n, thermostat, box_for)
@@ -217,15 +250,24 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
     assert stats.kstest(apart, "gamma", args=(n + 1,)).pvalue > 1e-3
 
 
-@pytest.mark.parametrize(("n", "samples"), [(1, 300), (2, 300), pytest.param(1, 20000, marks=pytest.mark.soak),
-                                            pytest.param(2, 20000, marks=pytest.mark.soak)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("n", "samples"),
+    [
+        (1, 300),
+        (2, 300),
+        pytest.param(1, 20000, marks=pytest.mark.soak),
+        pytest.param(2, 20000, marks=pytest.mark.soak),
+    ],
+)
 def test_a_box_with_one_or_two_molecules_has_its_volumes(n, samples):
-    """Moves of the volume by up to 1.8 volumes of one molecule: those to no volume are rejected. A proposal that is
-    changed to a possible one would have no reverse."""
+    """Moves of the volume by up to 1.8 volumes of one molecule: those to no volume are rejected. A
+    proposal that is changed to a possible one would have no reverse."""
 
     def box_for(asked, pressure):
         width = 2 * np.sqrt(n + 1) * THERMAL / pressure
-        return VolumeMoves(constant_ramp(THERMAL), asked, width, float(n), (0.0, 0.0), key_of(3, BAROSTAT))
+        return VolumeMoves(
+            constant_ramp(THERMAL), asked, width, float(n), (0.0, 0.0), key_of(3, BAROSTAT)
+        )
 
     volumes, moves = gas(n, "langevin", box_for, samples, 2)
     assert moves[1] < moves[0]
@@ -242,9 +284,14 @@ def test_a_box_with_one_or_two_molecules_has_its_volumes(n, samples):
 def test_a_rejected_move_leaves_no_trace(liquid):
     system, _, state = liquid
     dear = CellRescaling(
-        constant_ramp(THERMAL), Pressure((0.0,) * 6, (0.0,) * 6, 1.0), 1e4 * barostat_of(system, 0).rate,
-        COUPLINGS["flexible"], (1.0, 1.0, 1.0), (0.0, 0.0), key_of(1, BAROSTAT),
-    )  # fmt: skip
+        constant_ramp(THERMAL),
+        Pressure((0.0,) * 6, (0.0,) * 6, 1.0),
+        1e4 * barostat_of(system, 0).rate,
+        COUPLINGS["flexible"],
+        (1.0, 1.0, 1.0),
+        (0.0, 0.0),
+        key_of(1, BAROSTAT),
+    )
     fresh = system.engine()
     still, moved = state.copy(), state.copy()
     move(fresh, moved, VERLET.with_barostat(dear, 1), 0.0, 5)
@@ -258,7 +305,9 @@ def compressed():
     """32 nitrogens, dense, under a piston: system, state."""
     stage = {"ensemble": "nph", "pressure_bar": 2000.0, "duration_ps": 0.1, "barostat_time_ps": 0.3}
     forces = {"cutoff_A": 4.5, "truncation": "smooth_switch", "tail_correction": True}
-    system, engine, state = built({"nitrogen": 32}, 11.5, 2, spread=0.1, forces=forces, stages=[stage])
+    system, engine, state = built(
+        {"nitrogen": 32}, 11.5, 2, spread=0.1, forces=forces, stages=[stage]
+    )
     remove_overlaps(system, engine, state, THERMAL, 0.002)
     bath = Langevin(constant_ramp(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
     move(engine, state, WITH_THERMOSTAT["baoab"].with_thermostat(bath), 0.002, 300)
@@ -297,12 +346,21 @@ def test_a_piston_can_be_run_backwards(compressed):
     assert state.position == pytest.approx(start.position, abs=1e-9)
 
 
-@pytest.mark.parametrize("stage", [
-    {"pressure_coupling": "flexible"}, pytest.param({"barostat": "monte_carlo"}, marks=pytest.mark.soak),
-    pytest.param({"ensemble": "nph", "temperature_K": None}, marks=pytest.mark.soak),
-], ids=str)  # fmt: skip
+@pytest.mark.parametrize(
+    "stage",
+    [
+        {"pressure_coupling": "flexible"},
+        pytest.param({"barostat": "monte_carlo"}, marks=pytest.mark.soak),
+        pytest.param({"ensemble": "nph", "temperature_K": None}, marks=pytest.mark.soak),
+    ],
+    ids=str,
+)
 def test_every_barostat_has_the_same_bits_for_any_number_of_threads(stage):
-    own = {key: value for key, value in (NPT | {"duration_ps": 0.02} | stage).items() if value is not None}
+    own = {
+        key: value
+        for key, value in (NPT | {"duration_ps": 0.02} | stage).items()
+        if value is not None
+    }
     own |= {} if own["ensemble"] == "nph" else {"barostat_interval_ps": 0.006}
     scene = small_scene({"spce": 800}, 30.0, stages=[own], output=QUIET)
     found = [Simulation(scene.model_copy(update={"threads": k})).run().state for k in (1, None)]
@@ -312,8 +370,13 @@ def test_every_barostat_has_the_same_bits_for_any_number_of_threads(stage):
 
 def test_forces_follow_the_cell_through_a_run():
     """After a run at a pressure, forces, energies and virial are those of a new engine."""
-    scene = small_scene({"spce": 60}, 13.0, stages=[NPT | {"barostat_interval_ps": 0.004, "barostat_time_ps": 0.05}],
-                        forces={"cutoff_A": 5.5}, output=QUIET)  # fmt: skip
+    scene = small_scene(
+        {"spce": 60},
+        13.0,
+        stages=[NPT | {"barostat_interval_ps": 0.004, "barostat_time_ps": 0.05}],
+        forces={"cutoff_A": 5.5},
+        output=QUIET,
+    )
     simulation = Simulation(scene)
     results = simulation.run()
     assert abs(results.state.volume / 13.0**3 - 1) > 1e-3
@@ -326,7 +389,12 @@ def test_forces_follow_the_cell_through_a_run():
 
 def test_the_log_has_the_box_and_the_books(tmp_path):
     stages = [NPT | {"pressure_coupling": "flexible", "barostat_interval_ps": 0.004}]
-    output = {"trajectory": "t.xtc", "trajectory_interval_ps": 0.02, "log_interval_ps": 0.02, "pressure_tensor": True}
+    output = {
+        "trajectory": "t.xtc",
+        "trajectory_interval_ps": 0.02,
+        "log_interval_ps": 0.02,
+        "pressure_tensor": True,
+    }
     scene = small_scene({"spce": 60}, 13.0, stages=stages, forces={"cutoff_A": 5.0}, output=output)
     results = Simulation(scene, tmp_path / "out").run()
     assert "Pressure xy (bar)" in (tmp_path / "out" / "log.csv").read_text().splitlines()[0]
@@ -334,36 +402,93 @@ def test_the_log_has_the_box_and_the_books(tmp_path):
     assert trace / 3 == pytest.approx(results["pressure_bar"], rel=1e-9)
     assert results["volume"][-1] == pytest.approx(results.state.volume * 1e-3)
     assert results["gamma"][-1] != 90 and results["work"][-1] != 0
-    frames = results.trajectory() if callable(getattr(results, "trajectory", None)) else results.universe().trajectory
-    assert len({tuple(np.round(ts.dimensions, 4)) for ts in frames}) > 2  # each frame has its own cell
+    frames = (
+        results.trajectory()
+        if callable(getattr(results, "trajectory", None))
+        else results.universe().trajectory
+    )
+    assert (
+        len({tuple(np.round(ts.dimensions, 4)) for ts in frames}) > 2
+    )  # each frame has its own cell
 
 
-@pytest.mark.parametrize(("scene", "message"), [
-    ({"box": {"lengths_A": 30.0, "periodic": False}}, "box.periodic is false"),
-    ({"molecules": [{"model": "argon", "count": 9}, {"model": "krypton", "count": 9, "frozen": True}]}, "frozen"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [
+        ({"box": {"lengths_A": 30.0, "periodic": False}}, "box.periodic is false"),
+        (
+            {
+                "molecules": [
+                    {"model": "argon", "count": 9},
+                    {"model": "krypton", "count": 9, "frozen": True},
+                ]
+            },
+            "frozen",
+        ),
+    ],
+)
 def test_scenes_without_a_box_to_change(scene, message):
     with pytest.raises(SceneError, match=message):
         small_scene({"argon": 20}, 30.0, **({"stages": [NPT]} | scene))
 
 
-@pytest.mark.parametrize("coupled", [NPT, {"ensemble": "nph", "pressure_bar": 1.0, "duration_ps": 0.1}], ids=str)
+@pytest.mark.parametrize(
+    "coupled", [NPT, {"ensemble": "nph", "pressure_bar": 1.0, "duration_ps": 0.1}], ids=str
+)
 def test_a_barostat_does_not_go_with_a_field_on_net_charges(coupled):
-    ion = {"name": "A", "element": "Na", "sigma_A": 2.0, "epsilon_kJ_mol": 0.4, "mass_u": 23.0, "charge_e": 1.0,
-           "position_A": [0.0, 0.0, 0.0]}  # fmt: skip
-    scene = small_scene({"argon": 5}, 30.0, stages=[coupled], fields={"electric_V_per_nm": [0.0, 0.0, 0.1]},
-                        molecules=[{"name": "ion", "sites": [ion], "count": 8}])  # fmt: skip
+    ion = {
+        "name": "A",
+        "element": "Na",
+        "sigma_A": 2.0,
+        "epsilon_kJ_mol": 0.4,
+        "mass_u": 23.0,
+        "charge_e": 1.0,
+        "position_A": [0.0, 0.0, 0.0],
+    }
+    scene = small_scene(
+        {"argon": 5},
+        30.0,
+        stages=[coupled],
+        fields={"electric_V_per_nm": [0.0, 0.0, 0.1]},
+        molecules=[{"name": "ion", "sites": [ion], "count": 8}],
+    )
     with pytest.raises(SceneError, match="electric field depend on absolute positions"):
         build(scene)
 
 
 def test_a_box_that_becomes_too_small_or_boils_stops_in_words():
-    small = small_scene({"argon": 40}, 20.0, stages=[NPT | {"pressure_bar": 20000.0, "barostat_interval_ps": 0.002,
-        "duration_ps": 20.0, "barostat_time_ps": 0.05}], forces={"cutoff_A": 9.0}, output=QUIET)  # fmt: skip
+    small = small_scene(
+        {"argon": 40},
+        20.0,
+        stages=[
+            NPT
+            | {
+                "pressure_bar": 20000.0,
+                "barostat_interval_ps": 0.002,
+                "duration_ps": 20.0,
+                "barostat_time_ps": 0.05,
+            }
+        ],
+        forces={"cutoff_A": 9.0},
+        output=QUIET,
+    )
     with pytest.raises(SimulationError, match="too small for the cutoff"):
         Simulation(small).run()
-    boils = small_scene({"argon": 40}, 14.0, stages=[NPT | {"barostat_interval_ps": 0.002, "duration_ps": 200.0,
-        "barostat_time_ps": 0.02, "compressibility_per_bar": 1e-3}], forces={"cutoff_A": 6.0}, output=QUIET)  # fmt: skip
+    boils = small_scene(
+        {"argon": 40},
+        14.0,
+        stages=[
+            NPT
+            | {
+                "barostat_interval_ps": 0.002,
+                "duration_ps": 200.0,
+                "barostat_time_ps": 0.02,
+                "compressibility_per_bar": 1e-3,
+            }
+        ],
+        forces={"cutoff_A": 6.0},
+        output=QUIET,
+    )
     with pytest.raises(SimulationError, match="boils"):
         Simulation(boils).run()
 
@@ -371,7 +496,10 @@ def test_a_box_that_becomes_too_small_or_boils_stops_in_words():
 def test_a_compressibility_in_another_unit_is_said():
     scene = small_scene({"argon": 20}, 30.0, stages=[NPT | {"compressibility_per_bar": 4.5e-10}])
     assert any("another unit" in note for note in build(scene).notes)
-    assert not any("another unit" in note for note in build(small_scene({"argon": 20}, 30.0, stages=[NPT])).notes)
+    assert not any(
+        "another unit" in note
+        for note in build(small_scene({"argon": 20}, 30.0, stages=[NPT])).notes
+    )
 
 
 def test_pressures_become_components():

@@ -37,7 +37,9 @@ def run(name, **changes):
 
 
 def scene(name, **changes) -> BodyScene:
-    return Scene.read(ROOT / "systems" / f"{name}.toml", {k.replace("__", "."): v for k, v in changes.items()})
+    return Scene.read(
+        ROOT / "systems" / f"{name}.toml", {k.replace("__", "."): v for k, v in changes.items()}
+    )
 
 
 def _list(value):
@@ -49,7 +51,9 @@ def vectors(results, name, of="123"):
 
 
 def rotations(results):
-    return np.stack([results[f"q{i}{j}"] for i in (1, 2, 3) for j in (1, 2, 3)], axis=-1).reshape(-1, 3, 3)
+    return np.stack([results[f"q{i}{j}"] for i in (1, 2, 3) for j in (1, 2, 3)], axis=-1).reshape(
+        -1, 3, 3
+    )
 
 
 def worst(results, name):
@@ -63,11 +67,16 @@ def test_every_scene_keeps_what_it_should_and_says_what_to_look_at(path):
     assert len(results["time"]) >= 450  # enough to draw
     assert results["time"][-1] == pytest.approx(results.system.scene.run.duration_s)
     for name, error in results.summary["largest_relative_error"].items():
-        # Two scenes with resistance are of order 2; the gyrocompass hides its slow swing in a fast spin.
-        allowed = {"body_in_fluid": 1e-8, "gyroscope_friction": 1e-8, "gyrocompass": 1e-7}.get(path.stem, 1e-11)
+        # Two scenes with resistance are of order 2; the gyrocompass hides its slow swing in a fast
+        # spin.
+        allowed = {"body_in_fluid": 1e-8, "gyroscope_friction": 1e-8, "gyrocompass": 1e-7}.get(
+            path.stem, 1e-11
+        )
         assert error < (allowed if name == "energy" else 1e-12), name
     if "q11" in results.samples.columns:
-        assert results.summary["largest_orthogonality_error"] < (1e-10 if path.stem == "gyrocompass" else 1e-12)
+        assert results.summary["largest_orthogonality_error"] < (
+            1e-10 if path.stem == "gyrocompass" else 1e-12
+        )
 
 
 @pytest.mark.parametrize("shape", ["prolate", "oblate"])
@@ -98,7 +107,9 @@ def test_free_asymmetric_top_over_ten_periods():
     omega0 = (1.0, 0.4, 1.3)
     period = known.free_asymmetric_period((1, 2, 2.8), omega0)
     results = run("free_asymmetric_top", run__duration_s=10 * period, run__timestep_s=period / 800)
-    omega, rotation = known.free_asymmetric_top((1, 2, 2.8), rotations(results)[0], np.array(omega0), results["time"])
+    omega, rotation = known.free_asymmetric_top(
+        (1, 2, 2.8), rotations(results)[0], np.array(omega0), results["time"]
+    )
     found = vectors(results, "omega_body_")
     assert np.abs(found - omega).max() < 1e-10
     assert np.abs(rotations(results) - rotation).max() < 1e-10
@@ -111,8 +122,12 @@ def test_free_asymmetric_top_over_ten_periods():
 def test_intermediate_axis_flips_when_it_should():
     period = known.flip_interval((1, 2, 3), (1e-2, 1, 0))
     assert period == pytest.approx(20.7546097646692, abs=1e-12)
-    results = run("intermediate_axis", run__duration_s=4 * period, run__timestep_s=period / 2000,
-                  output__interval_s=period)  # fmt: skip
+    results = run(
+        "intermediate_axis",
+        run__duration_s=4 * period,
+        run__timestep_s=period / 2000,
+        output__interval_s=period,
+    )
     omega = vectors(results, "omega_body_")
     assert len(omega) == 5
     assert omega[:, 1] == pytest.approx([1, -1, 1, -1, 1], abs=1e-10)
@@ -121,7 +136,9 @@ def test_intermediate_axis_flips_when_it_should():
     assert np.abs(late).max() < 1e-8 * period
 
 
-@pytest.mark.parametrize(("spin", "stable"), [((1, 1e-2, 0), True), ((1e-2, 0, 1), True), ((1e-2, 1, 0), False)])
+@pytest.mark.parametrize(
+    ("spin", "stable"), [((1, 1e-2, 0), True), ((1e-2, 0, 1), True), ((1e-2, 1, 0), False)]
+)
 def test_only_the_middle_axis_is_unstable(spin, stable):
     results = run("intermediate_axis", start__angular_velocity_body_rad_s=spin)
     axis = int(np.argmax(spin))
@@ -153,20 +170,35 @@ def test_heavy_tops_follow_the_elliptic_solution(k):
 def test_nutation_and_mean_precession_of_heavy_tops(k):
     name = f"heavy_top_{k}"
     period = top_of(run(name)).period
-    results = run(name, run__duration_s=3 * period, run__timestep_s=period / 600, output__interval_s=period / 60)
+    results = run(
+        name,
+        run__duration_s=3 * period,
+        run__timestep_s=period / 600,
+        output__interval_s=period / 60,
+    )
     top = top_of(results)
     assert results["theta"][::60] == pytest.approx(np.full(4, results["theta"][0]), abs=1e-9)
     turned = np.unwrap(results["phi"])[-1] - results["phi"][0]
     assert turned / (3 * period) == pytest.approx(top.mean_precession, rel=1e-9)
     low, high = top.theta_limits
-    if results.system.scene.start.euler_rates_rad_s[1] == 0:  # starts at the upper limit, half a period from the lower
+    if (
+        results.system.scene.start.euler_rates_rad_s[1] == 0
+    ):  # starts at the upper limit, half a period from the lower
         assert results["theta"][30] == pytest.approx(high, abs=1e-9)
         assert results["theta"][0] == pytest.approx(low, abs=1e-9)
 
 
 @pytest.mark.parametrize(
     ("k", "picture"),
-    [(1, "circle"), (2, "waves"), (3, "cusps"), (4, "loops"), (5, "cusps"), (6, "cusps"), (7, "cusps")],
+    [
+        (1, "circle"),
+        (2, "waves"),
+        (3, "cusps"),
+        (4, "loops"),
+        (5, "cusps"),
+        (6, "cusps"),
+        (7, "cusps"),
+    ],
 )
 def test_the_seven_pictures_are_what_their_names_say(k, picture):
     results = run(f"heavy_top_{k}")
@@ -198,7 +230,9 @@ def test_steady_precession_stays_steady(root):
     rates = known.steady_precession_rates(top.i1, top.l_3, top.mgl, np.radians(60))
     found = np.polyfit(results["time"], np.unwrap(results["phi"]), 1)[0]
     assert found == pytest.approx(rates[("slow", "fast").index(root)], rel=1e-9)
-    assert top.i1 * 0.5 * found**2 - top.l_3 * found + top.mgl == pytest.approx(0, abs=1e-9 * top.l_3 * found)
+    assert top.i1 * 0.5 * found**2 - top.l_3 * found + top.mgl == pytest.approx(
+        0, abs=1e-9 * top.l_3 * found
+    )
 
 
 def test_the_sleeping_top_wakes_where_it_should():
@@ -208,7 +242,9 @@ def test_the_sleeping_top_wakes_where_it_should():
 
     def falls(spin):
         # a nudge of 1e-6 grows as exp(rate t), rate² = M g l/I1 - (L3/2 I1)²
-        results = run("sleeping_top", start__angular_velocity_body_rad_s=(1e-6, 0, spin), run__duration_s=30)
+        results = run(
+            "sleeping_top", start__angular_velocity_body_rad_s=(1e-6, 0, spin), run__duration_s=30
+        )
         return results["theta"].max() > 1e-3
 
     low, high = 0.9 * limit, 1.1 * limit
@@ -230,7 +266,12 @@ def test_the_fast_heavy_top_comes_through():
     assert place[at] == pytest.approx(expected, abs=1e-9)
     # straight down, half a nutation after the start: 1 + cos(theta) = 2.6e-13
     period = 0.745206947616769
-    down = run("fast_heavy_top", run__duration_s=period, run__timestep_s=period / 2000, output__interval_s=period / 2)
+    down = run(
+        "fast_heavy_top",
+        run__duration_s=period,
+        run__timestep_s=period / 2000,
+        output__interval_s=period / 2,
+    )
     low = vectors(down, "", "xyz")
     # theta is that of the axis that points at the centre of mass, body axis 2
     assert 1 + low[1, 2] == pytest.approx(2.6e-13, rel=0.05)
@@ -249,17 +290,32 @@ def test_the_fast_heavy_top_at_short_times_as_others_have_it():
 def test_euler_angles_refuse_the_pole_or_come_through_it(solver):
     # The same top with its axis as body axis 3, started horizontal.
     changes = {
-        "body.inertia_kg_m2": [0.234375, 0.234375, 0.46875], "body.centre_of_mass_m": [0, 0, 1],
-        "start.euler_angles_deg": [0, 90, 0], "start.angular_velocity_body_rad_s": [0, -4.61538, 150],
-        "run.integrator": solver, "run.formulation": "euler_angles", "run.duration_s": 0.5,
-        "run.timestep_s": 1e-5 if solver == "rk4" else 0.01, "output.trajectory": False,
-    } | ({} if solver == "rk4" else {"run.relative_tolerance": 1e-12, "run.absolute_tolerance": 1e-12})  # fmt: skip
+        "body.inertia_kg_m2": [0.234375, 0.234375, 0.46875],
+        "body.centre_of_mass_m": [0, 0, 1],
+        "start.euler_angles_deg": [0, 90, 0],
+        "start.angular_velocity_body_rad_s": [0, -4.61538, 150],
+        "run.integrator": solver,
+        "run.formulation": "euler_angles",
+        "run.duration_s": 0.5,
+        "run.timestep_s": 1e-5 if solver == "rk4" else 0.01,
+        "output.trajectory": False,
+    } | (
+        {}
+        if solver == "rk4"
+        else {"run.relative_tolerance": 1e-12, "run.absolute_tolerance": 1e-12}
+    )
     tilted = Scene.read(ROOT / "systems" / "fast_heavy_top.toml", changes)
     for spin in ([0, -4.61538, 150], [-4.61538, 0, 150], [4.61538, 0, 150]):
         one = tilted.model_copy(
-            update={"start": tilted.start.model_copy(update={"angular_velocity_body_rad_s": tuple(spin)})}
+            update={
+                "start": tilted.start.model_copy(
+                    update={"angular_velocity_body_rad_s": tuple(spin)}
+                )
+            }
         )
-        other = one.model_copy(update={"run": scene("fast_heavy_top", **{"run.duration_s": 0.5}).run})
+        other = one.model_copy(
+            update={"run": scene("fast_heavy_top", **{"run.duration_s": 0.5}).run}
+        )
         exact = Simulation(other).run()
         try:
             found = Simulation(one).run()
@@ -270,19 +326,27 @@ def test_euler_angles_refuse_the_pole_or_come_through_it(solver):
             assert "too near pi" in str(error)
         else:
             assert spin != [0, -4.61538, 150] or solver == "dop853"
-            assert vectors(found, "", "xyz")[-1] == pytest.approx(vectors(exact, "", "xyz")[-1], abs=1e-7)
+            assert vectors(found, "", "xyz")[-1] == pytest.approx(
+                vectors(exact, "", "xyz")[-1], abs=1e-7
+            )
 
 
 def test_gyroscope_friction():
     results = run("gyroscope_friction")
     system, t = results.system, results["time"]
     friction = system.scene.friction
-    spin = known.coasting_spin(system.inertia[2], friction.viscous_N_m_s[2], friction.dry_N_m[2],
-                               results["omega_body_3"][0], t)  # fmt: skip
+    spin = known.coasting_spin(
+        system.inertia[2],
+        friction.viscous_N_m_s[2],
+        friction.dry_N_m[2],
+        results["omega_body_3"][0],
+        t,
+    )
     assert np.abs(results["omega_body_3"] - spin).max() < 1e-10 * spin[0]
     lost = results["energy"] - results["energy"][0]
     assert np.abs(lost - results["work"]).max() < 1e-8 * abs(lost[-1])
-    # the account of the work against its integral, -int (c w² + d |w|) dt, by Simpson's rule over a quiet stretch
+    # the account of the work against its integral, -int (c w² + d |w|) dt, by Simpson's rule over a
+    # quiet stretch
     w = vectors(results, "omega_body_")
     power = -(w**2 @ np.array(friction.viscous_N_m_s) + np.abs(w) @ np.array(friction.dry_N_m))
     from scipy.integrate import simpson
@@ -294,8 +358,13 @@ def test_gyroscope_friction():
 
 
 def test_a_top_spun_down_stops_and_stays():
-    results = run("gyroscope_friction", start__euler_angles_deg=(0, 180, 0), start__euler_rates_rad_s=None,
-                  start__angular_velocity_body_rad_s=(0, 0, 20), run__duration_s=10)  # fmt: skip
+    results = run(
+        "gyroscope_friction",
+        start__euler_angles_deg=(0, 180, 0),
+        start__euler_rates_rad_s=None,
+        start__angular_velocity_body_rad_s=(0, 0, 20),
+        run__duration_s=10,
+    )
     stop = known.coasting_stop(1.2e-4, 1e-5, 5e-4, 20.0)
     at_rest = results["time"] > stop + results.system.scene.run.timestep_s
     assert 0 < stop < 9
@@ -308,33 +377,45 @@ def test_body_in_fluid():
     system, fluid = results.system, results.system.scene.fluid
     displaced = 1000 * 4 / 3 * np.pi * 0.05 * 0.05 * 0.2
     weight = (system.mass - displaced) * 9.81
-    speed = known.terminal_speed(weight, fluid.linear_resistance_kg_s[0], fluid.quadratic_resistance_kg_m[0])
+    speed = known.terminal_speed(
+        weight, fluid.linear_resistance_kg_s[0], fluid.quadratic_resistance_kg_m[0]
+    )
     assert -results["vz"][-1] == pytest.approx(speed, rel=1e-6)
     assert results["theta"][-1] == pytest.approx(np.pi / 2, abs=1e-6)
     assert np.hypot(results["vx"][-1], results["vy"][-1]) < 1e-6 * speed
     assert worst(results, "energy") < 1e-8
     added = system.body.translation.inertial_mass - system.mass
-    assert added[0] > 0.85 * displaced > 0.2 * displaced > added[2]  # a long body carries little end on
+    assert (
+        added[0] > 0.85 * displaced > 0.2 * displaced > added[2]
+    )  # a long body carries little end on
 
 
 def test_gyrocompass():
     results = run("gyrocompass")
     omega, latitude = np.hypot(5.0655e-5, 5.2455e-5), np.arctan2(5.2455e-5, 5.0655e-5)
     assert omega == pytest.approx(7.2921e-5, rel=1e-4)
-    period = known.gyrocompass_period_linear((0.05, 0.04, 0.045), 1.0, 9.81 * 0.005, omega, latitude)
+    period = known.gyrocompass_period_linear(
+        (0.05, 0.04, 0.045), 1.0, 9.81 * 0.005, omega, latitude
+    )
     simple = known.gyrocompass_period(1.0, 9.81 * 0.005, omega, latitude)
     t, heading = results["time"], np.degrees(np.mod(results["phi"], 2 * np.pi)) - 180
     slow = np.abs(np.fft.rfft(heading - heading.mean()))
     assert 2 <= np.argmax(slow) <= 4
     rising = np.flatnonzero((heading[:-1] < 0) & (heading[1:] >= 0))
-    crossing = t[rising] - heading[rising] * (t[rising + 1] - t[rising]) / (heading[rising + 1] - heading[rising])
+    crossing = t[rising] - heading[rising] * (t[rising + 1] - t[rising]) / (
+        heading[rising + 1] - heading[rising]
+    )
     found = np.diff(crossing).mean()
     assert found == pytest.approx(simple, rel=5e-3)
-    assert found == pytest.approx(period, rel=1e-3)  # the swing is of 5°: longer by amplitude²/16, 5e-4
+    assert found == pytest.approx(
+        period, rel=1e-3
+    )  # the swing is of 5°: longer by amplitude²/16, 5e-4
     small = run("gyrocompass", start__euler_angles_deg=(179.9, 90, 0), run__duration_s=8000)
     tilt = np.degrees(small["theta"]) - 90
     assert np.abs(np.degrees(np.mod(small["phi"], 2 * np.pi)) - 180).max() < 6
-    rest = np.degrees(known.gyrocompass_rest((0.05, 0.04, 0.045), 1.0, 9.81 * 0.005, omega, latitude))
+    rest = np.degrees(
+        known.gyrocompass_rest((0.05, 0.04, 0.045), 1.0, 9.81 * 0.005, omega, latitude)
+    )
     assert abs(tilt.mean()) == pytest.approx(abs(rest), rel=0.05)
 
 
@@ -348,12 +429,14 @@ def test_dropped_stone_and_the_same_fall_from_outside():
     # eastward: Omega cos(latitude) g t³/3
     assert results["x"][-1] == pytest.approx(5.1563e-5 * 9.806 * t[-1] ** 3 / 3, rel=1e-3)
     # from axes that do not turn: gravity turns, the stone starts with the speed of the ground
-    outside = Scene.from_dict({
-        "body": {"mass_kg": 1.0},
-        "start": {"position_m": list(start), "velocity_m_s": list(np.cross(turning, start))},
-        "run": {"duration_s": 4.5, "timestep_s": 0.01, "integrator": "kahan_li_6"},
-        "output": {"trajectory": False},
-    })  # fmt: skip
+    outside = Scene.from_dict(
+        {
+            "body": {"mass_kg": 1.0},
+            "start": {"position_m": list(start), "velocity_m_s": list(np.cross(turning, start))},
+            "run": {"duration_s": 4.5, "timestep_s": 0.01, "integrator": "kahan_li_6"},
+            "output": {"trajectory": False},
+        }
+    )
 
     def weight(pose):
         return from_vector(turning * pose.time) @ [0, 0, -9.806], np.zeros(3)
@@ -379,11 +462,15 @@ def test_satellite_wheel():
 
 def test_satellite_mass_loss():
     results = run("satellite_mass_loss")
-    spin = known.changing_inertia_spin(30.0, lambda t: np.interp(t, [20, 120], [60, 30]), results["time"])
+    spin = known.changing_inertia_spin(
+        30.0, lambda t: np.interp(t, [20, 120], [60, 30]), results["time"]
+    )
     assert np.abs(results["omega_body_3"] - spin).max() < 1e-10
     assert spin[-1] == 2 * spin[0]
     assert worst(results, "L_lab") < 1e-13
-    assert results["energy"][-1] - results["energy"][0] == pytest.approx(results["work"][-1], rel=1e-10)
+    assert results["energy"][-1] - results["energy"][0] == pytest.approx(
+        results["work"][-1], rel=1e-10
+    )
 
 
 def test_what_a_scene_lacks_is_not_there():
@@ -421,7 +508,8 @@ def free_body(inertia, omega, duration, dt, integrator="kahan_li_8", **more):
 
 
 def turned_alone(inertia, momentum, dt, steps, scheme):
-    """L in the body frame (3,) of a free body with any moments after so many steps: a scene refuses what no mass has."""
+    """L in the body frame (3,) of a free body with any moments after so many steps: a scene refuses
+    what no mass has."""
     state = state_of(rotation=np.eye(3)[None], angular_momentum_body=[momentum])
     engine = Engine(Body(NoTranslation(1.0), split_rotor(np.array([inertia], float))), {})
     move(engine, state, SCHEMES[scheme], dt, steps)
@@ -447,7 +535,8 @@ def thermal_bodies(inertia, n):
 
 
 def energy_error(rotor, rotation, momentum, angle=0.05, left=lambda momentum: 0.0):
-    """Root mean square over 30 rad in steps of so many rad (at the mean thermal rate); left, what is to be added."""
+    """Root mean square over 30 rad in steps of so many rad (at the mean thermal rate); left, what
+    is to be added."""
     inverse = rotor.inverse_inertia[0]
     h = angle / np.sqrt(inverse.mean())
     seen = path(rotor, rotation.copy(), momentum.copy(), h, round(30 / angle))
@@ -456,14 +545,21 @@ def energy_error(rotor, rotation, momentum, angle=0.05, left=lambda momentum: 0.
 
 def otherwise(rotor, order, common):
     """A split rotor with another order of axes and another rate about L."""
-    return rotor._replace(order=np.array([order]), common=np.array([common]), excess=rotor.inverse_inertia - common)
+    return rotor._replace(
+        order=np.array([order]), common=np.array([common]), excess=rotor.inverse_inertia - common
+    )
 
 
 # SPC/E, H2S, chlorobenzene; nearly linear; far from planar; nearly symmetric, both ways
 MOMENTS = [
-    (0.597, 1.344, 1.941), (1.641, 1.876, 3.517), (89.2, 327.4, 416.6), (0.1, 1.0, 1.05), (1.0, 2.0, 2.2),
-    (1.0, 1.01, 1.5), (1.0, 1.49, 1.5),
-]  # fmt: skip
+    (0.597, 1.344, 1.941),
+    (1.641, 1.876, 3.517),
+    (89.2, 327.4, 416.6),
+    (0.1, 1.0, 1.05),
+    (1.0, 2.0, 2.2),
+    (1.0, 1.01, 1.5),
+    (1.0, 1.49, 1.5),
+]
 
 
 @pytest.mark.parametrize("inertia", MOMENTS)
@@ -502,7 +598,9 @@ def test_the_split_rotor_conserves_the_energy_that_theory_says(inertia, order):
 
 
 def test_the_error_of_the_split_rotor_is_second_order_in_the_difference_of_two_moments():
-    errors = [energy_error(*thermal_bodies((1.0, 1.0 + split, 1.7), 40)) for split in (0.04, 0.02, 0.01)]
+    errors = [
+        energy_error(*thermal_bodies((1.0, 1.0 + split, 1.7), 40)) for split in (0.04, 0.02, 0.01)
+    ]
     assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([2, 2], abs=0.1)
 
 
@@ -519,8 +617,13 @@ def test_the_split_rotor_is_of_order_two_reversible_and_keeps_momentum(inertia, 
             q, l = start.copy(), momentum.copy()  # noqa: E741
             path(rotor, q, l, 60 * h / steps, steps)
             errors.append(np.linalg.norm(q - exact))
-            assert np.linalg.norm(l, axis=1) == pytest.approx(np.linalg.norm(momentum, axis=1), rel=1e-13)
-            assert np.abs(q @ l[..., None] - start @ momentum[..., None]).max() < 1e-13 * np.abs(momentum).max()
+            assert np.linalg.norm(l, axis=1) == pytest.approx(
+                np.linalg.norm(momentum, axis=1), rel=1e-13
+            )
+            assert (
+                np.abs(q @ l[..., None] - start @ momentum[..., None]).max()
+                < 1e-13 * np.abs(momentum).max()
+            )
             assert orthogonality_error(q) < 1e-13
         assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([2, 2], abs=0.1)
         path(rotor, q, l, -60 * h / steps, steps)
@@ -528,12 +631,16 @@ def test_the_split_rotor_is_of_order_two_reversible_and_keeps_momentum(inertia, 
         assert np.abs(l - momentum).max() < 1e-13 * np.abs(momentum).max()
 
 
-@pytest.mark.parametrize(("inertia", "axis"), [((1, 1, 2), 2), ((2, 1, 1), 0), ((1, 2, 1), 1), ((2, 2, 0.3), 2)])
+@pytest.mark.parametrize(
+    ("inertia", "axis"), [((1, 1, 2), 2), ((2, 1, 1), 0), ((1, 2, 1), 1), ((2, 2, 0.3), 2)]
+)
 def test_a_symmetric_body_is_one_turn_about_momentum_and_one_about_its_axis(inertia, axis):
     rotor = split_rotor(np.array([inertia], float))
     assert rotor.order[0, 2] == axis
     assert (np.flatnonzero(rotor.excess[0]) == axis).all()
-    assert not split_rotor(np.array([[0.0, 2.0, 2.0], [3.0, 3.0, 3.0], [0.0, 0.0, 0.0]])).excess.any()
+    assert not split_rotor(
+        np.array([[0.0, 2.0, 2.0], [3.0, 3.0, 3.0], [0.0, 0.0, 0.0]])
+    ).excess.any()
 
 
 def numbers(text):
@@ -557,10 +664,16 @@ def test_free_bodies_of_others(reference):
         ):
             case = cases["symmetric_top_precession"][name]
             found = turned_alone(case["I"], case["L0"], t / 7, 7, "velocity_verlet")
-            assert found[order] == pytest.approx([5 * np.sin(rate * t), 5 * np.cos(rate * t), 7], abs=1e-12)
+            assert found[order] == pytest.approx(
+                [5 * np.sin(rate * t), 5 * np.cos(rate * t), 7], abs=1e-12
+            )
     for k in range(3):
         spin = free_body([1, 2, 3], np.eye(3)[k], 4 * np.pi, np.pi / 400, "velocity_verlet")
-        assert np.abs(spin["q" + "xyz"[k]]) == pytest.approx(np.abs(np.sin(spin["time"] / 2)), abs=1e-12)
+        assert np.abs(spin["q" + "xyz"[k]]) == pytest.approx(
+            np.abs(np.sin(spin["time"] / 2)), abs=1e-12
+        )
         torque = {"applied": [{"axes": "body", "torque_N_m": (6 * np.eye(3)[k]).tolist()}]}
         pushed = free_body([1, 2, 3], [0, 0, 0], 1.0, 1e-3, "velocity_verlet", **torque)
-        assert pushed[f"omega_body_{k + 1}"] == pytest.approx(6 * pushed["time"] / (k + 1), abs=1e-12)
+        assert pushed[f"omega_body_{k + 1}"] == pytest.approx(
+            6 * pushed["time"] / (k + 1), abs=1e-12
+        )

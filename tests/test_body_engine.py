@@ -1,4 +1,5 @@
-"""The flows and terms of a single body: orders, reversal, and every effect against plain NumPy and a general solver."""
+"""The flows and terms of a single body: orders, reversal, and every effect against plain NumPy and
+a general solver."""
 
 import numpy as np
 import pytest
@@ -40,8 +41,16 @@ from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
 PINNED = {
-    "body": {"mass_kg": 2.0, "inertia_kg_m2": [0.5, 0.7, 0.9], "pinned": True, "centre_of_mass_m": [0.1, 0.2, 0.3]},
-    "start": {"euler_angles_deg": [10.0, 50.0, 70.0], "angular_velocity_body_rad_s": [1.0, -2.0, 3.0]},
+    "body": {
+        "mass_kg": 2.0,
+        "inertia_kg_m2": [0.5, 0.7, 0.9],
+        "pinned": True,
+        "centre_of_mass_m": [0.1, 0.2, 0.3],
+    },
+    "start": {
+        "euler_angles_deg": [10.0, 50.0, 70.0],
+        "angular_velocity_body_rad_s": [1.0, -2.0, 3.0],
+    },
     "gravity": {},
     "run": {"duration_s": 1.0, "timestep_s": 0.01},
     "output": {"trajectory": False, "interval_s": 0.1},
@@ -49,25 +58,31 @@ PINNED = {
 FREE = {
     "body": {"mass_kg": 2.0, "inertia_kg_m2": [0.5, 0.7, 0.9]},
     "start": {
-        "quaternion_wxyz": [0.3, -0.2, 0.5, 0.7], "angular_velocity_body_rad_s": [1.0, -2.0, 3.0],
-        "position_m": [1.0, 2.0, 3.0], "velocity_m_s": [0.5, -0.4, 0.3],
+        "quaternion_wxyz": [0.3, -0.2, 0.5, 0.7],
+        "angular_velocity_body_rad_s": [1.0, -2.0, 3.0],
+        "position_m": [1.0, 2.0, 3.0],
+        "velocity_m_s": [0.5, -0.4, 0.3],
     },
     "gravity": {"acceleration_m_s2": [1.0, 2.0, -9.0]},
     "run": {"duration_s": 1.0, "timestep_s": 0.01},
     "output": {"trajectory": False, "interval_s": 0.1},
-}  # fmt: skip
+}
 
 
 def simulate(data, applied=None, **changes):
-    scene = Scene.from_dict({k: dict(v) if isinstance(v, dict) else v for k, v in data.items()},
-                            overrides={k.replace("__", "."): v for k, v in changes.items()})  # fmt: skip
+    scene = Scene.from_dict(
+        {k: dict(v) if isinstance(v, dict) else v for k, v in data.items()},
+        overrides={k.replace("__", "."): v for k, v in changes.items()},
+    )
     return Simulation(scene, applied=applied).run()
 
 
 def end(results):
     q = np.array([results[f"q{i}{j}"][-1] for i in (1, 2, 3) for j in (1, 2, 3)]).reshape(3, 3)
-    x, v, w = (np.array([results[name][-1] for name in names]) for names in
-               (("x", "y", "z"), ("vx", "vy", "vz"), [f"omega_body_{k}" for k in (1, 2, 3)]))  # fmt: skip
+    x, v, w = (
+        np.array([results[name][-1] for name in names])
+        for names in (("x", "y", "z"), ("vx", "vy", "vz"), [f"omega_body_{k}" for k in (1, 2, 3)])
+    )
     return x, v, q, w
 
 
@@ -82,17 +97,31 @@ def test_a_call_of_no_steps_is_no_step():
     assert ends[0] == ends[1]
 
 
-# Steps in 2 s at which the error of each scheme has become a power of the step and is not yet rounding.
-STEPS = {"velocity_verlet": 200, "suzuki_4": 50, "kahan_li_6": 16, "kahan_li_8": 19, "srkn_4": 54, "srkn_6": 15,
-         "blanes_moan_6": 16}  # fmt: skip
+# Steps in 2 s at which the error of each scheme has become a power of the step and is not yet
+# rounding.
+STEPS = {
+    "velocity_verlet": 200,
+    "suzuki_4": 50,
+    "kahan_li_6": 16,
+    "kahan_li_8": 19,
+    "srkn_4": 54,
+    "srkn_6": 15,
+    "blanes_moan_6": 16,
+}
 
 
 @pytest.mark.parametrize("name", SCHEMES)
 def test_orders_on_a_torqued_asymmetric_body(name):
     n, order = STEPS.get(name, 60), SCHEMES[name].order
-    exact = simulate(PINNED, run__duration_s=2.0, run__integrator="srkn_6", run__timestep_s=0.005).state.rotation
-    ends = [simulate(PINNED, run__duration_s=2.0, run__integrator=name, run__timestep_s=2 / steps).state.rotation
-            for steps in (n, 2 * n)]  # fmt: skip
+    exact = simulate(
+        PINNED, run__duration_s=2.0, run__integrator="srkn_6", run__timestep_s=0.005
+    ).state.rotation
+    ends = [
+        simulate(
+            PINNED, run__duration_s=2.0, run__integrator=name, run__timestep_s=2 / steps
+        ).state.rotation
+        for steps in (n, 2 * n)
+    ]
     errors = [np.abs(q - exact).max() for q in ends]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2 if order == 8 else 0.1)
 
@@ -103,16 +132,34 @@ def test_orders_on_a_torqued_asymmetric_body(name):
         (lambda: split("mine", (0.4, 0.5), (1.0,), 2, ""), "mine: its kicks sum to 0.9, not to 1"),
         (lambda: split("mine", (0.5, 0.5), (1.1,), 2, ""), "mine: its drifts sum to 1.1, not to 1"),
         (lambda: split("mine", (0.5, 0.5), (float("nan"),), 2, ""), "mine: its drifts sum to nan"),
-        (lambda: split("mine", (0.4, 0.6), (1.0,), 2, ""), "flows 1 and 3 of 3 differ .kick 0.4 and kick 0.6."),
-        (lambda: split("mine", (1.0, 0.0), (1.0,), 1, ""), "flows 1 and 2 of 2 differ .kick 1 and drift 1."),
+        (
+            lambda: split("mine", (0.4, 0.6), (1.0,), 2, ""),
+            "flows 1 and 3 of 3 differ .kick 0.4 and kick 0.6.",
+        ),
+        (
+            lambda: split("mine", (1.0, 0.0), (1.0,), 1, ""),
+            "flows 1 and 2 of 2 differ .kick 1 and drift 1.",
+        ),
         (lambda: split("mine", (0.2, 0.6, 0.2), (0.4, 0.6), 2, ""), "flows 2 and 4 of 5 differ"),
-        (lambda: split("mine", (0.5, 0.5), (1.0,), 2, "", (0.1, 0.2)), "differ .kick 0.5, gradient 0.1 and kick 0.5, "),
-        (lambda: split("mine", (0.5, 0.5), (0.5, 0.5), 2, ""), "2 kicks, 2 drifts: kicks must be one more than drifts"),
-        (lambda: split("mine", (0.5, 0.5), (1.0,), 2, "", (0.1,)), "1 gradients: .* gradients as many as kicks"),
+        (
+            lambda: split("mine", (0.5, 0.5), (1.0,), 2, "", (0.1, 0.2)),
+            "differ .kick 0.5, gradient 0.1 and kick 0.5, ",
+        ),
+        (
+            lambda: split("mine", (0.5, 0.5), (0.5, 0.5), 2, ""),
+            "2 kicks, 2 drifts: kicks must be one more than drifts",
+        ),
+        (
+            lambda: split("mine", (0.5, 0.5), (1.0,), 2, "", (0.1,)),
+            "1 gradients: .* gradients as many as kicks",
+        ),
         (lambda: composed("mine", (0.6, -0.3, 0.6), 4, ""), "mine: its drifts sum to 0.9"),
         (lambda: composed("mine", (0.3, 0.7), 2, ""), "not time-reversible"),
         (lambda: composed("mine", (), 2, ""), "mine: its drifts sum to 0, not to 1"),
-        (lambda: Scheme("mine", (Flow(KICK, 0.5), Flow(DRIFT, 1.0)), 2, True, ""), "mine: its kicks sum to 0.5"),
+        (
+            lambda: Scheme("mine", (Flow(KICK, 0.5), Flow(DRIFT, 1.0)), 2, True, ""),
+            "mine: its kicks sum to 0.5",
+        ),
     ],
 )
 def test_a_row_that_is_inconsistent_or_not_reversible_is_refused_when_it_is_made(make, error):
@@ -132,7 +179,9 @@ def test_what_has_no_exact_flow_is_not_given_to_schemes_that_count_on_one():
         ({"wheels": [{"axis": [0.0, 0, 1], "momentum_kg_m2_s": 1.0}]}, "wheels"),
         ({"fluid": {"added_mass_kg": [1.0, 2.0, 3.0]}}, "added mass"),
     ):
-        with pytest.raises(SceneError, match=f"a body with {what} has no exact flow: srkn_6 would be of order 2"):
+        with pytest.raises(
+            SceneError, match=f"a body with {what} has no exact flow: srkn_6 would be of order 2"
+        ):
             simulate(FREE | more, run__integrator="srkn_6")
         simulate(FREE | more, run__integrator="kahan_li_6")
     with pytest.raises(SceneError, match="pefrl needs rotor = 'exact'"):
@@ -148,14 +197,22 @@ def test_a_top_runs_backwards(name):
     engine.forget()
     move(engine, state, SCHEMES[name], 0.01, 300)
     assert state.rotation == pytest.approx(system.state.rotation, abs=1e-12)
-    assert -state.angular_momentum_body == pytest.approx(system.state.angular_momentum_body, abs=1e-12)
+    assert -state.angular_momentum_body == pytest.approx(
+        system.state.angular_momentum_body, abs=1e-12
+    )
 
 
 def test_a_long_spin_keeps_q_a_rotation():
     # The same turn a million times over: an error of rounding in cos² + sin² would add up to 1e-10.
     for moments in ([0.7, 0.7, 0.9], [0.7, 0.7, 0.7], [0.5, 0.7, 0.9]):
-        results = simulate(FREE, body__inertia_kg_m2=moments, start__angular_velocity_body_rad_s=[0.0, 0.0, 3.0],
-                           run__timestep_s=1e-3, run__duration_s=1000.0, output__interval_s=500.0)  # fmt: skip
+        results = simulate(
+            FREE,
+            body__inertia_kg_m2=moments,
+            start__angular_velocity_body_rad_s=[0.0, 0.0, 3.0],
+            run__timestep_s=1e-3,
+            run__duration_s=1000.0,
+            output__interval_s=500.0,
+        )
         assert results.summary["largest_orthogonality_error"] < 2e-13
         q0 = results.system.state.rotation[0]
         assert np.abs(end(results)[2] - q0 @ from_vector(np.array([0, 0, 3000.0]))).max() < 1e-9
@@ -166,16 +223,23 @@ def solve(slopes, y, t):
 
 
 FLUID = {
-    "linear_resistance_kg_s": [1.0, 2.0, 3.0], "quadratic_resistance_kg_m": [0.5, 0.2, 0.7],
-    "linear_rotational_resistance_N_m_s": [0.1, 0.2, 0.3], "quadratic_rotational_resistance_N_m_s2": [0.05, 0.02, 0.03],
-    "displaced_mass_kg": 1.5, "centre_of_buoyancy_m": [0.01, -0.02, 0.05],
-    "added_mass_kg": [0.3, 0.6, 0.9], "added_inertia_kg_m2": [0.05, 0.1, 0.15],
-}  # fmt: skip
+    "linear_resistance_kg_s": [1.0, 2.0, 3.0],
+    "quadratic_resistance_kg_m": [0.5, 0.2, 0.7],
+    "linear_rotational_resistance_N_m_s": [0.1, 0.2, 0.3],
+    "quadratic_rotational_resistance_N_m_s2": [0.05, 0.02, 0.03],
+    "displaced_mass_kg": 1.5,
+    "centre_of_buoyancy_m": [0.01, -0.02, 0.05],
+    "added_mass_kg": [0.3, 0.6, 0.9],
+    "added_inertia_kg_m2": [0.05, 0.1, 0.15],
+}
 
 
 def kirchhoff_end(t):
     """P' = P x w + f, L' = L x w + P x v + n in the body frame, straight from the book."""
-    m, i = 2 + np.array(FLUID["added_mass_kg"]), np.array([0.5, 0.7, 0.9]) + FLUID["added_inertia_kg_m2"]
+    m, i = (
+        2 + np.array(FLUID["added_mass_kg"]),
+        np.array([0.5, 0.7, 0.9]) + FLUID["added_inertia_kg_m2"],
+    )
     system = build_body(Scene.from_dict(FREE))
     q, g = system.state.rotation[0], np.array([1.0, 2.0, -9.0])
     a, b, c, d = (np.array(FLUID[k]) for k in list(FLUID)[:4])
@@ -188,7 +252,12 @@ def kirchhoff_end(t):
         f = 2 * q.T @ g + lift - (a + b * np.linalg.norm(v)) * v
         n = np.cross(arm, lift) - (c + d * np.linalg.norm(w)) * w
         return np.concatenate(
-            [q @ v, (q @ hat(w)).ravel(), np.cross(p, w) + f, np.cross(angular, w) + np.cross(p, v) + n]
+            [
+                q @ v,
+                (q @ hat(w)).ravel(),
+                np.cross(p, w) + f,
+                np.cross(angular, w) + np.cross(p, v) + n,
+            ]
         )
 
     y = [[1.0, 2.0, 3.0], q.ravel(), m * (q.T @ [0.5, -0.4, 0.3]), i * [1.0, -2.0, 3.0]]
@@ -209,8 +278,13 @@ def test_a_body_in_a_fluid_follows_kirchhoff():
 
 def test_a_frictionless_fluid_keeps_energy_and_impulse():
     ideal = {key: FLUID[key] for key in ("added_mass_kg", "added_inertia_kg_m2")}
-    results = simulate(FREE | {"fluid": ideal}, gravity__acceleration_m_s2=[0.0, 0.0, 0.0], run__integrator="kahan_li_8",
-                       run__duration_s=20.0, run__timestep_s=0.02)  # fmt: skip
+    results = simulate(
+        FREE | {"fluid": ideal},
+        gravity__acceleration_m_s2=[0.0, 0.0, 0.0],
+        run__integrator="kahan_li_8",
+        run__duration_s=20.0,
+        run__timestep_s=0.02,
+    )
     assert np.abs(results["energy_error"]).max() < 1e-12
     before, after = results.system.state.velocity, results.state.velocity
     assert (before == after).all()  # the impulse of body and fluid; the body's own velocity wanders
@@ -219,17 +293,34 @@ def test_a_frictionless_fluid_keeps_energy_and_impulse():
 
 ROTOR = {
     "wheels": [
-        {"axis": [0.0, 1.0, 2.0], "momentum_kg_m2_s": 1.5, "motor_torque_N_m": [0.0, 1.0, -1.0], "times_s": [0.2, 0.5, 0.9]},
+        {
+            "axis": [0.0, 1.0, 2.0],
+            "momentum_kg_m2_s": 1.5,
+            "motor_torque_N_m": [0.0, 1.0, -1.0],
+            "times_s": [0.2, 0.5, 0.9],
+        },
         {"axis": [1.0, 0.0, 0.0], "motor_torque_N_m": 0.7, "from_s": 0.3, "to_s": 0.6},
     ],
     "friction": {"viscous_N_m_s": [0.2, 0.2, 0.2]},
-    "frame": {"angular_velocity_rad_s": [0.3, -0.2, 0.5], "origin_acceleration_m_s2": [1.0, 0.5, 0.2]},
+    "frame": {
+        "angular_velocity_rad_s": [0.3, -0.2, 0.5],
+        "origin_acceleration_m_s2": [1.0, 0.5, 0.2],
+    },
     "applied": [
         {"torque_N_m": [0.5, 0.2, -0.3]},
-        {"axes": "body", "force_N": [1.0, 2.0, -1.0], "at_m": [0.2, 0.0, 0.1], "torque_N_m": [0.0, 0.1, 0.0]},
-        {"force_N": [[0.0, 0.0, 1.0], [0.0, 3.0, 1.0]], "times_s": [0.0, 1.0], "at_m": [0.0, 0.3, 0.0]},
+        {
+            "axes": "body",
+            "force_N": [1.0, 2.0, -1.0],
+            "at_m": [0.2, 0.0, 0.1],
+            "torque_N_m": [0.0, 0.1, 0.0],
+        },
+        {
+            "force_N": [[0.0, 0.0, 1.0], [0.0, 3.0, 1.0]],
+            "times_s": [0.0, 1.0],
+            "at_m": [0.0, 0.3, 0.0],
+        },
     ],
-}  # fmt: skip
+}
 
 
 def rotor_end(t_end):
@@ -241,8 +332,13 @@ def rotor_end(t_end):
     slant = np.array([0.0, 1.0, 2.0]) / 5**0.5
 
     def rotors(t):
-        torque = quad(lambda s: np.interp(s, [0.2, 0.5, 0.9], [0, 1, -1]), 0, t, points=[0.2, 0.5, 0.9] if t > 0 else None,
-                      epsabs=1e-13)[0]  # fmt: skip
+        torque = quad(
+            lambda s: np.interp(s, [0.2, 0.5, 0.9], [0, 1, -1]),
+            0,
+            t,
+            points=[0.2, 0.5, 0.9] if t > 0 else None,
+            epsabs=1e-13,
+        )[0]
         return (1.5 + torque) * slant + 0.7 * np.clip(t - 0.3, 0, 0.3) * np.array([1.0, 0, 0])
 
     def slopes(t, y):
@@ -275,11 +371,16 @@ def test_wheels_drives_and_friction_in_a_turning_accelerated_frame():
         _, _, found, spin = end(results)
         gaps.append(max(np.abs(found - q).max(), np.abs(spin - w).max()))
         assert np.abs(results["energy_error"]).max() < 1e-4
-    assert not np.array_equal(results.system.axes, np.eye(3))  # the centre of mass is off every axis
+    assert not np.array_equal(
+        results.system.axes, np.eye(3)
+    )  # the centre of mass is off every axis
     wheels = np.stack([results[f"h_body_{k}"][[0, -1]] for k in (1, 2, 3)], axis=1)
     slant = np.array([0.0, 1.0, 2.0]) / 5**0.5
-    # the motors' torques over time: 0.15 up to the peak, as much down from it and beyond zero, 0.1 beyond their table
-    assert wheels == pytest.approx(np.array([1.5 * slant, 1.55 * slant + [0.21, 0.0, 0.0]]), abs=1e-12)
+    # the motors' torques over time: 0.15 up to the peak, as much down from it and beyond zero, 0.1
+    # beyond their table
+    assert wheels == pytest.approx(
+        np.array([1.5 * slant, 1.55 * slant + [0.21, 0.0, 0.0]]), abs=1e-12
+    )
     assert gaps[1] < 5e-5
     assert np.log2(gaps[0] / gaps[1]) == pytest.approx(2, abs=0.1)
 
@@ -289,10 +390,14 @@ def test_wheels_drives_and_friction_in_a_turning_accelerated_frame():
     [
         pytest.param("matrix", PINNED | ROTOR, id="matrix-rotor"),
         pytest.param("quaternion", FREE | {"fluid": FLUID}, id="quaternion-fluid"),
-        pytest.param("euler_angles", PINNED | ROTOR, id="euler_angles-rotor", marks=pytest.mark.soak),
+        pytest.param(
+            "euler_angles", PINNED | ROTOR, id="euler_angles-rotor", marks=pytest.mark.soak
+        ),
         pytest.param("quaternion", PINNED | ROTOR, id="quaternion-rotor", marks=pytest.mark.soak),
         pytest.param("matrix", FREE | {"fluid": FLUID}, id="matrix-fluid", marks=pytest.mark.soak),
-        pytest.param("euler_angles", FREE | {"fluid": FLUID}, id="euler_angles-fluid", marks=pytest.mark.soak),
+        pytest.param(
+            "euler_angles", FREE | {"fluid": FLUID}, id="euler_angles-fluid", marks=pytest.mark.soak
+        ),
     ],
 )
 def test_the_textbook_systems_are_the_same_motion(scene, formulation):
@@ -301,9 +406,15 @@ def test_the_textbook_systems_are_the_same_motion(scene, formulation):
     found = {
         "rk4": simulate(scene, run__integrator="rk4", run__timestep_s=1e-3, **options),
         "dop853": simulate(scene, run__integrator="dop853", run__timestep_s=0.1, **options),
-        "radau": simulate(scene, run__integrator="radau", run__timestep_s=0.1, run__relative_tolerance=1e-8,
-                          run__absolute_tolerance=1e-8, **options),
-    }  # fmt: skip
+        "radau": simulate(
+            scene,
+            run__integrator="radau",
+            run__timestep_s=0.1,
+            run__relative_tolerance=1e-8,
+            run__absolute_tolerance=1e-8,
+            **options,
+        ),
+    }
     for name, results in found.items():
         _, _, q, w = end(results)
         allowed = 1e-5 if name == "radau" else 1e-7
@@ -311,7 +422,9 @@ def test_the_textbook_systems_are_the_same_motion(scene, formulation):
         assert np.abs(results["energy_error"]).max() < 1e-4, name
     coarse = simulate(scene, run__integrator="rk4", run__timestep_s=0.05, **options)
     error = coarse.summary["largest_orthogonality_error"]
-    assert (error < 1e-14) == (formulation == "euler_angles")  # the accuracy control: it shows a step that is too long
+    assert (error < 1e-14) == (
+        formulation == "euler_angles"
+    )  # the accuracy control: it shows a step that is too long
     if formulation != "euler_angles":
         fine = simulate(scene, run__integrator="rk4", run__timestep_s=0.025, **options)
         assert np.log2(error / fine.summary["largest_orthogonality_error"]) > 3.5
@@ -321,21 +434,39 @@ def test_a_run_that_cannot_go_on_says_when():
     def singular(pose):  # falls into a centre
         return -1e3 * pose.position / np.linalg.norm(pose.position) ** 6, np.zeros(3)
 
-    with pytest.raises(SimulationError, match=r"at t = 0\.\d+: dop853 finds no step that keeps its tolerances"):
-        simulate(FREE, {"centre": singular}, run__integrator="dop853", start__velocity_m_s=[0.0, 0.0, 0.0],
-                 start__position_m=[0.5, 0.0, 0.0], gravity__acceleration_m_s2=[0.0, 0.0, 0.0])  # fmt: skip
-    light = {"body": {"mass_kg": 1e-100}, "applied": [{"force_N": [1e100, 0.0, 0.0]}],
-             "run": {"duration_s": 1e99, "timestep_s": 1e98}}  # fmt: skip
-    with pytest.raises(SimulationError, match=r"stopped at step .*: position or momentum of the body is not finite"):
+    with pytest.raises(
+        SimulationError, match=r"at t = 0\.\d+: dop853 finds no step that keeps its tolerances"
+    ):
+        simulate(
+            FREE,
+            {"centre": singular},
+            run__integrator="dop853",
+            start__velocity_m_s=[0.0, 0.0, 0.0],
+            start__position_m=[0.5, 0.0, 0.0],
+            gravity__acceleration_m_s2=[0.0, 0.0, 0.0],
+        )
+    light = {
+        "body": {"mass_kg": 1e-100},
+        "applied": [{"force_N": [1e100, 0.0, 0.0]}],
+        "run": {"duration_s": 1e99, "timestep_s": 1e98},
+    }
+    with pytest.raises(
+        SimulationError, match=r"stopped at step .*: position or momentum of the body is not finite"
+    ):
         simulate(light)
 
 
 def test_euler_angles_are_singular_only_near_their_poles():
-    tilted = FREE | {"start": {"euler_angles_deg": [0.0, 60.0, 0.0], "euler_rates_rad_s": [40.0, 0.0, 0.0]}}
+    tilted = FREE | {
+        "start": {"euler_angles_deg": [0.0, 60.0, 0.0], "euler_rates_rad_s": [40.0, 0.0, 0.0]}
+    }
     body = {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 1.0}}
     for solver in ("rk4", "dop853"):  # dt phi' = 2: too long a step for RK4, but not singular
         results = simulate(
-            tilted | {"body": body}, run__integrator=solver, run__formulation="euler_angles", run__timestep_s=0.05
+            tilted | {"body": body},
+            run__integrator=solver,
+            run__formulation="euler_angles",
+            run__timestep_s=0.05,
         )
         assert results["theta"] == pytest.approx(np.full(11, np.pi / 3), abs=0.2)
 
@@ -371,7 +502,9 @@ def test_a_push_against_resistance_is_solved_exactly(dry, linear, push, h):
                     return y[0] * sense + 1e-300
 
                 stops.terminal, stops.direction = True, -1
-                solved = solve_ivp(rate, (0, left), expected, method="DOP853", rtol=1e-12, atol=1e-15, events=stops)
+                solved = solve_ivp(
+                    rate, (0, left), expected, method="DOP853", rtol=1e-12, atol=1e-15, events=stops
+                )
                 expected = solved.y[:, -1] * [solved.status == 0, 1]
                 left = 0.0 if solved.status == 0 else left - solved.t[-1]
             assert after == pytest.approx(expected[0], rel=1e-9, abs=1e-12)
@@ -381,16 +514,23 @@ def test_a_push_against_resistance_is_solved_exactly(dry, linear, push, h):
 def test_stiff_resistance_ends_at_the_terminal_speed():
     for drag in (100.0, 1e6, 1e12):
         results = simulate(
-            {"body": {"mass_kg": 1.0}, "gravity": {}, "fluid": {"linear_resistance_kg_s": [drag] * 3},
-             "run": {"duration_s": 10.0, "timestep_s": 0.1}, "output": {"trajectory": False}}
-        )  # fmt: skip
+            {
+                "body": {"mass_kg": 1.0},
+                "gravity": {},
+                "fluid": {"linear_resistance_kg_s": [drag] * 3},
+                "run": {"duration_s": 10.0, "timestep_s": 0.1},
+                "output": {"trajectory": False},
+            }
+        )
         assert results["vz"][-1] == pytest.approx(-9.81 / drag, rel=1e-12)
         assert results["z"][-1] - results["z"][-2] == pytest.approx(-9.81 / drag * 0.1, rel=1e-9)
     bearing = {
-        "body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 1.0]}, "friction": {"dry_N_m": [0.0, 0.0, 2.0]},
+        "body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 1.0]},
+        "friction": {"dry_N_m": [0.0, 0.0, 2.0]},
         "applied": [{"axes": "body", "torque_N_m": [0.0, 0.0, 1.0]}],
-        "run": {"duration_s": 10.0, "timestep_s": 0.1}, "output": {"trajectory": False},
-    }  # fmt: skip
+        "run": {"duration_s": 10.0, "timestep_s": 0.1},
+        "output": {"trajectory": False},
+    }
     assert (simulate(bearing)["omega_body_3"] == 0).all()
     assert (simulate(bearing)["phi"] == 0).all()
     bearing["applied"][0]["torque_N_m"] = [0.0, 0.0, 3.0]  # 1 N m more than friction holds
@@ -400,11 +540,17 @@ def test_stiff_resistance_ends_at_the_terminal_speed():
 def test_equal_coefficients_resist_alike_in_all_directions():
     ball = {
         "body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.1}},
-        "fluid": {"quadratic_resistance_kg_m": [1.0, 1.0, 1.0], "quadratic_rotational_resistance_N_m_s2": [0.01] * 3},
-        "run": {"duration_s": 2.0, "timestep_s": 1e-3}, "output": {"trajectory": False},
-    }  # fmt: skip
+        "fluid": {
+            "quadratic_resistance_kg_m": [1.0, 1.0, 1.0],
+            "quadratic_rotational_resistance_N_m_s2": [0.01] * 3,
+        },
+        "run": {"duration_s": 2.0, "timestep_s": 1e-3},
+        "output": {"trajectory": False},
+    }
     for way in ([1.0, 0, 0], [0.6, 0.8, 0], [0.48, 0.6, 0.64]):
-        results = simulate(ball | {"start": {"velocity_m_s": way, "angular_velocity_body_rad_s": way}})
+        results = simulate(
+            ball | {"start": {"velocity_m_s": way, "angular_velocity_body_rad_s": way}}
+        )
         speed = np.array([results[k][-1] for k in ("vx", "vy", "vz")])
         assert speed == pytest.approx(np.array(way) / 3, abs=1e-6)  # v0/(1 + b v0 t/m)
         spin = np.array([results[f"omega_body_{k}"][-1] for k in (1, 2, 3)])
@@ -412,27 +558,47 @@ def test_equal_coefficients_resist_alike_in_all_directions():
     point = {k: v for k, v in ball.items() if k != "body"} | {"body": {"mass_kg": 1.0}}
     point["fluid"] = {"quadratic_resistance_kg_m": [1.0, 1.0, 1.0]}
     results = simulate(point | {"start": {"velocity_m_s": [0.48, 0.6, 0.64]}})
-    assert [results[k][-1] for k in ("vx", "vy", "vz")] == pytest.approx([0.16, 0.2, 0.64 / 3], abs=1e-6)
+    assert [results[k][-1] for k in ("vx", "vy", "vz")] == pytest.approx(
+        [0.16, 0.2, 0.64 / 3], abs=1e-6
+    )
 
 
-@pytest.mark.parametrize("integrator", ["velocity_verlet", "srkn_6", "kahan_li_8", "rk4", "dop853", "radau"])
+@pytest.mark.parametrize(
+    "integrator", ["velocity_verlet", "srkn_6", "kahan_li_8", "rk4", "dop853", "radau"]
+)
 def test_what_is_switched_on_and_off_gives_its_whole_impulse(integrator):
-    stone = {"body": {"mass_kg": 2.0}, "run": {"duration_s": 100.0, "timestep_s": 0.25, "integrator": integrator},
-             "output": {"trajectory": False}}  # fmt: skip
+    stone = {
+        "body": {"mass_kg": 2.0},
+        "run": {"duration_s": 100.0, "timestep_s": 0.25, "integrator": integrator},
+        "output": {"trajectory": False},
+    }
     for begin, end in ((0.0, 1.0), (50.0, 51.0), (50.07, 50.19), (99.0, 100.0)):
-        results = simulate(stone | {"applied": [{"force_N": [3.0, 0.0, 0.0], "from_s": begin, "to_s": end}]})
+        results = simulate(
+            stone | {"applied": [{"force_N": [3.0, 0.0, 0.0], "from_s": begin, "to_s": end}]}
+        )
         assert results["vx"][-1] == pytest.approx(1.5 * (end - begin), rel=1e-9)
-        assert results["x"][-1] == pytest.approx(1.5 * (end - begin) * (100.0 - 0.5 * (begin + end)), rel=1e-9)
+        assert results["x"][-1] == pytest.approx(
+            1.5 * (end - begin) * (100.0 - 0.5 * (begin + end)), rel=1e-9
+        )
         assert results["time"][-1] == pytest.approx(100.0, rel=2e-3)
         assert np.diff(results["time"]).min() > 0
 
 
 def test_breaks_at_the_ends_and_on_top_of_each_other_do_no_harm():
-    stone = {"body": {"mass_kg": 2.0}, "run": {"duration_s": 1.0, "timestep_s": 0.3}, "output": {"trajectory": False}}
-    late = simulate(stone | {"applied": [{"force_N": [3.0, 0.0, 0.0], "from_s": 0.95}]})  # three steps end at 0.9
+    stone = {
+        "body": {"mass_kg": 2.0},
+        "run": {"duration_s": 1.0, "timestep_s": 0.3},
+        "output": {"trajectory": False},
+    }
+    late = simulate(
+        stone | {"applied": [{"force_N": [3.0, 0.0, 0.0], "from_s": 0.95}]}
+    )  # three steps end at 0.9
     assert late["time"][-1] == pytest.approx(0.9)
     assert (late["vx"] == 0).all()
-    twins = [{"force_N": [3.0, 0.0, 0.0], "from_s": 0.5}, {"force_N": [1.0, 0.0, 0.0], "from_s": 0.5 + 1e-12}]
+    twins = [
+        {"force_N": [3.0, 0.0, 0.0], "from_s": 0.5},
+        {"force_N": [1.0, 0.0, 0.0], "from_s": 0.5 + 1e-12},
+    ]
     assert simulate(stone | {"applied": twins})["vx"][-1] == pytest.approx(2 * 0.4, rel=1e-9)
 
 
@@ -440,21 +606,40 @@ def test_a_frame_that_changes_its_axis_is_left_to_compositions():
     frame = {"angular_velocity_rad_s": [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]], "times_s": [0.0, 1.0]}
     with pytest.raises(SceneError, match="a frame that changes its axis has no exact flow"):
         simulate(FREE | {"frame": frame}, run__integrator="srkn_6")
-    exact = simulate(FREE | {"frame": frame}, run__integrator="dop853", run__timestep_s=0.1, run__relative_tolerance=1e-12,
-                     run__absolute_tolerance=1e-12)  # fmt: skip
+    exact = simulate(
+        FREE | {"frame": frame},
+        run__integrator="dop853",
+        run__timestep_s=0.1,
+        run__relative_tolerance=1e-12,
+        run__absolute_tolerance=1e-12,
+    )
     errors = [
-        max(np.abs(a - b).max() for a, b in zip(end(simulate(FREE | {"frame": frame}, run__integrator="suzuki_4",
-            run__timestep_s=dt)), end(exact), strict=True))
+        max(
+            np.abs(a - b).max()
+            for a, b in zip(
+                end(
+                    simulate(
+                        FREE | {"frame": frame}, run__integrator="suzuki_4", run__timestep_s=dt
+                    )
+                ),
+                end(exact),
+                strict=True,
+            )
+        )
         for dt in (0.1, 0.05)
-    ]  # fmt: skip
+    ]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.3)
 
 
 def test_a_table_does_not_cost_the_order_of_the_integrator():
     errors = []
     for dt in (0.1, 0.05):
-        results = simulate(PINNED | ROTOR | {"friction": None}, run__timestep_s=dt, run__integrator="kahan_li_6")
-        exact = simulate(PINNED | ROTOR | {"friction": None}, run__timestep_s=2e-3, run__integrator="kahan_li_6")
+        results = simulate(
+            PINNED | ROTOR | {"friction": None}, run__timestep_s=dt, run__integrator="kahan_li_6"
+        )
+        exact = simulate(
+            PINNED | ROTOR | {"friction": None}, run__timestep_s=2e-3, run__integrator="kahan_li_6"
+        )
         errors.append(np.abs(results.state.rotation - exact.state.rotation).max())
     assert np.log2(errors[0] / errors[1]) > 5
 
@@ -463,11 +648,24 @@ def test_courses():
     motor = window([1.0, 2.0, 3.0], 0.5, 1.5)
     assert value_at(motor, np.array([0.0, 0.5, 1.4, 1.5, 9.0]))[:, 0].tolist() == [0, 1, 1, 0, 0]
     ramp = table([1.0, 2.0, 4.0], [[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0]])
-    assert value_at(ramp, np.array([0.0, 1.0, 1.5, 3.0, 4.0, 9.0]))[:, 0].tolist() == [0, 0, 0.5, 3, 5, 5]
+    assert value_at(ramp, np.array([0.0, 1.0, 1.5, 3.0, 4.0, 9.0]))[:, 0].tolist() == [
+        0,
+        0,
+        0.5,
+        3,
+        5,
+        5,
+    ]
     both = integral(total([motor, ramp]), np.array([10.0, 0, 0]))
     for t in (0.3, 0.7, 1.2, 1.7, 3.1, 6.0):
-        area = quad(lambda s: float(value_at(motor, np.array([s]))[0, 0] + value_at(ramp, np.array([s]))[0, 0]), 0, t,
-                    points=[p for p in (0.5, 1.0, 1.5, 2.0, 4.0) if p < t] or None)[0]  # fmt: skip
+        area = quad(
+            lambda s: float(
+                value_at(motor, np.array([s]))[0, 0] + value_at(ramp, np.array([s]))[0, 0]
+            ),
+            0,
+            t,
+            points=[p for p in (0.5, 1.0, 1.5, 2.0, 4.0) if p < t] or None,
+        )[0]
         assert value_at(both, np.array([t]))[0, 0] == pytest.approx(10 + area, abs=1e-12)
     assert is_steady(steady([1.0, 2.0, 3.0]))
     assert not is_steady(motor)
@@ -487,16 +685,22 @@ def test_weight_and_buoyancy_are_minus_the_gradient_of_their_energy():
         there, back = state.copy(), state.copy()
         there.position[0, k] += step
         back.position[0, k] -= step
-        assert load.force[0, k] == pytest.approx((energy(back) - energy(there)) / (2 * step), rel=1e-6)
+        assert load.force[0, k] == pytest.approx(
+            (energy(back) - energy(there)) / (2 * step), rel=1e-6
+        )
         turn = from_vector(step * np.eye(3)[k])
         there, back = state.copy(), state.copy()
         there.rotation[0] = there.rotation[0] @ turn
         back.rotation[0] = back.rotation[0] @ turn.T
-        assert load.torque_body[0, k] == pytest.approx((energy(back) - energy(there)) / (2 * step), rel=1e-6)
+        assert load.torque_body[0, k] == pytest.approx(
+            (energy(back) - energy(there)) / (2 * step), rel=1e-6
+        )
 
 
 def test_a_python_function_can_apply_what_a_scene_does():
-    told = simulate(PINNED, {"torque": lambda pose: ([0, 0, 0], pose.rotation.T @ [0.5, 0.2, -0.3])})
+    told = simulate(
+        PINNED, {"torque": lambda pose: ([0, 0, 0], pose.rotation.T @ [0.5, 0.2, -0.3])}
+    )
     given = simulate(PINNED | {"applied": [{"torque_N_m": [0.5, 0.2, -0.3]}]})
     for a, b in zip(end(told), end(given), strict=True):
         assert a == pytest.approx(b, abs=1e-13)
@@ -509,7 +713,10 @@ def test_a_python_function_can_apply_what_a_scene_does():
         return -50.0 * pose.position, np.zeros(3)
 
     results = simulate(
-        FREE, {"spring": spring}, gravity__acceleration_m_s2=[0.0, 0.0, 0.0], run__integrator="kahan_li_6"
+        FREE,
+        {"spring": spring},
+        gravity__acceleration_m_s2=[0.0, 0.0, 0.0],
+        run__integrator="kahan_li_6",
     )
     w = np.sqrt(50.0 / 2)
     expected = np.array([1.0, 2.0, 3.0]) * np.cos(w) + np.array([0.5, -0.4, 0.3]) / w * np.sin(w)
@@ -518,13 +725,16 @@ def test_a_python_function_can_apply_what_a_scene_does():
     assert seen[0].rotation.shape == (3, 3)
     # on a pinned body it acts at the centre of mass: a weight of one's own
     own = simulate(
-        {k: v for k, v in PINNED.items() if k != "gravity"}, {"weight": lambda pose: ([0, 0, -9.81 * 2], [0, 0, 0])}
+        {k: v for k, v in PINNED.items() if k != "gravity"},
+        {"weight": lambda pose: ([0, 0, -9.81 * 2], [0, 0, 0])},
     )
     for a, b in zip(end(own), end(simulate(PINNED)), strict=True):
         assert a == pytest.approx(b, abs=1e-12)
 
 
-@pytest.mark.parametrize("answer", [None, [1, 2, 3], ([1, 2], [0, 0, 0]), ([np.nan, 0, 0], [0, 0, 0])])
+@pytest.mark.parametrize(
+    "answer", [None, [1, 2, 3], ([1, 2], [0, 0, 0]), ([np.nan, 0, 0], [0, 0, 0])]
+)
 def test_a_python_function_that_gives_no_force_is_told_so(answer):
     with pytest.raises(SimulationError, match="t = 0 s: an applied function gave"):
         simulate(FREE, {"odd": lambda pose: answer})
@@ -546,7 +756,9 @@ def test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn():
     # velocity and angular velocity are relative to the frame
     x, v, _, _ = end(turned)
     assert v == pytest.approx(back @ end(rest)[1] - np.cross(0.7 * direction, x), abs=1e-12)
-    assert "energy_error" not in turned.samples.columns  # not conserved in such a frame, and not said to be
+    assert (
+        "energy_error" not in turned.samples.columns
+    )  # not conserved in such a frame, and not said to be
 
 
 def test_the_same_scene_gives_the_same_bits_however_often_it_is_looked_at():
@@ -555,7 +767,9 @@ def test_the_same_scene_gives_the_same_bits_however_often_it_is_looked_at():
         for a, b in zip(ends[0], other, strict=True):
             assert a.tobytes() == b.tobytes()
     simulation = Simulation(Scene.from_dict(PINNED | ROTOR))
-    assert simulation.run().samples["energy"].tobytes() == simulation.run().samples["energy"].tobytes()
+    assert (
+        simulation.run().samples["energy"].tobytes() == simulation.run().samples["energy"].tobytes()
+    )
 
 
 @pytest.mark.parametrize(
@@ -564,14 +778,29 @@ def test_the_same_scene_gives_the_same_bits_however_often_it_is_looked_at():
         ({"mass_kg": 1.0}, "point", 3),
         ({"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}}, "linear", 5),
         ({"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 1.0}}, "spherical", 6),
-        ({"mass_kg": 1.0, "solid": {"shape": "cone", "radius_m": 1.0, "height_m": 3.0}}, "symmetric", 6),
-        ({"mass_kg": 1.0, "inertia_tensor_kg_m2": [[2.0, 0.1, 0], [0.1, 2.5, 0.2], [0, 0.2, 3.0]]}, "asymmetric", 6),
+        (
+            {"mass_kg": 1.0, "solid": {"shape": "cone", "radius_m": 1.0, "height_m": 3.0}},
+            "symmetric",
+            6,
+        ),
+        (
+            {
+                "mass_kg": 1.0,
+                "inertia_tensor_kg_m2": [[2.0, 0.1, 0], [0.1, 2.5, 0.2], [0, 0.2, 3.0]],
+            },
+            "asymmetric",
+            6,
+        ),
         ({"mass_kg": 1.0, "pinned": True, "centre_of_mass_m": [0.0, 0, 1.0]}, "linear", 2),
     ],
 )
 def test_every_kind_of_body_moves(body, kind, freedom):
-    data = {"body": body, "gravity": {}, "run": {"duration_s": 1.0, "timestep_s": 1e-3},
-            "output": {"trajectory": False}}  # fmt: skip
+    data = {
+        "body": body,
+        "gravity": {},
+        "run": {"duration_s": 1.0, "timestep_s": 1e-3},
+        "output": {"trajectory": False},
+    }
     if "pinned" in body:
         data["start"] = {"euler_angles_deg": [0.0, 60.0, 0.0]}
     results = Simulation(Scene.from_dict(data)).run()
@@ -591,15 +820,24 @@ def test_every_kind_of_body_moves(body, kind, freedom):
 
 
 def test_bodies_given_in_different_ways_are_the_same_body():
-    points = [{"mass_kg": m, "position_m": p} for m, p in
-              ((1.0, [0.0, 0.1, 0.5]), (2.0, [0.3, 0.0, 0.4]), (0.5, [-0.2, 0.4, 0.1]), (1.5, [0.0, -0.3, 0.2]))]  # fmt: skip
+    points = [
+        {"mass_kg": m, "position_m": p}
+        for m, p in (
+            (1.0, [0.0, 0.1, 0.5]),
+            (2.0, [0.3, 0.0, 0.4]),
+            (0.5, [-0.2, 0.4, 0.1]),
+            (1.5, [0.0, -0.3, 0.2]),
+        )
+    ]
     masses = np.array([p["mass_kg"] for p in points])
     places = np.array([p["position_m"] for p in points])
     centre = masses @ places / masses.sum()
 
     def tensor_about(origin):
         x = places - origin
-        return sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(masses, x, strict=True)).tolist()
+        return sum(
+            m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(masses, x, strict=True)
+        ).tolist()
 
     mass = float(masses.sum())
     rest = {key: PINNED[key] for key in ("start", "gravity", "run", "output")}
@@ -618,7 +856,9 @@ def test_bodies_given_in_different_ways_are_the_same_body():
         q, w = y[:9].reshape(3, 3), y[9:]
         tensor = np.array(tensor_about(np.zeros(3)))
         n = np.cross(centre, q.T @ [0, 0, -9.81 * mass])
-        return np.concatenate([(q @ hat(w)).ravel(), np.linalg.solve(tensor, n - np.cross(w, tensor @ w))])
+        return np.concatenate(
+            [(q @ hat(w)).ravel(), np.linalg.solve(tensor, n - np.cross(w, tensor @ w))]
+        )
 
     start = Scene.from_dict({"body": bodies[0]} | rest).start
     exact = solve(slopes, np.concatenate([start.attitude.ravel(), start.angular_velocity]), 1.0)
@@ -638,36 +878,63 @@ def test_starts_given_in_different_ways_are_the_same_start():
     starts = [
         {"euler_angles_deg": [20.0, 65.0, -130.0], "euler_rates_rad_s": rates.tolist()},
         {"rotation": q.as_matrix().tolist(), "angular_velocity_body_rad_s": finite.tolist()},
-        {"attitude_matrix": q.as_matrix().T.tolist(), "angular_velocity_body_rad_s": finite.tolist()},
-        {"quaternion_wxyz": (3 * q.as_quat(scalar_first=True)).tolist(),
-         "angular_velocity_lab_rad_s": q.apply(finite).tolist()},
+        {
+            "attitude_matrix": q.as_matrix().T.tolist(),
+            "angular_velocity_body_rad_s": finite.tolist(),
+        },
+        {
+            "quaternion_wxyz": (3 * q.as_quat(scalar_first=True)).tolist(),
+            "angular_velocity_lab_rad_s": q.apply(finite).tolist(),
+        },
         {"yaw_pitch_roll_deg": yaw.tolist(), "angular_velocity_body_rad_s": finite.tolist()},
-        {"rotation": (1.01 * q.as_matrix()).tolist(), "project": True, "angular_velocity_body_rad_s": finite.tolist()},
-    ]  # fmt: skip
+        {
+            "rotation": (1.01 * q.as_matrix()).tolist(),
+            "project": True,
+            "angular_velocity_body_rad_s": finite.tolist(),
+        },
+    ]
     states = [build_body(Scene.from_dict(PINNED | {"start": start})).state for start in starts]
     for state in states[1:]:
         assert state.rotation == pytest.approx(states[0].rotation, abs=1e-14)
-        assert state.angular_momentum_body == pytest.approx(states[0].angular_momentum_body, abs=1e-5)
+        assert state.angular_momentum_body == pytest.approx(
+            states[0].angular_momentum_body, abs=1e-5
+        )
 
 
-# The error of Q at t = 2 of a torqued asymmetric heavy top, steps of 0.025 x forces: ../shared/REFERENCES.md, section 2.
-# Which top is not said there: these are medians over 40, each within a factor 3.
+# The error of Q at t = 2 of a torqued asymmetric heavy top, steps of 0.025 x forces:
+# ../shared/REFERENCES.md, section 2. Which top is not said there: these are medians over 40, each
+# within a factor 3.
 AT_EQUAL_COST = {
-    "velocity_verlet": 8.7e-5, "two_stage": 2.5e-5, "yoshida_4": 2.0e-5, "suzuki_4": 4.1e-6, "pefrl": 8.7e-7,
-    "vefrl": 7.1e-7, "blanes_moan_4": 2.4e-7, "blanes_moan_6": 7.0e-8, "srkn_4": 6.1e-8, "chin_4a": 4.5e-8,
+    "velocity_verlet": 8.7e-5,
+    "two_stage": 2.5e-5,
+    "yoshida_4": 2.0e-5,
+    "suzuki_4": 4.1e-6,
+    "pefrl": 8.7e-7,
+    "vefrl": 7.1e-7,
+    "blanes_moan_4": 2.4e-7,
+    "blanes_moan_6": 7.0e-8,
+    "srkn_4": 6.1e-8,
+    "chin_4a": 4.5e-8,
     "srkn_6": 1.2e-8,
-}  # fmt: skip
+}
 
 
 def test_the_ranking_of_schemes_at_equal_cost():
     rng = np.random.default_rng(0)
-    forces = {name: SCHEMES[name].force_evaluations for name in AT_EQUAL_COST} | {"chin_4a": 2}  # as counted there
+    forces = {name: SCHEMES[name].force_evaluations for name in AT_EQUAL_COST} | {
+        "chin_4a": 2
+    }  # as counted there
     errors = []
     for _ in range(40):
         a, b, c = rng.uniform(0.1, 1.0, 3)
         body = Body(NoTranslation(1.0), split_rotor(np.array([[a + b, b + c, c + a]])))
-        engine = Engine(body, {"weight": SteadyForce(np.array([0.0, 0.0, -3.0]), 0.5 * rng.standard_normal(3))})
-        state = state_of(rotation=random_rotations(rng, 1), angular_momentum_body=1.5 * rng.standard_normal((1, 3)))
+        engine = Engine(
+            body, {"weight": SteadyForce(np.array([0.0, 0.0, -3.0]), 0.5 * rng.standard_normal(3))}
+        )
+        state = state_of(
+            rotation=random_rotations(rng, 1),
+            angular_momentum_body=1.5 * rng.standard_normal((1, 3)),
+        )
 
         def end(name, steps, engine=engine, state=state):
             moved = state.copy()
@@ -676,17 +943,22 @@ def test_the_ranking_of_schemes_at_equal_cost():
             return moved.rotation
 
         exact = end("srkn_6", 2000)
-        errors.append([np.abs(end(name, round(80 / forces[name])) - exact).max() for name in AT_EQUAL_COST])
+        errors.append(
+            [np.abs(end(name, round(80 / forces[name])) - exact).max() for name in AT_EQUAL_COST]
+        )
     found, told = np.median(errors, axis=0), np.array(list(AT_EQUAL_COST.values()))
     assert np.abs(np.log(found / told)).max() < np.log(3)
     assert spearmanr(found, told).statistic > 0.95
 
 
 def test_takahashi_imada_is_of_order_four_but_for_a_change_of_variables():
-    # Small swings all take the same time: after whole periods the change of variables has undone itself.
+    # Small swings all take the same time: after whole periods the change of variables has undone
+    # itself.
     tilt, swings = 1e-4, 5
     body = Body(NoTranslation(1.0), split_rotor(np.array([[1.0, 1.0, 1.0]])))
-    engine = Engine(body, {"weight": SteadyForce(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, -1.0]))})
+    engine = Engine(
+        body, {"weight": SteadyForce(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, -1.0]))}
+    )
     start = from_vector(np.array([[tilt, 0.0, 0.0]]))
     for name, order in (("takahashi_imada", 4), ("position_verlet", 2)):
         errors = []
@@ -694,21 +966,29 @@ def test_takahashi_imada_is_of_order_four_but_for_a_change_of_variables():
             state = state_of(rotation=start)
             engine.forget()
             move(engine, state, SCHEMES[name], 2 * np.pi / n, swings * n)
-            errors.append(np.abs(state.angular_momentum_body).max() / tilt)  # 0 at the end of a swing
+            errors.append(
+                np.abs(state.angular_momentum_body).max() / tilt
+            )  # 0 at the end of a swing
         assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
 
 
 def test_a_gradient_is_not_asked_of_forces_that_have_none():
-    for more in ({"friction": {"viscous_N_m_s": [0.1, 0.1, 0.1]}}, {"applied": [{"force_N": [1.0, 0, 0]}]}):
+    for more in (
+        {"friction": {"viscous_N_m_s": [0.1, 0.1, 0.1]}},
+        {"applied": [{"force_N": [1.0, 0, 0]}]},
+    ):
         with pytest.raises(SceneError, match="chin_4a needs the gradient of the forces"):
             simulate(FREE | more, run__integrator="chin_4a")
     with pytest.raises(SceneError, match="chin_4a needs the gradient"):
-        simulate(FREE, applied={"push": lambda pose: ([0, 0, 0], [0, 0, 0])}, run__integrator="chin_4a")
+        simulate(
+            FREE, applied={"push": lambda pose: ([0, 0, 0], [0, 0, 0])}, run__integrator="chin_4a"
+        )
 
 
 @pytest.mark.parametrize("strength", [1e-6, 1.0, 1e3, 1e6, 1e12])
 def test_quadratic_resistance_never_lets_go(strength):
-    """However strong, it brakes, and never past zero: |v| at the middle of a kick is that of the resistance itself."""
+    """However strong, it brakes, and never past zero: |v| at the middle of a kick is that of the
+    resistance itself."""
     point = {
         "body": {"mass_kg": 1.0},
         "start": {"velocity_m_s": [1.0, -2.0, 0.5]},
@@ -716,7 +996,9 @@ def test_quadratic_resistance_never_lets_go(strength):
     }
     point["fluid"] = {"quadratic_resistance_kg_m": [strength] * 3}
     results = Simulation(
-        Scene.from_dict(point | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}})
+        Scene.from_dict(
+            point | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}}
+        )
     ).run()
     speed = np.sqrt(sum(results[k] ** 2 for k in ("vx", "vy", "vz")))
     known = speed[0] / (1 + strength * speed[0] * results["time"])
@@ -730,7 +1012,9 @@ def test_quadratic_resistance_never_lets_go(strength):
     }
     fixed["fluid"] = {"quadratic_rotational_resistance_N_m_s2": [strength] * 3}
     turning = Simulation(
-        Scene.from_dict(fixed | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}})
+        Scene.from_dict(
+            fixed | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}}
+        )
     ).run()
     spin = np.sqrt(sum(turning[f"omega_body_{k}"] ** 2 for k in (1, 2, 3)))
     assert spin == pytest.approx(speed, rel=1e-9, abs=1e-12)
@@ -744,7 +1028,9 @@ def test_a_stone_let_go_in_a_stiff_fluid_falls_at_its_terminal_speed():
         "run": {"duration_s": 3.0, "timestep_s": 0.5},
     }
     results = Simulation(
-        Scene.from_dict(stone | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}})
+        Scene.from_dict(
+            stone | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}}
+        )
     ).run()
     assert results["vz"][1:] == pytest.approx(-np.sqrt(9.81 / 1e8), rel=1e-9)
 
@@ -765,7 +1051,9 @@ def pulled(pose):
 def test_functions_that_depend_on_velocities_are_noted(start):
     """At rest too; not those of the pose, and not with a solver of the textbook equations."""
     data = FREE | {"start": start}
-    simulation = Simulation(Scene.from_dict(data), applied={"drag": drag, "spin": gyroscopic, "pull": pulled})
+    simulation = Simulation(
+        Scene.from_dict(data), applied={"drag": drag, "spin": gyroscopic, "pull": pulled}
+    )
     assert simulation.system.velocity_dependent_functions() == ["drag", "spin"]
     notes = simulation.run().summary["notes"]
     assert any("drag and spin" in note and "order 1" in note and "dop853" in note for note in notes)

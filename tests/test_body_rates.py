@@ -1,4 +1,5 @@
-"""Rates of single bodies in the summary: precession, nutation, flips, measured in runs and in closed form."""
+"""Rates of single bodies in the summary: precession, nutation, flips, measured in runs and in
+closed form."""
 
 import json
 
@@ -15,12 +16,17 @@ SYSTEMS = ROOT / "systems"
 #: A top whose spin is fast enough for steady precession at 30°.
 SPIN, LEAN = 200.0, np.radians(30)
 TEXTBOOK = {
-    "body": {"mass_kg": 0.1, "inertia_kg_m2": [2e-4, 2e-4, 5e-5], "inertia_about": "pivot", "pinned": True,
-             "centre_of_mass_m": [0.0, 0.0, 0.04]},
+    "body": {
+        "mass_kg": 0.1,
+        "inertia_kg_m2": [2e-4, 2e-4, 5e-5],
+        "inertia_about": "pivot",
+        "pinned": True,
+        "centre_of_mass_m": [0.0, 0.0, 0.04],
+    },
     "start": {"euler_angles_deg": [0.0, 30.0, 0.0], "euler_rates_rad_s": [0.0, 0.0, SPIN]},
     "gravity": {},
     "run": {"duration_s": 3.0, "timestep_s": 1e-3, "integrator": "kahan_li_8"},
-}  # fmt: skip
+}
 
 
 def rates(scene, **more):
@@ -36,19 +42,28 @@ def shipped(name, **changes):
 
 
 @pytest.mark.parametrize("spin", [0.01, -0.02, 0.3])
-@pytest.mark.parametrize(("lean", "phi", "theta"), [(0.4, 5.0, 3.0), (1.9, -2.0, 4.0), (2.8, 1.0, 0.0)])
+@pytest.mark.parametrize(
+    ("lean", "phi", "theta"), [(0.4, 5.0, 3.0), (1.9, -2.0, 4.0), (2.8, 1.0, 0.0)]
+)
 def test_the_motion_of_a_top_is_the_quadrature_of_its_cubic(spin, lean, phi, theta):
     across, moment = 2e-4, 0.03924
     turning = across * phi * np.sin(lean) ** 2
     vertical = turning + spin * np.cos(lean)
     energy = 0.5 * across * ((phi * np.sin(lean)) ** 2 + theta**2) + moment * np.cos(lean)
     alpha, beta, b, c = 2 * moment / across, 2 * energy / across, vertical / across, spin / across
-    low, high, top = np.sort(np.roots([alpha, -(beta + c * c), 2 * b * c - alpha, beta - b * b]).real)
+    low, high, top = np.sort(
+        np.roots([alpha, -(beta + c * c), 2 * b * c - alpha, beta - b * b]).real
+    )
 
     def over_a_period(of):
         middle, half = (low + high) / 2, (high - low) / 2
-        speed = lambda u: np.sqrt(alpha * (top - u))  # noqa: E731
-        inner = lambda s: of(middle + half * np.sin(s)) / speed(middle + half * np.sin(s))  # noqa: E731
+
+        def speed(u):
+            return np.sqrt(alpha * (top - u))
+
+        def inner(s):
+            return of(middle + half * np.sin(s)) / speed(middle + half * np.sin(s))
+
         return 2 * quad(inner, -np.pi / 2, np.pi / 2, epsabs=0, epsrel=1e-11, limit=500)[0]
 
     period = over_a_period(lambda u: 1.0)
@@ -59,7 +74,9 @@ def test_the_motion_of_a_top_is_the_quadrature_of_its_cubic(spin, lean, phi, the
     assert found.precession == pytest.approx(angle / period, rel=1e-8)
 
 
-@pytest.mark.parametrize("omega", [[0.0, 30.0, 0.05], [0.3, 2.0, 0.1], [1.0, 0.1, 0.2], [0.1, 0.2, 3.0]])
+@pytest.mark.parametrize(
+    "omega", [[0.0, 30.0, 0.05], [0.3, 2.0, 0.1], [1.0, 0.1, 0.2], [0.1, 0.2, 3.0]]
+)
 @pytest.mark.parametrize("inertia", [[9.82e-6, 1.338e-5, 2.263e-5], [3.0, 1.0, 2.0]])
 def test_the_period_of_a_free_body_is_an_elliptic_integral(inertia, omega):
     inertia, omega = np.array(inertia), np.array(omega)
@@ -79,10 +96,16 @@ def test_rotation_about_the_middle_axis_never_returns():
 
 def test_steady_precession_has_the_slow_root_of_the_quadratic():
     momentum, moment, across = 5e-5 * SPIN, 0.1 * 9.81 * 0.04, 2e-4
-    slow = (momentum - np.sqrt(momentum**2 - 4 * across * np.cos(LEAN) * moment)) / (2 * across * np.cos(LEAN))
+    slow = (momentum - np.sqrt(momentum**2 - 4 * across * np.cos(LEAN) * moment)) / (
+        2 * across * np.cos(LEAN)
+    )
     assert slow == pytest.approx(4.2345866, abs=1e-7)
     turn = [slow, 0.0, SPIN - slow * np.cos(LEAN)]
-    found = rates(rigidmd.Scene.from_dict(TEXTBOOK | {"start": TEXTBOOK["start"] | {"euler_rates_rad_s": turn}}))
+    found = rates(
+        rigidmd.Scene.from_dict(
+            TEXTBOOK | {"start": TEXTBOOK["start"] | {"euler_rates_rad_s": turn}}
+        )
+    )
     assert found["precession_rad_s"] == pytest.approx((slow, slow), rel=1e-11)
     assert found["spin_rad_s"] == (pytest.approx(SPIN, rel=1e-13), None)
     assert "nutation_period_s" not in found  # theta is constant
@@ -100,8 +123,15 @@ TURNED = {
 def test_precession_is_about_the_direction_of_gravity(name):
     inertia, centre, angles, omega = TURNED[name]
     body = TEXTBOOK["body"] | {"inertia_kg_m2": inertia, "centre_of_mass_m": centre}
-    start = {"yaw_pitch_roll_deg": np.degrees(angles).tolist(), "angular_velocity_body_rad_s": omega}
-    scene = TEXTBOOK | {"body": body, "start": start, "gravity": {"acceleration_m_s2": [-3.0, 8.0, -6.0]}}
+    start = {
+        "yaw_pitch_roll_deg": np.degrees(angles).tolist(),
+        "angular_velocity_body_rad_s": omega,
+    }
+    scene = TEXTBOOK | {
+        "body": body,
+        "start": start,
+        "gravity": {"acceleration_m_s2": [-3.0, 8.0, -6.0]},
+    }
     found = rates(rigidmd.Scene.from_dict(scene))
     assert {"precession_rad_s", "nutation_period_s", "spin_rad_s"} == set(found)
     for key in ("precession_rad_s", "nutation_period_s"):
@@ -109,7 +139,9 @@ def test_precession_is_about_the_direction_of_gravity(name):
         assert measured == pytest.approx(theory, rel=1e-7), key
 
 
-@pytest.mark.parametrize(("name", "duration"), [("heavy_top_2", 0.4), ("heavy_top_4", 1.0), ("heavy_top_6", 1.5)])
+@pytest.mark.parametrize(
+    ("name", "duration"), [("heavy_top_2", 0.4), ("heavy_top_4", 1.0), ("heavy_top_6", 1.5)]
+)
 def test_tops_that_nutate_precess_as_in_theory_on_average(name, duration):
     found = rates(shipped(name, run__duration_s=duration))
     for key in ("precession_rad_s", "nutation_period_s"):
@@ -136,7 +168,9 @@ def test_a_wobble_about_a_stable_axis_is_no_flip():
     assert measured == pytest.approx(theory, rel=1e-9)
 
 
-@pytest.mark.parametrize(("name", "along"), [("free_symmetric_top_oblate", 30.0), ("free_symmetric_top_prolate", 20.0)])
+@pytest.mark.parametrize(
+    ("name", "along"), [("free_symmetric_top_oblate", 30.0), ("free_symmetric_top_prolate", 20.0)]
+)
 def test_a_free_symmetric_top_precesses_about_its_angular_momentum(name, along):
     results = rigidmd.Simulation(shipped(name, run__duration_s=0.5)).run()
     found, system = results.summary["rates"], results.system
@@ -149,14 +183,20 @@ def test_a_free_symmetric_top_precesses_about_its_angular_momentum(name, along):
 
 def test_rates_without_a_closed_form_have_no_theory():
     short = TEXTBOOK | {"run": {"duration_s": 0.6, "timestep_s": 1e-3}}
-    rubbed = rates(rigidmd.Scene.from_dict(short | {"friction": {"viscous_N_m_s": [1e-6, 1e-6, 1e-6]}}))
-    pushed = rates(rigidmd.Scene.from_dict(short), applied={"push": lambda pose: ([0, 0, 0], [1e-4, 0, 0])})
+    rubbed = rates(
+        rigidmd.Scene.from_dict(short | {"friction": {"viscous_N_m_s": [1e-6, 1e-6, 1e-6]}})
+    )
+    pushed = rates(
+        rigidmd.Scene.from_dict(short), applied={"push": lambda pose: ([0, 0, 0], [1e-4, 0, 0])}
+    )
     for found in (rubbed, pushed):
         assert found["precession_rad_s"][0] == pytest.approx(4.3, abs=0.3)
         assert {theory for _, theory in found.values()} == {None}
 
 
-@pytest.mark.parametrize("name", ["dropped_stone", "gyrocompass", "satellite_wheel", "body_in_fluid"])
+@pytest.mark.parametrize(
+    "name", ["dropped_stone", "gyrocompass", "satellite_wheel", "body_in_fluid"]
+)
 def test_bodies_that_do_none_of_this_have_no_rates(name):
     duration = 200.0 if name == "gyrocompass" else 1.0
     assert rates(shipped(name, run__duration_s=duration)) == {}
@@ -166,9 +206,19 @@ def test_a_run_that_is_too_short_has_the_theory_only(tmp_path, capsys):
     found = rates(shipped("heavy_top_3", run__duration_s=0.2))
     assert found["nutation_period_s"] == (None, pytest.approx(0.33876572785788))
     assert found["precession_rad_s"][0] is None
-    short = ["--set", "run.duration_s=0.2", "--set", "output.figures=false", "-o", str(tmp_path / "short")]
+    short = [
+        "--set",
+        "run.duration_s=0.2",
+        "--set",
+        "output.figures=false",
+        "-o",
+        str(tmp_path / "short"),
+    ]
     assert main(["run", str(SYSTEMS / "heavy_top_3.toml"), *short]) == 0
-    assert "every 0.3387657 s in theory; fewer than two periods in the samples" in capsys.readouterr().out
+    assert (
+        "every 0.3387657 s in theory; fewer than two periods in the samples"
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])

@@ -1,4 +1,5 @@
-"""A run of a single body from end to end: the commands, every file written and read back, interruption."""
+"""A run of a single body from end to end: the commands, every file written and read back,
+interruption."""
 
 import csv
 import json
@@ -34,19 +35,55 @@ def test_a_run_leaves_what_it_promises(tmp_path, capsys):
     said = capsys.readouterr().out
     for part in ("3 degrees of freedom", "L_z error", "orthogonality", "motion.csv", "axis.png"):
         assert part in said
-    names = {path.name for path in folder.iterdir() if not path.name.startswith((".rigidmd", "checkpoint"))}
-    figures = {f"{name}.{end}" for name in ("axis", "angles", "omega", "invariants") for end in ("png", "svg")}
-    files = {"scene.toml", "motion.csv", "motion.npz", "summary.json", "topology.pdb", "trajectory.xtc"}
+    names = {
+        path.name
+        for path in folder.iterdir()
+        if not path.name.startswith((".rigidmd", "checkpoint"))
+    }
+    figures = {
+        f"{name}.{end}"
+        for name in ("axis", "angles", "omega", "invariants")
+        for end in ("png", "svg")
+    }
+    files = {
+        "scene.toml",
+        "motion.csv",
+        "motion.npz",
+        "summary.json",
+        "topology.pdb",
+        "trajectory.xtc",
+    }
     assert names == figures | files
     assert (folder / "axis.png").read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in (folder / "axis.svg").read_bytes()[:1000]
     columns = read(folder / "motion.csv")
-    wanted = ["time", "x", "y", "z", "vx", "vy", "vz", *(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "qw", "qx", "qy",
-              "qz", "phi", "theta", "psi", "kinetic", "potential", "energy", "work"]  # fmt: skip
+    wanted = [
+        "time",
+        "x",
+        "y",
+        "z",
+        "vx",
+        "vy",
+        "vz",
+        *(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
+        "qw",
+        "qx",
+        "qy",
+        "qz",
+        "phi",
+        "theta",
+        "psi",
+        "kinetic",
+        "potential",
+        "energy",
+        "work",
+    ]
     wanted += [f"{name}_body_{k}" for name in ("omega", "L") for k in (1, 2, 3)]
     wanted += [f"{name}_lab_{k}" for name in ("omega", "L") for k in "xyz"]
     assert set(wanted) <= {header.split()[0] for header in columns}
-    assert {"energy_error", "L_z_error", "L_3_error", "orthogonality_error", "qw", "q23"} <= set(columns)
+    assert {"energy_error", "L_z_error", "L_3_error", "orthogonality_error", "qw", "q23"} <= set(
+        columns
+    )
     assert {
         "time (s)",
         "x (m)",
@@ -94,14 +131,21 @@ def test_a_motion_without_units_in_its_header_is_read_as_well(tmp_path, capsys):
 
 
 def test_columns_agree_with_each_other():
-    results = Simulation(Scene.read(ROOT / "systems" / "gyroscope_friction.toml",
-                                    {"run.duration_s": 0.2, "output.interval_s": 1e-4})).run()  # fmt: skip
+    results = Simulation(
+        Scene.read(
+            ROOT / "systems" / "gyroscope_friction.toml",
+            {"run.duration_s": 0.2, "output.interval_s": 1e-4},
+        )
+    ).run()
     q = np.stack([results[f"q{i}{j}"] for i in (1, 2, 3) for j in (1, 2, 3)], -1).reshape(-1, 3, 3)
     w = np.stack([results[f"omega_body_{k}"] for k in (1, 2, 3)], -1)
     x = np.stack([results[k] for k in "xyz"], -1)
     assert x == pytest.approx(0.04 * q[:, :, 2], abs=1e-15)
     speed = np.gradient(x, results["time"], axis=0, edge_order=2)
-    assert np.abs(speed - np.stack([results[f"v{k}"] for k in "xyz"], -1)).max() < 1e-4 * np.abs(speed).max()
+    assert (
+        np.abs(speed - np.stack([results[f"v{k}"] for k in "xyz"], -1)).max()
+        < 1e-4 * np.abs(speed).max()
+    )
     lab = np.stack([results[f"omega_lab_{k}"] for k in "xyz"], -1)
     assert lab == pytest.approx(np.einsum("tij,tj->ti", q, w), abs=1e-12)
     assert results["L_body_3"] == pytest.approx(1.2e-4 * w[:, 2], rel=1e-14)
@@ -115,9 +159,16 @@ def test_columns_agree_with_each_other():
 
 @pytest.mark.parametrize("name", ["trajectory.xtc", "t.trr", "t.nc", "t.xyz", "t.pdb"])
 def test_trajectories_show_the_body(name, tmp_path):
-    scene = Scene.read(ROOT / "systems" / "body_in_fluid.toml", {
-        "run.duration_s": 0.05, "output.interval_s": 0.01, "output.trajectory": name, "output.figures": False,
-        "start.velocity_m_s": [0.3, 0.2, 0.1]})  # fmt: skip
+    scene = Scene.read(
+        ROOT / "systems" / "body_in_fluid.toml",
+        {
+            "run.duration_s": 0.05,
+            "output.interval_s": 0.01,
+            "output.trajectory": name,
+            "output.figures": False,
+            "start.velocity_m_s": [0.3, 0.2, 0.1],
+        },
+    )
     results = Simulation(scene, tmp_path / "run").run()
     universe = mda.Universe(str(tmp_path / "run" / "topology.pdb"), str(tmp_path / "run" / name))
     assert len(universe.trajectory) == 6
@@ -133,7 +184,10 @@ def test_trajectories_show_the_body(name, tmp_path):
             assert frame.velocities.mean(axis=0) == pytest.approx(speed, abs=1e-3)
         if name not in ("t.xyz", "t.pdb"):
             assert frame.time == pytest.approx(0.01 * k, abs=1e-6)
-    for universe in (results.universe(), Simulation(scene).run().universe()):  # a second as a picosecond
+    for universe in (
+        results.universe(),
+        Simulation(scene).run().universe(),
+    ):  # a second as a picosecond
         trajectory = universe.trajectory
         assert [frame.time for frame in trajectory] == results["time"].tolist()
         assert (trajectory.dt, trajectory.totaltime) == (results["time"][1], results["time"][-1])
@@ -171,8 +225,16 @@ def test_an_observer_sees_the_body_and_an_interrupted_run_keeps_what_it_has(tmp_
 
 
 def test_a_run_that_fails_keeps_the_motion_so_far(tmp_path):
-    scene = Scene.read(TOP, {"output.figures": False, "run.integrator": "rk4", "run.formulation": "euler_angles",
-                             "start.euler_angles_deg": [0.0, 1e-3, 0.0], "start.euler_rates_rad_s": [0.0, -5.0, 0.0]})  # fmt: skip
+    scene = Scene.read(
+        TOP,
+        {
+            "output.figures": False,
+            "run.integrator": "rk4",
+            "run.formulation": "euler_angles",
+            "start.euler_angles_deg": [0.0, 1e-3, 0.0],
+            "start.euler_rates_rad_s": [0.0, -5.0, 0.0],
+        },
+    )
     with pytest.raises(SimulationError, match=r"singular at t = .* too near 0"):
         Simulation(scene, tmp_path / "run").run()
     assert len(read(tmp_path / "run" / "motion.csv")["time (s)"]) >= 1
@@ -203,18 +265,25 @@ def test_resolved_scenes_hold_what_a_solver_needs(name, integrator, tmp_path):
     assert resolved.run.relative_tolerance == resolved.run.absolute_tolerance == tolerance
     assert resolved.watch.orthogonality == 0.1
     write_scene(tmp_path, resolved)
-    assert rigidmd.resolve(Scene.read(tmp_path / "scene.toml")).model_dump() == resolved.model_dump()
+    assert (
+        rigidmd.resolve(Scene.read(tmp_path / "scene.toml")).model_dump() == resolved.model_dump()
+    )
 
 
 def test_wheels_are_shown(tmp_path):
-    results = Simulation(Scene.read(ROOT / "systems" / "satellite_wheel.toml"), tmp_path / "run").run()
+    results = Simulation(
+        Scene.read(ROOT / "systems" / "satellite_wheel.toml"), tmp_path / "run"
+    ).run()
     assert results["h_body_3"][-1] == pytest.approx(0.4)
     assert (tmp_path / "run" / "omega.png").is_file()
     assert repr(results).count("\n") == 0
 
 
 def test_a_run_says_what_is_wrong_with_it():
-    scene = Scene.read(TOP, {"output.trajectory": False, "run.integrator": "velocity_verlet", "run.timestep_s": 0.06})
+    scene = Scene.read(
+        TOP,
+        {"output.trajectory": False, "run.integrator": "velocity_verlet", "run.timestep_s": 0.06},
+    )
     simulation = Simulation(scene)
     said = simulation.introduction() + simulation.conclusion(simulation.run())
     assert "timestep_s is too long for this motion" in said
@@ -223,14 +292,20 @@ def test_a_run_says_what_is_wrong_with_it():
 
 
 def test_what_a_trajectory_cannot_hold_is_told(tmp_path):
-    stone = {"body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.05}},
-             "run": {"duration_s": 1.0, "timestep_s": 0.1}, "output": {"figures": False}}  # fmt: skip
+    stone = {
+        "body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.05}},
+        "run": {"duration_s": 1.0, "timestep_s": 0.1},
+        "output": {"figures": False},
+    }
     with pytest.raises(SceneError, match=r"start.position_m is 2e\+05 Å in the trajectory"):
-        Simulation(Scene.from_dict(stone | {"start": {"position_m": [0.0, 0.0, 1000.0]}}), tmp_path / "far")
+        Simulation(
+            Scene.from_dict(stone | {"start": {"position_m": [0.0, 0.0, 1000.0]}}), tmp_path / "far"
+        )
     for speed in (1e7, 1e60):  # the second one is beyond single precision, too
         fast = Scene.from_dict(stone | {"start": {"velocity_m_s": [speed, 0.0, 0.0]}})
         with pytest.raises(
-            SimulationError, match=r"beyond the 2e\+07 Å that .xtc .output.trajectory. can hold.* The motion so far"
+            SimulationError,
+            match=r"beyond the 2e\+07 Å that .xtc .output.trajectory. can hold.* The motion so far",
         ):
             Simulation(fast, tmp_path / f"{speed:g}").run()
         assert (tmp_path / f"{speed:g}" / "motion.csv").is_file()
@@ -239,7 +314,9 @@ def test_what_a_trajectory_cannot_hold_is_told(tmp_path):
 @pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
 def test_the_scene_that_a_run_writes_runs_again_to_the_same_bits(integrator, tmp_path):
     changes = {"run.duration_s": 0.05, "run.integrator": integrator}
-    first = Simulation(Scene.read(ROOT / "systems" / "heavy_top_3.toml", changes), tmp_path / "out").run()
+    first = Simulation(
+        Scene.read(ROOT / "systems" / "heavy_top_3.toml", changes), tmp_path / "out"
+    ).run()
     again = Scene.read(tmp_path / "out" / "scene.toml")
     assert again.output.interval_s is not None
     assert (again.run.formulation is None) == (integrator == "velocity_verlet")
@@ -260,12 +337,17 @@ def test_the_scene_that_a_run_writes_runs_again_to_the_same_bits(integrator, tmp
     ],
 )
 def test_a_topology_holds_the_first_place(output, position, topology):
-    data = {"body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.2}}, "start": {"position_m": position},
-            "run": {"duration_s": 0.1, "timestep_s": 0.01}}  # fmt: skip
+    data = {
+        "body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.2}},
+        "start": {"position_m": position},
+        "run": {"duration_s": 0.1, "timestep_s": 0.01},
+    }
     assert build_body(Scene.from_dict(data | {"output": output})).scene.output.topology == topology
     with pytest.raises(SceneError, match=r"which t\.pdb cannot hold"):
         build_body(
-            Scene.from_dict(data | {"output": {"topology": "t.pdb"}, "start": {"position_m": [0.0, 0.0, -30.0]}})
+            Scene.from_dict(
+                data | {"output": {"topology": "t.pdb"}, "start": {"position_m": [0.0, 0.0, -30.0]}}
+            )
         )
     with pytest.raises(SceneError, match=r"are both topology\.pdb"):
         Scene.from_dict(data | {"output": {"trajectory": "topology.pdb"}})
@@ -299,7 +381,9 @@ def stiff(tmp_path, friction, integrator="dop853"):
 
 
 @pytest.mark.parametrize("integrator", ["dop853", "radau"])
-def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to_the_same_bits(tmp_path, integrator):
+def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to_the_same_bits(
+    tmp_path, integrator
+):
     scene = stiff(tmp_path, 1e3, integrator)
     whole = Simulation(scene, tmp_path / "whole", warn=str).run()
     for name, after in (("early", 3), ("late", 10 if integrator == "radau" else 250)):
@@ -310,7 +394,9 @@ def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to
         def counting(reset=reset, run=run, counted=counted):
             reset()
             halts = run.engine.stop_requested
-            run.engine.stop_requested = lambda: halts() or (next(counted, None) is None and (run.stop(15) or True))
+            run.engine.stop_requested = lambda: (
+                halts() or (next(counted, None) is None and (run.stop(15) or True))
+            )
 
         run.part.reset = counting
         results = run.run()
@@ -320,14 +406,18 @@ def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to
         if integrator == "dop853":
             Simulation(scene, tmp_path / name, resume=True, warn=str).run()
             for file in ("motion.csv", "trajectory.xtc"):
-                assert (tmp_path / name / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
+                assert (tmp_path / name / file).read_bytes() == (
+                    tmp_path / "whole" / file
+                ).read_bytes()
     assert whole["time"][-1] == pytest.approx(0.02)
 
 
 def test_a_stiff_motion_ends_in_its_time_with_advice(tmp_path, monkeypatch):
     scene = stiff(tmp_path, 1e7)
     looks = iter(range(400))
-    monkeypatch.setattr(CheckpointSchedule, "time_is_up", property(lambda self: next(looks, None) is None))
+    monkeypatch.setattr(
+        CheckpointSchedule, "time_is_up", property(lambda self: next(looks, None) is None)
+    )
     results = Simulation(scene, tmp_path / "out", warn=str).run()
     assert results.interrupted
     assert results.out_of_time
@@ -336,7 +426,9 @@ def test_a_stiff_motion_ends_in_its_time_with_advice(tmp_path, monkeypatch):
 
 
 def test_a_motion_that_is_not_stiff_gets_no_such_advice():
-    scene = Scene.read(TOP, {"run.integrator": "dop853", "run.duration_s": 0.5, "output.interval_s": 0.01})
+    scene = Scene.read(
+        TOP, {"run.integrator": "dop853", "run.duration_s": 0.5, "output.interval_s": 0.01}
+    )
     run = Simulation(scene)
     run.run()
     assert run.engine.chosen_steps[0] > 50
@@ -354,21 +446,37 @@ assert not linecache.cache  # pydantic reads sources at the import of a scene if
 assert main(["run", sys.argv[1], "--set", "run.duration_s=0.01", "--output", sys.argv[2]]) == 0
 """
     scene, folder = ROOT / "systems" / "heavy_top_3.toml", tmp_path / "run"
-    done = subprocess.run([sys.executable, "-c", script, scene, folder], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script, scene, folder], capture_output=True, text=True, check=True
+    )
     threshold, frozen, *loaded = done.stdout.splitlines()[-1].split()
-    unused = {"ase", "rigidmd.engines.ode.engine", "rigidmd.forces.ewald.pme", "rigidmd.run.molecular", "rigidmd.view",
-              "matplotlib.pyplot", "scipy.integrate", "scipy.interpolate"}  # fmt: skip
+    unused = {
+        "ase",
+        "rigidmd.engines.ode.engine",
+        "rigidmd.forces.ewald.pme",
+        "rigidmd.run.molecular",
+        "rigidmd.view",
+        "matplotlib.pyplot",
+        "scipy.integrate",
+        "scipy.interpolate",
+    }
     assert unused & set(loaded) == set()
-    assert int(threshold) >= 10_000 and int(frozen) > 100_000  # no search for garbage among what is imported
+    assert (
+        int(threshold) >= 10_000 and int(frozen) > 100_000
+    )  # no search for garbage among what is imported
     assert (folder / "axis.png").is_file()
 
 
 def test_a_figure_is_laid_out_once_and_drawn_once_for_each_file(tmp_path, monkeypatch):
     drawn, laid_out = [], []
     draw, lay_out = Picture.draw, ConstrainedLayoutEngine.execute
-    monkeypatch.setattr(Picture, "draw", lambda figure, renderer: (drawn.append(figure), draw(figure, renderer)))
     monkeypatch.setattr(
-        ConstrainedLayoutEngine, "execute", lambda engine, figure: (laid_out.append(figure), lay_out(engine, figure))
+        Picture, "draw", lambda figure, renderer: (drawn.append(figure), draw(figure, renderer))
+    )
+    monkeypatch.setattr(
+        ConstrainedLayoutEngine,
+        "execute",
+        lambda engine, figure: (laid_out.append(figure), lay_out(engine, figure)),
     )
     scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.01})
     files = Simulation(scene, tmp_path / "run").run().files

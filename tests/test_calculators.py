@@ -20,26 +20,38 @@ from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
 
 NO_FORCES = {"lennard_jones": False, "electrostatics": "none"}
-#: Two sites, far enough from each other for ASE, which has a Lennard-Jones energy within molecules too.
+#: Two sites, far enough from each other for ASE, which has a Lennard-Jones energy within molecules
+#: too.
 ROD = {
     "name": "rod",
     "sites": [
-        {"name": f"A{k}", "element": "Ar", "mass_u": 40.0, "position_A": [x, 0, 0], "sigma_A": 3.4, "epsilon_kJ_mol": 1.0}
+        {
+            "name": f"A{k}",
+            "element": "Ar",
+            "mass_u": 40.0,
+            "position_A": [x, 0, 0],
+            "sigma_A": 3.4,
+            "epsilon_kJ_mol": 1.0,
+        }
         for k, x in enumerate((-1.9, 1.9))
     ],
-}  # fmt: skip
+}
 
 
 def waters(model, count=4, **tables):
     stages = [{"duration_ps": 0.1, "timestep_fs": 1.0}]
-    return small_scene({model: count}, None, start={"temperature_K": 300.0}, stages=stages, **tables)
+    return small_scene(
+        {model: count}, None, start={"temperature_K": 300.0}, stages=stages, **tables
+    )
 
 
 @pytest.mark.parametrize(("model", "calculator"), [("tip3p", TIP3P), ("tip4p", TIP4P)])
 def test_the_first_steps_are_those_of_the_built_in_model(model, calculator):
     """TIP4P has a massless site, which is not among the atoms."""
     scene = waters(model)
-    data = scene.model_dump(exclude_defaults=True) | {"molecules": [ase_sites(model) | {"count": 4}]}
+    data = scene.model_dump(exclude_defaults=True) | {
+        "molecules": [ase_sites(model) | {"count": 4}]
+    }
     built_in = Simulation(Scene.from_dict(data)).run()
     data = scene.model_dump(exclude_defaults=True) | {"forces": NO_FORCES}
     force = CalculatorForce(calculator(rc=1e4, width=1.0))
@@ -54,18 +66,27 @@ def test_the_first_steps_are_those_of_the_built_in_model(model, calculator):
 
 def rods(**forces):
     """Rods and argon in a triclinic box, with a barostat for its three edges."""
-    stage = {"ensemble": "npt", "temperature_K": 120.0, "pressure_bar": 500.0, "timestep_fs": 2.0, "duration_ps": 0.2}
+    stage = {
+        "ensemble": "npt",
+        "temperature_K": 120.0,
+        "pressure_bar": 500.0,
+        "timestep_fs": 2.0,
+        "duration_ps": 0.2,
+    }
     argon = {"name": "argon", "sites": [ROD["sites"][0] | {"position_A": [0.0, 0.0, 0.0]}]}
     return Scene.from_dict(
         {
             "box": {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 75.0, 85.0]},
             "molecules": [ROD | {"count": 40}, argon | {"count": 30}],
-            "forces": {"cutoff_A": 8.0, "electrostatics": "none", "tail_correction": False} | forces,
-            "start": {"temperature_K": 120.0}, "seed": 5, "precision": "double",
+            "forces": {"cutoff_A": 8.0, "electrostatics": "none", "tail_correction": False}
+            | forces,
+            "start": {"temperature_K": 120.0},
+            "seed": 5,
+            "precision": "double",
             "stages": [stage | {"pressure_coupling": "anisotropic"}],
             "output": {"trajectory": False, "log_interval_ps": 0.02},
         }
-    )  # fmt: skip
+    )
 
 
 def test_energy_pressure_and_a_barostat_in_a_triclinic_box_are_those_of_the_built_in_forces():
@@ -82,7 +103,8 @@ def test_energy_pressure_and_a_barostat_in_a_triclinic_box_are_those_of_the_buil
 
 
 class Springs(Calculator):
-    """Springs between all atoms. Counts its calls; `wrong` forces, random noise of energies, or an error on request."""
+    """Springs between all atoms. Counts its calls; `wrong` forces, random noise of energies, or an
+    error on request."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 
@@ -98,7 +120,10 @@ class Springs(Calculator):
             raise RuntimeError("no\n convergence")
         apart = self.atoms.positions[:, None] - self.atoms.positions
         noise = self.noise * self.rng.standard_normal()
-        self.results = {"energy": 5e-4 * (apart**2).sum() + noise, "forces": -2e-3 * self.wrong * apart.sum(axis=1)}
+        self.results = {
+            "energy": 5e-4 * (apart**2).sum() + noise,
+            "forces": -2e-3 * self.wrong * apart.sum(axis=1),
+        }
 
 
 def springs(**tables):
@@ -120,7 +145,9 @@ def test_there_is_one_call_for_each_new_configuration():
 
 
 def start(energy_noise_eV=0.0, **options):
-    Simulation(springs(), forces=[CalculatorForce(Springs(**options), energy_noise_eV=energy_noise_eV)]).step()
+    Simulation(
+        springs(), forces=[CalculatorForce(Springs(**options), energy_noise_eV=energy_noise_eV)]
+    ).step()
 
 
 def test_forces_that_are_not_the_derivative_are_refused_and_noise_may_be_given():
@@ -135,7 +162,8 @@ def test_forces_that_are_not_the_derivative_are_refused_and_noise_may_be_given()
 
 def test_an_error_of_the_calculator_names_step_and_atoms():
     with pytest.raises(
-        SceneError, match=r"calculator Springs raised RuntimeError: no convergence at step 0; the closest"
+        SceneError,
+        match=r"calculator Springs raised RuntimeError: no convergence at step 0; the closest",
     ):
         start(fails_at=0)
     calculator = Springs()
@@ -143,7 +171,8 @@ def test_an_error_of_the_calculator_names_step_and_atoms():
     simulation.step(20)
     calculator.fails_at = calculator.calls + 5
     with pytest.raises(
-        SimulationError, match=r"at step 2[4-6]; the closest atoms of different .* of molecule \d and [OH] of"
+        SimulationError,
+        match=r"at step 2[4-6]; the closest atoms of different .* of molecule \d and [OH] of",
     ):
         simulation.step(20)
 
@@ -170,7 +199,9 @@ def test_a_calculator_without_stress():
             assert "TIP3P has no stress: the pressure does not include it" in notes
 
 
-@pytest.mark.parametrize("given", [{"calculator": 3}, {"calculator": Springs(), "energy_noise_eV": -1.0}])
+@pytest.mark.parametrize(
+    "given", [{"calculator": 3}, {"calculator": Springs(), "energy_noise_eV": -1.0}]
+)
 def test_arguments_that_cannot_be(given):
     with pytest.raises(ValueError, match="must be a"):
         CalculatorForce(**given)
@@ -181,7 +212,9 @@ def test_a_run_resumes_with_the_same_bits(tmp_path):
     whole = Simulation(scene, tmp_path / "whole", forces=[CalculatorForce(Springs())]).run()
     Simulation(scene.with_end(0.05), tmp_path / "run", forces=[CalculatorForce(Springs())]).run()
     again = Scene.read(tmp_path / "run" / "scene.toml").with_end(0.1)
-    results = Simulation(again, tmp_path / "run", forces=[CalculatorForce(Springs())], resume=True).run()
+    results = Simulation(
+        again, tmp_path / "run", forces=[CalculatorForce(Springs())], resume=True
+    ).run()
     assert np.array_equal(results.state.position, whole.state.position)
     assert np.array_equal(results["Springs"][[0, -1]], whole["Springs"])
 
@@ -193,7 +226,9 @@ def test_a_scene_names_a_calculator_in_a_trusted_file(tmp_path, monkeypatch, cap
         "def waters(cutoff):\n    return CalculatorForce(TIP3P(rc=cutoff))\n"
     )
     custom = {"module": "forces.py", "name": "waters", "parameters": {"cutoff": 1e4}}
-    data = waters("tip3p").model_dump(exclude_defaults=True) | {"forces": NO_FORCES | {"custom": [custom]}}
+    data = waters("tip3p").model_dump(exclude_defaults=True) | {
+        "forces": NO_FORCES | {"custom": [custom]}
+    }
     (tmp_path / "s.toml").write_text(tomli_w.dumps(data))
     assert main(["run", "s.toml"]) == 2
     assert "forces.py is Python code" in capsys.readouterr().err
@@ -202,7 +237,8 @@ def test_a_scene_names_a_calculator_in_a_trusted_file(tmp_path, monkeypatch, cap
 
 
 def test_water_by_a_semi_empirical_method():
-    """GFN2-xTB conserves the energy of two rigid waters at 2 fs, with the random error of its iterations."""
+    """GFN2-xTB conserves the energy of two rigid waters at 2 fs, with the random error of its
+    iterations."""
     tblite = pytest.importorskip("tblite.ase")
     calculator = tblite.TBLite(method="GFN2-xTB", verbosity=0, accuracy=0.1)
     force = CalculatorForce(calculator, energy_noise_eV=1e-6)

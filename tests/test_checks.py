@@ -1,4 +1,5 @@
-"""An engine that notices: each kind of finding, what it says, what it leaves behind; and that ordinary runs go on."""
+"""An engine that notices: each kind of finding, what it says, what it leaves behind; and that
+ordinary runs go on."""
 
 import json
 import os
@@ -64,17 +65,30 @@ def test_too_long_a_step_stops_with_all_that_helps(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "Traceback" not in said
     for part in (
-        "warning: stages.1: timestep_fs = 25 is longer than what is stable", "fs, which velocity_verlet follows up to",
-        "stopped at step ", " ps): ", "Likely cause: ", "timestep_fs below", "where the stiffest motion is stable",
-        "Last good state, of step ", "last_good_state.npz",
-    ):  # fmt: skip
+        "warning: stages.1: timestep_fs = 25 is longer than what is stable",
+        "fs, which velocity_verlet follows up to",
+        "stopped at step ",
+        " ps): ",
+        "Likely cause: ",
+        "timestep_fs below",
+        "where the stiffest motion is stable",
+        "Last good state, of step ",
+        "last_good_state.npz",
+    ):
         assert part in said, part
     with np.load(tmp_path / "out" / "last_good_state.npz") as saved:
         assert all(np.isfinite(saved[key]).all() for key in ("position", "velocity", "rotation"))
     assert len((tmp_path / "out" / "log.csv").read_text().splitlines()) > 2
     # the last good state starts a run that goes well
-    again = small_scene({"spce": 40}, None, tmp_path / "out", box={}, start={}, stages=[{"duration_ps": 0.02}],
-                        structure={"file": "last_good_state.npz", "velocities": True})  # fmt: skip
+    again = small_scene(
+        {"spce": 40},
+        None,
+        tmp_path / "out",
+        box={},
+        start={},
+        stages=[{"duration_ps": 0.02}],
+        structure={"file": "last_good_state.npz", "velocities": True},
+    )
     Simulation(again).run()
 
 
@@ -104,15 +118,22 @@ def test_sites_inside_one_another(edge):
 
     said = stopped(small_scene({"argon": 20}, edge), change=overlap)
     assert "changes a momentum of molecule" in said
-    assert "AR of molecule 5 (argon) and AR of molecule 12 (argon) are 1.5 Å apart, 0.44 of their diameter" in said
+    assert (
+        "AR of molecule 5 (argon) and AR of molecule 12 (argon) are 1.5 Å apart, 0.44 of their diameter"
+        in said
+    )
     assert "Likely cause: these sites overlap" in said
     assert "Try a start without overlaps" in said
 
 
 def test_a_charge_on_a_site_without_repulsion(tmp_path):
     ion = {"name": "ion", "count": 5, "sites": [site("X", 20.0, charge=-1.0)]}
-    scene = small_scene({}, 20.0, molecules=[{"model": "tip4p2005", "count": 20}, ion],
-                        stages=[{"duration_ps": 2.0, "timestep_fs": 1.0}])  # fmt: skip
+    scene = small_scene(
+        {},
+        20.0,
+        molecules=[{"model": "tip4p2005", "count": 20}, ion],
+        stages=[{"duration_ps": 2.0, "timestep_fs": 1.0}],
+    )
     said = stopped(scene, tmp_path / "out")
     assert "of molecule 24 (ion) are" in said
     assert "HW1 of molecule 5 (tip4p2005)" in said
@@ -127,8 +148,14 @@ def test_a_charge_on_a_site_without_repulsion(tmp_path):
 
 def test_bad_inertia():
     arms = [site(f"H{k}", 1e-5, (x, 0.6, 0.0), 0.4) for k, x in enumerate((-0.8, 0.8))]
-    light = {"name": "light", "count": 30, "sites": [site("O", 18.0, charge=-0.8, sigma=3.1), *arms]}
-    said = stopped(small_scene({}, 20.0, molecules=[light], stages=[{"duration_ps": 0.5, "timestep_fs": 1.0}]))
+    light = {
+        "name": "light",
+        "count": 30,
+        "sites": [site("O", 18.0, charge=-0.8, sigma=3.1), *arms],
+    }
+    said = stopped(
+        small_scene({}, 20.0, molecules=[light], stages=[{"duration_ps": 0.5, "timestep_fs": 1.0}])
+    )
     assert "(light)" in said
     assert "Likely cause: bad inertia: a moment of light is 1.3e-05 u Å²" in said
     assert "more of its mass on the outer sites" in said
@@ -156,10 +183,14 @@ def test_a_load_that_is_no_number(name):
 
 @pytest.mark.parametrize("name", ["force", "torque_body", "velocity", "angular_momentum_body"])
 def test_a_bound_on_all_molecules_hides_no_finding(monkeypatch, name):
-    """One number of one molecule grows through its limit: found at the same size as if each molecule were looked at."""
+    """One number of one molecule grows through its limit: found at the same size as if each
+    molecule were looked at."""
     system = build(small_scene({"spce": 20, "nitrogen": 20}, 30.0))
     load, _ = system.engine().evaluate(system.state)
-    verlet, number = SCHEMES["velocity_verlet"], getattr(load if name in load._fields else system.state, name)
+    verlet, number = (
+        SCHEMES["velocity_verlet"],
+        getattr(load if name in load._fields else system.state, name),
+    )
 
     check = watch.StepCheck(system, system.scene.watch)
     check.thermal = 250.0
@@ -180,7 +211,8 @@ def test_a_bound_on_all_molecules_hides_no_finding(monkeypatch, name):
 
 
 def test_a_thermostat_is_held_to_its_own_time_only():
-    """A drift that a thermostat carries off may add up to any size; within its time constant it may not."""
+    """A drift that a thermostat carries off may add up to any size; within its time constant it may
+    not."""
     nvt = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]
     scene = small_scene({"spce": 40}, 18.5, stages=nvt, output={"log_interval_ps": 0.05})
     system, simulation = build(scene), Simulation(scene)
@@ -188,8 +220,13 @@ def test_a_thermostat_is_held_to_its_own_time_only():
     drifted = rows[-1]._replace(drift=rows[-3].drift + 0.4 * rows[-3].kinetic)
     limits = system.scene.watch
     assert watch.check_sample(system, limits, rows[-3], drifted) is None
-    assert watch.check_sample(system, limits, rows[-3], drifted._replace(drift=rows[-3].drift - rows[-3].kinetic))
-    assert watch.check_sample(system, limits, rows[0], rows[-1]._replace(drift=3 * rows[-1].kinetic)) is None
+    assert watch.check_sample(
+        system, limits, rows[-3], drifted._replace(drift=rows[-3].drift - rows[-3].kinetic)
+    )
+    assert (
+        watch.check_sample(system, limits, rows[0], rows[-1]._replace(drift=3 * rows[-1].kinetic))
+        is None
+    )
 
 
 def test_limits_can_be_set_and_lifted(capsys, tmp_path):
@@ -220,40 +257,61 @@ def test_limits_can_be_set_and_lifted(capsys, tmp_path):
     [
         ({"spce": 40}, 18.5, 1000.0, {"timestep_fs": 2.0}),
         ({"spce": 40}, 18.5, 0.0, {"timestep_fs": 4.0}),
-        ({"spce": 40}, 18.5, 300.0, {"timestep_fs": 8.0, "ensemble": "nvt", "temperature_K": 300.0}),
+        (
+            {"spce": 40},
+            18.5,
+            300.0,
+            {"timestep_fs": 8.0, "ensemble": "nvt", "temperature_K": 300.0},
+        ),
         ({"argon": 60}, 20.0, 1e5, {"timestep_fs": 0.5}),
         ({"tip4p2005": 3}, None, 0.0, {"timestep_fs": 2.0}),
         ({"nitrogen": 2}, None, 1e4, {"timestep_fs": 1.0}),
         ({"spce": 20, "nitrogen": 10}, 18.5, 300.0, {"timestep_fs": 6.0, "integrator": "srkn_6"}),
     ],
-)  # fmt: skip
+)
 def test_ordinary_and_hot_runs_go_on(counts, edge, kelvin, stage):
     stage = {"duration_ps": 500 * stage["timestep_fs"] / 1000} | stage
     warnings = []
     scene = small_scene(counts, edge, start={"temperature_K": kelvin}, stages=[stage])
     results = Simulation(scene, warn=warnings.append).run()
     # 8 fs is too long for accurate forces on water, and not too long to go on
-    assert ["is inaccurate for spce" in text for text in warnings] == [True] * (stage["timestep_fs"] == 8.0)
+    assert ["is inaccurate for spce" in text for text in warnings] == [True] * (
+        stage["timestep_fs"] == 8.0
+    )
     assert results.summary["stages"][0]["steps"] == 500
 
 
 @pytest.mark.parametrize("spread", [1e-3, 1e-7, 1e-12])
 def test_bodies_that_are_all_but_linear_go_on(spread):
-    """They spin about their axis a thousand times faster than they tumble; their sites hardly feel it."""
+    """They spin about their axis a thousand times faster than they tumble; their sites hardly feel
+    it."""
     arms = [site(f"H{k}", 12.0, (x, spread, 0.0), 0.2) for k, x in enumerate((-1.0, 1.0))]
     thin = {"name": "thin", "count": 20, "sites": [site("O", 16.0, charge=-0.4, sigma=3.1), *arms]}
-    results = Simulation(small_scene({}, 20.0, molecules=[thin], stages=[{"duration_ps": 1.0}])).run()
+    results = Simulation(
+        small_scene({}, 20.0, molecules=[thin], stages=[{"duration_ps": 1.0}])
+    ).run()
     assert np.ptp(results["energy"]) < 0.01 * results["kinetic"].max()
 
 
 @pytest.mark.parametrize(("timestep", "wrong"), [(11.0, True), (2.0, False)])
 def test_a_thermostat_cannot_hide_a_step_that_is_too_long(timestep, wrong):
-    """It takes out in every step what the step has added, so that the temperature of all motion looks right."""
-    stage = {"ensemble": "nvt", "temperature_K": 300.0, "timestep_fs": timestep, "duration_ps": 12.0}
+    """It takes out in every step what the step has added, so that the temperature of all motion
+    looks right."""
+    stage = {
+        "ensemble": "nvt",
+        "temperature_K": 300.0,
+        "timestep_fs": timestep,
+        "duration_ps": 12.0,
+    }
     warm = stage | {"timestep_fs": 2.0, "duration_ps": 1.0}
     stages = [warm, stage | {"thermostat_time_ps": 0.01}]
-    scene = small_scene({"tip4p2005": 40}, 11.0, stages=stages, forces={"cutoff_A": 5.4, "truncation": "smooth_switch"},
-                        watch=dict.fromkeys(("move", "turn_rad", "kick"), False))  # fmt: skip
+    scene = small_scene(
+        {"tip4p2005": 40},
+        11.0,
+        stages=stages,
+        forces={"cutoff_A": 5.4, "truncation": "smooth_switch"},
+        watch=dict.fromkeys(("move", "turn_rad", "kick"), False),
+    )
     results = Simulation(scene).run()
     told = " ".join(note for note in results.summary["notes"] if note.startswith("stages.1"))
     assert ("the conserved energy drifts by" in told) == wrong
@@ -263,7 +321,9 @@ def test_a_thermostat_cannot_hide_a_step_that_is_too_long(timestep, wrong):
 def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
     evaluated, loads = [], []
     evaluate, advance = Engine.evaluate, Engine.advance
-    monkeypatch.setattr(Engine, "evaluate", lambda self, state: evaluated.append(1) or evaluate(self, state))
+    monkeypatch.setattr(
+        Engine, "evaluate", lambda self, state: evaluated.append(1) or evaluate(self, state)
+    )
 
     def counted(self, state, scheme, dt, until, observed=False):
         loads.append(until - state.step[NOW])
@@ -271,7 +331,9 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
 
     monkeypatch.setattr(Engine, "advance", counted)
     ends, costs = [], []
-    quiet = dict.fromkeys(("move", "turn_rad", "kick", "energy", "orthogonality", "stable_step"), False)
+    quiet = dict.fromkeys(
+        ("move", "turn_rad", "kick", "energy", "orthogonality", "stable_step"), False
+    )
     for limits, often in ((quiet, 100_000), ({}, 100_000), ({}, 7)):
         monkeypatch.setattr(watch, "check_interval", lambda system, often=often: often)
         ends.append(Simulation(water(2.0, stages=[{"duration_ps": 0.2}], watch=limits)).run().state)
@@ -288,8 +350,10 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
 def test_a_run_that_nobody_looks_at_is_looked_at(monkeypatch):
     monkeypatch.setattr(watch, "check_interval", lambda system: 20)
     scene = water(16.0, stages=[{"duration_ps": 160.0, "timestep_fs": 16.0}])
-    silent = Scene.from_dict(scene.model_dump(exclude_none=True) | {
-        "output": {"log_interval_ps": 1e6, "trajectory": False}})  # fmt: skip
+    silent = Scene.from_dict(
+        scene.model_dump(exclude_none=True)
+        | {"output": {"log_interval_ps": 1e6, "trajectory": False}}
+    )
     step = int(stopped(silent).split()[3])
     assert step % 20 == 0
     assert step <= 200
@@ -314,27 +378,48 @@ def test_how_far_each_scheme_follows_an_oscillator(name):
 
     limit = stable_angle(scheme)
     assert all(growth(share * limit, 300) < 100 for share in (0.1, 0.5, 0.9, 0.98))
-    if name in ("velocity_verlet", "position_verlet", "yoshida_4", "suzuki_4", "two_stage", "kahan_li_6"):
+    if name in (
+        "velocity_verlet",
+        "position_verlet",
+        "yoshida_4",
+        "suzuki_4",
+        "two_stage",
+        "kahan_li_6",
+    ):
         assert growth(1.02 * limit, 300) > 1e3
-    known = {"velocity_verlet": 2.0, "position_verlet": 2.0, "takahashi_imada": np.sqrt(12), "yoshida_4": 1.573}
+    known = {
+        "velocity_verlet": 2.0,
+        "position_verlet": 2.0,
+        "takahashi_imada": np.sqrt(12),
+        "yoshida_4": 1.573,
+    }
     assert limit == pytest.approx(known.get(name, limit), abs=2e-3)
 
 
 def test_the_stiffest_motion_of_a_dimer():
-    """Two argon atoms at the bottom of their well: mu w² = 57.1464 epsilon / sigma² for Lennard-Jones."""
+    """Two argon atoms at the bottom of their well: mu w² = 57.1464 epsilon / sigma² for
+    Lennard-Jones."""
     system = build(small_scene({"argon": 2}, None, forces={"truncation": "plain"}))
     argon = system.species[0]
     system.state.position[:] = [[0.0, 0.0, 0.0], [0.0, 2 ** (1 / 6) * argon.sigma[0], 0.0]]
-    expected = np.sqrt(36 * 2 ** (2 / 3) * argon.epsilon[0] / argon.sigma[0] ** 2 / (argon.mass / 2))
+    expected = np.sqrt(
+        36 * 2 ** (2 / 3) * argon.epsilon[0] / argon.sigma[0] ** 2 / (argon.mass / 2)
+    )
     assert stiffest_mode(system, system.state).rate == pytest.approx(expected, rel=1e-3)
     system.state.position[1] += 1e4
-    assert stiffest_mode(system, system.state) is None or stiffest_mode(system, system.state).rate < 1e-6
+    assert (
+        stiffest_mode(system, system.state) is None
+        or stiffest_mode(system, system.state).rate < 1e-6
+    )
 
 
 def test_the_stiffest_libration_of_water_is_found_in_few_directions():
-    """Against all directions one by one: the largest eigenvalue of the whole matrix of force differences."""
+    """Against all directions one by one: the largest eigenvalue of the whole matrix of force
+    differences."""
     system = build(water(2.0))
-    simulation = Simulation(water(2.0, stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]))
+    simulation = Simulation(
+        water(2.0, stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}])
+    )
     state = simulation.run().state
     few = stiffest_mode(system, state).rate
     before = stable_step.DIRECTIONS
@@ -347,8 +432,10 @@ def test_the_stiffest_libration_of_water_is_found_in_few_directions():
 
 def test_in_a_large_system_a_slab_tells_the_stiffest_motion(monkeypatch):
     scene = small_scene(
-        {"spce": 300}, 20.8, stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]
-    )  # fmt: skip
+        {"spce": 300},
+        20.8,
+        stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}],
+    )
     simulation = Simulation(scene)
     state = simulation.run().state
     state.position[7] += [41.6, 0.0, -20.8]  # in which box a molecule is does not matter
@@ -379,12 +466,20 @@ def test_a_step_that_is_too_long_is_told_before_the_first_one(tmp_path):
 
 
 def top(**overrides):
-    return Scene.read(TOP, {key.replace("__", "."): value for key, value in overrides.items()} | {
-        f"output.{key}": value for key, value in PLAIN.items()})  # fmt: skip
+    return Scene.read(
+        TOP,
+        {key.replace("__", "."): value for key, value in overrides.items()}
+        | {f"output.{key}": value for key, value in PLAIN.items()},
+    )
 
 
 def test_a_body_whose_energy_goes_wrong(tmp_path, capsys):
-    wrong = dict(run__timestep_s=0.2, run__duration_s=100.0, run__integrator="velocity_verlet", output__interval_s=0.2)
+    wrong = dict(
+        run__timestep_s=0.2,
+        run__duration_s=100.0,
+        run__integrator="velocity_verlet",
+        output__interval_s=0.2,
+    )
     warnings = []
     simulation = Simulation(top(**wrong), tmp_path / "out", warn=warnings.append)
     with pytest.raises(SimulationError) as caught:
@@ -395,12 +490,16 @@ def test_a_body_whose_energy_goes_wrong(tmp_path, capsys):
     assert "The motion so far" in said
     assert len((tmp_path / "out" / "motion.csv").read_text().splitlines()) > 200
     assert warnings[0].startswith("timestep_s = 0.2 is longer than what is stable")
-    sets = [part for key, value in wrong.items() for part in ("--set", f"{key.replace('__', '.')}={value}")]
+    sets = [
+        part
+        for key, value in wrong.items()
+        for part in ("--set", f"{key.replace('__', '.')}={value}")
+    ]
     assert main(["run", str(TOP), "-o", str(tmp_path / "again"), *sets]) == 1
     assert "rigidmd: stopped at step 500" in capsys.readouterr().err
-    assert Simulation(top(**wrong, watch__energy=False)).run().summary["stable_timestep_s"] == pytest.approx(
-        0.085, rel=1e-3
-    )
+    assert Simulation(top(**wrong, watch__energy=False)).run().summary[
+        "stable_timestep_s"
+    ] == pytest.approx(0.085, rel=1e-3)
 
 
 def test_the_start_of_a_body_can_be_asked_for_at_any_step(capsys):
@@ -410,7 +509,9 @@ def test_the_start_of_a_body_can_be_asked_for_at_any_step(capsys):
 
 def test_a_body_that_is_lost_turns_too_far_or_loses_q():
     wild = dict(run__duration_s=30.0, run__integrator="rk4", output__interval_s=0.3)
-    assert "step 4 (1.2 s): position or momentum of the body is not finite" in stopped(top(run__timestep_s=0.3, **wild))
+    assert "step 4 (1.2 s): position or momentum of the body is not finite" in stopped(
+        top(run__timestep_s=0.3, **wild)
+    )
     lost = stopped(top(run__timestep_s=0.02, **wild))
     assert "Q is not a rotation" in lost
     assert "only accuracy keeps Q a rotation under rk4" in lost
@@ -436,10 +537,18 @@ def test_no_shipped_body_is_stopped_or_warned_of(path):
 @pytest.mark.parametrize("resistance", [1e-3, 1.0, 1e3, 1e6])
 def test_a_body_falls_in_oil_of_any_thickness_as_the_closed_form_says(resistance):
     """m dv/dt = m g - c v, with steps from far below m/c to 1e5 of it."""
-    results = Simulation(Scene.from_dict({
-        "body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.05}}, "gravity": {}, "output": PLAIN,
-        "start": {"velocity_m_s": [3.0, 0.0, 0.0]}, "run": {"duration_s": 30.0, "timestep_s": 0.1},
-        "fluid": {"linear_resistance_kg_s": [resistance] * 3}})).run()  # fmt: skip
+    results = Simulation(
+        Scene.from_dict(
+            {
+                "body": {"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 0.05}},
+                "gravity": {},
+                "output": PLAIN,
+                "start": {"velocity_m_s": [3.0, 0.0, 0.0]},
+                "run": {"duration_s": 30.0, "timestep_s": 0.1},
+                "fluid": {"linear_resistance_kg_s": [resistance] * 3},
+            }
+        )
+    ).run()
     kept, terminal = np.exp(-30.0 * resistance), 9.81 / resistance
     expected = [3.0 * kept, 0.0, -terminal * (1 - kept)]
     assert results.state.velocity[0] == pytest.approx(expected, rel=1e-11, abs=1e-11 * terminal)
@@ -449,7 +558,8 @@ def test_a_body_falls_in_oil_of_any_thickness_as_the_closed_form_says(resistance
 
 
 def test_a_term_of_somebody_elses_spoils_no_cache(tmp_path):
-    """A script with a term of its own leaves an index that names its module; another program runs without it."""
+    """A script with a term of its own leaves an index that names its module; another program runs
+    without it."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "mylaw.py").write_text(
         "from typing import NamedTuple\nclass Term(NamedTuple):\n    k: float\n"
@@ -459,7 +569,10 @@ def test_a_term_of_somebody_elses_spoils_no_cache(tmp_path):
     )
     said = []
     for script, path in (
-        ("from mylaw import Term; import shared; print(shared.first(Term(2.0)))", tmp_path / "mine"),
+        (
+            "from mylaw import Term; import shared; print(shared.first(Term(2.0)))",
+            tmp_path / "mine",
+        ),
         ("import shared; print(shared.first((3.0,)))", tmp_path),
     ):
         environment = os.environ | {
@@ -467,19 +580,33 @@ def test_a_term_of_somebody_elses_spoils_no_cache(tmp_path):
             "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path, path))),
         }
         done = subprocess.run(
-            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False
+            [sys.executable, "-c", script],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
         )
         said.append(done.stdout.strip() or done.stderr)
     assert said == ["2.0", "3.0"]
 
 
 def test_what_went_wrong_is_found_between_looks(monkeypatch):
-    """Soon after a collapse nothing is where it was; the state at which it is seen is found by computing again."""
+    """Soon after a collapse nothing is where it was; the state at which it is seen is found by
+    computing again."""
     ion = {"name": "ion", "count": 5, "sites": [site("X", 20.0, charge=-1.0)]}
-    stages = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.05, "timestep_fs": 1.0},
-              {"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "nose_hoover", "duration_ps": 2.0,
-               "timestep_fs": 1.0}]  # fmt: skip
-    scene = small_scene({}, 20.0, molecules=[{"model": "tip4p2005", "count": 20}, ion], stages=stages)
+    stages = [
+        {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.05, "timestep_fs": 1.0},
+        {
+            "ensemble": "nvt",
+            "temperature_K": 300.0,
+            "thermostat": "nose_hoover",
+            "duration_ps": 2.0,
+            "timestep_fs": 1.0,
+        },
+    ]
+    scene = small_scene(
+        {}, 20.0, molecules=[{"model": "tip4p2005", "count": 20}, ion], stages=stages
+    )
     most_overlapping_pair, seen = watch.most_overlapping_pair, []
 
     def only_between(system, state, molecule):
@@ -497,7 +624,9 @@ def test_a_long_way_back_is_not_computed_again(monkeypatch):
     monkeypatch.setattr(watch, "MOVES_PER_CHECK", 1)
     advanced, advance = [], Engine.advance
     monkeypatch.setattr(
-        Engine, "advance", lambda self, state, *rest: advanced.append(state) or advance(self, state, *rest)
+        Engine,
+        "advance",
+        lambda self, state, *rest: advanced.append(state) or advance(self, state, *rest),
     )
     scene = water(16.0, stages=[{"duration_ps": 160.0, "timestep_fs": 16.0}])
     stopped(scene)

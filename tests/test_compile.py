@@ -1,5 +1,5 @@
-"""The door to Numba: what we assume of it beyond its promises, addresses and their types, the cache, and the rules that
-sources keep."""
+"""The door to Numba: what we assume of it beyond its promises, addresses and their types, the
+cache, and the rules that sources keep."""
 
 import ast
 import ctypes
@@ -37,7 +37,7 @@ from rigidmd.compile.cache import CacheIndex, cache_folder, compiling_announced
 from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
 from rigidmd.compile.records import array_struct
 
-# --- what Numba does not promise -------------------------------------------------------------------------------------
+# --- what Numba does not promise ------------------------------------------------------------------
 
 
 #: A kernel that allocates, and two that call it.
@@ -85,7 +85,10 @@ def test_the_index_of_a_cache_may_be_of_our_class():
     assert issubclass(CacheIndex, IndexDataCacheFile)
     assert type(doubled._cache._cache_file) is CacheIndex
     names = os.listdir(doubled._cache.cache_path)
-    assert any(re.fullmatch(r"test_compile\.doubled-\d+\.py\d+\.\d+\.nbc\.[0-9a-f]{16}", name) for name in names)
+    assert any(
+        re.fullmatch(r"test_compile\.doubled-\d+\.py\d+\.\d+\.nbc\.[0-9a-f]{16}", name)
+        for name in names
+    )
 
 
 def test_a_dispatcher_opens_its_cache_only_to_compile():
@@ -99,7 +102,8 @@ def test_a_dispatcher_opens_its_cache_only_to_compile():
 
 @pytest.fixture
 def empty_cache(tmp_path, monkeypatch):
-    """Kernels that a test defines are compiled in it: Numba does not show code that comes from the cache."""
+    """Kernels that a test defines are compiled in it: Numba does not show code that comes from the
+    cache."""
     monkeypatch.setattr("rigidmd.compile.cache.cache_folder", lambda: str(tmp_path))
 
 
@@ -119,7 +123,10 @@ def test_an_inner_kernel_has_no_wrapper_and_says_so():
         return x + x
 
     assert type(inner) is InnerKernel
-    with pytest.raises(TypeError, match=r"inner is for compiled code only; for Python, use kernel\(from_python=True\)"):
+    with pytest.raises(
+        TypeError,
+        match=r"inner is for compiled code only; for Python, use kernel\(from_python=True\)",
+    ):
         inner(2.0)
     inner.compile((types.float64,))
     outer(2.0)
@@ -163,12 +170,21 @@ def test_an_inner_kernel_has_no_machine_code_and_is_optimised_in_its_caller():
 def test_an_inner_kernel_is_kept_and_linked_into_other_kernels_later(tmp_path):
     (tmp_path / "own.py").write_text(LATER)
     environment = os.environ | {
-        "RIGIDMD_CACHE": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
-    }  # fmt: skip
-    for name, printed in (("twice", "[2. 4.] 0"), ("four_times", "[4. 8.] 1"), ("four_times", "[4. 8.] 0")):
+        "RIGIDMD_CACHE": str(tmp_path / "cache"),
+        "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
+    }
+    for name, printed in (
+        ("twice", "[2. 4.] 0"),
+        ("four_times", "[4. 8.] 1"),
+        ("four_times", "[4. 8.] 0"),
+    ):
         script = f"import numpy as np, own; print(own.{name}(np.array([1.0, 2.0])), sum(own.inner.stats.cache_hits.values()))"
         done = subprocess.run(
-            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+            [sys.executable, "-c", script],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
         )
         assert done.stdout.strip() == printed
 
@@ -178,7 +194,7 @@ def test_a_callback_is_compiled_for_given_types_and_cached():
     assert code.address and type(code._cache._cache_file) is CacheIndex
 
 
-# --- values in memory ------------------------------------------------------------------------------------------------
+# --- values in memory -----------------------------------------------------------------------------
 
 
 class Mixed(NamedTuple):
@@ -212,7 +228,8 @@ def test_arrays_are_stored_as_assumed():
     kind, context = types.Array(types.float64, 2, "C"), cpu_target.target_context
     model, assumed = context.data_model_manager[kind], array_struct(2)
     stored = [
-        (name, context.get_abi_sizeof(context.get_value_type(model.get_member_fe_type(name)))) for name in model._fields
+        (name, context.get_abi_sizeof(context.get_value_type(model.get_member_fe_type(name))))
+        for name in model._fields
     ]
     fields = [(name, ctypes.sizeof(c_type)) for name, c_type in assumed._fields_]
     size = context.get_abi_sizeof(context.get_value_type(kind))
@@ -225,13 +242,30 @@ def test_arrays_are_stored_as_assumed():
 def test_values_are_stored_as_in_compiled_code():
     plane, found = np.arange(6.0).reshape(2, 3), np.zeros(12)
     inner = (np.uint16(65000), (np.array([7, 8, 9], np.int32),))
-    turned, code = np.arange(6, dtype=np.float32).reshape(2, 3).T, Code(add=(_add, (np.zeros(3), 0.0)))
-    mixed = Mixed(np.int8(-3), (True, False), plane, None, np.float32(0.5), True, inner, 2.5, -(2**40), turned, code)
+    turned, code = (
+        np.arange(6, dtype=np.float32).reshape(2, 3).T,
+        Code(add=(_add, (np.zeros(3), 0.0))),
+    )
+    mixed = Mixed(
+        np.int8(-3),
+        (True, False),
+        plane,
+        None,
+        np.float32(0.5),
+        True,
+        inner,
+        2.5,
+        -(2**40),
+        turned,
+        code,
+    )
     BoundTask(_tell, (mixed, found))()
     assert found.tolist() == [-3, 1, 0, 5, 0.5, 1, 65000, 8, 2.5, -(2**40), 5, 5]
     assert plane[0, 0] == -1.0
     context, struct = cpu_target.target_context, NumbaStruct(mixed)
-    assert ctypes.sizeof(struct._memory) == context.get_abi_sizeof(context.get_value_type(struct.kind))
+    assert ctypes.sizeof(struct._memory) == context.get_abi_sizeof(
+        context.get_value_type(struct.kind)
+    )
 
 
 def test_what_cannot_be_stored_or_has_another_type_is_named():
@@ -239,11 +273,13 @@ def test_what_cannot_be_stored_or_has_another_type_is_named():
         NumbaStruct((1.0, "text"))
     code = Code(add=(_add, (np.zeros(3), 0.0)))
     assert code.to_struct((np.zeros(2), 1.0)).kind == numba.typeof((np.zeros(3), 0.0))
-    with pytest.raises(TypingError, match=r"add was compiled for .*float64, 1d.*, not for .*float32, 1d"):
+    with pytest.raises(
+        TypingError, match=r"add was compiled for .*float64, 1d.*, not for .*float32, 1d"
+    ):
         code.to_struct((np.zeros(3, np.float32), 0.0))
 
 
-# --- addresses -------------------------------------------------------------------------------------------------------
+# --- addresses ------------------------------------------------------------------------------------
 
 
 class Content(NamedTuple):
@@ -280,7 +316,9 @@ def test_a_task_is_called_by_its_address():
     assert content.values.tolist() == [3, 2, 2, 2, 2]
 
 
-@pytest.mark.parametrize("strange", [np.zeros((4, 4)).T[1], np.zeros(4, np.float32), np.zeros((2, 2))])
+@pytest.mark.parametrize(
+    "strange", [np.zeros((4, 4)).T[1], np.zeros(4, np.float32), np.zeros((2, 2))]
+)
 def test_an_address_is_not_called_with_what_it_was_not_compiled_for(strange):
     with pytest.raises(TypingError, match="add was compiled for task_arguments"):
         add_once_and_in_blocks(content_of(strange), 2)
@@ -298,10 +336,10 @@ def test_every_block_is_worked_on_once_whichever_thread_takes_it():
     assert content.values[0] == 60 and (content.values[1:] == 40).all()
 
 
-# --- a second process ------------------------------------------------------------------------------------------------
+# --- a second process -----------------------------------------------------------------------------
 
-#: Compiles `_add` for several types while another process does so too, from the other end; prints what was read from the
-#: cache.
+#: Compiles `_add` for several types while another process does so too, from the other end; prints
+#: what was read from the cache.
 BOTH = """
 import numba, numpy as np, time
 from rigidmd.compile import TaskArguments, code
@@ -320,10 +358,13 @@ print([_add.compiled[kind]._cache_hits for _, _, kind in wanted][-2:])
 
 def with_compilers(count: str, asked: str, tmp_path) -> subprocess.CompletedProcess:
     environment = os.environ | {
-        "RIGIDMD_CACHE": str(tmp_path / "cache"), "RIGIDMD_COMPILERS": count,
+        "RIGIDMD_CACHE": str(tmp_path / "cache"),
+        "RIGIDMD_COMPILERS": count,
         "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests"))),
-    }  # fmt: skip
-    return subprocess.run([sys.executable, "-c", asked], env=environment, capture_output=True, text=True, timeout=300)
+    }
+    return subprocess.run(
+        [sys.executable, "-c", asked], env=environment, capture_output=True, text=True, timeout=300
+    )
 
 
 def test_a_second_process_compiles_the_last_tasks_first(tmp_path):
@@ -332,12 +373,15 @@ def test_a_second_process_compiles_the_last_tasks_first(tmp_path):
 
 
 def test_compiling_goes_on_alone_where_the_second_process_ends(tmp_path):
-    lost = BOTH.replace("with code", "code.SECOND_PROGRAM = 'raise SystemExit'\nwith code").replace("WAIT", "3")
+    lost = BOTH.replace("with code", "code.SECOND_PROGRAM = 'raise SystemExit'\nwith code").replace(
+        "WAIT", "3"
+    )
     done = with_compilers("2", lost, tmp_path)
     assert done.stdout.split("\n")[0] == "[0, 0]", done.stderr
 
 
-#: As an engine does it: how often its codes are made, and whether each that is made last can be called.
+#: As an engine does it: how often its codes are made, and whether each that is made last can be
+#: called.
 TOGETHER = """
 import numpy as np
 from rigidmd.compile import Code, compile_together
@@ -352,9 +396,12 @@ print(len(made), Code(add=(_add, contents[0])).address("add") == made[1][0].addr
 """
 
 
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="where there is one core, one process compiles")
+@pytest.mark.skipif(
+    (os.cpu_count() or 1) < 2, reason="where there is one core, one process compiles"
+)
 def test_codes_are_planned_and_then_compiled_together(tmp_path):
-    """First without addresses; then with them; once more only planned, since nothing is left to compile."""
+    """First without addresses; then with them; once more only planned, since nothing is left to
+    compile."""
     done = with_compilers("2", TOGETHER, tmp_path)
     assert done.stdout.splitlines() == [f"[{[False] * 4}, {[True] * 4}]", "3 True"], done.stderr
 
@@ -372,32 +419,45 @@ def test_a_wrong_number_of_compilers_is_one_sentence(named, tmp_path):
     assert f"RIGIDMD_COMPILERS is {named!r}, must be 1 or 2" in done.stderr
 
 
-# --- the cache -------------------------------------------------------------------------------------------------------
+# --- the cache ------------------------------------------------------------------------------------
 
 
 def test_the_cache_folder_is_swept_of_nothing_but_our_own(tmp_path):
-    old = [tmp_path / "thesis", tmp_path / "kernels-0123456789abcdef", tmp_path / "0123456789abcdef"]
+    old = [
+        tmp_path / "thesis",
+        tmp_path / "kernels-0123456789abcdef",
+        tmp_path / "0123456789abcdef",
+    ]
     for folder in old:
         folder.mkdir()
         os.utime(folder, (1e9, 1e9))
     asked = "from rigidmd.compile.cache import cache_folder; cache_folder()"
-    subprocess.run([sys.executable, "-c", asked], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True)
+    subprocess.run(
+        [sys.executable, "-c", asked], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True
+    )
     assert [folder.exists() for folder in old] == [True, False, True]
 
 
-MACHINE = "from rigidmd.compile import cache, machine; print(machine.SIMD_BITS, cache.compiler_digest())"
+MACHINE = (
+    "from rigidmd.compile import cache, machine; print(machine.SIMD_BITS, cache.compiler_digest())"
+)
 
 
 def machine_with(**settings):
     """Bits of vectors, and the name of the cache, where the environment has these settings."""
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")} | settings
-    done = subprocess.run([sys.executable, "-c", MACHINE], env=environment, cwd=ROOT, capture_output=True, text=True)
+    environment = {
+        key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")
+    } | settings
+    done = subprocess.run(
+        [sys.executable, "-c", MACHINE], env=environment, cwd=ROOT, capture_output=True, text=True
+    )
     return done.stdout.split()
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the processors are those of x86")
 @pytest.mark.parametrize(
-    ("name", "bits"), [("generic", "128"), ("nehalem", "128"), ("haswell", "256"), ("skylake-avx512", "512")]
+    ("name", "bits"),
+    [("generic", "128"), ("nehalem", "128"), ("haswell", "256"), ("skylake-avx512", "512")],
 )
 def test_vectors_are_as_wide_as_those_of_the_processor_that_is_named(name, bits):
     assert machine_with(NUMBA_CPU_NAME=name, NUMBA_CPU_FEATURES="")[0] == bits
@@ -406,8 +466,14 @@ def test_vectors_are_as_wide_as_those_of_the_processor_that_is_named(name, bits)
 def test_settings_that_change_code_have_a_cache_of_their_own():
     usual = machine_with()
     assert machine_with(NUMBA_OPT="3", NUMBA_NUM_THREADS="1", NUMBA_DEBUG_CACHE="0") == usual
-    changed = [machine_with(**{name: value}) for name, value in
-               (("NUMBA_OPT", "0"), ("NUMBA_BOUNDSCHECK", "1"), ("NUMBA_SLP_VECTORIZE", "1"))]  # fmt: skip
+    changed = [
+        machine_with(**{name: value})
+        for name, value in (
+            ("NUMBA_OPT", "0"),
+            ("NUMBA_BOUNDSCHECK", "1"),
+            ("NUMBA_SLP_VECTORIZE", "1"),
+        )
+    ]
     assert len({digest for _, digest in [usual, *changed]}) == 4
 
 
@@ -415,7 +481,10 @@ def test_a_folder_in_which_nothing_is_kept_is_named(tmp_path, monkeypatch):
     from rigidmd.compile import cache
 
     (tmp_path / "file").touch()
-    for named, expected in (("new", "kept on disk: the next run starts at once"), ("file/x", "RIGIDMD_CACHE names")):
+    for named, expected in (
+        ("new", "kept on disk: the next run starts at once"),
+        ("file/x", "RIGIDMD_CACHE names"),
+    ):
         monkeypatch.setenv("RIGIDMD_CACHE", str(tmp_path / named))
         cache.cache_folders.cache_clear()
         assert expected in cache.describe_cache()
@@ -439,10 +508,15 @@ def compiled_in(folder, tmp_path, before=""):
     if not (tmp_path / "own.py").exists():  # kernels are kept by the time of their file
         (tmp_path / "own.py").write_text(KERNEL)
     environment = os.environ | {
-        "RIGIDMD_CACHE": str(folder), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
-    }  # fmt: skip
-    script = f"{before}\nfrom own import twice; print(twice(21), sum(twice.stats.cache_hits.values()))"
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+        "RIGIDMD_CACHE": str(folder),
+        "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
+    }
+    script = (
+        f"{before}\nfrom own import twice; print(twice(21), sum(twice.stats.cache_hits.values()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
     return done.stdout.strip(), done.stderr
 
 
@@ -459,7 +533,9 @@ def kept(tmp_path_factory):
 @pytest.mark.parametrize("damage", ["empty", "cut", "flipped"])
 def test_a_damaged_file_of_the_cache_counts_as_absent(ending, damage, kept, tmp_path):
     shutil.copytree(kept / "cache", tmp_path / "cache")
-    (path,) = (path for path in (tmp_path / "cache").rglob(f"*twice*{ending}*") if ending in path.name)
+    (path,) = (
+        path for path in (tmp_path / "cache").rglob(f"*twice*{ending}*") if ending in path.name
+    )
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 16
     path.write_bytes({"empty": b"", "cut": bytes(data[:40]), "flipped": bytes(data)}[damage])
@@ -482,7 +558,7 @@ def test_a_cache_that_cannot_be_written_is_read(kept):
     assert sorted(kept.rglob("*")) == before
 
 
-# --- the index of the cache, which several processes change ----------------------------------------------------------
+# --- the index of the cache, which several processes change ---------------------------------------
 
 #: A class in a module that is called like one of the package, but whose file lies elsewhere.
 STRANGE_TERM = """
@@ -500,9 +576,12 @@ def hits_with(tmp_path, before: str, value: str) -> int:
     (tmp_path / "sums.py").exists() or (tmp_path / "sums.py").write_text(SUM)
     script = f"{before}\nfrom sums import double; double({value}); print(sum(double.stats.cache_hits.values()))"
     environment = os.environ | {
-        "RIGIDMD_CACHE": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
-    }  # fmt: skip
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+        "RIGIDMD_CACHE": str(tmp_path / "cache"),
+        "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
     return int(done.stdout)
 
 
@@ -539,7 +618,7 @@ def test_compiling_is_announced_only_if_something_is_compiled(tmp_path):
         assert said == expected
 
 
-# --- folders of others -----------------------------------------------------------------------------------------------
+# --- folders of others ----------------------------------------------------------------------------
 
 
 def folders_of(cache, ending):
@@ -549,7 +628,8 @@ def folders_of(cache, ending):
 
 
 @pytest.mark.parametrize(
-    ("which", "bits", "ending"), [(0, 0o020, ".nbi"), (1, 0o002, ".nbi"), (2, 0o020, ".nbi"), (3, 0o002, ".nbc")]
+    ("which", "bits", "ending"),
+    [(0, 0o020, ".nbi"), (1, 0o002, ".nbi"), (2, 0o020, ".nbi"), (3, 0o002, ".nbc")],
 )
 def test_code_that_others_may_write_is_not_used(which, bits, ending, kept, tmp_path):
     shutil.copytree(kept / "cache", tmp_path / "cache")
@@ -601,11 +681,19 @@ def test_without_a_home_folder_the_cache_is_a_temporary_one(home, tmp_path):
     environment |= {"TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
     (tmp_path / "here").mkdir()
     done = subprocess.run(
-        [sys.executable, "-c", script], env=environment, cwd=tmp_path / "here", capture_output=True, text=True
+        [sys.executable, "-c", script],
+        env=environment,
+        cwd=tmp_path / "here",
+        capture_output=True,
+        text=True,
     )
-    assert "not kept, as this user has no home folder: the next run compiles again" in done.stdout, done.stderr
+    assert (
+        "not kept, as this user has no home folder: the next run compiles again" in done.stdout
+    ), done.stderr
     assert f" False {tmp_path}/rigidmd-cache-" in done.stdout
-    assert list((tmp_path / "here").iterdir()) == [] and list(tmp_path.glob("rigidmd-cache-*")) == []
+    assert (
+        list((tmp_path / "here").iterdir()) == [] and list(tmp_path.glob("rigidmd-cache-*")) == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -621,7 +709,9 @@ def test_a_full_disk_costs_time_only(function, tmp_path):
         full += "tempfile.TemporaryFile = full\n"
     printed, warned = compiled_in(tmp_path / "cache", tmp_path, full)
     assert printed == "42 0"
-    assert warned.count("No space left on device") == (function == "IndexDataCacheFile._open_for_write")
+    assert warned.count("No space left on device") == (
+        function == "IndexDataCacheFile._open_for_write"
+    )
     assert "Traceback" not in warned
 
 
@@ -638,7 +728,7 @@ def test_a_kernel_is_compiled_once_for_all_constant_arguments():
     assert len(plus.signatures) == 1
 
 
-# --- rules that sources keep -----------------------------------------------------------------------------------------
+# --- rules that sources keep ----------------------------------------------------------------------
 
 
 def test_code_for_llvm_does_not_rely_on_typed_pointers():
@@ -649,7 +739,10 @@ def test_code_for_llvm_does_not_rely_on_typed_pointers():
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
                 continue
             name, of_builder = node.func.attr, ast.unparse(node.func.value) in ("builder", "b")
-            lacks = of_builder and needed.get(name) not in (None, *(key.arg for key in node.keywords))
+            lacks = of_builder and needed.get(name) not in (
+                None,
+                *(key.arg for key in node.keywords),
+            )
             if name == "as_pointer" or lacks:
                 found.append(f"{path.name}:{node.lineno}: {ast.unparse(node)}")
     assert found == []
@@ -664,13 +757,22 @@ def compiled_functions():
                 kind = getattr(call.func, "id", "")
                 if kind in ("kernel", "task", "implements", "chosen_by_type"):
                     keys = {key.arg: ast.unparse(key.value) for key in call.keywords}
-                    name = ast.unparse(call.args[0]).rpartition(".")[2] if kind == "implements" else node.name
+                    name = (
+                        ast.unparse(call.args[0]).rpartition(".")[2]
+                        if kind == "implements"
+                        else node.name
+                    )
                     yield name, node, keys
 
 
 def test_loops_without_counted_references_take_elements_by_their_index():
-    """Iterating over a view of an array, uncounted, ended in a crash; over ranges and tuples it is safe."""
-    uncounted = [(name, tree) for name, tree, keys in compiled_functions() if keys.get("count_references") == "False"]
+    """Iterating over a view of an array, uncounted, ended in a crash; over ranges and tuples it is
+    safe."""
+    uncounted = [
+        (name, tree)
+        for name, tree, keys in compiled_functions()
+        if keys.get("count_references") == "False"
+    ]
     assert {"block_forces", "set_local", "update_list"} <= {name for name, _ in uncounted}
     strange = []
     for name, tree in uncounted:
@@ -679,6 +781,9 @@ def test_loops_without_counted_references_take_elements_by_their_index():
             if isinstance(over, ast.Call) and ast.unparse(over.func) == "enumerate":
                 over = over.args[0]
             if over is not None and not isinstance(over, ast.Tuple):
-                safe = isinstance(over, ast.Call) and ast.unparse(over.func) in ("range", "literal_unroll")
+                safe = isinstance(over, ast.Call) and ast.unparse(over.func) in (
+                    "range",
+                    "literal_unroll",
+                )
                 strange += [] if safe else [f"{name}: for ... in {ast.unparse(over)}"]
     assert strange == []

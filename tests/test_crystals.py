@@ -1,5 +1,5 @@
-"""Crystals from CIF: the symmetry that a file states in any way, and the atoms that it makes. Truths are lists of operations
-of International Tables A, expanded here, and published cells."""
+"""Crystals from CIF: the symmetry that a file states in any way, and the atoms that it makes.
+Truths are lists of operations of International Tables A, expanded here, and published cells."""
 
 import re
 
@@ -12,16 +12,31 @@ from rigidmd.errors import StructureError
 
 CELL_KEYS = ("length_a", "length_b", "length_c", "angle_alpha", "angle_beta", "angle_gamma")
 #: A bent molecule of three atoms, fractional.
-ATOMS = (("O1", "O", (0.13, 0.21, 0.17)), ("H1", "H", (0.2, 0.25, 0.2)), ("H2", "H", (0.08, 0.27, 0.22)))
+ATOMS = (
+    ("O1", "O", (0.13, 0.21, 0.17)),
+    ("H1", "H", (0.2, 0.25, 0.2)),
+    ("H2", "H", (0.08, 0.27, 0.22)),
+)
 
 
 def cif(cell, atoms=ATOMS, operations=(), **tags) -> str:
-    """A CIF of the cell, the atoms (label, type, fractional coordinates) and other tags, with __ for -."""
-    lines = ["data_test", *(f"_cell_{key} {value}" for key, value in zip(CELL_KEYS, cell, strict=True))]
+    """A CIF of the cell, the atoms (label, type, fractional coordinates) and other tags, with __
+    for -."""
+    lines = [
+        "data_test",
+        *(f"_cell_{key} {value}" for key, value in zip(CELL_KEYS, cell, strict=True)),
+    ]
     lines += [f"_{tag.replace('__', '-')} '{value}'" for tag, value in tags.items()]
     if operations:
-        lines += ["loop_", "_space_group_symop_operation_xyz", *(f"'{operation}'" for operation in operations)]
-    lines += ["loop_", *(f"_atom_site_{key}" for key in ("label", "type_symbol", "fract_x", "fract_y", "fract_z"))]
+        lines += [
+            "loop_",
+            "_space_group_symop_operation_xyz",
+            *(f"'{operation}'" for operation in operations),
+        ]
+    lines += [
+        "loop_",
+        *(f"_atom_site_{key}" for key in ("label", "type_symbol", "fract_x", "fract_y", "fract_z")),
+    ]
     lines += [f"{label} {symbol} {' '.join(map(str, x))}" for label, symbol, x in atoms]
     return "\n".join([*lines, ""])
 
@@ -34,7 +49,9 @@ def read(tmp_path, text, name="a.cif"):
 def expanded(operations, x) -> np.ndarray:
     """Images of a point by operations such as 1/2-x,y,z."""
     values = dict(zip("xyz", x, strict=True))
-    return np.array([[eval(part, {}, values) for part in operation.split(",")] for operation in operations])
+    return np.array(
+        [[eval(part, {}, values) for part in operation.split(",")] for operation in operations]
+    )
 
 
 def same_points(one, other, cell, tolerance=1e-6):
@@ -113,7 +130,11 @@ R3_HEXAGONAL = [
 MONOCLINIC, UNIQUE_C = (9, 8, 10, 90, 101, 90), (9, 8, 10, 90, 90, 101)
 ORTHORHOMBIC, TETRAGONAL = (9, 11, 13, 90, 90, 90), (9, 9, 8, 90, 90, 90)
 RHOMBOHEDRAL, HEXAGONAL = (8, 8, 8, 75, 75, 75), (9, 9, 12, 90, 90, 120)
-NAME, HALL, CODE = "symmetry_space_group_name_H__M", "space_group_name_Hall", "space_group_IT_coordinate_system_code"
+NAME, HALL, CODE = (
+    "symmetry_space_group_name_H__M",
+    "space_group_name_Hall",
+    "space_group_IT_coordinate_system_code",
+)
 NUMBER = "space_group_IT_number"
 #: Cell, operations, and what a file without a list may state instead.
 STATED = [
@@ -164,7 +185,9 @@ def test_symmetry_without_a_list_of_operations(cell, operations, tags, tmp_path)
     assert not any("assumed" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("name", [None, "P 1 21/n 1", "P2(1)/n", "P 21/n (cell choice 2)", "?", "R -3 :H"])
+@pytest.mark.parametrize(
+    "name", [None, "P 1 21/n 1", "P2(1)/n", "P 21/n (cell choice 2)", "?", "R -3 :H"]
+)
 @pytest.mark.parametrize("number", [None, 14, 62])
 def test_a_list_of_operations_defines_the_symmetry(name, number, tmp_path):
     """Whatever name and number are; those of another group are reported."""
@@ -190,37 +213,70 @@ def test_a_list_of_operations_defines_the_symmetry(name, number, tmp_path):
 )
 def test_an_assumed_setting_is_reported(cell, tags, assumed, others, tmp_path):
     found = read(tmp_path, cif(cell, **tags))
-    expected = f"the setting {assumed} was assumed, which the file does not state (it may be {others})"
+    expected = (
+        f"the setting {assumed} was assumed, which the file does not state (it may be {others})"
+    )
     assert any(expected in note for note in found.notes)
 
 
 @pytest.mark.parametrize(
     ("cell", "operations", "tags", "message"),
     [
-        (ORTHORHOMBIC, (), {NAME: "P 42/n :2"}, r"its space group P 42/n :2 cannot be in its cell, edges 9.0000, 11.0000"),
+        (
+            ORTHORHOMBIC,
+            (),
+            {NAME: "P 42/n :2"},
+            r"its space group P 42/n :2 cannot be in its cell, edges 9.0000, 11.0000",
+        ),
         (HEXAGONAL, (), {NAME: "R -3 :R"}, r"its space group R -3 :R cannot be in its cell"),
         (ORTHORHOMBIC, ("x,y,z", "y,x,z"), {}, "its list of operations cannot be in its cell"),
-        (MONOCLINIC, (), {NAME: "P 1 21/n 1", NUMBER: 15}, "P 1 21/n 1 and its space group number 15 contradict each other"),
-        (ORTHORHOMBIC, (), {HALL: "-P 2bc 2ac", NAME: "P b c a"}, "-P 2bc 2ac and its space group P b c a contradict"),
+        (
+            MONOCLINIC,
+            (),
+            {NAME: "P 1 21/n 1", NUMBER: 15},
+            "P 1 21/n 1 and its space group number 15 contradict each other",
+        ),
+        (
+            ORTHORHOMBIC,
+            (),
+            {HALL: "-P 2bc 2ac", NAME: "P b c a"},
+            "-P 2bc 2ac and its space group P b c a contradict",
+        ),
         (MONOCLINIC, P21N[:3], {}, "its 3 symmetry operations are not a group: is one missing"),
         (MONOCLINIC, ("-x,-y,-z",), {}, "its 1 symmetry operations are not a group"),
-        (MONOCLINIC, (), {NAME: "P wrong"}, "its space group P wrong is unknown: give its operations"),
+        (
+            MONOCLINIC,
+            (),
+            {NAME: "P wrong"},
+            "its space group P wrong is unknown: give its operations",
+        ),
         (MONOCLINIC, (), {NUMBER: 231}, "its space group 231 is unknown"),
         (MONOCLINIC, (), {HALL: "P wrong"}, "its space group P wrong is unknown"),
-        (MONOCLINIC, ("x,y,z", "-x,y"), {}, "expected an operation such as x,1/2-y,z, found '-x,y'"),
+        (
+            MONOCLINIC,
+            ("x,y,z", "-x,y"),
+            {},
+            "expected an operation such as x,1/2-y,z, found '-x,y'",
+        ),
         (MONOCLINIC, ("x,y,z", "x,x,z"), {}, "neither a rotation nor a reflection"),
     ],
-)  # fmt: skip
+)
 def test_contradictions_are_refused(cell, operations, tags, message, tmp_path):
     with pytest.raises(StructureError, match=message):
         read(tmp_path, cif(cell, operations=operations, **tags))
 
 
 def test_what_is_stated_wrongly_beside_operations_is_reported(tmp_path):
-    tags = {"symmetry_cell_setting": "cubic", "exptl_crystal_density_diffrn": 2.5, "cell_formula_units_Z": 2}
+    tags = {
+        "symmetry_cell_setting": "cubic",
+        "exptl_crystal_density_diffrn": 2.5,
+        "cell_formula_units_Z": 2,
+    }
     found = read(tmp_path, cif(MONOCLINIC, operations=P21N, chemical_formula_sum="H2 O", **tags))
     notes = "; ".join(found.notes)
-    assert re.search(r"its cell, edges 9.0000, 8.0000, 10.0000 Å, angles 90, 101, 90°, is not cubic", notes)
+    assert re.search(
+        r"its cell, edges 9.0000, 8.0000, 10.0000 Å, angles 90, 101, 90°, is not cubic", notes
+    )
     assert "its cell of 706.77 Å³ holds H8 O4, 0.1693 g/cm³, from 3 atoms in the file" in notes
     assert "the density in the file is 2.5 g/cm³, but its atoms make 0.1693 g/cm³" in notes
     assert "its formula and Z are H4 O2 in the cell, but its atoms make H8 O4" in notes
@@ -233,20 +289,31 @@ def test_molecules_that_lack_their_symmetry(operations, tmp_path):
     """Half of a carbon dioxide: the message names the reason."""
     dry_ice = (("C1", "C", (0, 0, 0)), ("O1", "O", (0.1185, 0.1185, 0.1185)))
     (tmp_path / "a.cif").write_text(cif((5.624,) * 3 + (90,) * 3, dry_ice, operations))
-    reason = "x,y,z is the only symmetry operation in the file" if operations else "no symmetry operations in the file"
+    reason = (
+        "x,y,z is the only symmetry operation in the file"
+        if operations
+        else "no symmetry operations in the file"
+    )
     with pytest.raises(StructureError, match=rf"has atoms C O, expected co2_trappe(?s:.*){reason}"):
         read_structure(tmp_path / "a.cif", [load_model("co2_trappe")], None, True, 0.15)
     tags = {NAME: "P a -3"}
     (tmp_path / "a.cif").write_text(cif((5.624,) * 3 + (90,) * 3, dry_ice, **tags))
     found = read_structure(tmp_path / "a.cif", [load_model("co2_trappe")], None, True, 0.15)
     assert len(found.species) == 4
-    assert any("holds C4 O8, 1.643 g/cm³, from 2 atoms in the file, 2 on special positions" in n for n in found.notes)
+    assert any(
+        "holds C4 O8, 1.643 g/cm³, from 2 atoms in the file, 2 on special positions" in n
+        for n in found.notes
+    )
 
 
-#: Published cells: name, space group, cell, atoms, and the atoms of one molecule, molecules in the cell, bonds of a molecule,
-#: mean C-C, C-N or C-Cl distance.
+#: Published cells: name, space group, cell, atoms, and the atoms of one molecule, molecules in the
+#: cell, bonds of a molecule, mean C-C, C-N or C-Cl distance.
 ACETYLENE = (("C1", "C", (0.0562,) * 3), ("H1", "H", (0.1524,) * 3))
-HEXAMINE = (("C1", "C", (0.2378, 0, 0)), ("H1", "H", (0.3275, 0.0885, -0.0885)), ("N1", "N", (0.1232,) * 3))
+HEXAMINE = (
+    ("C1", "C", (0.2378, 0, 0)),
+    ("H1", "H", (0.3275, 0.0885, -0.0885)),
+    ("N1", "N", (0.1232,) * 3),
+)
 ADAMANTANE = (
     ("C1", "C", ("0.0000", "0.0000", "0.1980(3)")),
     ("C2", "C", ("-0.0262(4)", "0.1862(4)", "0.0992(3)")),
@@ -263,21 +330,44 @@ HEXACHLOROBENZENE = (
 PUBLISHED = [
     ("P a -3", ("6.0940(8)",) * 3 + (90,) * 3, ACETYLENE, {"C": 8, "H": 8}, ("C", "C", 4, 1.187)),
     ("P a 3", (6.094,) * 3 + (90,) * 3, ACETYLENE, {"C": 8, "H": 8}, ("C", "H", 8, 1.015)),
-    ("I -4 3 m", (7.021,) * 3 + (90,) * 3, HEXAMINE, {"C": 12, "H": 24, "N": 8}, ("C", "N", 24, 1.464)),
-    ("P -4 21 c", ("6.639(7)", "6.639(7)", "8.918(9)", 90, 90, 90), ADAMANTANE, {"C": 20}, ("C", "C", 24, 1.533)),
-    ("P 21/c", (8.08, 3.87, 16.65, 90, 117, 90), HEXACHLOROBENZENE, {"C": 12, "Cl": 12}, ("C", "Cl", 12, 1.72)),
+    (
+        "I -4 3 m",
+        (7.021,) * 3 + (90,) * 3,
+        HEXAMINE,
+        {"C": 12, "H": 24, "N": 8},
+        ("C", "N", 24, 1.464),
+    ),
+    (
+        "P -4 21 c",
+        ("6.639(7)", "6.639(7)", "8.918(9)", 90, 90, 90),
+        ADAMANTANE,
+        {"C": 20},
+        ("C", "C", 24, 1.533),
+    ),
+    (
+        "P 21/c",
+        (8.08, 3.87, 16.65, 90, 117, 90),
+        HEXACHLOROBENZENE,
+        {"C": 12, "Cl": 12},
+        ("C", "Cl", 12, 1.72),
+    ),
 ]
 
 
-@pytest.mark.parametrize(("name", "cell", "atoms", "contents", "bonds"), PUBLISHED, ids=lambda value: str(value)[:20])
+@pytest.mark.parametrize(
+    ("name", "cell", "atoms", "contents", "bonds"), PUBLISHED, ids=lambda value: str(value)[:20]
+)
 def test_published_crystals(name, cell, atoms, contents, bonds, tmp_path):
-    """Numbers of atoms and of bonds, and the mean length of bonds, follow from cell, space group and asymmetric unit."""
+    """Numbers of atoms and of bonds, and the mean length of bonds, follow from cell, space group
+    and asymmetric unit."""
     found = read(tmp_path, cif(cell, atoms, **{NAME: name}))
     assert {e: found.elements.count(e) for e in set(found.elements)} == contents
     one, other, count, length = bonds
     i, j, distance = pairs(found, 1.9)
     elements = np.array(found.elements)
-    bonded = (elements[i] == one) & (elements[j] == other) | (elements[i] == other) & (elements[j] == one)
+    bonded = (elements[i] == one) & (elements[j] == other) | (elements[i] == other) & (
+        elements[j] == one
+    )
     assert bonded.sum() == count
     assert distance[bonded].mean() == pytest.approx(length, abs=0.02)
 
@@ -286,7 +376,10 @@ def test_published_crystals(name, cell, atoms, contents, bonds, tmp_path):
 def test_special_positions_are_those_of_rounded_coordinates(digits, tmp_path):
     """Atoms near special positions, by printed digits, count once and are put exactly there."""
     third = round(1 / 3, digits)
-    atoms = (("C1", "C", (third, round(2 / 3, digits), 0.2)), ("N1", "N", (0, 0, round(0.1 + 1e-3, digits))))
+    atoms = (
+        ("C1", "C", (third, round(2 / 3, digits), 0.2)),
+        ("N1", "N", (0, 0, round(0.1 + 1e-3, digits))),
+    )
     found = read(tmp_path, cif((10, 10, 8, 90, 90, 120), atoms, **{NAME: "P -3 m 1"}))
     assert len(found.names) == 4
     x = found.position[:2] @ np.linalg.inv(found.cell)
@@ -303,7 +396,10 @@ def test_atoms_listed_with_their_images_count_once(tmp_path):
     faces = (("Ar1", "Ar", (0, 0.5, 0.5)), ("Ar2", "Ar", (1, 0.5, 0.5)), ("Ar3", "Ar", (0.5, 0, 0)))
     assert read(tmp_path, cif(ORTHORHOMBIC, faces)).names == ["Ar1", "Ar3"]
     mixed = (("C1", "C", (0.1, 0.2, 0.3)), ("N1", "N", (0.101, 0.2, 0.3)))
-    with pytest.raises(StructureError, match=r"atoms 1 and 2 are 0.009 Å apart in the cell: its atoms are disordered"):
+    with pytest.raises(
+        StructureError,
+        match=r"atoms 1 and 2 are 0.009 Å apart in the cell: its atoms are disordered",
+    ):
         read(tmp_path, cif(ORTHORHOMBIC, mixed))
 
 
@@ -320,17 +416,25 @@ def test_short_bonds_across_a_symmetry_element_stay(tmp_path):
 
 
 SYNTAX = {
-    "a comment in the head of a loop": lambda t: t.replace("operation_xyz", "operation_xyz #<--must include 'x,y,z'"),
+    "a comment in the head of a loop": lambda t: t.replace(
+        "operation_xyz", "operation_xyz #<--must include 'x,y,z'"
+    ),
     "comments after values": lambda t: t.replace("length_b 8", "length_b 8 # Angstrom"),
     "CR": lambda t: t.replace("\n", "\r"),
     "CRLF": lambda t: t.replace("\n", "\r\n"),
     "upper case": lambda t: (
-        t.replace("_cell_length_a", "_Cell_Length_A").replace("loop_", "LOOP_").replace("x,y", "X,Y")
+        t.replace("_cell_length_a", "_Cell_Length_A")
+        .replace("loop_", "LOOP_")
+        .replace("x,y", "X,Y")
     ),
     "letters": lambda t: f"# 5 Å\n{t}_publ_author_name Müller\n_publ_title 'Größe'\n",
-    "a text": lambda t: t.replace("data_test", "data_test\n_refine_details\n;\nloop_ _atom_site_x 'don't'\n;"),
+    "a text": lambda t: t.replace(
+        "data_test", "data_test\n_refine_details\n;\nloop_ _atom_site_x 'don't'\n;"
+    ),
     "an empty block": lambda t: f"data_global\n_publ_year 2001\n{t}",
-    "uncertainties": lambda t: t.replace("0.13 ", "0.13(2) ").replace("length_a 9", "length_a 9.000(12)"),
+    "uncertainties": lambda t: t.replace("0.13 ", "0.13(2) ").replace(
+        "length_a 9", "length_a 9.000(12)"
+    ),
     "signs and exponents": lambda t: t.replace("0.13 ", "+1.3E-1 ").replace("0.21 ", ".21 "),
     "decimals in operations": lambda t: t.replace("1/2+", "0.5+").replace("1/2-", ".5 - "),
 }
@@ -345,7 +449,10 @@ def test_syntax(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["crystal", "crystal.txt", "a.mmcif"])
 def test_a_crystal_is_known_by_its_first_lines(name, tmp_path):
-    is_expanded(read(tmp_path, "# of the Cambridge database\n\n" + cif(MONOCLINIC, operations=P21N), name), P21N)
+    is_expanded(
+        read(tmp_path, "# of the Cambridge database\n\n" + cif(MONOCLINIC, operations=P21N), name),
+        P21N,
+    )
 
 
 def with_column(text, key, values):
@@ -355,20 +462,36 @@ def with_column(text, key, values):
     return "\n".join([f"{head}_atom_site_fract_z", f"_atom_site_{key}", *rows, ""])
 
 
-@pytest.mark.parametrize("one", ["1", "1.0", "1.", "1.000", "1.0(0)", "0.9999", "0.998(3)", ".", "?", "1.0001"])
+@pytest.mark.parametrize(
+    "one", ["1", "1.0", "1.", "1.000", "1.0(0)", "0.9999", "0.998(3)", ".", "?", "1.0001"]
+)
 def test_occupancies_of_one(one, tmp_path):
-    found = read(tmp_path, with_column(cif(MONOCLINIC, operations=P21N), "occupancy", ["1.0", one, one]))
+    found = read(
+        tmp_path, with_column(cif(MONOCLINIC, operations=P21N), "occupancy", ["1.0", one, one])
+    )
     is_expanded(found, P21N)
 
 
 @pytest.mark.parametrize(
     ("key", "values", "message"),
     [
-        ("occupancy", ("1", "0.5", "0.5"), r"occupied only partly \(H1 0.5, H2 0.5\): the crystal is disordered"),
+        (
+            "occupancy",
+            ("1", "0.5", "0.5"),
+            r"occupied only partly \(H1 0.5, H2 0.5\): the crystal is disordered",
+        ),
         ("occupancy", ("1", "1", "0.97(1)"), r"occupied only partly \(H2 0.97\)"),
         ("occupancy", ("1", "1", "1.5"), "has the occupancy 1.5|have the occupancy 1.5"),
-        ("disorder_group", (".", "1", "2"), "atoms are in disorder groups 1, 2: the crystal is disordered"),
-        ("disorder_group", (".", ".", "-1"), "atoms are in disorder groups -1: the crystal is disordered"),
+        (
+            "disorder_group",
+            (".", "1", "2"),
+            "atoms are in disorder groups 1, 2: the crystal is disordered",
+        ),
+        (
+            "disorder_group",
+            (".", ".", "-1"),
+            "atoms are in disorder groups -1: the crystal is disordered",
+        ),
     ],
 )
 def test_disorder_is_refused(key, values, message, tmp_path):
@@ -387,7 +510,11 @@ def test_dummies_are_left_out(tmp_path):
     [
         ("_cell_angle_beta 101", "", "its cell is incomplete: _cell_angle_beta is not a number"),
         ("_cell_length_a 9", "_cell_length_a nine", "its cell is incomplete: _cell_length_a"),
-        ("_cell_angle_beta 101", "_cell_angle_beta 190", "no cell has the edges and angles 9 8 10 90 190 90"),
+        (
+            "_cell_angle_beta 101",
+            "_cell_angle_beta 190",
+            "no cell has the edges and angles 9 8 10 90 190 90",
+        ),
         ("0.25 ", "? ", "atom H1 has no position, expected three numbers, found 0.2 None 0.2"),
         ("0.25 ", "1/4 ", "atom H1 has no position, expected three numbers, found 0.2 1/4 0.2"),
         ("0.22", "", r"line \d+: this is not valid CIF: Wrong number of values in loop _atom_site"),
@@ -404,7 +531,9 @@ def test_damaged_files(old, new, message, tmp_path):
 
 def test_a_file_without_a_cell(tmp_path):
     text = "\n".join(line for line in cif(MONOCLINIC).splitlines() if not line.startswith("_cell"))
-    with pytest.raises(StructureError, match="has no cell: _cell_length_a to _cell_angle_gamma are missing"):
+    with pytest.raises(
+        StructureError, match="has no cell: _cell_length_a to _cell_angle_gamma are missing"
+    ):
         read(tmp_path, text)
 
 
@@ -413,9 +542,24 @@ def test_a_file_without_a_cell(tmp_path):
 
 @pytest.mark.parametrize(
     ("symbol", "element"),
-    [("O", "O"), ("O2-", "O"), ("Fe3+", "Fe"), ("C4+", "C"), ("D", "D"), ("Cl", "Cl"), ("M", "X"), ("MW", "X"),
-     ("EP", "X"), ("Du", "X"), ("L", "X"), ("Q", "X"), ("X", "X"), ("OW", ""), ("HW1", "")],
-)  # fmt: skip
+    [
+        ("O", "O"),
+        ("O2-", "O"),
+        ("Fe3+", "Fe"),
+        ("C4+", "C"),
+        ("D", "D"),
+        ("Cl", "Cl"),
+        ("M", "X"),
+        ("MW", "X"),
+        ("EP", "X"),
+        ("Du", "X"),
+        ("L", "X"),
+        ("Q", "X"),
+        ("X", "X"),
+        ("OW", ""),
+        ("HW1", ""),
+    ],
+)
 def test_types_and_elements(symbol, element, tmp_path):
     found = read(tmp_path, cif(ORTHORHOMBIC, (("A1", symbol, (0.1, 0.2, 0.3)),)))
     assert found.elements == [element]
@@ -423,15 +567,21 @@ def test_types_and_elements(symbol, element, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "names", [("OW", "HW1", "HW2", "MW"), ("O", "H", "H", "M"), ("O", "H", "H", "Du"), ("O", "D", "D", "X")]
+    "names",
+    [("OW", "HW1", "HW2", "MW"), ("O", "H", "H", "M"), ("O", "H", "H", "Du"), ("O", "D", "D", "X")],
 )
 def test_massless_sites_and_deuterium(names, tmp_path):
     """As GenIce writes TIP4P, with the names of sites as types, and others."""
     model = load_model("tip4p2005")
     centre, edge = np.array([[2.0, 2, 2], [6, 6, 6]]), 9.0
     x = (model.positions_body[None] + centre[:, None]).reshape(-1, 3) / edge
-    atoms = [(f"{name}{k}", name, point) for k, (name, point) in enumerate(zip(2 * names, x, strict=True))]
-    (tmp_path / "a.cif").write_text(cif((edge,) * 3 + (90,) * 3, atoms, ("X,Y,Z",), **{NAME: "P 1 "}))
+    atoms = [
+        (f"{name}{k}", name, point)
+        for k, (name, point) in enumerate(zip(2 * names, x, strict=True))
+    ]
+    (tmp_path / "a.cif").write_text(
+        cif((edge,) * 3 + (90,) * 3, atoms, ("X,Y,Z",), **{NAME: "P 1 "})
+    )
     found = read_structure(tmp_path / "a.cif", [model], None, True, 0.15)
     assert found.residual_max < 1e-6
     assert len(found.species) == 2
@@ -441,8 +591,12 @@ def test_massless_sites_and_deuterium(names, tmp_path):
 
 
 def mmcif(rows, cell=True, header=()) -> str:
-    """An mmCIF as OpenMM writes it; rows: type, name, residue, number, insertion code, alternative, position, model."""
-    edges = [f"_cell.{key} {value}" for key, value in zip(CELL_KEYS, (20, 21, 22, 90, 90, 90), strict=True)]
+    """An mmCIF as OpenMM writes it; rows: type, name, residue, number, insertion code, alternative,
+    position, model."""
+    edges = [
+        f"_cell.{key} {value}"
+        for key, value in zip(CELL_KEYS, (20, 21, 22, 90, 90, 90), strict=True)
+    ]
     columns = [
         "group_PDB",
         "id",
@@ -460,14 +614,25 @@ def mmcif(rows, cell=True, header=()) -> str:
         "auth_seq_id",
         "pdbx_PDB_model_num",
     ]
-    lines = ["data_cell", "#", *(edges if cell else ()), *header, "loop_", *(f"_atom_site.{c}" for c in columns)]
+    lines = [
+        "data_cell",
+        "#",
+        *(edges if cell else ()),
+        *header,
+        "loop_",
+        *(f"_atom_site.{c}" for c in columns),
+    ]
     for k, (symbol, name, residue, number, code, alternative, at, model) in enumerate(rows, 1):
         point = " ".join(f"{x:.4f}" for x in at)
-        lines.append(f"HETATM {k} {symbol} {name} {alternative} {residue} A . {code} {point} 0.0 {number} {model}")
+        lines.append(
+            f"HETATM {k} {symbol} {name} {alternative} {residue} A . {code} {point} 0.0 {number} {model}"
+        )
     return "\n".join([*lines, ""])
 
 
-def waters(model="tip4p2005", symbols=("O", "H", "H", "?"), numbers=(1, 2), codes=("?", "?"), models=(1, 1)):
+def waters(
+    model="tip4p2005", symbols=("O", "H", "H", "?"), numbers=(1, 2), codes=("?", "?"), models=(1, 1)
+):
     sites = load_model(model)
     names = ("O", "H1", "H2", "M")
     return [
@@ -477,7 +642,9 @@ def waters(model="tip4p2005", symbols=("O", "H", "H", "?"), numbers=(1, 2), code
     ]
 
 
-@pytest.mark.parametrize(("numbers", "codes"), [((1, 2), ("?", "?")), ((7, 7), ("A", "B")), ((3, 3), ("?", "A"))])
+@pytest.mark.parametrize(
+    ("numbers", "codes"), [((1, 2), ("?", "?")), ((7, 7), ("A", "B")), ((3, 3), ("?", "A"))]
+)
 def test_mmcif_of_molecules(numbers, codes, tmp_path):
     (tmp_path / "a.cif").write_text(mmcif(waters(numbers=numbers, codes=codes)))
     found = read_structure(tmp_path / "a.cif", [load_model("tip4p2005")], None, True, 0.15)
@@ -493,7 +660,9 @@ def test_models_and_alternatives_of_mmcif(tmp_path):
     (tmp_path / "a.cif").write_text(mmcif(waters(models=(1, 2))))
     with pytest.raises(StructureError, match="holds 2 structures"):
         read_atoms(tmp_path / "a.cif")
-    assert read_atoms(tmp_path / "a.cif", frame=2).position[0] == pytest.approx([7, 5.0, 6.0], abs=0.1)
+    assert read_atoms(tmp_path / "a.cif", frame=2).position[0] == pytest.approx(
+        [7, 5.0, 6.0], abs=0.1
+    )
     rows = [(*row[:5], "AB"[k % 2], *row[6:]) for k, row in enumerate(waters())]
     with pytest.raises(StructureError, match="has alternate locations A, B; keep one of them"):
         read(tmp_path, mmcif(rows))
@@ -511,7 +680,9 @@ def test_symmetry_and_orientation_of_mmcif(tmp_path):
     is_expanded(plain, operations, atoms)
     matrix = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]) / edges[:, None]
     entries = [
-        f"_atom_sites.fract_transf_matrix[{i + 1}][{j + 1}] {matrix[i, j]:.9f}" for i in range(3) for j in range(3)
+        f"_atom_sites.fract_transf_matrix[{i + 1}][{j + 1}] {matrix[i, j]:.9f}"
+        for i in range(3)
+        for j in range(3)
     ]
     entries += [f"_atom_sites.fract_transf_vector[{i + 1}] 0.1" for i in range(3)]
     turned = read(tmp_path, mmcif(rows, header=[*header, *entries]))

@@ -1,4 +1,5 @@
-"""Files of a run that are not what a run writes: each command ends with one sentence, or takes them."""
+"""Files of a run that are not what a run writes: each command ends with one sentence, or takes
+them."""
 
 import copy
 import json
@@ -29,8 +30,23 @@ from rigidmd.errors import OutputError, RigidMDError
 
 DEEP = "[" * 5000 + "]" * 5000
 #: What a value of a file of JSON becomes, as text.
-OTHERS = ["null", "3", "-1e300", "1e999", "NaN", '"text"', "[]", "{}", '[[1]]', '{"a": 1}', "true", "9" * 5000, DEEP,
-          '"\\u0000"', '"</script><b>"']  # fmt: skip
+OTHERS = [
+    "null",
+    "3",
+    "-1e300",
+    "1e999",
+    "NaN",
+    '"text"',
+    "[]",
+    "{}",
+    "[[1]]",
+    '{"a": 1}',
+    "true",
+    "9" * 5000,
+    DEEP,
+    '"\\u0000"',
+    '"</script><b>"',
+]
 #: Of a cell of a file of CSV.
 CELLS = [
     "",
@@ -51,10 +67,12 @@ CELLS = [
     " 1 ",
 ]
 ARGON = {
-    "box": {"lengths_A": 30.0}, "start": {"temperature_K": 90.0}, "molecules": [{"model": "argon", "count": 20}],
+    "box": {"lengths_A": 30.0},
+    "start": {"temperature_K": 90.0},
+    "molecules": [{"model": "argon", "count": 20}],
     "stages": [{"name": "first", "duration_ps": 0.02}, {"duration_ps": 0.1}],
     "output": {"log_interval_ps": 0.004, "trajectory_interval_ps": 0.01, "figures": False},
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +86,9 @@ def argon(tmp_path_factory):
 @pytest.fixture(scope="module")
 def top(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "top"
-    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.1, "output.figures": False})
+    scene = Scene.read(
+        ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.1, "output.figures": False}
+    )
     Simulation(scene, folder).run()
     return folder
 
@@ -81,7 +101,13 @@ def copied(folder, tmp_path):
 def places(value, path=()):
     """Paths to all values of nested tables and lists."""
     yield path
-    for key, inner in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+    for key, inner in (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    ):
         yield from places(inner, (*path, key))
 
 
@@ -167,7 +193,10 @@ def test_any_value_of_an_analysis(argon, tmp_path):
 
 def test_any_value_of_a_manifest(tmp_path):
     points = [SweepPoint(f"p{k}", {"seed": k}, "0" * 64) for k in range(2)]
-    write_manifest(tmp_path, Manifest("s", "s.toml", {"seed": ["seed"]}, {"a.b": 1}, {"c": [1]}, {"file": "0"}, points))
+    write_manifest(
+        tmp_path,
+        Manifest("s", "s.toml", {"seed": ["seed"]}, {"a.b": 1}, {"c": [1]}, {"file": "0"}, points),
+    )
     data = json.loads((tmp_path / "sweep.json").read_text())
     assert read_manifest(tmp_path).points == points
     found = [0, 0]
@@ -178,14 +207,30 @@ def test_any_value_of_a_manifest(tmp_path):
     assert min(found) > 5
 
 
-@pytest.mark.parametrize(("which", "name"), [("argon", "log.csv"), ("argon", "rdf.csv"), ("top", "motion.csv")])
+@pytest.mark.parametrize(
+    ("which", "name"), [("argon", "log.csv"), ("argon", "rdf.csv"), ("top", "motion.csv")]
+)
 def test_any_cell_of_a_table(which, name, request, tmp_path):
     source = request.getfixturevalue(which)
     folder, text = copied(source, tmp_path), (source / name).read_text()
     lines, chosen = text.splitlines(), random.Random(3)
     read = read_results if name == "rdf.csv" else read_record
-    texts = ["", "\n", "\0", '"', "a\n", lines[0], lines[0] + "\n", "x" * 3_000_000, text[:-20], text.replace("\n", "\r\n"),
-             "\ufeff" + text, text + "1,2\n", text * 2, ("," * 50_000 + "\n") * 2]  # fmt: skip
+    texts = [
+        "",
+        "\n",
+        "\0",
+        '"',
+        "a\n",
+        lines[0],
+        lines[0] + "\n",
+        "x" * 3_000_000,
+        text[:-20],
+        text.replace("\n", "\r\n"),
+        "\ufeff" + text,
+        text + "1,2\n",
+        text * 2,
+        ("," * 50_000 + "\n") * 2,
+    ]
     for _ in range(25):
         row = chosen.randrange(len(lines))
         cells = lines[row].split(",")
@@ -230,12 +275,16 @@ KINDS = ["pipe", "link to a pipe", "link to a device", "folder", "broken link", 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["summary.json", "log.csv", ANALYSIS, "rdf.csv", "scene.toml", "final.npz"])
+@pytest.mark.parametrize(
+    "name", ["summary.json", "log.csv", ANALYSIS, "rdf.csv", "scene.toml", "final.npz"]
+)
 def test_what_is_no_file_is_not_read(kind, name, argon, tmp_path):
     folder = copied(argon, tmp_path)
     put(kind, folder / name, tmp_path)
     if name == "scene.toml":
-        with pytest.raises(RigidMDError, match=name if kind != "broken link" else "is not the folder of a run"):
+        with pytest.raises(
+            RigidMDError, match=name if kind != "broken link" else "is not the folder of a run"
+        ):
             read_record(folder)
         return
     if name != "final.npz":
@@ -259,7 +308,9 @@ def test_a_pipe_hangs_no_command(command, name, argon, tmp_path, capsys):
     assert f"{folder / name} cannot be read: it is a pipe" in said.out + said.err
 
 
-@pytest.mark.parametrize("name", ["log.csv", "summary.json", "trajectory.xtc", "scene.toml", "rdf.csv"])
+@pytest.mark.parametrize(
+    "name", ["log.csv", "summary.json", "trajectory.xtc", "scene.toml", "rdf.csv"]
+)
 @pytest.mark.parametrize("command", ["report", "view", "analyse", "resume", "film"])
 def test_no_link_out_of_the_folder_of_a_run_is_followed(command, name, argon, tmp_path, capsys):
     folder = copied(argon, tmp_path)
@@ -271,7 +322,10 @@ def test_no_link_out_of_the_folder_of_a_run_is_followed(command, name, argon, tm
     (folder / name).symlink_to(elsewhere)
     assert cli.main([command, str(folder)]) == 2
     said = capsys.readouterr()
-    assert f"{folder / name} is a link out of its folder" in said.err and "salary" not in said.out + said.err
+    assert (
+        f"{folder / name} is a link out of its folder" in said.err
+        and "salary" not in said.out + said.err
+    )
 
 
 def test_a_link_within_the_folder_of_a_run_is_followed(argon, tmp_path):

@@ -1,4 +1,5 @@
-"""The defaults of users: electrostatics, truncation of charges, tail correction, real-space cutoff of PME, precision."""
+"""The defaults of users: electrostatics, truncation of charges, tail correction, real-space cutoff
+of PME, precision."""
 
 import json
 import re
@@ -23,7 +24,7 @@ from support import (
     real_error,
     stable_angle,
     step_error,
-)  # fmt: skip
+)
 
 from rigidmd import Scene, Simulation, resolve
 from rigidmd.commands.cli import main
@@ -38,7 +39,9 @@ def scene(edge: float | None = 13.0, **tables) -> Scene:
     """64 waters with nothing but what a user has to say."""
     box = {"lengths_A": edge} if edge else {"lengths_A": 13.0, "periodic": False}
     forces = {"cutoff_A": 6.0} if edge else {}
-    return Scene.from_dict({"box": box, "molecules": [WATER], "forces": forces, "stages": [NVT]} | tables)
+    return Scene.from_dict(
+        {"box": box, "molecules": [WATER], "forces": forces, "stages": [NVT]} | tables
+    )
 
 
 def forces_of(**tables):
@@ -49,22 +52,41 @@ def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
     assert forces_of().electrostatics == "pme"
     assert forces_of(edge=None).electrostatics == "coulomb"
     assert forces_of(molecules=[{"model": "argon", "count": 64}]).electrostatics == "none"
-    assert forces_of(forces={"electrostatics": "reaction_field", "cutoff_A": 6.0}).electrostatics == "reaction_field"
+    assert (
+        forces_of(forces={"electrostatics": "reaction_field", "cutoff_A": 6.0}).electrostatics
+        == "reaction_field"
+    )
 
 
 @pytest.mark.parametrize(
     ("edge", "forces", "message"),
     [
-        (13.0, {"reaction_field_permittivity": 78.0}, "would do nothing with electrostatics = 'pme' .the default."),
+        (
+            13.0,
+            {"reaction_field_permittivity": 78.0},
+            "would do nothing with electrostatics = 'pme' .the default.",
+        ),
         (
             None,
             {"ewald_accuracy": 1e-4},
             "ewald_accuracy would do nothing with electrostatics = 'coulomb' .the default",
         ),
-        (13.0, {"electrostatics": "coulomb"}, "'coulomb' is for open boxes; in a periodic one use pme"),
-        (None, {"electrostatics": "pme"}, "'pme' needs a periodic box; use coulomb, the sum over all pairs"),
+        (
+            13.0,
+            {"electrostatics": "coulomb"},
+            "'coulomb' is for open boxes; in a periodic one use pme",
+        ),
+        (
+            None,
+            {"electrostatics": "pme"},
+            "'pme' needs a periodic box; use coulomb, the sum over all pairs",
+        ),
         (13.0, {"ewald_cutoff_A": 7.0}, "ewald_cutoff_A = 7 is longer than half the shortest edge"),
-        (13.0, {"electrostatics": "pme", "reaction_field_truncation": "switch"}, "reaction_field_truncation would do"),
+        (
+            13.0,
+            {"electrostatics": "pme", "reaction_field_truncation": "switch"},
+            "reaction_field_truncation would do",
+        ),
     ],
 )
 def test_keys_that_do_nothing_are_refused(edge, forces, message):
@@ -76,7 +98,10 @@ def test_without_a_box_all_pairs_of_charges_act_whatever_the_cutoff():
     simulation = Simulation(scene(None, forces={"cutoff_A": 4.0}))
     found = simulation.start_energy(KJ_PER_MOL, "kJ/mol")["components"]
     system = simulation.system
-    position, charge = system.site_positions(simulation.state), system.of_sites(lambda m: m.charges) * COULOMB_CHARGE
+    position, charge = (
+        system.site_positions(simulation.state),
+        system.of_sites(lambda m: m.charges) * COULOMB_CHARGE,
+    )
     distance = np.linalg.norm(position[:, None] - position, axis=2)
     other = np.not_equal.outer(system.sites.molecule, system.sites.molecule)
     pairs = np.divide(np.outer(charge, charge), distance, out=np.zeros_like(distance), where=other)
@@ -84,36 +109,47 @@ def test_without_a_box_all_pairs_of_charges_act_whatever_the_cutoff():
     assert system.terms["lennard_jones"].potential.cutoff == 4.0
 
 
-# --- truncation of charges -------------------------------------------------------------------------------------------
+# --- truncation of charges ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("forces", "expected"),
     [
-        ({}, "shift"), ({"truncation": "force_switch"}, "shift"), ({"truncation": "plain"}, "plain"),
-        ({"truncation": "smooth_switch"}, "smooth_switch"), ({"reaction_field_truncation": "switch"}, "switch"),
+        ({}, "shift"),
+        ({"truncation": "force_switch"}, "shift"),
+        ({"truncation": "plain"}, "plain"),
+        ({"truncation": "smooth_switch"}, "smooth_switch"),
+        ({"reaction_field_truncation": "switch"}, "switch"),
     ],
-)  # fmt: skip
+)
 def test_a_reaction_field_is_truncated_apart_from_lennard_jones(forces, expected):
     found = forces_of(forces={"cutoff_A": 6.0, "electrostatics": "reaction_field"} | forces)
-    assert (found.reaction_field_truncation, found.truncation) == (expected, forces.get("truncation", "shift"))
+    assert (found.reaction_field_truncation, found.truncation) == (
+        expected,
+        forces.get("truncation", "shift"),
+    )
 
 
 def test_the_force_of_a_conducting_reaction_field_vanishes_at_the_cutoff():
     system = build(scene(forces={"cutoff_A": 6.0, "electrostatics": "reaction_field"}))
     term = system.terms["coulomb"]
-    energy = [1 / r + term.potential.field * r**2 + term.potential.terms[0] for r in (6.0, 6.0 - 1e-4)]
+    energy = [
+        1 / r + term.potential.field * r**2 + term.potential.terms[0] for r in (6.0, 6.0 - 1e-4)
+    ]
     assert energy[0] == pytest.approx(0, abs=1e-15)
     assert energy[1] == pytest.approx(0, abs=1e-8)
 
 
-# --- tail correction -------------------------------------------------------------------------------------------------
+# --- tail correction ------------------------------------------------------------------------------
 
 
 def positions_file(path, position, edges) -> str:
     rows = [f"Ar {x} {y} {z}" for x, y, z in position]
     lattice = " ".join(f"{x:g}" for x in np.diag(edges).ravel())
-    path.write_text("\n".join([str(len(rows)), f'Lattice="{lattice}" Properties=species:S:1:pos:R:3', *rows]) + "\n")
+    path.write_text(
+        "\n".join([str(len(rows)), f'Lattice="{lattice}" Properties=species:S:1:pos:R:3', *rows])
+        + "\n"
+    )
     return path.name
 
 
@@ -132,8 +168,10 @@ def test_a_tail_correction_is_for_boxes_that_molecules_fill(lattice, edges, expe
     position = spacing * (np.array(list(np.ndindex(*lattice))) + 0.5)
     tables = {
         "structure": {"file": positions_file(tmp_path / "argon.xyz", position, edges)},
-        "molecules": [{"model": "argon"}], "forces": {"cutoff_A": 6.0}, "stages": [NVT | {"temperature_K": 90.0}],
-    }  # fmt: skip
+        "molecules": [{"model": "argon"}],
+        "forces": {"cutoff_A": 6.0},
+        "stages": [NVT | {"temperature_K": 90.0}],
+    }
     system = build(Scene.from_dict(tables, tmp_path))
     assert system.scene.forces.tail_correction is expected
     assert (system.tail is not None) == expected
@@ -144,24 +182,44 @@ def test_a_tail_correction_is_for_boxes_that_molecules_fill(lattice, edges, expe
     "tables",
     [
         {"molecules": [WATER, {"model": "argon", "count": 2, "frozen": True}]},
-        {"box": {"lengths_A": [13.0, 13.0, 30.0]}, "fields": {"walls": [
-            {"axis": "z", "positions_A": [0.0, 13.0], "kind": "harmonic", "stiffness_kJ_mol_A2": 100.0}]}},
+        {
+            "box": {"lengths_A": [13.0, 13.0, 30.0]},
+            "fields": {
+                "walls": [
+                    {
+                        "axis": "z",
+                        "positions_A": [0.0, 13.0],
+                        "kind": "harmonic",
+                        "stiffness_kJ_mol_A2": 100.0,
+                    }
+                ]
+            },
+        },
         {"forces": {"cutoff_A": 6.0, "lennard_jones": False}},
-        {"forces": {"cutoff_A": 6.0, "custom": [{"name": "slow", "energy": "A/r", "parameters": {"A": 1.0}}]}},
+        {
+            "forces": {
+                "cutoff_A": 6.0,
+                "custom": [{"name": "slow", "energy": "A/r", "parameters": {"A": 1.0}}],
+            }
+        },
     ],
-)  # fmt: skip
+)
 def test_no_tail_correction_beside_walls_and_frozen_molecules(tables):
     system = build(scene(**tables))
     assert system.tail is None
     assert any("tail correction" in reason for reason in system.left_out)
 
 
-# --- PME -------------------------------------------------------------------------------------------------------------
+# --- PME ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cutoff", [6.0, 9.0])
 def test_the_real_space_cutoff_of_pme_is_that_of_speed_and_keeps_the_accuracy(cutoff):
-    tables = {"molecules": [WATER | {"count": 216}], "box": {"density_g_cm3": 0.997}, "precision": "double"}
+    tables = {
+        "molecules": [WATER | {"count": 216}],
+        "box": {"density_g_cm3": 0.997},
+        "precision": "double",
+    }
     system = build(scene(**tables, forces={"cutoff_A": cutoff}))
     forces = system.scene.forces
     assert 5.0 <= forces.ewald_cutoff_A <= 7.0  # by the density of charges, not by Lennard-Jones
@@ -182,7 +240,8 @@ def test_dilute_charges_have_a_longer_cutoff_and_given_ones_stay():
 
 
 def test_the_accuracy_is_better_than_the_defaults_of_gromacs_and_openmm():
-    """GROMACS: ewald-rtol 1e-5, order 4, a grid of at most 1.2 Å; OpenMM: a tolerance of 5e-4, order 5."""
+    """GROMACS: ewald-rtol 1e-5, order 4, a grid of at most 1.2 Å; OpenMM: a tolerance of 5e-4,
+    order 5."""
     edge, cutoff = 49.72, 9.0
     charges = charges_in(build(scene()).species, np.array([4096]))
     cell, volume, tolerance = edge * np.eye(3), edge**3, 5e-4
@@ -190,18 +249,22 @@ def test_the_accuracy_is_better_than_the_defaults_of_gromacs_and_openmm():
     assert erfc(alphas[0] * cutoff) == pytest.approx(1e-5)
     grids = (42, 42, 42), (45, 45, 45)  # ceil(2 alpha L/(3 tolerance^(1/5))) of OpenMM
     errors = [
-        np.hypot(real_error(charges, alpha, cutoff, volume), pme_error(charges, alpha, cell, grid, order))
+        np.hypot(
+            real_error(charges, alpha, cutoff, volume), pme_error(charges, alpha, cell, grid, order)
+        )
         for alpha, grid, order in zip(alphas, grids, (4, 5), strict=True)
     ]
     assert np.round(np.array(errors) * 1e5) == pytest.approx([9, 8])  # as in the manual
     assert build(scene()).force_error / COULOMB < 5e-5 < min(errors)
 
 
-# --- precision -------------------------------------------------------------------------------------------------------
+# --- precision ------------------------------------------------------------------------------------
 
 
 def precision_of(**stage) -> tuple[str, str]:
-    system = build(scene(stages=[{key: value for key, value in (NVT | stage).items() if value is not None}]))
+    system = build(
+        scene(stages=[{key: value for key, value in (NVT | stage).items() if value is not None}])
+    )
     return system.scene.precision, system.precision_reason
 
 
@@ -209,13 +272,25 @@ def precision_of(**stage) -> tuple[str, str]:
     ("stage", "precision", "reason"),
     [
         ({}, "mixed", "velocity_verlet at 2 fs, about 1e-02 of the forces, is 3,2"),
-        ({"timestep_fs": 0.1}, "double", "is 8 times that of single precision, 3e-06, and not 30 times"),
+        (
+            {"timestep_fs": 0.1},
+            "double",
+            "is 8 times that of single precision, 3e-06, and not 30 times",
+        ),
         ({"integrator": "srkn_4", "timestep_fs": 2.0}, "double", "srkn_4 at 2 fs"),
         ({"integrator": "two_stage", "timestep_fs": 4.0}, "mixed", "two_stage at 4 fs"),
-        ({"ensemble": "minimise", "temperature_K": None, "duration_ps": None}, "double", "no stage has a given time step"),
-        ({"integrator": "auto", "energy_error_kT": 1e-4, "timestep_fs": None}, "double", "chooses its step for a small"),
+        (
+            {"ensemble": "minimise", "temperature_K": None, "duration_ps": None},
+            "double",
+            "no stage has a given time step",
+        ),
+        (
+            {"integrator": "auto", "energy_error_kT": 1e-4, "timestep_fs": None},
+            "double",
+            "chooses its step for a small",
+        ),
     ],
-)  # fmt: skip
+)
 def test_precision_is_single_between_sites_where_the_step_hides_it(stage, precision, reason):
     tables = {} if stage.get("ensemble") != "minimise" else {"start": {"temperature_K": 300.0}}
     stages = [{key: value for key, value in (NVT | stage).items() if value is not None}]
@@ -226,7 +301,9 @@ def test_precision_is_single_between_sites_where_the_step_hides_it(stage, precis
     system = build(scene(stages=stages, **tables))
     assert system.scene.precision == precision
     assert reason in system.precision_reason
-    assert f"{precision} precision, chosen because" in describe(system.scene.model_copy(update={"precision": "auto"}))
+    assert f"{precision} precision, chosen because" in describe(
+        system.scene.model_copy(update={"precision": "auto"})
+    )
 
 
 def test_the_strictest_stage_decides_and_a_given_precision_stays():
@@ -254,49 +331,70 @@ def test_a_run_says_its_precision_and_energy_is_in_double(tmp_path):
     assert energy["components"] == exact["components"]
 
 
-@pytest.mark.parametrize("name", ["velocity_verlet", "two_stage", "pefrl", "srkn_6", "takahashi_imada"])
+@pytest.mark.parametrize(
+    "name", ["velocity_verlet", "two_stage", "pefrl", "srkn_6", "takahashi_imada"]
+)
 def test_the_error_of_a_step_is_that_of_the_frequency(name):
     """The phase of an oscillator after many steps, against w t."""
     scheme, angle = SCHEMES[name], 0.3
     matrix = np.eye(2)
     for flow in scheme.flows:
         if flow.kind == 0:  # a kick
-            matrix = np.array([[1, 0], [-flow.fraction * angle**2 * (1 - flow.gradient * angle**2), 1]]) @ matrix
+            matrix = (
+                np.array([[1, 0], [-flow.fraction * angle**2 * (1 - flow.gradient * angle**2), 1]])
+                @ matrix
+            )
         else:
             matrix = np.array([[1, flow.fraction], [0, 1]]) @ matrix
     followed = abs(np.angle(np.linalg.eigvals(matrix)[0]))
-    assert step_error(scheme, angle) == pytest.approx(abs((followed / angle) ** 2 - 1), rel=1e-6, abs=1e-12)
+    assert step_error(scheme, angle) == pytest.approx(
+        abs((followed / angle) ** 2 - 1), rel=1e-6, abs=1e-12
+    )
     assert step_error(scheme, 1.01 * stable_angle(scheme)) == inf
 
 
 def test_the_error_of_velocity_verlet_is_known():
     for angle in (0.01, 0.1, 0.3):
-        assert step_error(SCHEMES["velocity_verlet"], angle) == pytest.approx(angle**2 / 12, rel=0.02)
+        assert step_error(SCHEMES["velocity_verlet"], angle) == pytest.approx(
+            angle**2 / 12, rel=0.02
+        )
         assert step_error(WITH_THERMOSTAT["baoab"], angle) == pytest.approx(angle**2 / 12, rel=0.02)
     species = build(scene()).species
     assert error_of_step(species, 0.0, SCHEMES["velocity_verlet"], 2.0) == 0.0
-    assert error_of_step(species, 298.15, SCHEMES["velocity_verlet"], 2.0) > 100 * MARGIN * MIXED_ERROR
+    assert (
+        error_of_step(species, 298.15, SCHEMES["velocity_verlet"], 2.0) > 100 * MARGIN * MIXED_ERROR
+    )
 
 
 @pytest.mark.parametrize("edge", [40.0, 200.0])
 def test_a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid(edge, capsys):
-    """The mean density of the box would allow errors that a droplet or a pair of molecules in a gas does not have."""
+    """The mean density of the box would allow errors that a droplet or a pair of molecules in a gas
+    does not have."""
     path = ROOT / "systems" / "water_from_structure.toml"
-    assert main(["energy", str(path), "--accuracy", "--json", "--set", f"box.lengths_A={edge}"]) == 0
+    assert (
+        main(["energy", str(path), "--accuracy", "--json", "--set", f"box.lengths_A={edge}"]) == 0
+    )
     found = json.loads(capsys.readouterr().out)["accuracy"]
     assert 1e-7 < found["in_e2_per_A2"] < 5e-5
     scene = resolve(Scene.read(path, {"box.lengths_A": edge}))
-    assert max(scene.forces.pme_grid) <= 24  # a spacing that the box would not allow at a cutoff of 14 Å
+    assert (
+        max(scene.forces.pme_grid) <= 24
+    )  # a spacing that the box would not allow at a cutoff of 14 Å
 
 
 @pytest.mark.parametrize(
     ("integrator", "forces", "warned"),
     [
-        ("srkn_4", {}, True), ("srkn_4", {"truncation": "plain"}, True), ("srkn_4", {"truncation": "smooth_switch"}, False),
-        ("velocity_verlet", {}, False), ("srkn_4", {"lennard_jones": False}, False),
+        ("srkn_4", {}, True),
+        ("srkn_4", {"truncation": "plain"}, True),
+        ("srkn_4", {"truncation": "smooth_switch"}, False),
+        ("velocity_verlet", {}, False),
+        ("srkn_4", {"lennard_jones": False}, False),
     ],
-)  # fmt: skip
-def test_check_warns_of_an_order_that_the_truncation_does_not_allow(integrator, forces, warned, tmp_path, capsys):
+)
+def test_check_warns_of_an_order_that_the_truncation_does_not_allow(
+    integrator, forces, warned, tmp_path, capsys
+):
     forces = "".join(f"{key} = {json.dumps(value)}\n" for key, value in forces.items())
     text = f'[box]\nlengths_A = 40\n[[molecules]]\nmodel = "spce"\ncount = 8\n[forces]\n{forces}[start]\ntemperature_K = 300\n'
     (tmp_path / "s.toml").write_text(
@@ -313,9 +411,13 @@ def test_the_scene_of_a_run_has_no_keys_that_do_nothing(tmp_path):
     tables = tomllib.loads((tmp_path / "run" / "scene.toml").read_text())
     limits = {"most_iterations", "force_limit_kJ_mol_A", "torque_limit_kJ_mol"}
     assert set(tables["stages"][0]) == {"ensemble", *limits}
-    assert not {"nose_hoover_links", "pressure_coupling", "most_iterations"} & set(tables["stages"][1])
+    assert not {"nose_hoover_links", "pressure_coupling", "most_iterations"} & set(
+        tables["stages"][1]
+    )
     assert not {"damping_per_A", "reaction_field_permittivity"} & set(tables["forces"])
-    assert build(Scene.read(tmp_path / "run" / "scene.toml")).scene.stages == build(ran).scene.stages
+    assert (
+        build(Scene.read(tmp_path / "run" / "scene.toml")).scene.stages == build(ran).scene.stages
+    )
 
 
 @pytest.mark.parametrize("name", ["heavy_top_3", "water", "water_dimer"])

@@ -1,4 +1,5 @@
-"""README and the chapters: every command and snippet in them runs, every key and column is in the manual, no link is dead.
+"""README and the chapters: every command and snippet in them runs, every key and column is in the
+manual, no link is dead.
 
 A comment before a block tells this file how to treat it:
 
@@ -7,14 +8,16 @@ A comment before a block tells this file how to treat it:
                                    of --set to each `Scene.read` of a Python block: shorter runs
     <!-- test: not run, WHY -->    commands are parsed, and their scenes read, but not run
     <!-- test: output of CMD -->   every line of the block is in the output of CMD, in this order. CMD runs with the options
-                                   of the document where it is one of its commands, else as it stands
-    <!-- test: output like CMD --> the same, but each number may be any number, with any spaces before it, and a line may be
-                                   longer: the block is of a longer run, another machine or version of another program
+                                   of the document where it is one of its commands, else as it
+                                   stands
+    <!-- test: output like CMD --> the same, but each number may be any number, with any spaces
+                                   before it, and a line may be longer: the block is of a longer
+                                   run, another machine or version of another program
     <!-- output: WHERE -->         the block is not compared: WHERE has the version, the command and the machine that made it
     <!-- test: not output, WHY --> the block is a text that no command prints
 
-In quoted output `...` stands for any text, a line of it for any lines, and a number below 1e-9 for any such number: it is
-a rounding error. Every quoted output has one of these comments.
+In quoted output `...` stands for any text, a line of it for any lines, and a number below 1e-9 for
+any such number: it is a rounding error. Every quoted output has one of these comments.
 
 Commands and snippets of a document run in their order, in one folder that has a copy of systems/.
 """
@@ -55,9 +58,13 @@ from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 
 README = ROOT / "README.md"
 #: The chapters of this checkout; those of an installed package may be elsewhere.
-PAGES = {name: ROOT / "rigidmd" / "docs" / path.relative_to(DOCS) for name, path in CHAPTERS.items()}
+PAGES = {
+    name: ROOT / "rigidmd" / "docs" / path.relative_to(DOCS) for name, path in CHAPTERS.items()
+}
 DOCUMENTS = [README, *PAGES.values()]
-MANUAL = "\n".join(path.read_text(encoding="utf-8") for path in PAGES.values() if path.parent.name == "reference")
+MANUAL = "\n".join(
+    path.read_text(encoding="utf-8") for path in PAGES.values() if path.parent.name == "reference"
+)
 LANGUAGES = {"sh", "python", "toml", "text", "bibtex"}
 MINIMAL = {
     MolecularScene: {
@@ -89,14 +96,18 @@ def blocks_of(document: Path) -> list[Block]:
         line = lines[k]
         if marker := re.fullmatch(r"<!-- (test|output): (.*) -->", line):
             told = marker[2] if marker[1] == "test" else f"recorded {marker[2]}"
-            assert lines[k + 1].startswith("```"), f"{document.name}:{k + 1}: a block must follow at once"
+            assert lines[k + 1].startswith("```"), (
+                f"{document.name}:{k + 1}: a block must follow at once"
+            )
         elif line.startswith("```"):
             end = lines.index("```", k + 1)
             found.append(Block(k + 2, line[3:], "\n".join(lines[k + 1 : end]), told))
             told, k = "", end
         elif re.match(r" {4}\S", line) and not lines[k - 1]:
             end = next(n for n in range(k, len(lines)) if not lines[n].startswith("    "))
-            found.append(Block(k + 1, "sh", "\n".join(line[4:] for line in lines[k:end]), "not run, by CI"))
+            found.append(
+                Block(k + 1, "sh", "\n".join(line[4:] for line in lines[k:end]), "not run, by CI")
+            )
             k = end - 1
         k += 1
     return found
@@ -105,7 +116,11 @@ def blocks_of(document: Path) -> list[Block]:
 def commands_of(text: str) -> list[list[str]]:
     """The words of each command of a shell block, comments left out."""
     joined = text.replace("\\\n", " ")
-    return [shlex.split(part, comments=True) for line in joined.splitlines() for part in line.split("&&")]
+    return [
+        shlex.split(part, comments=True)
+        for line in joined.splitlines()
+        for part in line.split("&&")
+    ]
 
 
 NUMBER = r"[+-]?\d[\d,.]*(?:e[+-]?\d+)?"
@@ -139,7 +154,9 @@ class Reader:
     def follow(self, block: Block) -> None:
         how, _, rest = block.told.partition(" ")
         assert how in ("", "file", "with", "not", "output", "recorded"), block.told
-        assert block.told or block.language != "text" or "±" not in block.text, "quoted output must have its command"
+        assert block.told or block.language != "text" or "±" not in block.text, (
+            "quoted output must have its command"
+        )
         if how == "file":
             Path(rest).write_text(block.text + "\n", encoding="utf-8")
         options = shlex.split(rest) if how == "with" else []
@@ -187,9 +204,15 @@ class Reader:
                 source = (ROOT / script).read_text()
                 assert all(a in source for a in arguments if a.startswith("--")), words
             case ["python", script]:
-                # Terms of one's own name their classes in the cache, and would leave an index nobody else can read
-                own = {"RIGIDMD_CACHE": "cache", "PYTHONPATH": str(Path(rigidmd.__file__).parents[1])}
-                done = subprocess.run([sys.executable, script], env=os.environ | own, capture_output=True, text=True)
+                # Terms of one's own name their classes in the cache, and would leave an index
+                # nobody else can read
+                own = {
+                    "RIGIDMD_CACHE": "cache",
+                    "PYTHONPATH": str(Path(rigidmd.__file__).parents[1]),
+                }
+                done = subprocess.run(
+                    [sys.executable, script], env=os.environ | own, capture_output=True, text=True
+                )
                 assert done.returncode == 0, done.stderr
             case ["pip", "install", what]:
                 project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -216,7 +239,8 @@ class Reader:
             exec(compile("\n" * (block.line - 1) + block.text, "snippet", "exec"), self.namespace)
 
     def scene(self, data: dict, file: str) -> None:
-        """A whole scene must build; a fragment must validate within a minimal scene; a table of sites as such."""
+        """A whole scene must build; a fragment must validate within a minimal scene; a table of
+        sites as such."""
         if "sites" in data:
             assert file, "a molecule or table of parameters is a file"
             if "name" not in data:
@@ -231,7 +255,11 @@ class Reader:
             Path(named).touch()  # a fragment is not built: it is enough that the file is there
         faults = []
         for kind, minimal in MINIMAL.items():
-            whole = {key: value for key, value in minimal.items() if key != "box" or "structure" not in data} | data
+            whole = {
+                key: value
+                for key, value in minimal.items()
+                if key != "box" or "structure" not in data
+            } | data
             try:
                 kind.from_dict(whole, ".")
                 return
@@ -241,7 +269,8 @@ class Reader:
 
 
 def parse(arguments: list[str]) -> argparse.Namespace:
-    """The options of a command line, its scene read with them if it is there. Fails where the commands would."""
+    """The options of a command line, its scene read with them if it is there. Fails where the
+    commands would."""
     try:
         options = cli._parse(arguments)
     except SystemExit as error:
@@ -268,7 +297,9 @@ def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsy
     monkeypatch.setattr(sys, "argv", ["rigidmd"])
     reader = Reader(monkeypatch, capsys)
     for block in blocks_of(document):
-        assert block.language in LANGUAGES, f"{document.name}:{block.line}: a block of {block.language!r}"
+        assert block.language in LANGUAGES, (
+            f"{document.name}:{block.line}: a block of {block.language!r}"
+        )
         try:
             reader.follow(block)
         except BaseException as error:
@@ -286,9 +317,14 @@ def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsy
 
 
 def _first_of_its_kind(column: str) -> str:
-    """The column that stands in the manual for all of its kind: omega_body_1 (rad/s) for omega_body_2 (rad/s), q11 for q23."""
+    """The column that stands in the manual for all of its kind: omega_body_1 (rad/s) for
+    omega_body_2 (rad/s), q11 for q23."""
     column = re.sub(r"^L_\w+_error$", "L_z_error", column)
-    return re.sub(r"_[xyz](?= \(|$)", "_x", re.sub(r"_[123](?= \(|$)", "_1", re.sub(r"^q\d\d$", "q11", column)))
+    return re.sub(
+        r"_[xyz](?= \(|$)",
+        "_x",
+        re.sub(r"_[123](?= \(|$)", "_1", re.sub(r"^q\d\d$", "q11", column)),
+    )
 
 
 def section(title: str) -> str:
@@ -302,14 +338,25 @@ def section(title: str) -> str:
 
 _, COMMANDS = cli._parser()
 PLACEHOLDERS = {
-    "SCENE": "scene.toml", "[NAME]": "", "[CHAPTER]": "", "NAME": "x", "CHAPTER": "x", "KEY=VALUE": "a=1", "KEY=": "a=",
-    "N": "1", "PS": "1", "DIR": "x", "FILE": "x",
-}  # fmt: skip
+    "SCENE": "scene.toml",
+    "[NAME]": "",
+    "[CHAPTER]": "",
+    "NAME": "x",
+    "CHAPTER": "x",
+    "KEY=VALUE": "a=1",
+    "KEY=": "a=",
+    "N": "1",
+    "PS": "1",
+    "DIR": "x",
+    "FILE": "x",
+}
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
 def test_commands_in_the_text_are_commands(document):
-    text = re.sub(r"^```.*?^```$", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(
+        r"^```.*?^```$", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
     for quoted in re.findall(r"`([^`]+)`", text):
         words = quoted.replace("\n", " ").split()
         if words[0] == "rigidmd" and len(words) == 2 and words[1] not in PLACEHOLDERS:
@@ -328,13 +375,19 @@ def test_commands_in_the_text_are_commands(document):
 def test_every_command_and_option_is_in_the_manual():
     table = section("Commands")
     for name, parser in COMMANDS.items():
-        row = next((line for line in table.splitlines() if line.startswith(f"| `rigidmd {name}")), None)
+        row = next(
+            (line for line in table.splitlines() if line.startswith(f"| `rigidmd {name}")), None
+        )
         assert row, f"the manual has no row for `rigidmd {name}`"
         for action in parser._actions:
             for option in action.option_strings:
                 if option.startswith("--") and option not in ("--help", "--set"):
-                    short = next((o for o in action.option_strings if not o.startswith("--")), option)
-                    assert option in row or f"`{short} " in row, f"the manual's row of {name} lacks {option}"
+                    short = next(
+                        (o for o in action.option_strings if not o.startswith("--")), option
+                    )
+                    assert option in row or f"`{short} " in row, (
+                        f"the manual's row of {name} lacks {option}"
+                    )
 
 
 def tables_of(kind: type[BaseModel], path: str = "", many: bool = False):
@@ -343,7 +396,9 @@ def tables_of(kind: type[BaseModel], path: str = "", many: bool = False):
     yield f"`{name}`" if path else "Top level", kind
     for key, field in kind.model_fields.items():
         for inner in _models_in(field.annotation):
-            yield from tables_of(inner, f"{path}.{key}".strip("."), "tuple" in str(field.annotation))
+            yield from tables_of(
+                inner, f"{path}.{key}".strip("."), "tuple" in str(field.annotation)
+            )
 
 
 def _models_in(annotation) -> list[type[BaseModel]]:
@@ -382,9 +437,14 @@ def test_every_key_of_a_scene_is_in_the_manual_with_its_default(kind):
         for row in re.findall(r"^\| (`[a-z].*?) \| (.*?) ?\| ", section(title), re.MULTILINE):
             said |= {key: row[1].strip() for key in re.findall(r"`(\w+)`", row[0])}
         wanted = {
-            key: "needed" if field.is_required() else f"`{text}`" if (text := _toml(field.default)) else ""
+            key: "needed"
+            if field.is_required()
+            else f"`{text}`"
+            if (text := _toml(field.default))
+            else ""
             for key, field in model.model_fields.items()
-            if not _models_in(field.annotation) or "Literal" in str(field.annotation)  # a table, or a text in its place
+            if not _models_in(field.annotation)
+            or "Literal" in str(field.annotation)  # a table, or a text in its place
         }
         for key in REFUSED.get(heading, ()):
             wanted.pop(key)
@@ -394,7 +454,9 @@ def test_every_key_of_a_scene_is_in_the_manual_with_its_default(kind):
 
 def slugs(document: Path) -> set[str]:
     """Anchors of a document's headings, as they are made where it is shown."""
-    text = re.sub(r"^```.*?^```$", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(
+        r"^```.*?^```$", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
     titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
@@ -453,15 +515,21 @@ def test_help_lists_and_prints_the_chapters(capsys):
         with contextlib.suppress(StopIteration):
             code = next(block for block in blocks_of(PAGES[name]) if block.language == "sh")
             assert re.sub(r"systems/(?=\w+\.toml)", "", code.text) in said
-        for stem, ending in re.findall(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.py|\.ipynb)", source):
+        for stem, ending in re.findall(
+            r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.py|\.ipynb)", source
+        ):
             assert find_example(stem).path.suffix == ending  # `rigidmd new` copies it
         assert not re.search(r"systems/(scripts/)?\w+\.(toml|py)", said)
     cli.main(["help", "top"])
-    assert f"[picture: seven heavy tops, {DOCS / 'images' / 'seven_tops.png'}]" in capsys.readouterr().out
+    assert (
+        f"[picture: seven heavy tops, {DOCS / 'images' / 'seven_tops.png'}]"
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"), [("commandes", "did you mean commands?"), ("qqq", "there are installation, why, top, water")]
+    ("name", "expected"),
+    [("commandes", "did you mean commands?"), ("qqq", "there are installation, why, top, water")],
 )
 def test_a_chapter_that_is_not_there(name, expected, capsys):
     assert cli.main(["help", name]) == 2
@@ -484,20 +552,33 @@ def models_tables() -> str:
         model = tomllib.loads(path.read_text(encoding="utf-8"))
         mixing = "geometric mixing" if model.get("mixing") == "geometric" else ""
         remarks = "; ".join(filter(None, [model.get("note"), mixing]))
-        cells = [f"`{model['name']}`", model["title"], str(len(model["sites"])), remarks, model["source"]]
+        cells = [
+            f"`{model['name']}`",
+            model["title"],
+            str(len(model["sites"])),
+            remarks,
+            model["source"],
+        ]
         row = f"| {' | '.join(cells)} |".replace("|  |", "| |")
         rows[model["group"]].append(re.sub(r"doi:([^\s)|]+)", r"[doi:\1](https://doi.org/\1)", row))
     head = "| model | molecule | sites | remarks | source |\n|---|---|---|---|---|\n"
-    return "\n\n".join(f"## {GROUPS[group]}\n\n{head}" + "\n".join(rows[group]) for group in GROUPS) + "\n"
+    return (
+        "\n\n".join(f"## {GROUPS[group]}\n\n{head}" + "\n".join(rows[group]) for group in GROUPS)
+        + "\n"
+    )
 
 
 def test_the_table_of_integrators_has_their_orders_and_costs():
     table = section("Shipped integrators")
     rows = {}
-    for names, order, cost in re.findall(r"^\| (`.*?`)(?: \(default\))? \| (\d+) \| (\d+) \|", table, re.MULTILINE):
+    for names, order, cost in re.findall(
+        r"^\| (`.*?`)(?: \(default\))? \| (\d+) \| (\d+) \|", table, re.MULTILINE
+    ):
         rows |= dict.fromkeys(re.findall(r"`(\w+)`", names), (int(order), int(cost)))
     shipped = SCHEMES | WITH_THERMOSTAT
-    assert rows == {name: (scheme.order, scheme.force_evaluations) for name, scheme in shipped.items()}
+    assert rows == {
+        name: (scheme.order, scheme.force_evaluations) for name, scheme in shipped.items()
+    }
 
 
 def test_the_page_of_models_has_the_tables_of_their_files():

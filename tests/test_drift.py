@@ -1,4 +1,5 @@
-"""Errors of means and of drifts are as large as their scatter: white noise, processes with memory, random walks."""
+"""Errors of means and of drifts are as large as their scatter: white noise, processes with memory,
+random walks."""
 
 import numpy as np
 import pytest
@@ -43,7 +44,9 @@ def autoregressive(rng, n, time):
 
 def mixed(slow):
     """A slow process below white noise."""
-    return lambda rng, n, time: np.sqrt(1 - slow) * white(rng, n, time) + np.sqrt(slow) * memory(rng, n, time)
+    return lambda rng, n, time: (
+        np.sqrt(1 - slow) * white(rng, n, time) + np.sqrt(slow) * memory(rng, n, time)
+    )
 
 
 def fast_and_slow(rng, n, time):
@@ -58,15 +61,20 @@ def pulls(series, estimate=mean):
 
 
 PROCESSES = {
-    "white": white, "autoregressive": autoregressive, "memory": memory, "half of it slow": mixed(0.5),
-    "a tenth slow": mixed(0.1), "fast and slow": fast_and_slow,
-}  # fmt: skip
+    "white": white,
+    "autoregressive": autoregressive,
+    "memory": memory,
+    "half of it slow": mixed(0.5),
+    "a tenth slow": mixed(0.1),
+    "fast and slow": fast_and_slow,
+}
 
 
 @pytest.mark.parametrize("name", PROCESSES)
 @pytest.mark.parametrize("n", [16, 50, 160, 1000, pytest.param(5000, marks=pytest.mark.soak)])
 def test_the_error_of_a_mean_is_as_large_as_its_scatter(n, name):
-    """For lengths of 10, 20 and 100 of the longest correlation time; a tenth that is slow is harder to see."""
+    """For lengths of 10, 20 and 100 of the longest correlation time; a tenth that is slow is harder
+    to see."""
     rng = np.random.default_rng(n)
     for time in (n / 10, n / 20, n / 100) if name != "white" else (0.5,):
         if time < 0.75 and name != "white":
@@ -83,7 +91,9 @@ def test_the_error_of_a_mean_is_as_large_as_its_scatter(n, name):
             assert np.median([mean(x)[1] for x in white(rng, n, 0.5)]) < 1.35 / np.sqrt(n)
 
 
-@pytest.mark.parametrize("values", [np.ones(7), np.arange(7.0), np.arange(100.0), np.linspace(0, 1, 20) ** 2])
+@pytest.mark.parametrize(
+    "values", [np.ones(7), np.arange(7.0), np.arange(100.0), np.linspace(0, 1, 20) ** 2]
+)
 def test_what_is_too_short_has_no_error(values):
     assert mean(values) == (pytest.approx(values.mean()), None)
     assert mean(np.full(20, 0.1)) == (pytest.approx(0.1), 0.0)
@@ -92,14 +102,17 @@ def test_what_is_too_short_has_no_error(values):
 
 @pytest.mark.parametrize("levels", [(-2.0, -1.0, 0.0, 1.0, 2.0), (1.0, -1.0, 0.5, 0.5, -1.0)])
 def test_a_slow_part_below_fast_noise_has_the_error_of_its_batches(levels):
-    """One level a fifth of the samples: the variance of the mean of five, twice what neighbours share, 3/2 of that."""
+    """One level a fifth of the samples: the variance of the mean of five, twice what neighbours
+    share, 3/2 of that."""
     fast = 8.0 * np.random.default_rng(3).standard_normal((5, 1000))
     values = (fast - fast.mean(axis=1, keepdims=True) + np.array(levels)[:, None]).ravel()
     offset = np.array(levels) - np.mean(levels)
     shared = offset[1:] @ offset[:-1] / (offset @ offset) + 1 / 5
     variance = offset @ offset / 4 / 5 * (1 + 2 * min(max(shared, 0.0), 0.5))
     lost = 1 - inefficiency(values - values.mean()) / len(values)
-    assert mean(values) == pytest.approx((np.mean(levels), np.sqrt(1.5 * variance / lost)), rel=1e-9, abs=1e-12)
+    assert mean(values) == pytest.approx(
+        (np.mean(levels), np.sqrt(1.5 * variance / lost)), rel=1e-9, abs=1e-12
+    )
 
 
 # the equilibrated part
@@ -147,10 +160,19 @@ def test_few_independent_values_have_the_error_of_student():
 
 
 def test_values_without_an_error_are_printed_as_such():
-    assert format_signed(1.5, None) == "+1.5 (too short for an error)" == format_signed(1.5, float("nan"))
+    assert (
+        format_signed(1.5, None)
+        == "+1.5 (too short for an error)"
+        == format_signed(1.5, float("nan"))
+    )
     assert format_signed(1.5, 0.25) == "+1.50 ± 0.25"
-    quantities = [AveragedQuantity("U", "kJ/mol", 2.5), AveragedQuantity("T_trans", "K", 300.0, 300.0)]
-    run = AverageRun("baoab", "langevin", 2.0, 500.0, averages={"T_trans": (300.5, 1.0)}, short=["U", "density"])
+    quantities = [
+        AveragedQuantity("U", "kJ/mol", 2.5),
+        AveragedQuantity("T_trans", "K", 300.0, 300.0),
+    ]
+    run = AverageRun(
+        "baoab", "langevin", 2.0, 500.0, averages={"T_trans": (300.5, 1.0)}, short=["U", "density"]
+    )
     found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, quantities, [run])
     (told,) = describe_failures(found)
     assert told == (
@@ -172,9 +194,18 @@ def test_inefficiency_of_correlated_samples():
 @pytest.mark.soak
 def test_means_of_windows_of_a_run_have_honest_errors():
     """Windows of 10 ps of 0.6 ns of 100 argon atoms: potential energy, temperature, pressure."""
-    stages = [{"ensemble": "nvt", "temperature_K": 94.4, "timestep_fs": 10.0, "duration_ps": t} for t in (20.0, 600.0)]
-    scene = small_scene({"argon": 100}, 16.8, start={"temperature_K": 94.4}, stages=stages, forces={"cutoff_A": 8.0},
-                        output={"trajectory": False, "log_interval_ps": 0.1})  # fmt: skip
+    stages = [
+        {"ensemble": "nvt", "temperature_K": 94.4, "timestep_fs": 10.0, "duration_ps": t}
+        for t in (20.0, 600.0)
+    ]
+    scene = small_scene(
+        {"argon": 100},
+        16.8,
+        start={"temperature_K": 94.4},
+        stages=stages,
+        forces={"cutoff_A": 8.0},
+        output={"trajectory": False, "log_interval_ps": 0.1},
+    )
     results = Simulation(scene).run()
     for name in ("potential", "temperature", "pressure_bar"):
         values = results[name][results["stage"] == 1]
@@ -190,11 +221,17 @@ def test_means_of_windows_of_a_run_have_honest_errors():
 @pytest.mark.parametrize(
     ("n", "noise", "walk", "high"),
     [
-        (16, 1.0, 0.0, 0.8), (40, 1.0, 0.0, 0.8), (400, 1.0, 0.0, 0.8),
-        (40, 0.0, 1.0, 1.4), (200, 0.0, 1.0, 1.3), (1000, 0.0, 1.0, 1.3),
-        (200, 1.0, 0.03, 1.25), (1000, 1.0, 0.03, 1.6), (400, 1.0, 0.3, 1.5),
+        (16, 1.0, 0.0, 0.8),
+        (40, 1.0, 0.0, 0.8),
+        (400, 1.0, 0.0, 0.8),
+        (40, 0.0, 1.0, 1.4),
+        (200, 0.0, 1.0, 1.3),
+        (1000, 0.0, 1.0, 1.3),
+        (200, 1.0, 0.03, 1.25),
+        (1000, 1.0, 0.03, 1.6),
+        (400, 1.0, 0.3, 1.5),
     ],
-)  # fmt: skip
+)
 def test_the_error_of_a_slope_is_as_large_as_its_scatter(n, noise, walk, high):
     """Also where a walk hides under white noise."""
     rng = np.random.default_rng(0)

@@ -1,4 +1,5 @@
-"""The step: its order, what it keeps, that it can be run backwards, and that it does the same thing every time."""
+"""The step: its order, what it keeps, that it can be run backwards, and that it does the same thing
+every time."""
 
 import numba
 import numpy as np
@@ -46,9 +47,12 @@ VERLET = SCHEMES["velocity_verlet"]
 def liquid():
     """64 waters (13.4 Å, cut-off 6 Å, smooth), equilibrated: system, engine, state."""
     scene = small_scene(
-        {"spce": 64}, 12.42, forces={"cutoff_A": 6.0, "switch_start_A": 4.5},
-        stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 2.0}], output={"trajectory": False},
-    )  # fmt: skip
+        {"spce": 64},
+        12.42,
+        forces={"cutoff_A": 6.0, "switch_start_A": 4.5},
+        stages=[{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 2.0}],
+        output={"trajectory": False},
+    )
     simulation = Simulation(scene)
     state = simulation.run().state
     return simulation.system, simulation.engine, state
@@ -62,8 +66,8 @@ def run(engine, state, dt, steps, scheme=VERLET):
 
 
 def test_the_energy_error_is_of_order_two(liquid):
-    """Of its fluctuation: the error at the start is no measure, it is small or large by chance (orders of 1.88 to 2.08
-    from 30 starts, those of the fluctuation 1.98 to 2.03)."""
+    """Of its fluctuation: the error at the start is no measure, it is small or large by chance
+    (orders of 1.88 to 2.08 from 30 starts, those of the fluctuation 1.98 to 2.03)."""
     system, engine, state = liquid
     fluctuations = []
     for dt in (0.002, 0.001, 0.0005):
@@ -73,7 +77,9 @@ def test_the_energy_error_is_of_order_two(liquid):
             move(engine, moved, VERLET, dt, round(0.004 / dt))
             energies.append(observe(system, engine, moved).energy)
         fluctuations.append(np.std(energies))
-    assert np.log2(np.array(fluctuations[:-1]) / fluctuations[1:]) == pytest.approx([2, 2], abs=0.06)
+    assert np.log2(np.array(fluctuations[:-1]) / fluctuations[1:]) == pytest.approx(
+        [2, 2], abs=0.06
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,9 +92,10 @@ def test_the_energy_error_is_of_order_two(liquid):
     ],
 )
 def test_a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid(liquid, name, steps, margin):
-    """The median of 27 moments of the liquid. The forces have four derivatives: where a pair passes an end of the
-    switch, srkn_6 is of a lower order, the more visibly the shorter its steps. So single moments differ (3.7 to 7), and
-    the median of nine is off by more than 0.3 in one liquid of fifty."""
+    """The median of 27 moments of the liquid. The forces have four derivatives: where a pair passes
+    an end of the switch, srkn_6 is of a lower order, the more visibly the shorter its steps. So
+    single moments differ (3.7 to 7), and the median of nine is off by more than 0.3 in one liquid
+    of fifty."""
     _, _, state = liquid
     forces = {"cutoff_A": 6.0, "truncation": "smooth_switch", "switch_start_A": 2.0}
     system = build(small_scene({"spce": 64}, 12.42, forces=forces))
@@ -96,13 +103,23 @@ def test_a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid(liquid, na
     for _ in range(27):
         state = run(engine, state, 0.002, 50)
         exact = run(engine, state, 0.03 / 120, 120, scheme=SCHEMES["srkn_6"])
-        errors = [off(run(engine, state, 0.03 / n, n, scheme=SCHEMES[name]), exact) for n in (steps, 2 * steps)]
+        errors = [
+            off(run(engine, state, 0.03 / n, n, scheme=SCHEMES[name]), exact)
+            for n in (steps, 2 * steps)
+        ]
         orders.append(np.log2(errors[0] / errors[1]))
     assert np.median(orders) == pytest.approx(SCHEMES[name].order, abs=margin)
 
 
 # Steps at which the error of each scheme has become a power of the step and is not yet rounding.
-STEPS = {"blanes_moan_6": 24, "srkn_6": 16, "kahan_li_6": 27, "kahan_li_8": 14, "srkn_4": 40, "vefrl": 40}
+STEPS = {
+    "blanes_moan_6": 24,
+    "srkn_6": 16,
+    "kahan_li_6": 27,
+    "kahan_li_8": 14,
+    "srkn_4": 40,
+    "vefrl": 40,
+}
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +138,10 @@ def off(a, b):
 def test_trajectories_converge_with_the_order_of_the_scheme(dimer, name):
     engine, state, exact = dimer
     n, order = STEPS.get(name, 64), SCHEMES[name].order
-    errors = [off(run(engine, state, 0.064 / steps, steps, scheme=SCHEMES[name]), exact) for steps in (n, 2 * n)]
+    errors = [
+        off(run(engine, state, 0.064 / steps, steps, scheme=SCHEMES[name]), exact)
+        for steps in (n, 2 * n)
+    ]
     assert errors[1] > 3e-13
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2 if order > 4 else 0.1)
 
@@ -130,10 +150,14 @@ def test_trajectories_converge_with_the_order_of_the_scheme(dimer, name):
 def test_the_split_rotor_would_take_the_order_away(dimer, name):
     engine, state, exact = dimer
     scheme = SCHEMES[name].with_rotor("split")
-    errors = [off(run(engine, state, 0.064 / steps, steps, scheme=scheme), exact) for steps in (200, 400)]
+    errors = [
+        off(run(engine, state, 0.064 / steps, steps, scheme=scheme), exact) for steps in (200, 400)
+    ]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
     with pytest.raises(SceneError, match=f"{name} needs rotor = 'exact'"):
-        small_scene({"spce": 2}, 15.0, stages=[{"duration_ps": 1.0, "integrator": name, "rotor": "split"}])
+        small_scene(
+            {"spce": 2}, 15.0, stages=[{"duration_ps": 1.0, "integrator": name, "rotor": "split"}]
+        )
 
 
 @pytest.mark.parametrize("name", SCHEMES)
@@ -152,7 +176,9 @@ def test_schemes_are_palindromes_and_run_backwards(dimer, name):
     assert off(run(engine, there, 0.001, 100, scheme=scheme), state) < 1e-11
 
 
-@pytest.mark.parametrize("molecules", [{"spce": 5, "argon": 4}, {"argon": 6}, {"nitrogen": 4, "tip4p": 3}])
+@pytest.mark.parametrize(
+    "molecules", [{"spce": 5, "argon": 4}, {"argon": 6}, {"nitrogen": 4, "tip4p": 3}]
+)
 def test_sums_are_those_of_numpy(molecules):
     system, _, state = built(molecules, 30.0, 3)
     model, load = system.model, no_load(state)
@@ -162,9 +188,13 @@ def test_sums_are_those_of_numpy(molecules):
     found, mass = sums_of_state(model, state, load), model.mass[model.species][:, None]
     inverse = model.inverse_inertia[model.species][: len(state.rotation)]
     assert found.momentum == pytest.approx((mass * state.velocity).sum(axis=0), rel=1e-12, abs=1e-9)
-    assert found.flow == pytest.approx((mass * state.velocity).T @ state.velocity, rel=1e-12, abs=1e-9)
+    assert found.flow == pytest.approx(
+        (mass * state.velocity).T @ state.velocity, rel=1e-12, abs=1e-9
+    )
     assert found.translation == pytest.approx(found.flow.trace())
-    assert found.rotation == pytest.approx((inverse * state.angular_momentum_body**2).sum(), rel=1e-12)
+    assert found.rotation == pytest.approx(
+        (inverse * state.angular_momentum_body**2).sum(), rel=1e-12
+    )
     assert found.force == pytest.approx((load.force**2 / mass).sum(), rel=1e-12)
     assert found.torque == pytest.approx((inverse * load.torque_body**2).sum(), rel=1e-12)
     if len(state.rotation):
@@ -187,7 +217,13 @@ def test_an_extent_has_the_largest_of_every_array(molecules):
     assert largest_values(state, load) == tuple(np.abs(array).max(initial=0.0) for array in arrays)
     for k, array in enumerate(arrays):
         if len(array):
-            for worst in (-1e300, np.inf, -np.inf, np.nan, -np.nan):  # each is larger than the one before
+            for worst in (
+                -1e300,
+                np.inf,
+                -np.inf,
+                np.nan,
+                -np.nan,
+            ):  # each is larger than the one before
                 array.flat[7] = worst
                 np.testing.assert_equal(largest_values(state, load)[k], abs(worst))
     assert largest_values(state)[4:] == (0.0, 0.0)
@@ -204,7 +240,9 @@ def test_what_is_measured_at_the_end_of_a_move_is_that_of_the_state(molecules):
         load, _ = engine.evaluate_current(state)
         sums = engine.sums(state, load)
         assert (sums is not None) == with_sums
-        for found, expected in zip(sums or (), sums_of_state(system.model, state, load), strict=with_sums):
+        for found, expected in zip(
+            sums or (), sums_of_state(system.model, state, load), strict=with_sums
+        ):
             np.testing.assert_array_equal(found, expected)
 
     assert engine.extent(state) is None
@@ -215,7 +253,9 @@ def test_what_is_measured_at_the_end_of_a_move_is_that_of_the_state(molecules):
     state.velocity[1] *= 100.0
     engine.forget()
     same(known=False)
-    engine.advance(state, SCHEMES["pefrl"], 0.001, 8, True)  # ends with a drift: its forces are those before
+    engine.advance(
+        state, SCHEMES["pefrl"], 0.001, 8, True
+    )  # ends with a drift: its forces are those before
     same(known=False)
     other = engine.begin(system.state, verlet)
     assert engine.extent(other) is None
@@ -237,7 +277,9 @@ def test_momentum_is_kept_to_rounding(liquid):
     system, engine, state = liquid
     moved = run(engine, state, 0.002, 1000)
     mass = system.model.mass[system.model.species]
-    assert np.abs(mass @ moved.velocity).max() < 1e-12 * (mass[:, None] * np.abs(moved.velocity)).sum()
+    assert (
+        np.abs(mass @ moved.velocity).max() < 1e-12 * (mass[:, None] * np.abs(moved.velocity)).sum()
+    )
 
 
 def test_angular_momentum_is_kept_in_free_space():
@@ -250,11 +292,14 @@ def test_angular_momentum_is_kept_in_free_space():
         return (own + np.cross(s.position, mass[:, None] * s.velocity)).sum(axis=0)
 
     moved = run(engine, state, 0.0005, 1000)
-    assert total(moved) == pytest.approx(total(state), abs=1e-10 * np.abs(state.angular_momentum_body).sum())
+    assert total(moved) == pytest.approx(
+        total(state), abs=1e-10 * np.abs(state.angular_momentum_body).sum()
+    )
 
 
 def test_rotations_become_orthogonal_again():
-    """Without it errors of QᵀQ act as a torque: two waters had a drift of their angular momentum."""
+    """Without it errors of QᵀQ act as a torque: two waters had a drift of their angular
+    momentum."""
     system, engine, state = built({"spce": 4, "nitrogen": 3}, None, 9)
     draw_momenta(system.model, state, 50.0, np.random.default_rng(0))
     state.rotation[:] *= 1 + 1e-9
@@ -263,8 +308,9 @@ def test_rotations_become_orthogonal_again():
 
 
 def test_no_drift_beyond_its_error_at_one_femtosecond_over_twenty_picoseconds(liquid):
-    """Of four starts together: the error of a single slope is known to a third only, and one in fifty passes three of
-    it by chance. Over 48 starts the slopes had a mean of 0.0006 and a standard deviation of 0.017 kJ/mol/ns."""
+    """Of four starts together: the error of a single slope is known to a third only, and one in
+    fifty passes three of it by chance. Over 48 starts the slopes had a mean of 0.0006 and a
+    standard deviation of 0.017 kJ/mol/ns."""
     system, engine, state = liquid
     lines = []
     for seed in range(4):
@@ -284,7 +330,8 @@ def test_no_drift_beyond_its_error_at_one_femtosecond_over_twenty_picoseconds(li
 
 @pytest.mark.parametrize("name", SCHEMES)
 def test_splitting_a_run_changes_no_bit(liquid, name):
-    """Kicks wait for the drift that follows, over the end of a step too, but not over the end of a call."""
+    """Kicks wait for the drift that follows, over the end of a step too, but not over the end of a
+    call."""
     system, _, state = liquid
     whole = run(system.engine(), state, 0.002, 30, scheme=SCHEMES[name])
     engine, parts = system.engine(), state.copy()
@@ -296,7 +343,9 @@ def test_splitting_a_run_changes_no_bit(liquid, name):
 
 @pytest.mark.parametrize("counts", [{"spce": 70, "nitrogen": 20}, {"argon": 700}])
 def test_same_bits_for_one_and_two_threads_and_again(counts):
-    scene = small_scene(counts, 30.0, stages=[{"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.05}])
+    scene = small_scene(
+        counts, 30.0, stages=[{"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.05}]
+    )
     if MOST_THREADS < 2:
         pytest.skip("this machine has one core")
     ends = []
@@ -308,9 +357,7 @@ def test_same_bits_for_one_and_two_threads_and_again(counts):
             assert a.tobytes() == b.tobytes()
 
 
-@pytest.mark.parametrize(
-    ("model", "rotation"), [("argon", 0), ("nitrogen", 2), ("spce", 3)]
-)  # fmt: skip
+@pytest.mark.parametrize(("model", "rotation"), [("argon", 0), ("nitrogen", 2), ("spce", 3)])
 def test_drawn_momenta_have_the_temperature_exactly_and_no_momentum(model, rotation):
     system = build(small_scene({model: 50}, 40.0))
     seen = observe(system, system.engine(), system.state)
@@ -326,13 +373,21 @@ def test_maxwell_boltzmann_on_every_axis():
     system = build(small_scene({"spce": 4000}, 60.0))
     omega2 = system.state.angular_momentum_body**2 * system.model.inverse_inertia[0]
     assert omega2.mean(axis=0) == pytest.approx(np.full(3, 300 * BOLTZMANN), rel=0.08)
-    assert (18.0154 * system.state.velocity**2).mean(axis=0) == pytest.approx(np.full(3, 300 * BOLTZMANN), rel=0.08)
+    assert (18.0154 * system.state.velocity**2).mean(axis=0) == pytest.approx(
+        np.full(3, 300 * BOLTZMANN), rel=0.08
+    )
 
 
 @numba.njit
 def kinetic_energies(model, state, first, end):
     return groups.kinetic_energies(
-        model.species, model.mass, model.inverse_inertia, state.velocity, state.angular_momentum_body, first, end
+        model.species,
+        model.mass,
+        model.inverse_inertia,
+        state.velocity,
+        state.angular_momentum_body,
+        first,
+        end,
     )
 
 
@@ -345,15 +400,22 @@ def test_kinetic_energies_are_sums_over_molecules(counts, first, end):
     moving = (system.model.mass[kind] * (state.velocity[share] ** 2).sum(axis=1)).sum() / 2
     turning = 0.0
     if len(state.angular_momentum_body):
-        turning = (system.model.inverse_inertia[kind] * state.angular_momentum_body[share] ** 2).sum() / 2
-    assert kinetic_energies(system.model, state, first, end) == pytest.approx((moving, turning), rel=1e-13)
+        turning = (
+            system.model.inverse_inertia[kind] * state.angular_momentum_body[share] ** 2
+        ).sum() / 2
+    assert kinetic_energies(system.model, state, first, end) == pytest.approx(
+        (moving, turning), rel=1e-13
+    )
 
 
 def test_the_thermostat_samples_the_canonical_kinetic_energy():
-    # free flight, so the kinetic energy has nothing but the thermostat: mean and variance of a Gamma distribution
+    # free flight, so the kinetic energy has nothing but the thermostat: mean and variance of a
+    # Gamma distribution
     system = build(small_scene({"nitrogen": 6}, 40.0))  # linear: its free rotation is exact
     freedom, thermal = system.freedom.total, 300 * BOLTZMANN
-    row = VERLET.with_thermostat(VelocityRescaling(constant_ramp(thermal), 0.01, freedom, key_of(1, THERMOSTAT)))
+    row = VERLET.with_thermostat(
+        VelocityRescaling(constant_ramp(thermal), 0.01, freedom, key_of(1, THERMOSTAT))
+    )
     state = system.state.copy()
     engine = Engine(system.model, {})
     samples, heat = [], []
@@ -368,9 +430,12 @@ def test_the_thermostat_samples_the_canonical_kinetic_energy():
 
 
 def test_a_thermostat_that_rests_changes_no_bit():
-    """A stage at constant energy after one with a thermostat: the same machine code, and yet constant energy."""
+    """A stage at constant energy after one with a thermostat: the same machine code, and yet
+    constant energy."""
     system = build(small_scene({"spce": 8}, 20.0))
-    resting = VelocityRescaling(constant_ramp(0.0), np.inf, system.freedom.total, key_of(1, THERMOSTAT))
+    resting = VelocityRescaling(
+        constant_ramp(0.0), np.inf, system.freedom.total, key_of(1, THERMOSTAT)
+    )
     found = []
     for row in (VERLET, VERLET.with_thermostat(resting)):
         state = system.state.copy()
@@ -418,7 +483,12 @@ def test_linear_and_asymmetric_bodies_follow_euler_under_torque():
         return np.concatenate([a.ravel() for a in s[:4]])
 
     def unpack(y):
-        return state_of(*(part.reshape(a.shape) for part, a in zip(np.split(y, [6, 12, 30]), state, strict=False)))
+        return state_of(
+            *(
+                part.reshape(a.shape)
+                for part, a in zip(np.split(y, [6, 12, 30]), state, strict=False)
+            )
+        )
 
     def slopes(_, y):
         s = unpack(y)
@@ -430,7 +500,9 @@ def test_linear_and_asymmetric_bodies_follow_euler_under_torque():
         turning = (np.cross(s.angular_momentum_body, w) + load.torque_body) * (inverse > 0)
         return pack((s.velocity, load.force / mass, s.rotation @ hat, turning))
 
-    exact = unpack(solve_ivp(slopes, (0, 0.05), pack(state), method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1])
+    exact = unpack(
+        solve_ivp(slopes, (0, 0.05), pack(state), method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1]
+    )
     moved = run(engine, state, 0.05 / 4000, 4000)
     for a, b in zip(moved[:4], exact, strict=False):
         assert a == pytest.approx(b, abs=2e-5 * max(1, np.abs(b).max()))
@@ -473,7 +545,9 @@ def test_adding_an_integrator_to_a_scene(tmp_path, capsys):
         assert main(["run", str(tmp_path / f"{name}.toml"), "-o", str(tmp_path / name)]) == 0
     logs = [(tmp_path / name / "log.csv").read_text() for name in ("mine", "srkn_4")]
     assert logs[0] == logs[1]
-    assert main(["resume", str(tmp_path / "mine"), "--until", "0.08ps"]) == 0  # the folder has the row
+    assert (
+        main(["resume", str(tmp_path / "mine"), "--until", "0.08ps"]) == 0
+    )  # the folder has the row
     assert "mine" in capsys.readouterr().out
     found = measure_accuracy(
         Scene.read(tmp_path / "mine" / "scene.toml"), ["mine", "srkn_4", "other"], [8.0], repeats=1
@@ -487,12 +561,18 @@ def test_adding_an_integrator_from_python(monkeypatch):
     body = Scene.read("systems/heavy_top_3.toml")
     with pytest.raises(SceneError, match="is 'jump', must be 'velocity_verlet', "):
         Scene.read("systems/heavy_top_3.toml", {"run.integrator": "jump"})
-    assert rigidmd.integrator("jump", order=4, steps=SCHEMES["yoshida_4"].drifts, source="Yoshida") == "jump"
+    assert (
+        rigidmd.integrator("jump", order=4, steps=SCHEMES["yoshida_4"].drifts, source="Yoshida")
+        == "jump"
+    )
     scene = Scene.read("systems/heavy_top_3.toml", {"run.integrator": "jump"})
     assert scene.run.scheme.flows == SCHEMES["yoshida_4"].flows
     assert [row.source for row in scene.integrators] == ["Yoshida"]
     assert not body.integrators
-    names = {trial.integrator for trial in measure_accuracy(scene, timesteps=[0.01], span=0.1, repeats=1).trials}
+    names = {
+        trial.integrator
+        for trial in measure_accuracy(scene, timesteps=[0.01], span=0.1, repeats=1).trials
+    }
     assert {"jump", "velocity_verlet", "dop853"} <= names
     rigidmd.integrator("jump", order=2, steps=[0.5, 0.5])  # the scene is a value: it keeps its row
     assert scene.run.scheme.flows == SCHEMES["yoshida_4"].flows
@@ -505,12 +585,18 @@ def test_adding_an_integrator_from_python(monkeypatch):
     [
         ({"steps": [0.5, 0.4]}, "its drifts sum to 0.9, not to 1$"),
         ({"steps": [0.4, 0.6]}, "so that it is not time-reversible$"),
-        ({"steps": [0.5, 0.5], "order": 4}, "order = 4, but the error of an oscillator has order 2.0"),
+        (
+            {"steps": [0.5, 0.5], "order": 4},
+            "order = 4, but the error of an oscillator has order 2.0",
+        ),
         ({"steps": [1.0], "kicks": [0.5, 0.5]}, "contradict each other"),
         ({"kicks": [0.5, 0.5]}, "needs steps, or kicks and drifts"),
         ({"kicks": [0.5, 0.5], "drifts": [0.5, 0.5]}, "kicks must be one more than drifts"),
         ({"kicks": [0.5, float("nan")], "drifts": [1.0]}, "kicks.1"),
-        ({"kicks": [0.5, 0.0, 0.5], "drifts": [0.5, 0.5], "gradients": [0, 0.1, 0]}, "fraction 0 has no gradient"),
+        (
+            {"kicks": [0.5, 0.0, 0.5], "drifts": [0.5, 0.5], "gradients": [0, 0.1, 0]},
+            "fraction 0 has no gradient",
+        ),
         ({"steps": [1.0], "name": "srkn_4"}, "srkn_4 is an integrator of rigidmd"),
         ({"steps": [1.0], "name": "my row"}, "name: is 'my row'"),
         ({"steps": [1e5, -1e5, 1.0]}, "steps.0: is 100000.0, must not be more than 10"),
@@ -521,5 +607,7 @@ def test_rows_that_cannot_be(row, message):
         rigidmd.integrator(**({"name": "mine", "order": 2} | row))
     stage = {"duration_ps": 1.0, "integrator": row.get("name", "mine")}
     with pytest.raises(SceneError, match=r"integrators\.0") as caught:
-        small_scene({"argon": 20}, 30.0, integrators=[{"name": "mine", "order": 2} | row], stages=[stage])
+        small_scene(
+            {"argon": 20}, 30.0, integrators=[{"name": "mine", "order": 2} | row], stages=[stage]
+        )
     assert not [error for error in caught.value.errors if error.startswith("stages")]

@@ -1,9 +1,11 @@
-"""Settings of thermostats and barostats as other engines read them, each in the units of that engine.
+"""Settings of thermostats and barostats as other engines read them, each in the units of that
+engine.
 
-No engine runs here: the files that are written are read back. What the numbers mean is in the manuals: GROMACS tau-t of
-sd is the inverse of the friction, of nose-hoover a period, of v-rescale a time constant, all in ps and bar; LAMMPS'
-Langevin has a damping time, the inverse of the friction, and its chains and pistons the inverse of an angular
-frequency, in fs and atm; OpenMM has frictions and frequencies in 1/ps, and pressures in bar.
+No engine runs here: the files that are written are read back. What the numbers mean is in the
+manuals: GROMACS tau-t of sd is the inverse of the friction, of nose-hoover a period, of v-rescale a
+time constant, all in ps and bar; LAMMPS' Langevin has a damping time, the inverse of the friction,
+and its chains and pistons the inverse of an angular frequency, in fs and atm; OpenMM has frictions
+and frequencies in 1/ps, and pressures in bar.
 """
 
 import subprocess
@@ -34,7 +36,11 @@ from rigidmd.errors import SceneError
 COUNTS = {"spce": 6, "nitrogen": 4}
 NVT = {"ensemble": "nvt", "temperature_K": 310.0, "duration_ps": 0.4, "timestep_fs": 2.0}
 WARMING = NVT | {"temperature_K": [280.0, 320.0]}
-LANGEVIN = {"thermostat": "langevin", "friction_translation_per_ps": 5.0, "integrator": "velocity_verlet"}
+LANGEVIN = {
+    "thermostat": "langevin",
+    "friction_translation_per_ps": 5.0,
+    "integrator": "velocity_verlet",
+}
 CHAINS = {"thermostat": "nose_hoover", "thermostat_time_ps": 0.7, "nose_hoover_links": 4}
 RESCALING = {"thermostat_time_ps": 0.3}
 NPT = NVT | {"ensemble": "npt", "pressure_bar": 250.0}
@@ -42,7 +48,9 @@ NPT = NVT | {"ensemble": "npt", "pressure_bar": 250.0}
 
 def drawn(*stages, counts=COUNTS, tail=False, **sections):
     forces = {"cutoff_A": 5.0, "truncation": "shift", "tail_correction": tail}
-    return force_field_of(build(small_scene(counts, 13.0, stages=list(stages), **{"forces": forces} | sections)))
+    return force_field_of(
+        build(small_scene(counts, 13.0, stages=list(stages), **{"forces": forces} | sections))
+    )
 
 
 # GROMACS
@@ -57,12 +65,22 @@ def settings(folder, *stages, **sections):
     return {key.strip(): value.strip() for key, value in lines}
 
 
-@pytest.mark.parametrize(("stage", "coupling", "integrator", "time"), [
-    (LANGEVIN, "no", "sd", 1 / 5.0), (CHAINS, "nose-hoover", "md-vv", 0.7), (RESCALING, "v-rescale", "md", 0.3),
-], ids=["langevin", "nose_hoover", "velocity_rescaling"])  # fmt: skip
+@pytest.mark.parametrize(
+    ("stage", "coupling", "integrator", "time"),
+    [
+        (LANGEVIN, "no", "sd", 1 / 5.0),
+        (CHAINS, "nose-hoover", "md-vv", 0.7),
+        (RESCALING, "v-rescale", "md", 0.3),
+    ],
+    ids=["langevin", "nose_hoover", "velocity_rescaling"],
+)
 def test_gromacs_has_the_time_of_each_thermostat(stage, coupling, integrator, time, tmp_path):
     found = settings(tmp_path, NVT | stage)
-    assert (found["tcoupl"], found["integrator"], found["tc-grps"]) == (coupling, integrator, "System")
+    assert (found["tcoupl"], found["integrator"], found["tc-grps"]) == (
+        coupling,
+        integrator,
+        "System",
+    )
     assert float(found["tau-t"]) == pytest.approx(time, rel=1e-9)
     assert float(found["ref-t"]) == 310.0
     assert (float(found["dt"]), int(found["nsteps"])) == (0.002, 200)
@@ -84,12 +102,20 @@ def test_gromacs_warms_from_one_temperature_to_the_other(tmp_path):
     assert float(found["ref-t"]) == 280.0
 
 
-@pytest.mark.parametrize(("pressure", "coupling", "expected"), [
-    (250.0, "isotropic", [250.0]), ([250.0, 250.0, 400.0], "semi_isotropic", [250.0, 400.0]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("pressure", "coupling", "expected"),
+    [
+        (250.0, "isotropic", [250.0]),
+        ([250.0, 250.0, 400.0], "semi_isotropic", [250.0, 400.0]),
+    ],
+)
 def test_gromacs_has_the_pressure_of_each_direction(pressure, coupling, expected, tmp_path):
-    stage = NPT | {"pressure_bar": pressure, "pressure_coupling": coupling, "barostat_time_ps": 1.7,
-                   "compressibility_per_bar": 8e-5}  # fmt: skip
+    stage = NPT | {
+        "pressure_bar": pressure,
+        "pressure_coupling": coupling,
+        "barostat_time_ps": 1.7,
+        "compressibility_per_bar": 8e-5,
+    }
     found = settings(tmp_path, stage | RESCALING)
     assert [float(value) for value in found["ref-p"].split()] == expected
     assert [float(value) for value in found["compressibility"].split()] == [8e-5] * len(expected)
@@ -101,13 +127,25 @@ def test_gromacs_has_the_pressure_of_each_direction(pressure, coupling, expected
 def test_gromacs_takes_momentum_out_and_writes_at_the_intervals_of_the_scene(tmp_path):
     output = {"log_interval_ps": 0.03, "trajectory_interval_ps": 0.05}
     found = settings(tmp_path, NVT, run={"remove_momentum_interval_ps": 0.02}, output=output)
-    assert [int(found[key]) for key in ("nstcomm", "nstlog", "nstenergy", "nstxout-compressed")] == [10, 15, 15, 25]
+    assert [
+        int(found[key]) for key in ("nstcomm", "nstlog", "nstenergy", "nstxout-compressed")
+    ] == [10, 15, 15, 25]
 
 
 def test_gromacs_has_lengths_in_nm(tmp_path):
-    forces = {"cutoff_A": 5.0, "truncation": "switch", "switch_start_A": 4.2, "electrostatics": "none"}
+    forces = {
+        "cutoff_A": 5.0,
+        "truncation": "switch",
+        "switch_start_A": 4.2,
+        "electrostatics": "none",
+    }
     found = settings(tmp_path, NVT, counts={"argon": 20}, forces=forces)
-    assert [float(found[key]) for key in ("rlist", "rvdw", "rcoulomb", "rvdw-switch")] == [0.5, 0.5, 0.5, 0.42]
+    assert [float(found[key]) for key in ("rlist", "rvdw", "rcoulomb", "rvdw-switch")] == [
+        0.5,
+        0.5,
+        0.5,
+        0.42,
+    ]
 
 
 def test_gromacs_places_a_site_off_the_plane_of_its_masses(tmp_path):
@@ -122,7 +160,9 @@ def test_gromacs_places_a_site_off_the_plane_of_its_masses(tmp_path):
         site, i, j, k = (places[int(number) - 1] for number in row[:4])
         a, b, c = map(float, row[5:])
         assert abs(c) > 1
-        assert i + a * (j - i) + b * (k - i) + c * np.cross(j - i, k - i) == pytest.approx(site, abs=1e-9)
+        assert i + a * (j - i) + b * (k - i) + c * np.cross(j - i, k - i) == pytest.approx(
+            site, abs=1e-9
+        )
 
 
 # LAMMPS
@@ -143,17 +183,29 @@ def after(words, key, count):
     return [float(word) for word in words[at : at + count]]
 
 
-@pytest.mark.parametrize("counts", [{"spce": 6}, {"argon": 6}, {"spce": 6, "argon": 6}], ids="-".join)
+@pytest.mark.parametrize(
+    "counts", [{"spce": 6}, {"argon": 6}, {"spce": 6, "argon": 6}], ids="-".join
+)
 def test_lammps_has_the_damping_time_of_langevin(counts):
     found = commands(WARMING | LANGEVIN, counts=counts)
     if "spce" in counts:
         assert found["bodies"][:2] == ["rigid/small", "molecule"]
-        assert after(found["bodies"], "langevin", 3) == [280.0, 320.0, pytest.approx(1000 / 5.0)]  # fs
+        assert after(found["bodies"], "langevin", 3) == [
+            280.0,
+            320.0,
+            pytest.approx(1000 / 5.0),
+        ]  # fs
     if "argon" in counts:
         assert found["points"] == ["nve"]
-        assert after(found["points_bath"], "langevin", 3) == [280.0, 320.0, pytest.approx(1000 / 5.0)]
+        assert after(found["points_bath"], "langevin", 3) == [
+            280.0,
+            320.0,
+            pytest.approx(1000 / 5.0),
+        ]
     if len(counts) == 2:
-        seeds = [int(after(words, "langevin", 4)[3]) for name, words in found.items() if name != "points"]
+        seeds = [
+            int(after(words, "langevin", 4)[3]) for name, words in found.items() if name != "points"
+        ]
         assert len(set(seeds)) == 2
 
 
@@ -186,7 +238,9 @@ def test_lammps_has_pressures_in_atm_less_that_of_the_tail(counts, ensemble, tai
 
 
 def test_lammps_has_a_pressure_along_each_axis():
-    stage = NPT | CHAINS | {"pressure_bar": [100.0, 200.0, 300.0], "pressure_coupling": "anisotropic"}
+    stage = (
+        NPT | CHAINS | {"pressure_bar": [100.0, 200.0, 300.0], "pressure_coupling": "anisotropic"}
+    )
     words = commands(stage, counts={"spce": 6})["bodies"]
     for axis, pressure in zip("xyz", (100.0, 200.0, 300.0), strict=True):
         assert after(words, axis, 3) == pytest.approx([pressure * ATM, pressure * ATM, 1000.0])
@@ -194,7 +248,9 @@ def test_lammps_has_a_pressure_along_each_axis():
 
 
 def test_lammps_has_steps_in_fs():
-    text = lammps_files.input_script(drawn(NVT | LANGEVIN, output={"log_interval_ps": 0.03, "trajectory": False}))
+    text = lammps_files.input_script(
+        drawn(NVT | LANGEVIN, output={"log_interval_ps": 0.03, "trajectory": False})
+    )
     lines = [line.split() for line in text.splitlines()]
     assert ["timestep", "2.0"] in lines and ["run", "200"] in lines and ["thermo", "15"] in lines
 
@@ -207,7 +263,9 @@ def made(folder, *stages, **sections):
     mm = pytest.importorskip("openmm")
     own = drawn(*stages, engine={"name": "openmm"}, **sections)
     write_openmm(folder, own, own.system.state)
-    read = [mm.XmlSerializer.deserialize(path.read_text()) for path in sorted(folder.glob("[bi]*.xml"))]
+    read = [
+        mm.XmlSerializer.deserialize(path.read_text()) for path in sorted(folder.glob("[bi]*.xml"))
+    ]
     integrators = [one for one in read if isinstance(one, mm.Integrator)]
     return integrators, [one for one in read if not isinstance(one, mm.Integrator)]
 
@@ -233,7 +291,9 @@ def test_openmm_has_the_period_of_chains(tmp_path):
     assert in_units(integrator.getCollisionFrequency(), "1/ps") == pytest.approx(2 * pi / 0.7)
     assert in_units(integrator.getTemperature(), "kelvin") == 310.0
     assert integrator.getThermostat().getChainLength() == 4
-    assert [type(other).__name__ for other in others] == ["CMMotionRemover"]  # so that it counts three less
+    assert [type(other).__name__ for other in others] == [
+        "CMMotionRemover"
+    ]  # so that it counts three less
 
 
 @pytest.mark.parametrize("thermostat", [LANGEVIN, CHAINS], ids=["langevin", "nose_hoover"])
@@ -262,12 +322,16 @@ def test_openmm_has_the_energy_of_the_tail_at_its_volume(tmp_path):
         assert float(strength) / (edge / 10) ** 3 + constant == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("charges", [
-    {"electrostatics": "reaction_field", "reaction_field_truncation": "plain"},
-    {"electrostatics": "pme", "ewald_truncation": "plain", "ewald_accuracy": 1e-4},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "charges",
+    [
+        {"electrostatics": "reaction_field", "reaction_field_truncation": "plain"},
+        {"electrostatics": "pme", "ewald_truncation": "plain", "ewald_accuracy": 1e-4},
+    ],
+)
 def test_openmm_compares_continuous_energies_for_its_barostat(charges, tmp_path):
-    """Forces move molecules; a barostat compares all energies of the system, with steps at cutoffs and the tail."""
+    """Forces move molecules; a barostat compares all energies of the system, with steps at cutoffs
+    and the tail."""
     mm = pytest.importorskip("openmm")
     forces = {"cutoff_A": 5.0, "truncation": "plain", "tail_correction": True} | charges
     groups = []
@@ -285,9 +349,15 @@ def test_openmm_compares_continuous_energies_for_its_barostat(charges, tmp_path)
 
 
 def test_openmm_has_an_integrator_for_each_stage(tmp_path):
-    integrators, _ = made(tmp_path, NVT | LANGEVIN, {"duration_ps": 0.1}, NVT | LANGEVIN | {"timestep_fs": 1.0})
+    integrators, _ = made(
+        tmp_path, NVT | LANGEVIN, {"duration_ps": 0.1}, NVT | LANGEVIN | {"timestep_fs": 1.0}
+    )
     kinds = [type(one).__name__ for one in integrators]
-    assert sorted(kinds) == ["CustomIntegrator", "LangevinMiddleIntegrator", "LangevinMiddleIntegrator"]
+    assert sorted(kinds) == [
+        "CustomIntegrator",
+        "LangevinMiddleIntegrator",
+        "LangevinMiddleIntegrator",
+    ]
     seeds = {one.getRandomNumberSeed() for one in integrators if hasattr(one, "getFriction")}
     assert len(seeds) == 2
 
@@ -311,7 +381,9 @@ def with_strange(system, what):
     if what in ("thermostat", "barostat"):
         scene = scene.model_copy(update={"stages": (stage.model_copy(update={what: "made_up"}),)})
     elif what == "truncation":
-        scene = scene.model_copy(update={"forces": scene.forces.model_copy(update={"truncation": "made_up"})})
+        scene = scene.model_copy(
+            update={"forces": scene.forces.model_copy(update={"truncation": "made_up"})}
+        )
     elif what == "potential":  # it took the name of the Coulomb forces of rigidmd
         terms["coulomb"] = terms["coulomb"]._replace(potential=Stranger())
     else:
@@ -323,15 +395,21 @@ def with_strange(system, what):
 @pytest.mark.parametrize(
     ("what", "message"),
     [
-        ("thermostat", "stages.0.thermostat = 'made_up': {}"), ("barostat", "stages.0.barostat = 'made_up': {}"),
+        ("thermostat", "stages.0.thermostat = 'made_up': {}"),
+        ("barostat", "stages.0.barostat = 'made_up': {}"),
         ("truncation", "forces.truncation = 'made_up': {} has plain and shift and"),
         ("potential", "coulomb: the pair potential Stranger has no translation for {}"),
-        ("field", "field: a field has no translation for {}"), ("term", "term: the term Stranger has no translation for {}"),
+        ("field", "field: a field has no translation for {}"),
+        ("term", "term: the term Stranger has no translation for {}"),
     ],
-)  # fmt: skip
+)
 def test_what_no_table_has_is_refused(name, what, message):
     stage = NPT | {"thermostat": "langevin", "integrator": "velocity_verlet"}
-    system = build(small_scene({"spce": 4}, 13.0, stages=[stage], forces={"cutoff_A": 5.0, "truncation": "shift"}))
+    system = build(
+        small_scene(
+            {"spce": 4}, 13.0, stages=[stage], forces={"cutoff_A": 5.0, "truncation": "shift"}
+        )
+    )
     program = programs()[name]
     table = program.load(program.translations)
     found = list(table.refusals(force_field_of(with_strange(system, what))))
@@ -346,13 +424,18 @@ def test_what_no_table_has_is_refused(name, what, message):
 @pytest.mark.parametrize(
     ("platform", "precision", "properties"),
     [
-        ("CUDA", None, {"Precision": "mixed"}), ("OpenCL", "double", {"Precision": "double"}),
-        ("HIP", "single", {"Precision": "single"}), ("Reference", None, {}), ("CPU", None, {"Threads": "3"}),
+        ("CUDA", None, {"Precision": "mixed"}),
+        ("OpenCL", "double", {"Precision": "double"}),
+        ("HIP", "single", {"Precision": "single"}),
+        ("Reference", None, {}),
+        ("CPU", None, {"Threads": "3"}),
     ],
-)  # fmt: skip
+)
 def test_a_gpu_has_mixed_precision_unless_the_scene_says_otherwise(platform, precision, properties):
     assert openmm_engine.properties_of(platform, precision, 3) == properties
-    given = {"name": "openmm", "platform": platform} | ({"precision": precision} if precision else {})
+    given = {"name": "openmm", "platform": platform} | (
+        {"precision": precision} if precision else {}
+    )
     choice = small_scene({"argon": 2}, 20.0, engine=given).engine
     assert choice.options == {"platform": platform, "precision": precision}
     assert ("precision" in choice.title) == ("Precision" in properties)
@@ -360,16 +443,32 @@ def test_a_gpu_has_mixed_precision_unless_the_scene_says_otherwise(platform, pre
 
 def test_a_platform_with_one_precision_has_no_other():
     for platform, precision in (("CPU", "double"), ("Reference", "single")):
-        with pytest.raises(SceneError, match=f"precision = '{precision}' is for GPUs: the platform {platform} has"):
-            small_scene({"argon": 2}, 20.0, engine={"name": "openmm", "platform": platform, "precision": precision})
-    with pytest.raises(SceneError, match=r"precision would do nothing with engine.name = 'lammps'; it is for openmm"):
+        with pytest.raises(
+            SceneError, match=f"precision = '{precision}' is for GPUs: the platform {platform} has"
+        ):
+            small_scene(
+                {"argon": 2},
+                20.0,
+                engine={"name": "openmm", "platform": platform, "precision": precision},
+            )
+    with pytest.raises(
+        SceneError,
+        match=r"precision would do nothing with engine.name = 'lammps'; it is for openmm",
+    ):
         small_scene({"argon": 2}, 20.0, engine={"name": "lammps", "precision": "mixed"})
 
 
 def test_the_error_of_mixed_precision_is_the_one_in_the_manual():
-    assert f"(forces to {MIXED_ERROR:.0e})" in (ROOT / "rigidmd/docs/reference/scene.md").read_text()
-    system, ours, state = shaken(build(small_scene({"tip4p2005": 216}, 18.64, forces={"cutoff_A": 9.0})), 1, 0.2)
-    exact, found = ours.evaluate(state)[0].force, system.engine_of(system.terms, "mixed").evaluate(state)[0].force
+    assert (
+        f"(forces to {MIXED_ERROR:.0e})" in (ROOT / "rigidmd/docs/reference/scene.md").read_text()
+    )
+    system, ours, state = shaken(
+        build(small_scene({"tip4p2005": 216}, 18.64, forces={"cutoff_A": 9.0})), 1, 0.2
+    )
+    exact, found = (
+        ours.evaluate(state)[0].force,
+        system.engine_of(system.terms, "mixed").evaluate(state)[0].force,
+    )
     error = np.sqrt(np.sum((found - exact) ** 2) / np.sum(exact**2))
     assert 0.1 * float(MIXED_ERROR) < error < 2 * float(MIXED_ERROR)
 
@@ -465,7 +564,9 @@ def test_adding_an_engine_takes_a_folder_and_a_line(tmp_path):
 
     def run(*arguments, error="right"):
         command = [sys.executable, tmp_path / "script.py", folder.parent, error, *arguments]
-        return subprocess.run([*map(str, command)], capture_output=True, text=True, cwd=tmp_path, check=False)
+        return subprocess.run(
+            [*map(str, command)], capture_output=True, text=True, cwd=tmp_path, check=False
+        )
 
     there = ("--engine", "mirror", "--tilt", "3")
     done = run("run", scene, *there, "-o", "out")
@@ -477,9 +578,18 @@ def test_adding_an_engine_takes_a_folder_and_a_line(tmp_path):
     checked = run("check", scene, *there)
     assert checked.returncode == 0 and checked.stdout.rstrip().endswith("Mirror 1.0")
     assert run("verify", scene, *there).returncode == 0
-    andersen = ("stages.0.ensemble=nvt", "stages.0.temperature_K=90", "stages.0.thermostat=andersen")
-    refused = run("check", scene, *there, *(part for change in andersen for part in ("--set", change)))
-    assert "engine.name = 'mirror': stages.0.thermostat = 'andersen': Mirror has langevin" in refused.stderr
+    andersen = (
+        "stages.0.ensemble=nvt",
+        "stages.0.temperature_K=90",
+        "stages.0.thermostat=andersen",
+    )
+    refused = run(
+        "check", scene, *there, *(part for change in andersen for part in ("--set", change))
+    )
+    assert (
+        "engine.name = 'mirror': stages.0.thermostat = 'andersen': Mirror has langevin"
+        in refused.stderr
+    )
     refused = run("check", scene, "--engine", "lammps", "--tilt", "3")
     assert "tilt would do nothing with engine.name = 'lammps'; it is for mirror" in refused.stderr
     assert run("export", scene, "--to", "mirror", "-o", "exported").returncode == 0

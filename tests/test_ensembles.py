@@ -1,8 +1,8 @@
-"""Sampling, judged by a package of others: kinetic energies, ensembles at two states, known averages of liquids,
-dipoles and crystals.
+"""Sampling, judged by a package of others: kinetic energies, ensembles at two states, known
+averages of liquids, dipoles and crystals.
 
-`pytest -m soak -rP tests/test_ensembles.py` prints what was measured, each with its standard error. Limits are in
-standard errors: 4.5 where many figures are compared at once, else 3.5.
+`pytest -m soak -rP tests/test_ensembles.py` prints what was measured, each with its standard error.
+Limits are in standard errors: 4.5 where many figures are compared at once, else 3.5.
 """
 
 import contextlib
@@ -74,10 +74,17 @@ def follow(scene: dict, interval: float, sites: bool = False, folder=".") -> Cou
         if moment.stage == last and moment.step > 0:
             state = moment.state
             system = simulation.system
-            both = (system.site_positions(state), system.site_velocities(state)) if sites else (np.zeros((0, 3)),) * 2
+            both = (
+                (system.site_positions(state), system.site_velocities(state))
+                if sites
+                else (np.zeros((0, 3)),) * 2
+            )
             seen.append((state.velocity.copy(), state.angular_momentum_body.copy(), *both))
 
-    quiet = {"threads": 1, "output": {"trajectory": False, "figures": False, "log_interval_ps": interval}}
+    quiet = {
+        "threads": 1,
+        "output": {"trajectory": False, "figures": False, "log_interval_ps": interval},
+    }
     simulation = Simulation(Scene.from_dict(quiet | scene, folder), observers=Every(interval, look))
     results = simulation.run()
     return Course(simulation.system, results, last, *(np.array(x) for x in zip(*seen, strict=True)))
@@ -100,20 +107,27 @@ def error_of(values: np.ndarray) -> float:
     """Standard error of the mean of a series, by pymbar's statistical inefficiency."""
     if np.ptp(values) == 0:
         return 0.0
-    return float(values.std(ddof=1) * np.sqrt(timeseries.statistical_inefficiency(values) / len(values)))
+    return float(
+        values.std(ddof=1) * np.sqrt(timeseries.statistical_inefficiency(values) / len(values))
+    )
 
 
 def told(name: str, value: float, error: float, reference: float) -> float:
     """Print a figure; how many standard errors it is from the reference."""
-    print(f"{name}: {value:.6g} +- {error:.2g}, reference {reference:.6g}, {(value - reference) / error:+.1f} errors")
+    print(
+        f"{name}: {value:.6g} +- {error:.2g}, reference {reference:.6g}, {(value - reference) / error:+.1f} errors"
+    )
     return abs(value - reference) / error
 
 
-UNITS = pv.data.UnitData(BOLTZMANN / KJ_PER_MOL, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)  # kJ/mol, nm, nm³, K, bar, ps
+UNITS = pv.data.UnitData(
+    BOLTZMANN / KJ_PER_MOL, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0
+)  # kJ/mol, nm, nm³, K, bar, ps
 
 
 def kinetic_judged(kinetic: np.ndarray, freedom: float, temperature: float) -> tuple[float, float]:
-    """How far mean and width of kinetic energies (kJ/mol) are from those of a temperature, in standard errors."""
+    """How far mean and width of kinetic energies (kJ/mol) are from those of a temperature, in
+    standard errors."""
     parts = int(np.ceil(freedom / 3))
     data = pv.data.SimulationData(
         units=UNITS,
@@ -125,13 +139,16 @@ def kinetic_judged(kinetic: np.ndarray, freedom: float, temperature: float) -> t
 
 
 def squares(course: Course, temperature: float) -> dict[str, np.ndarray]:
-    """By species and component: each square of a momentum over its mean at a temperature, (f, molecules)."""
+    """By species and component: each square of a momentum over its mean at a temperature, (f,
+    molecules)."""
     model, thermal = course.system.model, BOLTZMANN * temperature
     kind = model.species
     mass = model.mass[kind]
     freedom = course.system.freedom_in(course.stage).translation
     kept = freedom < 3 * len(kind)
-    share = 1 - mass / mass.sum() if kept else np.ones(len(mass))  # what a conserved total momentum leaves
+    share = (
+        1 - mass / mass.sum() if kept else np.ones(len(mass))
+    )  # what a conserved total momentum leaves
     found = {}
     for s, species in enumerate(course.system.species):
         own = kind == s
@@ -139,12 +156,15 @@ def squares(course: Course, temperature: float) -> dict[str, np.ndarray]:
             moving = mass[own] * course.velocity[:, own, k] ** 2 / (thermal * share[own])
             found[f"{species.name} p_{'xyz'[k]}"] = moving
             if model.inertia[s, k] > 0:
-                found[f"{species.name} L_{k + 1}"] = course.angular[:, own, k] ** 2 / (thermal * model.inertia[s, k])
+                found[f"{species.name} L_{k + 1}"] = course.angular[:, own, k] ** 2 / (
+                    thermal * model.inertia[s, k]
+                )
     return found
 
 
 def kinetic_energies(course: Course) -> dict[str, tuple[np.ndarray, float]]:
-    """Of everything, and of each species: kinetic energies (f,), kJ/mol, and their degrees of freedom."""
+    """Of everything, and of each species: kinetic energies (f,), kJ/mol, and their degrees of
+    freedom."""
     model = course.system.model
     kind, freedom = model.species, course.system.freedom_in(course.stage)
     mass = model.mass[kind]
@@ -167,7 +187,8 @@ def kinetic_energies(course: Course) -> dict[str, tuple[np.ndarray, float]]:
 
 
 def equipartition_judged(course: Course, temperature: float) -> float:
-    """The worst of what physical_validation finds for translation and rotation, in standard errors."""
+    """The worst of what physical_validation finds for translation and rotation, in standard
+    errors."""
     system = course.system
     mass = system.sites.mass
     real = mass > 0  # what has no mass has no kinetic energy
@@ -177,7 +198,9 @@ def equipartition_judged(course: Course, temperature: float) -> float:
     freedom = system.freedom_in(course.stage)
     data = pv.data.SimulationData(
         units=UNITS,
-        ensemble=pv.data.EnsembleData("NVT", natoms=len(molecule), volume=1.0, temperature=temperature),
+        ensemble=pv.data.EnsembleData(
+            "NVT", natoms=len(molecule), volume=1.0, temperature=temperature
+        ),
         system=pv.data.SystemData(
             natoms=len(molecule),
             nconstraints=float((3 * count - 6).sum()),
@@ -187,24 +210,35 @@ def equipartition_judged(course: Course, temperature: float) -> float:
             molecule_idx=first,
             nconstraints_per_molecule=3 * count - 6,
         ),
-        trajectory=pv.data.TrajectoryData(0.1 * course.sites[:, real], 0.1 * course.site_velocities[:, real]),
+        trajectory=pv.data.TrajectoryData(
+            0.1 * course.sites[:, real], 0.1 * course.site_velocities[:, real]
+        ),
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # rigid molecules have no internal degrees of freedom
         found = pv.kinetic_energy.equipartition(
-            data, random_divisions=1, random_groups=2, random_division_seed=3, verbosity=0, bootstrap_seed=1
+            data,
+            random_divisions=1,
+            random_groups=2,
+            random_division_seed=3,
+            verbosity=0,
+            bootstrap_seed=1,
         )
     found = np.array(found)
-    assert np.isfinite(found).all(axis=1).sum() == 12  # all, half, other half: total, translation, rotation twice
+    assert (
+        np.isfinite(found).all(axis=1).sum() == 12
+    )  # all, half, other half: total, translation, rotation twice
     return float(np.nanmax(found))
 
 
 @pytest.mark.parametrize("thermostat", THERMOSTATS)
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name == "nitrogen" else pytest.mark.soak) for name in LIQUIDS]
+    "name",
+    [pytest.param(name, marks=[] if name == "nitrogen" else pytest.mark.soak) for name in LIQUIDS],
 )
 def test_kinetic_energies_are_those_of_the_temperature(name, thermostat):
-    """Distribution of the kinetic energies of translation and rotation of each species, and equipartition."""
+    """Distribution of the kinetic energies of translation and rotation of each species, and
+    equipartition."""
     *_, temperature, step = LIQUIDS[name]
     nonlinear = name in ("spce", "tip4p2005")
     length = 40.0 * step**0.5
@@ -233,7 +267,13 @@ DIAMETER, DEPTH = 3.0, 100.0
 DUMBBELL = {
     "name": "dumbbell",
     "sites": [
-        {"name": name, "mass_u": 20.0, "sigma_A": DIAMETER, "epsilon_K": DEPTH, "position_A": [0.0, 0.0, z]}
+        {
+            "name": name,
+            "mass_u": 20.0,
+            "sigma_A": DIAMETER,
+            "epsilon_K": DEPTH,
+            "position_A": [0.0, 0.0, z],
+        }
         for name, z in (("A", -0.335 * DIAMETER), ("B", 0.335 * DIAMETER))
     ],
 }
@@ -251,26 +291,39 @@ def dumbbells(count: int, forces: dict, *stages: dict) -> dict:
     }
 
 
-def state_data(course: Course, temperature: float, pressure: float | None = None) -> pv.data.SimulationData:
+def state_data(
+    course: Course, temperature: float, pressure: float | None = None
+) -> pv.data.SimulationData:
     """A stage at a temperature (K), and at a pressure (bar)."""
-    ensemble = {"ensemble": "NVT", "volume": 1.0} if pressure is None else {"ensemble": "NPT", "pressure": pressure}
+    ensemble = (
+        {"ensemble": "NVT", "volume": 1.0}
+        if pressure is None
+        else {"ensemble": "NPT", "pressure": pressure}
+    )
     return pv.data.SimulationData(
         units=UNITS,
-        ensemble=pv.data.EnsembleData(natoms=len(course.system.model.species), temperature=temperature, **ensemble),
+        ensemble=pv.data.EnsembleData(
+            natoms=len(course.system.model.species), temperature=temperature, **ensemble
+        ),
         observables=pv.data.ObservableData(
-            potential_energy=course["potential"], total_energy=course["energy"], volume=course["volume"]
+            potential_energy=course["potential"],
+            total_energy=course["energy"],
+            volume=course["volume"],
         ),
     )
 
 
 def ensemble_judged(name: str, one, two, **options) -> float:
-    """How far slopes of the log ratio of two distributions are from the true ones, in standard errors."""
+    """How far slopes of the log ratio of two distributions are from the true ones, in standard
+    errors."""
     printed = io.StringIO()
     with warnings.catch_warnings(), contextlib.redirect_stdout(printed):
         warnings.simplefilter("ignore")
         found = pv.ensemble.check(one, two, verbosity=1, **options)
     rows = re.findall(r"^\s+(\S+)\s+\+/-\s+(\S+)\s+\|\s+(\S+)", printed.getvalue(), re.MULTILINE)
-    for slope, error, true in rows[: len(found)]:  # the same follows as differences of temperature and pressure
+    for slope, error, true in rows[
+        : len(found)
+    ]:  # the same follows as differences of temperature and pressure
         told(f"{name}, slope", float(slope), float(error), float(true))
         assert float(error) < 0.15 * abs(float(true))  # a slope that is not known tells nothing
     return float(np.max(found))
@@ -304,7 +357,11 @@ def test_energies_of_water_at_two_temperatures():
 
 
 BAROSTATS = {
-    "cell_rescaling": {"barostat_time_ps": 0.2, "barostat_interval_ps": 0.02, "compressibility_per_bar": 5e-4},
+    "cell_rescaling": {
+        "barostat_time_ps": 0.2,
+        "barostat_interval_ps": 0.02,
+        "compressibility_per_bar": 5e-4,
+    },
     "monte_carlo": {"barostat_interval_ps": 0.02, "compressibility_per_bar": 2e-4},
 }
 
@@ -314,15 +371,30 @@ BAROSTATS = {
 def test_volumes_and_enthalpies_at_two_states(barostat):
     """Slopes (p1 - p2)/kT of V, 1/kT1 - 1/kT2 of the enthalpy, and both together of U and V."""
     found = []
-    # Hotter and pressed more, the volume is nearly that of the first: only so the distributions of both overlap enough.
-    for temperature, pressure in ((200.0, 1000.0), (200.0, 1450.0), (240.0, 1000.0), (240.0, 1450.0)):
+    # Hotter and pressed more, the volume is nearly that of the first: only so the distributions of
+    # both overlap enough.
+    for temperature, pressure in (
+        (200.0, 1000.0),
+        (200.0, 1450.0),
+        (240.0, 1000.0),
+        (240.0, 1450.0),
+    ):
         common = {"temperature_K": temperature, "timestep_fs": 4.0}
-        stage = common | {"ensemble": "npt", "thermostat": "langevin", "pressure_bar": pressure, "barostat": barostat}
+        stage = common | {
+            "ensemble": "npt",
+            "thermostat": "langevin",
+            "pressure_bar": pressure,
+            "barostat": barostat,
+        }
         stage |= THERMOSTATS["langevin"] | BAROSTATS[barostat]
         forces = {"cutoff_A": 6.3, "truncation": "smooth_switch"}
-        scene = dumbbells(50, forces, stage | {"duration_ps": 20.0}, stage | {"duration_ps": 1200.0})
+        scene = dumbbells(
+            50, forces, stage | {"duration_ps": 20.0}, stage | {"duration_ps": 1200.0}
+        )
         course = follow(scene, 0.2)
-        tried, accepted = (course.results.summary["stages"][-1][f"moves_{what}"] for what in ("tried", "accepted"))
+        tried, accepted = (
+            course.results.summary["stages"][-1][f"moves_{what}"] for what in ("tried", "accepted")
+        )
         print(f"{barostat}: {accepted / tried:.2f} of the moves accepted")
         found.append(state_data(course, temperature, pressure))
     base, squeezed, warm, both = found
@@ -333,7 +405,8 @@ def test_volumes_and_enthalpies_at_two_states(barostat):
 
 @pytest.mark.soak
 def test_fluctuations_of_the_energy_fall_with_the_square_of_the_step():
-    """NVE, velocity Verlet, of a mixture: rms fluctuations of the energy at steps that are halved."""
+    """NVE, velocity Verlet, of a mixture: rms fluctuations of the energy at steps that are
+    halved."""
     found = []
     for step in (1.0, 0.5, 0.25):
         warm, nve = WARM | {"duration_ps": 3.0}, {"timestep_fs": step, "temperature_K": None}
@@ -361,8 +434,11 @@ DIPOLE = {
 MOMENT = 1.1128 * (0.58588 - 0.1546)  # e Å
 
 
-def orientations(thermostat: dict, step: float, duration: float, interval: float, molecules: int) -> tuple:
-    """Mean cosine between dipole and field of 1 V/nm at 300 K, over time; its exact mean; the results."""
+def orientations(
+    thermostat: dict, step: float, duration: float, interval: float, molecules: int
+) -> tuple:
+    """Mean cosine between dipole and field of 1 V/nm at 300 K, over time; its exact mean; the
+    results."""
     direction = np.array([0.6, 0.0, 0.8])
     stage = {"ensemble": "nvt", "temperature_K": 300.0, "timestep_fs": step} | thermostat
     scene = {
@@ -385,8 +461,10 @@ def orientations(thermostat: dict, step: float, duration: float, interval: float
 def test_a_dipole_in_a_field():
     """<cos> = coth x - 1/x, x = mu E/kT, to 1e-3; and what a long step adds."""
     friction = {"thermostat": "langevin", "friction_translation_per_ps": 15.0}
-    for name, thermostat, step in (("langevin", friction, 2.0), ("andersen", {"thermostat": "andersen",
-                                    "thermostat_time_ps": 0.1}, 2.0)):  # fmt: skip
+    for name, thermostat, step in (
+        ("langevin", friction, 2.0),
+        ("andersen", {"thermostat": "andersen", "thermostat_time_ps": 0.1}, 2.0),
+    ):
         cosine, exact, _ = orientations(thermostat, step, 120.0, 0.2, 2000)
         error = error_of(cosine)
         assert error < 5e-4
@@ -398,14 +476,19 @@ def test_a_dipole_in_a_field():
 
 def test_a_few_dipoles_in_a_field():
     """The same to 1 %, in seconds."""
-    cosine, exact, _ = orientations({"thermostat": "langevin", "friction_translation_per_ps": 15.0}, 4.0, 8.0, 0.2, 400)
+    cosine, exact, _ = orientations(
+        {"thermostat": "langevin", "friction_translation_per_ps": 15.0}, 4.0, 8.0, 0.2, 400
+    )
     assert error_of(cosine) < 0.01 * exact
     assert told("<cos>", cosine.mean(), error_of(cosine), exact) < MANY
 
 
-@pytest.mark.parametrize(("duration", "largest"), [(350.0, 8e-4), pytest.param(3000.0, 3e-4, marks=pytest.mark.soak)])
+@pytest.mark.parametrize(
+    ("duration", "largest"), [(350.0, 8e-4), pytest.param(3000.0, 3e-4, marks=pytest.mark.soak)]
+)
 def test_dipoles_at_a_long_step_by_hybrid_monte_carlo(duration, largest):
-    """The same at 20 fs, where velocity Verlet with Langevin's thermostat is off by many errors; <exp(-dH/kT)> = 1."""
+    """The same at 20 fs, where velocity Verlet with Langevin's thermostat is off by many errors;
+    <exp(-dH/kT)> = 1."""
     hybrid = {"thermostat": "hybrid_monte_carlo", "trajectory_steps": 5}
     cosine, exact, results = orientations(hybrid, 20.0, duration, 0.1, 400)
     error = error_of(cosine)
@@ -413,36 +496,58 @@ def test_dipoles_at_a_long_step_by_hybrid_monte_carlo(duration, largest):
     assert told("<cos>, hybrid Monte Carlo, 20 fs", cosine.mean(), error, exact) < FEW
     weight = results["exp_minus_dH"][results["stage"] == 1]
     assert told("<exp(-dH/kT)>", weight.mean(), error_of(weight), 1.0) < MANY
-    assert 0.4 < results["acceptance"][results["stage"] == 1].mean() < 0.8  # so that the test is of rejections too
-    friction = {"thermostat": "langevin", "friction_translation_per_ps": 15.0, "integrator": "velocity_verlet"}
+    assert (
+        0.4 < results["acceptance"][results["stage"] == 1].mean() < 0.8
+    )  # so that the test is of rejections too
+    friction = {
+        "thermostat": "langevin",
+        "friction_translation_per_ps": 15.0,
+        "integrator": "velocity_verlet",
+    }
     cosine, exact, _ = orientations(friction, 20.0, 100.0, 0.2, 400)
-    assert told("<cos>, velocity Verlet with langevin, 20 fs", cosine.mean(), error_of(cosine), exact) > 5
+    assert (
+        told("<cos>, velocity Verlet with langevin, 20 fs", cosine.mean(), error_of(cosine), exact)
+        > 5
+    )
 
 
 # Liquids and crystals at a pressure.
 
 PRESSURE_UNIT = DEPTH * BOLTZMANN / DIAMETER**3 / BAR  # bar
-#: Of Mecke's equation of state at T* = 2 and p* = 2.013: density, residual energy; what is taken as its own uncertainty.
+#: Of Mecke's equation of state at T* = 2 and p* = 2.013: density, residual energy; what is taken as
+#: its own uncertainty.
 DENSITY, ENERGY, UNCERTAIN = 0.458, -10.900, (5e-4, 0.01)
 
 
 def compressed(barostat: str, pressure: float, duration: float) -> tuple:
-    """Dumbbells at T* = 2 and a pressure (bar): volume a molecule and residual energy, reduced, over time."""
+    """Dumbbells at T* = 2 and a pressure (bar): volume a molecule and residual energy, reduced,
+    over time."""
     stage = {
-        "ensemble": "npt", "temperature_K": 2 * DEPTH, "pressure_bar": pressure, "barostat": barostat,
-        "timestep_fs": 4.0, "thermostat": "velocity_rescaling",
-    } | BAROSTATS[barostat]  # fmt: skip
+        "ensemble": "npt",
+        "temperature_K": 2 * DEPTH,
+        "pressure_bar": pressure,
+        "barostat": barostat,
+        "timestep_fs": 4.0,
+        "thermostat": "velocity_rescaling",
+    } | BAROSTATS[barostat]
     forces = {"cutoff_A": 11.7, "truncation": "plain", "tail_correction": True}
-    course = follow(dumbbells(256, forces, stage | {"duration_ps": 15.0}, stage | {"duration_ps": duration}), 0.1)
-    return course["volume"] * 1e3 / DIAMETER**3 / 256, course["potential"] * KJ_PER_MOL / (256 * BOLTZMANN * DEPTH)
+    course = follow(
+        dumbbells(256, forces, stage | {"duration_ps": 15.0}, stage | {"duration_ps": duration}),
+        0.1,
+    )
+    return course["volume"] * 1e3 / DIAMETER**3 / 256, course["potential"] * KJ_PER_MOL / (
+        256 * BOLTZMANN * DEPTH
+    )
 
 
 @pytest.mark.soak
 def test_a_liquid_has_the_density_and_compressibility_of_its_equation_of_state():
-    """Two-centre Lennard-Jones, L* = 0.67, T* = 2, p* = 2.013: density and energy by either barostat; <dV²>/(V kT)
-    against -d ln V/dp between two pressures about it."""
+    """Two-centre Lennard-Jones, L* = 0.67, T* = 2, p* = 2.013: density and energy by either
+    barostat; <dV²>/(V kT) against -d ln V/dp between two pressures about it."""
     middle, apart = 2.013, 0.4
-    found = {barostat: compressed(barostat, middle * PRESSURE_UNIT, 250.0) for barostat in BAROSTATS}
+    found = {
+        barostat: compressed(barostat, middle * PRESSURE_UNIT, 250.0) for barostat in BAROSTATS
+    }
     for barostat, (volume, energy) in found.items():
         for name, values, reference, own in (
             ("density", 1 / volume, DENSITY, UNCERTAIN[0]),
@@ -455,8 +560,14 @@ def test_a_liquid_has_the_density_and_compressibility_of_its_equation_of_state()
     for k, name in enumerate(("volume", "residual energy")):
         one, other = (values[k] for values in found.values())
         error = np.hypot(error_of(one), error_of(other))
-        assert told(f"cell_rescaling less monte_carlo, {name}", one.mean() - other.mean(), error, 0.0) < FEW
-    ends = [compressed("cell_rescaling", (middle + sign * apart) * PRESSURE_UNIT, 100.0)[0] for sign in (1, -1)]
+        assert (
+            told(f"cell_rescaling less monte_carlo, {name}", one.mean() - other.mean(), error, 0.0)
+            < FEW
+        )
+    ends = [
+        compressed("cell_rescaling", (middle + sign * apart) * PRESSURE_UNIT, 100.0)[0]
+        for sign in (1, -1)
+    ]
     slope = -np.log(ends[0].mean() / ends[1].mean()) / (2 * apart)
     error_of_slope = np.hypot(*(error_of(end) / end.mean() for end in ends)) / (2 * apart)
     assert error_of_slope < 0.1 * slope
@@ -464,7 +575,15 @@ def test_a_liquid_has_the_density_and_compressibility_of_its_equation_of_state()
         value = 256 * volume.var() / (2 * volume.mean())
         error = value * error_of((volume - volume.mean()) ** 2) / volume.var()
         assert error < 0.25 * slope
-        assert told(f"compressibility by fluctuations, {barostat}", value, np.hypot(error, error_of_slope), slope) < FEW
+        assert (
+            told(
+                f"compressibility by fluctuations, {barostat}",
+                value,
+                np.hypot(error, error_of_slope),
+                slope,
+            )
+            < FEW
+        )
 
 
 @pytest.mark.soak
@@ -473,10 +592,12 @@ def test_a_piston_keeps_the_mean_pressure():
     warm = WARM | {"temperature_K": 200.0, "timestep_fs": 4.0, "duration_ps": 10.0}
     nph = {"ensemble": "nph", "pressure_bar": 1000.0, "timestep_fs": 2.0, "barostat_time_ps": 0.5}
     forces = {"cutoff_A": 6.3, "truncation": "smooth_switch", "tail_correction": True}
-    course = follow(dumbbells(50, forces, warm, nph | {"duration_ps": 10.0}, nph | {"duration_ps": 300.0}), 0.05)
+    course = follow(
+        dumbbells(50, forces, warm, nph | {"duration_ps": 10.0}, nph | {"duration_ps": 300.0}), 0.05
+    )
     pressure = course["pressure_bar"]
-    # The piston's swings cancel over whole periods, which a statistical inefficiency of at least 1 does not see:
-    # means over ten periods each.
+    # The piston's swings cancel over whole periods, which a statistical inefficiency of at least 1
+    # does not see: means over ten periods each.
     means = pressure[len(pressure) % 100 :].reshape(-1, 100).mean(axis=1)
     error = float(means.std(ddof=1) / np.sqrt(len(means)))
     assert error < 3
@@ -494,7 +615,12 @@ def crystal(folder, *stages: dict, stretched: np.ndarray | None = None) -> dict:
     if stretched is not None:
         atoms.set_cell(stretched, scale_atoms=True)
     atoms.write(folder / "argon.xyz", format="extxyz")
-    common = {"timestep_fs": 5.0, "temperature_K": COLD, "thermostat": "langevin", "friction_translation_per_ps": 3.0}
+    common = {
+        "timestep_fs": 5.0,
+        "temperature_K": COLD,
+        "thermostat": "langevin",
+        "friction_translation_per_ps": 3.0,
+    }
     return {
         "structure": {"file": "argon.xyz"},
         "molecules": [{"model": "argon"}],
@@ -507,20 +633,30 @@ def crystal(folder, *stages: dict, stretched: np.ndarray | None = None) -> dict:
 def pressed(coupling: str, pressure: object, duration: float) -> tuple[dict, dict]:
     """Two stages at a pressure: to come to it, to look."""
     stage = {
-        "ensemble": "npt", "pressure_bar": pressure, "pressure_coupling": coupling, "barostat_time_ps": 0.3,
-        "barostat_interval_ps": 0.025, "compressibility_per_bar": 5e-5,
-    }  # fmt: skip
+        "ensemble": "npt",
+        "pressure_bar": pressure,
+        "pressure_coupling": coupling,
+        "barostat_time_ps": 0.3,
+        "barostat_interval_ps": 0.025,
+        "compressibility_per_bar": 5e-5,
+    }
     return stage | {"duration_ps": 15.0}, stage | {"duration_ps": duration}
 
 
 @pytest.mark.soak
 def test_a_crystal_has_the_same_edges_whichever_way_they_move(tmp_path):
     def edges(coupling, duration):
-        course = follow(crystal(tmp_path, *pressed(coupling, PRESSED, duration)), 0.1, folder=tmp_path)
+        course = follow(
+            crystal(tmp_path, *pressed(coupling, PRESSED, duration)), 0.1, folder=tmp_path
+        )
         return [[course[name] for name in names] for names in ("abc", ("alpha", "beta", "gamma"))]
 
     reference = edges("isotropic", 100.0)[0][0]
-    for coupling, duration in (("semi_isotropic", 150.0), ("anisotropic", 150.0), ("flexible", 150.0)):
+    for coupling, duration in (
+        ("semi_isotropic", 150.0),
+        ("anisotropic", 150.0),
+        ("flexible", 150.0),
+    ):
         lengths, angles = edges(coupling, duration)
         for name, values in zip("abc", lengths, strict=True):
             error = np.hypot(error_of(values), error_of(reference))
@@ -535,8 +671,8 @@ def test_a_crystal_has_the_same_edges_whichever_way_they_move(tmp_path):
 
 @pytest.mark.soak
 def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
-    """Under a pressure xy the cell leans the other way, by P_xy/C; C from the stress of a cell that is held sheared,
-    and from how an unstressed cell fluctuates."""
+    """Under a pressure xy the cell leans the other way, by P_xy/C; C from the stress of a cell that
+    is held sheared, and from how an unstressed cell fluctuates."""
 
     def lean(pressure, duration):
         cells = []
@@ -549,7 +685,11 @@ def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
         scene |= crystal(tmp_path, *pressed("flexible", pressure, duration))
         Simulation(Scene.from_dict(scene, tmp_path), observers=Every(0.1, look)).run()
         cells = np.array(cells)
-        return cells.mean(axis=0), cells[:, 1, 0] / cells[:, 1, 1], np.prod(cells[:, range(3), range(3)], axis=1).mean()
+        return (
+            cells.mean(axis=0),
+            cells[:, 1, 0] / cells[:, 1, 1],
+            np.prod(cells[:, range(3), range(3)], axis=1).mean(),
+        )
 
     diagonal = [PRESSED] * 3
     cell, free, volume = lean([*diagonal, 0.0, 0.0, 0.0], 200.0)
@@ -562,7 +702,9 @@ def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
     held = np.diag(cell.diagonal())
     held[1, 0] = -0.02 * held[1, 1]
     stage = {"ensemble": "nvt"}
-    scene = crystal(tmp_path, stage | {"duration_ps": 5.0}, stage | {"duration_ps": 40.0}, stretched=held)
+    scene = crystal(
+        tmp_path, stage | {"duration_ps": 5.0}, stage | {"duration_ps": 40.0}, stretched=held
+    )
     course = follow(scene, 0.1, folder=tmp_path)
     stress = course["pressure_xy"]
     constant, own = stress.mean() / 0.02, error_of(stress) / 0.02
@@ -578,17 +720,28 @@ def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
 @pytest.mark.soak
 @pytest.mark.parametrize("coupling", ["anisotropic", "flexible"])
 def test_ice_keeps_its_cell(coupling, reference, tmp_path):
-    """Proton-disordered ice Ih of TIP4P/2005 at 250 K and 1 bar: 0.921 g/cm³ (Abascal & Vega 2005, table IV), its three
-    axes in the proportions of the crystal, and its angles right ones."""
+    """Proton-disordered ice Ih of TIP4P/2005 at 250 K and 1 bar: 0.921 g/cm³ (Abascal & Vega 2005,
+    table IV), its three axes in the proportions of the crystal, and its angles right ones."""
     shutil.copy(reference / "structures" / "genice_ice1h_tip4p_seed42.gro", tmp_path / "ice.gro")
     stage = {
-        "ensemble": "npt", "temperature_K": 250.0, "timestep_fs": 2.0, "thermostat": "langevin", "pressure_bar": 1.0,
-        "pressure_coupling": coupling, "barostat_time_ps": 0.5, "compressibility_per_bar": 1e-5,
-    }  # fmt: skip
+        "ensemble": "npt",
+        "temperature_K": 250.0,
+        "timestep_fs": 2.0,
+        "thermostat": "langevin",
+        "pressure_bar": 1.0,
+        "pressure_coupling": coupling,
+        "barostat_time_ps": 0.5,
+        "compressibility_per_bar": 1e-5,
+    }
     scene = {
         "structure": {"file": "ice.gro"},
         "molecules": [{"model": "tip4p2005"}],
-        "forces": {"cutoff_A": 7.0, "truncation": "shift", "tail_correction": True, "electrostatics": "pme"},
+        "forces": {
+            "cutoff_A": 7.0,
+            "truncation": "shift",
+            "tail_correction": True,
+            "electrostatics": "pme",
+        },
         "precision": "mixed",
         "start": {"temperature_K": 250.0},
         "stages": [stage | {"duration_ps": 10.0}, stage | {"duration_ps": 60.0}],
@@ -602,10 +755,17 @@ def test_ice_keeps_its_cell(coupling, reference, tmp_path):
     edges = np.array([course[name] for name in "abc"])
     growth = edges.mean(axis=1) / begin
     for name, values, whole in zip("abc", edges, begin, strict=True):
-        told(f"ice Ih, {coupling}, {name}, Å", values.mean(), error_of(values), whole * np.cbrt(growth.prod()))
+        told(
+            f"ice Ih, {coupling}, {name}, Å",
+            values.mean(),
+            error_of(values),
+            whole * np.cbrt(growth.prod()),
+        )
     assert growth / np.cbrt(growth.prod()) == pytest.approx(np.ones(3), rel=0.01)
     for name in ("alpha", "beta", "gamma"):
         if coupling == "flexible":
-            assert told(f"ice Ih, {name}, °", course[name].mean(), error_of(course[name]), 90.0) < MANY
+            assert (
+                told(f"ice Ih, {name}, °", course[name].mean(), error_of(course[name]), 90.0) < MANY
+            )
         else:
             assert course[name] == pytest.approx(90)

@@ -1,4 +1,5 @@
-"""The driver of mixed faults, `python tests/faults.py`: a little of it on every change, an hour in the soak tier."""
+"""The driver of mixed faults, `python tests/faults.py`: a little of it on every change, an hour in
+the soak tier."""
 
 import re
 import subprocess

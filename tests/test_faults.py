@@ -1,6 +1,8 @@
-"""Faults from outside: disks that fill, folders that go, signals, streams that are closed, damaged files.
+"""Faults from outside: disks that fill, folders that go, signals, streams that are closed, damaged
+files.
 
-Whatever happens, a run ends with one sentence, and what it has written before can be read and gone on with.
+Whatever happens, a run ends with one sentence, and what it has written before can be read and gone
+on with.
 """
 
 import ctypes
@@ -48,7 +50,8 @@ temperature_K = 298.0
 duration_ps = 0.1
 """
 TRAJECTORY = "trajectory.xtc"
-#: So long that a test ends it, without the estimate of the longest stable step that a long run makes.
+#: So long that a test ends it, without the estimate of the longest stable step that a long run
+#: makes.
 LONG = ("--set", "stages.0.duration_ps=1000", "--set", "watch.stable_step=false")
 
 
@@ -62,13 +65,26 @@ def scene(tmp_path_factory) -> Path:
 
 
 def command(scene: Path, folder: Path, *more: str) -> list[str]:
-    return [sys.executable, "-m", "rigidmd", "run", str(scene), "-o", str(folder), "--threads", "1", *more]
+    return [
+        sys.executable,
+        "-m",
+        "rigidmd",
+        "run",
+        str(scene),
+        "-o",
+        str(folder),
+        "--threads",
+        "1",
+        *more,
+    ]
 
 
 def ran(arguments: list[str], **options) -> subprocess.CompletedProcess:
     """A finished process, with what it wrote."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
-    return subprocess.run(arguments, timeout=300, env=environment() | options.pop("env", {}), **options)
+    return subprocess.run(
+        arguments, timeout=300, env=environment() | options.pop("env", {}), **options
+    )
 
 
 def environment() -> dict[str, str]:
@@ -77,7 +93,9 @@ def environment() -> dict[str, str]:
 
 def started(arguments: list[str], log: Path) -> subprocess.Popen:
     """A process that has begun to write its log."""
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment())
+    process = subprocess.Popen(
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment()
+    )
     while process.poll() is None and not (log.exists() and log.stat().st_size > 2000):
         time.sleep(0.005)
     return process
@@ -95,7 +113,9 @@ def disk(tmp_path) -> Iterator:
     place.mkdir()
 
     def make(size: int) -> Path:
-        made = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", place], capture_output=True)
+        made = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", place], capture_output=True
+        )
         if made.returncode:
             pytest.skip(f"no small file system can be made here: {made.stderr.decode().strip()}")
         return place
@@ -104,9 +124,17 @@ def disk(tmp_path) -> Iterator:
     subprocess.run(["umount", place], capture_output=True)
 
 
-# What is written when the disk is full: the scene, the log, the first checkpoint, frames or a later checkpoint.
+# What is written when the disk is full: the scene, the log, the first checkpoint, frames or a later
+# checkpoint.
 @pytest.mark.parametrize(
-    "size", [96, *(pytest.param(size, marks=pytest.mark.soak) for size in (4, 8, 16, 24, 32, 48, 64, 128, 192, 256))]
+    "size",
+    [
+        96,
+        *(
+            pytest.param(size, marks=pytest.mark.soak)
+            for size in (4, 8, 16, 24, 32, 48, 64, 128, 192, 256)
+        ),
+    ],
 )
 def test_a_disk_that_fills(size, scene, disk, tmp_path):
     """The run ends with a sentence; with room again it goes on to the same bits."""
@@ -114,7 +142,9 @@ def test_a_disk_that_fills(size, scene, disk, tmp_path):
     done = ran(command(scene, place / "run", *LONG))
     said = done.stderr.decode()
     assert done.returncode == 2 and "No space left on device" in said and "Traceback" not in said
-    assert not [path for path in (place / "run").iterdir() if path.name.startswith(".") and path.suffix]
+    assert not [
+        path for path in (place / "run").iterdir() if path.name.startswith(".") and path.suffix
+    ]
     shutil.copytree(place / "run", tmp_path / "run")
     if "rigidmd resume" in said:
         until = "0.1ps" if size < 150 else "0.5ps"
@@ -128,11 +158,16 @@ def test_a_disk_that_fills(size, scene, disk, tmp_path):
 
 def test_a_folder_that_is_removed_meanwhile(scene, tmp_path):
     run = started(command(scene, tmp_path / "run", *LONG), tmp_path / "run" / LOG)
-    (tmp_path / "run").rename(tmp_path / "gone")  # at once: one file after another may leave a checkpoint for a moment
+    (tmp_path / "run").rename(
+        tmp_path / "gone"
+    )  # at once: one file after another may leave a checkpoint for a moment
     said = run.communicate(timeout=60)[1].decode()
     assert run.returncode == 2
     # the file that the run is writing to, or the next one, whichever it notices first
-    assert "was removed while the run was writing it" in said or "cannot be written: No such file" in said, said
+    assert (
+        "was removed while the run was writing it" in said
+        or "cannot be written: No such file" in said
+    ), said
     assert "Traceback" not in said and "rigidmd resume" not in said
 
 
@@ -145,28 +180,43 @@ def test_a_folder_that_cannot_be_written(scene, disk, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "stream", ["full", pytest.param("closed", marks=pytest.mark.soak), pytest.param("gone", marks=pytest.mark.soak)]
+    "stream",
+    [
+        "full",
+        pytest.param("closed", marks=pytest.mark.soak),
+        pytest.param("gone", marks=pytest.mark.soak),
+    ],
 )
 def test_a_standard_output_that_takes_nothing(stream, scene, tmp_path):
     """The run is not lost for it."""
     line = " ".join(f"'{part}'" for part in command(scene, tmp_path / "run"))
-    into = {"full": "> /dev/full", "closed": ">&- 2>&-", "gone": "| true; exit ${PIPESTATUS[0]}"}[stream]
+    into = {"full": "> /dev/full", "closed": ">&- 2>&-", "gone": "| true; exit ${PIPESTATUS[0]}"}[
+        stream
+    ]
     done = ran(["bash", "-c", f"{line} {into}"])
     assert "Traceback" not in done.stderr.decode()
     assert same(scene, tmp_path / "run")
 
 
 @pytest.mark.parametrize(
-    "changed", [{"LC_ALL": "C"}, pytest.param({"PYTHONIOENCODING": "latin-1"}, marks=pytest.mark.soak)]
+    "changed",
+    [{"LC_ALL": "C"}, pytest.param({"PYTHONIOENCODING": "latin-1"}, marks=pytest.mark.soak)],
 )
 def test_a_poor_environment(changed, scene, tmp_path):
     """No home, no UTF-8, a path with spaces and letters of other scripts."""
     folder = tmp_path / "ein Häuschen 水"
     # variables of OpenBLAS choose its code, and with it the last bits of what NumPy multiplies
-    names = [name for name in os.environ if name in ("PATH", "RIGIDMD_CACHE") or name.startswith("OPENBLAS_")]
+    names = [
+        name
+        for name in os.environ
+        if name in ("PATH", "RIGIDMD_CACHE") or name.startswith("OPENBLAS_")
+    ]
     kept = {name: os.environ[name] for name in names}
     done = subprocess.run(
-        command(scene, folder), capture_output=True, env=kept | changed | {"PYTHONPATH": str(ROOT)}, timeout=300
+        command(scene, folder),
+        capture_output=True,
+        env=kept | changed | {"PYTHONPATH": str(ROOT)},
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     assert b"orthogonality" in done.stdout
@@ -184,8 +234,10 @@ def test_a_run_that_is_stopped_by_signals_goes_on(sent, scene, tmp_path):
     for _ in range(25):
         run = subprocess.Popen(
             command(scene, tmp_path / "run", "--resume", "--set", "stages.0.duration_ps=0.5"),
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment(),
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=environment(),
+        )
         time.sleep(float(rng.uniform(1.0, 8.0)))  # not while Python itself starts
         run.send_signal(sent)
         said = run.communicate(timeout=120)[1].decode()
@@ -208,7 +260,9 @@ def test_ctrl_c_in_a_callback_of_a_compiler_is_not_lost(capfd):
         return 0
 
     call = ctypes.CFUNCTYPE(ctypes.c_int)(press)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background may ignore it
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a process in the background may ignore it
     try:
         with pytest.raises(KeyboardInterrupt), interruptible():
             call()
@@ -224,14 +278,17 @@ def test_ctrl_c_in_a_callback_of_a_compiler_is_not_lost(capfd):
 
 @pytest.mark.soak
 def test_a_command_that_is_interrupted_while_it_compiles(scene, tmp_path):
-    """Ctrl-C ends it with 130, wherever it comes, and the code that it leaves behind can be used."""
+    """Ctrl-C ends it with 130, wherever it comes, and the code that it leaves behind can be
+    used."""
     rng = np.random.default_rng(4)
     for k in range(9):
         cache = {"RIGIDMD_CACHE": str(tmp_path / f"cache{k}")}
         run = subprocess.Popen(
-            command(scene, tmp_path / f"run{k}"), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            command(scene, tmp_path / f"run{k}"),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             env=environment() | cache,
-        )  # fmt: skip
+        )
         time.sleep(float(rng.uniform(1.0, 20.0)))
         run.send_signal(signal.SIGINT)
         said = run.communicate(timeout=300)[1].decode()
@@ -246,7 +303,10 @@ def test_two_first_compilations_at_once(scene, tmp_path):
     environ = environment() | {"RIGIDMD_CACHE": str(tmp_path / "cache")}
     both = [
         subprocess.Popen(
-            command(scene, tmp_path / f"run{k}"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environ
+            command(scene, tmp_path / f"run{k}"),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=environ,
         )
         for k in range(2)
     ]
@@ -276,14 +336,20 @@ def test_what_a_library_makes_an_error_of_another_type_is_reported(of, scene, mo
     monkeypatch.setattr(rigidmd.Scene, "read", read)
     assert cli.main(["check", str(scene)]) == (2 if of is MemoryError else 130)
     said = capsys.readouterr().err
-    assert ("not enough memory" if of is MemoryError else "interrupted") in said and "way" not in said
+    assert (
+        "not enough memory" if of is MemoryError else "interrupted"
+    ) in said and "way" not in said
 
 
 def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:
     """What a command would go on with after reading a file of a run. Raises RigidMDError."""
     if name == FINAL:
         found = read_state(folder / name)
-        arrays = {"species": found.species, "residue_number": found.residue_number, "models": found.models}
+        arrays = {
+            "species": found.species,
+            "residue_number": found.residue_number,
+            "models": found.models,
+        }
         arrays |= found.state._asdict()
         return {name: array.tobytes() for name, array in arrays.items() if array is not None}
     kept, faults = latest(folder)
@@ -291,7 +357,9 @@ def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:
         assert all(CHECKPOINT in fault for fault in faults)
         return {name: array.tobytes() for name, array in kept.arrays.items()}
     owner = {LOG: "LogFile", TRAJECTORY: "Frames"}[name]
-    size, checksum = next(part["kept"] for who, part in kept.values["of"].items() if who == owner)[:2]
+    size, checksum = next(part["kept"] for who, part in kept.values["of"].items() if who == owner)[
+        :2
+    ]
     found = AppendedFile(folder / name, (size, checksum))
     found.cut()
     found.close()
@@ -300,11 +368,13 @@ def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:
 
 @pytest.mark.parametrize("times", [25, pytest.param(1000, marks=pytest.mark.soak)])
 def test_damaged_files_of_a_run(times, scene, tmp_path):
-    """Flipped and cut files are refused by name or give way to the checkpoint before; or the damage changes nothing."""
+    """Flipped and cut files are refused by name or give way to the checkpoint before; or the damage
+    changes nothing."""
     names = [CHECKPOINT, PREVIOUS, FINAL, LOG, TRAJECTORY]
     whole = {name: read_back(scene.parent / "whole", name) for name in names}
     before = {
-        name: array.tobytes() for name, array in read_checkpoint(scene.parent / "whole" / PREVIOUS).arrays.items()
+        name: array.tobytes()
+        for name, array in read_checkpoint(scene.parent / "whole" / PREVIOUS).arrays.items()
     }
     rng = np.random.default_rng(times)
     refused = dict.fromkeys(names, 0)

@@ -1,4 +1,5 @@
-"""What acts on molecules from outside: electric fields, gravity, walls, restraints; and what then keeps its momentum."""
+"""What acts on molecules from outside: electric fields, gravity, walls, restraints; and what then
+keeps its momentum."""
 
 import json
 import re
@@ -39,21 +40,48 @@ def site(name, mass, position, charge, sigma=None):
     return {"name": name, "mass_u": mass, "position_A": position, "charge_e": charge} | well
 
 
-#: An asymmetric body with a net charge and a dipole, its mirror image of the opposite charge, a neutral dipole, a point.
-KITE = [site("A", 10.0, [0, 0, 0], 1.0), site("B", 12.0, [1.2, 0.3, 0], -0.4), site("C", 5.0, [0, 1, 0.8], 0.1)]
+#: An asymmetric body with a net charge and a dipole, its mirror image of the opposite charge, a
+#: neutral dipole, a point.
+KITE = [
+    site("A", 10.0, [0, 0, 0], 1.0),
+    site("B", 12.0, [1.2, 0.3, 0], -0.4),
+    site("C", 5.0, [0, 1, 0.8], 0.1),
+]
 ETIK = [entry | {"charge_e": -entry["charge_e"]} for entry in KITE]
 ROD = [site("P", 8.0, [0, 0, 0.5], 0.5), site("N", 9.0, [0, 0, -0.6], -0.5)]
 #: One with Lennard-Jones sites away from its centre, for walls.
-DUMBBELL = [site("L", 14.0, [0, 0, 0.5], 0.5, 3.0), site("M", 6.0, [0, 0.2, -0.9], -0.5, 2.5), site("H", 1.0, [1, 0, 0], 0.0)]  # fmt: skip
+DUMBBELL = [
+    site("L", 14.0, [0, 0, 0.5], 0.5, 3.0),
+    site("M", 6.0, [0, 0.2, -0.9], -0.5, 2.5),
+    site("H", 1.0, [1, 0, 0], 0.0),
+]
 
 
 def alone(counts, fields, box=None, **sections):
-    """The system, engine, and start, turned anew, of molecules of these sites that only fields act on."""
-    kinds = {"kite": KITE, "etik": ETIK, "rod": ROD, "dumbbell": DUMBBELL, "bead": [site("Z", 20.0, [0, 0, 0], 1.0)]}
-    molecules = [{"name": name, "count": count, "sites": kinds[name]} for name, count in counts.items()]
+    """The system, engine, and start, turned anew, of molecules of these sites that only fields act
+    on."""
+    kinds = {
+        "kite": KITE,
+        "etik": ETIK,
+        "rod": ROD,
+        "dumbbell": DUMBBELL,
+        "bead": [site("Z", 20.0, [0, 0, 0], 1.0)],
+    }
+    molecules = [
+        {"name": name, "count": count, "sites": kinds[name]} for name, count in counts.items()
+    ]
     box = box or {"lengths_A": 20.0, "periodic": False}
-    system = build(small_scene({}, None, molecules=molecules, fields=fields, box=box,
-                               forces={"electrostatics": "none"} | sections.pop("forces", {}), **sections))  # fmt: skip
+    system = build(
+        small_scene(
+            {},
+            None,
+            molecules=molecules,
+            fields=fields,
+            box=box,
+            forces={"electrostatics": "none"} | sections.pop("forces", {}),
+            **sections,
+        )
+    )
     terms = {name: term for name, term in system.terms.items() if name in system.external}
     state = system.state.copy()
     if len(state.rotation):
@@ -65,13 +93,35 @@ STEADY = {"electric_V_per_nm": [0.3, -0.2, 0.6]}
 OSCILLATING = STEADY | {"electric_frequency_per_ps": 2.5, "electric_phase_deg": 40.0}
 GRAVITY = {"gravity_m_s2": [0.0, 3e13, -5e13]}
 LJ_WALLS = {
-    "walls": [{"axis": "y", "kind": "lj93", "positions_A": [1.0, 13.0], "sigma_A": 2.8, "epsilon_kJ_mol": 1.3,
-               "cutoff_A": 7.0}]
-}  # fmt: skip
-SOFT_WALLS = {"walls": [{"axis": "z", "kind": "harmonic", "positions_A": [7.0, 9.0], "stiffness_kJ_mol_A2": 4.0}]}
-SPRINGS = {"restraints": [{"species": "dumbbell", "molecules": "2-3", "stiffness_kJ_mol_A2": [3.0, 0.0, 5.0]}]}
-ALL = {"steady": STEADY, "oscillating": OSCILLATING, "gravity": GRAVITY, "lj93": LJ_WALLS, "harmonic": SOFT_WALLS,
-       "restraints": SPRINGS}  # fmt: skip
+    "walls": [
+        {
+            "axis": "y",
+            "kind": "lj93",
+            "positions_A": [1.0, 13.0],
+            "sigma_A": 2.8,
+            "epsilon_kJ_mol": 1.3,
+            "cutoff_A": 7.0,
+        }
+    ]
+}
+SOFT_WALLS = {
+    "walls": [
+        {"axis": "z", "kind": "harmonic", "positions_A": [7.0, 9.0], "stiffness_kJ_mol_A2": 4.0}
+    ]
+}
+SPRINGS = {
+    "restraints": [
+        {"species": "dumbbell", "molecules": "2-3", "stiffness_kJ_mol_A2": [3.0, 0.0, 5.0]}
+    ]
+}
+ALL = {
+    "steady": STEADY,
+    "oscillating": OSCILLATING,
+    "gravity": GRAVITY,
+    "lj93": LJ_WALLS,
+    "harmonic": SOFT_WALLS,
+    "restraints": SPRINGS,
+}
 
 
 def energy_of(engine, state):
@@ -80,12 +130,18 @@ def energy_of(engine, state):
 
 @pytest.mark.parametrize("kind", ALL)
 def test_forces_and_torques_are_the_slopes_of_the_energy(kind):
-    counts = {"dumbbell": 4, "kite": 2} if kind in ("steady", "oscillating", "gravity") else {"dumbbell": 6}
+    counts = (
+        {"dumbbell": 4, "kite": 2}
+        if kind in ("steady", "oscillating", "gravity")
+        else {"dumbbell": 6}
+    )
     _, engine, state = alone(counts, ALL[kind])
     state.time[0] = 0.37
     rng = np.random.default_rng(1)
     # the lattice stands between the walls: some have to go into the soft ones
-    state.position[:] += (2.0 if kind == "harmonic" else 0.3) * rng.standard_normal(state.position.shape)
+    state.position[:] += (2.0 if kind == "harmonic" else 0.3) * rng.standard_normal(
+        state.position.shape
+    )
     load, tallies = engine.evaluate(state)
     assert all((tally.virial == 0).all() for tally in tallies.values())
     h, turns = 1e-5, kind not in ("gravity", "restraints")
@@ -99,22 +155,31 @@ def test_forces_and_torques_are_the_slopes_of_the_energy(kind):
                 moved = state.copy()
                 moved.position[m, k] += step
                 ends.append(energy_of(engine, moved))
-            assert load.force[m, k] == pytest.approx(-(ends[0] - ends[1]) / (2 * h), abs=1e-7 * scale)
+            assert load.force[m, k] == pytest.approx(
+                -(ends[0] - ends[1]) / (2 * h), abs=1e-7 * scale
+            )
             ends = []
             for step in (h, -h):
                 moved = state.copy()
                 moved.rotation[m] = moved.rotation[m] @ from_vector(np.eye(3)[None, k] * step)[0]
                 ends.append(energy_of(engine, moved))
-            assert load.torque_body[m, k] == pytest.approx(-(ends[0] - ends[1]) / (2 * h), abs=1e-7 * scale)
+            assert load.torque_body[m, k] == pytest.approx(
+                -(ends[0] - ends[1]) / (2 * h), abs=1e-7 * scale
+            )
 
 
 def test_units_are_those_of_the_keys():
-    """1 V/nm pulls at a charge e with 1.602e-10 N, 96.49 kJ/mol/nm; 1 m/s² at 1 u with 1.66e-27 N."""
+    """1 V/nm pulls at a charge e with 1.602e-10 N, 96.49 kJ/mol/nm; 1 m/s² at 1 u with 1.66e-27
+    N."""
     _, engine, state = alone({"bead": 1}, {"electric_V_per_nm": [0.0, 0.0, 1.0]})
     newton = AVOGADRO * 1e-10 * 1e-3 * 100  # J/m is kJ/mol/Å, is u Å/ps²
-    assert engine.evaluate(state)[0].force[0].tolist() == pytest.approx([0, 0, ELEMENTARY_CHARGE * 1e9 * newton])
+    assert engine.evaluate(state)[0].force[0].tolist() == pytest.approx(
+        [0, 0, ELEMENTARY_CHARGE * 1e9 * newton]
+    )
     _, engine, state = alone({"bead": 1}, {"gravity_m_s2": [0.0, 2e12, 0.0]})
-    assert engine.evaluate(state)[0].force[0].tolist() == pytest.approx([0, 20e-3 / AVOGADRO * 2e12 * newton, 0])
+    assert engine.evaluate(state)[0].force[0].tolist() == pytest.approx(
+        [0, 20e-3 / AVOGADRO * 2e12 * newton, 0]
+    )
 
 
 def test_a_field_sees_every_charge_where_it_is():
@@ -141,18 +206,30 @@ def test_a_dipole_turns_towards_the_field():
     for theta in (0.0, 0.4, pi / 2, pi):
         # a turn that carries mu into the xz plane, theta from z
         axis = np.cross(mu, [0, 0, 1.0])
-        upright = from_vector((axis / np.linalg.norm(axis) * np.arccos(mu[2] / np.linalg.norm(mu)))[None])[0]
+        upright = from_vector(
+            (axis / np.linalg.norm(axis) * np.arccos(mu[2] / np.linalg.norm(mu)))[None]
+        )[0]
         state.rotation[0] = from_vector(np.array([[0, theta, 0]]))[0] @ upright
         load, tallies = engine.evaluate(state)
         torque = state.rotation[0] @ load.torque_body[0]
         assert torque.tolist() == pytest.approx([0, -size * np.sin(theta), 0], abs=1e-12 * size)
-        assert tallies["electric_field"].energy == pytest.approx(-size * np.cos(theta), abs=1e-12 * size)
+        assert tallies["electric_field"].energy == pytest.approx(
+            -size * np.cos(theta), abs=1e-12 * size
+        )
         assert not load.force.any()
 
 
 def walls(kind, **more):
-    own = {"sigma_A": 3.0, "epsilon_kJ_mol": 2.0} if kind == "lj93" else {"stiffness_kJ_mol_A2": 5.0}
-    return {"walls": [{"axis": "z", "kind": kind, "positions_A": [-4.0, inf], "acts_on": "centres"} | own | more]}
+    own = (
+        {"sigma_A": 3.0, "epsilon_kJ_mol": 2.0} if kind == "lj93" else {"stiffness_kJ_mol_A2": 5.0}
+    )
+    return {
+        "walls": [
+            {"axis": "z", "kind": kind, "positions_A": [-4.0, inf], "acts_on": "centres"}
+            | own
+            | more
+        ]
+    }
 
 
 def test_walls_are_what_their_formulas_say():
@@ -170,7 +247,9 @@ def test_walls_are_what_their_formulas_say():
         assert energy(z) == pytest.approx(plain, rel=1e-13)
         assert energy(z, cutoff_A=8.0) == pytest.approx(plain - cut, rel=1e-13)
     assert energy(4.1, cutoff_A=8.0) == 0
-    assert energy(2.0, positions_A=[-4.0, 5.0]) == pytest.approx(energy(2.0) + energy(-1.0), rel=1e-13)
+    assert energy(2.0, positions_A=[-4.0, 5.0]) == pytest.approx(
+        energy(2.0) + energy(-1.0), rel=1e-13
+    )
     _, engine, state = alone({"bead": 3}, walls("harmonic", positions_A=[-4.0, 2.0]))
     state.position[:, 2] = [-4.5, 0.0, 4.0]
     load, tallies = engine.evaluate(state)
@@ -183,21 +262,28 @@ def test_a_site_behind_a_wall_is_an_error_that_says_where():
     for z in (-4.0, -4.2):
         state.position[1, 2] = z
         with pytest.raises(
-            BehindWallError, match=rf"molecule 2 has a site at z = {z:g} Å, behind the wall at z = -4 Å"
+            BehindWallError,
+            match=rf"molecule 2 has a site at z = {z:g} Å, behind the wall at z = -4 Å",
         ):
             engine.evaluate(state)
     state.position[1, 2] = np.nan
     with pytest.raises(SimulationError, match="molecule 2 is lost"):
         engine.evaluate(state)
     # one that shoots through the wall in a run is named, with a cause and advice
-    scene = small_scene({"argon": 2}, None, stages=[{"duration_ps": 1.0, "timestep_fs": 10}], watch={"move": False},
-                        fields=walls("lj93", positions_A=[0.0, inf], cutoff_A=0.5))  # fmt: skip
+    scene = small_scene(
+        {"argon": 2},
+        None,
+        stages=[{"duration_ps": 1.0, "timestep_fs": 10}],
+        watch={"move": False},
+        fields=walls("lj93", positions_A=[0.0, inf], cutoff_A=0.5),
+    )
     simulation = Simulation(scene)
     state = simulation.system.state.copy()
     state.position[0, 2], state.velocity[0, 2] = 5.0, -1000.0
     simulation.start_from(state)
     with pytest.raises(
-        SimulationError, match=r"molecule 1 \(argon\) has a site at z = -.* behind .*a shorter timestep"
+        SimulationError,
+        match=r"molecule 1 \(argon\) has a site at z = -.* behind .*a shorter timestep",
     ):
         simulation.run()
 
@@ -229,7 +315,9 @@ def conserved_along(kind, scheme, dt):
 
 
 @pytest.mark.parametrize("kind", RUNS)
-@pytest.mark.parametrize("name", ["velocity_verlet", pytest.param("srkn_4", marks=pytest.mark.soak)])
+@pytest.mark.parametrize(
+    "name", ["velocity_verlet", pytest.param("srkn_4", marks=pytest.mark.soak)]
+)
 def test_energy_less_work_is_conserved_to_the_order_of_the_scheme(kind, name):
     scheme, dt = SCHEMES[name], RUNS[kind][3] * (2 if name == "srkn_4" else 1)
     errors = []
@@ -241,7 +329,8 @@ def test_energy_less_work_is_conserved_to_the_order_of_the_scheme(kind, name):
 
 
 def test_a_field_that_oscillates_does_work_that_is_booked():
-    """Without the books the energy is not conserved at all; and a charge at rest gains what E0²/2 m w² says."""
+    """Without the books the energy is not conserved at all; and a charge at rest gains what E0²/2 m
+    w² says."""
     counts, fields, span, dt = RUNS["oscillating"]
     system, engine, state = alone(counts, fields)
     before = observe(system, engine, state).energy
@@ -252,14 +341,20 @@ def test_a_field_that_oscillates_does_work_that_is_booked():
     fields = {"electric_V_per_nm": [field, 0.0, 0.0], "electric_frequency_per_ps": f}
     system, engine, state = alone({"bead": 1}, fields)
     state.velocity[:] = 0.0
-    move(engine, state, SCHEMES["srkn_4"], 1 / f / 160, 40)  # a quarter of a period: all is kinetic energy
+    move(
+        engine, state, SCHEMES["srkn_4"], 1 / f / 160, 40
+    )  # a quarter of a period: all is kinetic energy
     speed = field * ELEMENTARY_CHARGE * AVOGADRO * 1e-2 / 20.0 / (2 * pi * f)
     assert state.velocity[0].tolist() == pytest.approx([speed, 0, 0], rel=1e-7)
-    assert engine.evaluate(state)[1]["electric_field"].energy == pytest.approx(0, abs=1e-7 * 10 * speed**2)
+    assert engine.evaluate(state)[1]["electric_field"].energy == pytest.approx(
+        0, abs=1e-7 * 10 * speed**2
+    )
 
 
 def test_a_charge_that_travels_through_images_keeps_its_energy():
-    system, engine, state = alone({"bead": 1}, {"electric_V_per_nm": [1.0, 0.0, 0.0]}, {"lengths_A": 20.0})
+    system, engine, state = alone(
+        {"bead": 1}, {"electric_V_per_nm": [1.0, 0.0, 0.0]}, {"lengths_A": 20.0}
+    )
     before, start = observe(system, engine, state).energy, state.position.copy()
     move(engine, state, VERLET, 0.01, 500)
     assert (state.position - start)[0, 0] > 25 * 20
@@ -269,9 +364,19 @@ def test_a_charge_that_travels_through_images_keeps_its_energy():
 
 def slit(fields, **sections):
     """Waters between walls in a box, with a field."""
-    both = {"axis": "z", "kind": "lj93", "positions_A": [0.0, 16.0], "sigma_A": 2.5, "epsilon_kJ_mol": 1.5}
-    data = {"box": {"lengths_A": [14.0, 14.0, 28.0]}, "forces": {"cutoff_A": 6.9, "truncation": "smooth_switch"},
-            "fields": {"walls": [both]} | fields, "output": {"trajectory": False}}  # fmt: skip
+    both = {
+        "axis": "z",
+        "kind": "lj93",
+        "positions_A": [0.0, 16.0],
+        "sigma_A": 2.5,
+        "epsilon_kJ_mol": 1.5,
+    }
+    data = {
+        "box": {"lengths_A": [14.0, 14.0, 28.0]},
+        "forces": {"cutoff_A": 6.9, "truncation": "smooth_switch"},
+        "fields": {"walls": [both]} | fields,
+        "output": {"trajectory": False},
+    }
     return small_scene({"spce": 60}, 1.0, **data | sections)
 
 
@@ -280,10 +385,14 @@ def test_a_run_of_waters_between_walls_keeps_its_energy_and_the_momentum_along_t
     oscillating = {"electric_V_per_nm": [0.2, 0.0, 1.0], "electric_frequency_per_ps": 3.0}
     results = Simulation(slit(oscillating, stages=stages)).run()
     stage = results.summary["stages"][1]
-    assert abs(stage["drift_kJ_mol_ns_per_molecule"]) < 4 * stage["drift_error_kJ_mol_ns_per_molecule"]
+    assert (
+        abs(stage["drift_kJ_mol_ns_per_molecule"]) < 4 * stage["drift_error_kJ_mol_ns_per_molecule"]
+    )
     nve = results["stage"] == 1
     noise = stage["energy_rms_kJ_mol_per_molecule"] * 60
-    assert np.ptp(results["energy"][nve]) > 20 * noise  # without the work of the field it would not be so
+    assert (
+        np.ptp(results["energy"][nve]) > 20 * noise
+    )  # without the work of the field it would not be so
     assert noise < 2e-3 * results["kinetic"][nve].mean()
     assert results.summary["degrees_of_freedom"] == 60 * 6 - 2
     assert results.summary["momentum_conserved"] == ["x", "y"]
@@ -349,10 +458,18 @@ def test_the_errors_of_precision_are_those_of_what_is_conserved():
 
 
 def test_threads_change_no_bit():
-    fields = OSCILLATING | walls("lj93", acts_on="sites", positions_A=[-1.0, 31.0]) | {"gravity_m_s2": [0.0, 0.0, 3e12]}
+    fields = (
+        OSCILLATING
+        | walls("lj93", acts_on="sites", positions_A=[-1.0, 31.0])
+        | {"gravity_m_s2": [0.0, 0.0, 3e12]}
+    )
     fields["restraints"] = [{"molecules": "1-100", "stiffness_kJ_mol_A2": 2.0}]
     scene = small_scene(
-        {"spce": 700}, None, fields=fields, box={"lengths_A": [30.0, 30.0, 44.0]}, forces={"cutoff_A": 9.0}
+        {"spce": 700},
+        None,
+        fields=fields,
+        box={"lengths_A": [30.0, 30.0, 44.0]},
+        forces={"cutoff_A": 9.0},
     )
     found = []
     for threads in (1, 2):
@@ -378,28 +495,42 @@ def test_a_start_from_nothing_stands_between_walls():
 
 def test_molecules_of_a_file_are_taken_to_the_images_between_the_walls(tmp_path):
     rows = [(3.0, 3.0, 7.0), (8.0, 3.0, 37.0), (3.0, 8.0, -24.0)]
-    lines = [f"    1AR      Ar{k:5d}" + "".join(f"{c / 10:8.3f}" for c in x) for k, x in enumerate(rows, 1)]
+    lines = [
+        f"    1AR      Ar{k:5d}" + "".join(f"{c / 10:8.3f}" for c in x)
+        for k, x in enumerate(rows, 1)
+    ]
     (tmp_path / "a.gro").write_text("\n".join(["t", "3", *lines, "2.0 2.0 3.0"]) + "\n")
 
     def found(positions):
         fields = walls("lj93", positions_A=positions)
-        scene = small_scene({}, None, tmp_path, molecules=[{"model": "argon"}], box={}, structure={"file": "a.gro"},
-                            fields=fields, forces={"cutoff_A": 9.0})  # fmt: skip
+        scene = small_scene(
+            {},
+            None,
+            tmp_path,
+            molecules=[{"model": "argon"}],
+            box={},
+            structure={"file": "a.gro"},
+            fields=fields,
+            forces={"cutoff_A": 9.0},
+        )
         return build(scene).state.position
 
     assert found([0.0, 14.0])[:, 2].tolist() == pytest.approx([7, 7, 6])
     assert found([-30.0, -16.0])[:, 2].tolist() == pytest.approx([-23, -23, -24])
     with pytest.raises(
-        SceneError, match=r"fields.walls.0: at the start, molecule 3 \(argon\) has a site at z = 6 Å, behind"
+        SceneError,
+        match=r"fields.walls.0: at the start, molecule 3 \(argon\) has a site at z = 6 Å, behind",
     ):
         found([6.5, 20.0])
 
 
 def test_restraints_hold_the_molecules_that_are_named():
     molecules = [{"model": "argon", "count": 5, "frozen": [5]}, {"model": "krypton", "count": 3}]
-    restraints = [{"species": "krypton", "stiffness_kJ_mol_A2": 2.0, "position_A": [1.0, 2.0, 3.0]},
-                  {"species": "argon", "molecules": [2, 4], "stiffness_kJ_mol_A2": [0.0, 0.0, 3.0]},
-                  {"species": "argon", "stiffness_kJ_mol_A2": 1.0}]  # fmt: skip
+    restraints = [
+        {"species": "krypton", "stiffness_kJ_mol_A2": 2.0, "position_A": [1.0, 2.0, 3.0]},
+        {"species": "argon", "molecules": [2, 4], "stiffness_kJ_mol_A2": [0.0, 0.0, 3.0]},
+        {"species": "argon", "stiffness_kJ_mol_A2": 1.0},
+    ]
     system = build(small_scene({}, 30.0, molecules=molecules, fields={"restraints": restraints}))
     found = [system.terms[f"restraints_{k}"] for k in range(3)]
     assert [term.molecule.tolist() for term in found] == [[5, 6, 7], [1, 3], [0, 1, 2, 3]]
@@ -409,7 +540,10 @@ def test_restraints_hold_the_molecules_that_are_named():
 
 
 def test_what_is_frozen_is_left_alone():
-    molecules = [{"model": "spce", "count": 4, "frozen": [1]}, {"model": "argon", "count": 2, "frozen": True}]
+    molecules = [
+        {"model": "spce", "count": 4, "frozen": [1]},
+        {"model": "argon", "count": 2, "frozen": True},
+    ]
     fields = STEADY | GRAVITY | walls("lj93", acts_on="sites", positions_A=[-3.0, 20.0])
     system = build(small_scene({}, 36.0, molecules=molecules, fields=fields))
     state = system.state.copy()
@@ -433,11 +567,14 @@ def test_check_tells_of_fields_and_of_what_is_left_out():
     )
     assert "gravity: (0, 0, -9.81) m/s²" in text
     assert (
-        "walls 0: at z = 0 Å and z = 16 Å, on 60 sites: Lennard-Jones 9-3, sigma 2.5 Å, epsilon 1.5 kJ/mol, no" in text
+        "walls 0: at z = 0 Å and z = 16 Å, on 60 sites: Lennard-Jones 9-3, sigma 2.5 Å, epsilon 1.5 kJ/mol, no"
+        in text
     )
     assert "total momentum: conserved along x and y" in text
     assert "  restraints: not in [fields]" in text
-    held = describe(small_scene({"spce": 4}, 20.0, fields={"restraints": [{"stiffness_kJ_mol_A2": 2.0}]}))
+    held = describe(
+        small_scene({"spce": 4}, 20.0, fields={"restraints": [{"stiffness_kJ_mol_A2": 2.0}]})
+    )
     assert "restraints 0: 4 molecules restrained to their starting positions, 2 kJ/mol/Å²" in held
     assert "total momentum: conserved nowhere" in held
     assert "electric field, gravity, walls: not in [fields]" in held
@@ -446,7 +583,13 @@ def test_check_tells_of_fields_and_of_what_is_left_out():
     assert "fields.walls: pme includes the periodic images beyond the walls" in pme
 
 
-LJ = {"axis": "z", "kind": "lj93", "positions_A": [0.0, 20.0], "sigma_A": 3.0, "epsilon_kJ_mol": 1.0}
+LJ = {
+    "axis": "z",
+    "kind": "lj93",
+    "positions_A": [0.0, 20.0],
+    "sigma_A": 3.0,
+    "epsilon_kJ_mol": 1.0,
+}
 SOFT = {"axis": "z", "kind": "harmonic", "positions_A": [0.0, 20.0], "stiffness_kJ_mol_A2": 5.0}
 HELD = {"stiffness_kJ_mol_A2": 5.0}
 NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
@@ -455,48 +598,141 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
 @pytest.mark.parametrize(
     ("fields", "more", "message"),
     [
-        ({"electric_frequency_per_ps": 1.0}, {}, "electric_frequency_per_ps would do nothing without electric_V_per_nm"),
-        ({"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_phase_deg": 90.0}, {},
-         "electric_phase_deg would do nothing without electric_frequency_per_ps"),
-        ({"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_frequency_per_ps": 300.0}, {},
-         "a period of 3.33 fs is less than two steps of stages.0 (2 fs)"),
-        ({"electric_V_per_nm": [0.0, 0.0, 1.0]}, {"molecules": [{"model": "argon", "count": 3}]},
-         "fields.electric_V_per_nm would do nothing: no molecule that moves has a charge"),
-        ({"electric_V_per_nm": [0.0, 1.0]}, {}, "fields.electric_V_per_nm: has 2 entries, needs more"),
-        ({"electric_V_nm": [0.0, 0.0, 1.0]}, {}, "fields.electric_V_nm: unknown key; did you mean electric_V_per_nm"),
-        ({"gravity_m_s2": [0.0, 0.0, -9.81]}, {}, "nothing stops the fall along z, which is periodic"),
-        ({"gravity_m_s2": [0.0, 1.0, -9.81], "walls": [LJ]}, {}, "nothing stops the fall along y, which is periodic"),
-        ({"walls": [LJ | {"stiffness_kJ_mol_A2": 1.0}]}, {},
-         "fields.walls.0: stiffness_kJ_mol_A2 would do nothing with kind = 'lj93'"),
-        ({"walls": [{key: LJ[key] for key in ("axis", "kind", "positions_A")}]}, {},
-         "kind = 'lj93' needs sigma_A and epsilon_kJ_mol"),
-        ({"walls": [LJ | {"axis": "c"}]}, {}, "fields.walls.0.axis: is 'c', must be 'x', 'y' or 'z'"),
-        ({"walls": [LJ | {"positions_A": [5.0, 5.0]}]}, {}, "positions_A = [5, 5]: the first must be below the second"),
-        ({"walls": [LJ | {"positions_A": [-inf, inf]}]}, NO_BOX, "positions_A = [-inf, inf] defines no wall"),
+        (
+            {"electric_frequency_per_ps": 1.0},
+            {},
+            "electric_frequency_per_ps would do nothing without electric_V_per_nm",
+        ),
+        (
+            {"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_phase_deg": 90.0},
+            {},
+            "electric_phase_deg would do nothing without electric_frequency_per_ps",
+        ),
+        (
+            {"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_frequency_per_ps": 300.0},
+            {},
+            "a period of 3.33 fs is less than two steps of stages.0 (2 fs)",
+        ),
+        (
+            {"electric_V_per_nm": [0.0, 0.0, 1.0]},
+            {"molecules": [{"model": "argon", "count": 3}]},
+            "fields.electric_V_per_nm would do nothing: no molecule that moves has a charge",
+        ),
+        (
+            {"electric_V_per_nm": [0.0, 1.0]},
+            {},
+            "fields.electric_V_per_nm: has 2 entries, needs more",
+        ),
+        (
+            {"electric_V_nm": [0.0, 0.0, 1.0]},
+            {},
+            "fields.electric_V_nm: unknown key; did you mean electric_V_per_nm",
+        ),
+        (
+            {"gravity_m_s2": [0.0, 0.0, -9.81]},
+            {},
+            "nothing stops the fall along z, which is periodic",
+        ),
+        (
+            {"gravity_m_s2": [0.0, 1.0, -9.81], "walls": [LJ]},
+            {},
+            "nothing stops the fall along y, which is periodic",
+        ),
+        (
+            {"walls": [LJ | {"stiffness_kJ_mol_A2": 1.0}]},
+            {},
+            "fields.walls.0: stiffness_kJ_mol_A2 would do nothing with kind = 'lj93'",
+        ),
+        (
+            {"walls": [{key: LJ[key] for key in ("axis", "kind", "positions_A")}]},
+            {},
+            "kind = 'lj93' needs sigma_A and epsilon_kJ_mol",
+        ),
+        (
+            {"walls": [LJ | {"axis": "c"}]},
+            {},
+            "fields.walls.0.axis: is 'c', must be 'x', 'y' or 'z'",
+        ),
+        (
+            {"walls": [LJ | {"positions_A": [5.0, 5.0]}]},
+            {},
+            "positions_A = [5, 5]: the first must be below the second",
+        ),
+        (
+            {"walls": [LJ | {"positions_A": [-inf, inf]}]},
+            NO_BOX,
+            "positions_A = [-inf, inf] defines no wall",
+        ),
         ({"walls": [LJ | {"positions_A": [0.0, inf]}]}, {}, "a periodic box needs both walls"),
-        ({"walls": [LJ, SOFT | {"positions_A": [21.0, 30.0]}]}, NO_BOX, "the walls across z leave no space between them"),
-        ({"walls": [LJ | {"positions_A": [0.0, 22.0]}]}, {},
-         "along z the box is 30 Å, and must be 33 Å at least: 22 Å between the walls, 2 Å by which sites may protrude, "
-         "and the cutoff of 9 Å"),
-        ({"walls": [LJ]}, {"box": {"lengths_A": 40.0, "angles_deg": [90.0, 80.0, 90.0]}}, "need a box with right angles"),
-        ({"walls": [LJ | {"positions_A": [0.0, 5.0]}]}, {}, "the walls across z leave no space for molecules"),
-        ({"walls": [LJ]}, {"molecules": [{"name": "bare", "count": 2, "sites": [site("Q", 5.0, [0, 0, 0], 1.0)]}]},
-         "bare has no site with Lennard-Jones parameters, and would pass the walls; use acts_on = 'centres'"),
+        (
+            {"walls": [LJ, SOFT | {"positions_A": [21.0, 30.0]}]},
+            NO_BOX,
+            "the walls across z leave no space between them",
+        ),
+        (
+            {"walls": [LJ | {"positions_A": [0.0, 22.0]}]},
+            {},
+            "along z the box is 30 Å, and must be 33 Å at least: 22 Å between the walls, 2 Å by which sites may protrude, "
+            "and the cutoff of 9 Å",
+        ),
+        (
+            {"walls": [LJ]},
+            {"box": {"lengths_A": 40.0, "angles_deg": [90.0, 80.0, 90.0]}},
+            "need a box with right angles",
+        ),
+        (
+            {"walls": [LJ | {"positions_A": [0.0, 5.0]}]},
+            {},
+            "the walls across z leave no space for molecules",
+        ),
+        (
+            {"walls": [LJ]},
+            {
+                "molecules": [
+                    {"name": "bare", "count": 2, "sites": [site("Q", 5.0, [0, 0, 0], 1.0)]}
+                ]
+            },
+            "bare has no site with Lennard-Jones parameters, and would pass the walls; use acts_on = 'centres'",
+        ),
         ({"walls": [LJ]}, {"forces": {"tail_correction": True}}, "omit it between walls"),
         ({"restraints": [{}]}, {}, "fields.restraints.0.stiffness_kJ_mol_A2: is missing"),
-        ({"restraints": [{"stiffness_kJ_mol_A2": [0.0, 0.0, 0.0]}]}, {}, "stiffness_kJ_mol_A2: is 0: it would do nothing"),
-        ({"restraints": [HELD | {"molecules": "3-1"}]}, {}, "fields.restraints.0.molecules: is '3-1': 3-1 ends before"),
-        ({"restraints": [HELD | {"molecules": "2-9"}]}, {},
-         "fields.restraints.0.molecules: no spce has the number 2-9; they have 1 to 5"),
-        ({"restraints": [HELD | {"species": "ice"}]}, {}, "fields.restraints.0.species: there is no 'ice'; there are spce"),
-        ({"restraints": [HELD]}, {"molecules": [{"model": "spce", "count": 2}, {"model": "argon", "count": 2}]},
-         "fields.restraints.0.species is required: there are spce, argon"),
-        ({"restraints": [HELD | {"molecules": "1-2"}]}, {"molecules": [{"model": "spce", "count": 5, "frozen": [2]}]},
-         "fields.restraints.0.molecules: 1-2 includes frozen molecules"),
-        ({"restraints": [HELD]}, {"run": {"remove_momentum_interval_ps": 1.0}},
-         "run.remove_momentum_interval_ps: fields or frozen molecules change all components"),
+        (
+            {"restraints": [{"stiffness_kJ_mol_A2": [0.0, 0.0, 0.0]}]},
+            {},
+            "stiffness_kJ_mol_A2: is 0: it would do nothing",
+        ),
+        (
+            {"restraints": [HELD | {"molecules": "3-1"}]},
+            {},
+            "fields.restraints.0.molecules: is '3-1': 3-1 ends before",
+        ),
+        (
+            {"restraints": [HELD | {"molecules": "2-9"}]},
+            {},
+            "fields.restraints.0.molecules: no spce has the number 2-9; they have 1 to 5",
+        ),
+        (
+            {"restraints": [HELD | {"species": "ice"}]},
+            {},
+            "fields.restraints.0.species: there is no 'ice'; there are spce",
+        ),
+        (
+            {"restraints": [HELD]},
+            {"molecules": [{"model": "spce", "count": 2}, {"model": "argon", "count": 2}]},
+            "fields.restraints.0.species is required: there are spce, argon",
+        ),
+        (
+            {"restraints": [HELD | {"molecules": "1-2"}]},
+            {"molecules": [{"model": "spce", "count": 5, "frozen": [2]}]},
+            "fields.restraints.0.molecules: 1-2 includes frozen molecules",
+        ),
+        (
+            {"restraints": [HELD]},
+            {"run": {"remove_momentum_interval_ps": 1.0}},
+            "run.remove_momentum_interval_ps: fields or frozen molecules change all components",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_is_refused_in_words(fields, more, message):
     with pytest.raises(SceneError) as refused:
         build(small_scene({"spce": 5}, 30.0, fields=fields, **more))
@@ -525,7 +761,9 @@ def test_fields_that_are_tied_to_places_say_so():
         "walls_0",
         "restraints_0",
     ]
-    assert not build(scene({"electric_V_per_nm": [0.0, 0.0, 0.0]})).external  # a sweep may pass through nothing
+    assert not build(
+        scene({"electric_V_per_nm": [0.0, 0.0, 0.0]})
+    ).external  # a sweep may pass through nothing
 
 
 @pytest.mark.soak
@@ -536,7 +774,7 @@ def test_a_resolved_scene_with_fields_runs_again_to_the_same_bits(tmp_path):
     assert all(np.array_equal(a, b) for a, b in zip(first.state, again.state, strict=True))
 
 
-# --- a new field takes two files -------------------------------------------------------------------------------------
+# --- a new field takes two files ------------------------------------------------------------------
 
 TRAP = """
 from typing import NamedTuple
@@ -625,7 +863,10 @@ def test_adding_a_field_takes_two_files(tmp_path):
     files = {
         "scene/fields.py": edited(
             "scene/fields.py",
-            ('class Fields(Section):\n    """External fields that act on molecules."""\n', TRAP_KEYS),
+            (
+                'class Fields(Section):\n    """External fields that act on molecules."""\n',
+                TRAP_KEYS,
+            ),
             ("FIELDS = {\n", TRAP_ENTRY),
         ),
         "forces/fields/trap.py": TRAP,
@@ -635,7 +876,9 @@ def test_adding_a_field_takes_two_files(tmp_path):
     assert found["energy"] == pytest.approx(found["expected"])
     assert found["force"] == pytest.approx(found["sum"])
     assert "  trap: 0.5 kJ/mol/Å²\n" in found["check"]
-    assert "\n  trap, electric field, gravity, walls, restraints: not in [fields]" in found["without"]
+    assert (
+        "\n  trap, electric field, gravity, walls, restraints: not in [fields]" in found["without"]
+    )
     assert found["schema"] == "A harmonic trap of all molecules."
     (negative,), (unknown, missing), (frozen,) = found["errors"]
     assert negative == "fields.trap.stiffness_kJ_mol_A2: is -1.0, must be greater than 0"
@@ -655,7 +898,9 @@ def held_apart(entry, box):
     stages = [{"ensemble": "minimise"}]
     box = box or {"lengths_A": 20.0, "periodic": False}
     scene = small_scene({}, None, molecules=molecules, fields=fields, box=box, stages=stages)
-    start = np.array([[2, 3, 1], [9, 9, 9], [3, 4, 2.5], [5, 2, 3], [6, 4, 3], [5.5, 2.5, 5]], float)
+    start = np.array(
+        [[2, 3, 1], [9, 9, 9], [3, 4, 2.5], [5, 2, 3], [6, 4, 3], [5.5, 2.5, 5]], float
+    )
     return scene, start
 
 
@@ -680,18 +925,28 @@ def centres(state, groups, mass):
 @pytest.mark.parametrize("box", [None, TILTED], ids=["open", "tilted"])
 @pytest.mark.parametrize("entry", [PAIR, GROUPS], ids=["pair", "groups"])
 def test_a_restrained_distance(entry, box, monkeypatch):
-    """Energy by the nearest images, forces and virial by differences of the energy, no force on the whole."""
+    """Energy by the nearest images, forces and virial by differences of the energy, no force on the
+    whole."""
     scene, start = held_apart(entry, box)
-    monkeypatch.setattr(distances, "_faults_in_box", lambda *_: [])  # the lattice of the start is elsewhere
+    monkeypatch.setattr(
+        distances, "_faults_in_box", lambda *_: []
+    )  # the lattice of the start is elsewhere
     system = build(scene)
     term = system.terms["restraints_0"]
     engine, state = Engine(system.model, {"restraints_0": term}), system.state.copy()
     state.position[:] = start
     mass = system.model.mass[system.model.species]
-    groups = [np.atleast_1d(np.array(group) - 1) for group in ([1], [4])] if entry is PAIR else [[0, 2], [3, 4, 5]]
+    groups = (
+        [np.atleast_1d(np.array(group) - 1) for group in ([1], [4])]
+        if entry is PAIR
+        else [[0, 2], [3, 4, 5]]
+    )
     groups = [np.array(group) for group in groups]
     if box is not None:  # molecules that have crossed faces of the box
-        state.position[:] += np.array([[0, 0, 0], [1, 0, 0], [0, 1, -1], [1, -2, 0], [0, 1, 0], [1, 1, 1]]) @ state.cell
+        state.position[:] += (
+            np.array([[0, 0, 0], [1, 0, 0], [0, 1, -1], [1, -2, 0], [0, 1, 0], [1, 1, 1]])
+            @ state.cell
+        )
     load, tallies = engine.evaluate(state)
     arm = centres(state, groups, mass)
     stiffness = 100 * entry["stiffness_kJ_mol_A2"]
@@ -709,7 +964,9 @@ def test_a_restrained_distance(entry, box, monkeypatch):
                 moved = state.copy()
                 moved.position[m, k] += step
                 ends.append(energy_of(engine, moved))
-            assert load.force[m, k] == pytest.approx(-(ends[0] - ends[1]) / (2 * h), abs=1e-7 * scale)
+            assert load.force[m, k] == pytest.approx(
+                -(ends[0] - ends[1]) / (2 * h), abs=1e-7 * scale
+            )
     for i in range(3):
         for j in range(i + 1):  # strains that leave the cell lower triangular
             ends = []
@@ -720,16 +977,26 @@ def test_a_restrained_distance(entry, box, monkeypatch):
                 moved.cell[:] = state.cell @ strain if box else state.cell
                 ends.append(energy_of(engine, moved))
             slope = (ends[0] - ends[1]) / (2 * h)
-            assert slope == pytest.approx(-tally.virial[j, i], abs=1e-6 * max(1.0, np.abs(tally.virial).max()))
+            assert slope == pytest.approx(
+                -tally.virial[j, i], abs=1e-6 * max(1.0, np.abs(tally.virial).max())
+            )
 
 
 def test_a_restrained_distance_in_a_run():
-    """Columns of the log have it; the conserved energy and the momentum are conserved; a barostat is possible."""
+    """Columns of the log have it; the conserved energy and the momentum are conserved; a barostat
+    is possible."""
     entry = {"between": [1, 2], "distance_A": 8.5, "stiffness_kJ_mol_A2": 5.0}
     other = entry | {"between": [3, 6], "distance_A": 9.5}
-    stages = [{"duration_ps": 0.4}, {"ensemble": "npt", "temperature_K": 90, "pressure_bar": 1, "duration_ps": 0.02}]
+    stages = [
+        {"duration_ps": 0.4},
+        {"ensemble": "npt", "temperature_K": 90, "pressure_bar": 1, "duration_ps": 0.02},
+    ]
     scene = small_scene(
-        {"argon": 27}, 27.0, stages=stages, fields={"restraints": [other, entry]}, output={"log_interval_ps": 0.01}
+        {"argon": 27},
+        27.0,
+        stages=stages,
+        fields={"restraints": [other, entry]},
+        output={"log_interval_ps": 0.01},
     )
     results = Simulation(scene).run()
     assert results.units["distance_1"] == "Å"
@@ -751,10 +1018,16 @@ def test_a_restrained_distance_in_a_run():
         (PAIR | {"between": [[1, 2], [2, 3]]}, "between: a molecule is named twice"),
         (PAIR | {"distance_A": None}, "between needs distance_A"),
         (PAIR | {"between": None}, "distance_A would do nothing without between"),
-        (PAIR | {"stiffness_kJ_mol_A2": [1.0, 1.0, 2.0]}, "stiffness_kJ_mol_A2 has one number for a distance"),
+        (
+            PAIR | {"stiffness_kJ_mol_A2": [1.0, 1.0, 2.0]},
+            "stiffness_kJ_mol_A2 has one number for a distance",
+        ),
         (PAIR | {"position_A": [1.0, 1.0, 2.0]}, "position_A would do nothing with between"),
         (PAIR | {"distance_A": 9.5}, "may come near half the smallest height of the box, 10 Å"),
-        (PAIR | {"distance_A": 8.0, "stiffness_kJ_mol_A2": 0.01}, "use a larger box or a higher stiffness"),
+        (
+            PAIR | {"distance_A": 8.0, "stiffness_kJ_mol_A2": 0.01},
+            "use a larger box or a higher stiffness",
+        ),
         (PAIR | {"between": [[1, 6], 2]}, "Å from its first one, more than a quarter"),
     ],
 )
@@ -769,4 +1042,8 @@ def test_other_engines_refuse_a_restrained_distance(tmp_path, capsys):
     assert "distance of molecule 1 and molecule 4 restrained to 4 Å, 7 kJ/mol/Å²" in text
     for program in ("gromacs", "lammps"):
         with pytest.raises(SceneError, match="restraints"):
-            export(small_scene({"argon": 6}, 20.0, fields={"restraints": [PAIR]}), program, tmp_path / program)
+            export(
+                small_scene({"argon": 6}, 20.0, fields={"restraints": [PAIR]}),
+                program,
+                tmp_path / program,
+            )

@@ -66,16 +66,23 @@ def test_long_curves_have_no_gaps(points):
 
 
 def test_no_figure_is_written_past_this():
-    written = [path.name for path in (ROOT / "rigidmd").rglob("*.py") if ".savefig(" in path.read_text()]
+    written = [
+        path.name for path in (ROOT / "rigidmd").rglob("*.py") if ".savefig(" in path.read_text()
+    ]
     assert written == ["style.py"]
 
 
 def test_every_figure_shows_names_as_they_are_written():
-    made = [path.name for path in (ROOT / "rigidmd").rglob("*.py") if re.search(r"\bFigure\b", path.read_text())]
+    made = [
+        path.name
+        for path in (ROOT / "rigidmd").rglob("*.py")
+        if re.search(r"\bFigure\b", path.read_text())
+    ]
     assert made == ["picture.py"]  # see below for its texts
 
 
-#: Names that users give: Matplotlib reads formulas between dollar signs, and fails at most of these.
+#: Names that users give: Matplotlib reads formulas between dollar signs, and fails at most of
+#: these.
 NAMES = ["$`$", "$a$ $", r"\frac{$x$", "$$", "$(x) ${v}", r"\$a$", "a_b^c", "%(x)s {} <b>"]
 
 
@@ -96,7 +103,9 @@ def test_texts_of_a_figure_are_no_formulas(name):
     shown = [text for text in figure.findobj(Text) if text.get_text() == name]
     assert len(shown) == 10
     assert not any(text.get_parse_math() for text in shown)
-    assert any(label.get_parse_math() and "10^" in label.get_text() for label in axis.get_yticklabels())
+    assert any(
+        label.get_parse_math() and "10^" in label.get_text() for label in axis.get_yticklabels()
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -108,7 +117,16 @@ def test_figures_of_a_run_and_of_a_molecule_take_any_name(name, staged, tmp_path
     figures = [energy_figure(named, Samples([name] * len(stages), table=rows), summary)]
     record = record_of(named, samples, summary)
     figures.append(columns_figure(record, ["potential"], samples.described))
-    figures.append(drawn(Curve("curve", ("r (Å)", np.arange(3.0)), name, {name: np.arange(3.0), "other": np.ones(3)})))
+    figures.append(
+        drawn(
+            Curve(
+                "curve",
+                ("r (Å)", np.arange(3.0)),
+                name,
+                {name: np.arange(3.0), "other": np.ones(3)},
+            )
+        )
+    )
     for figure in figures:
         save_figure(figure, io.BytesIO(), format="png")
     molecule = load_model("spce")
@@ -121,28 +139,51 @@ STEPS = [0, 5, 3, 4, 0, 500]
 
 
 def samples_of(rng, start=-1000.0):
-    """Samples of a run of STAGES; a minimisation begins far above, and its first stage begins far from its mean."""
+    """Samples of a run of STAGES; a minimisation begins far above, and its first stage begins far
+    from its mean."""
     rows, step = [], 0
     blank = dict.fromkeys(Sample._fields, 0.0) | {"user_energies": ()}
     for k, (name, steps) in enumerate(zip(STAGES, STEPS, strict=True)):
         for n in range(steps or 2):
             step += bool(steps)
-            value = -10 + rng.normal() + (start * np.exp(-4 * n) if k == 1 else 1e4 if not steps else 0.0)
-            given = {"step": step, "time": 0.1 * step, "stage": k, "stage_name": name, "potential": value}
-            noise = {"kinetic": rng.normal(), "temperature_translation": 300 + rng.normal(), "drift": rng.normal()}
+            value = (
+                -10
+                + rng.normal()
+                + (start * np.exp(-4 * n) if k == 1 else 1e4 if not steps else 0.0)
+            )
+            given = {
+                "step": step,
+                "time": 0.1 * step,
+                "stage": k,
+                "stage_name": name,
+                "potential": value,
+            }
+            noise = {
+                "kinetic": rng.normal(),
+                "temperature_translation": 300 + rng.normal(),
+                "drift": rng.normal(),
+            }
             rows.append(Sample(**blank | given | noise | {"temperature_rotation": float("nan")}))
-    return Samples(STAGES, table=np.array([[float(getattr(row, name)) for name in NUMBERS] for row in rows]))
+    return Samples(
+        STAGES, table=np.array([[float(getattr(row, name)) for name in NUMBERS] for row in rows])
+    )
 
 
 @pytest.fixture(scope="module")
 def staged():
     stages = [
-        {"name": name, "duration_ps": 0.1 * steps} if steps else {"name": name, "ensemble": "minimise"}
+        {"name": name, "duration_ps": 0.1 * steps}
+        if steps
+        else {"name": name, "ensemble": "minimise"}
         for name, steps in zip(STAGES, STEPS, strict=True)
     ]
     system = build(small_scene({"argon": 4}, None, stages=stages))
     told = {"drift_kJ_mol_ns_per_molecule": 0.1, "drift_error_kJ_mol_ns_per_molecule": 0.1}
-    return system, samples_of(np.random.default_rng(1)), {"stages": [told | {"name": name} for name in STAGES]}
+    return (
+        system,
+        samples_of(np.random.default_rng(1)),
+        {"stages": [told | {"name": name} for name in STAGES]},
+    )
 
 
 def test_the_figure_of_a_run_has_one_time_axis_and_stages_that_can_be_read(staged):
@@ -155,7 +196,11 @@ def test_the_figure_of_a_run_has_one_time_axis_and_stages_that_can_be_read(stage
         assert [text.get_text() for text in named] == [STAGES[k] for k in (1, 2, 3, 5)]
         boxes = [text.get_window_extent(renderer) for text in named]
         assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
-        assert all(axis.get_window_extent(renderer).contains(*corner) for box in boxes for corner in box.corners())
+        assert all(
+            axis.get_window_extent(renderer).contains(*corner)
+            for box in boxes
+            for corner in box.corners()
+        )
 
 
 def test_panels_have_the_range_of_what_is_equilibrated(staged):
@@ -179,7 +224,11 @@ def test_panels_have_the_range_of_what_is_equilibrated(staged):
     [
         ([0.0, 1.0, 0.0, 1.0], [0, 0, 0, 0], (-0.05, 1.05)),  # all of it
         ([99.0, 1.0, 0.0, 1.0], [0, 0, 0, 0], (-0.1, 2.1)),  # the start is beyond
-        ([99.0, 98.0, 99.0, 1.0, 0.0, 1.0, 0.0], [0, 0, 0, 1, 1, 1, 1], (-4.95, 103.95)),  # a stage of its own
+        (
+            [99.0, 98.0, 99.0, 1.0, 0.0, 1.0, 0.0],
+            [0, 0, 0, 1, 1, 1, 1],
+            (-4.95, 103.95),
+        ),  # a stage of its own
         ([5.0, 5.0, 5.0], [0, 0, 0], None),
         ([np.nan, np.nan], [0, 0], None),
         ([np.nan, 1.0, 0.0], [0, 0, 0], (-0.05, 1.05)),
@@ -202,12 +251,19 @@ def test_as_many_integrators_as_there_are_are_told_apart():
     for axis in figure.axes:
         curves = [line for line in axis.lines if line.get_label() in names]
         assert [line.get_label() for line in curves] == names
-        styles = {(line.get_color(), line.get_linestyle(), str(line._dash_pattern)) for line in curves}
+        styles = {
+            (line.get_color(), line.get_linestyle(), str(line._dash_pattern)) for line in curves
+        }
         assert len(styles) == len(names)
     left, right = figure.axes
     for axis, error in ((left, "trajectory_error"), (right, "energy_rms")):
-        front = [f"{trial.timestep:.2g}" for trial in IntegratorAccuracy(trial_system, trials, 10, 1e-30).front(error)]
-        steps = [text.get_text() for text in axis.texts if text.get_text() != "error of the reference"]
+        front = [
+            f"{trial.timestep:.2g}"
+            for trial in IntegratorAccuracy(trial_system, trials, 10, 1e-30).front(error)
+        ]
+        steps = [
+            text.get_text() for text in axis.texts if text.get_text() != "error of the reference"
+        ]
         assert 0 < len(steps) <= len(front)  # of the best alone, and not one on another
         assert set(steps) <= set(front)
         assert axis.get_xlabel() == ""  # one label for both panels

@@ -75,7 +75,9 @@ def energies(engine, state):
             ending,
             *which,
             id=f"{ending}-{k}",
-            marks=[] if (k == 1 and ending != "force_shift") or ending == "switch" else pytest.mark.soak,
+            marks=[]
+            if (k == 1 and ending != "force_shift") or ending == "switch"
+            else pytest.mark.soak,
         )
         for ending in ENDINGS
         for k, which in enumerate(MIXTURES)
@@ -94,14 +96,20 @@ def test_energies_are_those_of_the_oracle(counts, edge, ending):
 def test_energies_without_box_and_cut_off():
     system, engine, state = built({"tip4p2005": 3, "argon": 2}, None)
     lj, coulomb = Oracle(system).energy(state.position, state.rotation)
-    assert energies(engine, state) == pytest.approx({"lennard_jones": lj, "coulomb": coulomb}, rel=1e-11)
+    assert energies(engine, state) == pytest.approx(
+        {"lennard_jones": lj, "coulomb": coulomb}, rel=1e-11
+    )
     assert not system.constants
 
 
 def test_a_box_with_unequal_edges_and_many_cells():
-    # 30 Å against a cut-off of 4: cells whose neighbourhood does not meet itself; far outside the box as well
+    # 30 Å against a cut-off of 4: cells whose neighbourhood does not meet itself; far outside the
+    # box as well
     scene = small_scene(
-        {"nitrogen": 60, "argon": 40}, None, box={"lengths_A": [30.0, 10.0, 17.0]}, forces={"cutoff_A": 4.0}
+        {"nitrogen": 60, "argon": 40},
+        None,
+        box={"lengths_A": [30.0, 10.0, 17.0]},
+        forces={"cutoff_A": 4.0},
     )
     system = build(scene)
     engine, state = system.engine(), system.state.copy()
@@ -113,14 +121,25 @@ def test_a_box_with_unequal_edges_and_many_cells():
     assert energies(engine, state)["lennard_jones"] == pytest.approx(expected, rel=1e-9)
 
 
-BEYOND_HALF = [80.0, np.degrees(np.arccos(0.50008 * 20 / 24)), np.degrees(np.arccos(0.50008 * 20 / 17))]  # as printed
-SLANTED = [[60.0, 60.0, 60.0], [70.0, 100.0, 50.0], [120.0, 110.0, 95.0], [35.0, 60.0, 80.0], BEYOND_HALF]
+BEYOND_HALF = [
+    80.0,
+    np.degrees(np.arccos(0.50008 * 20 / 24)),
+    np.degrees(np.arccos(0.50008 * 20 / 17)),
+]  # as printed
+SLANTED = [
+    [60.0, 60.0, 60.0],
+    [70.0, 100.0, 50.0],
+    [120.0, 110.0, 95.0],
+    [35.0, 60.0, 80.0],
+    BEYOND_HALF,
+]
 
 
 @pytest.mark.parametrize("skin", [0.3, 3.0])
 @pytest.mark.parametrize("angles", SLANTED)
 def test_slanted_boxes(angles, skin):
-    """Energies are the oracle's, forces the slope of its energy, and molecules may be whole cells away."""
+    """Energies are the oracle's, forces the slope of its energy, and molecules may be whole cells
+    away."""
     box = {"lengths_A": [20.0, 17.0, 24.0], "angles_deg": angles}
     forces = ended("force_switch") | {"cutoff_A": 5.2, "skin_A": skin}
     system = build(small_scene({"spce": 20, "nitrogen": 15}, None, box=box, forces=forces))
@@ -130,19 +149,26 @@ def test_slanted_boxes(angles, skin):
     state.position[:] += rng.normal(size=state.position.shape)
     state.position[:] += rng.integers(-3, 4, state.position.shape) @ cell_of(system.space)
     lj, coulomb = oracle.energy(state.position, state.rotation)
-    assert energies(engine, state) == pytest.approx({"lennard_jones": lj, "coulomb": coulomb}, rel=1e-10)
+    assert energies(engine, state) == pytest.approx(
+        {"lennard_jones": lj, "coulomb": coulomb}, rel=1e-10
+    )
     load, h = engine.evaluate(state)[0], 1e-4
     for m, k in ((0, 0), (7, 1), (30, 2)):
         up, down = state.position.copy(), state.position.copy()
         up[m, k] += h
         down[m, k] -= h
-        slope = (sum(oracle.energy(up, state.rotation)) - sum(oracle.energy(down, state.rotation))) / (2 * h)
-        assert load.force[m, k] == pytest.approx(-slope, rel=1e-5, abs=1e-7 * np.abs(load.force).max())
+        slope = (
+            sum(oracle.energy(up, state.rotation)) - sum(oracle.energy(down, state.rotation))
+        ) / (2 * h)
+        assert load.force[m, k] == pytest.approx(
+            -slope, rel=1e-5, abs=1e-7 * np.abs(load.force).max()
+        )
 
 
 @pytest.mark.parametrize("angles", [[90.0, 90.0, 90.0], [70.0, 100.0, 50.0]])
 def test_molecules_millions_of_cells_away(angles):
-    """The energy to the digits that positions there have; and where boxes can no longer be counted, a clear refusal."""
+    """The energy to the digits that positions there have; and where boxes can no longer be counted,
+    a clear refusal."""
     box = {"lengths_A": [20.0, 17.0, 24.0], "angles_deg": angles}
     system = build(small_scene({"spce": 20}, None, box=box, forces=ended("force_switch")))
     engine, state = system.engine(), system.state.copy()
@@ -153,14 +179,19 @@ def test_molecules_millions_of_cells_away(angles):
         moved.position[:] += cells * away
         assert sum(energies(engine, moved).values()) == pytest.approx(expected, rel=digits)
     moved.position[3, 1] = -1e12
-    with pytest.raises(SimulationError, match=r"molecule 4 is lost: it is 1e\+12 Å from the origin"):
+    with pytest.raises(
+        SimulationError, match=r"molecule 4 is lost: it is 1e\+12 Å from the origin"
+    ):
         engine.evaluate(moved)
 
 
 def test_a_cell_and_the_same_lattice_by_another_have_the_same_energy():
     """A cell that leans by more than half an edge is reduced."""
     counts, forces = {"spce": 20}, {"cutoff_A": 6.0, "truncation": "shift"}
-    leaning = {"lengths_A": [13.0, (13.0**2 + 13.0**2) ** 0.5, 13.0], "angles_deg": [90.0, 90.0, 45.0]}
+    leaning = {
+        "lengths_A": [13.0, (13.0**2 + 13.0**2) ** 0.5, 13.0],
+        "angles_deg": [90.0, 90.0, 45.0],
+    }
     cube = build(small_scene(counts, 13.0, forces=forces))
     other = build(small_scene(counts, None, box=leaning, forces=forces))
     assert cell_of(other.space) == pytest.approx(13.0 * np.eye(3))
@@ -233,9 +264,12 @@ SLANTED = {"lengths_A": [21.0, 22.0, 23.0], "angles_deg": [70.0, 100.0, 80.0]}
     ],
 )
 def test_virials_are_sums_over_pairs(box, precision, digits):
-    """For a list that has served for some steps, of sites far from the origin; by all pairs of images."""
+    """For a list that has served for some steps, of sites far from the origin; by all pairs of
+    images."""
     forces = {"cutoff_A": 6.0, "truncation": "force_shift"}
-    system, engine, state = built({"nitrogen": 300}, None, 3, 0.1, box=box, forces=forces, precision=precision)
+    system, engine, state = built(
+        {"nitrogen": 300}, None, 3, 0.1, box=box, forces=forces, precision=precision
+    )
     state.position[:] += [3e5, -2e5, 1e5]
     move(engine, state, SCHEMES["velocity_verlet"], 0.0002, 20)
     virial = engine.evaluate(state)[1]["lennard_jones"].virial
@@ -252,7 +286,10 @@ def test_virials_are_sums_over_pairs(box, precision, digits):
         centres = centre[i] - centre[owner != owner[i]]
         if periodic:
             edges = np.round(origin_vector @ np.linalg.inv(state.cell))
-            origin_vector, centres = origin_vector - edges @ state.cell, centres - edges @ state.cell
+            origin_vector, centres = (
+                origin_vector - edges @ state.cell,
+                centres - edges @ state.cell,
+            )
         for image in images:
             shift = image @ state.cell if periodic else 0.0
             d, between = origin_vector + shift, centres + shift
@@ -288,18 +325,25 @@ def test_a_list_with_little_room_grows_and_misses_nothing(precision):
             entries=np.empty((blocks, 3), np.uint16),
             masked=np.empty((blocks, 1, 2), np.int32),
             neighbors=np.empty((blocks, 2), np.int32),
-            origin_vector=np.empty((blocks, 6 if precision == "mixed" else 0), own.pairs.origin_vector.dtype),
+            origin_vector=np.empty(
+                (blocks, 6 if precision == "mixed" else 0), own.pairs.origin_vector.dtype
+            ),
         )
         pairs.counters[USABLE] = 0
         cramped.append(
-            own._replace(pairs=pairs, sums=own.sums._replace(forces_behind=own.sums.forces_behind[:, :8].copy()))
+            own._replace(
+                pairs=pairs,
+                sums=own.sums._replace(forces_behind=own.sums.forces_behind[:, :8].copy()),
+            )
         )
     engine._workspaces = tuple(cramped)
     assert energies(engine, state) == expected
 
 
 def test_sums_that_only_a_passing_moment_needs_are_in_common():
-    _, engine, state = built({"spce": 200}, 18.5, 4, forces={"cutoff_A": 8.0})  # so many that there are blocks
+    _, engine, state = built(
+        {"spce": 200}, 18.5, 4, forces={"cutoff_A": 8.0}
+    )  # so many that there are blocks
     engine.evaluate(state)
     one, two = engine.workspaces.values()
     assert one.sums.forces_behind.size != two.sums.forces_behind.size
@@ -329,7 +373,9 @@ def test_a_cutoff_within_which_are_too_many_sites_is_refused():
     engine.evaluate(state)
     (own,) = engine.workspaces.values()
     own.pairs.needed[0, NEIGHBORS_OF_ONE] = MAX_NEIGHBORS + 1
-    with pytest.raises(SimulationError, match="sites are within the cutoff of 8 Å: take a shorter one"):
+    with pytest.raises(
+        SimulationError, match="sites are within the cutoff of 8 Å: take a shorter one"
+    ):
         own.with_capacity(state.cell)
 
 
@@ -355,24 +401,39 @@ def test_blocks_of_lists_grow_in_number_with_the_edge_of_the_box():
     for sites, blocks in ((100, 1), (900, 16), (12_288, 16), (1_000_000, 20), (2_000_000, 25)):
         bounds = clusters_of(sites, np.float64).bounds
         assert len(bounds) == blocks + 1
-        assert bounds[0] == 0 and bounds[-1] * lane_count(np.float64) >= sites and (np.diff(bounds) > 0).all()
+        assert (
+            bounds[0] == 0
+            and bounds[-1] * lane_count(np.float64) >= sites
+            and (np.diff(bounds) > 0).all()
+        )
 
 
-CHANGED = {"squeezed": np.diag([0.99] * 3), "sheared": np.array([[1, 0, 0], [0.01, 1, 0], [-0.02, 0.01, 1]])}
+CHANGED = {
+    "squeezed": np.diag([0.99] * 3),
+    "sheared": np.array([[1, 0, 0], [0.01, 1, 0], [-0.02, 0.01, 1]]),
+}
 
 
 @pytest.mark.parametrize("change", CHANGED)
 @pytest.mark.parametrize("electrostatics", ["reaction_field", "ewald", "pme"])
 def test_everything_follows_a_cell_that_changes(electrostatics, change):
-    """Between two calls of `advance` the cell changes by a percent: all is as with an engine made for the new one."""
-    forces = {"cutoff_A": 6.0, "electrostatics": electrostatics, "tail_correction": True, "skin_A": 4.0}
+    """Between two calls of `advance` the cell changes by a percent: all is as with an engine made
+    for the new one."""
+    forces = {
+        "cutoff_A": 6.0,
+        "electrostatics": electrostatics,
+        "tail_correction": True,
+        "skin_A": 4.0,
+    }
     system, engine, state = built({"spce": 60}, 14.0, 7, spread=0.1, forces=forces)
     move(engine, state, SCHEMES["velocity_verlet"], 0.0005, 5)
     state.position[:] = state.position @ CHANGED[change]
     state.cell[:] = state.cell @ CHANGED[change]
     engine.forget()
     kept, fresh = observe(system, engine, state), observe(system, system.engine(), state)
-    assert kept.load.force == pytest.approx(fresh.load.force, abs=1e-11 * np.abs(fresh.load.force).max())
+    assert kept.load.force == pytest.approx(
+        fresh.load.force, abs=1e-11 * np.abs(fresh.load.force).max()
+    )
     assert kept.virial == pytest.approx(fresh.virial, abs=1e-11 * np.abs(fresh.virial).max())
     assert kept.components == pytest.approx(fresh.components, rel=1e-11)
     assert kept.pressure_bar == pytest.approx(fresh.pressure_bar, rel=1e-9)
@@ -396,11 +457,14 @@ def test_a_box_that_is_no_number_is_told(counts, at):
 @pytest.mark.parametrize("precision", ["double", pytest.param("mixed", marks=pytest.mark.soak)])
 @pytest.mark.parametrize("angles", [[90, 90, 90], [70, 100, 115]])
 def test_a_list_serves_while_the_box_changes_little(angles, precision):
-    """Pairs across the edges, which move with the images, are those of a new list; of a larger change too, anew."""
+    """Pairs across the edges, which move with the images, are those of a new list; of a larger
+    change too, anew."""
     box = {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": angles}
     counts = {"spce": 150, "nitrogen": 20}
     forces = {"cutoff_A": 7.0}  # of a switched energy: a pair at the cutoff has no force
-    system, engine, state = built(counts, 20.0, 3, spread=0.1, box=box, forces=forces, precision=precision)
+    system, engine, state = built(
+        counts, 20.0, 3, spread=0.1, box=box, forces=forces, precision=precision
+    )
     rng = np.random.default_rng(1)
     engine.evaluate(state)
     lists = [own.pairs for own in engine.workspaces.values()]
@@ -415,7 +479,9 @@ def test_a_list_serves_while_the_box_changes_little(angles, precision):
         scale = np.sqrt(np.mean(expected.force**2))
         assert np.abs(load.force - expected.force).max() < digits * scale * 10
         for name, tally in theirs.items():
-            assert tallies[name].virial == pytest.approx(tally.virial, abs=digits * np.abs(tally.virial).max())
+            assert tallies[name].virial == pytest.approx(
+                tally.virial, abs=digits * np.abs(tally.virial).max()
+            )
         assert ([own.counters[BUILDS] for own in lists] == [1, 1]) == (abs(size) < 0.01)
         assert max(own.slack[0] for own in lists) > 0 or abs(size) > 0.01
     for own in lists:
@@ -423,20 +489,25 @@ def test_a_list_serves_while_the_box_changes_little(angles, precision):
 
 
 def test_a_cell_that_becomes_too_small_for_the_cut_off_stops_in_words():
-    _, engine, state = built({"argon": 100}, 14.0, 3, spread=0.1, forces={"cutoff_A": 6.9, "skin_A": 6.0})
+    _, engine, state = built(
+        {"argon": 100}, 14.0, 3, spread=0.1, forces={"cutoff_A": 6.9, "skin_A": 6.0}
+    )
     engine.evaluate(state)
     state.cell[:] *= 0.99
     state.position[:] *= 0.99
     engine.evaluate(state)  # a thinner skin serves
     state.cell[:] *= 0.99
     state.position[:] *= 0.99
-    with pytest.raises(SimulationError, match=r"the box has become too small for the cutoff of 6.9 Å: half its"):
+    with pytest.raises(
+        SimulationError, match=r"the box has become too small for the cutoff of 6.9 Å: half its"
+    ):
         engine.evaluate(state)
 
 
 @pytest.mark.parametrize("field", ["position", "velocity", "rotation", "step"])
 def test_code_is_not_run_on_arrays_that_it_was_not_compiled_for(field):
-    """Five argon atoms without forces and with `position` in Fortran's order once went astray without a word."""
+    """Five argon atoms without forces and with `position` in Fortran's order once went astray
+    without a word."""
     system, _, state = built({"argon": 5} if field != "rotation" else {"spce": 5}, 40.0)
     array = getattr(state, field)
     strange = np.asfortranarray(array) if array.ndim > 1 else array.astype(np.int32)
@@ -455,8 +526,12 @@ def test_an_address_is_held_to_the_type_it_was_compiled_for():
         loading.bind((own._replace(sites=sites),), state, no_load(state))
 
 
-WAVY = {"name": "wavy", "energy": "A*exp(-B*r) - C/r**6 + 0.1*sin(r)*log(r)", "truncation": "force_switch",
-        "parameters": {"Ar": {"A": 4e5, "B": 3.7, "C": 5e3}, "Kr": {"A": 6e5, "B": 3.6, "C": 6e3}}}  # fmt: skip
+WAVY = {
+    "name": "wavy",
+    "energy": "A*exp(-B*r) - C/r**6 + 0.1*sin(r)*log(r)",
+    "truncation": "force_switch",
+    "parameters": {"Ar": {"A": 4e5, "B": 3.7, "C": 5e3}, "Kr": {"A": 6e5, "B": 3.6, "C": 6e3}},
+}
 ALIKE = {
     "one kind": ({"argon": 60}, 20.0, {"truncation": "smooth_switch"}),
     "no box": ({"spce": 20, "argon": 6}, None, {}),
@@ -467,7 +542,13 @@ ALIKE = {
 
 
 #: The others have types of kernels that no other test has.
-SHARED = [("no box", "double"), ("charges", "mixed"), ("charges", "double"), ("damped", "double"), ("a text", "double")]
+SHARED = [
+    ("no box", "double"),
+    ("charges", "mixed"),
+    ("charges", "double"),
+    ("damped", "double"),
+    ("a text", "double"),
+]
 
 
 @pytest.mark.parametrize(
@@ -506,7 +587,8 @@ def test_the_list_is_rebuilt_for_moves_and_for_turns():
 
 
 def test_a_list_lasts_until_sites_have_moved_by_half_its_skin():
-    """Two groups of four that come into each other's range from outside of the list, each by 0.7 of the skin."""
+    """Two groups of four that come into each other's range from outside of the list, each by 0.7 of
+    the skin."""
     cutoff, skin = 8.0, 1.6
     system, engine, state = built(
         {"argon": 8}, 40.0, forces={"cutoff_A": cutoff, "skin_A": skin, "truncation": "plain"}
@@ -535,11 +617,15 @@ def test_a_list_for_places_ahead_serves_longer_and_misses_nothing():
         move(other, same, SCHEMES["velocity_verlet"], dt, 1)
         if n % 10 == 9:
             load, expected = engine.evaluate(state)[0], system.engine().evaluate(state)[0]
-            assert load.force == pytest.approx(expected.force, abs=1e-10 * np.abs(expected.force).max())
+            assert load.force == pytest.approx(
+                expected.force, abs=1e-10 * np.abs(expected.force).max()
+            )
     for own in engine.workspaces.values():
         assert own.pairs.times[LEAD_TIME] < 0  # built on the way back
     assert all(own.pairs.times[LEAD_TIME] == 0.0 for own in other.workspaces.values())
-    builds = [sum(own.pairs.counters[BUILDS] for own in of.workspaces.values()) for of in (engine, other)]
+    builds = [
+        sum(own.pairs.counters[BUILDS] for own in of.workspaces.values()) for of in (engine, other)
+    ]
     assert builds[0] < 0.95 * builds[1]
 
 
@@ -563,10 +649,14 @@ def test_places_ahead_are_where_velocities_lead_and_molecules_stay_rigid():
 
     velocity = (at(h) - at(-h)) / (2 * h)
     charged = system.of_sites(lambda m: m.charges != 0)
-    assert velocity == pytest.approx(system.site_velocities(state)[charged], abs=1e-4 * np.abs(velocity).max())
+    assert velocity == pytest.approx(
+        system.site_velocities(state)[charged], abs=1e-4 * np.abs(velocity).max()
+    )
     before, after = at(0.0), at(0.2)
     assert before == pytest.approx(system.site_positions(state)[charged], abs=1e-12)
-    rate = np.abs(state.angular_momentum_body * system.model.inverse_inertia[system.model.species]).max()
+    rate = np.abs(
+        state.angular_momentum_body * system.model.inverse_inertia[system.model.species]
+    ).max()
     assert 0.2 * rate > 1.0
     one, two = np.nonzero(np.triu(sites.molecule[:, None] == sites.molecule, 1))
     spans = [np.linalg.norm(places[one] - places[two], axis=1) for places in (before, after)]
@@ -575,7 +665,8 @@ def test_places_ahead_are_where_velocities_lead_and_molecules_stay_rigid():
 
 @pytest.mark.parametrize("change", ["lately", "long ago", "fast", "unknown"])
 def test_a_list_is_built_for_the_present_where_places_ahead_are_too_far(change):
-    """Where they are not, bodies turn by more than 0.3 rad on the way, and sites of a molecule keep their distances."""
+    """Where they are not, bodies turn by more than 0.3 rad on the way, and sites of a molecule keep
+    their distances."""
     forces = {"cutoff_A": 6.0, "skin_A": 4.0}
     system, engine, state = built({"spce": 150}, 20.0, 3, spread=0.1, forces=forces)
     move(engine, state, SCHEMES["velocity_verlet"], 0.001, 1)
@@ -584,12 +675,19 @@ def test_a_list_is_built_for_the_present_where_places_ahead_are_too_far(change):
         own.pairs.counters[USABLE] = 0
         own.pairs.times[BUILT] = -1e9 if change == "long ago" else -0.06
     if change in ("fast", "unknown"):
-        state.velocity[17, 1] = state.angular_momentum_body[20, 2] = 1e5 if change == "fast" else np.nan
+        state.velocity[17, 1] = state.angular_momentum_body[20, 2] = (
+            1e5 if change == "fast" else np.nan
+        )
     load = engine.evaluate(state)[0]
     assert load.force == pytest.approx(expected.force, abs=1e-10 * np.abs(expected.force).max())
-    assert all((own.pairs.times[LEAD_TIME] != 0.0) == (change == "lately") for own in engine.workspaces.values())
+    assert all(
+        (own.pairs.times[LEAD_TIME] != 0.0) == (change == "lately")
+        for own in engine.workspaces.values()
+    )
     if change == "lately":
-        rate = np.abs(state.angular_momentum_body * system.model.inverse_inertia[system.model.species]).max()
+        rate = np.abs(
+            state.angular_momentum_body * system.model.inverse_inertia[system.model.species]
+        ).max()
         assert 0.3 < rate * own.pairs.times[LEAD_TIME] < 1.0
 
 
@@ -597,29 +695,43 @@ def test_a_list_is_built_for_the_present_where_places_ahead_are_too_far(change):
 def test_a_list_with_almost_no_skin_is_built_at_every_step(precision):
     """Its sites are where they are to rounding, which is more than the skin."""
     forces = {"cutoff_A": 6.0, "skin_A": 1e-15}
-    system, engine, state = built({"spce": 60, "nitrogen": 10}, 20.0, 3, forces=forces, precision=precision)
+    system, engine, state = built(
+        {"spce": 60, "nitrogen": 10}, 20.0, 3, forces=forces, precision=precision
+    )
     move(engine, state, SCHEMES["velocity_verlet"], 0.0005, 4)
-    expected, digits = system.engine().evaluate(state)[0], {"double": 1e-10, "mixed": 1e-5}[precision]
-    assert engine.evaluate(state)[0].force == pytest.approx(expected.force, abs=digits * np.abs(expected.force).max())
+    expected, digits = (
+        system.engine().evaluate(state)[0],
+        {"double": 1e-10, "mixed": 1e-5}[precision],
+    )
+    assert engine.evaluate(state)[0].force == pytest.approx(
+        expected.force, abs=digits * np.abs(expected.force).max()
+    )
     assert [own.pairs.counters[BUILDS] for own in engine.workspaces.values()] == [5, 5]
 
 
 def test_the_pressure_of_an_ideal_gas():
-    """Molecules beyond each other's reach: P V = 2/3 of the energy of translation, whatever rotates."""
-    system, engine, state = built({"nitrogen": 12}, 200.0, forces={"cutoff_A": 8.0, "truncation": "shift"})
+    """Molecules beyond each other's reach: P V = 2/3 of the energy of translation, whatever
+    rotates."""
+    system, engine, state = built(
+        {"nitrogen": 12}, 200.0, forces={"cutoff_A": 8.0, "truncation": "shift"}
+    )
     seen = observe(system, engine, state)
     assert seen.potential == 0.0 and seen.kinetic_rotation > 0.0
     mass = system.model.mass[system.model.species]
     expected = float(mass @ (state.velocity**2).sum(axis=1)) / (3 * state.volume) / BAR
     assert seen.pressure_bar == pytest.approx(expected, rel=1e-12)
-    assert expected * state.volume * BAR == pytest.approx(11 * BOLTZMANN * seen.temperature_translation, rel=1e-12)
+    assert expected * state.volume * BAR == pytest.approx(
+        11 * BOLTZMANN * seen.temperature_translation, rel=1e-12
+    )
 
 
 def test_the_self_energy_of_the_reaction_field():
     system = build(small_scene({"spce": 4}, 20.0, forces={"truncation": "switch"}))
     field = 0.5 / 9.0**3
     dipole2 = (system.species[0].dipole_debye / 4.803204712570263) ** 2
-    assert system.constants["reaction_field_self"] == pytest.approx(-4 * field * dipole2 * 138935.457644, rel=1e-9)
+    assert system.constants["reaction_field_self"] == pytest.approx(
+        -4 * field * dipole2 * 138935.457644, rel=1e-9
+    )
 
 
 @kernel(from_python=True)
@@ -632,16 +744,22 @@ def pair_forces_at(argon, charges, r2, found):
 def switched_laws(name, start):
     """Lennard-Jones of one and of two kinds, and charges, between the same sites."""
     laws = [
-        lennard_jones(np.zeros(1, np.int32), np.full(kinds, 3.4), np.full(kinds, 100.0), 9.0, name, start)
+        lennard_jones(
+            np.zeros(1, np.int32), np.full(kinds, 3.4), np.full(kinds, 100.0), 9.0, name, start
+        )
         for kinds in (1, 2)
     ]
-    laws = [law._replace(c12=np.full_like(law.c12, 2e9), c6=np.full_like(law.c6, 3e6)) for law in laws]
+    laws = [
+        law._replace(c12=np.full_like(law.c12, 2e9), c6=np.full_like(law.c6, 3e6)) for law in laws
+    ]
     return *laws, reaction_field(np.zeros(1), 9.0, 78.5, name, start)
 
 
 def forces_of_products(argon, charges, r):
     """force/r of energies that a switch multiplies, in NumPy."""
-    s, slope = np.array([SWITCH_FUNCTIONS[type(argon.truncation)](argon.truncation, x) for x in r]).T
+    s, slope = np.array(
+        [SWITCH_FUNCTIONS[type(argon.truncation)](argon.truncation, x) for x in r]
+    ).T
     of_argon = 2e9 * r**-12 - 3e6 * r**-6, 24e9 * r**-14 - 18e6 * r**-8
     of_charges = 1 / r + charges.field * r**2 + charges.terms[0], r**-3 - 2 * charges.field
     return np.stack([s * w - slope * u / r for u, w in (of_argon, of_charges)], axis=1)
@@ -657,14 +775,16 @@ def test_a_switched_force_is_that_of_the_product(name, start):
     for law in (one, two):
         found = np.empty((len(r), 2))
         pair_forces_at(law.for_slots(1, np.float64), charges.for_slots(1, np.float64), r**2, found)
-        limit = 1e-13 if name == "switch" else 2e-12  # terms of the smooth one are up to 1e4 times their sum
+        limit = (
+            1e-13 if name == "switch" else 2e-12
+        )  # terms of the smooth one are up to 1e4 times their sum
         assert (np.abs(found - expected) / np.abs(expected).max(axis=0)).max() < limit
 
 
 @pytest.mark.parametrize("start", [8.1, 7.2, 6.8])
 def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
-    """The polynomial in r² that mixed precision adds to the force: here in double precision, and how far its terms
-    cancel, which single precision would show."""
+    """The polynomial in r² that mixed precision adds to the force: here in double precision, and
+    how far its terms cancel, which single precision would show."""
     one, _, charges = switched_laws("switch", start)
     laws = one.for_slots(1, np.float32), charges.for_slots(1, np.float32)
     corrections = laws[0].correction, laws[1].switched
@@ -683,23 +803,36 @@ def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
     for k, correction in enumerate(corrections):
         largest = np.abs(found[:, k] - without[:, k]).max()
         assert 4 * np.abs(correction.coefficients).sum() < 200 * largest
-        assert np.abs(found[:, k] - expected[:, k]).max() < 3e-7 * np.abs(expected[~before, k]).max()
+        assert (
+            np.abs(found[:, k] - expected[:, k]).max() < 3e-7 * np.abs(expected[~before, k]).max()
+        )
         assert found[before, k] == pytest.approx(expected[before, k], rel=1e-14)
 
 
 @pytest.mark.parametrize("name", TRUNCATIONS)
 def test_what_a_law_does_for_its_ending_is_decided_by_the_ending(name):
-    """A wide switch has an addend in mixed precision too; a smooth one multiplies the energy there; what is no switch
-    has nothing to add."""
+    """A wide switch has an addend in mixed precision too; a smooth one multiplies the energy there;
+    what is no switch has nothing to add."""
     for start, dtype in ((0.0, np.float32), (8.0, np.float64)):
         one, two, charges = switched_laws(name, start)
-        one, two, charges = one.for_slots(1, dtype), two.for_slots(1, dtype), charges.for_slots(1, dtype)
-        kind = SwitchTerm if name == "switch" or (name == "smooth_switch" and dtype == np.float64) else tuple
+        one, two, charges = (
+            one.for_slots(1, dtype),
+            two.for_slots(1, dtype),
+            charges.for_slots(1, dtype),
+        )
+        kind = (
+            SwitchTerm
+            if name == "switch" or (name == "smooth_switch" and dtype == np.float64)
+            else tuple
+        )
         assert one.correction == ()
-        assert {type(x) for x in (one.addend12, one.addend6, two.addend12, two.addend6, charges.switched)} == {kind}
+        assert {
+            type(x)
+            for x in (one.addend12, one.addend6, two.addend12, two.addend6, charges.switched)
+        } == {kind}
 
 
-# --- a new pair potential takes two files ----------------------------------------------------------------------------
+# --- a new pair potential takes two files ---------------------------------------------------------
 
 SOFT = """
 from typing import NamedTuple
@@ -823,8 +956,14 @@ def test_adding_a_pair_potential_takes_two_files(tmp_path):
     files = {
         "scene/forces.py": edited(
             "scene/forces.py",
-            ('class Forces(Section):\n    """Forces between sites of different molecules."""\n', SOFT_KEYS),
-            ("POTENTIALS = {", 'POTENTIALS = {"soft_repulsion": ("soft repulsion", "not in [forces]"), '),
+            (
+                'class Forces(Section):\n    """Forces between sites of different molecules."""\n',
+                SOFT_KEYS,
+            ),
+            (
+                "POTENTIALS = {",
+                'POTENTIALS = {"soft_repulsion": ("soft repulsion", "not in [forces]"), ',
+            ),
         ),
         "forces/potentials/soft_repulsion.py": SOFT,
     }

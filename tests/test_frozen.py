@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 from reference import Oracle
-from support import SCHEMES, build, built, describe, mobile, move, nearest_rotation, observe, shaken, small_scene
+from support import (
+    SCHEMES,
+    build,
+    built,
+    describe,
+    mobile,
+    move,
+    nearest_rotation,
+    observe,
+    shaken,
+    small_scene,
+)
 
 from rigidmd.errors import SceneError
 from rigidmd.run import Simulation
@@ -32,7 +43,13 @@ def fourmol(folder):
     masses = {int(kind): mass for kind, mass in table("Masses", 2)}
     atoms, velocity = table("Atoms # full", 7), table("Velocities", 4)[:, 1:] * 1000
     kind = atoms[:, 2].astype(int)
-    return atoms[:, 1].astype(int), kind, np.array([masses[k] for k in kind]), atoms[:, 4:7], velocity
+    return (
+        atoms[:, 1].astype(int),
+        kind,
+        np.array([masses[k] for k in kind]),
+        atoms[:, 4:7],
+        velocity,
+    )
 
 
 def columns(path, key):
@@ -43,7 +60,8 @@ def columns(path, key):
 
 @pytest.mark.parametrize("case", ["small", "single"])
 def test_rigid_bodies_among_frozen_atoms_follow_lammps(reference, case):
-    """8 steps of 0.25 fs. The cut-off of 8 Å exceeds half the box of 15 Å, so the box stands there eight times."""
+    """8 steps of 0.25 fs. The cut-off of 8 Å exceeds half the box of 15 Å, so the box stands there
+    eight times."""
     folder = reference / "lammps_rigid"
     owner, kind, mass, position, velocity = fourmol(folder)
     bodies = [owner == m for m in (3, 4, 5)] if case == "small" else [owner <= 2]
@@ -51,20 +69,31 @@ def test_rigid_bodies_among_frozen_atoms_follow_lammps(reference, case):
     molecules = []
     for b, members in enumerate(bodies):
         sites = [
-            {"name": f"T{kind[i]}", "mass_u": mass[i], "position_A": position[i].tolist(),
-             "sigma_A": WELLS[kind[i]][1], "epsilon_kJ_mol": WELLS[kind[i]][0] * CALORIE}
+            {
+                "name": f"T{kind[i]}",
+                "mass_u": mass[i],
+                "position_A": position[i].tolist(),
+                "sigma_A": WELLS[kind[i]][1],
+                "epsilon_kJ_mol": WELLS[kind[i]][0] * CALORIE,
+            }
             for i in np.flatnonzero(members)
-        ]  # fmt: skip
+        ]
         alone = len(sites) == 1
         molecules.append({"name": f"b{b}", "sites": sites, "count": 8, "frozen": alone})
     pairs = [
-        {"sites": [f"T{a}", f"T{b}"], "epsilon_kJ_mol": e * CALORIE, "sigma_A": s} for (a, b), (e, s) in SPECIAL.items()
+        {"sites": [f"T{a}", f"T{b}"], "epsilon_kJ_mol": e * CALORIE, "sigma_A": s}
+        for (a, b), (e, s) in SPECIAL.items()
     ]
     scene = Scene.from_dict(
         {
             "box": {"lengths_A": 30.0},
             "molecules": molecules,
-            "forces": {"cutoff_A": 8.0, "truncation": "plain", "mixing": "geometric", "pairs": pairs},
+            "forces": {
+                "cutoff_A": 8.0,
+                "truncation": "plain",
+                "mixing": "geometric",
+                "pairs": pairs,
+            },
             "start": {"temperature_K": 0.0},
             "stages": [{"duration_ps": 0.002, "timestep_fs": 0.25, "rotor": "exact"}],
         }
@@ -81,12 +110,16 @@ def test_rigid_bodies_among_frozen_atoms_follow_lammps(reference, case):
         state.rotation[own] = q
         if not scene.molecules[b].frozen:
             state.velocity[own] = m @ v / m.sum()
-            state.angular_momentum_body[own] = q.T @ np.cross(x - centre, m[:, None] * v).sum(axis=0)
+            state.angular_momentum_body[own] = q.T @ np.cross(x - centre, m[:, None] * v).sum(
+                axis=0
+            )
     engine = system.engine()
     move(engine, state, scene.stages[0].scheme, 0.00025, 8)
     file = folder / f"fix-timestep-rigid_nve_{case}.yaml"
     found, speeds = system.site_positions(state), system.site_velocities(state)
-    first = np.concatenate([np.flatnonzero(system.sites.molecule == 8 * b) for b in range(len(bodies))])
+    first = np.concatenate(
+        [np.flatnonzero(system.sites.molecule == 8 * b) for b in range(len(bodies))]
+    )
     order = np.concatenate([np.flatnonzero(members) for members in bodies])
     assert np.abs(found[first] - columns(file, "run_pos")[order]).max() < 1e-8
     moving = np.concatenate([np.full(members.sum(), members.sum() > 1) for members in bodies])
@@ -126,7 +159,9 @@ def test_what_is_frozen_acts_on_others_and_not_on_itself(slit):
     whole = sum(oracle.energy(state.position, state.rotation))
     among = frozen_energy(system, state, oracle.owner >= 20)
     assert among != 0
-    assert seen.potential - sum(system.constants.values()) == pytest.approx(whole - among, rel=1e-10)
+    assert seen.potential - sum(system.constants.values()) == pytest.approx(
+        whole - among, rel=1e-10
+    )
 
 
 def frozen_energy(system, state, frozen):
@@ -139,13 +174,22 @@ def frozen_energy(system, state, frozen):
 
 
 def test_a_run_among_frozen_molecules_keeps_its_energy(tmp_path):
-    molecules = [{"model": "spce", "count": 20}, {"model": "argon", "name": "wall", "count": 8, "frozen": True}]
+    molecules = [
+        {"model": "spce", "count": 20},
+        {"model": "argon", "name": "wall", "count": 8, "frozen": True},
+    ]
     stages = [
         {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0},
         {"duration_ps": 1.0, "timestep_fs": 0.5},
     ]
-    scene = small_scene({}, 16.0, molecules=molecules, forces={"cutoff_A": 7.0, "switch_start_A": 5.0}, stages=stages,
-                        output={"trajectory": False})  # fmt: skip
+    scene = small_scene(
+        {},
+        16.0,
+        molecules=molecules,
+        forces={"cutoff_A": 7.0, "switch_start_A": 5.0},
+        stages=stages,
+        output={"trajectory": False},
+    )
     simulation = Simulation(scene)
     results = simulation.run()
     nve = results["stage"] == 1
@@ -162,14 +206,22 @@ def test_a_scene_in_which_nothing_would_move_is_refused():
         build(small_scene({}, 20.0, molecules=[{"model": "argon", "count": 3, "frozen": True}]))
     with pytest.raises(SceneError, match="omit it with frozen molecules"):
         small_scene(
-            {}, 20.0, forces={"tail_correction": True},
-            molecules=[{"model": "argon", "count": 3}, {"model": "nitrogen", "count": 3, "frozen": True}],
-        )  # fmt: skip
+            {},
+            20.0,
+            forces={"tail_correction": True},
+            molecules=[
+                {"model": "argon", "count": 3},
+                {"model": "nitrogen", "count": 3, "frozen": True},
+            ],
+        )
 
 
 def test_some_molecules_of_a_species_freeze_as_a_species_of_their_own_would():
     """The same molecules as one species of which some are frozen, and as two: the same bits."""
-    two = [{"model": "spce", "count": 20}, {"model": "spce", "name": "ice", "count": 6, "frozen": True}]
+    two = [
+        {"model": "spce", "count": 20},
+        {"model": "spce", "name": "ice", "count": 6, "frozen": True},
+    ]
     one = [{"model": "spce", "count": 26, "frozen": "21-24, 25, 26"}]
     found = []
     for molecules in (two, one):
@@ -190,7 +242,9 @@ def test_some_molecules_of_a_species_freeze_as_a_species_of_their_own_would():
 
 
 def test_describe_tells_which_are_frozen():
-    text = describe(small_scene({}, 20.0, molecules=[{"model": "spce", "count": 10, "frozen": [2, 3, 7]}]))
+    text = describe(
+        small_scene({}, 20.0, molecules=[{"model": "spce", "count": 10, "frozen": [2, 3, 7]}])
+    )
     assert "  7 spce: asymmetric" in text
     assert "  3 spce: asymmetric" in text
     assert text.count("frozen") == 1
@@ -208,7 +262,12 @@ def gro(atoms, edge=30.0):
         f"{n:5d}{residue:<5}{name:>5}{k:5d}" + "".join(f"{c / 10:8.3f}" for c in x)
         for k, (n, residue, name, x) in enumerate(atoms, 1)
     ]
-    return "\n".join(["t", str(len(atoms)), *lines, f"{edge / 10:.3f} {edge / 10:.3f} {edge / 10:.3f}"]) + "\n"
+    return (
+        "\n".join(
+            ["t", str(len(atoms)), *lines, f"{edge / 10:.3f} {edge / 10:.3f} {edge / 10:.3f}"]
+        )
+        + "\n"
+    )
 
 
 SPOTS = 5.0 * np.array(list(np.ndindex(4, 4, 4))) + 2.0
@@ -219,14 +278,18 @@ MIXED = [(7 + k, name, name.capitalize(), SPOTS[k]) for k, name in enumerate(["A
 def noble(folder, name, text, frozen, **more):
     (folder / name).write_text(text)
     molecules = [{"model": "argon", "frozen": frozen}, {"model": "krypton"}]
-    return small_scene({}, None, folder, molecules=molecules, box={}, structure={"file": name} | more)
+    return small_scene(
+        {}, None, folder, molecules=molecules, box={}, structure={"file": name} | more
+    )
 
 
 def test_molecules_are_picked_by_their_residue_numbers(tmp_path):
     assert frozen_of(noble(tmp_path, "a.gro", gro(MIXED), [7, 11])) == [0, 4]
     assert frozen_of(noble(tmp_path, "a.gro", gro(MIXED), "8-12")) == [2, 4]  # of argon only
     assert frozen_of(noble(tmp_path, "a.gro", gro(MIXED), "7-9, 13")) == [0, 2, 6]
-    with pytest.raises(SceneError, match=r"molecules.0.frozen: no argon has the number 8; they have 7 to 13"):
+    with pytest.raises(
+        SceneError, match=r"molecules.0.frozen: no argon has the number 8; they have 7 to 13"
+    ):
         build(noble(tmp_path, "a.gro", gro(MIXED), [8]))
     twice = frozen_of(noble(tmp_path, "a.gro", gro(MIXED), [9], repeat=(1, 2, 1)))
     assert twice == [2, 10]  # in each copy of the cell
@@ -234,7 +297,16 @@ def test_molecules_are_picked_by_their_residue_numbers(tmp_path):
         f"ATOM  {k + 1:5d} {atom:<4} {name:<4}A{number:4d}    {x[0]:8.3f}{x[1]:8.3f}{x[2]:8.3f}  1.00  0.00          {atom:>2}"
         for k, (number, name, atom, x) in enumerate(MIXED)
     ]
-    text = "\n".join(["CRYST1   30.000   30.000   30.000  90.00  90.00  90.00 P 1           1", *lines, "END"]) + "\n"
+    text = (
+        "\n".join(
+            [
+                "CRYST1   30.000   30.000   30.000  90.00  90.00  90.00 P 1           1",
+                *lines,
+                "END",
+            ]
+        )
+        + "\n"
+    )
     assert frozen_of(noble(tmp_path, "a.pdb", text, [7, 11])) == [0, 4]
 
 
@@ -245,7 +317,10 @@ def test_without_residues_molecules_are_counted_within_their_species(tmp_path):
     assert frozen_of(noble(tmp_path, "a.xyz", text, "2-4")) == [2, 4, 6]
     one = [(1, "", name, x) for _, _, name, x in MIXED]  # one residue of no name around all of them
     assert frozen_of(noble(tmp_path, "b.gro", gro(one), [4])) == [6]
-    lattice = [{"model": "argon", "count": 4, "frozen": [1, 4]}, {"model": "krypton", "count": 3, "frozen": [2]}]
+    lattice = [
+        {"model": "argon", "count": 4, "frozen": [1, 4]},
+        {"model": "krypton", "count": 3, "frozen": [2]},
+    ]
     assert frozen_of(small_scene({}, 20.0, molecules=lattice)) == [0, 3, 5]
 
 
@@ -274,7 +349,11 @@ def test_a_restart_freezes_the_same_molecules(tmp_path):
     assert [residue.resname for residue in results.universe().residues] == ["AR", "KR"] * 4
     again = Scene.read(
         tmp_path / "out" / "scene.toml",
-        {"structure.file": str(tmp_path / "out" / "final.npz"), "structure.velocities": True, "start": None},
+        {
+            "structure.file": str(tmp_path / "out" / "final.npz"),
+            "structure.velocities": True,
+            "start": None,
+        },
     )
     system = build(again)
     assert frozen_of(again) == [0, 4]
@@ -290,7 +369,9 @@ def pair_energy(system, sigma, epsilon, r):
 @pytest.mark.parametrize("names", [("OW", "Ar"), ("spce.OW", "argon.Ar"), ("Ar", "O")])
 def test_particular_pairs_have_their_own_parameters(names):
     pairs = [{"sites": names, "sigma_A": 3.0, "epsilon_kJ_mol": 2.5}]
-    system, engine, state = built({"spce": 1, "argon": 2}, None, 0, forces={"electrostatics": "none", "pairs": pairs})
+    system, engine, state = built(
+        {"spce": 1, "argon": 2}, None, 0, forces={"electrostatics": "none", "pairs": pairs}
+    )
     state.position[:] = [[0, 0, 0], [4.0, 0, 0], [0, 500.0, 0]]
     oxygen = system.site_positions(state)[list(system.sites.name).index("OW")]
     seen = observe(system, engine, state)
@@ -300,12 +381,16 @@ def test_particular_pairs_have_their_own_parameters(names):
     near = pair_energy(system, 3.0, 2.5, np.linalg.norm(oxygen - state.position[2]))
     own = system.species[1]
     argon = pair_energy(system, own.sigma[0], own.epsilon[0] / 100, 3.5)
-    assert observe(system, engine, state).potential == pytest.approx(seen.potential + near + argon, rel=1e-7)
+    assert observe(system, engine, state).potential == pytest.approx(
+        seen.potential + near + argon, rel=1e-7
+    )
 
 
 def test_a_pair_can_be_given_to_sites_that_have_no_well_of_their_own():
     pairs = [{"sites": ["HW1", "Ar"], "sigma_A": 2.0, "epsilon_kJ_mol": 1.0}]
-    system, engine, state = built({"spce": 1, "argon": 1}, None, 0, forces={"electrostatics": "none", "pairs": pairs})
+    system, engine, state = built(
+        {"spce": 1, "argon": 1}, None, 0, forces={"electrostatics": "none", "pairs": pairs}
+    )
     plain, other, _ = built({"spce": 1, "argon": 1}, None, 0, forces={"electrostatics": "none"})
     state.position[:] = [[0, 0, 0], [3.5, 0, 0]]
     hydrogen = system.site_positions(state)[list(system.sites.name).index("HW1")]
@@ -316,5 +401,7 @@ def test_a_pair_can_be_given_to_sites_that_have_no_well_of_their_own():
 
 def test_a_pair_of_unknown_sites_is_refused():
     pairs = [{"sites": ["OW", "Xx"], "sigma_A": 2.0, "epsilon_kJ_mol": 1.0}]
-    with pytest.raises(SceneError, match=r"forces.pairs.0.sites: no site is 'Xx'; there are spce.OW"):
+    with pytest.raises(
+        SceneError, match=r"forces.pairs.0.sites: no site is 'Xx'; there are spce.OW"
+    ):
         build(small_scene({"spce": 2}, 20.0, forces={"pairs": pairs}))

@@ -1,7 +1,9 @@
-"""Input from strangers: whatever a file or an option holds, it is taken or refused with one of our errors.
+"""Input from strangers: whatever a file or an option holds, it is taken or refused with one of our
+errors.
 
-Valid input is changed at random: keys dropped, doubled and renamed, extreme numbers, wrong types, strange text, bytes
-cut off and flipped; besides input that is arbitrary. Nothing here compiles kernels: `check` describes a run.
+Valid input is changed at random: keys dropped, doubled and renamed, extreme numbers, wrong types,
+strange text, bytes cut off and flipped; besides input that is arbitrary. Nothing here compiles
+kernels: `check` describes a run.
 """
 
 import contextlib
@@ -186,36 +188,153 @@ ONE_WATER = "3\nwater\nO 0.0 0.0 0.0\nH 0.8164904 0.5773590 0.0\nH -0.8164904 0.
 
 
 NUMBERS = [
-    0, 1, -1, 2, 3, 7, 2**31, 2**53, 10**12, 2**63 - 1, 2**63, 10**30, 10**400,
-    0.0, -0.0, 0.5, 1.0, -1.0, 3.0, 90.0, 1e3, 1e-3, 1e6, 1e-6, 1e10, 1e-10, 1e30, 1e-30, 1e31, 1e-31, 1e100, 1e-100,
-    1e200, -1e200, 1e300, 1e-300, 5e-324, float("inf"), float("-inf"), float("nan"),
-]  # fmt: skip
-FACTORS = [0.0, -1.0, 0.5, 0.8, 0.9, 0.99, 1.01, 1.1, 1.3, 2.0, 5.0, 0.1, 30.0, 1e-3, 1e3, 1e-6, 1e6, 1e-12, 1e12]
+    0,
+    1,
+    -1,
+    2,
+    3,
+    7,
+    2**31,
+    2**53,
+    10**12,
+    2**63 - 1,
+    2**63,
+    10**30,
+    10**400,
+    0.0,
+    -0.0,
+    0.5,
+    1.0,
+    -1.0,
+    3.0,
+    90.0,
+    1e3,
+    1e-3,
+    1e6,
+    1e-6,
+    1e10,
+    1e-10,
+    1e30,
+    1e-30,
+    1e31,
+    1e-31,
+    1e100,
+    1e-100,
+    1e200,
+    -1e200,
+    1e300,
+    1e-300,
+    5e-324,
+    float("inf"),
+    float("-inf"),
+    float("nan"),
+]
+FACTORS = [
+    0.0,
+    -1.0,
+    0.5,
+    0.8,
+    0.9,
+    0.99,
+    1.01,
+    1.1,
+    1.3,
+    2.0,
+    5.0,
+    0.1,
+    30.0,
+    1e-3,
+    1e3,
+    1e-6,
+    1e6,
+    1e-12,
+    1e12,
+]
 TEXTS = [
-    "", " ", "x", "nan", "1", "spce", "argon", "\x1b[31mred\x07", "a\x00b", "\u202eleft", "ä", "²", "٣", "1-10", "1-99999999999999999999",
-    "../x", "/", ".", "~", "/dev/zero", "/dev/tty", "x.gro", "x.xyz", "x.toml", "a" * 300, "a" * 300 + ".toml", "[a(b", "int", "float",
-    "1.2.3", "O", "H", "nve", "npt", "pme", "ewald", "none", "true", "z", "%s", "{}", "\n", "\t", "Å" * 70,
-]  # fmt: skip
+    "",
+    " ",
+    "x",
+    "nan",
+    "1",
+    "spce",
+    "argon",
+    "\x1b[31mred\x07",
+    "a\x00b",
+    "\u202eleft",
+    "ä",
+    "²",
+    "٣",
+    "1-10",
+    "1-99999999999999999999",
+    "../x",
+    "/",
+    ".",
+    "~",
+    "/dev/zero",
+    "/dev/tty",
+    "x.gro",
+    "x.xyz",
+    "x.toml",
+    "a" * 300,
+    "a" * 300 + ".toml",
+    "[a(b",
+    "int",
+    "float",
+    "1.2.3",
+    "O",
+    "H",
+    "nve",
+    "npt",
+    "pme",
+    "ewald",
+    "none",
+    "true",
+    "z",
+    "%s",
+    "{}",
+    "\n",
+    "\t",
+    "Å" * 70,
+]
 STRANGE = st.one_of(
     st.sampled_from(NUMBERS),
     st.sampled_from(TEXTS),
     st.booleans(),
     st.floats(),
-    st.integers(-(2**70), 2**70).filter(lambda n: not 10**4 < n < 2**31),  # such counts are many molecules
+    st.integers(-(2**70), 2**70).filter(
+        lambda n: not 10**4 < n < 2**31
+    ),  # such counts are many molecules
     st.text(max_size=20),
     st.sampled_from(
-        [[], {}, [[]], [{}], {"a": 1}, [1.0, 2.0, 3.0], [0.0, 0.0, 0.0], ["A", "B"], [[1.0, 2.0, 3.0]] * 2]
+        [
+            [],
+            {},
+            [[]],
+            [{}],
+            {"a": 1},
+            [1.0, 2.0, 3.0],
+            [0.0, 0.0, 0.0],
+            ["A", "B"],
+            [[1.0, 2.0, 3.0]] * 2,
+        ]
     ),
     st.sampled_from([[], [[]], [[], []], [[[]]], [[[], []]], [[], [[]]]]),
 ).map(deepcopy)  # or a later change would change what is drawn from
 BYTE_CHANGES = st.lists(
     st.tuples(
-        st.sampled_from(["digit", "digit", "digit", "cut", "flip", "drop line", "double line", "word", "insert"]),
+        st.sampled_from(
+            ["digit", "digit", "digit", "cut", "flip", "drop line", "double line", "word", "insert"]
+        ),
         st.floats(0, 1, exclude_max=True),
         st.one_of(
             st.binary(min_size=1, max_size=4),
             st.sampled_from([str(number).encode() for number in NUMBERS]),
-            st.sampled_from([text.encode() for text in (*TEXTS, "?", "-", "\ufeff", '"', "'''", "[[", "]", "=", "#")]),
+            st.sampled_from(
+                [
+                    text.encode()
+                    for text in (*TEXTS, "?", "-", "\ufeff", '"', "'''", "[[", "]", "=", "#")
+                ]
+            ),
         ),
     ),
     min_size=1,
@@ -242,11 +361,17 @@ def changed(draw, tables):
         holder = data
         for key in parents:
             holder = holder[key]
-        what = draw(st.sampled_from(["drop", "replace", "scale", "scale", "scale", "double", "rename", "add"]))
+        what = draw(
+            st.sampled_from(
+                ["drop", "replace", "scale", "scale", "scale", "double", "rename", "add"]
+            )
+        )
         if what == "drop":
             del holder[last]
         elif what == "scale" and type(holder[last]) in (int, float):
-            holder[last] *= draw(st.sampled_from(FACTORS if isinstance(holder[last], float) else [0, 1, 2, 3, 10]))
+            holder[last] *= draw(
+                st.sampled_from(FACTORS if isinstance(holder[last], float) else [0, 1, 2, 3, 10])
+            )
         elif what in ("replace", "scale"):
             holder[last] = draw(STRANGE)
         elif what == "double" and isinstance(holder, list):
@@ -266,14 +391,20 @@ def with_bytes_changed(content: bytes, changes) -> bytes:
         at = int(where * len(content))
         lines = content.split(b"\n")
         line = int(where * len(lines))
-        if what == "digit" and (digits := [k for k, byte in enumerate(content) if 48 <= byte <= 57]):
+        if what == "digit" and (
+            digits := [k for k, byte in enumerate(content) if 48 <= byte <= 57]
+        ):
             at = digits[int(where * len(digits))]
-            content = content[:at] + bytes([48 + piece[0] % 10 if piece else 48]) + content[at + 1 :]
+            content = (
+                content[:at] + bytes([48 + piece[0] % 10 if piece else 48]) + content[at + 1 :]
+            )
         elif what == "cut":
             content = content[:at]
         elif what == "flip" and content:
             content = (
-                content[:at] + bytes([content[at] ^ (1 << piece[0] % 8)]) + content[at + 1 :] if piece else content
+                content[:at] + bytes([content[at] ^ (1 << piece[0] % 8)]) + content[at + 1 :]
+                if piece
+                else content
             )
         elif what == "drop line":
             content = b"\n".join(lines[:line] + lines[line + 1 :])
@@ -299,14 +430,22 @@ class Trial:
     @property
     def peak(self) -> float:
         """Largest memory of this process so far, bytes."""
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
+            1 if sys.platform == "darwin" else 1024
+        )
 
     def __call__(self, *arguments: str) -> int:
         """The exit code of a command, which must be 0 or 2 with a message that is safe to print."""
         out, err = io.StringIO(), io.StringIO()
         begin = time.process_time()
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
-            warnings.simplefilter("error", RuntimeWarning)  # of NumPy: numbers that overflow or mean nothing
+        with (
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter(
+                "error", RuntimeWarning
+            )  # of NumPy: numbers that overflow or mean nothing
             code = main(list(arguments))
         self.note(time.process_time() - begin, code == 2, arguments)
         said = out.getvalue() + err.getvalue()
@@ -356,9 +495,12 @@ def fuzz(*strategies):
     def tests(function):
         def limited(count):
             told = settings(
-                max_examples=count, deadline=None, derandomize=True, database=None,
+                max_examples=count,
+                deadline=None,
+                derandomize=True,
+                database=None,
                 suppress_health_check=list(HealthCheck),
-            )  # fmt: skip
+            )
             return told(given(*strategies)(function))
 
         return limited(FEW), pytest.mark.soak(limited(MANY))
@@ -387,7 +529,12 @@ def attack(trial, folder):
 def test_all_that_is_changed_is_valid(attack, folder, trial):
     assert [attack(written(scene)) for scene in SCENES] == [0] * len(SCENES)
     for name, text in STRUCTURES.items():
-        assert attack(FROM_FILE.replace("FILE", name).encode(), **{name.replace(".", "_"): text.encode()}) == 0, name
+        assert (
+            attack(
+                FROM_FILE.replace("FILE", name).encode(), **{name.replace(".", "_"): text.encode()}
+            )
+            == 0
+        ), name
     _models(trial, attack, folder, (tomllib.loads(MODEL), []))
     _tables(attack, (tomllib.loads(TABLE), False, []))
     _states(attack, folder, ({}, []))
@@ -411,7 +558,10 @@ def _overrides(attack, told):
 def _structures(attack, told):
     name, changes, frame = told
     scene = FROM_FILE.replace("FILE", name).replace("[box]", f"{frame}[box]")
-    attack(scene.encode(), **{name.replace(".", "_"): with_bytes_changed(STRUCTURES[name].encode(), changes)})
+    attack(
+        scene.encode(),
+        **{name.replace(".", "_"): with_bytes_changed(STRUCTURES[name].encode(), changes)},
+    )
 
 
 def _models(trial, attack, folder, told):
@@ -426,7 +576,9 @@ def _tables(attack, told):
     own = 'file = "x.xyz"\nparameters = "t.toml"'
     scene = WATER.replace('model = "spce"', own)
     attack(
-        scene.encode(), t_toml=written(table), x_xyz=with_bytes_changed(ONE_WATER.encode(), changes if geometry else [])
+        scene.encode(),
+        t_toml=written(table),
+        x_xyz=with_bytes_changed(ONE_WATER.encode(), changes if geometry else []),
     )
 
 
@@ -434,7 +586,9 @@ def _states(attack, folder, told):
     arrays, changes = told
     turn = np.tile(np.eye(3), (2, 1, 1))
     state = state_of(np.array([[0.0, 0, 0], [5, 5, 5]]), None, turn, None, 18.0 * np.eye(3))
-    write_state(folder / "good.npz", SavedState(state, ["spce"], np.zeros(2, int), np.array([1, 2])))
+    write_state(
+        folder / "good.npz", SavedState(state, ["spce"], np.zeros(2, int), np.array([1, 2]))
+    )
     with np.load(folder / "good.npz") as good:
         found = {name: good[name] for name in good.files}
     for name, array in arrays.items():
@@ -448,7 +602,9 @@ def _states(attack, folder, told):
 
 
 def _checkpoints(trial, folder, changes):
-    write_checkpoint(folder, Checkpoint({"of": {"x": {"a": 1}}, "run": {}}, {"x/y": np.arange(50.0)}))
+    write_checkpoint(
+        folder, Checkpoint({"of": {"x": {"a": 1}}, "run": {}}, {"x/y": np.arange(50.0)})
+    )
     path = folder / "checkpoint.npz"
     kept = path.read_bytes()
     path.write_bytes(with_bytes_changed(kept, changes))
@@ -459,20 +615,33 @@ def _checkpoints(trial, folder, changes):
         assert str(path) in str(error)
         trial.note(time.process_time() - begin, True, changes)
     else:
-        assert np.array_equal(found.of("x").arrays["y"], np.arange(50.0))  # nothing wrong is ever taken
+        assert np.array_equal(
+            found.of("x").arrays["y"], np.arange(50.0)
+        )  # nothing wrong is ever taken
         trial.note(time.process_time() - begin, False, changes)
 
 
 @st.composite
 def overrides(draw):
-    """A scene, a dotted key and a value: one of its own keys with a number near its own, or anything."""
+    """A scene, a dotted key and a value: one of its own keys with a number near its own, or
+    anything."""
     scene = draw(st.sampled_from(SCENES))
     own = {".".join(map(str, path)): value for path, value in paths(scene)}
     if draw(st.booleans()):
-        key = draw(st.sampled_from([key for key, value in own.items() if type(value) in (int, float)]))
-        return scene, key, own[key] * draw(st.sampled_from([1, 2, 0] if isinstance(own[key], int) else FACTORS))
+        key = draw(
+            st.sampled_from([key for key, value in own.items() if type(value) in (int, float)])
+        )
+        return (
+            scene,
+            key,
+            own[key] * draw(st.sampled_from([1, 2, 0] if isinstance(own[key], int) else FACTORS)),
+        )
     key = draw(
-        st.one_of(st.sampled_from(KEYS), st.sampled_from(KEYS).map(lambda key: f"{key}.0"), st.text(max_size=20))
+        st.one_of(
+            st.sampled_from(KEYS),
+            st.sampled_from(KEYS).map(lambda key: f"{key}.0"),
+            st.text(max_size=20),
+        )
     )
     strange = st.sampled_from([*NUMBERS, *TEXTS, "[[", "{a=1}", "[1,2", "=", "a=b"])
     return scene, key, draw(st.one_of(strange, st.text(max_size=20)))
@@ -481,20 +650,50 @@ def overrides(draw):
 KEYS = sorted({".".join(map(str, path)) for scene in SCENES for path, _ in paths(scene)})
 ARRAYS = st.one_of(
     st.none(),
-    st.sampled_from([
-        np.zeros(0), np.zeros((2, 3)), np.full((2, 3), np.nan), np.full((2, 3), 1e300), np.zeros((3, 3)), np.eye(3),
-        -np.eye(3), np.full((3, 3), np.inf), np.diag([18.0, np.inf, 18.0]), np.array([[18.0, 0, 0], [18, 0, 0], [0, 0, 18]]),
-        1e-300 * np.eye(3), np.zeros(2, int), np.full(2, 7), np.array(["spce"]), np.array(["\x1b[31m"]), np.array(3.0),
-        np.array(2), np.zeros((2, 3, 3)), np.zeros(2, complex), np.zeros((2, 3), bool), np.array(10**9), np.array([]),
-    ]),
-)  # fmt: skip
-NAMES = ["schema", "species_names", "species", "residue_number", "models", *state_of()._fields, "other"]
+    st.sampled_from(
+        [
+            np.zeros(0),
+            np.zeros((2, 3)),
+            np.full((2, 3), np.nan),
+            np.full((2, 3), 1e300),
+            np.zeros((3, 3)),
+            np.eye(3),
+            -np.eye(3),
+            np.full((3, 3), np.inf),
+            np.diag([18.0, np.inf, 18.0]),
+            np.array([[18.0, 0, 0], [18, 0, 0], [0, 0, 18]]),
+            1e-300 * np.eye(3),
+            np.zeros(2, int),
+            np.full(2, 7),
+            np.array(["spce"]),
+            np.array(["\x1b[31m"]),
+            np.array(3.0),
+            np.array(2),
+            np.zeros((2, 3, 3)),
+            np.zeros(2, complex),
+            np.zeros((2, 3), bool),
+            np.array(10**9),
+            np.array([]),
+        ]
+    ),
+)
+NAMES = [
+    "schema",
+    "species_names",
+    "species",
+    "residue_number",
+    "models",
+    *state_of()._fields,
+    "other",
+]
 
 test_scenes, test_many_scenes = fuzz(changed(SCENES))(_scenes)
 test_texts, test_many_texts = fuzz(
     st.one_of(
         st.tuples(st.sampled_from(SCENES).map(written), BYTE_CHANGES),
-        st.tuples(st.one_of(st.binary(max_size=200), st.text(max_size=200).map(str.encode)), st.just([])),
+        st.tuples(
+            st.one_of(st.binary(max_size=200), st.text(max_size=200).map(str.encode)), st.just([])
+        ),
     )
 )(_texts)
 test_overrides, test_many_overrides = fuzz(overrides())(_overrides)
@@ -511,7 +710,9 @@ test_models, test_many_models = fuzz(
         st.tuples(st.just(tomllib.loads(MODEL)), BYTE_CHANGES),
     )
 )(_models)
-test_tables, test_many_tables = fuzz(st.tuples(changed([tomllib.loads(TABLE)]), st.booleans(), BYTE_CHANGES))(_tables)
+test_tables, test_many_tables = fuzz(
+    st.tuples(changed([tomllib.loads(TABLE)]), st.booleans(), BYTE_CHANGES)
+)(_tables)
 test_states, test_many_states = fuzz(
     st.tuples(
         st.dictionaries(st.sampled_from(NAMES), ARRAYS, max_size=2),

@@ -32,20 +32,52 @@ WATER = {"spce": 12, "argon": 4}
 #: Without waves: energies are those of the oracle, which compiles nothing.
 PLAIN = {
     "reaction_field": {"truncation": "shift"},
-    **{name: {"truncation": name, "electrostatics": "none"} for name in ("plain", "force_switch", "switch")},
+    **{
+        name: {"truncation": name, "electrostatics": "none"}
+        for name in ("plain", "force_switch", "switch")
+    },
 }
 WAVES = {
     "tip5p": ({"tip5p": 6, "co2_trappe": 4, "na_spce": 2, "argon": 2}, {"tail_correction": True}),
     "tip4p": ({"tip4p2005": 8, "argon": 4}, {"pairs": PAIRS}),
-    "benzene": ({"benzene_opls": 4, "argon": 2}, {"mixing": "geometric", "ewald_truncation": "plain"}),
+    "benzene": (
+        {"benzene_opls": 4, "argon": 2},
+        {"mixing": "geometric", "ewald_truncation": "plain"},
+    ),
     "methanol": ({"methanol_trappe": 6, "argon": 2}, {}),
 }
 
 
 def energies(folder):
     """What GROMACS computes of the first step, kJ/mol, by its own names."""
-    gmx(folder, "grompp", "-f", "1_nve.mdp", "-c", "conf.gro", "-p", "topol.top", "-o", "first.tpr", "-maxwarn", "1")
-    gmx(folder, "mdrun", "-s", "first.tpr", "-nsteps", "0", "-nt", "1", "-g", "first.log", "-c", "last.gro")
+    gmx(
+        folder,
+        "grompp",
+        "-f",
+        "1_nve.mdp",
+        "-c",
+        "conf.gro",
+        "-p",
+        "topol.top",
+        "-o",
+        "first.tpr",
+        "-maxwarn",
+        "1",
+    )
+    gmx(
+        folder,
+        "mdrun",
+        "-s",
+        "first.tpr",
+        "-nsteps",
+        "0",
+        "-nt",
+        "1",
+        "-g",
+        "first.log",
+        "-c",
+        "last.gro",
+    )
     text = (folder / "first.log").read_text()
     lines = text[text.index("Energies (kJ/mol)") :].splitlines()[1:]
     found = {}
@@ -53,7 +85,9 @@ def energies(folder):
         if not names.strip():
             return found
         found |= zip(
-            (names[k : k + 15].strip() for k in range(0, len(names), 15)), map(float, values.split()), strict=True
+            (names[k : k + 15].strip() for k in range(0, len(names), 15)),
+            map(float, values.split()),
+            strict=True,
         )
     return found
 
@@ -95,27 +129,39 @@ def test_energies_are_those_of_rigidmd(case, tmp_path):
     assert found["LJ (SR)"] == pytest.approx(tallies["lennard_jones"].energy / KJ_PER_MOL, rel=1e-5)
     # of Coulomb energies large parts cancel: those of molecules with themselves
     parts = [value for name, value in found.items() if name.startswith(("LJ", "Coul", "Disper"))]
-    assert found["Potential"] == pytest.approx(potential / KJ_PER_MOL, abs=1e-5 * np.abs(parts).sum())
-    assert found["Kinetic En."] == pytest.approx(sum(kinetic_energies(system, state)) / KJ_PER_MOL, rel=2e-5)
+    assert found["Potential"] == pytest.approx(
+        potential / KJ_PER_MOL, abs=1e-5 * np.abs(parts).sum()
+    )
+    assert found["Kinetic En."] == pytest.approx(
+        sum(kinetic_energies(system, state)) / KJ_PER_MOL, rel=2e-5
+    )
     moved = positions(tmp_path / "last.gro") - positions(tmp_path / "conf.gro")
-    assert np.abs(moved - 1.6 * np.rint(moved / 1.6)).max() < 1e-3  # GROMACS has put virtual sites where they were
+    assert (
+        np.abs(moved - 1.6 * np.rint(moved / 1.6)).max() < 1e-3
+    )  # GROMACS has put virtual sites where they were
 
 
 def positions(path):
     """Positions in a .gro, nm."""
     lines = path.read_text().splitlines()[2:-1]
     width = lines[0][20:].index(".", lines[0][20:].index(".") + 1) - lines[0][20:].index(".")
-    return np.array([[float(line[20 + width * k : 20 + width * (k + 1)]) for k in range(3)] for line in lines])
+    return np.array(
+        [[float(line[20 + width * k : 20 + width * (k + 1)]) for k in range(3)] for line in lines]
+    )
 
 
 @needs_gmx
 def test_a_leaning_box(tmp_path):
     box = {"lengths_A": [16.0, 15.0, 15.5], "angles_deg": [75.0, 80.0, 100.0]}
-    scene = small_scene({"spce": 12, "argon": 6}, 1.0, box=box, stages=STAGES, forces={"cutoff_A": 6.0} | FINE)
+    scene = small_scene(
+        {"spce": 12, "argon": 6}, 1.0, box=box, stages=STAGES, forces={"cutoff_A": 6.0} | FINE
+    )
     system, ours, state = shaken(build(scene), 3, 0.2)
     write_gromacs(tmp_path, force_field_of(system), state)
     found, tallies = energies(tmp_path), ours.evaluate(state)[1]
-    potential = (sum(t.energy for t in tallies.values()) + sum(system.constants.values())) / KJ_PER_MOL
+    potential = (
+        sum(t.energy for t in tallies.values()) + sum(system.constants.values())
+    ) / KJ_PER_MOL
     assert found["Potential"] == pytest.approx(potential, abs=1e-5 * abs(found["Coul. recip."]))
 
 
@@ -132,11 +178,16 @@ def test_every_stage_runs(tmp_path):
         npt | {"thermostat": "langevin", "pressure_coupling": "semi_isotropic"},
     ]
     scene = small_scene(
-        {"tip4p2005": 20, "nitrogen": 5}, 16.0, stages=stages, forces={"cutoff_A": 6.0, "electrostatics": "pme"}
+        {"tip4p2005": 20, "nitrogen": 5},
+        16.0,
+        stages=stages,
+        forces={"cutoff_A": 6.0, "electrostatics": "pme"},
     )
     system = build(scene)
     write_gromacs(tmp_path, force_field_of(system), system.state)
-    ran = subprocess.run(["./run.sh", "-nt", "1"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    ran = subprocess.run(
+        ["./run.sh", "-nt", "1"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert ran.returncode == 0, ran.stderr[-3000:]
     assert "WARNING" not in ran.stderr
     for name in ("1_nve", "2_nvt", "3_nvt", "4_warm_up", "5_npt", "6_npt"):
@@ -146,16 +197,31 @@ def test_every_stage_runs(tmp_path):
 def test_what_gromacs_cannot_do_is_told_at_once(tmp_path):
     stages = [
         {"duration_ps": 0.1, "ensemble": "nvt", "temperature_K": 300.0, "thermostat": "andersen"},
-        {"duration_ps": 0.1, "ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat": "monte_carlo"},
+        {
+            "duration_ps": 0.1,
+            "ensemble": "npt",
+            "temperature_K": 300.0,
+            "pressure_bar": 1.0,
+            "barostat": "monte_carlo",
+        },
         {"duration_ps": 0.1, "integrator": "yoshida_4"},
     ]
     counts = {"spce": 4, "methanol_trappe": 2, "methane_opls": 2}
-    system = build(small_scene(counts, 16.0, stages=stages, forces={"cutoff_A": 6.0, "truncation": "smooth_switch"}))
+    system = build(
+        small_scene(
+            counts, 16.0, stages=stages, forces={"cutoff_A": 6.0, "truncation": "smooth_switch"}
+        )
+    )
     messages = " ".join(table.refusals(force_field_of(system)))
     for words in (
-        "forces.truncation = 'smooth_switch'", "forces.reaction_field_truncation = 'smooth_switch'", "no rigid bodies whose mass", "one kind of triangle", "andersen",
-        "monte_carlo", "yoshida_4",
-    ):  # fmt: skip
+        "forces.truncation = 'smooth_switch'",
+        "forces.reaction_field_truncation = 'smooth_switch'",
+        "no rigid bodies whose mass",
+        "one kind of triangle",
+        "andersen",
+        "monte_carlo",
+        "yoshida_4",
+    ):
         assert words in messages
     free = small_scene({"spce": 2}, None)
     with pytest.raises(SceneError, match=r"GROMACS: .*no box or no cutoff"):
@@ -165,10 +231,18 @@ def test_what_gromacs_cannot_do_is_told_at_once(tmp_path):
 
 @needs_gmx
 @pytest.mark.parametrize("truncation", ["plain", "shift", "force_switch"])
-@pytest.mark.parametrize(("counts", "error"), [({"argon": 300}, 1e-5), ({"argon": 200, "krypton": 100}, 3e-4)])
+@pytest.mark.parametrize(
+    ("counts", "error"), [({"argon": 300}, 1e-5), ({"argon": 200, "krypton": 100}, 3e-4)]
+)
 def test_the_tail_correction_of_points_is_that_of_gromacs(counts, error, truncation, tmp_path):
-    """A molecule is not among its own neighbours. GROMACS has a mean C6 over pairs of different atoms of a mixture."""
-    forces = {"cutoff_A": 9.0, "truncation": truncation, "tail_correction": True, "electrostatics": "none"}
+    """A molecule is not among its own neighbours. GROMACS has a mean C6 over pairs of different
+    atoms of a mixture."""
+    forces = {
+        "cutoff_A": 9.0,
+        "truncation": truncation,
+        "tail_correction": True,
+        "electrostatics": "none",
+    }
     system = build(small_scene(counts, 22.5, forces=forces, stages=STAGES))
     write_gromacs(tmp_path, force_field_of(system), system.state)
     expected = system.tail.energy(system.space.volume) / KJ_PER_MOL

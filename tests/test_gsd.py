@@ -6,7 +6,15 @@ import gsd.hoomd
 import numpy as np
 import pytest
 from scenes import FORTY_WATERS, NPT, NVT, forty_waters
-from support import GsdFile, GsdReader, build, from_quaternion, read_frames, same_after_stops, small_scene
+from support import (
+    GsdFile,
+    GsdReader,
+    build,
+    from_quaternion,
+    read_frames,
+    same_after_stops,
+    small_scene,
+)
 
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.run import Every, Simulation
@@ -18,14 +26,16 @@ BOX = {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 100.0, 75.0]}
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run of a mixture in a triclinic box: the folder, its results and the states of its frames."""
+    """A run of a mixture in a triclinic box: the folder, its results and the states of its
+    frames."""
     folder = tmp_path_factory.mktemp("gsd") / "run"
     output = {"trajectory": "t.gsd", "trajectory_interval_ps": 0.01}
     states = []
     simulation = Simulation(
-        small_scene(COUNTS, None, box=BOX, stages=[{"duration_ps": 0.04}], output=output), folder,
+        small_scene(COUNTS, None, box=BOX, stages=[{"duration_ps": 0.04}], output=output),
+        folder,
         observers=[Every(0.01, lambda moment: states.append(moment.state.copy()))],
-    )  # fmt: skip
+    )
     return folder, simulation.run(), states
 
 
@@ -42,9 +52,14 @@ def test_frames_come_back(run):
         assert np.abs(found.position[centres] - state.position).max() < 5e-6
         assert np.allclose(found.velocity[centres], state.velocity, rtol=1e-6, atol=1e-6)
         scale = np.abs(state.angular_momentum_body).max()
-        assert np.abs(found.angular_momentum_body[centres] - state.angular_momentum_body).max() < 3e-7 * scale
+        assert (
+            np.abs(found.angular_momentum_body[centres] - state.angular_momentum_body).max()
+            < 3e-7 * scale
+        )
         assert np.allclose(found.cell, state.cell, rtol=1e-6, atol=1e-5)
-        assert np.abs(found.position[found.sites] - results.system.site_positions(state)).max() < 5e-6
+        assert (
+            np.abs(found.position[found.sites] - results.system.site_positions(state)).max() < 5e-6
+        )
     assert np.array_equal(results.rotation[3], reader.read(3).rotation())
 
 
@@ -59,14 +74,34 @@ def test_it_is_what_hoomd_has(run):
     types = np.array(first.types)[first.typeid]
     assert list(types[:n]) == ["tip4p2005"] * 6 + ["Ar"] * 3 + ["nitrogen"] * 4
     assert list(types[n : n + 4]) == ["O", "H", "H", "MW"]
-    assert list(first.body[:n]) == [0, 1, 2, 3, 4, 5, -1, -1, -1, 9, 10, 11, 12]  # its own number, or none
-    assert list(first.body[n:]) == [k for k in range(6) for _ in range(4)] + [k for k in range(9, 13) for _ in range(2)]
-    assert first.mass[:n] == pytest.approx([results.system.species[k].mass for k in results.system.model.species])
+    assert list(first.body[:n]) == [
+        0,
+        1,
+        2,
+        3,
+        4,
+        5,
+        -1,
+        -1,
+        -1,
+        9,
+        10,
+        11,
+        12,
+    ]  # its own number, or none
+    assert list(first.body[n:]) == [k for k in range(6) for _ in range(4)] + [
+        k for k in range(9, 13) for _ in range(2)
+    ]
+    assert first.mass[:n] == pytest.approx(
+        [results.system.species[k].mass for k in results.system.model.species]
+    )
     assert first.mass[n : n + 4].sum() == pytest.approx(first.mass[0])
     assert first.charge.sum() == pytest.approx(0.0, abs=1e-6)
     assert len(bonds.group) == 2 * 6 + 4
     assert all(first.body[i] == first.body[j] for i, j in bonds.group)
-    rows = np.array([[box[0], 0, 0], [box[3] * box[1], box[1], 0], [box[4] * box[2], box[5] * box[2], box[2]]])
+    rows = np.array(
+        [[box[0], 0, 0], [box[3] * box[1], box[1], 0], [box[4] * box[2], box[5] * box[2], box[2]]]
+    )
     inside = last.position @ np.linalg.inv(rows)
     assert np.abs(inside).max() <= 0.5 + 1e-6
     whole = last.position + last.image @ rows
@@ -79,7 +114,11 @@ def test_it_is_what_hoomd_has(run):
     inertia = first.moment_inertia[:6].astype(float)
     energy = 0.0
     for k, (unit, sign) in enumerate(
-        [([1, 0, 3, 2], [-1, 1, 1, -1]), ([2, 3, 0, 1], [-1, -1, 1, 1]), ([3, 2, 1, 0], [-1, 1, -1, 1])]
+        [
+            ([1, 0, 3, 2], [-1, 1, 1, -1]),
+            ([2, 3, 0, 1], [-1, -1, 1, 1]),
+            ([3, 2, 1, 0], [-1, 1, -1, 1]),
+        ]
     ):
         part = (p * (q[:, unit] * sign)).sum(
             axis=1
@@ -92,7 +131,9 @@ def test_it_is_what_hoomd_has(run):
 
 def test_a_run_goes_on_to_the_same_bytes(tmp_path):
     same_after_stops(
-        forty_waters(NVT, NPT, output=FORTY_WATERS["output"] | {"trajectory": "trajectory.gsd"}), [3, 61, 133], tmp_path
+        forty_waters(NVT, NPT, output=FORTY_WATERS["output"] | {"trajectory": "trajectory.gsd"}),
+        [3, 61, 133],
+        tmp_path,
     )
 
 
@@ -105,7 +146,10 @@ def test_wrapped_centres_and_no_box(tmp_path):
         file.write(system.state, 0.5, 7)
         file.close()
         frames = read_frames(path, 12, 100)
-        assert np.abs(frames.positions[0] - system.site_positions(system.state, wrapped=True)).max() < 1e-5
+        assert (
+            np.abs(frames.positions[0] - system.site_positions(system.state, wrapped=True)).max()
+            < 1e-5
+        )
         assert (frames.cells is None) == ("periodic" in box)
         assert frames.time[0] == 0.5
         assert GsdReader(path).read(0).velocity is None
@@ -179,9 +223,12 @@ def test_damaged_files_are_told(run, tmp_path):
 def test_a_body_has_none():
     with pytest.raises(SceneError, match=r"\.xtc"):
         Scene.from_dict(
-            {"body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 1.0]}, "run": {"duration_s": 1.0, "timestep_s": 0.1},
-             "output": {"trajectory": "t.gsd"}}
-        )  # fmt: skip
+            {
+                "body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 1.0]},
+                "run": {"duration_s": 1.0, "timestep_s": 0.1},
+                "output": {"trajectory": "t.gsd"},
+            }
+        )
 
 
 def test_it_can_be_looked_at_after_a_kill(run, tmp_path):

@@ -1,4 +1,5 @@
-"""LAMMPS as an engine: both compute the same, a run comes back into the same folder, and what cannot be is refused."""
+"""LAMMPS as an engine: both compute the same, a run comes back into the same folder, and what
+cannot be is refused."""
 
 import json
 import os
@@ -58,7 +59,9 @@ def test_both_engines_compute_the_same(name):
     engine.close()
 
 
-@pytest.mark.parametrize("truncation", ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"])
+@pytest.mark.parametrize(
+    "truncation", ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
+)
 def test_every_ending_is_the_same(truncation):
     """Each has a style of LAMMPS, or a table: then splines decide how near it comes."""
     forces = {"cutoff_A": 6.0, "truncation": truncation}
@@ -77,11 +80,14 @@ def test_charges_within_a_cutoff_and_without_a_box():
 
 
 def test_an_error_of_the_forces_is_found(monkeypatch):
-    """Charges larger by a thousandth are seen in the terms of the start, and stop a run before its first step."""
+    """Charges larger by a thousandth are seen in the terms of the start, and stop a run before its
+    first step."""
     wrong = lammps_files.COULOMB_REAL * 1.001
     monkeypatch.setattr(lammps_files, "COULOMB_REAL", wrong)
     _, _, engine, lines = both({"spce": 12}, {"forces": {"cutoff_A": 6.0}}, edge=13.0)
-    assert {"coulomb", "potential energy", "rms force on a molecule"} <= {x.name for x in lines if not x.agrees}
+    assert {"coulomb", "potential energy", "rms force on a molecule"} <= {
+        x.name for x in lines if not x.agrees
+    }
     engine.close()
 
 
@@ -92,15 +98,21 @@ def test_all_models_in_one_box():
     engine.close()
 
 
-#: Ranks of MPI wait in a loop: two of them take the cores from the other worker of the tests, for 100 s in all.
+#: Ranks of MPI wait in a loop: two of them take the cores from the other worker of the tests, for
+#: 100 s in all.
 RANKS = [1, pytest.param(2, marks=pytest.mark.soak)]
 
 
 @pytest.mark.parametrize("ranks", RANKS)
 def test_a_short_run_is_the_same(ranks):
-    """Both turn bodies by the same composition of rotations: what is left is the constants of LAMMPS."""
-    scene = small_scene({"spce": 20, "nitrogen": 4, "argon": 2}, 15.0, forces={"cutoff_A": 7.0},
-                        engine={"name": "lammps", "ranks": ranks})  # fmt: skip
+    """Both turn bodies by the same composition of rotations: what is left is the constants of
+    LAMMPS."""
+    scene = small_scene(
+        {"spce": 20, "nitrogen": 4, "argon": 2},
+        15.0,
+        forces={"cutoff_A": 7.0},
+        engine={"name": "lammps", "ranks": ranks},
+    )
     found = verify(scene)
     assert found.agrees, found.description()
     assert found.run[0].difference < 1e-6 and found.run[0].here > 0.1
@@ -110,19 +122,32 @@ def test_a_short_run_is_the_same(ranks):
 
 def test_states_come_back_as_they_went():
     """Bodies of all kinds, from the positions and velocities of their sites."""
-    counts = {"spce": 5, "nitrogen": 5, "argon": 3, "benzene_opls": 2, "methane_opls": 3, "tip5p": 2}
+    counts = {
+        "spce": 5,
+        "nitrogen": 5,
+        "argon": 3,
+        "benzene_opls": 2,
+        "methane_opls": 3,
+        "tip5p": 2,
+    }
     system, _, state = built(counts, 24.0, 3)
     state.velocity[:] = np.random.default_rng(0).standard_normal(state.velocity.shape)
     there = state.copy()
     turning = system.model.inertia[system.model.species] > 0
-    there.angular_momentum_body[:] = np.random.default_rng(1).standard_normal(turning.shape) * turning
+    there.angular_momentum_body[:] = (
+        np.random.default_rng(1).standard_normal(turning.shape) * turning
+    )
     bodies = RigidBodies(system)
-    back = bodies.state(state, system.site_positions(there), system.site_velocities(there), there.cell)
+    back = bodies.state(
+        state, system.site_positions(there), system.site_velocities(there), there.cell
+    )
     np.testing.assert_allclose(back.position, there.position, atol=1e-13)
     np.testing.assert_allclose(back.velocity, there.velocity, atol=1e-13)
     np.testing.assert_allclose(back.angular_momentum_body, there.angular_momentum_body, atol=1e-12)
     np.testing.assert_allclose(back.rotation, there.rotation, atol=1e-12)
-    np.testing.assert_allclose(system.site_positions(back), system.site_positions(there), atol=1e-12)
+    np.testing.assert_allclose(
+        system.site_positions(back), system.site_positions(there), atol=1e-12
+    )
 
 
 def test_chunks_are_the_whole_and_a_state_given_again_goes_on():
@@ -136,7 +161,11 @@ def test_chunks_are_the_whole_and_a_state_given_again_goes_on():
         if until == 12:
             engine.forget()  # it is given the state anew: rounding
     np.testing.assert_allclose(parts.position, whole.position, atol=1e-10)
-    assert parts.step[NOW] == 20 and parts.time[NOW] == pytest.approx(0.02) and parts.energy_ledger[HEAT] == 0
+    assert (
+        parts.step[NOW] == 20
+        and parts.time[NOW] == pytest.approx(0.02)
+        and parts.energy_ledger[HEAT] == 0
+    )
     engine.close()
 
 
@@ -173,7 +202,12 @@ def scene(tmp_path) -> Path:
 @pytest.mark.parametrize("ranks", RANKS)
 def test_a_run_is_one_like_any_other(ranks, scene, tmp_path, capsys):
     folder = tmp_path / "run"
-    assert cli.main(["run", str(scene), "--engine", "lammps", "--ranks", str(ranks), "-o", str(folder)]) == 0
+    assert (
+        cli.main(
+            ["run", str(scene), "--engine", "lammps", "--ranks", str(ranks), "-o", str(folder)]
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert f"computed by LAMMPS on {ranks} rank" in said
     assert "stages.0: thermostat nose_hoover, because lammps has no velocity_rescaling" in said
@@ -182,9 +216,15 @@ def test_a_run_is_one_like_any_other(ranks, scene, tmp_path, capsys):
     drift = record.columns["drift"]
     assert np.isnan(drift[1:5]).all() and np.abs(drift[5:]).max() < 0.1  # kJ/mol, of 20 molecules
     summary = json.loads((folder / "summary.json").read_text())
-    assert summary["engine"].startswith("LAMMPS 20") and summary["stages"][0]["drift_kJ_mol_ns_per_molecule"] is None
+    assert (
+        summary["engine"].startswith("LAMMPS 20")
+        and summary["stages"][0]["drift_kJ_mol_ns_per_molecule"] is None
+    )
     for command in ("view", "report", "analyse"):
-        assert cli.main([command, str(folder), *(["--only", "rdf"] if command == "analyse" else [])]) == 0
+        assert (
+            cli.main([command, str(folder), *(["--only", "rdf"] if command == "analyse" else [])])
+            == 0
+        )
     capsys.readouterr()
     assert cli.main(["compare", str(folder), str(folder)]) == 0
     # the folder knows its engine: it goes on there, from the state of the end
@@ -195,7 +235,11 @@ def test_a_run_is_one_like_any_other(ranks, scene, tmp_path, capsys):
 
 def test_a_stage_without_a_drift_draws_none():
     stage = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.02}
-    settings = {"forces": {"cutoff_A": 6.0}, "stages": [stage], "output": {"log_interval_ps": 0.005}}
+    settings = {
+        "forces": {"cutoff_A": 6.0},
+        "stages": [stage],
+        "output": {"log_interval_ps": 0.005},
+    }
     results = Simulation(small_scene({"spce": 12}, 13.0, **THERE | settings)).run()
     assert len(energy_figure(results.system, results.samples, results.summary).axes) == 2
     assert results.summary["stages"][0]["drift_kJ_mol_ns_per_molecule"] is None
@@ -208,14 +252,20 @@ def test_an_exported_folder_runs_by_itself(tmp_path):
     export = ["export", str(tmp_path / "water.toml"), "--to", "lammps", "-o", str(folder)]
     assert cli.main(export) == 0
     program = lammps.command(1)[0]
-    done = subprocess.run([program, "-in", "in.lammps"], cwd=folder, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [program, "-in", "in.lammps"], cwd=folder, capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stdout[-2000:]
     head, first = re.search(r"( *Step .*)\n(.*)\n", done.stdout).groups()
     row = dict(zip(head.split(), map(float, first.split()), strict=True))
     system = build(Scene.read(folder / "scene.toml"))  # for its constants
-    assert row["v_potential"] == pytest.approx(_start_potential(tmp_path / "water.toml") / 4.184, abs=0.02)
+    assert row["v_potential"] == pytest.approx(
+        _start_potential(tmp_path / "water.toml") / 4.184, abs=0.02
+    )
     assert row["v_potential"] - row["PotEng"] == pytest.approx(
-        (system.constants["coulomb_intramolecular"] + system.tail.energy(system.space.volume)) / 418.4, abs=1e-3
+        (system.constants["coulomb_intramolecular"] + system.tail.energy(system.space.volume))
+        / 418.4,
+        abs=1e-3,
     )
     assert (folder / "final.lammps").is_file() and (folder / "trajectory_1.lammpstrj").is_file()
     assert cli.main(export) == 2  # nothing is overwritten
@@ -231,10 +281,19 @@ def _start_potential(scene: Path) -> float:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (["stages.0.thermostat=velocity_rescaling"], "stages.0.thermostat = 'velocity_rescaling': LAMMPS has nose_h"),
-        (["stages.1.integrator=srkn_4"], "stages.1.integrator = 'srkn_4': LAMMPS moves rigid bodies by velocity_ver"),
+        (
+            ["stages.0.thermostat=velocity_rescaling"],
+            "stages.0.thermostat = 'velocity_rescaling': LAMMPS has nose_h",
+        ),
+        (
+            ["stages.1.integrator=srkn_4"],
+            "stages.1.integrator = 'srkn_4': LAMMPS moves rigid bodies by velocity_ver",
+        ),
         (["fields.electric_V_per_nm=[0,0,0.1]"], "electric field: a field has no translation for"),
-        (["forces.electrostatics=pme", "forces.ewald_truncation=shift"], "LAMMPS has no shift of the real-space"),
+        (
+            ["forces.electrostatics=pme", "forces.ewald_truncation=shift"],
+            "LAMMPS has no shift of the real-space",
+        ),
         (
             ["stages.0.ensemble=npt", "stages.0.pressure_bar=1", "stages.0.barostat=monte_carlo"],
             "has its own for rigid",
@@ -278,7 +337,9 @@ def test_lammps_that_is_absent_or_fails_says_so(monkeypatch, scene, tmp_path, ca
     with pytest.raises(SimulationError, match="LAMMPS stopped: exit code -9"):
         engine.advance(state, None, 0.002, 200)
     state.position[1] = state.position[0] + 0.05
-    with pytest.raises(EngineError, match=r"LAMMPS stopped: ERROR.*Pair distance < table inner cutoff"):
+    with pytest.raises(
+        EngineError, match=r"LAMMPS stopped: ERROR.*Pair distance < table inner cutoff"
+    ):
         LammpsEngine(system).evaluate(state)
     monkeypatch.setattr(shutil, "which", lambda name, path=None: None)
     assert cli.main(["run", str(scene), "--engine", "lammps", "-o", str(tmp_path / "run")]) == 2
@@ -298,13 +359,24 @@ def test_a_process_ends_with_its_engine():
 @pytest.mark.soak
 @pytest.mark.parametrize("ensemble", ["nve", "nvt", "npt"])
 def test_means_are_those_of_rigidmd(ensemble):
-    """216 SPC/E: potential energy, temperatures, pressure and density within errors, of runs that share their start."""
-    warm = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 10.0, "thermostat": "nose_hoover"}
+    """216 SPC/E: potential energy, temperatures, pressure and density within errors, of runs that
+    share their start."""
+    warm = {
+        "ensemble": "nvt",
+        "temperature_K": 300.0,
+        "duration_ps": 10.0,
+        "thermostat": "nose_hoover",
+    }
     last = {"ensemble": ensemble, "duration_ps": 60.0}
     last |= {"temperature_K": 300.0, "thermostat": "nose_hoover"} if ensemble != "nve" else {}
     last |= {"pressure_bar": 1.0} if ensemble == "npt" else {}
     forces = {"cutoff_A": 9.0, "electrostatics": "pme", "tail_correction": True}
-    settings = {"forces": forces, "stages": [warm], "box": {"density_g_cm3": 0.998}, "output": {"trajectory": False}}
+    settings = {
+        "forces": forces,
+        "stages": [warm],
+        "box": {"density_g_cm3": 0.998},
+        "output": {"trajectory": False},
+    }
     liquid = Simulation(small_scene({"spce": 216}, 18.6, **settings))
     liquid.run()
     found = {}
@@ -314,7 +386,13 @@ def test_means_are_those_of_rigidmd(ensemble):
         simulation.start_from(liquid.state)
         samples = simulation.run().samples
         late = slice(len(samples.rows) // 6, None)
-        names = ("potential", "temperature_translation", "temperature_rotation", "pressure_bar", "density")
+        names = (
+            "potential",
+            "temperature_translation",
+            "temperature_rotation",
+            "pressure_bar",
+            "density",
+        )
         found[engine] = {name: mean(list(samples[name][late])) for name in names}
     for name, (here, error) in found["rigidmd"].items():
         there, other_error = found["lammps"][name]

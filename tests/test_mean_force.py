@@ -1,4 +1,5 @@
-"""The potential of mean force: synthetic samples of a known potential, and runs of two argon atoms."""
+"""The potential of mean force: synthetic samples of a known potential, and runs of two argon
+atoms."""
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ def morse(r):
 
 
 def drawn(rng, potential, distance, stiffness, count):
-    """Distances of two molecules in space, with a restraint, from the inverse of their distribution."""
+    """Distances of two molecules in space, with a restraint, from the inverse of their
+    distribution."""
     r = np.linspace(2.5, 14, 40001)
     energy = (potential(r) + 0.5 * stiffness * (r - distance) ** 2) / KT
     density = np.cumsum(r**2 * np.exp(energy.min() - energy))
@@ -79,9 +81,13 @@ def test_correlated_samples_have_larger_errors():
 
 def test_windows_that_are_no_chain():
     apart = windows(4, lennard_jones, distances=[4.0, 5.2], stiffness=60.0)
-    with pytest.raises(OutputError, match=r"windows at 4 and 5\.2 Å have no common distances: add a window"):
+    with pytest.raises(
+        OutputError, match=r"windows at 4 and 5\.2 Å have no common distances: add a window"
+    ):
         potential_of_mean_force(apart, KT)
-    little = potential_of_mean_force(windows(4, lennard_jones, distances=[4.0, 4.3, 5.3], stiffness=30.0), KT)
+    little = potential_of_mean_force(
+        windows(4, lennard_jones, distances=[4.0, 4.3, 5.3], stiffness=30.0), KT
+    )
     assert any("4.3 and 5.3 Å hardly overlap" in note for note in little.notes)
     short = [Window(4.0, STIFFNESS, np.array([4.0, 4.1, 3.9]))]
     with pytest.raises(OutputError, match="decorrelated samples of 3, and needs 10: run longer"):
@@ -126,7 +132,9 @@ def test_a_sweep_of_windows(tmp_path, capsys):
     results = swept(tmp_path, 40, [4.0, 4.8])
     before = {path: path.read_bytes() for path in (tmp_path / "sweep").rglob("*") if path.is_file()}
     curves = [rigidmd.pmf(sweep).curves[0] for sweep in (results, tmp_path / "sweep")]
-    assert {path: path.read_bytes() for path in (tmp_path / "sweep").rglob("*") if path.is_file()} == before
+    assert {
+        path: path.read_bytes() for path in (tmp_path / "sweep").rglob("*") if path.is_file()
+    } == before
     assert main(["analyse", str(tmp_path / "sweep"), "--only", "pmf", "--figures", "svg"]) == 0
     printed = capsys.readouterr().out
     assert "potential of mean force along a restrained distance" in printed

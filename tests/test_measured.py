@@ -15,8 +15,14 @@ OUTPUT = {"trajectory_interval_ps": 0.1, "pressure_tensor_interval_ps": 0.01, "f
 
 def liquid(model, count, density, duration, temperature=298.15, **output):
     """Results of a liquid under velocity rescaling, in memory."""
-    stage = {"ensemble": "nvt", "temperature_K": temperature, "duration_ps": duration, "timestep_fs": 2.0,
-             "integrator": "baoab", "thermostat": "velocity_rescaling"}  # fmt: skip
+    stage = {
+        "ensemble": "nvt",
+        "temperature_K": temperature,
+        "duration_ps": duration,
+        "timestep_fs": 2.0,
+        "integrator": "baoab",
+        "thermostat": "velocity_rescaling",
+    }
     scene = {
         "box": {"density_g_cm3": density},
         "molecules": [{"model": model, "count": count}],
@@ -59,7 +65,9 @@ def test_tip4p2005_diffuses_and_flows_as_published():
 
 def test_spce_has_the_published_dielectric_constant():
     """Twenty minutes: the dipole forgets itself in 10 ps."""
-    results = liquid("spce", 216, 0.997, 2000.0, trajectory_interval_ps=0.2, pressure_tensor_interval_ps=False)
+    results = liquid(
+        "spce", 216, 0.997, 2000.0, trajectory_interval_ps=0.2, pressure_tensor_interval_ps=False
+    )
     assert near(rigidmd.analysis.dielectric(results).value(), 71.0)
 
 
@@ -76,14 +84,17 @@ def test_nitrogen_diffuses_as_its_correlation_of_velocities_says():
 
 def test_a_slab_of_water_has_the_published_density_and_surface_tension():
     """NIST SAT-TMMC of TIP4P/2005; Vega & de Miguel 2007, J. Chem. Phys. 126, 154707."""
-    scene = Scene.read(ROOT / "systems" / "water_slab.toml", {"stages.production.duration_ps": 1000.0})
+    scene = Scene.read(
+        ROOT / "systems" / "water_slab.toml", {"stages.production.duration_ps": 1000.0}
+    )
     results = Simulation(scene).run()
     assert near(rigidmd.analysis.interfaces(results).value("liquid"), 0.9965, slack=0.0015)
     assert near(rigidmd.analysis.surface_tension(results).value(), 69.3, slack=0.9)
 
 
 def test_argon_coexists_with_its_vapour_as_published():
-    """NIST SAT-TMMC, Lennard-Jones with linear-force shift at 3 sigma at a reduced temperature of 0.8."""
+    """NIST SAT-TMMC, Lennard-Jones with linear-force shift at 3 sigma at a reduced temperature of
+    0.8."""
     stage = {"ensemble": "nvt", "integrator": "baoab", "temperature_K": 95.84, "timestep_fs": 10.0}
     scene = {
         "box": {"lengths_A": [34.05, 34.05, 93.0], "vacuum_A": 100.0},

@@ -39,14 +39,27 @@ def turn_all(rotor, species, rotation, angular_momentum, h, together):
 @pytest.mark.parametrize("moments", ["of every kind", "of two axes", "round"])
 @pytest.mark.parametrize("longest", [0.2, 3.0])
 def test_many_bodies_turn_together_as_one_by_one(moments, longest):
-    """All six orders of axes, symmetric, linear and spherical bodies; short turns, and some too long for the series."""
+    """All six orders of axes, symmetric, linear and spherical bodies; short turns, and some too
+    long for the series."""
     rng = np.random.default_rng(4)
     inertia = {
-        "of every kind": [[1, 2, 2.5], [1, 2.5, 2], [2, 1, 2.5], [2, 2.5, 1], [2.5, 1, 2], [2.5, 2, 1],
-                          [1, 1, 1.5], [2, 2, 2], [0, 1, 1], [1.5, 1, 1], [0.5, 1.4, 1.5], [1.4, 0.5, 1.5]],
+        "of every kind": [
+            [1, 2, 2.5],
+            [1, 2.5, 2],
+            [2, 1, 2.5],
+            [2, 2.5, 1],
+            [2.5, 1, 2],
+            [2.5, 2, 1],
+            [1, 1, 1.5],
+            [2, 2, 2],
+            [0, 1, 1],
+            [1.5, 1, 1],
+            [0.5, 1.4, 1.5],
+            [1.4, 0.5, 1.5],
+        ],
         "of two axes": [[1, 1, 1.5], [1.5, 1, 1]],
         "round": [[2, 2, 2], [0, 1, 1]],
-    }[moments]  # fmt: skip
+    }[moments]
     rotor = split_rotor(np.array(inertia, float))
     n = 20 * LANES + 1
     species = rng.integers(0, len(inertia), n)
@@ -80,13 +93,19 @@ def kick_all(species, inverse_mass, inverse_inertia, state, load, h):
 
 @pytest.mark.parametrize("turning", [True, False])
 def test_many_bodies_are_kicked_together(turning):
-    """Species in any order, one of them linear; as many bodies as do not fill the last group. Points have no momenta."""
+    """Species in any order, one of them linear; as many bodies as do not fill the last group.
+    Points have no momenta."""
     rng, n = np.random.default_rng(6), 5 * LANES + 1
     species, inverse_mass = rng.integers(0, 3, n).astype(np.int32), np.array([1.0, 0.25, 0.0])
     inverse_inertia = np.array([[1.0, 2.0, 3.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     turns = n if turning else 0
-    state = state_of(np.zeros((n, 3)), rng.standard_normal((n, 3)), np.zeros((turns, 3, 3)),
-                     rng.standard_normal((turns, 3)), np.eye(3))  # fmt: skip
+    state = state_of(
+        np.zeros((n, 3)),
+        rng.standard_normal((n, 3)),
+        np.zeros((turns, 3, 3)),
+        rng.standard_normal((turns, 3)),
+        np.eye(3),
+    )
     load = Load(rng.standard_normal((n, 3)), rng.standard_normal((turns, 3)))
     velocity = state.velocity + 0.3 * inverse_mass[species, None] * load.force
     idle = inverse_inertia[species[:turns]] == 0
@@ -104,7 +123,9 @@ def test_rotations_agree_with_scipy():
     rng = np.random.default_rng(0)
     quaternions, vectors = rng.standard_normal((20, 4)), rng.standard_normal((20, 3))
     vectors[0] = 0.0
-    assert from_quaternion(quaternions) == pytest.approx(Rotation.from_quat(quaternions, scalar_first=True).as_matrix())
+    assert from_quaternion(quaternions) == pytest.approx(
+        Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+    )
     assert from_vector(vectors) == pytest.approx(Rotation.from_rotvec(vectors).as_matrix())
 
 
@@ -146,10 +167,13 @@ def test_principal_frame_diagonalises_and_sees_the_kind():
         frame = principal_frame(masses, positions @ q.T + 5.0)
         assert frame.kind == kind
         x = (positions @ q.T + 5.0 - frame.centre) @ frame.axes
-        tensor = (masses[:, None, None] * ((x**2).sum(1)[:, None, None] * np.eye(3) - x[:, :, None] * x[:, None])).sum(
-            0
+        tensor = (
+            masses[:, None, None]
+            * ((x**2).sum(1)[:, None, None] * np.eye(3) - x[:, :, None] * x[:, None])
+        ).sum(0)
+        assert tensor == pytest.approx(
+            np.diag(frame.inertia), abs=1e-12 * max(1, frame.inertia.max())
         )
-        assert tensor == pytest.approx(np.diag(frame.inertia), abs=1e-12 * max(1, frame.inertia.max()))
         assert np.linalg.det(frame.axes) == pytest.approx(1)
 
 

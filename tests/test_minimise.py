@@ -1,4 +1,5 @@
-"""Minimisation in the rigid degrees of freedom and the cell: gradients, known minima, what a stage of it says and keeps."""
+"""Minimisation in the rigid degrees of freedom and the cell: gradients, known minima, what a stage
+of it says and keeps."""
 
 import csv
 import json
@@ -73,22 +74,29 @@ def minimum_of(scene, state: State | None = None):
     ],
 )
 def test_the_gradient_is_that_of_the_enthalpy(coupling, electrostatics):
-    """Points, linear and asymmetric molecules, shifts, turns and all components of a leaning cell."""
+    """Points, linear and asymmetric molecules, shifts, turns and all components of a leaning
+    cell."""
     asked = {"pressure_bar": ASKED[coupling], "pressure_coupling": coupling} if coupling else {}
     scene = small_scene(
-        MIXTURE, 13.0, forces=FORCES | {"electrostatics": electrostatics},
+        MIXTURE,
+        13.0,
+        forces=FORCES | {"electrostatics": electrostatics},
         stages=[stage_of(**asked), {"duration_ps": 0.01}],
-    )  # fmt: skip
+    )
     system, _, state = shaken(build(scene), 3, spread=0.1)
     if coupling == "flexible":
         state.cell[1, 0], state.cell[2, 0], state.cell[2, 1] = 0.4, 0.3, -0.6
     enthalpy = Enthalpy(system, scene.stages[0], state)
     point = enthalpy.at(state)
     n, turns = 3 * len(state.position), (system.model.inertia > 0)[system.model.species].ravel()
-    coordinates = {None: 0, "isotropic": 1, "semi_isotropic": 2, "anisotropic": 3, "flexible": 6}[coupling]
+    coordinates = {None: 0, "isotropic": 1, "semi_isotropic": 2, "anisotropic": 3, "flexible": 6}[
+        coupling
+    ]
     assert len(point.gradient) == 2 * n + coordinates
     assert (point.gradient[n : 2 * n][~turns] == 0).all()
-    some = np.random.default_rng(0).choice(np.flatnonzero(np.append(np.ones(n, bool), turns)), 12, replace=False)
+    some = np.random.default_rng(0).choice(
+        np.flatnonzero(np.append(np.ones(n, bool), turns)), 12, replace=False
+    )
     for k in [*some, *range(2 * n, len(point.gradient))]:
         gains = []
         for h in (1e-4, -1e-4):
@@ -103,7 +111,12 @@ def test_the_gradient_is_that_of_the_enthalpy(coupling, electrostatics):
 
 
 def test_turns_of_any_size_and_strains_are_those_of_the_docstring():
-    scene = small_scene(MIXTURE, 13.0, forces=FORCES, stages=[stage_of(pressure_bar=0.0, pressure_coupling="flexible")])
+    scene = small_scene(
+        MIXTURE,
+        13.0,
+        forces=FORCES,
+        stages=[stage_of(pressure_bar=0.0, pressure_coupling="flexible")],
+    )
     system, _, state = shaken(build(scene), 3, spread=0.1)
     enthalpy, rng = Enthalpy(system, scene.stages[0], state), np.random.default_rng(1)
     n = len(state.position)
@@ -138,7 +151,9 @@ def bipyramid() -> np.ndarray:
     return np.vstack([ring, [[0, 0, 0.55], [0, 0, -0.55]]])
 
 
-@pytest.mark.parametrize(("points", "energy"), [(bipyramid(), -16.505384), (icosahedron(), -44.326801)])
+@pytest.mark.parametrize(
+    ("points", "energy"), [(bipyramid(), -16.505384), (icosahedron(), -44.326801)]
+)
 def test_lennard_jones_clusters(points, energy):
     """Hoare & Pal 1971, Adv. Phys. 20, 161; the Cambridge Cluster Database."""
     n = len(points)
@@ -146,13 +161,18 @@ def test_lennard_jones_clusters(points, energy):
     results, found = minimum_of(scene, cluster(points, 2))
     assert found["converged"]
     assert found["largest_force_kJ_mol_A"] <= 1e-6
-    assert n * found["energy_after_kJ_mol_per_molecule"] * KJ_PER_MOL / WELL == pytest.approx(energy, abs=1e-6)
-    assert results["potential"][-1] == pytest.approx(n * found["energy_after_kJ_mol_per_molecule"], rel=1e-12)
+    assert n * found["energy_after_kJ_mol_per_molecule"] * KJ_PER_MOL / WELL == pytest.approx(
+        energy, abs=1e-6
+    )
+    assert results["potential"][-1] == pytest.approx(
+        n * found["energy_after_kJ_mol_per_molecule"], rel=1e-12
+    )
     assert found["pressure_bar"] is None
 
 
 def pair_energy(model: str, x: np.ndarray) -> float:
-    """Two rigid molecules (kJ/mol), the first at the origin: x (9,), place and rotation vectors of both. Plain NumPy."""
+    """Two rigid molecules (kJ/mol), the first at the origin: x (9,), place and rotation vectors of
+    both. Plain NumPy."""
     m = load_model(model)
     sites = m.positions_body
     a = Rotation.from_rotvec(x[3:6]).apply(sites)
@@ -194,7 +214,9 @@ def test_fcc_argon_has_its_lattice_constant_at_no_pressure():
     """Shells within the cut-off: 2 (sigma/a)^6 S12 = S6 with S_p = sum (r/a)^-p."""
     cutoff, n = 8.66, 4
     near = np.array(list(np.ndindex(7, 7, 7))) - 3
-    sites = (near[:, None] + np.array([[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])).reshape(-1, 3)
+    sites = (
+        near[:, None] + np.array([[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
+    ).reshape(-1, 3)
     shells = np.linalg.norm(sites, axis=1)
     shells = shells[(shells > 0) & (shells < 1.65)]
     exact = 3.405 * (2 * (shells**-12.0).sum() / (shells**-6.0).sum()) ** (1 / 6)
@@ -205,9 +227,12 @@ def test_fcc_argon_has_its_lattice_constant_at_no_pressure():
     position = a * points + 0.05 * np.random.default_rng(0).standard_normal(points.shape)
     limits = {"force_limit_kJ_mol_A": 1e-6, "pressure_limit_bar": 1e-3}
     scene = small_scene(
-        {"argon": len(points)}, n * a, forces={"cutoff_A": cutoff, "truncation": "shift"},
-        stages=[stage_of(pressure_bar=0.0, **limits)], output={"pressure_tensor": True},
-    )  # fmt: skip
+        {"argon": len(points)},
+        n * a,
+        forces={"cutoff_A": cutoff, "truncation": "shift"},
+        stages=[stage_of(pressure_bar=0.0, **limits)],
+        output={"pressure_tensor": True},
+    )
     results, found = minimum_of(scene, state_of(position, cell=np.eye(3) * n * a))
     assert found["converged"]
     assert found["largest_pressure_deviation_bar"] <= 1e-3
@@ -224,22 +249,33 @@ def nitrogen_crystal(a: float, n: int, matrix: np.ndarray) -> tuple[State, np.nd
     axes = np.tile(along, (n**3, 1))
     across = np.cross(axes, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=1)[:, None]
-    rotation = np.stack([axes, across, np.cross(axes, across)], axis=2)  # the molecule lies along its first axis
+    rotation = np.stack(
+        [axes, across, np.cross(axes, across)], axis=2
+    )  # the molecule lies along its first axis
     return state_of(centres @ matrix, None, rotation, None, n * a * np.eye(3) @ matrix), axes
 
 
 def test_a_nitrogen_crystal_finds_its_shape_and_stays():
     n = 3
     sheared = np.array([[1.0, 0, 0], [0.02, 1.0, 0], [-0.01, 0, 1.0]])
-    stage = stage_of(pressure_bar=0.0, pressure_coupling="flexible", pressure_limit_bar=1e-3, **TIGHT)
+    stage = stage_of(
+        pressure_bar=0.0, pressure_coupling="flexible", pressure_limit_bar=1e-3, **TIGHT
+    )
     found = []
     for matrix in (np.eye(3), sheared):
         state, axes = nitrogen_crystal(5.66, n, matrix)
-        scene = small_scene({"nitrogen": len(axes)}, 5.66 * n, forces={"cutoff_A": 8.0}, stages=[stage, stage])
+        scene = small_scene(
+            {"nitrogen": len(axes)}, 5.66 * n, forces={"cutoff_A": 8.0}, stages=[stage, stage]
+        )
         results, again = minimum_of(scene, state)
-        assert [stage["minimum"]["converged"] for stage in results.summary["stages"]] == [True, True]
+        assert [stage["minimum"]["converged"] for stage in results.summary["stages"]] == [
+            True,
+            True,
+        ]
         assert again["iterations"] == 0
-        assert np.abs(np.einsum("ni,ni->n", results.state.rotation[:, :, 0], axes)) == pytest.approx(1.0, abs=1e-9)
+        assert np.abs(
+            np.einsum("ni,ni->n", results.state.rotation[:, :, 0], axes)
+        ) == pytest.approx(1.0, abs=1e-9)
         found.append((results.state.cell, again["energy_after_kJ_mol_per_molecule"]))
     (cubic, energy), (relaxed, other) = found
     assert np.abs(cubic - cubic[0, 0] * np.eye(3)).max() < 1e-6
@@ -250,12 +286,16 @@ def test_a_nitrogen_crystal_finds_its_shape_and_stays():
 @pytest.mark.parametrize("coupling", ASKED)
 def test_the_cell_takes_the_pressure_asked_for(coupling):
     """Each coordinate of the coupling its own; what no coordinate holds stays as it was."""
-    asked = {"semi_isotropic": (900.0, 900.0, 500.0), "flexible": (100.0, 200.0, 300.0, 100.0, -100.0, 150.0)}.get(
-        coupling, ASKED[coupling]
-    )
+    asked = {
+        "semi_isotropic": (900.0, 900.0, 500.0),
+        "flexible": (100.0, 200.0, 300.0, 100.0, -100.0, 150.0),
+    }.get(coupling, ASKED[coupling])
     stage = stage_of(pressure_bar=asked, pressure_coupling=coupling, pressure_limit_bar=0.1)
     scene = small_scene(
-        {"argon": 20, "nitrogen": 20, "spce": 30}, 15.5, forces=FORCES | {"cutoff_A": 5.0}, stages=[stage]
+        {"argon": 20, "nitrogen": 20, "spce": 30},
+        15.5,
+        forces=FORCES | {"cutoff_A": 5.0},
+        stages=[stage],
     )
     system, _, state = shaken(build(scene), 1)
     volume = state.volume
@@ -278,7 +318,8 @@ def test_the_cell_takes_the_pressure_asked_for(coupling):
 
 
 def test_it_begins_from_overlaps():
-    """Two pairs of molecules in one another, one of them a hundredth of a diameter apart: 1e24 wells."""
+    """Two pairs of molecules in one another, one of them a hundredth of a diameter apart: 1e24
+    wells."""
     scene = small_scene({"argon": 10, "spce": 10}, 18.5, stages=[stage_of()])
     system, _, state = shaken(build(scene), 1, spread=0.1)
     state.position[1] = state.position[0] + [0.03, 0.01, 0.0]
@@ -293,7 +334,9 @@ def test_it_begins_from_overlaps():
 
 
 def test_frozen_molecules_stay():
-    scene = small_scene({}, 18.5, molecules=[{"model": "spce", "count": 12, "frozen": "1-4"}], stages=[stage_of()])
+    scene = small_scene(
+        {}, 18.5, molecules=[{"model": "spce", "count": 12, "frozen": "1-4"}], stages=[stage_of()]
+    )
     system, _, state = shaken(build(scene), 1, spread=0.1)
     before, held = state.copy(), ~mobile(system.model)
     found = minimise(system, state, scene.stages[0])
@@ -306,7 +349,9 @@ def test_frozen_molecules_stay():
 
 def test_what_it_keeps_and_what_it_books():
     scene = small_scene(
-        {"argon": 10, "spce": 10}, 18.5, stages=[{"duration_ps": 0.01}, stage_of(), {"duration_ps": 0.01}]
+        {"argon": 10, "spce": 10},
+        18.5,
+        stages=[{"duration_ps": 0.01}, stage_of(), {"duration_ps": 0.01}],
     )
     seen = []
 
@@ -315,7 +360,15 @@ def test_what_it_keeps_and_what_it_books():
 
         def see(self, moment):
             state = moment.state
-            seen.append((moment.step, moment.time, state.velocity, state.angular_momentum_body, state.position))
+            seen.append(
+                (
+                    moment.step,
+                    moment.time,
+                    state.velocity,
+                    state.angular_momentum_body,
+                    state.position,
+                )
+            )
 
     once = []
     observers = [Look(0.01, print), Every(0.01, lambda moment: once.append(moment.state.position))]
@@ -348,21 +401,27 @@ def test_what_it_keeps_and_what_it_books():
     ):
         assert middle[key] is None
     assert middle["steps"] == 0
-    assert middle["potential_kJ_mol_per_molecule"] == middle["minimum"]["energy_after_kJ_mol_per_molecule"]
+    assert (
+        middle["potential_kJ_mol_per_molecule"]
+        == middle["minimum"]["energy_after_kJ_mol_per_molecule"]
+    )
     assert results.universe().trajectory.dt > 0
 
 
 def test_it_says_how_far_it_came():
     scene = small_scene({"spce": 10}, 18.5, stages=[stage_of(most_iterations=3)])
     with pytest.warns(
-        RigidMDWarning, match=r"stages.0: the minimisation has not converged after 3 iterations .*most_iterations = 3"
+        RigidMDWarning,
+        match=r"stages.0: the minimisation has not converged after 3 iterations .*most_iterations = 3",
     ):
         results, found = minimum_of(scene)
     assert not found["converged"]
     assert found["ended_by"] == "most_iterations = 3"
     assert found["iterations"] == 3
     assert found["largest_force_kJ_mol_A"] > 0.1
-    assert any("largest force" in note and "(limit 0.1)" in note for note in results.summary["notes"])
+    assert any(
+        "largest force" in note and "(limit 0.1)" in note for note in results.summary["notes"]
+    )
     assert found["energy_after_kJ_mol_per_molecule"] < found["energy_before_kJ_mol_per_molecule"]
 
 
@@ -378,24 +437,35 @@ def test_it_can_be_stopped():
 def test_charges_that_nothing_keeps_apart():
     ion = {"mass_u": 20.0, "position_A": [0.0, 0.0, 0.0]}
     molecules = [
-        {"name": "plus", "count": 1, "sites": [ion | {"name": "P", "charge_e": 1.0, "sigma_A": 2.5, "epsilon_kJ_mol": 0.4}]},
+        {
+            "name": "plus",
+            "count": 1,
+            "sites": [ion | {"name": "P", "charge_e": 1.0, "sigma_A": 2.5, "epsilon_kJ_mol": 0.4}],
+        },
         {"name": "minus", "count": 1, "sites": [ion | {"name": "M", "charge_e": -1.0}]},
-    ]  # fmt: skip
+    ]
     scene = small_scene({}, None, molecules=molecules, stages=[stage_of()])
     simulation = Simulation(scene)
     simulation.start_from(state_of([[0.0, 0, 0], [4.0, 0.3, 0]]))
-    with pytest.raises(SimulationError, match=r"no lower bound: P of molecule 1 .* and M of molecule 2 .*forces.pairs"):
+    with pytest.raises(
+        SimulationError,
+        match=r"no lower bound: P of molecule 1 .* and M of molecule 2 .*forces.pairs",
+    ):
         simulation.run()
 
 
 def test_a_box_that_nothing_holds_together():
-    scene = small_scene({"argon": 8}, 12.5, forces={"cutoff_A": 6.0}, stages=[stage_of(pressure_bar=-5000.0)])
+    scene = small_scene(
+        {"argon": 8}, 12.5, forces={"cutoff_A": 6.0}, stages=[stage_of(pressure_bar=-5000.0)]
+    )
     with pytest.raises(SimulationError, match=r"has grown to .* volumes .*higher pressure_bar"):
         minimum_of(scene)
 
 
 def test_a_box_that_becomes_too_small_for_the_cut_off():
-    scene = small_scene({"argon": 8}, 12.5, forces={"cutoff_A": 6.0}, stages=[stage_of(pressure_bar=5000.0)])
+    scene = small_scene(
+        {"argon": 8}, 12.5, forces={"cutoff_A": 6.0}, stages=[stage_of(pressure_bar=5000.0)]
+    )
     with pytest.raises(SimulationError, match="too small for the cutoff"):
         minimum_of(scene)
 
@@ -407,24 +477,48 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
         ([stage_of(timestep_fs=1.0)], {}, "timestep_fs would do nothing"),
         ([stage_of(temperature_K=300.0)], {}, "temperature_K would do nothing"),
         ([stage_of(integrator="srkn_6")], {}, "integrator would do nothing"),
-        ([stage_of(pressure_coupling="flexible")], {}, "would do nothing in a minimise stage without pressure_bar"),
-        ([stage_of(pressure_limit_bar=2.0)], {}, "would do nothing in a minimise stage without pressure_bar"),
+        (
+            [stage_of(pressure_coupling="flexible")],
+            {},
+            "would do nothing in a minimise stage without pressure_bar",
+        ),
+        (
+            [stage_of(pressure_limit_bar=2.0)],
+            {},
+            "would do nothing in a minimise stage without pressure_bar",
+        ),
         ([stage_of(pressure_bar=(1.0, 2.0))], {}, "one pressure, not one that changes"),
         ([stage_of(pressure_bar=(1.0, 2.0, 3.0))], {}, "pressure_coupling = 'anisotropic'"),
         ([stage_of(most_iterations=0)], {}, "most_iterations"),
         ([stage_of(force_limit_kJ_mol_A=0.0)], {}, "force_limit_kJ_mol_A"),
-        ([{"duration_ps": 1.0, "force_limit_kJ_mol_A": 0.2}], {}, "force_limit_kJ_mol_A would do nothing in an nve stage"),
+        (
+            [{"duration_ps": 1.0, "force_limit_kJ_mol_A": 0.2}],
+            {},
+            "force_limit_kJ_mol_A would do nothing in an nve stage",
+        ),
         ([{"ensemble": "nve"}], {}, r"stages.0.duration_ps: is missing"),
-        ([stage_of(), {"duration_ps": 1.0}], {"start": {}}, "the first stage that is not a minimisation is nve"),
-        ([stage_of(pressure_bar=1.0)], {"box": {"lengths_A": 20.0, "periodic": False}}, "box.periodic is false"),
-        ([stage_of(pressure_bar=1.0)], {"molecules": [{"model": "spce", "count": 4, "frozen": "1"}]}, "frozen molecules do not move"),
+        (
+            [stage_of(), {"duration_ps": 1.0}],
+            {"start": {}},
+            "the first stage that is not a minimisation is nve",
+        ),
+        (
+            [stage_of(pressure_bar=1.0)],
+            {"box": {"lengths_A": 20.0, "periodic": False}},
+            "box.periodic is false",
+        ),
+        (
+            [stage_of(pressure_bar=1.0)],
+            {"molecules": [{"model": "spce", "count": 4, "frozen": "1"}]},
+            "frozen molecules do not move",
+        ),
         (
             [stage_of(), {"ensemble": "nvt", "duration_ps": 1.0, "temperature_K": 300.0}],
             {"start": {"temperature_K": 0.0}},
             "cannot heat molecules at rest",
         ),
     ],
-)  # fmt: skip
+)
 def test_bad_input(stages, more, expected):
     with pytest.raises(SceneError, match=expected):
         small_scene({"spce": 4}, 20.0, stages=stages, **more)
@@ -475,7 +569,10 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
     (tmp_path / "scene.toml").write_text(SCENE)
     assert main(["check", str(tmp_path / "scene.toml")]) == 0
     said = capsys.readouterr().out
-    assert "0: minimise: to a minimum of the potential energy; no time passes and momenta do not change" in said
+    assert (
+        "0: minimise: to a minimum of the potential energy; no time passes and momenta do not change"
+        in said
+    )
     assert "1: cell: to a minimum of the enthalpy at 1 bar, the cell isotropic" in said
     assert "torques of 0.1 kJ/mol and a pressure within 1 bar; at most 5000 iterations" in said
     assert main(["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]) == 0
@@ -510,23 +607,39 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
 
 
 def test_a_minimum_alone_has_no_figure(tmp_path):
-    Simulation(small_scene({"argon": 4}, None, stages=[stage_of()], start={}), tmp_path / "out").run(progress=True)
+    Simulation(
+        small_scene({"argon": 4}, None, stages=[stage_of()], start={}), tmp_path / "out"
+    ).run(progress=True)
     assert "energy.png" not in {path.name for path in (tmp_path / "out").iterdir()}
     assert "stages:" in describe(small_scene({"argon": 4}, None, stages=[stage_of()], start={}))
 
 
 SHORT = {"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.02}
-SEVERAL = [stage_of(name="a"), stage_of(name="b"), SHORT, stage_of(name="c", most_iterations=3), SHORT]
-EVERY_STEP_OR_TWO = {"trajectory_interval_ps": 0.01, "log_interval_ps": 0.004, "pressure_tensor_interval_ps": 0.01}
+SEVERAL = [
+    stage_of(name="a"),
+    stage_of(name="b"),
+    SHORT,
+    stage_of(name="c", most_iterations=3),
+    SHORT,
+]
+EVERY_STEP_OR_TWO = {
+    "trajectory_interval_ps": 0.01,
+    "log_interval_ps": 0.004,
+    "pressure_tensor_interval_ps": 0.01,
+}
 
 
 def several(folder, stages, trajectory, **options):
     output = EVERY_STEP_OR_TWO | {"trajectory": trajectory, "figures": False}
-    scene = small_scene({"argon": 20}, 20.0, stages=stages, start={"temperature_K": 90.0}, output=output)
+    scene = small_scene(
+        {"argon": 20}, 20.0, stages=stages, start={"temperature_K": 90.0}, output=output
+    )
     return Simulation(scene, folder, warn=lambda warning: None, **options)
 
 
-@pytest.mark.parametrize("ending", [".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb", None])
+@pytest.mark.parametrize(
+    "ending", [".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb", None]
+)
 def test_a_trajectory_has_one_frame_of_each_time(tmp_path, ending):
     folder = None if ending is None else tmp_path / "out"
     seen = []
@@ -544,10 +657,16 @@ def test_a_trajectory_has_one_frame_of_each_time(tmp_path, ending):
     energies = results["potential"]
     minima = {0: results.summary["stages"][1], 2: results.summary["stages"][3]}
     for k, stage in minima.items():
-        assert results.atoms(k).get_potential_energy() / ase.units.kJ * ase.units.mol == pytest.approx(
+        assert results.atoms(
+            k
+        ).get_potential_energy() / ase.units.kJ * ase.units.mol == pytest.approx(
             20 * stage["minimum"]["energy_after_kJ_mol_per_molecule"]
         )
-    assert list(results["stage"][:3]) == [0, 0, 1]  # the log has the energy before each minimisation
+    assert list(results["stage"][:3]) == [
+        0,
+        0,
+        1,
+    ]  # the log has the energy before each minimisation
     assert energies[0] > energies[1] >= energies[2]
     if ending is None:
         assert results._tensor[:, 0] == pytest.approx(times)
@@ -560,7 +679,9 @@ def test_a_trajectory_has_one_frame_of_each_time(tmp_path, ending):
 
 
 @pytest.mark.parametrize("stopped_in", [0, 1, 3])
-def test_an_interrupted_minimisation_leaves_a_frame_that_its_repetition_replaces(tmp_path, monkeypatch, stopped_in):
+def test_an_interrupted_minimisation_leaves_a_frame_that_its_repetition_replaces(
+    tmp_path, monkeypatch, stopped_in
+):
     whole = several(tmp_path / "whole", SEVERAL, "t.xtc")
     whole.run()
     run = several(tmp_path / "out", SEVERAL, "t.xtc")
@@ -582,9 +703,15 @@ def test_an_interrupted_minimisation_leaves_a_frame_that_its_repetition_replaces
 
 def test_a_minimisation_and_its_overlap_removal_end_in_their_time(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(CheckpointSchedule, "time_is_up", property(lambda self: asked.append(1) or len(asked) > 1))
+    monkeypatch.setattr(
+        CheckpointSchedule, "time_is_up", property(lambda self: asked.append(1) or len(asked) > 1)
+    )
     (tmp_path / "two.xyz").write_text("3\n\nAr 0 0 0\nAr 0.9 0 0\nAr 0 1.1 0\n")
-    sections = {"structure": {"file": "two.xyz"}, "molecules": [{"model": "argon"}], "box": {"periodic": False}}
+    sections = {
+        "structure": {"file": "two.xyz"},
+        "molecules": [{"model": "argon"}],
+        "box": {"periodic": False},
+    }
     scene = small_scene({}, None, tmp_path, **sections, stages=[stage_of(), SHORT], start={})
     results = Simulation(scene, tmp_path / "out", warn=lambda warning: None).run()
     assert results.interrupted
@@ -612,16 +739,25 @@ def test_a_minimum_alone_has_one_frame(tmp_path):
 
 def test_structures_that_overlap_may_be_minimised(tmp_path):
     (tmp_path / "two.xyz").write_text("2\n\nAr 0 0 0\nAr 1.5 0 0\n")
-    sections = {"structure": {"file": "two.xyz"}, "molecules": [{"model": "argon"}], "box": {"periodic": False}}
-    scene = small_scene({}, None, tmp_path, **sections, stages=[stage_of(force_limit_kJ_mol_A=1e-4)], start={})
+    sections = {
+        "structure": {"file": "two.xyz"},
+        "molecules": [{"model": "argon"}],
+        "box": {"periodic": False},
+    }
+    scene = small_scene(
+        {}, None, tmp_path, **sections, stages=[stage_of(force_limit_kJ_mol_A=1e-4)], start={}
+    )
     results, found = minimum_of(scene)
     assert found["converged"]
     assert any("overlap" in note for note in results.summary["notes"])
-    assert np.linalg.norm(np.diff(results.state.position, axis=0)) == pytest.approx(2 ** (1 / 6) * 3.405, rel=1e-3)
+    assert np.linalg.norm(np.diff(results.state.position, axis=0)) == pytest.approx(
+        2 ** (1 / 6) * 3.405, rel=1e-3
+    )
 
 
 def test_compiling_is_not_minimising(monkeypatch):
-    """The first forces, which may compile for a minute, come before the clock of the stage, in its precision."""
+    """The first forces, which may compile for a minute, come before the clock of the stage, in its
+    precision."""
     from rigidmd.run import molecular
 
     order = []
@@ -657,7 +793,8 @@ def test_compiling_is_not_minimising(monkeypatch):
     ],
 )
 def test_loose_limits_need_no_double_precision(counts, limit, precision):
-    """The minimum is the same to the error of mixed precision; no kernel of double precision is loaded."""
+    """The minimum is the same to the error of mixed precision; no kernel of double precision is
+    loaded."""
     limits = {"force_limit_kJ_mol_A": limit, "torque_limit_kJ_mol": limit}
     energies = {}
     for each in ("mixed", "double"):
@@ -700,8 +837,12 @@ def test_where_mixed_precision_stalls_double_precision_continues(monkeypatch):
 
 @pytest.mark.parametrize("field", [5.3, 8.0])
 def test_molecules_in_a_uniform_field_alone_have_torques_and_no_forces(field):
-    """They rotate until the first step is short enough; ions in a field too strong for the step are not badly packed."""
-    sections = {"forces": {"lennard_jones": False, "electrostatics": "none"}, "start": {"temperature_K": 300.0}}
+    """They rotate until the first step is short enough; ions in a field too strong for the step are
+    not badly packed."""
+    sections = {
+        "forces": {"lennard_jones": False, "electrostatics": "none"},
+        "start": {"temperature_K": 300.0},
+    }
     sections |= {
         "fields": {"electric_V_per_nm": [0.0, 0.0, field]},
         "stages": [{"duration_ps": 0.5, "timestep_fs": 6.25}],
@@ -712,5 +853,7 @@ def test_molecules_in_a_uniform_field_alone_have_torques_and_no_forces(field):
     assert removal.steps > 0
     assert removal.excess <= 1
     sections["stages"] = [{"duration_ps": 5.0, "timestep_fs": 500.0}]
-    with pytest.raises(SceneError, match=r"timestep_fs of the first stage is too long for electric"):
+    with pytest.raises(
+        SceneError, match=r"timestep_fs of the first stage is too long for electric"
+    ):
         Simulation(small_scene({"na_spce": 3}, None, **sections), warn=str).start()

@@ -1,4 +1,5 @@
-"""The models that come along: published geometry, dipoles and inertia; other isotopes; molecules of one's own."""
+"""The models that come along: published geometry, dipoles and inertia; other isotopes; molecules of
+one's own."""
 
 import json
 import re
@@ -30,95 +31,258 @@ DEBYE = 4.80320471  # D in e Å
 #: B in cm⁻¹ times I in u Å²: h / (8 pi² c), CODATA 2018.
 ROTATIONAL = 16.857629
 
-# name: kind, degrees of freedom, mass u, dipole D and what it may differ by (the digits of its source), lengths Å, angles.
-# Dipoles are those of the models' own papers, or of Vega & Abascal 2011, Phys. Chem. Chem. Phys. 13, 19663 (water), and
-# where no paper is at hand computed by the formula beside it.
+# name: kind, degrees of freedom, mass u, dipole D and what it may differ by (the digits of its
+# source), lengths Å, angles. Dipoles are those of the models' own papers, or of Vega & Abascal
+# 2011, Phys. Chem. Chem. Phys. 13, 19663 (water), and where no paper is at hand computed by the
+# formula beside it.
 OH, HOH = ("OW", "HW1"), ("HW1", "OW", "HW2")
 MODEL_TABLE = {
     "spc": ("asymmetric", 6, 18.0154, (2.27, 6e-3), {OH: 1.0}, {HOH: 109.47}),
     "spce": ("asymmetric", 6, 18.0154, (2.351, 1e-3), {OH: 1.0}, {HOH: 109.47}),
     "tip3p": ("asymmetric", 6, 18.0154, (2.347, 1e-3), {OH: 0.9572}, {HOH: 104.52}),
-    "tip3pew": ("asymmetric", 6, 18.0154, (2.347 * 0.415 / 0.417, 1e-3), {OH: 0.9572}, {HOH: 104.52}),
-    "tip4p": ("asymmetric", 6, 18.0154, (2.177, 1e-3), {OH: 0.9572, ("OW", "MW"): 0.15}, {HOH: 104.52}),
-    "tip4pew": ("asymmetric", 6, 18.0154, (2.321, 1e-3), {OH: 0.9572, ("OW", "MW"): 0.125}, {HOH: 104.52}),
-    "tip4p2005": ("asymmetric", 6, 18.0154, (2.305, 1e-3), {OH: 0.9572, ("OW", "MW"): 0.1546}, {HOH: 104.52}),
-    "tip4pice": ("asymmetric", 6, 18.0154, (2.426, 1e-3), {OH: 0.9572, ("OW", "MW"): 0.1577}, {HOH: 104.52}),
+    "tip3pew": (
+        "asymmetric",
+        6,
+        18.0154,
+        (2.347 * 0.415 / 0.417, 1e-3),
+        {OH: 0.9572},
+        {HOH: 104.52},
+    ),
+    "tip4p": (
+        "asymmetric",
+        6,
+        18.0154,
+        (2.177, 1e-3),
+        {OH: 0.9572, ("OW", "MW"): 0.15},
+        {HOH: 104.52},
+    ),
+    "tip4pew": (
+        "asymmetric",
+        6,
+        18.0154,
+        (2.321, 1e-3),
+        {OH: 0.9572, ("OW", "MW"): 0.125},
+        {HOH: 104.52},
+    ),
+    "tip4p2005": (
+        "asymmetric",
+        6,
+        18.0154,
+        (2.305, 1e-3),
+        {OH: 0.9572, ("OW", "MW"): 0.1546},
+        {HOH: 104.52},
+    ),
+    "tip4pice": (
+        "asymmetric",
+        6,
+        18.0154,
+        (2.426, 1e-3),
+        {OH: 0.9572, ("OW", "MW"): 0.1577},
+        {HOH: 104.52},
+    ),
     # charges, lengths and the angle give 2.4345 D
     "tip4peps": (
-        "asymmetric", 6, 18.0154, (2 * 0.527 * (0.9572 * np.cos(np.radians(52.26)) - 0.105) * DEBYE, 1e-6),
-        {OH: 0.9572, ("OW", "MW"): 0.105}, {HOH: 104.52},
+        "asymmetric",
+        6,
+        18.0154,
+        (2 * 0.527 * (0.9572 * np.cos(np.radians(52.26)) - 0.105) * DEBYE, 1e-6),
+        {OH: 0.9572, ("OW", "MW"): 0.105},
+        {HOH: 104.52},
     ),
     "tip5p": (
-        "asymmetric", 6, 18.0154, (2.29, 5e-3), {OH: 0.9572, ("OW", "LP1"): 0.7, ("OW", "LP2"): 0.7},
+        "asymmetric",
+        6,
+        18.0154,
+        (2.29, 5e-3),
+        {OH: 0.9572, ("OW", "LP1"): 0.7, ("OW", "LP2"): 0.7},
         {HOH: 104.52, ("LP1", "OW", "LP2"): 109.47},
     ),
-    "opc": ("asymmetric", 6, 18.0154, (2.48, 5e-3), {OH: 0.8724, ("OW", "MW"): 0.1594}, {HOH: 103.6}),
-    "opc3": ("asymmetric", 6, 18.0154, (2.43, 5e-3), {OH: 0.97888, ("HW1", "HW2"): 1.598507}, {HOH: 109.47}),
+    "opc": (
+        "asymmetric",
+        6,
+        18.0154,
+        (2.48, 5e-3),
+        {OH: 0.8724, ("OW", "MW"): 0.1594},
+        {HOH: 103.6},
+    ),
+    "opc3": (
+        "asymmetric",
+        6,
+        18.0154,
+        (2.43, 5e-3),
+        {OH: 0.97888, ("HW1", "HW2"): 1.598507},
+        {HOH: 109.47},
+    ),
     "nitrogen": ("linear", 5, 28.0134, (0.0, 1e-9), {("N1", "N2"): 1.09}, {}),
-    "nitrogen_trappe": ("linear", 5, 28.0134, (0.0, 1e-9), {("N1", "N2"): 1.1, ("N1", "M"): 0.55}, {}),
+    "nitrogen_trappe": (
+        "linear",
+        5,
+        28.0134,
+        (0.0, 1e-9),
+        {("N1", "N2"): 1.1, ("N1", "M"): 0.55},
+        {},
+    ),
     "nitrogen_2cljq": ("linear", 5, 28.0134, (0.0, 1e-9), {("N1", "N2"): 1.0464}, {}),
     "oxygen_trappe": ("linear", 5, 31.9988, (0.0, 1e-9), {("O1", "O2"): 1.21}, {}),
     "oxygen_2cljq": ("linear", 5, 31.9988, (0.0, 1e-9), {("O1", "O2"): 0.9699}, {}),
-    "co2_trappe": ("linear", 5, 44.0098, (0.0, 1e-9), {("C", "O1"): 1.16}, {("O1", "C", "O2"): 180.0}),
-    "co2_epm2": ("linear", 5, 44.0098, (0.0, 1e-9), {("C", "O1"): 1.149}, {("O1", "C", "O2"): 180.0}),
+    "co2_trappe": (
+        "linear",
+        5,
+        44.0098,
+        (0.0, 1e-9),
+        {("C", "O1"): 1.16},
+        {("O1", "C", "O2"): 180.0},
+    ),
+    "co2_epm2": (
+        "linear",
+        5,
+        44.0098,
+        (0.0, 1e-9),
+        {("C", "O1"): 1.149},
+        {("O1", "C", "O2"): 180.0},
+    ),
     "co2_2cljq": ("linear", 5, 44.0098, (0.0, 1e-9), {("CO1", "CO2"): 2.4176}, {}),
     "ethane_trappe": ("linear", 5, 30.07, (0.0, 1e-9), {("C1", "C2"): 1.54}, {}),
     "ethane_2cljq": ("linear", 5, 30.07, (0.0, 1e-9), {("C1", "C2"): 2.3762}, {}),
     "ethylene_trappe": ("linear", 5, 28.054, (0.0, 1e-9), {("C1", "C2"): 1.33}, {}),
     "ethylene_2cljq": ("linear", 5, 28.054, (0.0, 1e-9), {("C1", "C2"): 1.2695}, {}),
     "acetylene_2cljq": ("linear", 5, 26.038, (0.0, 1e-9), {("C1", "C2"): 1.2998}, {}),
-    # three charges at the height of the hydrogens below nitrogen, less M: 3 q (h - 0.08), h² = 1.012² (1 - 4/3 sin²(t/2))
+    # three charges at the height of the hydrogens below nitrogen, less M: 3 q (h - 0.08), h² =
+    # 1.012² (1 - 4/3 sin²(t/2))
     "ammonia_trappe": (
-        "symmetric", 6, 17.0307,
+        "symmetric",
+        6,
+        17.0307,
         (1.23 * (1.012 * np.sqrt(1 - 4 / 3 * np.sin(np.radians(53.35)) ** 2) - 0.08) * DEBYE, 1e-6),
-        {("N", "H1"): 1.012, ("N", "M"): 0.08}, {("H1", "N", "H2"): 106.7, ("H2", "N", "H3"): 106.7},
+        {("N", "H1"): 1.012, ("N", "M"): 0.08},
+        {("H1", "N", "H2"): 106.7, ("H2", "N", "H3"): 106.7},
     ),
     # 2 0.235 1.336 cos(46.035°)
     "h2s_opls": (
-        "asymmetric", 6, 34.076, (0.47 * 1.336 * np.cos(np.radians(46.035)) * DEBYE, 1e-6), {("S", "H1"): 1.336},
+        "asymmetric",
+        6,
+        34.076,
+        (0.47 * 1.336 * np.cos(np.radians(46.035)) * DEBYE, 1e-6),
+        {("S", "H1"): 1.336},
         {("H1", "S", "H2"): 92.07},
     ),
-    "so2": ("asymmetric", 6, 64.0588, (1.998, 5e-4), {("S", "O1"): 1.4782}, {("O1", "S", "O2"): 119.82}),
+    "so2": (
+        "asymmetric",
+        6,
+        64.0588,
+        (1.998, 5e-4),
+        {("S", "O1"): 1.4782},
+        {("O1", "S", "O2"): 119.82},
+    ),
     "methane_trappe": ("point", 3, 16.043, (0.0, 1e-9), {}, {}),
-    "methane_opls": ("spherical", 6, 16.043, (0.0, 1e-9), {("C", "H1"): 1.09}, {("H1", "C", "H3"): 109.4712}),
+    "methane_opls": (
+        "spherical",
+        6,
+        16.043,
+        (0.0, 1e-9),
+        {("C", "H1"): 1.09},
+        {("H1", "C", "H3"): 109.4712},
+    ),
     "benzene_opls": (
-        "symmetric", 6, 78.114, (0.0, 1e-9), {("C1", "C2"): 1.4, ("C4", "H4"): 1.08},
+        "symmetric",
+        6,
+        78.114,
+        (0.0, 1e-9),
+        {("C1", "C2"): 1.4, ("C4", "H4"): 1.08},
         {("C1", "C2", "C3"): 120.0, ("C1", "C2", "H2"): 120.0},
     ),
     "benzene_trappe": (
-        "symmetric", 6, 78.114, (0.0, 1e-9), {("C1", "C2"): 1.392, ("C4", "H4"): 1.08},
+        "symmetric",
+        6,
+        78.114,
+        (0.0, 1e-9),
+        {("C1", "C2"): 1.392, ("C4", "H4"): 1.08},
         {("C1", "C2", "C3"): 120.0, ("C1", "C2", "H2"): 120.0},
     ),
     # 0.725 0.917 - 1.45 0.166
     "hf_jorgensen": (
-        "linear", 5, 20.006, ((0.725 * 0.917 - 1.45 * 0.166) * DEBYE, 1e-6), {("F", "H"): 0.917, ("F", "M"): 0.166}, {},
+        "linear",
+        5,
+        20.006,
+        ((0.725 * 0.917 - 1.45 * 0.166) * DEBYE, 1e-6),
+        {("F", "H"): 0.917, ("F", "M"): 0.166},
+        {},
     ),
     "methanol_trappe": (
-        "asymmetric", 6, 32.0424, (2.22, 5e-3), {("CH3", "O"): 1.43, ("O", "H"): 0.945}, {("CH3", "O", "H"): 108.5},
+        "asymmetric",
+        6,
+        32.0424,
+        (2.22, 5e-3),
+        {("CH3", "O"): 1.43, ("O", "H"): 0.945},
+        {("CH3", "O", "H"): 108.5},
     ),
-    "acetonitrile_opls": ("linear", 5, 41.0527, (3.44, 5e-3), {("CH3", "C"): 1.458, ("C", "N"): 1.157}, {}),
+    "acetonitrile_opls": (
+        "linear",
+        5,
+        41.0527,
+        (3.44, 5e-3),
+        {("CH3", "C"): 1.458, ("C", "N"): 1.157},
+        {},
+    ),
     # 0.269 1.54 + 0.398 1.157
     "acetonitrile_trappe": (
-        "linear", 5, 41.0527, ((0.269 * 1.54 + 0.398 * 1.157) * DEBYE, 1e-6), {("CH3", "C"): 1.54, ("C", "N"): 1.157}, {},
+        "linear",
+        5,
+        41.0527,
+        ((0.269 * 1.54 + 0.398 * 1.157) * DEBYE, 1e-6),
+        {("CH3", "C"): 1.54, ("C", "N"): 1.157},
+        {},
     ),
-    "ccl4": ("spherical", 6, 153.823, (0.0, 1e-9), {("C", "CL1"): 2.0438}, {("CL1", "C", "CL2"): 109.4712}),
+    "ccl4": (
+        "spherical",
+        6,
+        153.823,
+        (0.0, 1e-9),
+        {("C", "CL1"): 2.0438},
+        {("CL1", "C", "CL2"): 109.4712},
+    ),
     "argon": ("point", 3, 39.948, (0.0, 1e-9), {}, {}),
     "neon": ("point", 3, 20.1797, (0.0, 1e-9), {}, {}),
     "krypton": ("point", 3, 83.798, (0.0, 1e-9), {}, {}),
     "xenon": ("point", 3, 131.293, (0.0, 1e-9), {}, {}),
-}  # fmt: skip
+}
 
 # Rmin/2 in Å and epsilon in kcal/mol of Joung & Cheatham 2008; masses of IUPAC.
 IONS = {
-    "spce": {"li": (0.791, 0.3367344), "na": (1.212, 0.3526418), "k": (1.593, 0.4297054), "rb": (1.737, 0.4451036),
-             "cs": (2.021, 0.0898565), "f": (2.257, 0.0074005), "cl": (2.711, 0.0127850), "br": (2.751, 0.0269586),
-             "i": (2.919, 0.0427845)},
-    "tip4pew": {"li": (0.808, 0.1039884), "na": (1.226, 0.1684375), "k": (1.590, 0.2794651), "rb": (1.709, 0.4331494),
-                "cs": (1.888, 0.3944318), "f": (2.538, 0.0015752), "cl": (2.760, 0.0116615), "br": (2.768, 0.0303773),
-                "i": (2.952, 0.0417082)},
-}  # fmt: skip
-MASSES = {"li": 6.94, "na": 22.98977, "k": 39.0983, "rb": 85.4678, "cs": 132.90545, "f": 18.998403, "cl": 35.453,
-          "br": 79.904, "i": 126.90447}  # fmt: skip
+    "spce": {
+        "li": (0.791, 0.3367344),
+        "na": (1.212, 0.3526418),
+        "k": (1.593, 0.4297054),
+        "rb": (1.737, 0.4451036),
+        "cs": (2.021, 0.0898565),
+        "f": (2.257, 0.0074005),
+        "cl": (2.711, 0.0127850),
+        "br": (2.751, 0.0269586),
+        "i": (2.919, 0.0427845),
+    },
+    "tip4pew": {
+        "li": (0.808, 0.1039884),
+        "na": (1.226, 0.1684375),
+        "k": (1.590, 0.2794651),
+        "rb": (1.709, 0.4331494),
+        "cs": (1.888, 0.3944318),
+        "f": (2.538, 0.0015752),
+        "cl": (2.760, 0.0116615),
+        "br": (2.768, 0.0303773),
+        "i": (2.952, 0.0417082),
+    },
+}
+MASSES = {
+    "li": 6.94,
+    "na": 22.98977,
+    "k": 39.0983,
+    "rb": 85.4678,
+    "cs": 132.90545,
+    "f": 18.998403,
+    "cl": 35.453,
+    "br": 79.904,
+    "i": 126.90447,
+}
 
 
 def at(m, name):
@@ -161,7 +325,9 @@ def test_geometry_mass_and_dipole_are_the_published_ones(name):
     for (a, b), length in lengths.items():
         assert np.linalg.norm(at(m, a) - at(m, b)) == pytest.approx(length, abs=6e-5), (a, b)
     for (a, corner, b), degrees in angles.items():
-        assert angle(m, a, corner, b) == pytest.approx(degrees, abs=2e-2 if name in ("so2",) else 6e-3), (a, corner, b)
+        assert angle(m, a, corner, b) == pytest.approx(
+            degrees, abs=2e-2 if name in ("so2",) else 6e-3
+        ), (a, corner, b)
 
 
 @pytest.mark.parametrize("name", [n for n in MODEL_TABLE if load_model(n).group == "water"])
@@ -175,7 +341,10 @@ def test_the_inertia_of_water(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "constants"),  # cm⁻¹ of the real molecule in its ground state, Huber & Herzberg 1979 and Herzberg 1966
+    (
+        "name",
+        "constants",
+    ),  # cm⁻¹ of the real molecule in its ground state, Huber & Herzberg 1979 and Herzberg 1966
     [
         ("nitrogen_trappe", [1.9896]),
         ("oxygen_trappe", [1.4377]),
@@ -191,8 +360,8 @@ def test_the_inertia_of_water(name):
     ],
 )
 def test_the_inertia_of_real_molecules(name, constants):
-    """A model that keeps the shape of its molecule turns as it does, within the 3 % that vibration is worth (of water's
-    plane, whose moments do not add up in the ground state)."""
+    """A model that keeps the shape of its molecule turns as it does, within the 3 % that vibration
+    is worth (of water's plane, whose moments do not add up in the ground state)."""
     m = load_model(name)
     found = ROTATIONAL / m.inertia[m.inertia > 0][: len(constants)]
     assert found == pytest.approx(constants, rel=3e-2)
@@ -224,9 +393,12 @@ def test_charges_in_the_place_of_a_quadrupole(name, quadrupole):
     assert found == pytest.approx(quadrupole, abs=2e-4)
 
 
-@pytest.mark.parametrize(("turn", "within"), [("T", 0.006), ("side by side", 0.04), ("slipped", 0.017)])
+@pytest.mark.parametrize(
+    ("turn", "within"), [("T", 0.006), ("side by side", 0.04), ("slipped", 0.017)]
+)
 def test_how_well_charges_stand_for_a_quadrupole(turn, within):
-    """What the files say: energies of two at 4 Å against those of point quadrupoles (Gray & Gubbins 1984)."""
+    """What the files say: energies of two at 4 Å against those of point quadrupoles (Gray & Gubbins
+    1984)."""
     m = load_model("acetylene_2cljq")
     row = np.flatnonzero(m.charges)
     along, q = m.positions_body[row, 0], m.charges[row]
@@ -241,7 +413,9 @@ def test_how_well_charges_stand_for_a_quadrupole(turn, within):
     assert abs(energy / ideal - 1) == pytest.approx(within, rel=0.1)
 
 
-@pytest.mark.parametrize(("water", "ion"), [(water, ion) for water, table in IONS.items() for ion in table])
+@pytest.mark.parametrize(
+    ("water", "ion"), [(water, ion) for water, table in IONS.items() for ion in table]
+)
 def test_ions(water, ion):
     m = load_model(f"{ion}_{water}")
     half, depth = IONS[water][ion]
@@ -254,8 +428,12 @@ def test_ions(water, ion):
 
 def test_lennard_jones_parameters_in_the_units_of_their_papers():
     spc = load_model("spc")  # A = 0.37122 nm (kJ/mol)^(1/6), B = 0.3428 nm (kJ/mol)^(1/12)
-    assert (4 * epsilon(spc) * (spc.sigma[0] / 10) ** 6) ** (1 / 6) == pytest.approx(0.37122, rel=1e-6)
-    assert (4 * epsilon(spc) * (spc.sigma[0] / 10) ** 12) ** (1 / 12) == pytest.approx(0.3428, rel=1e-6)
+    assert (4 * epsilon(spc) * (spc.sigma[0] / 10) ** 6) ** (1 / 6) == pytest.approx(
+        0.37122, rel=1e-6
+    )
+    assert (4 * epsilon(spc) * (spc.sigma[0] / 10) ** 12) ** (1 / 12) == pytest.approx(
+        0.3428, rel=1e-6
+    )
     tip4p = load_model("tip4p")  # 600,000 and 610 kcal/mol
     assert 4 * epsilon(tip4p) / 4.184 * tip4p.sigma[0] ** 12 == pytest.approx(600e3, rel=1e-3)
     assert 4 * epsilon(tip4p) / 4.184 * tip4p.sigma[0] ** 6 == pytest.approx(610, rel=1e-3)
@@ -294,7 +472,8 @@ def test_lennard_jones_parameters_in_the_units_of_their_papers():
 
 
 def test_lone_pairs_are_where_gromacs_builds_them():
-    """oplsaa.ff/tip5p.itp: x_L = x_O + a (r_1 + r_2) ± c (r_1 x r_2), a = -0.344908, c = 6.4437903493 / nm."""
+    """oplsaa.ff/tip5p.itp: x_L = x_O + a (r_1 + r_2) ± c (r_1 x r_2), a = -0.344908, c =
+    6.4437903493 / nm."""
     m = load_model("tip5p")
     first, second = at(m, "HW1") - at(m, "OW"), at(m, "HW2") - at(m, "OW")
     across = 0.64437903493 * np.cross(first, second)
@@ -322,7 +501,9 @@ def test_heavy_water():
 
 
 def test_isotopes_in_a_scene(tmp_path, capsys):
-    data = small_scene({"tip4p2005": 27}, 12.0, forces={"cutoff_A": 5.0}).model_dump(exclude_none=True)
+    data = small_scene({"tip4p2005": 27}, 12.0, forces={"cutoff_A": 5.0}).model_dump(
+        exclude_none=True
+    )
     data["molecules"] = [data["molecules"][0] | {"masses_u": {"H": 2.014, "OW": 17.999}}]
     assert build(Scene.from_dict(data)).species[0].mass == pytest.approx(17.999 + 2 * 2.014)
     data["molecules"] = [data["molecules"][0] | {"masses_u": {"MW": 1.0, "D": 2.0}}]
@@ -405,7 +586,9 @@ def test_a_geometry_with_a_table_of_parameters_is_the_model(own):
 
 def test_what_a_site_says_itself_goes_before_the_table(own):
     """The scene's own entry, a charge of zero too, and in another unit of energy."""
-    entry = 'sites = [{ name = "H", charge_e = 0.0, sigma_A = 2.5, epsilon_kJ_mol = 0.2 }]\ncount = 8'
+    entry = (
+        'sites = [{ name = "H", charge_e = 0.0, sigma_A = 2.5, epsilon_kJ_mol = 0.2 }]\ncount = 8'
+    )
     (own / "own.toml").write_text(OWN.replace("count = 8", entry))
     found = build(Scene.read(own / "own.toml")).species[0]
     hydrogen = [i for i, e in enumerate(found.elements) if e == "H"]
@@ -430,7 +613,10 @@ def test_sites_of_a_scene_take_their_parameters_from_the_table_too(own):
 
 def test_check_says_what_kind_of_molecule_it_is(own, capsys):
     assert main(["check", str(own / "own.toml")]) == 0
-    assert "8 benzene: symmetric, planar, 12 sites, 78.1140 u, neutral, no dipole" in capsys.readouterr().out
+    assert (
+        "8 benzene: symmetric, planar, 12 sites, 78.1140 u, neutral, no dipole"
+        in capsys.readouterr().out
+    )
     (own / "aromatic.toml").write_text(TABLE.replace("charge_e = 0.115", "charge_e = 0.215"))
     assert main(["check", str(own / "own.toml")]) == 0
     out = capsys.readouterr().out
@@ -456,7 +642,9 @@ def test_copied_files_do_not_rename_a_species(named, own):
     species = f'parameters = "aromatic.toml"\n{named}'
     other = '[[molecules]]\nfile = "inner.toml"\ncount = 2\n[fields]\nrestraints = [{ species = "SPECIES", stiffness_kJ_mol_A2 = 1.0 }]\n[start]'
     name = "ring" if named else "benzene"
-    text = OWN.replace('parameters = "aromatic.toml"\n', species).replace("[start]", other.replace("SPECIES", name))
+    text = OWN.replace('parameters = "aromatic.toml"\n', species).replace(
+        "[start]", other.replace("SPECIES", name)
+    )
     (own / "own.toml").write_text(text)
     first = build(Scene.read(own / "own.toml"))
     (own / "kept").mkdir()
@@ -470,15 +658,24 @@ def test_copied_files_do_not_rename_a_species(named, own):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (('parameters = "aromatic.toml"', 'parameters = "../aromatic.toml"'), "is outside the scene's folder"),
+        (
+            ('parameters = "aromatic.toml"', 'parameters = "../aromatic.toml"'),
+            "is outside the scene's folder",
+        ),
         (
             ('parameters = "aromatic.toml"', 'parameters = "none.toml"'),
             "line 6: molecules.0.parameters: there is no such file",
         ),
         (('parameters = "aromatic.toml"', 'parameters = "aromatic.csv"'), "must be a .toml file"),
-        (('parameters = "aromatic.toml"', ""), "a geometry file needs sites, or a file of parameters"),
+        (
+            ('parameters = "aromatic.toml"', ""),
+            "a geometry file needs sites, or a file of parameters",
+        ),
         (('file = "benzene.xyz"', 'model = "spce"'), "parameters would do nothing"),
-        (('"aromatic.toml"', '"aromatic.toml"\nsites = [{ name = "S" }]'), "sites: S is not an atom of it"),
+        (
+            ('"aromatic.toml"', '"aromatic.toml"\nsites = [{ name = "S" }]'),
+            "sites: S is not an atom of it",
+        ),
     ],
 )
 def test_faults_of_tables_in_a_scene(change, expected, own, capsys):
@@ -495,7 +692,10 @@ def test_faults_of_tables_in_a_scene(change, expected, own, capsys):
             "atom H: no entry of sites or of parameters has this name or the name H; there are ",
         ),
         (('name = "N"', 'name = "H"'), "sites: H appears twice"),
-        (("sigma_A = 2.42\n", ""), "needs both sigma_A and one of epsilon_kJ_mol, epsilon_kcal_mol, epsilon_K"),
+        (
+            ("sigma_A = 2.42\n", ""),
+            "needs both sigma_A and one of epsilon_kJ_mol, epsilon_kcal_mol, epsilon_K",
+        ),
         (("epsilon_kcal_mol = 0.03", "epsilon_kcal_mol = 0.03\nepsilon_K = 15.0"), "not both"),
         (("charge_e = 0.115", "charge = 0.115"), "did you mean charge_e?"),
         (("charge_e = 0.115", "position_A = [0, 0, 0]"), "position_A belongs to a molecule"),
@@ -509,7 +709,9 @@ def test_faults_of_a_table(change, expected, own, capsys):
 
 
 def test_another_mixing_rule_than_the_model_was_made_with_is_said(own, capsys):
-    text = OWN.replace('file = "benzene.xyz"\nparameters = "aromatic.toml"', 'model = "benzene_opls"')
+    text = OWN.replace(
+        'file = "benzene.xyz"\nparameters = "aromatic.toml"', 'model = "benzene_opls"'
+    )
     (own / "own.toml").write_text(text)
     assert main(["check", str(own / "own.toml")]) == 0
     assert "mixing" not in capsys.readouterr().out
@@ -527,7 +729,9 @@ def test_the_list_of_models_is_readable(capsys):
     assert max(map(len, lines)) <= 100
     listed = [line.split()[0] for line in lines if line.startswith("  ")]
     assert sorted(listed) == ALL
-    assert re.search(r"tip4p2005 +4 +18.02 +2.305 +\+0.5564 -1.113 +Abascal & Vega 2005", "\n".join(lines))
+    assert re.search(
+        r"tip4p2005 +4 +18.02 +2.305 +\+0.5564 -1.113 +Abascal & Vega 2005", "\n".join(lines)
+    )
     argon = models_table([load_model("argon")]).splitlines()[-1]
     assert argon.split() == ["argon", "1", "39.95", "Verlet", "1967"]
 
@@ -583,7 +787,9 @@ def test_a_drawing_is_not_overwritten_unasked(capsys, tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["tip4p2005.png"]
 
 
-@pytest.mark.parametrize("name", ["so2", "tip5p", "benzene_opls", "ccl4", "na_spce", "co2_epm2", "methane_trappe"])
+@pytest.mark.parametrize(
+    "name", ["so2", "tip5p", "benzene_opls", "ccl4", "na_spce", "co2_epm2", "methane_trappe"]
+)
 def test_every_kind_of_molecule_can_be_drawn(name, tmp_path):
     """Every site's name stands in the picture, once, and what is charged says so."""
     assert main(["models", name, "-o", str(tmp_path / "m.svg")]) == 0
@@ -614,7 +820,9 @@ def test_bonds_are_those_of_chemistry_and_join_everything():
         m = load_model(name)
         return {frozenset((m.site_names[i], m.site_names[j])) for i, j in bonds(m)}
 
-    assert named("tip4p2005") == {frozenset(p) for p in (("OW", "HW1"), ("OW", "HW2"), ("OW", "MW"))}
+    assert named("tip4p2005") == {
+        frozenset(p) for p in (("OW", "HW1"), ("OW", "HW2"), ("OW", "MW"))
+    }
     assert len(named("benzene_opls")) == 12
     assert named("so2") >= {frozenset(("S", "O1")), frozenset(("S", "O2"))}
     assert frozenset(("O1", "O2")) not in named("so2")
@@ -639,20 +847,31 @@ def test_a_model_that_is_not_there():
 
 def test_a_model_from_a_structure_reads_back_to_the_same_molecule(own, capsys, monkeypatch):
     monkeypatch.chdir(own)
-    (own / "aromatic.toml").write_text(TABLE.replace("charge_e = 0.115", "charge_e = 0.115\nparameters = { A = 0.1 }"))
-    assert main(["models", "--from", "benzene.xyz", "--parameters", "aromatic.toml", "--name", "ring"]) == 0
+    (own / "aromatic.toml").write_text(
+        TABLE.replace("charge_e = 0.115", "charge_e = 0.115\nparameters = { A = 0.1 }")
+    )
+    assert (
+        main(["models", "--from", "benzene.xyz", "--parameters", "aromatic.toml", "--name", "ring"])
+        == 0
+    )
     out, err = capsys.readouterr()
-    assert out.startswith("benzene.toml: ring, symmetric, planar, 12 sites, 78.1140 u, neutral, no dipole; geometry of")
+    assert out.startswith(
+        "benzene.toml: ring, symmetric, planar, 12 sites, 78.1140 u, neutral, no dipole; geometry of"
+    )
     assert 'file = "benzene.toml"' in out
     assert "no atom uses N" in err
-    scene = OWN.replace('file = "benzene.xyz"\nparameters = "aromatic.toml"', 'file = "benzene.toml"')
+    scene = OWN.replace(
+        'file = "benzene.xyz"\nparameters = "aromatic.toml"', 'file = "benzene.toml"'
+    )
     (own / "new.toml").write_text(scene)
     before, after = (build(Scene.read(own / name)).species[0] for name in ("own.toml", "new.toml"))
     for what in ("masses", "positions_body", "charges", "sigma", "epsilon", "inertia"):
         assert getattr(before, what).tobytes() == getattr(after, what).tobytes(), what
     assert after.parameters == before.parameters == 6 * ({},) + 6 * ({"A": 0.1},)
     assert (after.name, after.elements) == ("ring", before.elements)
-    assert after.site_names == tuple(f"{e}{k}" for e in "CH" for k in range(1, 7))  # atoms that share a name
+    assert after.site_names == tuple(
+        f"{e}{k}" for e in "CH" for k in range(1, 7)
+    )  # atoms that share a name
     assert main(["models", "benzene.toml"]) == 0
     assert "78.1140 u, neutral" in capsys.readouterr().out
 
@@ -679,7 +898,10 @@ def test_a_model_without_a_table_has_masses_and_says_what_to_fill_in(own, capsys
         ("O H H", "O H1 H2"),
         ("H1 H1 H11 H12", "H13 H14 H11 H12"),
         ("OW HW1 HW1 OW", "OW1 HW11 HW12 OW2"),
-        (" ".join(["HYDRO"] * 11), " ".join([*(f"HYDR{k}" for k in range(1, 10)), "HYD10", "HYD11"])),
+        (
+            " ".join(["HYDRO"] * 11),
+            " ".join([*(f"HYDR{k}" for k in range(1, 10)), "HYD10", "HYD11"]),
+        ),
     ],
 )
 def test_sites_of_a_new_model_have_names_of_their_own(names, numbered, own, capsys, monkeypatch):
@@ -692,17 +914,35 @@ def test_sites_of_a_new_model_have_names_of_their_own(names, numbered, own, caps
 
 def test_the_residue_and_charge_of_a_new_model(own, capsys, monkeypatch):
     monkeypatch.chdir(own)
-    lines = [f"ATOM  {k:>5} {name:<4} LIG A   1    {x:8.3f}   0.000   0.000  1.00  0.00          {name[0]:>2}"
-             for k, (name, x) in enumerate((("C1", 0.0), ("H1", 1.09)), 1)]  # fmt: skip
+    lines = [
+        f"ATOM  {k:>5} {name:<4} LIG A   1    {x:8.3f}   0.000   0.000  1.00  0.00          {name[0]:>2}"
+        for k, (name, x) in enumerate((("C1", 0.0), ("H1", 1.09)), 1)
+    ]
     (own / "lig.pdb").write_text(
         "CRYST1   30.000   30.000   30.000  90.00  90.00  90.00\n" + "\n".join(lines) + "\nEND\n"
     )
-    assert main(["models", "--from", "lig.pdb", "--parameters", "aromatic.toml", "-o", "x.toml"]) == 0
+    assert (
+        main(["models", "--from", "lig.pdb", "--parameters", "aromatic.toml", "-o", "x.toml"]) == 0
+    )
     assert "its cell is ignored" in capsys.readouterr().err
     assert read_molecule(own / "x.toml").residue_names == ("LIG",)
-    for charge, said in (("0.1151", "+0.0001 e, nearly but not exactly 0"), ("0.6", "+0.485 e, not a whole number")):
-        (own / "aromatic.toml").write_text(TABLE.replace("charge_e = 0.115", f"charge_e = {charge}"))
-        again = ["models", "--from", "lig.pdb", "--parameters", "aromatic.toml", "-o", "x.toml", "--force"]
+    for charge, said in (
+        ("0.1151", "+0.0001 e, nearly but not exactly 0"),
+        ("0.6", "+0.485 e, not a whole number"),
+    ):
+        (own / "aromatic.toml").write_text(
+            TABLE.replace("charge_e = 0.115", f"charge_e = {charge}")
+        )
+        again = [
+            "models",
+            "--from",
+            "lig.pdb",
+            "--parameters",
+            "aromatic.toml",
+            "-o",
+            "x.toml",
+            "--force",
+        ]
         assert main(again) == 0
         assert said in capsys.readouterr().err
 
@@ -719,25 +959,48 @@ CUT = '2\nLattice="5 0 0 0 5 0 0 0 5"\nN 0.3 0 0\nN 4.3 0 0\n'
         (["--from", "two.xyz"], "holds 2 structures: keep one"),
         (["--from", "pair.xyz"], "pair.xyz: has 2 molecules N2: keep one"),
         (["--from", "cut.xyz"], "bonded through the faces of its cell"),
-        (["--from", "benzene.xyz", "--parameters", "none.toml"], "none.toml: there is no such file"),
-        (["--from", "benzene.xyz", "--parameters", "poor.toml"], "atom H: no entry of the table has this name"),
+        (
+            ["--from", "benzene.xyz", "--parameters", "none.toml"],
+            "none.toml: there is no such file",
+        ),
+        (
+            ["--from", "benzene.xyz", "--parameters", "poor.toml"],
+            "atom H: no entry of the table has this name",
+        ),
         (["--from", "benzene.xyz", "--name", ""], "name: is ''"),
         (["--from", "benzene.xyz", "-o", "x.png"], "x.png: the name of this model ends in .toml"),
         (["--from", "benzene.xyz", "-o", "no/x.toml"], "the folder no does not exist"),
         (["--from", "benzene.xyz", "-o", "own.toml"], "own.toml exists; --force replaces it"),
-        (["--from", "benzene.xyz", "--parameters", "aromatic.toml", "-o", "aromatic.toml", "--force"],
-         "aromatic.toml is an input of this model"),
-        (["--from", "benzene.xyz", "--draw"], "draw it afterwards: rigidmd models benzene.toml --draw"),
+        (
+            [
+                "--from",
+                "benzene.xyz",
+                "--parameters",
+                "aromatic.toml",
+                "-o",
+                "aromatic.toml",
+                "--force",
+            ],
+            "aromatic.toml is an input of this model",
+        ),
+        (
+            ["--from", "benzene.xyz", "--draw"],
+            "draw it afterwards: rigidmd models benzene.toml --draw",
+        ),
         (["spce", "--from", "benzene.xyz"], "leave out spce"),
         (["spce", "--parameters", "aromatic.toml"], "--parameters belongs to --from FILE"),
         (["--name", "x"], "--name belongs to --from FILE"),
     ],
-)  # fmt: skip
+)
 def test_models_that_cannot_be_made(arguments, expected, own, capsys, monkeypatch):
     monkeypatch.chdir(own)
     benzene, pair = (own / "benzene.xyz").read_text(), "N 0 0 0\nN 1.1 0 0\nN 0 0 6\nN 1.1 0 6\n"
-    files = {"two.xyz": 2 * benzene, "pair.xyz": f"4\n\n{pair}", "cut.xyz": CUT,
-             "poor.toml": TABLE.replace('name = "H"', 'name = "F"')}  # fmt: skip
+    files = {
+        "two.xyz": 2 * benzene,
+        "pair.xyz": f"4\n\n{pair}",
+        "cut.xyz": CUT,
+        "poor.toml": TABLE.replace('name = "H"', 'name = "F"'),
+    }
     for name, text in files.items():
         (own / name).write_text(text)
     before = {path.name: path.read_bytes() for path in own.iterdir()}

@@ -1,4 +1,5 @@
-"""Names and paths of users in generated files that are code: they change texts in them, and nothing else."""
+"""Names and paths of users in generated files that are code: they change texts in them, and nothing
+else."""
 
 import ast
 import re
@@ -8,7 +9,15 @@ import subprocess
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from support import Manifest, SweepPoint, build, force_field_of, gromacs_files, lammps_files, write_slurm_script
+from support import (
+    Manifest,
+    SweepPoint,
+    build,
+    force_field_of,
+    gromacs_files,
+    lammps_files,
+    write_slurm_script,
+)
 
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.scene import Scene
@@ -16,9 +25,27 @@ from rigidmd.scene import Scene
 PLAIN = ("one", "two", "first", "AR", "RES")
 #: What some language obeys, at the ends of names and within them.
 EVIL = [
-    '"""; open("PWNED","w"); """', 'x"""', "a & b &", "$(touch PWNED)", "${x}", "`id`", "a; shell ls", "# a", "a\\",
-    "{stages}{title}{system}", "%s%n", "../../x", "[ system ]", "#include", "*/", "'''", "\\N{BULLET}", "é µ ₂", " ", "-rf",
-]  # fmt: skip
+    '"""; open("PWNED","w"); """',
+    'x"""',
+    "a & b &",
+    "$(touch PWNED)",
+    "${x}",
+    "`id`",
+    "a; shell ls",
+    "# a",
+    "a\\",
+    "{stages}{title}{system}",
+    "%s%n",
+    "../../x",
+    "[ system ]",
+    "#include",
+    "*/",
+    "'''",
+    "\\N{BULLET}",
+    "é µ ₂",
+    " ",
+    "-rf",
+]
 TEXT = st.one_of(
     st.sampled_from(EVIL),
     st.text(st.sampled_from("abz09 \"'`$&#;\\{}()[]<>%!*/|~@^,.:+=-_é₂"), min_size=1, max_size=30),
@@ -26,20 +53,35 @@ TEXT = st.one_of(
 )
 SITE = st.text(st.sampled_from("Aa9\"'`$&#;\\{}()[]<>%!*/|~@^,.:+=-_"), min_size=1, max_size=5)
 NAMES = st.tuples(TEXT, TEXT, TEXT, SITE, SITE)
-OFTEN = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+OFTEN = settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
 def data(names):
     """A scene of points of two species, two stages, with these names."""
     first, second, stage, site, residue = names
-    sites = [{"name": site, "element": "Ar", "mass_u": 40.0, "position_A": [0.0, 0.0, 0.0], "sigma_A": 3.4,
-              "epsilon_kJ_mol": 1.0}]  # fmt: skip
+    sites = [
+        {
+            "name": site,
+            "element": "Ar",
+            "mass_u": 40.0,
+            "position_A": [0.0, 0.0, 0.0],
+            "sigma_A": 3.4,
+            "epsilon_kJ_mol": 1.0,
+        }
+    ]
     entry = {"sites": sites, "count": 3, "residue_names": [residue]}
-    return (
-        {"name": "names", "box": {"lengths_A": 40.0}, "start": {"temperature_K": 90.0},
-         "molecules": [{"name": first, **entry}, {"name": first + second, **entry}],
-         "stages": [{"name": stage, "duration_ps": 0.1}, {"name": stage + stage, "duration_ps": 0.1}]}
-    )  # fmt: skip
+    return {
+        "name": "names",
+        "box": {"lengths_A": 40.0},
+        "start": {"temperature_K": 90.0},
+        "molecules": [{"name": first, **entry}, {"name": first + second, **entry}],
+        "stages": [
+            {"name": stage, "duration_ps": 0.1},
+            {"name": stage + stage, "duration_ps": 0.1},
+        ],
+    }
 
 
 def named(names):
@@ -93,16 +135,25 @@ def test_names_change_no_setting_of_gromacs(usual, tmp_path, names):
         files[name] = gromacs_files.write_gromacs(tmp_path / name, drawn, usual[0].state)
     assert len({*files["found"]}) == len(files["found"]) == len(files["usual"])
     for one, other in zip(*files.values(), strict=True):
-        before, after = (tmp_path / "usual" / one).read_text(), (tmp_path / "found" / other).read_text()
+        before, after = (
+            (tmp_path / "usual" / one).read_text(),
+            (tmp_path / "found" / other).read_text(),
+        )
         if one.endswith(".gro"):
             assert [(line[:5], line[15:], len(line)) for line in before.splitlines()[2:]] == [
                 (line[:5], line[15:], len(line)) for line in after.splitlines()[2:]
             ]
             continue
-        before, after = (without_comments(text, "#" if one == "run.sh" else ";") for text in (before, after))
+        before, after = (
+            without_comments(text, "#" if one == "run.sh" else ";") for text in (before, after)
+        )
         assert [len(line.split()) for line in before] == [len(line.split()) for line in after]
-        assert [line for line in before if line.startswith("[")] == [line for line in after if line.startswith("[")]
-        assert not re.search(r"[$`\\#]|^ *\*", "\n".join(after).replace('"$@"', "")) or one == "run.sh"
+        assert [line for line in before if line.startswith("[")] == [
+            line for line in after if line.startswith("[")
+        ]
+        assert (
+            not re.search(r"[$`\\#]|^ *\*", "\n".join(after).replace('"$@"', "")) or one == "run.sh"
+        )
     subprocess.run(["sh", "-n", tmp_path / "found" / "run.sh"], check=True)
     names = re.findall(r"^(\S+) 1$", (tmp_path / "found" / "topol.top").read_text(), re.MULTILINE)
     assert len(names) == len(set(names)) == 2
@@ -130,7 +181,9 @@ def test_names_change_no_statement_of_the_script_for_openmm(usual, tmp_path, nam
 def script(folder, name, scene, trust):
     points = [SweepPoint(f"p{k}", {}, "") for k in range(3)]
     folder.mkdir(parents=True, exist_ok=True)
-    path, _ = write_slurm_script(folder, Manifest(name, scene, {}, {}, {}, {}, points), 3600.0, 1, trust, 75)
+    path, _ = write_slurm_script(
+        folder, Manifest(name, scene, {}, {}, {}, {}, points), 3600.0, 1, trust, 75
+    )
     return path.read_text()
 
 
@@ -155,22 +208,45 @@ def test_paths_change_no_word_of_the_script_of_a_job(tmp_path, name, folder, sce
     text = script(tmp_path / folder, name, scene, [trust])
     assert tokens(text) == tokens(usual)
     subprocess.run(["bash", "-n", "-c", text], check=True)
-    options = [[line for line in one.splitlines() if line.startswith("#SBATCH")] for one in (usual, text)]
-    assert [line.split("=")[0] for line in options[0]] == [line.split("=")[0] for line in options[1]]
+    options = [
+        [line for line in one.splitlines() if line.startswith("#SBATCH")] for one in (usual, text)
+    ]
+    assert [line.split("=")[0] for line in options[0]] == [
+        line.split("=")[0] for line in options[1]
+    ]
     run = next(shlex.split(line) for line in text.splitlines() if line.startswith("rigidmd "))
-    assert run[:7] == ["rigidmd", "sweep", scene, "-o", str(tmp_path / folder), "--trust", str(tmp_path.cwd() / trust)]
+    assert run[:7] == [
+        "rigidmd",
+        "sweep",
+        scene,
+        "-o",
+        str(tmp_path / folder),
+        "--trust",
+        str(tmp_path.cwd() / trust),
+    ]
     output = next(line for line in options[1] if "--output" in line)
     written = str(tmp_path / folder).replace("%", "%%")
     assert output == f'#SBATCH --output="{written}/slurm-%a.out"'
 
 
-@pytest.mark.parametrize("hidden", ["\n", "\r", "\t", "\x00", "\x1b", "\x7f", "\x85", "\u2028", "\u202e"])
+@pytest.mark.parametrize(
+    "hidden", ["\n", "\r", "\t", "\x00", "\x1b", "\x7f", "\x85", "\u2028", "\u202e"]
+)
 @pytest.mark.parametrize(
     "key",
-    ["molecules.0.name", "stages.0.name", "name", "molecules.0.file", "structure.file", "molecules.0.sites.0.name"],
+    [
+        "molecules.0.name",
+        "stages.0.name",
+        "name",
+        "molecules.0.file",
+        "structure.file",
+        "molecules.0.sites.0.name",
+    ],
 )
 def test_names_with_control_characters_are_refused(key, hidden, tmp_path):
-    with pytest.raises(SceneError, match=r"control character|must be one|plain file name|should match") as refused:
+    with pytest.raises(
+        SceneError, match=r"control character|must be one|plain file name|should match"
+    ) as refused:
         Scene.from_dict(data(PLAIN), overrides={key: f"a{hidden}b"})
     assert key in str(refused.value)
     assert not any(hidden in fault for fault in refused.value.errors)

@@ -26,7 +26,11 @@ def words(*values):
 # counter (4 words), key (2 words), result: kat_vectors of Random123 for philox4x32-10
 KNOWN = [
     (words(*["0"] * 4), words("0", "0"), words("6627e8d5", "e169c58d", "bc57ac4c", "9b00dbd8")),
-    (words(*["ffffffff"] * 4), words(*["ffffffff"] * 2), words("408f276d", "41c83b0e", "a20bc7c6", "6d5451fd")),
+    (
+        words(*["ffffffff"] * 4),
+        words(*["ffffffff"] * 2),
+        words("408f276d", "41c83b0e", "a20bc7c6", "6d5451fd"),
+    ),
     (
         words("243f6a88", "85a308d3", "13198a2e", "03707344"),
         words("a4093822", "299f31d0"),
@@ -38,7 +42,12 @@ KNOWN = [
 @pytest.mark.parametrize(("counter", "key", "result"), KNOWN)
 def test_known_answers(counter, key, result):
     a, b, c, d = counter
-    found = philox(Key(np.uint64(key[0]), np.uint64(key[1])), np.uint64(a), np.uint64(b), np.uint64(c + (d << 32)))
+    found = philox(
+        Key(np.uint64(key[0]), np.uint64(key[1])),
+        np.uint64(a),
+        np.uint64(b),
+        np.uint64(c + (d << 32)),
+    )
     assert tuple(map(int, found)) == result
 
 
@@ -84,7 +93,9 @@ def test_numbers_in_batches_are_normal():
         assert abs((np.abs(rows) > x).sum() / 2 - expected) < 4 * np.sqrt(expected)
     for values in (rows, rows**2):
         assert np.abs(np.corrcoef(values.T) - np.eye(6)).max() < 5 / np.sqrt(len(rows))
-        assert abs(np.corrcoef(values[1:].ravel(), values[:-1].ravel())[0, 1]) < 5 / np.sqrt(rows.size)
+        assert abs(np.corrcoef(values[1:].ravel(), values[:-1].ravel())[0, 1]) < 5 / np.sqrt(
+            rows.size
+        )
 
 
 def test_numbers_in_batches_are_those_of_their_words():
@@ -92,7 +103,9 @@ def test_numbers_in_batches_are_those_of_their_words():
     key, step = key_of(5, THERMOSTAT), 11
     found = six_of_each(3, key, step)
     for m in (0, 1, BATCH - 1, BATCH, 2 * BATCH + 2, 3 * BATCH - 1):
-        (a, b, c, d), (e, f, more, rest) = ([int(word) for word in philox(key, draw, m, step)] for draw in (7, 8))
+        (a, b, c, d), (e, f, more, rest) = (
+            [int(word) for word in philox(key, draw, m, step)] for draw in (7, 8)
+        )
         extra = more % 2**21, rest % 2**21, (more >> 21) * 2**10 + (rest >> 22)
         u = [(word * 2**21 + low + 0.5) / 2**53 for word, low in zip((a, b, c), extra, strict=True)]
         radius, angle = np.sqrt(-2 * np.log(u)), 2 * np.pi * np.array([d, e, f]) / 2**32
@@ -113,6 +126,9 @@ def test_streams_are_apart():
     }
     assert len(keys) == 4 * 3 * 2
     numbers = {
-        uniforms(key_of(1, THERMOSTAT), draw, m, step) for draw in (0, 1) for m in (0, 1) for step in (0, 1, 2**40)
+        uniforms(key_of(1, THERMOSTAT), draw, m, step)
+        for draw in (0, 1)
+        for m in (0, 1)
+        for step in (0, 1, 2**40)
     }
     assert len(numbers) == 2 * 2 * 3

@@ -1,4 +1,5 @@
-"""Normal modes: closed forms, sums over a lattice, differences of an energy in NumPy, counts of modes, what is refused."""
+"""Normal modes: closed forms, sums over a lattice, differences of an energy in NumPy, counts of
+modes, what is refused."""
 
 import csv
 
@@ -31,7 +32,8 @@ from rigidmd.units import COULOMB, KJ_PER_MOL
 DIMER = ROOT / "systems" / "water_dimer.toml"
 ARGON = load_model("argon")
 SIGMA, WELL = float(ARGON.sigma[0]), float(ARGON.epsilon[0])
-#: Curvature of the Lennard-Jones potential at its minimum, 72 / 2^(1/3) epsilon/sigma² = 57.146 of them.
+#: Curvature of the Lennard-Jones potential at its minimum, 72 / 2^(1/3) epsilon/sigma² = 57.146 of
+#: them.
 CURVATURE = 72 / 2 ** (1 / 3)
 MIXTURE = {"argon": 3, "nitrogen": 3, "spce": 4}
 
@@ -79,19 +81,26 @@ def test_a_dipole_in_a_field():
     across = sorted(water.inertia[k] for k in range(3) if k != along)[::-1]  # ascending w
     field = np.linalg.norm([0.3, -0.2, 0.6]) * si.e * si.N_A * 1e-2  # u Å/ps² on a charge e
     assert (modes.rate[:4] == 0).all()
-    assert modes.rate[4:] ** 2 == pytest.approx([dipole[along] * field / i for i in across], rel=1e-8)
+    assert modes.rate[4:] ** 2 == pytest.approx(
+        [dipole[along] * field / i for i in across], rel=1e-8
+    )
     assert modes.translation[4:] == pytest.approx([0, 0], abs=1e-12)
     # infrared: N_A/(12 epsilon_0 c²) |dM/dq|², and |dM/dq|² is mu²/I
     unit = si.N_A * si.e**2 / (12 * si.epsilon_0 * si.c**2 * si.atomic_mass) / 1000
-    assert modes.intensity[4:] == pytest.approx([unit * dipole[along] ** 2 / i for i in across], rel=1e-6)
+    assert modes.intensity[4:] == pytest.approx(
+        [unit * dipole[along] ** 2 / i for i in across], rel=1e-6
+    )
 
 
 def test_a_crystal_of_argon_is_that_of_lattice_dynamics():
-    """All w² of 108 atoms, from dynamical matrices at the 27 wave vectors that the box admits, in NumPy."""
+    """All w² of 108 atoms, from dynamical matrices at the 27 wave vectors that the box admits, in
+    NumPy."""
     a, cutoff, cells = 5.31, 7.5, 3
     basis = a / 2 * np.array([[0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0]])
     corners = a * np.array(list(np.ndindex(cells, cells, cells)))
-    scene = small_scene({"argon": 4 * cells**3}, cells * a, forces={"cutoff_A": cutoff, "truncation": "plain"})
+    scene = small_scene(
+        {"argon": 4 * cells**3}, cells * a, forces={"cutoff_A": cutoff, "truncation": "plain"}
+    )
     state = state_of((corners[:, None] + basis).reshape(-1, 3), cell=cells * a * np.eye(3))
     found = modes_from(scene, state)
 
@@ -108,7 +117,10 @@ def test_a_crystal_of_argon_is_that_of_lattice_dynamics():
         # the four wave vectors of the primitive lattice that are n/cells in the cubic one
         for extra in ([0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]):
             k = 2 * np.pi / a * (np.array(n) / cells + extra)
-            square.extend(np.linalg.eigvalsh(np.einsum("n,nij->ij", 1 - np.cos(steps @ k), constants)) / ARGON.mass)
+            square.extend(
+                np.linalg.eigvalsh(np.einsum("n,nij->ij", 1 - np.cos(steps @ k), constants))
+                / ARGON.mass
+            )
     square = np.sort(square)
     assert np.abs(found.rate**2 - square).max() < 1e-7 * square[-1]
     assert (found.rate == 0).sum() == 3
@@ -116,33 +128,47 @@ def test_a_crystal_of_argon_is_that_of_lattice_dynamics():
 
 
 def test_forces_that_jump_at_the_minimum_are_refused():
-    """A shell of neighbours at the cutoff, less than a displacement inside. Its Hessian is symmetric, and wrong."""
+    """A shell of neighbours at the cutoff, less than a displacement inside. Its Hessian is
+    symmetric, and wrong."""
     a = 5.31
     corners = a * np.array(list(np.ndindex(3, 3, 3)))
     basis = a / 2 * np.array([[0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0]])
     state = state_of((corners[:, None] + basis).reshape(-1, 3), cell=3 * a * np.eye(3))
-    scene = small_scene({"argon": 108}, 3 * a, forces={"cutoff_A": a * np.sqrt(2) * (1 + 1e-8), "truncation": "shift"})
-    with pytest.raises(SimulationError, match=r"forces are not smooth.*truncation = 'smooth_switch'"):
+    scene = small_scene(
+        {"argon": 108},
+        3 * a,
+        forces={"cutoff_A": a * np.sqrt(2) * (1 + 1e-8), "truncation": "shift"},
+    )
+    with pytest.raises(
+        SimulationError, match=r"forces are not smooth.*truncation = 'smooth_switch'"
+    ):
         modes_from(scene, state, minimise=False)
 
 
 def dimer_energy(state):
-    """Energy (u Å²/ps²) of two SPC/E waters displaced by moves (12, ...): shifts and rotation vectors, in NumPy."""
+    """Energy (u Å²/ps²) of two SPC/E waters displaced by moves (12, ...): shifts and rotation
+    vectors, in NumPy."""
     water = load_model("spce")
 
     def energy(moves):
         moves, total = np.asarray(moves), 0.0
         sites = []
         for m in range(2):
-            rotation = Rotation.from_rotvec(moves[6 + 3 * m : 9 + 3 * m].reshape(3, -1).T).as_matrix()
+            rotation = Rotation.from_rotvec(
+                moves[6 + 3 * m : 9 + 3 * m].reshape(3, -1).T
+            ).as_matrix()
             at = np.einsum("ij,njk,sk->nsi", state.rotation[m], rotation, water.positions_body)
-            sites.append(at + state.position[m] + moves[3 * m : 3 * m + 3].reshape(3, -1).T[:, None])
+            sites.append(
+                at + state.position[m] + moves[3 * m : 3 * m + 3].reshape(3, -1).T[:, None]
+            )
         for i, one in enumerate(np.moveaxis(sites[0], 1, 0)):
             for j, other in enumerate(np.moveaxis(sites[1], 1, 0)):
                 r = np.linalg.norm(one - other, axis=1)
                 total = total + COULOMB * water.charges[i] * water.charges[j] / r
                 if water.epsilon[i] * water.epsilon[j] > 0:
-                    total = total + 4 * water.epsilon[i] * ((water.sigma[i] / r) ** 12 - (water.sigma[i] / r) ** 6)
+                    total = total + 4 * water.epsilon[i] * (
+                        (water.sigma[i] / r) ** 12 - (water.sigma[i] / r) ** 6
+                    )
         return total.reshape(moves.shape[1:])
 
     return energy, np.concatenate([np.repeat([water.mass] * 2, 3), np.tile(water.inertia, 2)])
@@ -151,12 +177,17 @@ def dimer_energy(state):
 def test_the_water_dimer_is_that_of_differences_of_its_energy(dimer):
     energy, masses = dimer_energy(dimer.coordinates.state)
     assert energy(np.zeros(12)) / KJ_PER_MOL == pytest.approx(dimer.energy, rel=1e-12)
-    second = hessian(energy, np.zeros(12), initial_step=0.05).ddf / np.sqrt(np.outer(masses, masses))
+    second = hessian(energy, np.zeros(12), initial_step=0.05).ddf / np.sqrt(
+        np.outer(masses, masses)
+    )
     square = np.linalg.eigvalsh((second + second.T) / 2)
     assert np.abs(dimer.rate**2 - square).max() < 1e-6 * square[-1]
     assert (dimer.rate == 0).sum() == 6
     # the modes are its eigenvectors
-    assert np.abs(dimer.vector @ second - (dimer.rate**2)[:, None] * dimer.vector).max() < 1e-5 * square[-1]
+    assert (
+        np.abs(dimer.vector @ second - (dimer.rate**2)[:, None] * dimer.vector).max()
+        < 1e-5 * square[-1]
+    )
 
 
 def test_thermodynamics_of_the_dimer(dimer):
@@ -200,14 +231,21 @@ def test_lanczos_has_the_modes_of_the_complete_spectrum(mixture):
     assert some.number.tolist() == [*range(1, 10), *range(43, 49)]
     whole = mixture.wavenumber[some.number - 1]
     assert np.abs(some.wavenumber - whole)[3:] == pytest.approx(0, abs=5e-6)
-    assert (np.abs(some.wavenumber - whole)[3:] <= some.error[3:] + mixture.error[some.number - 1][3:]).all()
-    assert np.abs((some.vector * mixture.vector[some.number - 1]).sum(axis=1))[3:] == pytest.approx(1, abs=1e-6)
+    assert (
+        np.abs(some.wavenumber - whole)[3:] <= some.error[3:] + mixture.error[some.number - 1][3:]
+    ).all()
+    assert np.abs((some.vector * mixture.vector[some.number - 1]).sum(axis=1))[3:] == pytest.approx(
+        1, abs=1e-6
+    )
     with pytest.raises(ValueError, match="leave out count"):
         some.free_energy(300)
 
 
 def test_frozen_molecules_have_no_modes():
-    molecules = [{"model": "spce", "count": 3}, {"model": "spce", "name": "ice", "count": 3, "frozen": True}]
+    molecules = [
+        {"model": "spce", "count": 3},
+        {"model": "spce", "name": "ice", "count": 3, "frozen": True},
+    ]
     scene = small_scene({}, 13.0, molecules=molecules, forces={"cutoff_A": 6.0})
     modes = modes_from(scene, shaken(build(scene), 3, 0.1)[2])
     assert len(modes.rate) == 18
@@ -216,19 +254,28 @@ def test_frozen_molecules_have_no_modes():
 
 
 def test_the_longest_step_is_the_limit():
-    """Atoms on springs, which velocity Verlet follows at a step of 0.98 times 2/w, and not at one of 1.02 times."""
+    """Atoms on springs, which velocity Verlet follows at a step of 0.98 times 2/w, and not at one
+    of 1.02 times."""
     unwatched = {key: False for key in ("energy", "kick", "move", "stable_step")}
 
     def scene(step: float):
         stage = {"ensemble": "nve", "timestep_fs": step, "duration_ps": 0.04 * step}
         return small_scene(
-            {"argon": 8}, 80.0, forces={"cutoff_A": 8.0}, stages=[stage], watch=unwatched,
-            fields={"restraints": [{"stiffness_kJ_mol_A2": SPRING / 100}]}, output={"log_interval_ps": 1e-3 * step},
-        )  # fmt: skip
+            {"argon": 8},
+            80.0,
+            forces={"cutoff_A": 8.0},
+            stages=[stage],
+            watch=unwatched,
+            fields={"restraints": [{"stiffness_kJ_mol_A2": SPRING / 100}]},
+            output={"log_interval_ps": 1e-3 * step},
+        )
 
     modes = rigidmd.normal_modes(scene(1.0))
     assert modes.rate == pytest.approx(np.full(24, np.sqrt(SPRING / ARGON.mass)), rel=1e-7)
-    below, above = (rigidmd.Simulation(scene(part * modes.longest_step_fs)).run()["kinetic"] for part in (0.98, 1.02))
+    below, above = (
+        rigidmd.Simulation(scene(part * modes.longest_step_fs)).run()["kinetic"]
+        for part in (0.98, 1.02)
+    )
     assert len(below) == len(above) == 41
     assert below.max() < 100 * below[0]
     assert above[-1] > 1e9 * above[0]
@@ -240,7 +287,8 @@ def test_what_is_not_a_minimum_is_refused(mixture):
     state = mixture.coordinates.state.copy()
     state.position[0] += 0.05
     with pytest.raises(
-        SimulationError, match=r"largest force is \d.*largest torque \d.*leave out --no-minimise, or begin"
+        SimulationError,
+        match=r"largest force is \d.*largest torque \d.*leave out --no-minimise, or begin",
     ):
         modes_from(mixture.system.scene, state, minimise=False)
     with pytest.raises(SimulationError, match="no force holds these molecules"):
@@ -250,7 +298,8 @@ def test_what_is_not_a_minimum_is_refused(mixture):
 
 
 def test_unstable_modes_are_negative():
-    """Three atoms in a row: they bend, with w² = -3 V'(2r)/(r m) where the force V'(r) + V'(2r) is zero."""
+    """Three atoms in a row: they bend, with w² = -3 V'(2r)/(r m) where the force V'(r) + V'(2r) is
+    zero."""
     scene = small_scene({"argon": 3}, None)
     modes = modes_from(scene, state_of(np.array([[0.0, 0, 0], [3.8, 0, 0], [7.6, 0, 0]])))
 
@@ -258,9 +307,13 @@ def test_unstable_modes_are_negative():
         return 24 * WELL * (SIGMA**6 / r**7 - 2 * SIGMA**12 / r**13)
 
     r = brentq(lambda r: slope(r) + slope(2 * r), 3.6, 4.0)
-    assert modes.rate[:2] == pytest.approx(np.full(2, -np.sqrt(3 * slope(2 * r) / r / ARGON.mass)), rel=1e-6)
+    assert modes.rate[:2] == pytest.approx(
+        np.full(2, -np.sqrt(3 * slope(2 * r) / r / ARGON.mass)), rel=1e-6
+    )
     assert (modes.rate[2:7] == 0).all() and (modes.rate[7:] > 0).all()
-    assert modes.free_energy(0) == pytest.approx(si.N_A * si.hbar * modes.rate[7:].sum() * 1e12 / 2000)
+    assert modes.free_energy(0) == pytest.approx(
+        si.N_A * si.hbar * modes.rate[7:].sum() * 1e12 / 2000
+    )
 
 
 def test_the_command_writes_a_table_and_an_animation(tmp_path, monkeypatch, capsys):
@@ -282,7 +335,9 @@ def test_the_command_writes_a_table_and_an_animation(tmp_path, monkeypatch, caps
     period = 1 / float(rows[-1]["frequency (1/ps)"])
     assert record.time[-1] == pytest.approx(2 * period, rel=1e-6)
     frames = read_frames(record.trajectory, 6, 1000)
-    shift = np.linalg.norm(frames.positions - frames.positions[12], axis=2)  # a quarter of a period: the minimum
+    shift = np.linalg.norm(
+        frames.positions - frames.positions[12], axis=2
+    )  # a quarter of a period: the minimum
     assert 0.2 < shift.max() < 0.6
     assert shift[[36, 60, 84]].max() < 0.02
     assert np.abs(frames.positions[48] - frames.positions[0]).max() < 0.02
@@ -305,9 +360,13 @@ def test_a_mode_that_does_not_exist_is_refused_before_computing(monkeypatch, tmp
 
 
 def test_atoms_far_from_each_other_end_at_the_minimum():
-    modes = rigidmd.normal_modes(small_scene({"argon": 2}, None, box={"lengths_A": 60, "periodic": False}))
+    modes = rigidmd.normal_modes(
+        small_scene({"argon": 2}, None, box={"lengths_A": 60, "periodic": False})
+    )
     assert modes.energy == pytest.approx(-WELL / KJ_PER_MOL)
-    assert modes.rate[5] ** 2 == pytest.approx(CURVATURE * WELL / SIGMA**2 / (ARGON.mass / 2), rel=1e-4)
+    assert modes.rate[5] ** 2 == pytest.approx(
+        CURVATURE * WELL / SIGMA**2 / (ARGON.mass / 2), rel=1e-4
+    )
     assert not modes.rate[:5].any()
 
 
@@ -318,8 +377,13 @@ def test_the_temperature_is_that_of_the_end_of_the_last_ramp(temperatures):
         {"ensemble": "minimise"},
         {"duration_ps": 1},
     ]
-    scene = rigidmd.Scene.from_dict(small_scene({"argon": 2}, None, stages=stages).model_dump(exclude_none=True))
-    assert modes_from(scene, state_of(np.array([[0.0, 0, 0], [3.8, 0, 0]]))).temperature == temperatures[1]
+    scene = rigidmd.Scene.from_dict(
+        small_scene({"argon": 2}, None, stages=stages).model_dump(exclude_none=True)
+    )
+    assert (
+        modes_from(scene, state_of(np.array([[0.0, 0, 0], [3.8, 0, 0]]))).temperature
+        == temperatures[1]
+    )
 
 
 CRYSTAL = """data_alpha_nitrogen
@@ -364,7 +428,11 @@ def test_modes_at_the_gamma_point_are_those_of_the_unit_cell(tmp_path):
     # librations E_g, T_g, T_g and translations A_u, E_u, T_u, T_u: Pa-3 has degenerate modes
     libration = cell.wavenumber[3:][cell.translation[3:] < 0.5]
     assert len(libration) == 8
-    assert np.ptp(libration[:2]) < 0.05 and np.ptp(libration[2:5]) < 0.05 and np.ptp(libration[5:]) < 0.05
+    assert (
+        np.ptp(libration[:2]) < 0.05
+        and np.ptp(libration[2:5]) < 0.05
+        and np.ptp(libration[5:]) < 0.05
+    )
     with pytest.raises(ValueError, match="leave out count and gamma"):
         cell.free_energy(300)
     with pytest.raises(SceneError, match="count and gamma"):
@@ -373,7 +441,9 @@ def test_modes_at_the_gamma_point_are_those_of_the_unit_cell(tmp_path):
         rigidmd.normal_modes(rigidmd.Scene.read(DIMER), gamma=True)
     system, state = cell.system, cell.coordinates.state.copy()
     state.position[3] += 0.2
-    with pytest.raises(SimulationError, match="has not the period of its unit cell: of 8 copies of a molecule"):
+    with pytest.raises(
+        SimulationError, match="has not the period of its unit cell: of 8 copies of a molecule"
+    ):
         periodic_basis(system, state, cell.coordinates.index)
     state = cell.coordinates.state.copy()
     state.rotation[9] = Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix() @ state.rotation[9]
@@ -382,9 +452,12 @@ def test_modes_at_the_gamma_point_are_those_of_the_unit_cell(tmp_path):
 
 
 def test_the_layout_of_vectors(mixture):
-    """Shifts of all molecules first, along x, y, z; then rotations about the principal axes that have inertia."""
+    """Shifts of all molecules first, along x, y, z; then rotations about the principal axes that
+    have inertia."""
     state, system = mixture.coordinates.state, mixture.system
-    mass, per_moment = (of[system.model.species] for of in (system.model.mass, system.model.inverse_inertia))
+    mass, per_moment = (
+        of[system.model.species] for of in (system.model.mass, system.model.inverse_inertia)
+    )
     for column, (molecule, axis) in {0: (0, 0), 13: (4, 1)}.items():
         q = np.zeros(mixture.vector.shape[1])
         q[column] = 0.01
@@ -403,15 +476,19 @@ def test_the_layout_of_vectors(mixture):
 
 
 def test_the_lattice_energy_of_a_crystal(tmp_path, capsys):
-    """It does not depend on the number of cells, and is no part of a liquid or of a crystal in a field."""
+    """It does not depend on the number of cells, and is no part of a liquid or of a crystal in a
+    field."""
     cells = [
-        rigidmd.Simulation(crystal(tmp_path, repeat)).start_energy(100.0, "kJ/mol") for repeat in ([2, 2, 2], [3, 2, 2])
+        rigidmd.Simulation(crystal(tmp_path, repeat)).start_energy(100.0, "kJ/mol")
+        for repeat in ([2, 2, 2], [3, 2, 2])
     ]
     for found in cells:
         assert found["lattice_energy_per_molecule"] == found["potential"] / found["molecules"]
     one, other = (found["lattice_energy_per_molecule"] for found in cells)
     assert one == pytest.approx(other, rel=1e-5)
-    assert -8.5 < one < -6.9  # 6.9 kJ/mol is the heat of sublimation, less than this by the zero-point energy
+    assert (
+        -8.5 < one < -6.9
+    )  # 6.9 kJ/mol is the heat of sublimation, less than this by the zero-point energy
     liquid = rigidmd.Simulation(small_scene(MIXTURE, 20.0)).start_energy(100.0, "kJ/mol")
     assert liquid["lattice_energy_per_molecule"] is None
     assert liquid["potential_per_molecule"] == liquid["potential"] / 10

@@ -1,4 +1,5 @@
-"""In a notebook: progress, what values show, figures of columns, films, a plot of a run that goes on, the tutorial."""
+"""In a notebook: progress, what values show, figures of columns, films, a plot of a run that goes
+on, the tutorial."""
 
 import base64
 import contextlib
@@ -41,14 +42,20 @@ def top(**more):
 
 
 def argon(folder=None, **options):
-    stages = [{"ensemble": "nvt", "duration_ps": 0.02, "temperature_K": 90.0}, {"duration_ps": 0.02}]
+    stages = [
+        {"ensemble": "nvt", "duration_ps": 0.02, "temperature_K": 90.0},
+        {"duration_ps": 0.02},
+    ]
     output = {"log_interval_ps": 0.004, "trajectory_interval_ps": 0.01}
-    return Simulation(small_scene({"argon": 20}, 20.0, stages=stages, output=output), folder, **options)
+    return Simulation(
+        small_scene({"argon": 20}, 20.0, stages=stages, output=output), folder, **options
+    )
 
 
 @pytest.fixture
 def cell(monkeypatch):
-    """A notebook's cell: the list of its outputs, each the list of what was shown there, as MIME bundles."""
+    """A notebook's cell: the list of its outputs, each the list of what was shown there, as MIME
+    bundles."""
     display = pytest.importorskip("IPython.display", reason="IPython is not installed")
     outputs = []
 
@@ -123,7 +130,9 @@ def test_elsewhere_progress_is_asked_for(capsys, monkeypatch):
     Simulation(top()).run()
     assert capsys.readouterr() == ("", "")
     Simulation(top()).run(progress=True)
-    assert capsys.readouterr().err == "  compiling (kept on disk: the next run starts at once) ...\n"
+    assert (
+        capsys.readouterr().err == "  compiling (kept on disk: the next run starts at once) ...\n"
+    )
 
 
 def test_a_live_plot_is_one_picture_that_changes(cell, monkeypatch):
@@ -142,7 +151,9 @@ def test_a_live_plot_is_one_picture_that_changes(cell, monkeypatch):
     assert cell[2][-1]["text/plain"] == "temperature, drift against time"
     with pytest.raises(KeyError, match="did you mean theta"):
         Simulation(top(), observers=rigidmd.LivePlot("theto")).run(progress=False)
-    with pytest.warns(RigidMDWarning, match="LivePlot cannot be drawn: KeyError: .no column 'L_x_error'"):
+    with pytest.warns(
+        RigidMDWarning, match="LivePlot cannot be drawn: KeyError: .no column 'L_x_error'"
+    ):
         Simulation(top(), observers=rigidmd.LivePlot("L_x_error")).run(progress=False)
 
 
@@ -161,11 +172,21 @@ def test_scenes_and_results_show_tables_and_a_figure(tmp_path):
     ):
         assert part in water
     body = Scene.read(TOP)._repr_html_()
-    for part in ("symmetric, pinned, 0.15 kg", "0.000306, 0.000306, 0.00012 kg m²", "gravity", "kahan_li_8"):
+    for part in (
+        "symmetric, pinned, 0.15 kg",
+        "0.000306, 0.000306, 0.00012 kg m²",
+        "gravity",
+        "kahan_li_8",
+    ):
         assert part in body
     simulation = argon(tmp_path / "<b>")
     results = simulation.run()
-    shown = {"scene": water, "body": body, "ready": simulation._repr_html_(), "results": results._repr_html_()}
+    shown = {
+        "scene": water,
+        "body": body,
+        "ready": simulation._repr_html_(),
+        "results": results._repr_html_(),
+    }
     assert "&lt;b&gt;" in shown["ready"]
     assert "&lt;b&gt;" in shown["results"]
     for stage in results.summary["stages"]:
@@ -180,9 +201,14 @@ def test_scenes_and_results_show_tables_and_a_figure(tmp_path):
 
 def test_analyses_show_values_and_a_figure(tmp_path):
     output = {"trajectory_interval_ps": 0.004}
-    results = Simulation(small_scene({"argon": 20}, 20.0, stages=[{"duration_ps": 0.2}], output=output)).run()
+    results = Simulation(
+        small_scene({"argon": 20}, 20.0, stages=[{"duration_ps": 0.2}], output=output)
+    ).run()
     g, moved = rigidmd.analysis.rdf(results, "argon", "argon"), rigidmd.analysis.msd(results)
-    for result, names in ((g, ["r (A)", "g argon-argon"]), (moved, ["Time (ps)", "MSD argon (A^2)"])):
+    for result, names in (
+        (g, ["r (A)", "g argon-argon"]),
+        (moved, ["Time (ps)", "MSD argon (A^2)"]),
+    ):
         shown = result._repr_html_()
         Balance(shown)
         assert "<svg" in shown
@@ -201,7 +227,10 @@ def test_analyses_show_values_and_a_figure(tmp_path):
 
 
 def test_an_analysis_of_values_shows_their_notes():
-    values = [Value("D", "1e-9 m^2/s", 2.5, 0.25, 1.0), Value("D inf", "1e-9 m^2/s", None, None, None, "too <short>")]
+    values = [
+        Value("D", "1e-9 m^2/s", 2.5, 0.25, 1.0),
+        Value("D inf", "1e-9 m^2/s", None, None, None, "too <short>"),
+    ]
     result = AnalysisResult("diffusion", "diffusion", values, notes=["a note"])
     shown = result._repr_html_()
     Balance(shown)
@@ -216,7 +245,11 @@ def test_an_analysis_of_several_curves_has_a_panel_for_each():
     axis = ("t", np.arange(3.0))
     curves = [Curve(name, axis, name, {name: np.arange(3.0)}) for name in ("one", "two", "three")]
     result = AnalysisResult("several", "several curves", [], curves)
-    assert [panel.get_ylabel() for panel in result.plot().axes if panel.get_visible()] == ["one", "two", "three"]
+    assert [panel.get_ylabel() for panel in result.plot().axes if panel.get_visible()] == [
+        "one",
+        "two",
+        "three",
+    ]
     assert [panel.get_ylabel() for panel in result.plot("two").axes] == ["two"]
     assert list(result.to_dataframe("three")) == ["t", "three"]
 
@@ -242,7 +275,9 @@ def test_every_shipped_scene_shows_itself(path):
 
 def test_a_scene_that_cannot_be_built_shows_why(tmp_path):
     scene = small_scene({"argon": 2}, 20.0, stages=[{"duration_ps": 1.0}])
-    (tmp_path / "own.toml").write_text('name = "own"\n[[sites]]\nname = "A"\nposition_A = [0, 0, 0]\n')
+    (tmp_path / "own.toml").write_text(
+        'name = "own"\n[[sites]]\nname = "A"\nposition_A = [0, 0, 0]\n'
+    )
     data = scene.model_dump(exclude_none=True) | {"molecules": [{"file": "own.toml", "count": 2}]}
     text = Scene.from_dict(data, tmp_path)._repr_html_()
     assert "<td>fault</td>" in text
@@ -255,7 +290,10 @@ def test_plots_are_of_the_columns_with_their_units():
     kelvin, pressure = figure.axes
     assert (kelvin.get_ylabel(), pressure.get_ylabel()) == ("K", "pressure (bar)")
     assert pressure.get_xlabel() == "time (ps)"
-    assert [text.get_text() for text in kelvin.get_legend().get_texts()] == ["temperature translation", "temperature"]
+    assert [text.get_text() for text in kelvin.get_legend().get_texts()] == [
+        "temperature translation",
+        "temperature",
+    ]
     assert (pressure.lines[0].get_ydata() == results["pressure_bar"]).all()
     assert (pressure.lines[0].get_xdata() == results["time"]).all()
     body = Simulation(top()).run()
@@ -272,7 +310,11 @@ def test_plots_are_of_the_columns_with_their_units():
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("temperatur", "did you mean temperature"), ("stage_name", "has text"), ("qqq", "there are step, time")],
+    [
+        ("temperatur", "did you mean temperature"),
+        ("stage_name", "has text"),
+        ("qqq", "there are step, time"),
+    ],
 )
 def test_a_column_that_cannot_be_plotted(name, expected):
     with pytest.raises(KeyError, match=expected):
@@ -315,7 +357,9 @@ def test_the_film_of_molecules_is_a_widget(tmp_path):
     told = [json.loads((tmp_path / name).read_text()) for name in ("memory.json", "files.json")]
     place = []
     for data in told:
-        assert data["properties"]["time"]["values"] == pytest.approx([0, 0.01, 0.02, 0.03, 0.04], abs=1e-6)
+        assert data["properties"]["time"]["values"] == pytest.approx(
+            [0, 0.01, 0.02, 0.03, 0.04], abs=1e-6
+        )
         place.append(np.array([[frame[axis] for axis in "xyz"] for frame in data["structures"]]))
         assert 0 <= place[-1].min() < place[-1].max() <= 20  # inside the box
     assert place[0].shape == (5, 3, 20)
@@ -343,7 +387,9 @@ def test_the_tutorial_is_listed_copied_and_has_no_outputs(tmp_path, monkeypatch,
     assert main(["new", "tutorial"]) == 2
     assert "tutorial.ipynb exists; --force replaces it" in capsys.readouterr().err
     for part in json.loads(TUTORIAL.read_text())["cells"]:
-        assert part["cell_type"] == "markdown" or (part["outputs"] == [] and part["execution_count"] is None)
+        assert part["cell_type"] == "markdown" or (
+            part["outputs"] == [] and part["execution_count"] is None
+        )
 
 
 def executed(folder, changed=lambda source: source):
@@ -354,14 +400,18 @@ def executed(folder, changed=lambda source: source):
     book = nbformat.read(TUTORIAL, as_version=4)
     for part in book.cells:
         part.source = changed(part.source) if part.cell_type == "code" else part.source
-    client.NotebookClient(book, timeout=600, resources={"metadata": {"path": str(folder)}}).execute()
+    client.NotebookClient(
+        book, timeout=600, resources={"metadata": {"path": str(folder)}}
+    ).execute()
     return book
 
 
 def shown_by(book):
     """MIME bundles and texts that the cells show."""
     outputs = [output for part in book.cells if part.cell_type == "code" for output in part.outputs]
-    assert [output for output in outputs if output.output_type == "stream" and output.name == "stderr"] == []
+    assert [
+        output for output in outputs if output.output_type == "stream" and output.name == "stderr"
+    ] == []
     return [output.get("data") or {"text/plain": output.text} for output in outputs]
 
 
@@ -373,8 +423,12 @@ def test_the_tutorial_runs(tmp_path):
         return source.replace("start=2.0", "start=0.0")
 
     shown = shown_by(executed(tmp_path, shorter))
-    assert sum("image/png" in bundle for bundle in shown) == 4  # columns, errors of steps, the live plot, g(r)
-    assert sum("<svg" in bundle.get("text/html", "") for bundle in shown) == 3  # results, an analysis
+    assert (
+        sum("image/png" in bundle for bundle in shown) == 4
+    )  # columns, errors of steps, the live plot, g(r)
+    assert (
+        sum("<svg" in bundle.get("text/html", "") for bundle in shown) == 3
+    )  # results, an analysis
     assert sum("<progress" in bundle.get("text/html", "") for bundle in shown) == 3
     hand, run = re.search(
         r"by formula ([\d.]+)°, in the run ([\d.]+)°", "".join(b["text/plain"] for b in shown)

@@ -51,16 +51,36 @@ HDO = {
             "sigma_A": 3.1,
             "epsilon_kJ_mol": 0.6,
         },
-        {"name": "H", "element": "H", "mass_u": 1.008, "position_A": [0.8, 0.6, 0], "charge_e": 0.4},
-        {"name": "D", "element": "H", "mass_u": 2.014, "position_A": [-0.8, 0.6, 0], "charge_e": 0.4},
+        {
+            "name": "H",
+            "element": "H",
+            "mass_u": 1.008,
+            "position_A": [0.8, 0.6, 0],
+            "charge_e": 0.4,
+        },
+        {
+            "name": "D",
+            "element": "H",
+            "mass_u": 2.014,
+            "position_A": [-0.8, 0.6, 0],
+            "charge_e": 0.4,
+        },
     ],
 }
-#: Every kind of body, and argon so that all have several kinds of Lennard-Jones sites: that compiles once.
+#: Every kind of body, and argon so that all have several kinds of Lennard-Jones sites: that
+#: compiles once.
 CLUSTERS = [
-    {"spce": 4}, {"tip4p2005": 4}, {"tip5p": 4}, {"nitrogen_trappe": 6}, {"co2_trappe": 5}, {"benzene_opls": 3},
-    {"methane_opls": 4}, {"methanol_trappe": 4}, {"ammonia_trappe": 4},
+    {"spce": 4},
+    {"tip4p2005": 4},
+    {"tip5p": 4},
+    {"nitrogen_trappe": 6},
+    {"co2_trappe": 5},
+    {"benzene_opls": 3},
+    {"methane_opls": 4},
+    {"methanol_trappe": 4},
+    {"ammonia_trappe": 4},
     {"tip5p": 2, "co2_trappe": 2, "benzene_opls": 1, "methane_opls": 2, "spce": 2, "na_spce": 1},
-]  # fmt: skip
+]
 MIXTURE = CLUSTERS[-1]
 
 
@@ -102,7 +122,9 @@ def test_mass_points_move_as_the_molecule(name, sites):
     assert sorted([*found, *body.site[body.site >= 0]]) == list(range(len(molecule.masses)))
     for site, position in found.items():
         assert np.abs(position - molecule.positions_body[site]).max() < 1e-10
-    assert len(body.mass) == {"point": 1, "linear": 2}.get(molecule.kind, 3 if planar(molecule) else 4)
+    assert len(body.mass) == {"point": 1, "linear": 2}.get(
+        molecule.kind, 3 if planar(molecule) else 4
+    )
 
 
 def planar(molecule):
@@ -118,12 +140,16 @@ def test_energies_and_forces_on_bodies_of_a_cluster(counts):
     particles, (at, _) = theirs._particles, theirs._particles.positions(state)
     theirs._put(theirs._evaluating_context, state)
     theirs._evaluating_context.computeVirtualSites()
-    virtual_sites = theirs._evaluating_context.getState(getPositions=True).getPositions(asNumpy=True)._value * 10
+    virtual_sites = (
+        theirs._evaluating_context.getState(getPositions=True).getPositions(asNumpy=True)._value
+        * 10
+    )
     assert np.abs(virtual_sites - at)[particles.site].max() < 1e-10
 
 
 def test_molecules_whose_base_has_two_masses_keep_their_shape():
-    """OpenMM's SETTLE would take such a triangle for one with equal masses, and end in numbers that are none."""
+    """OpenMM's SETTLE would take such a triangle for one with equal masses, and end in numbers that
+    are none."""
     scene = small_scene({}, None, molecules=[HDO, {"model": "argon", "count": 2}])
     system, ours, state = shaken(build(scene), 2, 0.1)
     agree(ours, OpenmmEngine(system, platform="Reference"), state, 1e-10)
@@ -134,7 +160,8 @@ def test_molecules_whose_base_has_two_masses_keep_their_shape():
 
 
 def extrapolated(system, make, start, row):
-    """Positions of sites after 50 fs, from steps of 1, 1/2 and 1/4 fs extrapolated to none: those of no integrator."""
+    """Positions of sites after 50 fs, from steps of 1, 1/2 and 1/4 fs extrapolated to none: those
+    of no integrator."""
     found = []
     for n in (1, 2, 4):
         engine = make()
@@ -147,7 +174,8 @@ def extrapolated(system, make, start, row):
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])
 def test_both_engines_go_the_same_way(platform):
-    """OpenMM turns bodies by keeping distances, another method of order 2: what is left at no step is the physics."""
+    """OpenMM turns bodies by keeping distances, another method of order 2: what is left at no step
+    is the physics."""
     system, _, state = built(MIXTURE | {"argon": 2}, None, seed=3, spread=0.1)
     row = system.scene.stages[0].scheme
     mine = extrapolated(system, system.engine, state, row)
@@ -158,7 +186,8 @@ def test_both_engines_go_the_same_way(platform):
 
 
 def test_linear_bodies_stay_rotations_however_often_they_are_read():
-    """Their spin about the axis is nobody's: what was read last decides, and its rounding must not grow."""
+    """Their spin about the axis is nobody's: what was read last decides, and its rounding must not
+    grow."""
     system, _, state = built({"co2_trappe": 5, "argon": 2}, None, seed=3)
     bodies, rng = RigidBodies(system), np.random.default_rng(1)
     found = state
@@ -172,7 +201,9 @@ def test_linear_bodies_stay_rotations_however_often_they_are_read():
     assert np.abs(unit - np.eye(3)).max() < 1e-14
     opposite = found._replace(rotation=found.rotation * [-1.0, -1.0, 1.0])
     position = system.site_positions(opposite)
-    assert np.isfinite(bodies.state(found, position, np.zeros_like(position), state.cell).rotation).all()
+    assert np.isfinite(
+        bodies.state(found, position, np.zeros_like(position), state.cell).rotation
+    ).all()
 
 
 BOX = {"forces": {"cutoff_A": 6.0}}
@@ -184,18 +215,29 @@ WAYS = [*((ending, "lorentz-berthelot") for ending in ENDINGS), ("switch", "geom
 
 @pytest.mark.parametrize(("truncation", "mixing"), WAYS)
 def test_endings_and_mixing(truncation, mixing):
-    forces = {"cutoff_A": 6.0, "truncation": truncation, "mixing": mixing, "reaction_field_permittivity": 20.0}
+    forces = {
+        "cutoff_A": 6.0,
+        "truncation": truncation,
+        "mixing": mixing,
+        "reaction_field_permittivity": 20.0,
+    }
     system, _, state = built({"spce": 8, "argon": 8}, 13.0, forces=forces)
     tallies = OpenmmEngine(system, platform="Reference").evaluate(state)[1]
     expected = Oracle(system).energy(state.position, state.rotation)
-    assert [tallies[name].energy for name in ("lennard_jones", "coulomb")] == pytest.approx(expected, rel=1e-9)
+    assert [tallies[name].energy for name in ("lennard_jones", "coulomb")] == pytest.approx(
+        expected, rel=1e-9
+    )
 
 
 def test_damped_shifted_force():
     forces = {"cutoff_A": 6.0, "electrostatics": "damped_shifted_force"}
     system, _, state = built({"spce": 8, "argon": 8}, 13.0, forces=forces)
     found = OpenmmEngine(system, platform="Reference").evaluate(state)[1]["coulomb"].energy
-    x, charge, owner = system.site_positions(state), force_field_of(system).charge, system.sites.molecule
+    x, charge, owner = (
+        system.site_positions(state),
+        force_field_of(system).charge,
+        system.sites.molecule,
+    )
     i, j = np.triu_indices(len(x), 1)
     d = x[i] - x[j]
     r = np.linalg.norm(d - 13.0 * np.rint(d / 13.0), axis=1)
@@ -226,24 +268,43 @@ def test_a_leaning_box_with_parameters_of_pairs():
 
 
 def test_pme_with_ions_and_frozen_molecules():
-    """On a fine grid, to the accuracy of its splines: the two differ in how they correct for them."""
-    forces = {"cutoff_A": 6.0, "electrostatics": "pme", "ewald_alpha_per_A": 0.5, "pme_order": 5, "pme_grid": [64] * 3}
+    """On a fine grid, to the accuracy of its splines: the two differ in how they correct for
+    them."""
+    forces = {
+        "cutoff_A": 6.0,
+        "electrostatics": "pme",
+        "ewald_alpha_per_A": 0.5,
+        "pme_order": 5,
+        "pme_grid": [64] * 3,
+    }
     molecules = [
-        {"model": "spce", "count": 12}, {"model": "na_spce", "count": 2},
+        {"model": "spce", "count": 12},
+        {"model": "na_spce", "count": 2},
         {"model": "spce", "name": "ice", "count": 3, "frozen": True},
-    ]  # fmt: skip
-    system, ours, state = shaken(build(small_scene({}, 13.0, molecules=molecules, forces=forces)), 3, 0.2)
-    state.position[-3:], state.rotation[-3:] = system.state.position[-3:], system.state.rotation[-3:]
+    ]
+    system, ours, state = shaken(
+        build(small_scene({}, 13.0, molecules=molecules, forces=forces)), 3, 0.2
+    )
+    state.position[-3:], state.rotation[-3:] = (
+        system.state.position[-3:],
+        system.state.rotation[-3:],
+    )
     agree(ours, OpenmmEngine(system, platform="Reference"), state, 1e-6)
     single = OpenmmEngine(system, platform="CPU")
     agree(ours, single, state, 1e-4)
 
 
 def test_waves_of_ewald_become_a_grid():
-    """OpenMM has splines of order 5: a grid of the accuracy asked for takes the place of other orders and of waves."""
+    """OpenMM has splines of order 5: a grid of the accuracy asked for takes the place of other
+    orders and of waves."""
     found = []
     for method in ("ewald", "pme"):
-        forces = {"cutoff_A": 6.0, "electrostatics": method, "ewald_accuracy": 1e-6, "ewald_truncation": "plain"}
+        forces = {
+            "cutoff_A": 6.0,
+            "electrostatics": method,
+            "ewald_accuracy": 1e-6,
+            "ewald_truncation": "plain",
+        }
         system, _, state = built({"spce": 12}, 13.0, seed=1, forces=forces)
         tallies = OpenmmEngine(system, platform="Reference").evaluate(state)[1]
         found.append(sum(t.energy for t in tallies.values()) + sum(system.constants.values()))
@@ -253,17 +314,31 @@ def test_waves_of_ewald_become_a_grid():
 THERMOSTATS = {
     "nve": {},
     "nose_hoover": {"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "nose_hoover"},
-    "langevin": {"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "langevin", "friction_translation_per_ps": 10.0},
+    "langevin": {
+        "ensemble": "nvt",
+        "temperature_K": 300.0,
+        "thermostat": "langevin",
+        "friction_translation_per_ps": 10.0,
+    },
     "npt": {
-        "ensemble": "npt", "temperature_K": 300.0, "thermostat": "langevin", "pressure_bar": 1000.0, "barostat": "monte_carlo",
+        "ensemble": "npt",
+        "temperature_K": 300.0,
+        "thermostat": "langevin",
+        "pressure_bar": 1000.0,
+        "barostat": "monte_carlo",
         "barostat_interval_ps": 0.005,
     },
-}  # fmt: skip
+}
 
 
 def staged(kind, duration=1.0, counts=None):
     stage = {"duration_ps": duration, "timestep_fs": 1.0} | THERMOSTATS[kind]
-    scene = small_scene(counts or {"spce": 20}, 13.0, stages=[stage], forces={"cutoff_A": 6.0, "tail_correction": True})
+    scene = small_scene(
+        counts or {"spce": 20},
+        13.0,
+        stages=[stage],
+        forces={"cutoff_A": 6.0, "tail_correction": True},
+    )
     return shaken(build(scene), 3, 0.1)
 
 
@@ -287,7 +362,9 @@ def test_stages_repeat_go_on_and_conserve(kind):
     engine.advance(state, row, 1e-3, 60)
     memory, kept = engine.memory(), state.copy()
     if kind == "nve":
-        assert abs(conserved(system, engine, state) - before) < 2e-2 * sum(kinetic_energies(system, state))
+        assert abs(conserved(system, engine, state) - before) < 2e-2 * sum(
+            kinetic_energies(system, state)
+        )
     engine.advance(state, row, 1e-3, 100)
     other, again = fresh()
     other.advance(again, row, 1e-3, 60)
@@ -306,9 +383,15 @@ def test_stages_repeat_go_on_and_conserve(kind):
 
 
 def test_what_is_frozen_stays():
-    molecules = [{"model": "spce", "count": 12}, {"model": "spce", "name": "ice", "count": 3, "frozen": True}]
+    molecules = [
+        {"model": "spce", "count": 12},
+        {"model": "spce", "name": "ice", "count": 3, "frozen": True},
+    ]
     system, _, start = shaken(build(small_scene({}, 13.0, molecules=molecules, **BOX)), 3, 0.1)
-    start.position[-3:], start.rotation[-3:] = system.state.position[-3:], system.state.rotation[-3:]
+    start.position[-3:], start.rotation[-3:] = (
+        system.state.position[-3:],
+        system.state.rotation[-3:],
+    )
     engine, row = OpenmmEngine(system, platform="Reference"), system.scene.stages[0].scheme
     state = engine.begin(start, row)
     engine.advance(state, row, 1e-3, 20)
@@ -335,12 +418,22 @@ def test_thermostats_keep_the_temperature_of_both_motions(kind):
 
 @pytest.mark.soak
 def test_the_barostat_gives_the_volume_of_an_ideal_gas():
-    """(N + 1) kT/P, of bodies that hardly touch: the sites of a pair exclude 0.02 Å³, of 140 for each molecule.
+    """(N + 1) kT/P, of bodies that hardly touch: the sites of a pair exclude 0.02 Å³, of 140 for
+    each molecule.
 
-    The cut-off is short because OpenMM's largest change of the volume is a part of what that was, not of what it is."""
-    stage = {"duration_ps": 1000.0, "timestep_fs": 2.0} | THERMOSTATS["npt"] | {"pressure_bar": 300.0}
+    The cut-off is short because OpenMM's largest change of the volume is a part of what that was,
+    not of what it is."""
+    stage = (
+        {"duration_ps": 1000.0, "timestep_fs": 2.0} | THERMOSTATS["npt"] | {"pressure_bar": 300.0}
+    )
     sites = [
-        {"name": name, "element": "N", "position_A": [x, 0.0, 0.0], "sigma_A": 0.3, "epsilon_kJ_mol": 1e-6}
+        {
+            "name": name,
+            "element": "N",
+            "position_A": [x, 0.0, 0.0],
+            "sigma_A": 0.3,
+            "epsilon_kJ_mol": 1e-6,
+        }
         for name, x in (("N1", -0.5), ("N2", 0.5))
     ]
     gas = {"name": "gas", "count": 20, "sites": [site | {"mass_u": 14.0} for site in sites]}
@@ -357,17 +450,28 @@ def test_the_barostat_gives_the_volume_of_an_ideal_gas():
 
 
 def test_the_folder_runs_by_itself(tmp_path):
-    stages = [{"name": kind, "duration_ps": 0.01, "timestep_fs": 1.0} | THERMOSTATS[kind] for kind in THERMOSTATS]
+    stages = [
+        {"name": kind, "duration_ps": 0.01, "timestep_fs": 1.0} | THERMOSTATS[kind]
+        for kind in THERMOSTATS
+    ]
     every = {"log_interval_ps": 0.005, "trajectory_interval_ps": 0.005}
     system = build(
-        small_scene({"tip4p2005": 10, "co2_trappe": 3, "methane_opls": 2}, 13.0, stages=stages, output=every, **BOX)
+        small_scene(
+            {"tip4p2005": 10, "co2_trappe": 3, "methane_opls": 2},
+            13.0,
+            stages=stages,
+            output=every,
+            **BOX,
+        )
     )
     drawn = force_field_of(system)
     names = write_openmm(tmp_path, drawn, system.state)
     assert set(names) == {path.name for path in tmp_path.iterdir()}
     subprocess.run([sys.executable, "run.py", "Reference"], cwd=tmp_path, check=True)
     lines = (tmp_path / "log.csv").read_text().splitlines()
-    assert [line.split(",")[0] for line in lines[1:]] == [kind for kind in THERMOSTATS for _ in range(2)]
+    assert [line.split(",")[0] for line in lines[1:]] == [
+        kind for kind in THERMOSTATS for _ in range(2)
+    ]
     assert (tmp_path / "final.xml").stat().st_size and (tmp_path / "trajectory.dcd").stat().st_size
     row = system.scene.stages[0].scheme
     engine = OpenmmEngine(system, platform="Reference")
@@ -380,31 +484,54 @@ def test_the_folder_runs_by_itself(tmp_path):
 def test_what_openmm_cannot_do_is_told_at_once():
     stages = [
         {"duration_ps": 0.1, "ensemble": "nvt", "temperature_K": [300.0, 310.0]},
-        {"duration_ps": 0.1, "ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "thermostat": "langevin"},
+        {
+            "duration_ps": 0.1,
+            "ensemble": "npt",
+            "temperature_K": 300.0,
+            "pressure_bar": 1.0,
+            "thermostat": "langevin",
+        },
         {"duration_ps": 0.1, "ensemble": "nph", "pressure_bar": 1.0},
         {"duration_ps": 0.1, "integrator": "yoshida_4"},
     ]
     scene = small_scene({"spce": 4}, 13.0, stages=stages, **BOX)
     messages = " ".join(table.refusals(force_field_of(build(scene))))
-    for words in ("velocity_rescaling", "cell_rescaling", "nph", "changes over the stage", "yoshida_4"):
+    for words in (
+        "velocity_rescaling",
+        "cell_rescaling",
+        "nph",
+        "changes over the stage",
+        "yoshida_4",
+    ):
         assert words in messages
     falling = small_scene(
-        {"spce": 4}, 13.0, fields={"electric_V_per_nm": [0.0, 0.0, 0.1]}, engine={"name": "openmm"}, **BOX
+        {"spce": 4},
+        13.0,
+        fields={"electric_V_per_nm": [0.0, 0.0, 0.1]},
+        engine={"name": "openmm"},
+        **BOX,
     )
-    with pytest.raises(SceneError, match=r"engine.name = .openmm.: electric field: a field has no translation for"):
+    with pytest.raises(
+        SceneError, match=r"engine.name = .openmm.: electric field: a field has no translation for"
+    ):
         external_engine(build(falling))
 
 
 def test_a_platform_that_is_not_there():
     system = build(small_scene({"spce": 4}, 13.0, **BOX))
-    with pytest.raises(EngineError, match=r"no platform 'Abacus' here: there are Reference, CPU.*knows CPU, Reference"):
+    with pytest.raises(
+        EngineError,
+        match=r"no platform 'Abacus' here: there are Reference, CPU.*knows CPU, Reference",
+    ):
         OpenmmEngine(system, platform="Abacus")
 
 
 def test_without_openmm_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "openmm", None)
     system = build(small_scene({"spce": 4}, 13.0, **BOX))
-    with pytest.raises(EngineError, match="OpenMM is not installed: pip install openmm installs it"):
+    with pytest.raises(
+        EngineError, match="OpenMM is not installed: pip install openmm installs it"
+    ):
         OpenmmEngine(system)
 
 

@@ -1,4 +1,5 @@
-"""Numbers in another unit are told with the likely cause; shipped models and scenes give no warning."""
+"""Numbers in another unit are told with the likely cause; shipped models and scenes give no
+warning."""
 
 import numpy as np
 import pytest
@@ -12,11 +13,29 @@ from rigidmd.errors import SceneError
 from rigidmd.scene import Scene
 from rigidmd.scene.models import available_models
 
-ARGON = {"name": "Ar", "element": "Ar", "mass_u": 39.948, "position_A": [0.0, 0.0, 0.0], "sigma_A": 3.4,
-         "epsilon_kJ_mol": 1.0}  # fmt: skip
-OXYGEN = {"name": "O", "element": "O", "mass_u": 15.999, "position_A": [0.0, 0.0, 0.0], "sigma_A": 3.2,
-          "epsilon_kJ_mol": 0.65}  # fmt: skip
-HYDROGEN = {"name": "H", "element": "H", "mass_u": 1.008, "position_A": [0.9572, 0.0, 0.0], "charge_e": 0.4}
+ARGON = {
+    "name": "Ar",
+    "element": "Ar",
+    "mass_u": 39.948,
+    "position_A": [0.0, 0.0, 0.0],
+    "sigma_A": 3.4,
+    "epsilon_kJ_mol": 1.0,
+}
+OXYGEN = {
+    "name": "O",
+    "element": "O",
+    "mass_u": 15.999,
+    "position_A": [0.0, 0.0, 0.0],
+    "sigma_A": 3.2,
+    "epsilon_kJ_mol": 0.65,
+}
+HYDROGEN = {
+    "name": "H",
+    "element": "H",
+    "mass_u": 1.008,
+    "position_A": [0.9572, 0.0, 0.0],
+    "charge_e": 0.4,
+}
 
 
 def of_sites(*sites, count=2, edge=30.0, **tables):
@@ -30,13 +49,28 @@ def of_sites(*sites, count=2, edge=30.0, **tables):
     [
         ([OXYGEN | {"mass_u": 1.6}, HYDROGEN], "mass_u of O is 1.6 u, and O has 16 u"),
         ([OXYGEN, HYDROGEN | {"mass_u": 10.08}], "mass_u of H is 10.08 u, and H has 1.008 u"),
-        ([OXYGEN, HYDROGEN | {"position_A": [0.09572, 0.0, 0.0]}], "0.09572 Å, below 0.5: are the positions in nm?"),
-        ([OXYGEN, HYDROGEN | {"position_A": [95.72, 0.0, 0.0]}], "95.72 Å, above 15: are the positions in pm?"),
+        (
+            [OXYGEN, HYDROGEN | {"position_A": [0.09572, 0.0, 0.0]}],
+            "0.09572 Å, below 0.5: are the positions in nm?",
+        ),
+        (
+            [OXYGEN, HYDROGEN | {"position_A": [95.72, 0.0, 0.0]}],
+            "95.72 Å, above 15: are the positions in pm?",
+        ),
         ([ARGON | {"sigma_A": 0.34}], "largest sigma_A is 0.34 Å, below 0.9: is it in nm?"),
-        ([ARGON | {"epsilon_kJ_mol": 996.0}], "well depth is 996 kJ/mol, above 40: is it in J/mol or in K?"),
+        (
+            [ARGON | {"epsilon_kJ_mol": 996.0}],
+            "well depth is 996 kJ/mol, above 40: is it in J/mol or in K?",
+        ),
         ([ARGON | {"epsilon_kJ_mol": 119.8}], "is it in J/mol or in K?"),
-        ([OXYGEN | {"charge_e": -0.4}, HYDROGEN | {"charge_e": 6.4e-20}], "charge_e of H is 6.4e-20 e"),
-        ([OXYGEN | {"element": "X", "mass_u": 2.7e-26}], "mass_u of O is 2.7e-26 u, below 0.1: is it in kg or g?"),
+        (
+            [OXYGEN | {"charge_e": -0.4}, HYDROGEN | {"charge_e": 6.4e-20}],
+            "charge_e of H is 6.4e-20 e",
+        ),
+        (
+            [OXYGEN | {"element": "X", "mass_u": 2.7e-26}],
+            "mass_u of O is 2.7e-26 u, below 0.1: is it in kg or g?",
+        ),
     ],
 )
 def test_a_model_in_another_unit(sites, cause):
@@ -45,11 +79,18 @@ def test_a_model_in_another_unit(sites, cause):
     assert any(cause in warning for warning in warnings), warnings
 
 
-@pytest.mark.parametrize("site", [
-    ARGON, OXYGEN | {"mass_u": 17.007}, HYDROGEN | {"mass_u": 2.014}, HYDROGEN | {"mass_u": 3.024},
-    ARGON | {"element": "C", "mass_u": 16.043}, ARGON | {"element": "C", "mass_u": 14.027},
-    ARGON | {"element": "Li", "mass_u": 6.015},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "site",
+    [
+        ARGON,
+        OXYGEN | {"mass_u": 17.007},
+        HYDROGEN | {"mass_u": 2.014},
+        HYDROGEN | {"mass_u": 3.024},
+        ARGON | {"element": "C", "mass_u": 16.043},
+        ARGON | {"element": "C", "mass_u": 14.027},
+        ARGON | {"element": "Li", "mass_u": 6.015},
+    ],
+)
 def test_isotopes_and_united_atoms_are_what_they_are(site):
     assert build(of_sites(site)).warnings == []
 
@@ -81,14 +122,29 @@ NPT = {"ensemble": "npt", "temperature_K": 90.0, "duration_ps": 0.01}
     [
         ({"stages": [NPT | {"pressure_bar": 101325.0}]}, "1 atm is 101325 Pa, or 1.01325 bar"),
         ({"stages": [NPT | {"pressure_bar": 1e5}]}, "1 atm is 101325 Pa"),
-        ({"stages": [NPT | {"pressure_bar": 2e6}]}, "stages.0.pressure_bar is 2e+06 bar, above 50000: is it in Pa?"),
-        ({"fields": {"gravity_m_s2": [0.0, 0.0, 9.81]}}, "points up, along +z: should it be [0, 0, -9.81]?"),
-        ({"fields": {"gravity_m_s2": [0.0, 0.0, -981.0]}}, "is 981 m/s², above 500: is it in cm/s²?"),
-        ({"fields": {"electric_V_per_nm": [0.0, 1e8, 0.0]}}, "fields.electric_V_per_nm is 1e+08 V/nm"),
+        (
+            {"stages": [NPT | {"pressure_bar": 2e6}]},
+            "stages.0.pressure_bar is 2e+06 bar, above 50000: is it in Pa?",
+        ),
+        (
+            {"fields": {"gravity_m_s2": [0.0, 0.0, 9.81]}},
+            "points up, along +z: should it be [0, 0, -9.81]?",
+        ),
+        (
+            {"fields": {"gravity_m_s2": [0.0, 0.0, -981.0]}},
+            "is 981 m/s², above 500: is it in cm/s²?",
+        ),
+        (
+            {"fields": {"electric_V_per_nm": [0.0, 1e8, 0.0]}},
+            "fields.electric_V_per_nm is 1e+08 V/nm",
+        ),
     ],
 )
 def test_a_scene_in_another_unit(tables, cause):
-    charged = [ARGON | {"charge_e": 1.0}, ARGON | {"name": "Cl", "charge_e": -1.0, "position_A": [2.5, 0.0, 0.0]}]
+    charged = [
+        ARGON | {"charge_e": 1.0},
+        ARGON | {"name": "Cl", "charge_e": -1.0, "position_A": [2.5, 0.0, 0.0]},
+    ]
     edge = None if "gravity_m_s2" in tables.get("fields", {}) else 30.0  # what falls needs no box
     warnings = build(of_sites(*charged, edge=edge, **tables)).warnings
     assert any(cause in warning for warning in warnings), warnings
@@ -123,10 +179,19 @@ def test_a_cutoff_below_contact_has_no_tail_correction():
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ({"start.euler_angles_deg": [0.0, 0.52, 0.0]}, "are these radians? They would be [0, 29.79, 0]°"),
-        ({"start.euler_angles_deg": [1.5708, 0.7854, 0.0]}, "are these radians? They would be [90, 45, 0]°"),
+        (
+            {"start.euler_angles_deg": [0.0, 0.52, 0.0]},
+            "are these radians? They would be [0, 29.79, 0]°",
+        ),
+        (
+            {"start.euler_angles_deg": [1.5708, 0.7854, 0.0]},
+            "are these radians? They would be [90, 45, 0]°",
+        ),
         ({"gravity.acceleration_m_s2": [0.0, 0.0, 9.81]}, "points up, along +z"),
-        ({"run.timestep_s": 0.05, "run.integrator": "velocity_verlet"}, "timestep_s = 0.05 is inaccurate"),
+        (
+            {"run.timestep_s": 0.05, "run.integrator": "velocity_verlet"},
+            "timestep_s = 0.05 is inaccurate",
+        ),
     ],
 )
 def test_a_body_in_another_unit(override, words, capsys):
@@ -160,18 +225,41 @@ def test_check_warns_of_steps_by_their_accuracy(step, words, tmp_path, capsys):
 
 @pytest.mark.parametrize(("step", "words"), [(10.0, "is inaccurate for spce at 300 K"), (2.0, "")])
 def test_a_run_notes_inaccurate_steps(step, words):
-    stages = [{"ensemble": "nvt", "temperature_K": 300.0, "timestep_fs": step, "duration_ps": 2e-3 * step}]
-    scene = small_scene({"spce": 20}, 30.0, stages=stages, forces={"cutoff_A": 6.0, "electrostatics": "reaction_field"})
+    stages = [
+        {"ensemble": "nvt", "temperature_K": 300.0, "timestep_fs": step, "duration_ps": 2e-3 * step}
+    ]
+    scene = small_scene(
+        {"spce": 20},
+        30.0,
+        stages=stages,
+        forces={"cutoff_A": 6.0, "electrostatics": "reaction_field"},
+    )
     notes = rigidmd.Simulation(scene, warn=str).run().summary["notes"]
-    assert any(words in note for note in notes) if words else not any("timestep" in note for note in notes)
+    assert (
+        any(words in note for note in notes)
+        if words
+        else not any("timestep" in note for note in notes)
+    )
 
 
-@pytest.mark.parametrize(("step", "words"), [(0.05, "timestep_s = 0.05 is inaccurate"), (0.002, "")])
+@pytest.mark.parametrize(
+    ("step", "words"), [(0.05, "timestep_s = 0.05 is inaccurate"), (0.002, "")]
+)
 def test_a_run_of_a_body_notes_inaccurate_steps(step, words):
-    changes = {"run.timestep_s": step, "run.integrator": "velocity_verlet", "run.duration_s": 2 * step}
-    scene = rigidmd.Scene.read(ROOT / "systems" / "heavy_top_3.toml", changes | {"output.interval_s": step})
+    changes = {
+        "run.timestep_s": step,
+        "run.integrator": "velocity_verlet",
+        "run.duration_s": 2 * step,
+    }
+    scene = rigidmd.Scene.read(
+        ROOT / "systems" / "heavy_top_3.toml", changes | {"output.interval_s": step}
+    )
     notes = rigidmd.Simulation(scene, warn=str).run().summary["notes"]
-    assert any(words in note for note in notes) if words else not any("timestep" in note for note in notes)
+    assert (
+        any(words in note for note in notes)
+        if words
+        else not any("timestep" in note for note in notes)
+    )
 
 
 @pytest.mark.parametrize(("sigma", "warns"), [(0.34, True), (3.4, False)])

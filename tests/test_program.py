@@ -1,4 +1,5 @@
-"""The step as a table of passes: what is compiled for which part of a scene, and how the table is printed."""
+"""The step as a table of passes: what is compiled for which part of a scene, and how the table is
+printed."""
 
 import numpy as np
 import pytest
@@ -41,7 +42,9 @@ def made(uses=ALWAYS):
     return program, log
 
 
-@pytest.mark.parametrize(("at", "expected"), [(EARLY, [10, 20]), (LATE, [10, 30]), (EARLY | LATE, [10, 20, 30])])
+@pytest.mark.parametrize(
+    ("at", "expected"), [(EARLY, [10, 20]), (LATE, [10, 30]), (EARLY | LATE, [10, 20, 30])]
+)
 def test_passes_run_in_their_order_when_they_act(at, expected):
     program, log = made()
     assert run_rows(program.rows, at) == 0
@@ -65,7 +68,10 @@ def test_what_is_never_used_is_no_row():
 def test_arguments_of_another_type_are_refused():
     program, log = made(uses=EARLY)
     status = np.zeros(1, np.int64)
-    other = [Pass("one", _append, (log, 1.5, status)), Pass("early", _append, (log, 20, status), when=EARLY)]
+    other = [
+        Pass("one", _append, (log, 1.5, status)),
+        Pass("early", _append, (log, 20, status), when=EARLY),
+    ]
     with pytest.raises(TypeError, match="_append was compiled for"):
         program.bind(other)
 
@@ -75,7 +81,8 @@ PRESSED = STAGE | {"ensemble": "npt", "pressure_bar": 1.0, "barostat_interval_ps
 
 
 def test_the_step_loop_is_compiled_once_for_all_thermostats_barostats_and_forces():
-    """Also for trajectories, no thermostat, and charges; the update of a list is compiled once for all potentials."""
+    """Also for trajectories, no thermostat, and charges; the update of a list is compiled once for
+    all potentials."""
     counts = {"spce": 5, "argon": 5}
 
     def run(stage, **forces):
@@ -94,8 +101,13 @@ def test_the_step_loop_is_compiled_once_for_all_thermostats_barostats_and_forces
 
 
 def test_a_stage_without_a_thermostat_has_no_flow_of_one():
-    system, engine, state = built({"argon": 5}, 20.0, stages=[STAGE, {"ensemble": "nve", "duration_ps": 0.01}])
-    texts = [[row.text for row in program_of(engine, state, integrator_of_stage(system, k))] for k in (0, 1)]
+    system, engine, state = built(
+        {"argon": 5}, 20.0, stages=[STAGE, {"ensemble": "nve", "duration_ps": 0.01}]
+    )
+    texts = [
+        [row.text for row in program_of(engine, state, integrator_of_stage(system, k))]
+        for k in (0, 1)
+    ]
     assert any("thermostat VelocityRescaling" in text for text in texts[0])
     assert not any("thermostat" in text for text in texts[1])
 
@@ -127,14 +139,21 @@ def test_check_prints_the_program_of_each_stage(tmp_path, capsys, monkeypatch):
 
 
 def test_check_measures_the_rows_of_a_step(tmp_path, capsys):
-    scene = small_scene({"spce": 30, "argon": 5}, 14.0, forces={"cutoff_A": 5.0}, stages=[STAGE | {"timestep_fs": 0.5}])
+    scene = small_scene(
+        {"spce": 30, "argon": 5},
+        14.0,
+        forces={"cutoff_A": 5.0},
+        stages=[STAGE | {"timestep_fs": 0.5}],
+    )
     write_scene(tmp_path, scene)
     assert main(["check", str(tmp_path / "scene.toml"), "--profile"]) == 0
     lines = capsys.readouterr().out.partition("time of a step of stages.0")[2].splitlines()
     rows = [" ".join(line.split()[:-2]) for line in lines[2:] if line.endswith("%")]
     system, engine = build(scene), build(scene).engine()
     program = program_of(engine, system.state, integrator_of_stage(system, 0))
-    expected = [row.text.strip() for row in program if ": " in row.text and row.when != "with energies"]
+    expected = [
+        row.text.strip() for row in program if ": " in row.text and row.when != "with energies"
+    ]
     assert rows[:-1] == [text for text in expected if not text.startswith(("kick", "drift"))]
     times = [float(line.split()[-2]) for line in lines[2:] if line.endswith("%")]
     assert len(times) > 5
@@ -152,5 +171,7 @@ def test_a_scene_is_compiled_without_running_it(tmp_path, capsys, monkeypatch):
     simulation = Simulation(small_scene({"argon": 5}, 20.0, stages=[STAGE]), warn=str)
     before = simulation.state.copy()
     simulation.compile()
-    assert all(np.array_equal(one, other) for one, other in zip(simulation.state, before, strict=True))
+    assert all(
+        np.array_equal(one, other) for one, other in zip(simulation.state, before, strict=True)
+    )
     assert simulation.run().state.step[0] == 1

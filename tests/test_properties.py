@@ -1,4 +1,5 @@
-"""Properties that hold for anything, by examples that hypothesis looks for: rotations, rotors, whole scenes."""
+"""Properties that hold for anything, by examples that hypothesis looks for: rotations, rotors,
+whole scenes."""
 
 import numpy as np
 import pytest
@@ -59,7 +60,9 @@ def test_any_angles_come_back_as_the_same_rotation(turned):
 
 
 @FEW
-@given(st.integers(1, 6).flatmap(lambda n: st.lists(vectors(10.0), min_size=n, max_size=n)), st.data())
+@given(
+    st.integers(1, 6).flatmap(lambda n: st.lists(vectors(10.0), min_size=n, max_size=n)), st.data()
+)
 def test_any_masses_have_a_principal_frame(positions, data):
     masses = np.array([data.draw(floats(1e-3, 1e3)) for _ in positions])
     positions = np.array(positions)
@@ -75,7 +78,8 @@ def test_any_masses_have_a_principal_frame(positions, data):
     assert frame.inertia[2] <= (frame.inertia[0] + frame.inertia[1]) * (1 + 3e-8)
 
 
-#: Moments of a body: of three positive numbers, each pair added, so that no moment is more than the sum of the others.
+#: Moments of a body: of three positive numbers, each pair added, so that no moment is more than the
+#: sum of the others.
 moments = st.tuples(*[floats(-6.0, 0.0)] * 3).map(
     lambda p: np.roll(10.0 ** np.array(p), 1) + np.roll(10.0 ** np.array(p), 2)
 )
@@ -83,23 +87,31 @@ moments = st.tuples(*[floats(-6.0, 0.0)] * 3).map(
 
 @FEW
 @given(moments, floats(-80.0, 80.0), vectors(), floats(0.001, 1.0))
-def test_a_free_rotor_keeps_what_it_should_for_any_inertia_at_any_scale(inertia, exponent, direction, h):
+def test_a_free_rotor_keeps_what_it_should_for_any_inertia_at_any_scale(
+    inertia, exponent, direction, h
+):
     scale = 10.0**exponent
     size = np.linalg.norm(direction)
     if size < 1e-3:
         direction, size = np.array([1.0, 0.0, 0.0]), 1.0
     momentum = direction / size
     step = h / np.abs(momentum / inertia).max()
-    for rotor in (split_rotor(scale * inertia[None]), ExactRotor(*split_rotor(scale * inertia[None]))):
+    for rotor in (
+        split_rotor(scale * inertia[None]),
+        ExactRotor(*split_rotor(scale * inertia[None])),
+    ):
         q, l = np.eye(3)[None].copy(), scale * momentum[None]  # noqa: E741
         spin(rotor, q, l, step, 100)
         assert np.linalg.norm(l[0] / scale) == pytest.approx(1, rel=1e-13)
         assert np.abs(q[0] @ l[0] / scale - momentum).max() < 1e-13
         assert orthogonality_error(q) < 1e-13
         if isinstance(rotor, ExactRotor):
-            # a moment a million times smaller than L²/2T has its energy from what rounding leaves of L about it
+            # a moment a million times smaller than L²/2T has its energy from what rounding leaves
+            # of L about it
             kinetic = [(v**2 / inertia).sum() for v in (momentum, l[0] / scale)]
-            assert kinetic[1] == pytest.approx(kinetic[0], rel=1e-12 + 1e-15 * inertia.max() / inertia.min())
+            assert kinetic[1] == pytest.approx(
+                kinetic[0], rel=1e-12 + 1e-15 * inertia.max() / inertia.min()
+            )
 
 
 def site(k: int):
@@ -132,9 +144,16 @@ scenes = st.fixed_dictionaries(
     {
         "seed": st.integers(0, 100),
         "box": st.sampled_from(
-            [{"lengths_A": 12.0}, {"lengths_A": [12.0, 30.0, 12.0]}, {"lengths_A": 5.0}, {"density_g_cm3": 1.0}]
+            [
+                {"lengths_A": 12.0},
+                {"lengths_A": [12.0, 30.0, 12.0]},
+                {"lengths_A": 5.0},
+                {"density_g_cm3": 1.0},
+            ]
         ),
-        "molecules": st.tuples(molecules, st.sampled_from([1, 2, 20])).map(lambda one: [one[0] | {"count": one[1]}]),
+        "molecules": st.tuples(molecules, st.sampled_from([1, 2, 20])).map(
+            lambda one: [one[0] | {"count": one[1]}]
+        ),
         "forces": st.fixed_dictionaries(
             {
                 "cutoff_A": st.sampled_from([1.0, 5.0, 6.0]),
@@ -158,7 +177,12 @@ def test_any_small_scene_runs_ten_steps_or_is_refused_in_words(data):
 
 ONE_KIND = scenes.map(
     lambda data: data | {"molecules": [{"model": "spce", "count": data["molecules"][0]["count"]}]}
-).map(lambda data: data | {"stages": [data["stages"][0] | {"integrator": "velocity_verlet", "ensemble": "nve"}]})
+).map(
+    lambda data: (
+        data
+        | {"stages": [data["stages"][0] | {"integrator": "velocity_verlet", "ensemble": "nve"}]}
+    )
+)
 
 
 @FEWER

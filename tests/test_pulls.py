@@ -1,7 +1,8 @@
-"""Errors that runs report, compared with the scatter of their values over seeds. Minutes each: the soak tier.
+"""Errors that runs report, compared with the scatter of their values over seeds. Minutes each: the
+soak tier.
 
-The pull is (value - truth)/error; its root mean square is 1 for an honest error. `pytest -m soak -rP tests/test_pulls.py`
-prints what was measured.
+The pull is (value - truth)/error; its root mean square is 1 for an honest error. `pytest -m soak
+-rP tests/test_pulls.py` prints what was measured.
 """
 
 import numpy as np
@@ -14,14 +15,16 @@ pytestmark = pytest.mark.soak
 
 SEEDS = 60
 TEMPERATURE, PRESSURE = 120.0, 500.0
-#: Limits of the root mean square of pulls, over all lengths, and fraction of pulls that may be beyond 3.
+#: Limits of the root mean square of pulls, over all lengths, and fraction of pulls that may be
+#: beyond 3.
 LEAST, MOST, BEYOND = 0.8, 1.3, 0.025
 #: The same for the pulls of one length, whose root mean square has an error of 9 %.
 LEAST_OF_LENGTH, MOST_OF_LENGTH = 0.6, 1.5
 
 
 def argon(seed, ensemble, durations, **output):
-    """Results of 64 argon atoms with a stage of each duration (ps), at 120 K and 1.36 g/cm3, or 500 bar."""
+    """Results of 64 argon atoms with a stage of each duration (ps), at 120 K and 1.36 g/cm3, or 500
+    bar."""
     stage = {"ensemble": ensemble, "temperature_K": TEMPERATURE, "timestep_fs": 10.0}
     if ensemble == "npt":
         stage["pressure_bar"] = PRESSURE
@@ -38,7 +41,8 @@ def argon(seed, ensemble, durations, **output):
 
 
 def check_pulls(name, measured, truth=None, least=LEAST, most=MOST):
-    """Print and check pulls. measured : length (ps) -> values and errors (seeds, 2), None where there is none
+    """Print and check pulls. measured : length (ps) -> values and errors (seeds, 2), None where
+        there is none
 
     truth : the mean of all values, weighted by length, if it is None
     least, most : limits of the root mean square of all pulls
@@ -52,8 +56,12 @@ def check_pulls(name, measured, truth=None, least=LEAST, most=MOST):
         truth = np.average([pairs[:, 0].mean() for pairs in found.values()], weights=list(found))
     pulls = {length: (pairs[:, 0] - truth) / pairs[:, 1] for length, pairs in found.items()}
     for length, of_length in pulls.items():
-        beyond = f"{np.mean(np.abs(of_length) > 3):.1%} beyond 3, largest {np.abs(of_length).max():.1f}"
-        print(f"{name}, {length:g} ps: {rms(of_length):.2f}, mean {of_length.mean():+.2f}, {beyond}")
+        beyond = (
+            f"{np.mean(np.abs(of_length) > 3):.1%} beyond 3, largest {np.abs(of_length).max():.1f}"
+        )
+        print(
+            f"{name}, {length:g} ps: {rms(of_length):.2f}, mean {of_length.mean():+.2f}, {beyond}"
+        )
         assert LEAST_OF_LENGTH < rms(of_length) < MOST_OF_LENGTH * most / MOST, name
         if is_known:
             assert abs(of_length.mean()) < 4 * of_length.std() / np.sqrt(len(of_length)), name
@@ -83,16 +91,20 @@ KEYS = {
     ],
 )
 def test_errors_of_a_summary_are_those_of_the_scatter_over_seeds(ensemble, durations):
-    """The first stage relaxes. Temperature and pressure are known where a thermostat and a barostat set them."""
+    """The first stage relaxes. Temperature and pressure are known where a thermostat and a barostat
+    set them."""
     sampled = durations[1:]
     frames = {"trajectory_interval_ps": 1000.0}
-    runs = [argon(seed, ensemble, durations, **frames).summary["stages"][1:] for seed in range(SEEDS)]
+    runs = [
+        argon(seed, ensemble, durations, **frames).summary["stages"][1:] for seed in range(SEEDS)
+    ]
     known = {"T": TEMPERATURE} | ({"P": PRESSURE} if ensemble == "npt" else {})
     for name, (value, error) in KEYS.items():
         if name == "density" and ensemble == "nvt":
             continue
         measured = {
-            length: [(stages[k][value], stages[k][error]) for stages in runs] for k, length in enumerate(sampled)
+            length: [(stages[k][value], stages[k][error]) for stages in runs]
+            for k, length in enumerate(sampled)
         }
         check_pulls(f"{ensemble}: {name}", measured, known.get(name))
 

@@ -12,7 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import BODIES, BODY, BODY_COLUMNS, COLUMNS, ROOT, TENSOR, Observation, contents, load_model, small_scene
+from support import (
+    BODIES,
+    BODY,
+    BODY_COLUMNS,
+    COLUMNS,
+    ROOT,
+    TENSOR,
+    Observation,
+    contents,
+    load_model,
+    small_scene,
+)
 
 import rigidmd
 from rigidmd.errors import OutputError, SceneError, StructureError
@@ -25,7 +36,10 @@ SHORT = {"run.duration_s": 0.05, "output.figures": False}
 
 
 def argon(folder=None, **options):
-    stages = [{"ensemble": "nvt", "duration_ps": 0.02, "temperature_K": 90.0}, {"duration_ps": 0.02}]
+    stages = [
+        {"ensemble": "nvt", "duration_ps": 0.02, "temperature_K": 90.0},
+        {"duration_ps": 0.02},
+    ]
     scene = small_scene({"argon": 20}, 20.0, stages=stages, output={"log_interval_ps": 0.01})
     return Simulation(scene, folder, **options)
 
@@ -42,20 +56,33 @@ def test_results_are_what_the_log_says(tmp_path):
         for row, value in zip(rows, results[name], strict=True):
             told = row[column.header]
             assert (
-                told == value if column.unit == "" else float(told or "nan") == pytest.approx(value, abs=0, nan_ok=True)
+                told == value
+                if column.unit == ""
+                else float(told or "nan") == pytest.approx(value, abs=0, nan_ok=True)
             )
     potential = rows[0]["Potential Energy (kJ/mole)"]
     assert -100 < float(potential) < 100  # 20 atoms of a gas, in kJ/mol
     assert results["potential"][0] == float(potential)
     own = results["stage"] == 1
-    assert np.diff(results["conserved"][own]) == pytest.approx(np.diff(results["drift"][own]), abs=1e-9)
+    assert np.diff(results["conserved"][own]) == pytest.approx(
+        np.diff(results["drift"][own]), abs=1e-9
+    )
     freedom, boltzmann = 3 * 20 - 3, 0.00831446261815324  # kJ/mol/K
     assert results["kinetic"] == pytest.approx(0.5 * freedom * boltzmann * results["temperature"])
 
 
 def test_the_record_and_its_table_name_the_same_units():
-    said = {"kJ/mol": "(kJ/mole)", "K": "(K)", "bar": "(bar)", "ps": "(ps)", "nm³": "(nm^3)", "g/cm³": "(g/mL)",
-            "u Å/ps": "(u A/ps)", "Å": "(A)", "°": "(deg)"}  # fmt: skip
+    said = {
+        "kJ/mol": "(kJ/mole)",
+        "K": "(K)",
+        "bar": "(bar)",
+        "ps": "(ps)",
+        "nm³": "(nm^3)",
+        "g/cm³": "(g/mL)",
+        "u Å/ps": "(u A/ps)",
+        "Å": "(A)",
+        "°": "(deg)",
+    }
     for column in COLUMNS.values():
         if column.header:
             assert column.header.endswith(said.get(column.unit, column.header))
@@ -87,11 +114,15 @@ def test_observers_see_the_units_of_the_log():
     energy = []
     for shift in (1e-4, -1e-4):
         state.position[0, 0] += shift
-        energy.append(sum(tally.energy for tally in engine.evaluate(state)[1].values()) / KJ_PER_MOL)
+        energy.append(
+            sum(tally.energy for tally in engine.evaluate(state)[1].values()) / KJ_PER_MOL
+        )
         state.position[0, 0] -= shift
     assert isinstance(seen[-1][0], Observation)
     assert seen[-1][0].force.shape == (len(system.model.species), 3)
-    assert seen[-1][0].force[0, 0] == pytest.approx(-(energy[0] - energy[1]) / 2e-4, rel=1e-5, abs=1e-9)
+    assert seen[-1][0].force[0, 0] == pytest.approx(
+        -(energy[0] - energy[1]) / 2e-4, rel=1e-5, abs=1e-9
+    )
 
 
 def test_a_body_has_matrices_and_si_units():
@@ -117,10 +148,15 @@ def test_every_column_of_every_body_is_in_the_table():
         results = Simulation(
             Scene.read(
                 path,
-                {f"{key}_s": n * scene.run.timestep_s for key, n in (("run.duration", 10), ("output.interval", 1))},
+                {
+                    f"{key}_s": n * scene.run.timestep_s
+                    for key, n in (("run.duration", 10), ("output.interval", 1))
+                },
             )
         ).run()
-        assert set(results.units) == set(results.samples.columns) | ({"Q"} if "q11" in results.units else set())
+        assert set(results.units) == set(results.samples.columns) | (
+            {"Q"} if "q11" in results.units else set()
+        )
         found |= set(results.units)
     assert found - {"Q"} <= set(BODY_COLUMNS)
     assert {family for family, members in BODY.items() if not found & set(members.names)} == set()
@@ -138,7 +174,9 @@ def test_a_data_frame_has_the_headers_of_the_log(tmp_path):
             assert list(frame[header]) == list(log[header])
     results = Simulation(Scene.read(TOP, SHORT), tmp_path / "b").run()
     frame = results.to_dataframe()
-    assert list(frame.columns) == (tmp_path / "b" / "motion.csv").read_text().splitlines()[0].split(",")
+    assert list(frame.columns) == (tmp_path / "b" / "motion.csv").read_text().splitlines()[0].split(
+        ","
+    )
     assert (frame["theta (rad)"] == results["theta"]).all()
 
 
@@ -152,15 +190,21 @@ def test_without_pandas_one_sentence_says_so(monkeypatch):
 @pytest.mark.parametrize("time", [float("nan"), float("inf"), -1.0])
 def test_times_from_python_are_finite(time):
     scene = Scene.read(TOP, SHORT)
-    with pytest.raises(ValueError, match=r"walltime is .*, must be a finite number of seconds, not negative"):
+    with pytest.raises(
+        ValueError, match=r"walltime is .*, must be a finite number of seconds, not negative"
+    ):
         Simulation(scene, walltime=time)
-    with pytest.raises(ValueError, match=r"the interval of Every is .*, must be a finite time above 0"):
+    with pytest.raises(
+        ValueError, match=r"the interval of Every is .*, must be a finite time above 0"
+    ):
         Every(time, print)
 
     class Seldom(rigidmd.Observer):
         interval = time
 
-    with pytest.raises(ValueError, match=r"the interval of Seldom is .*, must be a finite time above 0"):
+    with pytest.raises(
+        ValueError, match=r"the interval of Seldom is .*, must be a finite time above 0"
+    ):
         Simulation(scene, observers=Seldom()).run()
     with pytest.raises(TypeError, match="3 is not a Simulation"):
         rigidmd.run_together([3])  # pyright: ignore[reportArgumentType]
@@ -168,10 +212,18 @@ def test_times_from_python_are_finite(time):
 
 def test_values_show_what_they_are(tmp_path):
     water = Scene.read(ROOT / "systems" / "water.toml")
-    assert repr(water) == "<MolecularScene water: 216 spce; minimisation, equilibration 10 ps, production 20 ps>"
-    assert "216 spce of structures/water216.gro" in repr(Scene.read(ROOT / "systems" / "water_from_structure.toml"))
+    assert (
+        repr(water)
+        == "<MolecularScene water: 216 spce; minimisation, equilibration 10 ps, production 20 ps>"
+    )
+    assert "216 spce of structures/water216.gro" in repr(
+        Scene.read(ROOT / "systems" / "water_from_structure.toml")
+    )
     scene = Scene.read(TOP, SHORT)
-    assert repr(scene) == "<BodyScene heavy_top_3: one body, pinned; 0.05 s in 100 steps of 0.0005 s, kahan_li_8>"
+    assert (
+        repr(scene)
+        == "<BodyScene heavy_top_3: one body, pinned; 0.05 s in 100 steps of 0.0005 s, kahan_li_8>"
+    )
     simulation = Simulation(scene)
     assert repr(simulation).startswith("<Simulation heavy_top_3: one body (symmetric, pinned)")
     assert "results stay in memory" in repr(simulation)
@@ -181,7 +233,13 @@ def test_values_show_what_they_are(tmp_path):
     written = Simulation(scene, folder)
     assert f"writes to {folder}" in repr(written)
     assert f"5 files in {folder}" in repr(written.run())
-    states = [simulation.system, simulation.state, results.samples, results.system, load_model("tip4p2005")]
+    states = [
+        simulation.system,
+        simulation.state,
+        results.samples,
+        results.system,
+        load_model("tip4p2005"),
+    ]
     seen = Simulation(scene, observers=Every(0.01, lambda moment: states.append(moment)))
     seen.run()
     assert type(states[-1]).__name__ in repr(states[-1])
@@ -229,31 +287,49 @@ HOVER = {
 
 def pyright(project):
     """What pyright says of the project in a folder: its report as a dictionary."""
-    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable, "-p", str(project)]
+    command = [
+        sys.executable,
+        "-m",
+        "pyright",
+        "--outputjson",
+        "--pythonpath",
+        sys.executable,
+        "-p",
+        str(project),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     try:
         found = json.loads(done.stdout)
         assert "generalDiagnostics" in found
     except (ValueError, AssertionError):
-        pytest.skip(f"pyright cannot run here (pip install 'pyright[nodejs]'): {done.stderr.strip()[-200:]}")
+        pytest.skip(
+            f"pyright cannot run here (pip install 'pyright[nodejs]'): {done.stderr.strip()[-200:]}"
+        )
     return found
 
 
 def findings_in_script(folder, text):
-    """What pyright says of a script, the tutorial and the chapter about it: (severity, line, message) of each finding."""
+    """What pyright says of a script, the tutorial and the chapter about it: (severity, line,
+    message) of each finding."""
     cells = json.loads((ROOT / "systems" / "notebooks" / "tutorial.ipynb").read_text())["cells"]
     chapter = (ROOT / "rigidmd" / "docs" / "tutorials" / "notebook.md").read_text()
     files = {
         "script.py": text,
-        "tutorial.py": "\n".join("".join(part["source"]) for part in cells if part["cell_type"] == "code"),
+        "tutorial.py": "\n".join(
+            "".join(part["source"]) for part in cells if part["cell_type"] == "code"
+        ),
         "chapter.py": "".join(re.findall(r"```python\n(.*?)```", chapter, re.DOTALL)),
     }
     for name, source in files.items():
         (folder / name).write_text(source)
     shown = {"reportUnusedExpression": "none"}  # the last line of a cell
-    (folder / "pyrightconfig.json").write_text(json.dumps({"include": list(files), "extraPaths": [str(ROOT)]} | shown))
+    (folder / "pyrightconfig.json").write_text(
+        json.dumps({"include": list(files), "extraPaths": [str(ROOT)]} | shown)
+    )
     found = pyright(folder)["generalDiagnostics"]
-    return [(entry["severity"], entry["range"]["start"]["line"], entry["message"]) for entry in found]
+    return [
+        (entry["severity"], entry["range"]["start"]["line"], entry["message"]) for entry in found
+    ]
 
 
 def test_an_editor_knows_the_types(tmp_path):
@@ -262,7 +338,10 @@ def test_an_editor_knows_the_types(tmp_path):
     found = findings_in_script(tmp_path, SCRIPT + hover + wrong)
     lines = SCRIPT.count("\n")
     at_wrong = lines + len(HOVER)
-    assert {at for severity, at, _ in found if severity != "information"} == {at_wrong, at_wrong + 1}
+    assert {at for severity, at, _ in found if severity != "information"} == {
+        at_wrong,
+        at_wrong + 1,
+    }
     for line, (expression, kind) in enumerate(HOVER.items(), start=lines):
         (message,) = [message for _, at, message in found if at == line]
         told = message.removeprefix(f'Type of "{expression}" is "').removesuffix('"')
@@ -342,16 +421,21 @@ def test_the_package_says_that_it_has_types():
 
 
 def heavy_top(folder=None, **options):
-    scene = Scene.read(TOP, SHORT | {"run.integrator": "velocity_verlet", "output.trajectory": False})
+    scene = Scene.read(
+        TOP, SHORT | {"run.integrator": "velocity_verlet", "output.trajectory": False}
+    )
     return Simulation(scene, folder, **options)
 
 
 @pytest.mark.parametrize("make", [argon, heavy_top])
 def test_steps_are_the_steps_of_a_run(make, tmp_path):
-    """Over the end of a stage and past the end of the scene, mixed with `run`; files and bits are those of `run`."""
+    """Over the end of a stage and past the end of the scene, mixed with `run`; files and bits are
+    those of `run`."""
     seen, whole = [], make(tmp_path / "whole", observers=Every(0.002, lambda moment: None)).run()
     count = int(whole.state.step[0])
-    simulation = make(tmp_path / "steps", observers=Every(0.002, lambda moment: seen.append(moment.step)))
+    simulation = make(
+        tmp_path / "steps", observers=Every(0.002, lambda moment: seen.append(moment.step))
+    )
     assert simulation.step() == 1 and simulation.state.step[0] == 1
     assert seen[0] == 0 and seen[-1] <= 1
     with pytest.raises(RuntimeError, match="the run has begun"):
@@ -425,9 +509,13 @@ elif {ends!r} == "signal":
     except KeyboardInterrupt:
         sys.exit(simulation.state.step[0] >= 16 and os.path.exists("run/summary.json"))
 """
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True
+    )
     assert (done.returncode, done.stderr) == (int(ends == "signal"), "")
-    assert json.loads((tmp_path / "run" / "summary.json").read_text())["interrupted"] == (ends != "deleted")
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["interrupted"] == (
+        ends != "deleted"
+    )
     heavy_top_scene = Scene.read(tmp_path / "run" / "scene.toml")
     assert not Simulation(heavy_top_scene, tmp_path / "run", resume=True).run().interrupted
 
@@ -457,7 +545,9 @@ def test_an_observer_is_any_object_with_an_interval_and_see(tmp_path):
     one, two = Plain(), PlainWithFile()
     results = argon(tmp_path / "out", observers=[one, two]).run()
     assert one.times == two.times == pytest.approx([0, 0.01, 0.02, 0.03, 0.04])
-    assert (tmp_path / "out" / "times.txt").read_text() == "5" and tmp_path / "out" / "times.txt" in results.files
+    assert (
+        tmp_path / "out" / "times.txt"
+    ).read_text() == "5" and tmp_path / "out" / "times.txt" in results.files
     argon(observers=one).run()
     assert len(one.times) == 10
     for wrong in (3, print, object(), [one, "see"]):
@@ -477,7 +567,9 @@ def test_a_simulation_takes_what_its_kind_of_scene_has():
 
 
 @pytest.mark.parametrize("make", [argon, heavy_top])
-def test_a_run_again_in_its_folder_continues_after_an_interrupt_and_repeats_after_its_end(make, tmp_path):
+def test_a_run_again_in_its_folder_continues_after_an_interrupt_and_repeats_after_its_end(
+    make, tmp_path
+):
     whole = make(tmp_path / "whole").run()
     calls = []
 
@@ -499,7 +591,9 @@ def test_a_run_again_in_its_folder_continues_after_an_interrupt_and_repeats_afte
     assert np.array_equal(again.state.rotation, whole.state.rotation)
     assert calls.count(0) >= 2
     other = make(tmp_path / "run")  # the files are now those of another run
-    with pytest.raises(OutputError, match="resume=True continues it, force=True replaces it") as refused:
+    with pytest.raises(
+        OutputError, match="resume=True continues it, force=True replaces it"
+    ) as refused:
         other.run()
     assert "--" not in str(refused.value) and " -o" not in str(refused.value)
 
@@ -517,7 +611,9 @@ def test_the_state_is_read_only_and_observables_follow_it():
             moved.position[1, 2] += shift
             other.start_from(moved)
             energies.append(other.observation.potential)
-        assert forces[1, 2] == pytest.approx(-(energies[0] - energies[1]) / 2e-4, rel=1e-5, abs=1e-9)
+        assert forces[1, 2] == pytest.approx(
+            -(energies[0] - energies[1]) / 2e-4, rel=1e-5, abs=1e-9
+        )
     for array in simulation.state:
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0
@@ -540,11 +636,26 @@ def test_a_simulation_begins_only_from_states_that_it_can_have():
     state = simulation.state.copy()
     simulation.start_from(state)
     wrong = {
-        "rotation": [-state.rotation, 2 * state.rotation, state.rotation[:2], state.rotation * np.nan],
-        "position": [state.position[:3], np.vstack([state.position] * 2), state.position + np.inf, None],
+        "rotation": [
+            -state.rotation,
+            2 * state.rotation,
+            state.rotation[:2],
+            state.rotation * np.nan,
+        ],
+        "position": [
+            state.position[:3],
+            np.vstack([state.position] * 2),
+            state.position + np.inf,
+            None,
+        ],
         "velocity": [state.velocity * 1j, state.velocity[:, :2]],
         "angular_momentum_body": [state.angular_momentum_body[0]],
-        "cell": [-state.cell, state.cell.T + np.triu(np.ones((3, 3)), 1), np.diag([np.inf] * 3), state.cell / 2],
+        "cell": [
+            -state.cell,
+            state.cell.T + np.triu(np.ones((3, 3)), 1),
+            np.diag([np.inf] * 3),
+            state.cell / 2,
+        ],
     }
     for name, values in wrong.items():
         for value in values:
@@ -561,7 +672,9 @@ def test_a_simulation_cannot_be_pickled_or_copied():
     for attempt in (pickle.dumps, copy.copy, copy.deepcopy):
         with pytest.raises(TypeError, match="a Simulation has compiled code"):
             attempt(simulation)
-    assert np.array_equal(pickle.loads(pickle.dumps(simulation.state)).position, simulation.state.position)
+    assert np.array_equal(
+        pickle.loads(pickle.dumps(simulation.state)).position, simulation.state.position
+    )
 
 
 def test_messages_name_arguments_of_python_not_options(tmp_path):
@@ -572,12 +685,24 @@ def test_messages_name_arguments_of_python_not_options(tmp_path):
     entry = {"module": "spring.py", "name": "x"}
     first = "stages.0.temperature_K"
     for expected, call in {
-        "overrides stages.0.timestep_fs: is -1": lambda: Scene.read(path, {"stages.0.timestep_fs": -1}),
-        "overrides stages.7.x: stages has entries 0 to": lambda: Scene.read(path, {"stages.7.x": 1}),
-        "overrides={'box.volume': None}: box has no volume": lambda: Scene.read(path, {"box.volume": None}),
-        f"sets={{'{first}': [280, 290]}} or sets={{'seed': range(1, 9)}}": lambda: rigidmd.sweep(path, {"seed": 1}),
-        "call rigidmd.trust(": lambda: rigidmd.resolve(Scene.read(path, {"forces.custom": [entry]})),
-        "no Python file by module": lambda: rigidmd.sweep(path, {"seed": [1, 2]}, trust=[tmp_path / "spring.py"]),
+        "overrides stages.0.timestep_fs: is -1": lambda: Scene.read(
+            path, {"stages.0.timestep_fs": -1}
+        ),
+        "overrides stages.7.x: stages has entries 0 to": lambda: Scene.read(
+            path, {"stages.7.x": 1}
+        ),
+        "overrides={'box.volume': None}: box has no volume": lambda: Scene.read(
+            path, {"box.volume": None}
+        ),
+        f"sets={{'{first}': [280, 290]}} or sets={{'seed': range(1, 9)}}": lambda: rigidmd.sweep(
+            path, {"seed": 1}
+        ),
+        "call rigidmd.trust(": lambda: rigidmd.resolve(
+            Scene.read(path, {"forces.custom": [entry]})
+        ),
+        "no Python file by module": lambda: rigidmd.sweep(
+            path, {"seed": [1, 2]}, trust=[tmp_path / "spring.py"]
+        ),
         "there is no such file": lambda: rigidmd.trust(tmp_path / "other.py"),
     }.items():
         with pytest.raises(SceneError) as caught:

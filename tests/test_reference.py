@@ -5,7 +5,17 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from support import CentralSites, Engine, Model, NoRotor, build, lennard_jones, observe, pair_forces, state_of
+from support import (
+    CentralSites,
+    Engine,
+    Model,
+    NoRotor,
+    build,
+    lennard_jones,
+    observe,
+    pair_forces,
+    state_of,
+)
 from support import lennard_jones_tail as tail
 
 from rigidmd.errors import StructureError
@@ -17,7 +27,9 @@ from rigidmd.units import BOLTZMANN
 def points(positions, edge, **law):
     """Engine and state of LJ points (sigma = epsilon = 1)."""
     n = len(positions)
-    sites = CentralSites(np.arange(n + 1, dtype=np.int32), np.arange(n, dtype=np.int32))  # as a scene has them
+    sites = CentralSites(
+        np.arange(n + 1, dtype=np.int32), np.arange(n, dtype=np.int32)
+    )  # as a scene has them
     kind = np.zeros(n, np.int32)
     made = lennard_jones(kind, np.ones(1), np.ones(1), **law)
     term = pair_forces(made, sites)
@@ -32,7 +44,9 @@ def five_digits(printed):
 
 @pytest.mark.parametrize("config", [pytest.param("config1", marks=pytest.mark.soak), "config4"])
 def test_nist_lennard_jones(reference, config):
-    table = json.loads((reference / "nist_lj_cuboid" / "REFERENCE.json").read_text())["table"][config]
+    table = json.loads((reference / "nist_lj_cuboid" / "REFERENCE.json").read_text())["table"][
+        config
+    ]
     file = reference / "nist_lj_cuboid" / f"lj_sample_config_periodic{config[-1]}.txt"
     positions = np.loadtxt(file, skiprows=2, usecols=(1, 2, 3))
     assert len(positions) == table["N"]
@@ -60,13 +74,21 @@ def test_a_cutoff_that_reaches_hundreds_of_clusters():
         cKDTree(positions % edge, boxsize=edge), cutoff, output_type="ndarray"
     )
     r = found["v"][found["i"] < found["j"]]
-    assert engine.evaluate(state)[1]["lj"].energy == pytest.approx(4 * (r**-12.0 - r**-6.0).sum(), rel=1e-11)
+    assert engine.evaluate(state)[1]["lj"].energy == pytest.approx(
+        4 * (r**-12.0 - r**-6.0).sum(), rel=1e-11
+    )
 
 
 def co2_scene(reference):
     def site(name, mass, sigma, epsilon, position):
-        return {"name": name, "element": name[0], "mass_u": mass, "sigma_A": sigma, "epsilon_K": epsilon,
-                "position_A": [0.0, 0.0, position]}  # fmt: skip
+        return {
+            "name": name,
+            "element": name[0],
+            "mass_u": mass,
+            "sigma_A": sigma,
+            "epsilon_K": epsilon,
+            "position_A": [0.0, 0.0, position],
+        }
 
     sites = [
         site("O1", 15.9994, 3.017, 85.671, -1.149),
@@ -148,7 +170,8 @@ def test_a_crystal_with_disordered_hydrogens_is_refused(reference):
 
 @pytest.mark.soak
 def test_two_centre_lennard_jones_liquid():
-    """Mecke et al.: L* = 0.67, T* = 2, rho* = 0.458: p* = 2.013, u* = -10.9000. sigma 1 Å, epsilon 100 K, m 20 u."""
+    """Mecke et al.: L* = 0.67, T* = 2, rho* = 0.458: p* = 2.013, u* = -10.9000. sigma 1 Å, epsilon
+    100 K, m 20 u."""
     sites = [
         {
             "name": f"A{k}",

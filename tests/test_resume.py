@@ -83,10 +83,14 @@ ENSEMBLES = {
     "andersen": (NVT | {"thermostat": "andersen"}, NVE | {"integrator": "srkn_4"}),
     "hybrid_monte_carlo": (
         NVT | {"thermostat": "hybrid_monte_carlo", "trajectory_steps": 4, "timestep_fs": 6.0},
-        NPT | {"thermostat": "hybrid_monte_carlo", "trajectory_steps": 3, "momentum_refreshment": 0.4},
+        NPT
+        | {"thermostat": "hybrid_monte_carlo", "trajectory_steps": 3, "momentum_refreshment": 0.4},
     ),
     "monte_carlo": (NPT | {"barostat": "monte_carlo"}, NVE | {"integrator": "position_verlet"}),
-    "flexible": (NPT | {"thermostat": "langevin", "pressure_coupling": "flexible"}, NVE | {"integrator": "chin_4a"}),
+    "flexible": (
+        NPT | {"thermostat": "langevin", "pressure_coupling": "flexible"},
+        NVE | {"integrator": "chin_4a"},
+    ),
     "minimise": (MINIMISE, NVT, MINIMISE, NVE),
     "auto": (NVT, {"integrator": "auto", "energy_error_kT": 0.01, "duration_ps": 0.4}),
 }
@@ -95,12 +99,16 @@ ENSEMBLES = {
 @pytest.mark.parametrize(
     ("name", "precision"),
     [  # in the default tier one; test_thermostat_states.py has the chains of nose_hoover
-        pytest.param(*which, marks=[] if which == ("hybrid_monte_carlo", "double") else pytest.mark.soak)
+        pytest.param(
+            *which, marks=[] if which == ("hybrid_monte_carlo", "double") else pytest.mark.soak
+        )
         for which in product(ENSEMBLES, ("double", "mixed"))
     ],
 )
 def test_every_ensemble_goes_on_to_the_same_bits(name, precision, tmp_path):
-    stops = [8, 16, 49, 76] if name == "hybrid_monte_carlo" else [17, 60, 111, 140]  # the ends of trajectories
+    stops = (
+        [8, 16, 49, 76] if name == "hybrid_monte_carlo" else [17, 60, 111, 140]
+    )  # the ends of trajectories
     same_after_stops(forty_waters(*ENSEMBLES[name], precision=precision), stops, tmp_path)
 
 
@@ -118,13 +126,17 @@ def test_every_ensemble_goes_on_to_the_same_bits(name, precision, tmp_path):
     ],
 )
 def test_every_format_goes_on(name, tmp_path):
-    same_after_stops(forty_waters(NVT, output=FORTY_WATERS["output"] | {"trajectory": name}), [31, 80], tmp_path)
+    same_after_stops(
+        forty_waters(NVT, output=FORTY_WATERS["output"] | {"trajectory": name}), [31, 80], tmp_path
+    )
 
 
 @pytest.mark.soak
 def test_pme_goes_on(tmp_path):
     forces = {"cutoff_A": 5.0, "truncation": "shift", "electrostatics": "pme"}
-    same_after_stops(forty_waters(NPT, NVE, forces=forces, precision="mixed"), [31, 80, 120], tmp_path)
+    same_after_stops(
+        forty_waters(NPT, NVE, forces=forces, precision="mixed"), [31, 80, 120], tmp_path
+    )
 
 
 @pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
@@ -136,7 +148,9 @@ def test_a_body_goes_on(integrator, tmp_path):
     for _ in range(3):
         stops = stopped_at(left)
         stops.interval = 0.005
-        results = Simulation(Scene.from_dict(data), tmp_path / "parts", observers=stops, resume=True).run()
+        results = Simulation(
+            Scene.from_dict(data), tmp_path / "parts", observers=stops, resume=True
+        ).run()
     assert not results.interrupted
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
     assert [name for name in whole if whole[name] != parts[name]] == []
@@ -149,7 +163,8 @@ def test_a_body_goes_on(integrator, tmp_path):
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """A run that was stopped after 60 of 100 steps, with checkpoints at 0 and 60: its folder, its scene."""
+    """A run that was stopped after 60 of 100 steps, with checkpoints at 0 and 60: its folder, its
+    scene."""
     folder = tmp_path_factory.mktemp("stopped")
     (folder / "water.toml").write_text(
         "[box]\ndensity_g_cm3 = 0.9\n[[molecules]]\nmodel = 'spce'\ncount = 40\n"
@@ -173,8 +188,13 @@ def test_the_command_resume_goes_on_and_lengthens(again, capsys):
     folder = str(again / "run")
     assert cli.main(["resume", folder]) == 0
     assert read_checkpoint(again / "run" / CHECKPOINT).values["of"]["run"]["position"]["first"] == 0
-    assert cli.main(["run", str(again / "water.toml"), "-o", folder, "--resume", "--until", "0.12ps"]) == 0
-    steps = [int(line.split(",")[0]) for line in (again / "run" / "log.csv").read_text().splitlines()[1:]]
+    assert (
+        cli.main(["run", str(again / "water.toml"), "-o", folder, "--resume", "--until", "0.12ps"])
+        == 0
+    )
+    steps = [
+        int(line.split(",")[0]) for line in (again / "run" / "log.csv").read_text().splitlines()[1:]
+    ]
     assert steps == list(range(0, 121, 10))
     capsys.readouterr()
     assert cli.main(["resume", folder, "--until", "0.05ps"]) == 2
@@ -182,9 +202,12 @@ def test_the_command_resume_goes_on_and_lengthens(again, capsys):
 
 
 def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
-    """`rigidmd resume` reads the scene that the run has written: its inputs are copies, and what was open is decided."""
+    """`rigidmd resume` reads the scene that the run has written: its inputs are copies, and what
+    was open is decided."""
     auto = {"duration_ps": 0.1, "integrator": "auto", "energy_error_kT": 1e-2}
-    data = forty_waters(NVT, auto, structure={"file": "final.npz"}, start={"temperature_K": 298.0}, box={})
+    data = forty_waters(
+        NVT, auto, structure={"file": "final.npz"}, start={"temperature_K": 298.0}, box={}
+    )
     data["molecules"] = [{"model": "spce"}]
     folder = stopped / "run"
     looks = stopped_at(set())
@@ -195,11 +218,14 @@ def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
         again = Scene.read(parts / "scene.toml")
         Simulation(again, parts, resume=True, observers=stopped_at({step} if step else set())).run()
     assert contents(tmp_path / "whole") == contents(parts)
-    assert [path.name for path in parts.iterdir() if path.name.startswith("input_")] == ["input_structure_final.npz"]
+    assert [path.name for path in parts.iterdir() if path.name.startswith("input_")] == [
+        "input_structure_final.npz"
+    ]
 
 
 def test_compare_reports_where_two_runs_diverge(again, stopped, tmp_path, capsys):
-    """A run and itself, its continuation, and a run of another scene whose log was changed in a bit."""
+    """A run and itself, its continuation, and a run of another scene whose log was changed in a
+    bit."""
     one, other = str(stopped / "run"), again / "run"
     assert cli.main(["compare", one, str(other)]) == 0
     assert "the runs are the same to the last bit\n" in capsys.readouterr().out
@@ -231,7 +257,12 @@ def test_the_summary_tells_what_a_run_was_made_with(stopped):
     told = json.loads((stopped / "run" / "summary.json").read_text())
     for package in ("numba", "llvmlite", "numpy"):
         assert told[f"{package}_version"] == version(package)
-    assert (told["seed"], told["precision"], told["threads"], told["input_sha256"]) == (1, "mixed", 1, {})
+    assert (told["seed"], told["precision"], told["threads"], told["input_sha256"]) == (
+        1,
+        "mixed",
+        1,
+        {},
+    )
     assert "64bit" in told["processor_features"] or platform.machine() not in ("x86_64", "AMD64")
     own = Scene.read(stopped / "run" / "scene.toml", {"threads": 2, "name": "other"})
     assert provenance.scene_digest(own) == told["scene_sha256"]
@@ -255,7 +286,9 @@ def test_an_input_that_changes_meanwhile_is_the_one_that_was_read(stopped, tmp_p
     away = Every(0.05, lambda moment: (tmp_path / "start.npz").unlink(missing_ok=True))
     results = Simulation(Scene.from_dict(data, tmp_path), tmp_path / "run", observers=away).run()
     assert results.summary["input_sha256"] == {"structure.file": digest}
-    assert read_checkpoint(tmp_path / "run" / CHECKPOINT).values["of"]["run"]["inputs"] == {"structure.file": digest}
+    assert read_checkpoint(tmp_path / "run" / CHECKPOINT).values["of"]["run"]["inputs"] == {
+        "structure.file": digest
+    }
 
 
 def test_another_scene_is_not_gone_on_with(again, capsys):
@@ -272,7 +305,11 @@ def everything(folder: Path) -> dict[str, object]:
     """All that is in a folder: bytes of files, targets of links."""
     found = {path.name: path for path in sorted(folder.iterdir()) if path.name != ".rigidmd-lock"}
     return {
-        name: os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else path.stat().st_mode
+        name: os.readlink(path)
+        if path.is_symlink()
+        else path.read_bytes()
+        if path.is_file()
+        else path.stat().st_mode
         for name, path in found.items()
     }
 
@@ -297,21 +334,48 @@ def piped(path: Path) -> None:
 
 BROKEN = {
     "a damaged log": (lambda run: flip(run / "log.csv"), [], "log.csv has changed or is damaged"),
-    "a damaged trajectory": (lambda run: flip(run / "trajectory.xtc"), [], "trajectory.xtc has changed"),
+    "a damaged trajectory": (
+        lambda run: flip(run / "trajectory.xtc"),
+        [],
+        "trajectory.xtc has changed",
+    ),
     "no log": (lambda run: (run / "log.csv").unlink(), [], "log.csv: there is no such file"),
-    "no trajectory": (lambda run: (run / "trajectory.xtc").unlink(), [], "trajectory.xtc: there is no such file"),
-    "a short log": (lambda run: os.truncate(run / "log.csv", 50), [], "log.csv is shorter than it was"),
-    "a linked log": (lambda run: linked(run / "log.csv"), [], "log.csv is a link out of its folder"),
+    "no trajectory": (
+        lambda run: (run / "trajectory.xtc").unlink(),
+        [],
+        "trajectory.xtc: there is no such file",
+    ),
+    "a short log": (
+        lambda run: os.truncate(run / "log.csv", 50),
+        [],
+        "log.csv is shorter than it was",
+    ),
+    "a linked log": (
+        lambda run: linked(run / "log.csv"),
+        [],
+        "log.csv is a link out of its folder",
+    ),
     "a linked trajectory": (
         lambda run: linked(run / "trajectory.xtc"),
         [],
         "trajectory.xtc is a link out of its folder",
     ),
-    "a piped log": (lambda run: piped(run / "log.csv"), [], "log.csv: is a pipe, a socket or a device"),
+    "a piped log": (
+        lambda run: piped(run / "log.csv"),
+        [],
+        "log.csv: is a pipe, a socket or a device",
+    ),
     "a shorter scene": (lambda run: None, ["--until", "0.001ps"], "already longer"),
-    "another seed": (lambda run: change(run / "scene.toml", "seed = 1", "seed = 2"), [], "seed is 2, there 1"),
+    "another seed": (
+        lambda run: change(run / "scene.toml", "seed = 1", "seed = 2"),
+        [],
+        "seed is 2, there 1",
+    ),
     "a figure of another": (
-        lambda run: [change(run / "scene.toml", "figures = false", "figures = true"), (run / "energy.png").touch()],
+        lambda run: [
+            change(run / "scene.toml", "figures = false", "figures = true"),
+            (run / "energy.png").touch(),
+        ],
         [],
         "energy.png exists, was not written by rigidmd",
     ),
@@ -326,7 +390,8 @@ def change(path: Path, old: str, new: str) -> None:
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_refused_resume_changes_nothing(case, again, capsys):
-    """Neither a summary nor frames beyond the checkpoint are lost: all is checked before the first change."""
+    """Neither a summary nor frames beyond the checkpoint are lost: all is checked before the first
+    change."""
     run = again / "run"
     data = Scene.read(again / "water.toml", {"threads": 1})
     Simulation(
@@ -369,7 +434,8 @@ def test_frames_beyond_a_checkpoint_outlive_a_refused_resume(name, again, capsys
 
 @pytest.mark.parametrize("command", ["report", "view", "analyse", "sweep", "run", "resume"])
 def test_no_command_writes_through_a_link(command, again, capsys):
-    """Folders of runs may come from strangers, with links in the place of any file: what these point to stays."""
+    """Folders of runs may come from strangers, with links in the place of any file: what these
+    point to stays."""
     run, away = again / "run", again / "away"
     assert cli.main(["analyse", str(run), "--only", "density_profile"]) == 0
     change(run / ".rigidmd-run", "log.csv", "log.csv\nreport.html\nview.html\nanalyses.csv")
@@ -379,7 +445,15 @@ def test_no_command_writes_through_a_link(command, again, capsys):
     assert not [name for name in files if "offsets" in name] and "density_profile.png" in files
     shutil.copytree(run, again / "kept")
     arguments = {
-        "run": ["run", str(again / "water.toml"), "-o", str(run), "--force", "--set", "stages.0.duration_ps=0.01"],
+        "run": [
+            "run",
+            str(again / "water.toml"),
+            "-o",
+            str(run),
+            "--force",
+            "--set",
+            "stages.0.duration_ps=0.01",
+        ],
         "sweep": ["sweep", str(again / "water.toml"), "--set", "seed=1", "-o", str(run)],
         "analyse": ["analyse", str(run), "--only", "density_profile"],
     }
@@ -401,7 +475,8 @@ def test_no_command_writes_through_a_link(command, again, capsys):
 
 
 def test_a_file_that_grows_replaces_what_has_its_name(tmp_path):
-    """A link, a pipe or a file of others: what a link points to stays, and no pipe is waited for."""
+    """A link, a pipe or a file of others: what a link points to stays, and no pipe is waited
+    for."""
     (tmp_path / "victim").write_text("precious")
     (tmp_path / "link").symlink_to(tmp_path / "victim")
     (tmp_path / "broken").symlink_to(tmp_path / "nothing")
@@ -430,18 +505,28 @@ def test_a_file_that_grows_replaces_what_has_its_name(tmp_path):
 def test_force_replaces_only_what_a_run_has_written(name, setting, again, capsys):
     run = again / "run"
     marker = run / ".rigidmd-run"
-    marker.write_text("".join(line for line in marker.read_text().splitlines(keepends=True) if line.strip() != name))
+    marker.write_text(
+        "".join(
+            line for line in marker.read_text().splitlines(keepends=True) if line.strip() != name
+        )
+    )
     (run / name).write_text("precious")
     before = everything(run)
     more = ["--set", setting] if setting else []
     for how in (
         ("--force", "--resume")
-        if setting and "trajectory" not in setting and "topology" not in setting and "pressure" not in setting
+        if setting
+        and "trajectory" not in setting
+        and "topology" not in setting
+        and "pressure" not in setting
         else ("--force",)
     ):
         assert cli.main(["run", str(again / "water.toml"), "-o", str(run), how, *more]) == 2
         said = capsys.readouterr().err
-        assert f"{name} exists, was not written by rigidmd, and would be replaced" in said and "compiling" not in said
+        assert (
+            f"{name} exists, was not written by rigidmd, and would be replaced" in said
+            and "compiling" not in said
+        )
         assert everything(run) == before
 
 
@@ -454,7 +539,10 @@ def test_force_replaces_only_what_an_export_has_written(again, capsys):
     (made / "run.sh").write_text("precious")
     before = everything(made)
     assert cli.main([*command, "--force"]) == 2
-    assert "run.sh exists, was not written by rigidmd" in capsys.readouterr().err and everything(made) == before
+    assert (
+        "run.sh exists, was not written by rigidmd" in capsys.readouterr().err
+        and everything(made) == before
+    )
 
 
 def test_a_callback_that_changes_the_directory(again, monkeypatch):
@@ -468,19 +556,29 @@ def test_a_callback_that_changes_the_directory(again, monkeypatch):
     results = Simulation(Scene.from_dict(data), "new", observers=moved).run()
     assert everything(elsewhere / "run") == before and not (elsewhere / "new").exists()
     assert {path.name for path in results.files} <= set(everything(again / "new"))
-    assert all(path.is_file() for path in results.files) and results.universe().trajectory.n_frames == 2
+    assert (
+        all(path.is_file() for path in results.files)
+        and results.universe().trajectory.n_frames == 2
+    )
     monkeypatch.chdir(again)
-    Simulation(Scene.from_dict(data | {"name": "new"}).with_end(0.03), "new", observers=moved, resume=True).run()
+    Simulation(
+        Scene.from_dict(data | {"name": "new"}).with_end(0.03), "new", observers=moved, resume=True
+    ).run()
     monkeypatch.chdir(again)
-    run_together([Simulation(Scene.from_dict(data | {"seed": k}), f"of{k}", observers=moved) for k in (1, 2)])
-    assert [path.name for path in elsewhere.iterdir()] == ["run"] and everything(elsewhere / "run") == before
+    run_together(
+        [Simulation(Scene.from_dict(data | {"seed": k}), f"of{k}", observers=moved) for k in (1, 2)]
+    )
+    assert [path.name for path in elsewhere.iterdir()] == ["run"] and everything(
+        elsewhere / "run"
+    ) == before
     assert len((again / "of2" / "log.csv").read_text().splitlines()) == 4
 
 
 @pytest.mark.parametrize("ends", ["raises", "exits", "returns"])
 @pytest.mark.parametrize("name", ["trajectory.xtc"])
 def test_a_forked_child_leaves_the_files_of_the_run_alone(ends, name, again):
-    """A child of a callback that unwinds, or comes back into the run, writes nothing and ends no lock."""
+    """A child of a callback that unwinds, or comes back into the run, writes nothing and ends no
+    lock."""
     program = f"""
 import os, sys
 from rigidmd import Every, Scene, Simulation
@@ -500,16 +598,23 @@ try:
 except (OutputError, SimulationError):
     assert os.getpid() != parent
 """
-    done = subprocess.run([sys.executable, "-c", program], cwd=again, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=again, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
-    steps = [int(line.split(",")[0]) for line in (again / "forked" / "log.csv").read_text().splitlines()[1:]]
+    steps = [
+        int(line.split(",")[0])
+        for line in (again / "forked" / "log.csv").read_text().splitlines()[1:]
+    ]
     assert steps == list(range(31))
     assert not (again / "forked" / "last_good_state.npz").exists()
 
 
 def test_a_run_cannot_run_itself(again, tmp_path):
     data = Scene.from_dict(forty_waters(NVT | {"duration_ps": 0.01}, threads=1))
-    simulation = Simulation(data, tmp_path / "run", observers=Every(0.005, lambda moment: simulation.run()))
+    simulation = Simulation(
+        data, tmp_path / "run", observers=Every(0.005, lambda moment: simulation.run())
+    )
     with pytest.raises(RuntimeError, match="running already"):
         simulation.run()
     simulation = Simulation(data, tmp_path / "run", force=True)
@@ -541,7 +646,9 @@ def test_observers_of_a_checkpoint_are_known_by_what_they_are(again):
     """What may change (figures, the user's own observers) takes no other observer's memory."""
     data = forty_waters(NVT, threads=1)
     first, second = Counting(0), Counting(100)
-    Simulation(Scene.from_dict(data), again / "two", observers=[first, second, stopped_at({40})]).run()
+    Simulation(
+        Scene.from_dict(data), again / "two", observers=[first, second, stopped_at({40})]
+    ).run()
     assert (first.counted, second.counted) == (5, 105)
     figure = data | {"output": data["output"] | {"figures": True}}
     for now, own in (
@@ -550,7 +657,10 @@ def test_observers_of_a_checkpoint_are_known_by_what_they_are(again):
     ):
         Simulation(Scene.from_dict(now), again / "two", resume=True, observers=own).run()
     assert [one.counted for one in own] == [11, 111, 10]  # the third is new
-    assert not (again / "two" / "energy.png").exists() or "energy.png" in (again / "two" / ".rigidmd-run").read_text()
+    assert (
+        not (again / "two" / "energy.png").exists()
+        or "energy.png" in (again / "two" / ".rigidmd-run").read_text()
+    )
 
 
 @dataclass
@@ -598,7 +708,9 @@ def test_a_field_that_is_added_to_the_record_survives_a_stop(kind, tmp_path, mon
         record = simulation.part.record
         assert list(record.names.values()) == [[f"at {10 * k}"] for k in range(len(reached))]
         assert record.squares.tolist() == [k**2 for k in range(len(reached))]
-        assert len(record.tables) == len(reached) and record.tables["at 20"].tolist() == pytest.approx([0.02, 0.02])
+        assert len(record.tables) == len(reached) and record.tables[
+            "at 20"
+        ].tolist() == pytest.approx([0.02, 0.02])
 
 
 class Remembering(Every):
@@ -618,13 +730,17 @@ def test_what_an_observer_remembers_is_declared_once(again):
     data = forty_waters(NVT, threads=1)
     for stops in ({40}, set()):
         counts = Remembering()
-        Simulation(Scene.from_dict(data), again / "two", resume=True, observers=[counts, stopped_at(stops)]).run()
+        Simulation(
+            Scene.from_dict(data), again / "two", resume=True, observers=[counts, stopped_at(stops)]
+        ).run()
     assert counts.counted == 11 and counts.times == pytest.approx(0.01 * np.arange(11))
     kept = read_checkpoint(again / "two" / CHECKPOINT)
     kept.values["of"]["user-Remembering"]["counted"] = "many"
     write_checkpoint(again / "two", kept)
     with pytest.raises(CheckpointError, match="integer"):
-        Simulation(Scene.from_dict(data), again / "two", resume=True, observers=[Remembering()]).run()
+        Simulation(
+            Scene.from_dict(data), again / "two", resume=True, observers=[Remembering()]
+        ).run()
 
 
 def test_a_checkpoint_of_another_version_is_refused(again, capsys):
@@ -640,33 +756,58 @@ def test_a_checkpoint_of_another_version_is_refused(again, capsys):
                 archive.writestr("contents", checkpoint._contents(archive))
         before = everything(again / "run")
         assert cli.main(["resume", str(again / "run")]) == 2
-        assert f"was written by {age} rigidmd (version {schema} of the format" in capsys.readouterr().err
+        assert (
+            f"was written by {age} rigidmd (version {schema} of the format"
+            in capsys.readouterr().err
+        )
         assert everything(again / "run") == before
 
 
 def altered(array: np.ndarray) -> dict[str, np.ndarray]:
     """An array with other values: every kind of change that its type can hold."""
-    changed = {"longer": np.concatenate([array.reshape(-1), array.reshape(-1)[:1]]), "text": array.astype(str)}
-    changed["of another type"] = array.astype(np.float32 if array.dtype == np.float64 else np.float64)
+    changed = {
+        "longer": np.concatenate([array.reshape(-1), array.reshape(-1)[:1]]),
+        "text": array.astype(str),
+    }
+    changed["of another type"] = array.astype(
+        np.float32 if array.dtype == np.float64 else np.float64
+    )
     if array.ndim:
         changed["shorter"] = array[:-1]
     values = {"off by one": lambda x: x + 1, "negative": lambda x: -x - 1, "zero": lambda x: 0 * x}
     if array.dtype.kind == "f":
-        values |= {"nan": lambda x: x * np.nan, "infinite": lambda x: x + np.inf, "huge": lambda x: x + 1e300}
+        values |= {
+            "nan": lambda x: x * np.nan,
+            "infinite": lambda x: x + np.inf,
+            "huge": lambda x: x + 1e300,
+        }
     else:
-        values |= {"huge": lambda x: np.iinfo(array.dtype).max, "lowest": lambda x: np.iinfo(array.dtype).min}
+        values |= {
+            "huge": lambda x: np.iinfo(array.dtype).max,
+            "lowest": lambda x: np.iinfo(array.dtype).min,
+        }
     with np.errstate(all="ignore"):
         for name, function in values.items():
             for place in (np.s_[...], *([0] if array.size > 1 else [])):
                 changed[f"{name}, {'all' if place is ... else 'first'}"] = other = array.copy()
                 flat = other.reshape(-1)
                 flat[place] = function(flat[place])
-    return {name: other for name, other in changed.items() if array.size and not np.array_equal(array, other)}
+    return {
+        name: other
+        for name, other in changed.items()
+        if array.size and not np.array_equal(array, other)
+    }
 
 
 def leaves(value: object, path: tuple = ()) -> list[tuple]:
     """The paths of all values in nested lists and dictionaries, and of these."""
-    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    inner = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     return [path, *(leaf for key, part in inner for leaf in leaves(part, (*path, key)))]
 
 
@@ -677,23 +818,43 @@ def changes_of(kept: Checkpoint) -> list[tuple[str, Checkpoint]]:
         for kind, other in altered(array).items():
             found.append((f"{name}: {kind}", Checkpoint(kept.values, kept.arrays | {name: other})))
         found.append(
-            (f"{name}: left out", Checkpoint(kept.values, {k: a for k, a in kept.arrays.items() if k != name}))
+            (
+                f"{name}: left out",
+                Checkpoint(kept.values, {k: a for k, a in kept.arrays.items() if k != name}),
+            )
         )
     for path in leaves(kept.values)[1:]:
         *way, last = path
         whole = functools.reduce(lambda part, key: part[key], way, kept.values)[last]
-        others = [None, "x", [], {}, [None], -1.5, float("nan"), float("inf"), 10**30, -(10**30), 40, 7, -1]
+        others = [
+            None,
+            "x",
+            [],
+            {},
+            [None],
+            -1.5,
+            float("nan"),
+            float("inf"),
+            10**30,
+            -(10**30),
+            40,
+            7,
+            -1,
+        ]
         others += [whole + 1, -whole, whole + 0.5] if isinstance(whole, int | float) else []
         for other in others:
             told = copy.deepcopy(kept.values)
             functools.reduce(lambda part, key: part[key], way, told)[last] = other
             if other != whole:
-                found.append((f"{'.'.join(map(str, path))}: {other!r:.20}", Checkpoint(told, kept.arrays)))
+                found.append(
+                    (f"{'.'.join(map(str, path))}: {other!r:.20}", Checkpoint(told, kept.arrays))
+                )
     return found
 
 
-#: What nothing else in a checkpoint decides: other values of these are of another run, which must end by itself. The time
-#: at which a list was built decides how far ahead the next one is built, and so the order of sums.
+#: What nothing else in a checkpoint decides: other values of these are of another run, which must
+#: end by itself. The time at which a list was built decides how far ahead the next one is built,
+#: and so the order of sums.
 FREE = re.compile(
     r"state/(velocity|angular_momentum_body|books|bath|position|rotation)|Sampler/|engine/load.torque_body|engine/\w+.times"
 )
@@ -713,10 +874,14 @@ def test_sizes_that_are_none_cut_no_file(owner, kept, again):
 @pytest.mark.parametrize(
     ("kind", "count"),
     [("molecules", 25), ("verlet", 60), ("dop853", 60)]
-    + [pytest.param(kind, 10**6, marks=pytest.mark.soak) for kind in ("molecules", "verlet", "dop853", "rk4")],
+    + [
+        pytest.param(kind, 10**6, marks=pytest.mark.soak)
+        for kind in ("molecules", "verlet", "dop853", "rk4")
+    ],
 )
 def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
-    """With right checksums: refused with a sentence, or they change no bit. No crash, no hang, no wrong course."""
+    """With right checksums: refused with a sentence, or they change no bit. No crash, no hang, no
+    wrong course."""
     data = (
         forty_waters(NVT | {"duration_ps": 0.06}, threads=1)
         if kind == "molecules"
@@ -741,7 +906,9 @@ def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
         with contextlib.suppress(FileNotFoundError):
             before |= {file: (run / file).read_bytes() for file in (CHECKPOINT, PREVIOUS)}
         try:
-            simulation = Simulation(Scene.from_dict(data), run, observers=look, resume=True, warn=lambda sentence: None)
+            simulation = Simulation(
+                Scene.from_dict(data), run, observers=look, resume=True, warn=lambda sentence: None
+            )
             simulation.run()
         except CheckpointError:
             refused += 1
@@ -749,7 +916,9 @@ def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
                 wrong.append(f"{name}: refused, and files have changed")
         except OutputError as error:
             refused += 1
-            if "has changed or is damaged" not in str(error) and "shorter than it was" not in str(error):
+            if "has changed or is damaged" not in str(error) and "shorter than it was" not in str(
+                error
+            ):
                 wrong.append(f"{name}: {error}")
         except SimulationError as error:
             if not FREE.match(name):
@@ -760,7 +929,9 @@ def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
             same += 1
             if contents(run) != whole and not FREE.match(name):
                 wrong.append(f"{name}: other bits")
-    assert not wrong, f"{len(wrong)} of {count}, {same} the same, {refused} refused:\n" + "\n".join(wrong)
+    assert not wrong, f"{len(wrong)} of {count}, {same} the same, {refused} refused:\n" + "\n".join(
+        wrong
+    )
     assert refused > same / 2
 
 
@@ -770,8 +941,12 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(damage, again, capsys)
     data = bytearray(path.read_bytes())
     with zipfile.ZipFile(path) as archive:
         longest = max(archive.infolist(), key=lambda info: info.compress_size)
-    data[longest.header_offset + longest.compress_size // 2] ^= 4  # headers have bits without meaning
-    path.write_bytes({"flipped": bytes(data), "cut": bytes(data[: len(data) // 3]), "empty": b""}[damage])
+    data[longest.header_offset + longest.compress_size // 2] ^= (
+        4  # headers have bits without meaning
+    )
+    path.write_bytes(
+        {"flipped": bytes(data), "cut": bytes(data[: len(data) // 3]), "empty": b""}[damage]
+    )
     assert cli.main(["resume", str(again / "run")]) == 0
     said = capsys.readouterr().err
     assert "checkpoint.npz: is damaged" in said and "The checkpoint before it is used" in said
@@ -837,7 +1012,14 @@ def test_a_run_stops_before_its_wall_time_is_up(stopped, tmp_path, capsys, monke
         now[0] += 0.01
         return now[0]
 
-    command = ["run", str(stopped / "water.toml"), "-o", str(tmp_path / "run"), "--set", "stages.0.duration_ps=1000"]
+    command = [
+        "run",
+        str(stopped / "water.toml"),
+        "-o",
+        str(tmp_path / "run"),
+        "--set",
+        "stages.0.duration_ps=1000",
+    ]
     steps = []
     for more in ([], ["--resume"]):
         began, seen = now[0], len(steps)
@@ -868,18 +1050,30 @@ def killed(command: list[str], after: float) -> int:
 
 @pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.soak)])
 def test_a_run_that_is_killed_goes_on(times, stopped, tmp_path):
-    """kill -9 at random moments, with a checkpoint at every look, of a run that is longer than anybody waits for."""
-    scene = ["run", str(stopped / "water.toml"), "--set", "output.checkpoint_minutes=1e-9", "--threads", "1"]
+    """kill -9 at random moments, with a checkpoint at every look, of a run that is longer than
+    anybody waits for."""
+    scene = [
+        "run",
+        str(stopped / "water.toml"),
+        "--set",
+        "output.checkpoint_minutes=1e-9",
+        "--threads",
+        "1",
+    ]
     scene += ["--set", "output.log_interval_ps=0.02"]
     longest = 1000 * times
     command = [sys.executable, "-m", "rigidmd", *scene, "-o", str(tmp_path / "parts"), "--resume"]
     rng = np.random.default_rng(times)
     for _ in range(times):
         assert (
-            killed([*command, "--set", f"stages.0.duration_ps={longest}"], float(rng.uniform(0.0, 0.3)))
+            killed(
+                [*command, "--set", f"stages.0.duration_ps={longest}"], float(rng.uniform(0.0, 0.3))
+            )
             == -signal.SIGKILL
         )
-    lines = (tmp_path / "parts" / "log.csv").read_text().splitlines()[1:]  # the last perhaps half a line, or none yet
+    lines = (
+        (tmp_path / "parts" / "log.csv").read_text().splitlines()[1:]
+    )  # the last perhaps half a line, or none yet
     reached = max((int(line.partition(",")[0]) for line in lines), default=0)
     end = ["--set", f"stages.0.duration_ps={np.ceil(reached / 1000) + 1.0}"]
     assert cli.main([*scene, "-o", str(tmp_path / "parts"), "--resume", *end]) == 0
@@ -903,10 +1097,15 @@ def test_a_failed_write_stops_the_run(stopped, tmp_path):
 def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     """The recipe of the manual, with a scheduler that starts the next job at once."""
     manual = (ROOT / "rigidmd" / "docs" / "guides" / "resume.md").read_text()
-    job = next(block for block in re.findall(r"```text\n(.*?)```", manual, re.DOTALL) if "#SBATCH" in block)
+    job = next(
+        block for block in re.findall(r"```text\n(.*?)```", manual, re.DOTALL) if "#SBATCH" in block
+    )
     (tmp_path / "job.sh").write_text(job.replace("3:55:00", "0:00:05"))
     (tmp_path / "bin").mkdir()
-    commands = {"sbatch": 'echo job >> jobs; exec bash "$1"', "rigidmd": f'exec {sys.executable} -m rigidmd "$@"'}
+    commands = {
+        "sbatch": 'echo job >> jobs; exec bash "$1"',
+        "rigidmd": f'exec {sys.executable} -m rigidmd "$@"',
+    }
     for name, line in commands.items():
         (tmp_path / "bin" / name).write_text(f"#!/bin/bash\n{line}\n")
         (tmp_path / "bin" / name).chmod(0o755)
@@ -921,7 +1120,7 @@ def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     assert [name for name in whole if whole[name] != parts[name]] == []
 
 
-# --- files that vanish during a run ----------------------------------------------------------------------------------
+# --- files that vanish during a run ---------------------------------------------------------------
 
 
 def taken_away(path: Path, how: str) -> None:
@@ -950,7 +1149,9 @@ def loses(tmp_path: Path, name: str, how: str, stages: int, **output) -> Simulat
             taken_away(tmp_path / "run" / name, how)
             once.append(False)
 
-    return Simulation(small_scene({"argon": 8}, 20.0, **data), tmp_path / "run", observers=[Every(0.002, act)])
+    return Simulation(
+        small_scene({"argon": 8}, 20.0, **data), tmp_path / "run", observers=[Every(0.002, act)]
+    )
 
 
 VANISHING = [
@@ -964,14 +1165,18 @@ VANISHING = [
 
 @pytest.mark.parametrize(("name", "how"), VANISHING)
 def test_a_file_that_vanishes_stops_the_run_at_the_next_checkpoint(name, how, tmp_path):
-    with pytest.raises(OutputError, match=rf"stopped at step 2 .*{name} was {how} while the run was writing it"):
+    with pytest.raises(
+        OutputError, match=rf"stopped at step 2 .*{name} was {how} while the run was writing it"
+    ):
         loses(tmp_path, name, how, stages=2).run()
     assert not (tmp_path / "run" / "summary.json").exists()
 
 
 @pytest.mark.parametrize("checkpoints", [True, False])
 @pytest.mark.parametrize(("name", "how"), VANISHING)
-def test_a_file_that_vanishes_in_the_last_stage_is_noted_and_not_listed(name, how, checkpoints, tmp_path):
+def test_a_file_that_vanishes_in_the_last_stage_is_noted_and_not_listed(
+    name, how, checkpoints, tmp_path
+):
     output = {} if checkpoints else {"checkpoint_minutes": False}
     with pytest.warns(RigidMDWarning, match=f"{name} was {how} while the run was writing it"):
         results = loses(tmp_path, name, how, stages=1, **output).run()
@@ -982,17 +1187,22 @@ def test_a_file_that_vanishes_in_the_last_stage_is_noted_and_not_listed(name, ho
     assert len(results["time"]) == 2
 
 
-# --- the duration of the last stage ----------------------------------------------------------------------------------
+# --- the duration of the last stage ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ramp", [{"temperature_K": [90.0, 140.0]}, {"temperature_K": [140.0, 90.0]}])
+@pytest.mark.parametrize(
+    "ramp", [{"temperature_K": [90.0, 140.0]}, {"temperature_K": [140.0, 90.0]}]
+)
 def test_the_duration_of_a_ramp_stays(ramp, tmp_path):
     """Another duration would be another slope of the temperature from there on."""
     thermostat = {"ensemble": "nvt"}
 
     def scene(duration, **temperature):
         return small_scene(
-            {"argon": 8}, 20.0, stages=[{"duration_ps": duration} | thermostat | temperature], output={"figures": False}
+            {"argon": 8},
+            20.0,
+            stages=[{"duration_ps": duration} | thermostat | temperature],
+            output={"figures": False},
         )
 
     Simulation(scene(0.004, **ramp), tmp_path / "ramp").run()

@@ -1,4 +1,5 @@
-"""Other ways to write a rotation: quaternions, Euler angles and their rates, yaw-pitch-roll, attitude matrices."""
+"""Other ways to write a rotation: quaternions, Euler angles and their rates, yaw-pitch-roll,
+attitude matrices."""
 
 import itertools
 
@@ -28,7 +29,8 @@ X, Y, Z = np.eye(3)
 
 
 def extreme_angles(middles):
-    """Every first and last angle of a list that has all the corners, with every middle one (k, 3)."""
+    """Every first and last angle of a list that has all the corners, with every middle one (k,
+    3)."""
     turns = [0.0, 1e-17, -1e-9, 0.7, np.pi / 2, -np.pi / 2, 2.5, -3.0, np.pi, 1e-9 - np.pi]
     return np.array(list(itertools.product(turns, middles, turns)))
 
@@ -39,9 +41,12 @@ def near(rng, rotations):
 
 
 def all_rotations(rng):
-    """Random ones, half turns, quarter turns, hardly any turn, and everything close to a lock of either sequence."""
+    """Random ones, half turns, quarter turns, hardly any turn, and everything close to a lock of
+    either sequence."""
     axes = np.array(list(itertools.product([-1, 0, 1], repeat=3)), dtype=float)
-    axes = axes[np.any(axes, axis=1)] / np.linalg.norm(axes[np.any(axes, axis=1)], axis=1, keepdims=True)
+    axes = axes[np.any(axes, axis=1)] / np.linalg.norm(
+        axes[np.any(axes, axis=1)], axis=1, keepdims=True
+    )
     angles = np.array([1e-17, 1e-9, np.pi / 2, np.pi - 1e-9, np.pi])
     tilts = TINY + [np.pi - tiny for tiny in TINY]
     lands = [sign * (np.pi / 2 - tiny) for tiny in TINY for sign in (1, -1)]
@@ -85,7 +90,8 @@ def test_quaternions_of_all_rotations():
 
 
 @pytest.mark.parametrize(
-    "quaternion", [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0, 0.6, -0.8, 0], [0, 0, 0.6, -0.8]]
+    "quaternion",
+    [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0, 0.6, -0.8, 0], [0, 0, 0.6, -0.8]],
 )
 def test_sign_of_a_quaternion_is_that_of_its_first_component(quaternion):
     found = to_quaternion(from_quaternion(-np.array(quaternion, dtype=float)))
@@ -95,7 +101,9 @@ def test_sign_of_a_quaternion_is_that_of_its_first_component(quaternion):
 
 def test_small_turns_keep_their_digits_in_a_quaternion():
     vectors = np.array([[1e-12, -2e-12, 3e-12], [0, 0, 1e-150]])
-    assert to_quaternion(from_vector(vectors))[:, 1:] == pytest.approx(vectors / 2, rel=1e-14, abs=0)
+    assert to_quaternion(from_vector(vectors))[:, 1:] == pytest.approx(
+        vectors / 2, rel=1e-14, abs=0
+    )
 
 
 def test_euler_angles_and_yaw_pitch_roll_are_the_sequences_they_claim():
@@ -108,7 +116,8 @@ def test_euler_angles_and_yaw_pitch_roll_are_the_sequences_they_claim():
     assert from_yaw_pitch_roll(angles) == pytest.approx(
         from_vector(first * Z) @ from_vector(middle * Y) @ from_vector(last * X)
     )
-    # Capital letters are scipy's intrinsic sequences: about the axes that turn along, so the first one stands leftmost.
+    # Capital letters are scipy's intrinsic sequences: about the axes that turn along, so the first
+    # one stands leftmost.
     flat = angles.reshape(-1, 3)
     assert from_euler_angles(flat) == pytest.approx(Rotation.from_euler("ZXZ", flat).as_matrix())
     assert from_yaw_pitch_roll(flat) == pytest.approx(Rotation.from_euler("ZYX", flat).as_matrix())
@@ -139,7 +148,9 @@ def test_euler_angles_close_to_the_lock_keep_their_digits():
 def test_at_the_lock_the_first_angle_holds_everything():
     half_turn_x = np.diag([1.0, -1, -1])
     turn = from_vector([0, 0, 0.4])
-    assert to_euler_angles(from_euler_angles([1.5, 0, -0.2])) == pytest.approx([1.3, 0, 0], abs=ROUNDING)
+    assert to_euler_angles(from_euler_angles([1.5, 0, -0.2])) == pytest.approx(
+        [1.3, 0, 0], abs=ROUNDING
+    )
     assert to_euler_angles(turn @ half_turn_x) == pytest.approx([0.4, np.pi, 0], abs=ROUNDING)
     assert to_euler_angles(half_turn_x @ turn) == pytest.approx([-0.4, np.pi, 0], abs=ROUNDING)
     assert np.array_equal(to_euler_angles(np.diag([-1.0, -1, 1])), [np.pi, 0, 0])
@@ -149,7 +160,9 @@ def test_euler_rates_are_those_of_the_rotation():
     rng = np.random.default_rng(4)
     angles, rates = rng.uniform(-3, 3, (2, 50, 3))
     h = 1e-5
-    change = (from_euler_angles(angles + h * rates) - from_euler_angles(angles - h * rates)) / (2 * h)
+    change = (from_euler_angles(angles + h * rates) - from_euler_angles(angles - h * rates)) / (
+        2 * h
+    )
     omega = angular_velocity_of_euler_rates(angles, rates)
     assert change == pytest.approx(from_euler_angles(angles) @ hat(omega), abs=1e-8)
     assert euler_rates(angles, omega) == pytest.approx(rates, rel=1e-10)
@@ -165,17 +178,23 @@ def test_euler_rates_refuse_the_singularity(theta):
     angles = np.array([[0.1, 1.0, 0.2], [0.1, theta, 0.2]])
     with pytest.raises(ValueError, match="sin theta = 0"):
         euler_rates(angles, np.ones(3))
-    assert angular_velocity_of_euler_rates(angles[1], [0, 0, 2.0]) == pytest.approx([0, 0, 2])  # that way all is well
+    assert angular_velocity_of_euler_rates(angles[1], [0, 0, 2.0]) == pytest.approx(
+        [0, 0, 2]
+    )  # that way all is well
 
 
 def test_euler_rates_are_right_close_to_the_singularity():
     angles, rates = np.array([0.4, 1e-9, -2.0]), np.array([3.0, -1.0, 2.0])
-    assert euler_rates(angles, angular_velocity_of_euler_rates(angles, rates)) == pytest.approx(rates, abs=1e-6)
+    assert euler_rates(angles, angular_velocity_of_euler_rates(angles, rates)) == pytest.approx(
+        rates, abs=1e-6
+    )
 
 
 def test_attitude_matrices_are_the_inverse():
     q = random_rotations(np.random.default_rng(5), 6).reshape(2, 3, 3, 3)
-    assert attitude_matrix(q) @ q == pytest.approx(np.broadcast_to(np.eye(3), q.shape), abs=ROUNDING)
+    assert attitude_matrix(q) @ q == pytest.approx(
+        np.broadcast_to(np.eye(3), q.shape), abs=ROUNDING
+    )
     assert np.array_equal(from_attitude_matrix(attitude_matrix(q)), q)
     assert not np.shares_memory(attitude_matrix(q), q)
 
@@ -190,7 +209,9 @@ def test_nearest_rotation():
     distance = np.linalg.norm(matrices - nearest, axis=(1, 2))
     for others in (random_rotations(rng, 500), from_vector(1e-3 * rng.standard_normal((500, 3)))):
         rivals = nearest[:, None] @ others if others[0, 0, 0] > 0.99 else others[None]
-        assert np.all(np.linalg.norm(matrices[:, None] - rivals, axis=(2, 3)) >= distance[:, None] - 1e-12)
+        assert np.all(
+            np.linalg.norm(matrices[:, None] - rivals, axis=(2, 3)) >= distance[:, None] - 1e-12
+        )
     q = all_rotations(rng)
     assert np.abs(nearest_rotation(q) - q).max() < ROUNDING
     assert nearest_rotation(3 * q[0]) == pytest.approx(q[0])

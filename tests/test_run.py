@@ -1,4 +1,5 @@
-"""Runs from end to end: every shipped system, every file written and read back, interruption, the commands."""
+"""Runs from end to end: every shipped system, every file written and read back, interruption, the
+commands."""
 
 import csv
 import json
@@ -61,7 +62,9 @@ from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 
-@pytest.mark.filterwarnings("ignore:frames are not evenly spaced")  # its few steps end between two frames
+@pytest.mark.filterwarnings(
+    "ignore:frames are not evenly spaced"
+)  # its few steps end between two frames
 @pytest.mark.parametrize("path", MOLECULES, ids=lambda path: path.stem)
 def test_every_system_runs_a_few_steps(path, tmp_path):
     assert path.read_text().startswith("# ")
@@ -80,7 +83,11 @@ def test_every_system_runs_a_few_steps(path, tmp_path):
         np.ptp(results["conserved"][results["stage"] == len(scene.stages) - 1])
         < 1e-3 * np.abs(results["kinetic"]).max()
     )
-    names = {file.name for file in (tmp_path / "out").iterdir() if not file.name.startswith(("input_", "."))}
+    names = {
+        file.name
+        for file in (tmp_path / "out").iterdir()
+        if not file.name.startswith(("input_", "."))
+    }
     assert names == {
         "scene.toml",
         "summary.json",
@@ -99,7 +106,9 @@ def test_every_system_runs_a_few_steps(path, tmp_path):
 
 def test_the_resolved_scene_runs_again_to_the_same_bits(tmp_path):
     short = {"stages.0.duration_ps": 0.02}
-    first = Simulation(Scene.read(ROOT / "systems" / "water_from_structure.toml", short), tmp_path / "a").run()
+    first = Simulation(
+        Scene.read(ROOT / "systems" / "water_from_structure.toml", short), tmp_path / "a"
+    ).run()
     scene = Scene.read(tmp_path / "a" / "scene.toml")
     assert scene.forces.cutoff_A == 9.0
     again = Simulation(scene, tmp_path / "b").run()
@@ -109,11 +118,18 @@ def test_the_resolved_scene_runs_again_to_the_same_bits(tmp_path):
 
 def test_the_final_state_starts_another_run(tmp_path):
     stages = [{"duration_ps": 0.02}]
-    first = Simulation(small_scene({"spce": 20, "argon": 3}, 18.5, stages=stages), tmp_path / "a").run()
+    first = Simulation(
+        small_scene({"spce": 20, "argon": 3}, 18.5, stages=stages), tmp_path / "a"
+    ).run()
     scene = small_scene(
-        {"spce": 20, "argon": 3}, None, tmp_path / "a", stages=stages, box={},
-        structure={"file": "final.npz", "velocities": True}, start={},
-    )  # fmt: skip
+        {"spce": 20, "argon": 3},
+        None,
+        tmp_path / "a",
+        stages=stages,
+        box={},
+        structure={"file": "final.npz", "velocities": True},
+        start={},
+    )
     system = build(scene)
     for name in State._fields[:4]:
         assert getattr(first.state, name).tobytes() == getattr(system.state, name).tobytes()
@@ -121,15 +137,24 @@ def test_the_final_state_starts_another_run(tmp_path):
     assert system.space == first.system.space
 
 
-@pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.gsd", "t.traj", "t.dcd", "t.nc", "t.xyz", "t.pdb"])
+@pytest.mark.parametrize(
+    "name", ["t.xtc", "t.trr", "t.gsd", "t.traj", "t.dcd", "t.nc", "t.xyz", "t.pdb"]
+)
 @pytest.mark.parametrize("topology", ["topology.gro", "topology.pdb"])
 def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp_path):
     lengths, angles = [20.0, 21.0, 22.0], [80.0, 100.0, 75.0]
     scene = small_scene(
-        {"tip4p2005": 6, "nitrogen": 4}, None, stages=[{"duration_ps": 0.04}],
+        {"tip4p2005": 6, "nitrogen": 4},
+        None,
+        stages=[{"duration_ps": 0.04}],
         box={"lengths_A": lengths, "angles_deg": angles},
-        output={"trajectory": name, "trajectory_interval_ps": 0.01, "topology": topology, "positions": "unwrapped"},
-    )  # fmt: skip
+        output={
+            "trajectory": name,
+            "trajectory_interval_ps": 0.01,
+            "topology": topology,
+            "positions": "unwrapped",
+        },
+    )
     seen = []
 
     def observe(moment):
@@ -162,9 +187,18 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
     assert (trajectory.dt, trajectory.totaltime, trajectory[3].time) == (0.01, 0.04, seen[3][0])
     copy = universe.copy().trajectory
     assert [frame.time for frame in copy[::2]] == [moment for moment, _, _ in seen[::2]]
-    if name[1:] not in (".xyz", ".pdb", ".gsd", ".traj"):  # what MDAnalysis reads from the file alone
-        alone = mda.Universe(str(tmp_path / "out" / topology), str(tmp_path / "out" / name)).trajectory
-        assert [frame.time for frame in alone] == pytest.approx([moment for moment, _, _ in seen], abs=1e-5)
+    if name[1:] not in (
+        ".xyz",
+        ".pdb",
+        ".gsd",
+        ".traj",
+    ):  # what MDAnalysis reads from the file alone
+        alone = mda.Universe(
+            str(tmp_path / "out" / topology), str(tmp_path / "out" / name)
+        ).trajectory
+        assert [frame.time for frame in alone] == pytest.approx(
+            [moment for moment, _, _ in seen], abs=1e-5
+        )
     assert list(universe.atoms.names[:4]) == ["OW", "HW1", "HW2", "MW"]
     assert universe.residues.n_residues == 10
 
@@ -172,7 +206,9 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
 @pytest.mark.parametrize("angles", [[90.0, 90.0, 90.0], [80.0, 75.0, 100.0]])
 def test_wrapped_molecules_are_whole_and_inside(angles, tmp_path):
     box = {"lengths_A": 20.0, "angles_deg": angles}
-    simulation = Simulation(small_scene({"spce": 30}, None, box=box, output={"trajectory": "t.trr"}))
+    simulation = Simulation(
+        small_scene({"spce": 30}, None, box=box, output={"trajectory": "t.trr"})
+    )
     system, state = simulation.system, simulation.state.copy()
     state.position[:] += 300.0
     x = system.site_positions(state, wrapped=True).reshape(30, 3, 3)
@@ -186,12 +222,16 @@ def test_wrapped_molecules_are_whole_and_inside(angles, tmp_path):
 
 
 def test_log_and_summary(tmp_path):
-    scene = small_scene({"spce": 20}, 18.5, stages=[{"duration_ps": 0.05}], output={"log_interval_ps": 0.01})
+    scene = small_scene(
+        {"spce": 20}, 18.5, stages=[{"duration_ps": 0.05}], output={"log_interval_ps": 0.01}
+    )
     results = Simulation(scene, tmp_path / "out").run()
     with (tmp_path / "out" / "log.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == tuple(columns(tensor=False).values())
-    assert [float(row["Time (ps)"]) for row in rows] == pytest.approx([0, 0.01, 0.02, 0.03, 0.04, 0.05])
+    assert [float(row["Time (ps)"]) for row in rows] == pytest.approx(
+        [0, 0.01, 0.02, 0.03, 0.04, 0.05]
+    )
     for row, sample in zip(rows, results.samples.rows, strict=True):
         total = float(row["Potential Energy (kJ/mole)"]) + float(row["Kinetic Energy (kJ/mole)"])
         assert float(row["Total Energy (kJ/mole)"]) == pytest.approx(total)
@@ -203,17 +243,24 @@ def test_log_and_summary(tmp_path):
     energy, n, time = results["energy"], 20, results["time"]
     gradient = np.polyfit(time, energy, 1)[0]
     stage = summary["stages"][0]
-    assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(gradient * 1000 / n, rel=1e-6, abs=1e-9)
+    assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(
+        gradient * 1000 / n, rel=1e-6, abs=1e-9
+    )
     thermal = 0.0083144626 * stage["temperature_K"] * 117
-    assert stage["drift_kT_ns_per_degree_of_freedom"] == pytest.approx(gradient * 1000 / thermal, rel=1e-6, abs=1e-9)
+    assert stage["drift_kT_ns_per_degree_of_freedom"] == pytest.approx(
+        gradient * 1000 / thermal, rel=1e-6, abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(
-    ("counts", "edge"), [({"argon": 1}, 20.0), ({"argon": 1}, None), ({"nitrogen": 1}, 20.0), ({"spce": 2}, 18.1)]
+    ("counts", "edge"),
+    [({"argon": 1}, 20.0), ({"argon": 1}, None), ({"nitrogen": 1}, 20.0), ({"spce": 2}, 18.1)],
 )
 @pytest.mark.parametrize("ensemble", ["nve", "nvt"])
 def test_the_smallest_systems(counts, edge, ensemble, tmp_path):
-    stage = {"ensemble": ensemble, "duration_ps": 0.02} | ({"temperature_K": 300.0} if ensemble == "nvt" else {})
+    stage = {"ensemble": ensemble, "duration_ps": 0.02} | (
+        {"temperature_K": 300.0} if ensemble == "nvt" else {}
+    )
     results = Simulation(small_scene(counts, edge, stages=[stage]), tmp_path / "out").run()
     text = summary_text(results.summary)
     assert "20 steps" in text or "10 steps" in text
@@ -225,7 +272,9 @@ def test_the_smallest_systems(counts, edge, ensemble, tmp_path):
 
 def test_a_simulation_runs_twice_alike_and_keeps_true_times():
     stages = [{"duration_ps": 0.06}, {"duration_ps": 0.06, "timestep_fs": 3.0}]
-    simulation = Simulation(small_scene({"spce": 20}, 18.5, stages=stages, output={"trajectory_interval_ps": 0.02}))
+    simulation = Simulation(
+        small_scene({"spce": 20}, 18.5, stages=stages, output={"trajectory_interval_ps": 0.02})
+    )
     first = simulation.run()
     kept = first.state.copy()
     second = simulation.run()
@@ -234,7 +283,9 @@ def test_a_simulation_runs_twice_alike_and_keeps_true_times():
     with pytest.warns(UserWarning, match=r"not evenly spaced \(0.02 to 0.021 ps\)"):
         trajectory = first.universe().trajectory
     times = [frame.time for frame in trajectory]
-    assert times == pytest.approx([0, 0.02, 0.04, 0.06, 0.081, 0.102])  # 20 fs are seven steps of 3 fs
+    assert times == pytest.approx(
+        [0, 0.02, 0.04, 0.06, 0.081, 0.102]
+    )  # 20 fs are seven steps of 3 fs
     assert trajectory.dt == pytest.approx(0.02)
     assert trajectory.totaltime == pytest.approx(0.102)
 
@@ -248,9 +299,14 @@ ASKED = {
 
 @pytest.mark.parametrize("speed", [0.4, 1.0])
 def test_the_energy_of_a_removed_momentum_is_in_the_summary(speed):
-    """P²/2M of what is removed, as a positive number; only where something is removed is there a sentence."""
+    """P²/2M of what is removed, as a positive number; only where something is removed is there a
+    sentence."""
     stages = [{"duration_ps": 0.04, "timestep_fs": 4.0}, {"duration_ps": 0.04, "timestep_fs": 4.0}]
-    sections = {"stages": stages, "run": {"remove_momentum_interval_ps": 0.031}, "output": {"trajectory": False}}
+    sections = {
+        "stages": stages,
+        "run": {"remove_momentum_interval_ps": 0.031},
+        "output": {"trajectory": False},
+    }
     simulation = Simulation(small_scene({"argon": 20}, 20.0, **sections), warn=str)
     system, state = simulation.system, simulation.state.copy()
     state.velocity[:] += [speed, -0.5 * speed, 0.2]
@@ -258,7 +314,9 @@ def test_the_energy_of_a_removed_momentum_is_in_the_summary(speed):
     mass = system.model.mass[system.model.species]
     momentum = mass @ state.velocity
     removed = simulation.run().summary["momentum_removed"]
-    assert removed["energy_kJ_mol"] == pytest.approx(momentum @ momentum / (2 * mass.sum()) / KJ_PER_MOL, rel=1e-9)
+    assert removed["energy_kJ_mol"] == pytest.approx(
+        momentum @ momentum / (2 * mass.sum()) / KJ_PER_MOL, rel=1e-9
+    )
     assert any("remove_momentum_interval_ps" in note for note in system.notes)
     for thermostat in ("langevin", "hybrid_monte_carlo"):
         stage = {
@@ -277,9 +335,15 @@ def test_intervals_that_are_not_whole_steps_are_noted():
     stages = [
         {"duration_ps": 0.016, "timestep_fs": 4.0},
         {"duration_ps": 0.05, "timestep_fs": 2.0},
-        {"ensemble": "npt", "temperature_K": 90.0, "pressure_bar": 1.0, "duration_ps": 0.022, "timestep_fs": 4.0,
-         "barostat_interval_ps": 0.03},
-    ]  # fmt: skip
+        {
+            "ensemble": "npt",
+            "temperature_K": 90.0,
+            "pressure_bar": 1.0,
+            "duration_ps": 0.022,
+            "timestep_fs": 4.0,
+            "barostat_interval_ps": 0.03,
+        },
+    ]
     sections = {"stages": stages, "output": ASKED, "run": {"remove_momentum_interval_ps": 1.001}}
     scene = small_scene({"argon": 20}, 20.0, **sections)
     assert scene.rounded_times() == [
@@ -303,12 +367,16 @@ def test_intervals_that_are_not_whole_steps_are_noted():
     assert results["time"][:3] == pytest.approx([0.0, 0.008, 0.016])
 
 
-@pytest.mark.parametrize("thermostat", ["langevin", "andersen", "velocity_rescaling", "nose_hoover", None])
+@pytest.mark.parametrize(
+    "thermostat", ["langevin", "andersen", "velocity_rescaling", "nose_hoover", None]
+)
 def test_one_point_molecule_runs_under_every_thermostat(thermostat):
     stage = {"duration_ps": 1.0} | (
         {"ensemble": "nvt", "temperature_K": 100.0, "thermostat": thermostat} if thermostat else {}
     )
-    run = Simulation(small_scene({"argon": 1}, 20.0, stages=[stage], start={"temperature_K": 100.0}), warn=str)
+    run = Simulation(
+        small_scene({"argon": 1}, 20.0, stages=[stage], start={"temperature_K": 100.0}), warn=str
+    )
     results = run.run()
     moves = thermostat in ("langevin", "andersen")
     assert results.summary["degrees_of_freedom"] == (3 if moves else 0)
@@ -324,21 +392,28 @@ def test_one_point_molecule_runs_under_every_thermostat(thermostat):
 def free_flight(name, folder):
     """Two argon atoms far apart in a large box, which cross its sides."""
     scene = small_scene(
-        {"argon": 2}, 60.0, stages=[{"duration_ps": 20.0, "timestep_fs": 10.0}], start={"temperature_K": 3000.0},
-        forces={"cutoff_A": 6.0}, output={"trajectory": name, "trajectory_interval_ps": 0.1, "log_interval_ps": 10.0},
-    )  # fmt: skip
+        {"argon": 2},
+        60.0,
+        stages=[{"duration_ps": 20.0, "timestep_fs": 10.0}],
+        start={"temperature_K": 3000.0},
+        forces={"cutoff_A": 6.0},
+        output={"trajectory": name, "trajectory_interval_ps": 0.1, "log_interval_ps": 10.0},
+    )
     return Simulation(scene, folder).run()
 
 
 @pytest.mark.parametrize("name", ["t.xtc", "t.trr", "t.dcd", "t.nc", "t.xyz", "t.pdb", "memory"])
 def test_displacements_over_time_are_speeds(name, tmp_path):
-    """What a diffusion coefficient rests on: times of frames, and positions that do not jump at the sides of the box."""
+    """What a diffusion coefficient rests on: times of frames, and positions that do not jump at the
+    sides of the box."""
     results = free_flight(*(("t.xtc", None) if name == "memory" else (name, tmp_path / "out")))
     universe = results.universe()
     path = universe.trajectory.timeseries(order="fac")
     speed = np.diff(path, axis=0) / universe.trajectory.dt
     assert np.abs(path).max() > 60
-    assert speed == pytest.approx(np.broadcast_to(results.state.velocity, speed.shape), abs=0.2)  # of some 10 Å/ps
+    assert speed == pytest.approx(
+        np.broadcast_to(results.state.velocity, speed.shape), abs=0.2
+    )  # of some 10 Å/ps
     assert universe.trajectory.dt == pytest.approx(0.1)
     assert universe.trajectory.totaltime == pytest.approx(20)
     assert results.summary["positions"] == "unwrapped"
@@ -348,12 +423,19 @@ def test_displacements_over_time_are_speeds(name, tmp_path):
 def test_the_summary_says_when_positions_are_wrapped():
     scene = small_scene({"argon": 20}, 20.0, output={"positions": "wrapped"})
     assert "displacements need unwrapped frames" in summary_text(Simulation(scene).run().summary)
-    for without in ({"output": {"trajectory": False}}, {"box": {"lengths_A": 20.0, "periodic": False}}):
-        assert "positions" not in summary_text(Simulation(small_scene({"argon": 20}, 20.0, **without)).run().summary)
+    for without in (
+        {"output": {"trajectory": False}},
+        {"box": {"lengths_A": 20.0, "periodic": False}},
+    ):
+        assert "positions" not in summary_text(
+            Simulation(small_scene({"argon": 20}, 20.0, **without)).run().summary
+        )
 
 
 def test_a_format_too_narrow_for_a_long_way_is_told(tmp_path):
-    scene = small_scene({"argon": 2}, 60.0, output={"trajectory": "t.pdb", "trajectory_interval_ps": 0.002})
+    scene = small_scene(
+        {"argon": 2}, 60.0, output={"trajectory": "t.pdb", "trajectory_interval_ps": 0.002}
+    )
     simulation = Simulation(scene, tmp_path / "out")
     state = simulation.system.state.copy()
     state.velocity[:] = [[-1e6, 0, 0], [1e6, 0, 0]]
@@ -366,8 +448,14 @@ def test_a_format_too_narrow_for_a_long_way_is_told(tmp_path):
 
 
 def test_the_topology_is_the_first_frame_relief_included(tmp_path):
-    short = {"stages.0.duration_ps": 0.004, "stages.1.duration_ps": 0.004, "output.positions": "unwrapped"}
-    results = Simulation(Scene.read(ROOT / "systems" / "water_nitrogen.toml", short), tmp_path / "out").run()
+    short = {
+        "stages.0.duration_ps": 0.004,
+        "stages.1.duration_ps": 0.004,
+        "output.positions": "unwrapped",
+    }
+    results = Simulation(
+        Scene.read(ROOT / "systems" / "water_nitrogen.toml", short), tmp_path / "out"
+    ).run()
     assert results.summary["relief_steps"] > 0
     universe = results.universe()
     first = mda.Universe(str(tmp_path / "out" / "topology.gro")).atoms.positions
@@ -376,11 +464,14 @@ def test_the_topology_is_the_first_frame_relief_included(tmp_path):
 
 
 def argon(**more):
-    return small_scene({"argon": 20}, 25.0, stages=[{"duration_ps": 0.1}], output={"log_interval_ps": 0.01}, **more)
+    return small_scene(
+        {"argon": 20}, 25.0, stages=[{"duration_ps": 0.1}], output={"log_interval_ps": 0.01}, **more
+    )
 
 
 def test_energy_that_goes_with_the_total_momentum_is_booked():
-    """Total momentum goes at steps that the row decides, and its energy into the books, whatever else acts."""
+    """Total momentum goes at steps that the row decides, and its energy into the books, whatever
+    else acts."""
     system = build(argon())
     mass = float(system.model.mass[system.model.species].sum())
     state = system.state.copy()
@@ -404,7 +495,10 @@ def test_a_drift_of_all_molecules_is_noted():
     results = simulation.run()
     mass = float(results.system.model.mass[results.system.model.species].sum())
     said = next(note for note in results.summary["notes"] if "drift together" in note)
-    assert f"which adds {mass * 0.5**2 / (57 * BOLTZMANN):.2g} K to T_trans; run.remove_momentum_interval_ps" in said
+    assert (
+        f"which adds {mass * 0.5**2 / (57 * BOLTZMANN):.2g} K to T_trans; run.remove_momentum_interval_ps"
+        in said
+    )
 
 
 MIE = {"energy": "4*e*((s/r)**14 - (s/r)**7)", "parameters": {"AR": {"e": 1.0, "s": 3.4}}}
@@ -418,7 +512,12 @@ SCREENED = {"energy": "a*exp(-r/2)/r", "parameters": {"AR": {"a": 5.0}}}
         ({"spce": 20}, 3.54, None, ""),  # WCA, rounded
         ({"spce": 20}, 7.0, None, ""),
         ({"argon": 10, "ccl4": 5}, 3.7, None, "shorter than 3.82 Å, where the energy of argon.AR"),
-        ({"argon": 20}, 0.34, MIE, "mie: a cutoff of 0.34 Å is shorter than 3.7. Å, .* argon.AR and argon.AR .* in nm"),
+        (
+            {"argon": 20},
+            0.34,
+            MIE,
+            "mie: a cutoff of 0.34 Å is shorter than 3.7. Å, .* argon.AR and argon.AR .* in nm",
+        ),
         ({"argon": 20}, 3.0, MIE, "mie: .* 3 Å is shorter than 3.7"),
         ({"argon": 20}, 3.9, MIE, ""),
         ({"argon": 20}, 3.0, SCREENED, ""),  # repels everywhere
@@ -427,7 +526,11 @@ SCREENED = {"energy": "a*exp(-r/2)/r", "parameters": {"AR": {"a": 5.0}}}
 def test_a_cutoff_within_the_minimum_of_an_energy_is_noted(counts, cutoff, entry, words):
     forces = {"cutoff_A": cutoff}
     if entry:
-        forces = {"cutoff_A": 8.0, "lennard_jones": False, "custom": [entry | {"name": "mie", "cutoff_A": cutoff}]}
+        forces = {
+            "cutoff_A": 8.0,
+            "lennard_jones": False,
+            "custom": [entry | {"name": "mie", "cutoff_A": cutoff}],
+        }
     scene = small_scene(counts, 20.0, forces=forces)
     found = [note for note in build(scene).notes if "has its minimum" in note]
     assert len(found) == bool(words) and all(re.search(words, note) for note in found)
@@ -437,27 +540,43 @@ def test_a_cutoff_within_the_minimum_of_an_energy_is_noted(counts, cutoff, entry
 @pytest.mark.parametrize("density", [1.4, 1.95, 2.6])
 @pytest.mark.parametrize(("gap", "agrees"), [(1e-7, True), (3e-4, False)])
 def test_two_engines_agree_by_the_size_of_each_quantity(density, gap, agrees):
-    """Also where the virial is many times the energies, or these cancel: dense, on a lattice, cold."""
+    """Also where the virial is many times the energies, or these cancel: dense, on a lattice,
+    cold."""
     box, forces = {"density_g_cm3": density}, {"cutoff_A": 4.6, "truncation": "plain"}
-    system = build(small_scene({"argon": 32}, None, box=box, forces=forces, start={"temperature_K": 1.0}))
+    system = build(
+        small_scene({"argon": 32}, None, box=box, forces=forces, start={"temperature_K": 1.0})
+    )
     term = system.terms["lennard_jones"]
     other = term._replace(
-        potential=term.potential._replace(c12=term.potential.c12 * (1 + gap), c6=term.potential.c6 * (1 - gap))
+        potential=term.potential._replace(
+            c12=term.potential.c12 * (1 + gap), c6=term.potential.c6 * (1 - gap)
+        )
     )
     here, there = (system.engine_of({"lennard_jones": each}, "double") for each in (term, other))
     state = shaken(system, 1, 0.05)[2]
     lines = compare_at(system, state, here, there)
     assert {line.name for line in lines if not line.agrees} == (
-        set() if agrees else {"lennard jones", "potential energy", "rms force on a molecule", "virial"}
+        set()
+        if agrees
+        else {"lennard jones", "potential energy", "rms force on a molecule", "virial"}
     )
 
 
 def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **made):
-    """The summary of made-up samples of one stage: values (n,) of columns; others are still or noise."""
+    """The summary of made-up samples of one stage: values (n,) of columns; others are still or
+    noise."""
     rng, n = np.random.default_rng(seed), len(next(iter(made.values())))
-    given = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.05 * n, "timestep_fs": 4.0} | stage
+    given = {
+        "ensemble": "nvt",
+        "temperature_K": 300.0,
+        "duration_ps": 0.05 * n,
+        "timestep_fs": 4.0,
+    } | stage
     scene = small_scene(
-        counts or {"spce": 40}, 16.0, stages=[given], forces={"cutoff_A": 7.9, "truncation": truncation}
+        counts or {"spce": 40},
+        16.0,
+        stages=[given],
+        forces={"cutoff_A": 7.9, "truncation": truncation},
     )
     system = build(scene)
     state = system.state.copy()
@@ -465,10 +584,22 @@ def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **
     state.velocity[:] = [momentum * np.sqrt(BOLTZMANN * 300.0 / mass), 0.0, 0.0]
     rows = Samples(["nvt"])
     for k in range(n):
-        plain = {name: 300.0 + rng.standard_normal() for name in COLUMNS if name.startswith("temperature")}
+        plain = {
+            name: 300.0 + rng.standard_normal()
+            for name in COLUMNS
+            if name.startswith("temperature")
+        }
         own = {name: float(values[k]) for name, values in made.items()}
-        row = dict.fromkeys(COLUMNS, 0.0) | plain | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
-        rows.append(Sample(**row | {"time": 0.05 * k, "momentum": momentum, "orthogonality_error": 0.0} | own))
+        row = (
+            dict.fromkeys(COLUMNS, 0.0)
+            | plain
+            | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
+        )
+        rows.append(
+            Sample(
+                **row | {"time": 0.05 * k, "momentum": momentum, "orthogonality_error": 0.0} | own
+            )
+        )
     record = MolecularRecord()
     record.position.computing = [1.0]
     return summarise(system, record, rows, state, 0.0, 1.0, False)
@@ -476,7 +607,11 @@ def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **
 
 def noted(*given, **made):
     """Notes on the stage, or on a common drift, of the summary of made-up samples."""
-    return [note for note in summarised(*given, **made)["notes"] if "stages.0" in note or "together" in note]
+    return [
+        note
+        for note in summarised(*given, **made)["notes"]
+        if "stages.0" in note or "together" in note
+    ]
 
 
 KEPT = {"thermostat": "velocity_rescaling"}
@@ -487,16 +622,23 @@ def test_means_are_over_the_equilibrated_part():
     rng, time = np.random.default_rng(5), 0.05 * np.arange(400)
     relaxing = np.exp(-time / 1.0)
     potential = -1600 + 400 * relaxing + 10 * rng.standard_normal(400)
-    found = summarised(KEPT, potential=potential, temperature=300 + 80 * relaxing + rng.standard_normal(400))
+    found = summarised(
+        KEPT, potential=potential, temperature=300 + 80 * relaxing + rng.standard_normal(400)
+    )
     stage = found["stages"][0]
     begin = stage["equilibrated_from_ps"]
     assert 2.5 < begin < 8
     assert stage["means_over"] == f"the last {19.95 - begin:.4g} of 19.95 ps"
     own = time > begin - 1e-9
-    of_potential = stage["potential_kJ_mol_per_molecule"], stage["potential_error_kJ_mol_per_molecule"]
+    of_potential = (
+        stage["potential_kJ_mol_per_molecule"],
+        stage["potential_error_kJ_mol_per_molecule"],
+    )
     assert of_potential == pytest.approx(mean_and_error(potential[own] / 40), rel=1e-9)
     assert abs(stage["temperature_K"] - 300) < 4 * stage["temperature_error_K"] < 1
-    assert stage["temperature_translation_error_K"] == pytest.approx(1 / np.sqrt(own.sum()), rel=0.5)
+    assert stage["temperature_translation_error_K"] == pytest.approx(
+        1 / np.sqrt(own.sum()), rel=0.5
+    )
     text = summary_text(found | {"scene": "made up"})
     assert f"means           over {stage['means_over']}" in text
     assert "K, set point 300 K" in text
@@ -504,70 +646,110 @@ def test_means_are_over_the_equilibrated_part():
     assert re.search(r"potential +-39.\d+ ± 0.0\d+ kJ/mol per molecule", text)
 
 
-@pytest.mark.parametrize(("given", "potential", "words", "begins"), [
-    (KEPT, np.linspace(0.0, 1.0, 39), "all 1.9 ps, too short to detect equilibration", None),
-    (KEPT, np.zeros(100), "all 4.95 ps", 0.0),
-    (KEPT, np.linspace(0.0, 1e3, 100), "all 4.95 ps, not yet steady", 0.0),
-    (KEPT | {"temperature_K": [300.0, 200.0]}, np.linspace(0.0, 1e3, 100),
-     "all 4.95 ps, in which the set point changes", 0.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("given", "potential", "words", "begins"),
+    [
+        (KEPT, np.linspace(0.0, 1.0, 39), "all 1.9 ps, too short to detect equilibration", None),
+        (KEPT, np.zeros(100), "all 4.95 ps", 0.0),
+        (KEPT, np.linspace(0.0, 1e3, 100), "all 4.95 ps, not yet steady", 0.0),
+        (
+            KEPT | {"temperature_K": [300.0, 200.0]},
+            np.linspace(0.0, 1e3, 100),
+            "all 4.95 ps, in which the set point changes",
+            0.0,
+        ),
+    ],
+)
 def test_the_part_of_means_is_said(given, potential, words, begins):
     stage = summarised(given, potential=potential)["stages"][0]
     assert stage["means_over"] == words
     assert stage["equilibrated_from_ps"] == (None if begins is None else pytest.approx(begins))
 
 
-@pytest.mark.parametrize(("slope", "noise", "verdict"), [
-    (0.0, 1e-3, r"not significant, [012].\d standard errors$"),
-    (1e-3, 1e-3, r"significant, \d+.\d standard errors, but small$"),
-    (10.0, 1e-3, r"significant, \d+.\d standard errors, and large$"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("slope", "noise", "verdict"),
+    [
+        (0.0, 1e-3, r"not significant, [012].\d standard errors$"),
+        (1e-3, 1e-3, r"significant, \d+.\d standard errors, but small$"),
+        (10.0, 1e-3, r"significant, \d+.\d standard errors, and large$"),
+    ],
+)
 def test_a_drift_has_a_verdict(slope, noise, verdict):
-    """The limit is 0.001 kT per degree of freedom: 0.6 kJ/mol for 40 waters in 20 ps, 0.03 kJ/mol/ps."""
+    """The limit is 0.001 kT per degree of freedom: 0.6 kJ/mol for 40 waters in 20 ps, 0.03
+    kJ/mol/ps."""
     drift = slope * 0.05 * np.arange(400) + noise * np.random.default_rng(3).standard_normal(400)
     found = summarised(KEPT, drift=drift, temperature=np.full(400, 300.0))
     assert re.match(verdict, found["stages"][0]["drift_verdict"])
-    assert f"(conserved energy): {found['stages'][0]['drift_verdict']}" in summary_text(found | {"scene": "made up"})
+    assert f"(conserved energy): {found['stages'][0]['drift_verdict']}" in summary_text(
+        found | {"scene": "made up"}
+    )
     assert summarised(KEPT, drift=drift[:10])["stages"][0]["drift_verdict"] is None
 
 
 def test_constant_energy_after_a_thermostat_explains_its_temperature():
-    warm = {"ensemble": "npt", "temperature_K": [80.0, 100.0], "pressure_bar": 10.0, "duration_ps": 0.5}
+    warm = {
+        "ensemble": "npt",
+        "temperature_K": [80.0, 100.0],
+        "pressure_bar": 10.0,
+        "duration_ps": 0.5,
+    }
     stages = [{"ensemble": "minimise"}, warm, {"duration_ps": 5.0}, {"duration_ps": 0.1}]
-    results = Simulation(small_scene({"argon": 40}, 19.0, stages=stages, output={"log_interval_ps": 0.01})).run()
+    results = Simulation(
+        small_scene({"argon": 40}, 19.0, stages=stages, output={"log_interval_ps": 0.01})
+    ).run()
     _, one, two, three = results.summary["stages"]
     assert one["set_temperature_K"] == (80.0, 100.0) and "temperature_scatter_K" not in one
     assert "temperature_scatter_K" not in three  # nothing was drawn at its start
-    steady = results["temperature"][(results["stage"] == 2) & (results["time"] > two["equilibrated_from_ps"] - 1e-9)]
+    steady = results["temperature"][
+        (results["stage"] == 2) & (results["time"] > two["equilibrated_from_ps"] - 1e-9)
+    ]
     square = 2 * steady.mean() ** 2 / 117 - steady.var()
     assert two["temperature_scatter_K"] == pytest.approx(np.sqrt(square))
     assert two["temperature_before_K"] == 100.0
     text = summary_text(results.summary)
     off = two["temperature_K"] - 100.0
-    assert f"{off:+.2g} K from the 100 K before: this stage keeps the energy of one moment; such" in text
+    assert (
+        f"{off:+.2g} K from the 100 K before: this stage keeps the energy of one moment; such"
+        in text
+    )
     assert ("equilibrate longer" in text) == (abs(off) > 3 * two["temperature_scatter_K"])
     assert "set point 80 to 100 K" in text and "set point 10 bar" in text
 
 
 @pytest.mark.soak
 def test_temperatures_at_constant_energy_scatter_as_estimated():
-    stages = [{"ensemble": "nvt", "temperature_K": 100.0, "duration_ps": 15.0, "timestep_fs": 5.0},
-              {"duration_ps": 20.0, "timestep_fs": 5.0}]  # fmt: skip
-    sections = {"stages": stages, "output": {"trajectory": False, "log_interval_ps": 0.05}, "forces": {"cutoff_A": 8.0}}
-    runs = [Simulation(small_scene({"argon": 100}, 17.5, seed=seed, **sections), warn=str) for seed in range(1, 41)]
+    stages = [
+        {"ensemble": "nvt", "temperature_K": 100.0, "duration_ps": 15.0, "timestep_fs": 5.0},
+        {"duration_ps": 20.0, "timestep_fs": 5.0},
+    ]
+    sections = {
+        "stages": stages,
+        "output": {"trajectory": False, "log_interval_ps": 0.05},
+        "forces": {"cutoff_A": 8.0},
+    }
+    runs = [
+        Simulation(small_scene({"argon": 100}, 17.5, seed=seed, **sections), warn=str)
+        for seed in range(1, 41)
+    ]
     found = [results.summary["stages"][1] for results in run_together(runs) if results]
     measured = np.std([stage["temperature_K"] for stage in found], ddof=1)
     estimated = np.sqrt(np.mean([stage["temperature_scatter_K"] ** 2 for stage in found]))
     assert measured == pytest.approx(estimated, rel=3 / np.sqrt(2 * 39))
 
 
-@pytest.mark.parametrize("thermostat", ["langevin", "andersen", "velocity_rescaling", "nose_hoover", None])
+@pytest.mark.parametrize(
+    "thermostat", ["langevin", "andersen", "velocity_rescaling", "nose_hoover", None]
+)
 @pytest.mark.parametrize("momentum", [0.0, 0.5, 3.0, 12.0])  # sqrt(M kT) is thermal
 def test_a_thermal_momentum_is_noted_where_it_is_conserved(thermostat, momentum):
     stage = {"thermostat": thermostat} if thermostat else {"ensemble": "nve", "temperature_K": None}
-    told = noted({"timestep_fs": 2.0} | stage, {"argon": 40}, momentum, temperature=np.full(40, 300.0))
+    told = noted(
+        {"timestep_fs": 2.0} | stage, {"argon": 40}, momentum, temperature=np.full(40, 300.0)
+    )
     if thermostat in ("langevin", "andersen"):
-        assert [("thermal motion has" in note, "adds" in note) for note in told] == [(True, False)] * (momentum > 10)
+        assert [("thermal motion has" in note, "adds" in note) for note in told] == [
+            (True, False)
+        ] * (momentum > 10)
     else:
         assert ["which adds" in note for note in told] == [True] * (momentum > 0)
 
@@ -587,37 +769,56 @@ def test_a_thermal_momentum_is_noted_where_it_is_conserved(thermostat, momentum)
     ],
 )
 def test_temperatures_are_judged_without_the_error_of_the_step(bias, apart, spread, n, words):
-    """At the steps T_trans and T_rot are 7 K apart and the mean is that of the thermostat, as with velocity Verlet."""
+    """At the steps T_trans and T_rot are 7 K apart and the mean is that of the thermostat, as with
+    velocity Verlet."""
     noise = np.random.default_rng(1).standard_normal((3, n)) * spread
     told = noted(
-        KEPT, temperature=300 + noise[0], temperature_translation=303.5 + noise[1],
-        temperature_rotation=296.5 + noise[2], temperature_translation_unbiased=300 + bias + apart / 2 + noise[0] + noise[1],
+        KEPT,
+        temperature=300 + noise[0],
+        temperature_translation=303.5 + noise[1],
+        temperature_rotation=296.5 + noise[2],
+        temperature_translation_unbiased=300 + bias + apart / 2 + noise[0] + noise[1],
         temperature_rotation_unbiased=300 + bias - apart / 2 + noise[0] - noise[1],
-    )  # fmt: skip
-    assert len(told) == len(words) and all(word in note for word, note in zip(words, told, strict=True))
+    )
+    assert len(told) == len(words) and all(
+        word in note for word, note in zip(words, told, strict=True)
+    )
     for note in told:
         assert "Try" in note and "without the error of the step" in note
     if bias == 5.5 and words:
-        assert re.search(r"T_trans 303.\d, T_rot 296.\d.* Try timestep_fs = 2, or integrator = 'baoab'", told[0])
+        assert re.search(
+            r"T_trans 303.\d, T_rot 296.\d.* Try timestep_fs = 2, or integrator = 'baoab'", told[0]
+        )
 
 
 def test_temperatures_of_other_integrators_are_judged_at_the_steps():
-    unknown = dict.fromkeys(("temperature_translation_unbiased", "temperature_rotation_unbiased"), np.full(200, np.nan))
+    unknown = dict.fromkeys(
+        ("temperature_translation_unbiased", "temperature_rotation_unbiased"), np.full(200, np.nan)
+    )
     noise = np.random.default_rng(0).standard_normal(200)
     moved = {"temperature_translation": 310 + noise, "temperature_rotation": 290 - noise}
     (told,) = noted(KEPT | {"integrator": "two_stage"}, **moved, **unknown)
     assert "20 ± " in told and "without the error" not in told
     points = {"temperature_rotation": np.full(200, np.nan), "temperature": 300 + noise}
-    warm = {"temperature_translation_unbiased": 310 + noise, "temperature_rotation_unbiased": np.full(200, np.nan)}
+    warm = {
+        "temperature_translation_unbiased": 310 + noise,
+        "temperature_rotation_unbiased": np.full(200, np.nan),
+    }
     (told,) = noted(KEPT, {"argon": 40}, **points | warm)
     assert "10 K too hot" in told and "nan" not in told
 
 
-@pytest.mark.parametrize(("thermostat", "freedom"), [("langevin", 6 * 40), ("velocity_rescaling", 6 * 40 - 3)])
-def test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage(thermostat, freedom):
+@pytest.mark.parametrize(
+    ("thermostat", "freedom"), [("langevin", 6 * 40), ("velocity_rescaling", 6 * 40 - 3)]
+)
+def test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage(
+    thermostat, freedom
+):
     """A thermostat that changes the total momentum has three more."""
     time = 0.05 * np.arange(400)
-    summary = summarised({"thermostat": thermostat}, time=time, drift=0.7 * time, temperature=np.full(400, 300.0))
+    summary = summarised(
+        {"thermostat": thermostat}, time=time, drift=0.7 * time, temperature=np.full(400, 300.0)
+    )
     (stage,) = summary["stages"]
     assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(700 / 40)
     expected = 700 * KJ_PER_MOL / (BOLTZMANN * 300 * freedom)
@@ -636,7 +837,9 @@ def test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_
     ],
 )
 @pytest.mark.parametrize("ensemble", ["nve", "nvt"])
-def test_a_drift_is_noted_where_it_is_certain_and_has_added_up(rate, n, interval, noise, told, ensemble):
+def test_a_drift_is_noted_where_it_is_certain_and_has_added_up(
+    rate, n, interval, noise, told, ensemble
+):
     time = interval * np.arange(n)
     slope = rate / 1000 * BOLTZMANN / KJ_PER_MOL * 300 * (6 * 40 - 3)  # kJ/mol/ps
     drift = slope * time + noise * np.random.default_rng(2).standard_normal(n)
@@ -665,9 +868,16 @@ def test_a_run_prints_each_note_once(tmp_path, capsys):
 
 
 def test_warnings_reach_whoever_calls_from_python():
-    plain = {"run.timestep_s": 0.3, "run.duration_s": 0.9, "run.integrator": "velocity_verlet", "watch.energy": False}
+    plain = {
+        "run.timestep_s": 0.3,
+        "run.duration_s": 0.9,
+        "run.integrator": "velocity_verlet",
+        "watch.energy": False,
+    }
     scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", plain)
-    with pytest.warns(RigidMDWarning, match=r"timestep_s = 0.3 is longer than what is stable") as caught:
+    with pytest.warns(
+        RigidMDWarning, match=r"timestep_s = 0.3 is longer than what is stable"
+    ) as caught:
         Simulation(scene).run()
     assert caught[0].filename == __file__
 
@@ -677,28 +887,57 @@ def test_when_total_momentum_is_taken_out():
     frozen = [{"model": "spce", "count": 2}, {"model": "argon", "count": 2, "frozen": True}]
     assert rigidmd.resolve(argon()).run.remove_momentum_interval_ps is False
     assert rigidmd.resolve(argon(forces=pme)).run.remove_momentum_interval_ps == 1.0
-    assert rigidmd.resolve(argon(forces=pme | {"electrostatics": "ewald"})).run.remove_momentum_interval_ps is False
     assert (
-        rigidmd.resolve(argon(forces=pme, run={"remove_momentum_interval_ps": False})).run.remove_momentum_interval_ps
+        rigidmd.resolve(
+            argon(forces=pme | {"electrostatics": "ewald"})
+        ).run.remove_momentum_interval_ps
         is False
     )
-    assert rigidmd.resolve(small_scene({}, 25.0, molecules=frozen, forces=pme)).run.remove_momentum_interval_ps is False
+    assert (
+        rigidmd.resolve(
+            argon(forces=pme, run={"remove_momentum_interval_ps": False})
+        ).run.remove_momentum_interval_ps
+        is False
+    )
+    assert (
+        rigidmd.resolve(
+            small_scene({}, 25.0, molecules=frozen, forces=pme)
+        ).run.remove_momentum_interval_ps
+        is False
+    )
     assert rigidmd.resolve(small_scene({"argon": 3}, None)).run.remove_momentum_interval_ps is False
     with pytest.raises(SceneError, match="total momentum is not conserved with frozen molecules"):
         small_scene({}, 25.0, molecules=frozen, run={"remove_momentum_interval_ps": 0.1})
     text = describe(argon(run={"remove_momentum_interval_ps": 0.2}))
     assert "total momentum: removed every 0.2 ps" in text
-    assert "run.remove_momentum_interval_ps is false" in describe(argon(run={"remove_momentum_interval_ps": False}))
+    assert "run.remove_momentum_interval_ps is false" in describe(
+        argon(run={"remove_momentum_interval_ps": False})
+    )
 
 
 DECIDED = {
     "reaction_field": {"cutoff_A", "switch_start_A"},
-    "ewald": {"cutoff_A", "switch_start_A", "ewald_alpha_per_A", "ewald_k_radius_per_A", "ewald_truncation"},
-    "pme": {"cutoff_A", "switch_start_A", "ewald_alpha_per_A", "pme_grid", "pme_order", "ewald_truncation"},
+    "ewald": {
+        "cutoff_A",
+        "switch_start_A",
+        "ewald_alpha_per_A",
+        "ewald_k_radius_per_A",
+        "ewald_truncation",
+    },
+    "pme": {
+        "cutoff_A",
+        "switch_start_A",
+        "ewald_alpha_per_A",
+        "pme_grid",
+        "pme_order",
+        "ewald_truncation",
+    },
 }
 
 
-@pytest.mark.parametrize("electrostatics", ["reaction_field", pytest.param("ewald", marks=pytest.mark.soak), "pme"])
+@pytest.mark.parametrize(
+    "electrostatics", ["reaction_field", pytest.param("ewald", marks=pytest.mark.soak), "pme"]
+)
 def test_the_scene_that_a_run_writes_holds_every_number_it_used(electrostatics, tmp_path):
     """And runs again to the same bits, though nothing is left for it to decide."""
     forces = {"electrostatics": electrostatics} | (
@@ -752,24 +991,32 @@ def test_a_cell_that_leans_too_much_leaves_only_the_grid_open():
     first, again = (build(each).terms["coulomb_reciprocal"] for each in (scene, resolved))
     assert (resolved.forces.ewald_accuracy, resolved.forces.pme_order) == (5e-5, first.order)
     assert (first.grid, first.order) == (again.grid, again.order)
-    even = rigidmd.resolve(small_scene({"spce": 30}, None, box=box, forces=forces | {"pme_grid": [60, 60, 60]}))
+    even = rigidmd.resolve(
+        small_scene({"spce": 30}, None, box=box, forces=forces | {"pme_grid": [60, 60, 60]})
+    )
     assert (even.forces.pme_grid, even.forces.ewald_accuracy) == ((60, 60, 60), None)
 
 
 def test_faults_of_all_tables_are_said_at_once():
     molecules = [{"model": "spce", "count": 3, "frozen": "2-9"}]
-    scene = small_scene({}, 17.0, molecules=molecules, forces={"electrostatics": "pme", "ewald_alpha_per_A": 2.0})
+    scene = small_scene(
+        {}, 17.0, molecules=molecules, forces={"electrostatics": "pme", "ewald_alpha_per_A": 2.0}
+    )
     with pytest.raises(SceneError) as error:
         build(scene)
     assert [fault.partition(":")[0].partition(" =")[0] for fault in error.value.errors] == [
-        "molecules.0.frozen", "forces.cutoff_A", "forces.ewald_alpha_per_A"
-    ]  # fmt: skip
+        "molecules.0.frozen",
+        "forces.cutoff_A",
+        "forces.ewald_alpha_per_A",
+    ]
     assert "(the default)" in str(error.value)
 
 
 def test_an_accuracy_that_cannot_be_had_is_called_the_default():
     forces = {"electrostatics": "pme", "cutoff_A": 6.0, "ewald_alpha_per_A": 1.3}
-    with pytest.raises(SceneError, match=r"ewald_accuracy = 5e-05 \(the default\) cannot be reached"):
+    with pytest.raises(
+        SceneError, match=r"ewald_accuracy = 5e-05 \(the default\) cannot be reached"
+    ):
         build(small_scene({"spce": 30}, 18.5, forces=forces | {"pme_grid": [8, 8, 8]}))
 
 
@@ -796,7 +1043,9 @@ def test_every_frame_is_on_the_disk_at_once(name, tmp_path):
 
     def observe(moment):
         if moment.step and moment.step % 4 == 0:
-            universe = mda.Universe(str(tmp_path / "out" / "topology.gro"), str(tmp_path / "out" / name))
+            universe = mda.Universe(
+                str(tmp_path / "out" / "topology.gro"), str(tmp_path / "out" / name)
+            )
             seen.append(sum(1 for _ in universe.trajectory))
 
     scene = small_scene(
@@ -811,11 +1060,18 @@ def test_every_frame_is_on_the_disk_at_once(name, tmp_path):
 
 @pytest.mark.parametrize("box", [{"lengths_A": [20, 21, 22], "angles_deg": [80, 75, 70]}, None])
 def test_frames_of_xtc_are_those_that_mdanalysis_writes(box, tmp_path):
-    scene = {"molecules": [{"model": "spce", "count": 30 if box else 1}], "stages": [{"duration_ps": 0.04}]}
+    scene = {
+        "molecules": [{"model": "spce", "count": 30 if box else 1}],
+        "stages": [{"duration_ps": 0.04}],
+    }
     structure = {"box": {"periodic": False}, "structure": {"file": "one.xyz"}}
     scene |= {"box": box, "forces": {"cutoff_A": 7.0}} if box else structure
     (tmp_path / "one.xyz").write_text("3\n\nO 0 0 0\nH 0.8 0.6 0\nH -0.8 0.6 0\n")
-    scene |= {"name": "cell", "output": {"trajectory_interval_ps": 0.008}, "start": {"temperature_K": 300}}
+    scene |= {
+        "name": "cell",
+        "output": {"trajectory_interval_ps": 0.008},
+        "start": {"temperature_K": 300},
+    }
     scene = Scene.from_dict(scene, tmp_path)
     Simulation(scene, tmp_path / "out").run()
     own, other = tmp_path / "out" / "trajectory.xtc", tmp_path / "other.xtc"
@@ -832,7 +1088,10 @@ def test_frames_of_xtc_are_those_that_mdanalysis_writes(box, tmp_path):
 def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
     now = 0.0
     monkeypatch.setattr(log.clock, "monotonic", lambda: now)
-    path, samples = tmp_path / "log.csv", Simulation(small_scene({"argon": 5}, 30.0)).run().samples.rows
+    path, samples = (
+        tmp_path / "log.csv",
+        Simulation(small_scene({"argon": 5}, 30.0)).run().samples.rows,
+    )
     file = log.Log(path, False)
 
     def lines():
@@ -843,7 +1102,13 @@ def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
         now = 0.01 * k
         file.write(samples[0])
         assert lines() == (1 if k < 50 else 51)
-    for now, written in ((5.0, 61), (5.01, 61), (5.1, 63), (5.2, 64), (5.21, 64)):  # lines that come seldom do not wait
+    for now, written in (
+        (5.0, 61),
+        (5.01, 61),
+        (5.1, 63),
+        (5.2, 64),
+        (5.21, 64),
+    ):  # lines that come seldom do not wait
         file.write(samples[0])
         assert lines() == written, now
     assert file.kept[0] == path.stat().st_size
@@ -853,11 +1118,17 @@ def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
     assert lines() == 66
 
 
-@pytest.mark.filterwarnings("ignore:frames are not evenly spaced")  # its few steps end between two frames
+@pytest.mark.filterwarnings(
+    "ignore:frames are not evenly spaced"
+)  # its few steps end between two frames
 def test_from_python_in_five_lines():
     scene = rigidmd.Scene.read(
         ROOT / "systems" / "nitrogen.toml",
-        {"stages.0.duration_ps": 0.02, "stages.1.duration_ps": 0.02, "output.trajectory_interval_ps": 0.01},
+        {
+            "stages.0.duration_ps": 0.02,
+            "stages.1.duration_ps": 0.02,
+            "output.trajectory_interval_ps": 0.01,
+        },
     )
     temperatures = []
     watch = rigidmd.Every(0.02, lambda moment: temperatures.append(moment.observation.temperature))
@@ -888,7 +1159,9 @@ def test_what_an_observer_keeps_does_not_change(scene_of_both):
     for now, then in zip(kept, copies, strict=True):
         for array, copy in zip(now, then, strict=True):
             assert array.tobytes() == copy.tobytes()
-    assert any(not np.array_equal(first, last) for first, last in zip(copies[0], copies[-1], strict=True))
+    assert any(
+        not np.array_equal(first, last) for first, last in zip(copies[0], copies[-1], strict=True)
+    )
 
 
 def test_results_are_a_mapping_of_their_columns(scene_of_both):
@@ -904,15 +1177,21 @@ def test_observers_cannot_write_to_the_state():
         moment.state.position[:] = 0
 
     with pytest.raises(ValueError, match="read-only"):
-        Simulation(small_scene({"argon": 10}, 20.0), observers=[Every(0.002, meddle)], warn=str).run()
+        Simulation(
+            small_scene({"argon": 10}, 20.0), observers=[Every(0.002, meddle)], warn=str
+        ).run()
 
 
 def running(tmp_path, lines):
-    """A long argon run in another process, once its log has so many lines: (process, its folder)."""
+    """A long argon run in another process, once its log has so many lines: (process, its
+    folder)."""
     scene, out = str(ROOT / "systems" / "argon.toml"), tmp_path / "out"
     arguments = ["run", scene, "-o", str(out), "--set", "stages.0.duration_ps=1000"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "rigidmd", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "rigidmd", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     deadline = time.monotonic() + 120
     while not ((out / "log.csv").exists() and (out / "log.csv").read_text().count("\n") > lines):
@@ -971,12 +1250,16 @@ def test_a_signal_of_the_program_s_own_is_left_to_it():
     stages = [{"duration_ps": 0.02}]
     before = signal.signal(signal.SIGTERM, lambda number, frame: caught.append(number))
     try:
-        results = Simulation(small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, kill)]).run()
+        results = Simulation(
+            small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, kill)]
+        ).run()
     finally:
         signal.signal(signal.SIGTERM, before)
     assert caught == [signal.SIGTERM]
     assert not results.interrupted
-    results = Simulation(small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, kill)]).run()
+    results = Simulation(
+        small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, kill)]
+    ).run()
     assert (results.interrupted, results.signal, results["step"][-1]) == (True, signal.SIGTERM, 4)
     assert results["time"][-1] == results.state.time[0]
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
@@ -990,7 +1273,9 @@ def test_off_a_terminal_lines_say_how_far_it_is(monkeypatch, capsys):
         now[0] += 20.0
 
     stages = [{"duration_ps": 0.02}]
-    simulation = Simulation(small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, wait)])
+    simulation = Simulation(
+        small_scene({"argon": 10}, 20.0, stages=stages), observers=[Every(0.002, wait)]
+    )
     simulation.run(progress=True)
     lines = [line for line in capsys.readouterr().err.splitlines() if "compiling" not in line]
     # of ten steps at 20 s each (one more before them): a line every 40 s
@@ -1011,7 +1296,11 @@ def test_the_time_left_is_of_the_steps_of_this_run(monkeypatch, capsys, tmp_path
         return minimise(*given)
 
     def lines(duration, **options):
-        stages = [{"ensemble": "minimise", "most_iterations": 2}, {"duration_ps": 0.02}, {"duration_ps": duration}]
+        stages = [
+            {"ensemble": "minimise", "most_iterations": 2},
+            {"duration_ps": 0.02},
+            {"duration_ps": duration},
+        ]
         scene = small_scene({"argon": 10}, 20.0, stages=stages, output={"figures": False})
         looks = Every(0.002, lambda moment: wait(20.0))
         compiling = {"say": lambda sentence: wait(500.0)}
@@ -1033,7 +1322,9 @@ def test_every_bar_has_the_rate_of_what_it_has_seen(monkeypatch, capsys, kind):
     monkeypatch.setattr(progress.clock, "monotonic", lambda: now[0])
     monkeypatch.setattr(progress, "in_notebook", lambda: kind == "notebook")
     monkeypatch.setattr(
-        progress.DisplayArea, "show", lambda self, bundle, metadata=None: shown.append(bundle["text/plain"])
+        progress.DisplayArea,
+        "show",
+        lambda self, bundle, metadata=None: shown.append(bundle["text/plain"]),
     )
     monkeypatch.setattr(sys.stderr, "isatty", lambda: kind == "terminal", raising=False)
     with progress.progress_of(100.0, "ps", True) as bar:
@@ -1079,8 +1370,24 @@ class FailingTwice(Failing):
 
 
 FILES_OF = {
-    "argon": {"scene.toml", "topology.gro", "trajectory.xtc", "log.csv", "final.npz", "energy.png", "summary.json"},
-    "top": {"scene.toml", "topology.pdb", "trajectory.xtc", "motion.csv", "motion.npz", "axis.png", "summary.json"},
+    "argon": {
+        "scene.toml",
+        "topology.gro",
+        "trajectory.xtc",
+        "log.csv",
+        "final.npz",
+        "energy.png",
+        "summary.json",
+    },
+    "top": {
+        "scene.toml",
+        "topology.pdb",
+        "trajectory.xtc",
+        "motion.csv",
+        "motion.npz",
+        "axis.png",
+        "summary.json",
+    },
 }
 
 
@@ -1110,7 +1417,9 @@ def test_an_observer_that_fails_costs_no_file_of_another(tmp_path, scene_of_both
     assert sum("Failing failed at" in note for note in summary["notes"]) == 1
     assert {Path(name).name for name in summary["files"]} <= there
     assert seen[-1].step == seen[-2].step  # also those after it saw the moment
-    again = Simulation(scene, tmp_path / "out", observers=[Every(0.002, seen.append)] * 3, resume=True, warn=str)
+    again = Simulation(
+        scene, tmp_path / "out", observers=[Every(0.002, seen.append)] * 3, resume=True, warn=str
+    )
     if method == "see" and kind == "argon":
         assert not again.run().interrupted
 
@@ -1135,7 +1444,9 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
     assert [note.split(" cannot be drawn: ValueError: ") for note in notes] == [
         ["Failing", "it does not work"],
         [
-            {"argon": "energy.png"}.get(kind, ", ".join(f"{stem}.png, {stem}.svg" for stem in FIGURES)),
+            {"argon": "energy.png"}.get(
+                kind, ", ".join(f"{stem}.png, {stem}.svg" for stem in FIGURES)
+            ),
             "ParseException: no mathematics",
         ],
         ["Failing", "it does not work"],
@@ -1154,7 +1465,9 @@ def test_one_figure_of_a_body_that_fails_leaves_the_others(tmp_path, monkeypatch
         return write(figure, stem, suffixes)
 
     monkeypatch.setattr(run_observers, "save_files", fails_first)
-    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.interval_s": 0.001})
+    scene = Scene.read(
+        ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.interval_s": 0.001}
+    )
     results = Simulation(scene, tmp_path / "out", warn=str).run()
     assert {path.name for path in results.files} >= {"angles.png", "omega.png", "summary.json"}
     assert "no axis" in results.summary["notes"][-1]
@@ -1188,9 +1501,23 @@ def test_the_commands(capsys, tmp_path):
     assert main(["models"]) == 0
     assert "2.351" in capsys.readouterr().out  # the dipole of SPC/E
     assert main(["schema"]) == 0
-    schema = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    schema = json.loads(
+        capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON")
+    )
     assert "timestep_fs" in schema["$defs"]["Stage"]["properties"]
-    assert main(["check", water, "--set", "stages.production.timestep_fs=4", "--set", "molecules.0.model=tip3p"]) == 0
+    assert (
+        main(
+            [
+                "check",
+                water,
+                "--set",
+                "stages.production.timestep_fs=4",
+                "--set",
+                "molecules.0.model=tip3p",
+            ]
+        )
+        == 0
+    )
     out = capsys.readouterr().out
     assert "5000 steps of 4 fs" in out
     assert "216 tip3p" in out
@@ -1205,7 +1532,9 @@ def test_energy_of_the_dimer_in_every_unit(capsys):
     assert found["kJ/mol"]["potential"] == pytest.approx(-30.124, abs=2e-3)
     assert found["kcal/mol"]["potential"] == pytest.approx(found["kJ/mol"]["potential"] / 4.184)
     assert found["eV"]["potential"] == pytest.approx(found["kJ/mol"]["potential"] / 96.48533212)
-    assert found["K"]["potential"] == pytest.approx(found["kJ/mol"]["potential"] / 0.00831446261815324)
+    assert found["K"]["potential"] == pytest.approx(
+        found["kJ/mol"]["potential"] / 0.00831446261815324
+    )
     assert found["kJ/mol"]["largest_force_per_A"] < 0.02  # a minimum, to the file's six digits
     assert main(["energy", dimer]) == 0
     assert "lennard jones" in capsys.readouterr().out
@@ -1230,7 +1559,9 @@ def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
     listed = capsys.readouterr().out
-    assert listed.index("greet someone") < listed.index("list the scenes")  # position 5 is before all others
+    assert listed.index("greet someone") < listed.index(
+        "list the scenes"
+    )  # position 5 is before all others
     assert main(["greet", "Ada"]) == 3
     assert capsys.readouterr().out == "hello Ada\n"
     with pytest.raises(SystemExit):
@@ -1246,14 +1577,22 @@ def test_version():
 def test_output_goes_to_runs_by_default(tmp_path):
     short = ["--set", "stages.0.duration_ps=0.01", "--set", "stages.1.duration_ps=0.01"]
     done = rigidmd_command(
-        "run", ROOT / "systems" / "argon.toml", *short, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}
+        "run",
+        ROOT / "systems" / "argon.toml",
+        *short,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "runs" / "argon" / "summary.json").exists()
     assert "argon: 500 argon; 500 bodies, 500 sites, 1497 degrees of freedom" in done.stdout
     assert "summary.json" in done.stdout
     again = rigidmd_command(
-        "run", ROOT / "systems" / "argon.toml", *short, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}
+        "run",
+        ROOT / "systems" / "argon.toml",
+        *short,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     assert again.returncode == 2
     assert "--force" in again.stderr
@@ -1284,7 +1623,8 @@ ROWS = {
 
 @pytest.mark.parametrize(
     ("name", "precision"),
-    [(name, "double") for name in ROWS] + [pytest.param(name, "mixed", marks=pytest.mark.soak) for name in ROWS],
+    [(name, "double") for name in ROWS]
+    + [pytest.param(name, "mixed", marks=pytest.mark.soak) for name in ROWS],
 )
 def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch):
     """They are those of an evaluation, to the bit, and the run goes on as if nobody had looked."""
@@ -1292,13 +1632,21 @@ def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch
     forces = {"cutoff_A": 5.5, "electrostatics": electrostatics, "tail_correction": True}
     stage = {"duration_ps": 1.0} | ROWS[name]
     system, engine, start = built(
-        {"spce": 20, "nitrogen": 12}, 12.0, 3, spread=0.05, forces=forces, stages=[stage], precision=precision,
+        {"spce": 20, "nitrogen": 12},
+        12.0,
+        3,
+        spread=0.05,
+        forces=forces,
+        stages=[stage],
+        precision=precision,
         fields={"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_frequency_per_ps": 3.0},
-    )  # fmt: skip
+    )
     row, other, evaluated = integrator_of_stage(system, 0), system.engine(), []
     looked, alone = engine.begin(start, row), other.begin(start, row)
     evaluate = Engine.evaluate
-    monkeypatch.setattr(Engine, "evaluate", lambda self, state: evaluated.append(self) or evaluate(self, state))
+    monkeypatch.setattr(
+        Engine, "evaluate", lambda self, state: evaluated.append(self) or evaluate(self, state)
+    )
     for until in (7, 20, 21, 30):
         engine.advance(looked, row, 1e-3, until, observed=True)
         other.advance(alone, row, 1e-3, until)
@@ -1353,9 +1701,12 @@ def test_two_intervals_of_the_log_end_in_the_same_bits(tmp_path):
     ends = []
     for interval in (0.01, 0.025):
         scene = small_scene(
-            {"nitrogen": 40}, 20.0, precision="mixed", stages=[{"duration_ps": 0.2}],
+            {"nitrogen": 40},
+            20.0,
+            precision="mixed",
+            stages=[{"duration_ps": 0.2}],
             output={"log_interval_ps": interval},
-        )  # fmt: skip
+        )
         ends.append(rigidmd.Simulation(scene, tmp_path / str(interval)).run().state)
     assert all(np.array_equal(a, b) for a, b in zip(*ends, strict=True))
 
@@ -1374,7 +1725,9 @@ def test_a_look_at_a_state_that_was_changed_from_outside_is_anew():
 def test_the_lists_of_the_start_serve_the_first_stage(monkeypatch):
     """Two stages make two engines, each with lists of its own; the start makes none of its own."""
     made, engine_of = [], System.engine_of
-    monkeypatch.setattr(System, "engine_of", lambda *given: made.append(engine_of(*given)) or made[-1])
+    monkeypatch.setattr(
+        System, "engine_of", lambda *given: made.append(engine_of(*given)) or made[-1]
+    )
     stages = [{"duration_ps": 0.01}, {"duration_ps": 0.01}]
     simulation = Simulation(small_scene({"argon": 20}, 25.0, stages=stages))
     simulation.start_from(simulation.state)
@@ -1383,4 +1736,7 @@ def test_the_lists_of_the_start_serve_the_first_stage(monkeypatch):
     simulation.run()
     used = [engine for engine in made if engine.workspaces]
     assert len(used) == 2
-    assert [int(engine.workspaces["lennard_jones"].pairs.counters[BUILDS]) for engine in used] == [1, 1]
+    assert [int(engine.workspaces["lennard_jones"].pairs.counters[BUILDS]) for engine in used] == [
+        1,
+        1,
+    ]

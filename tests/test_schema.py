@@ -1,4 +1,5 @@
-"""The JSON schema of scenes, as an editor uses it: shipped scenes are valid, errors are told where they are."""
+"""The JSON schema of scenes, as an editor uses it: shipped scenes are valid, errors are told where
+they are."""
 
 import json
 import tomllib
@@ -34,12 +35,16 @@ timestep_s = 0.01
 
 def told(text):
     """Where an editor would put its marks, and what it would say."""
-    return [(error.json_path, error.message) for error in VALIDATOR.iter_errors(tomllib.loads(text))]
+    return [
+        (error.json_path, error.message) for error in VALIDATOR.iter_errors(tomllib.loads(text))
+    ]
 
 
 def test_it_is_a_schema_and_says_of_what(capsys):
     assert main(["schema"]) == 0
-    printed = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    printed = json.loads(
+        capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON")
+    )
     assert printed == schema()
     Draft202012Validator.check_schema(printed)
     assert printed["$schema"] == "https://json-schema.org/draft/2020-12/schema"
@@ -56,23 +61,58 @@ def test_shipped_scenes_are_valid(path):
 @pytest.mark.parametrize(
     ("scene", "old", "new", "path", "message"),
     [
-        (WATER, "lengths_A = 20.0", 'lengths_A = 20.0\ndensity = 1', "$.box", "'density' was unexpected"),
+        (
+            WATER,
+            "lengths_A = 20.0",
+            "lengths_A = 20.0\ndensity = 1",
+            "$.box",
+            "'density' was unexpected",
+        ),
         (WATER, '"spce"', '"SPC/E"', "$.molecules[0].model", "'SPC/E' is not one of"),
-        (WATER, "count = 20", "count = 2.5", "$.molecules[0].count", "2.5 is not of type 'integer'"),
-        (WATER, "duration_ps = 1", 'duration_ps = "1"', "$.stages[0].duration_ps", "'1' is not of type 'number'"),
+        (
+            WATER,
+            "count = 20",
+            "count = 2.5",
+            "$.molecules[0].count",
+            "2.5 is not of type 'integer'",
+        ),
+        (
+            WATER,
+            "duration_ps = 1",
+            'duration_ps = "1"',
+            "$.stages[0].duration_ps",
+            "'1' is not of type 'number'",
+        ),
         (TOP, "duration_s = 1.0", "", "$.run", "'duration_s' is a required property"),
         (WATER, "= 300", '= "warm"', "$.start.temperature_K", "'warm' is not of type 'number'"),
         (WATER, "[start]", "[strat]", "$", "'strat' was unexpected"),
         (WATER, "[[molecules]]", "[molecules]", "$.molecules", "is not of type 'array'"),
-        (WATER, "[[stages]]", '[structure]\nfile = "a.data"\natom_types = { 1 = 8 }\n[[stages]]', "$.structure.atom_types['1']",
-         "8 is not of type 'string'"),
+        (
+            WATER,
+            "[[stages]]",
+            '[structure]\nfile = "a.data"\natom_types = { 1 = 8 }\n[[stages]]',
+            "$.structure.atom_types['1']",
+            "8 is not of type 'string'",
+        ),
         (TOP, "timestep_s = 0.01", "timestep_fs = 0.01", "$.run", "'timestep_fs' was unexpected"),
         (TOP, "mass_kg = 1.0", "mass_kg = -1.0", "$.body.mass_kg", "-1.0 is less than or equal to"),
         (TOP, "[1.0, 1.0, 2.0]", "[1.0, 1.0]", "$.body.inertia_kg_m2", "[1.0, 1.0] is too short"),
-        (TOP, "[run]", "[[stages]]\n[run]", "$", "'stages' was unexpected"),  # a body has none: it is held against its kind
-        (TOP, "duration_s = 1.0", 'duration_s = 1.0\nintegrator = "euler"', "$.run.integrator", "'euler' is not one of"),
+        (
+            TOP,
+            "[run]",
+            "[[stages]]\n[run]",
+            "$",
+            "'stages' was unexpected",
+        ),  # a body has none: it is held against its kind
+        (
+            TOP,
+            "duration_s = 1.0",
+            'duration_s = 1.0\nintegrator = "euler"',
+            "$.run.integrator",
+            "'euler' is not one of",
+        ),
     ],
-)  # fmt: skip
+)
 def test_errors_are_told_where_they_are(scene, old, new, path, message):
     assert told(scene) == []
     assert old in scene

@@ -1,8 +1,8 @@
 """Whatever `check` accepts starts: every numeric key of the schema with odd values, one at a time.
 
-A scene with an odd value is refused by `check`, or it runs: to its end, or until a limit of `watch` or a lost molecule
-stops it. `run` never refuses what `check` accepts, with one exception: a lattice of molecules that overlap removal cannot
-separate, which only forces show.
+A scene with an odd value is refused by `check`, or it runs: to its end, or until a limit of `watch`
+or a lost molecule stops it. `run` never refuses what `check` accepts, with one exception: a lattice
+of molecules that overlap removal cannot separate, which only forces show.
 """
 
 import copy
@@ -26,7 +26,9 @@ from rigidmd.scene.base import override
 
 FLOATS = (-1e30, -1.0, 0.0, 1e-90, 1e-30, 1e-9, 0.3, 7.0, 1e4, 1e9, 1e30, 1e90)
 INTEGERS = (-1, 0, 1, 2, 7, 1000, 2**31, 2**63 - 1, 2**63, 10**30)
-SCENES = {name: (text, {}) for name, text in (MOLECULES | BODIES).items()} | VARIANTS | BODY_VARIANTS
+SCENES = (
+    {name: (text, {}) for name, text in (MOLECULES | BODIES).items()} | VARIANTS | BODY_VARIANTS
+)
 #: Exit codes of a run: its end, or --walltime.
 ENDED, OUT_OF_TIME = 0, 75
 SECONDS = 120  # of a case, with compiling
@@ -57,7 +59,8 @@ def key_of(path: tuple) -> str:
 
 
 def cases() -> dict[str, list[tuple[tuple, float]]]:
-    """By scene, the numbers to change: each key in the first scene that has it; of a list its first and last entry."""
+    """By scene, the numbers to change: each key in the first scene that has it; of a list its first
+    and last entry."""
     found: dict[str, list[tuple[tuple, float]]] = {}
     known: set[str] = set()
     for name in SCENES:
@@ -66,20 +69,32 @@ def cases() -> dict[str, list[tuple[tuple, float]]]:
             by_key.setdefault(key_of(path), []).append((path, value))
         new = {key: entries for key, entries in by_key.items() if key not in known}
         known |= set(new)
-        found[name] = [entry for entries in new.values() for entry in {0: entries[0], -1: entries[-1]}.values()]
+        found[name] = [
+            entry for entries in new.values() for entry in {0: entries[0], -1: entries[-1]}.values()
+        ]
     return found
 
 
 def numeric_keys(node: Any, definitions: dict, keys: tuple = ()) -> Iterator[str]:
-    """Dotted keys of all numbers in a JSON schema; of a table with free names the key of the table."""
+    """Dotted keys of all numbers in a JSON schema; of a table with free names the key of the
+    table."""
     if reference := node.get("$ref"):
         yield from numeric_keys(definitions[reference.rpartition("/")[2]], definitions, keys)
     if node.get("type") in ("number", "integer"):
         yield ".".join(keys)
     for key, inner in node.get("properties", {}).items():
         yield from numeric_keys(inner, definitions, (*keys, key))
-    parts = [*node.get("anyOf", ()), *node.get("oneOf", ()), *node.get("allOf", ()), *node.get("prefixItems", ())]
-    parts += [inner for key in ("items", "additionalProperties") if isinstance(inner := node.get(key), dict)]
+    parts = [
+        *node.get("anyOf", ()),
+        *node.get("oneOf", ()),
+        *node.get("allOf", ()),
+        *node.get("prefixItems", ()),
+    ]
+    parts += [
+        inner
+        for key in ("items", "additionalProperties")
+        if isinstance(inner := node.get(key), dict)
+    ]
     for inner in parts:
         yield from numeric_keys(inner, definitions, keys)
 
@@ -90,14 +105,20 @@ def test_the_walk_knows_every_numeric_key():
     wanted = set(numeric_keys(whole, whole["$defs"]))
     known = {key_of(path) for name in SCENES for path, _ in numbers_of(tables_of(name))}
     # of a table with free names the schema has the key of the table
-    missing = {key for key in wanted if not any(key == other or other.startswith(f"{key}.") for other in known)}
+    missing = {
+        key
+        for key in wanted
+        if not any(key == other or other.startswith(f"{key}.") for other in known)
+    }
     assert not missing
 
 
 def write(folder: Path, tables: dict[str, Any]) -> Path:
     path = folder / "scene.toml"
     path.write_bytes(tomli_w.dumps(tables).encode())
-    (folder / "argon.xyz").write_text('1\nLattice="9.0 0 0 0 9.0 0 0 0 9.0" pbc="T T T"\nAr 1.0 2.0 3.0\n')
+    (folder / "argon.xyz").write_text(
+        '1\nLattice="9.0 0 0 0 9.0 0 0 0 9.0" pbc="T T T"\nAr 1.0 2.0 3.0\n'
+    )
     return path
 
 
@@ -155,7 +176,9 @@ def error_of(path: Path, folder: Path) -> str:
 @pytest.mark.parametrize("name", SCENES)
 def test_what_check_accepts_starts(name, capsys, tmp_path):
     base = write(tmp_path, tables_of(name))
-    assert main(["run", str(base), "-o", str(tmp_path / "run")]) == 0, capsys.readouterr().err  # compiles
+    assert main(["run", str(base), "-o", str(tmp_path / "run")]) == 0, (
+        capsys.readouterr().err
+    )  # compiles
     failures = []
     for keys, value in cases()[name]:
         for odd in INTEGERS if isinstance(value, int) else FLOATS:

@@ -1,4 +1,5 @@
-"""The scenes that travel with the package: `rigidmd examples`, `rigidmd new`, and what the wheel holds."""
+"""The scenes that travel with the package: `rigidmd examples`, `rigidmd new`, and what the wheel
+holds."""
 
 import os
 import pty
@@ -15,14 +16,21 @@ from rigidmd.scene import Scene
 
 def test_every_package_and_every_data_file_is_in_the_wheel():
     tool = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    packages = {".".join(path.parent.relative_to(ROOT).parts) for path in (ROOT / "rigidmd").rglob("__init__.py")}
+    packages = {
+        ".".join(path.parent.relative_to(ROOT).parts)
+        for path in (ROOT / "rigidmd").rglob("__init__.py")
+    }
     assert set(tool["packages"]) == packages | {"rigidmd.systems"}
     assert tool["package-dir"] == {"rigidmd.systems": "systems"}
     data = tool["package-data"]
     homes = {"rigidmd": ROOT / "rigidmd", "rigidmd.systems": ROOT / "systems"}
     scripts = (ROOT / "systems" / "scripts", ROOT / "rigidmd" / "docs" / "site")
     held = {
-        file for name, home in homes.items() for pattern in data[name] for file in home.glob(pattern) if file.is_file()
+        file
+        for name, home in homes.items()
+        for pattern in data[name]
+        for file in home.glob(pattern)
+        if file.is_file()
     }
     there = {
         file
@@ -95,7 +103,9 @@ def test_the_name_of_a_series_is_its_first_scene(tmp_path, monkeypatch, capsys):
     assert main(["new", "heavy_top"]) == 0
     said = capsys.readouterr().out
     assert "heavy_top_7); this is heavy_top_1" in said
-    assert (tmp_path / "heavy_top_1.toml").read_bytes() == (ROOT / "systems" / "heavy_top_1.toml").read_bytes()
+    assert (tmp_path / "heavy_top_1.toml").read_bytes() == (
+        ROOT / "systems" / "heavy_top_1.toml"
+    ).read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -134,14 +144,20 @@ def test_help_has_lines_for_a_terminal(capsys):
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_help_uses_a_pager_on_a_terminal(terminal):
-    command = [sys.executable, "-c", "import sys; from rigidmd.commands.cli import main; main(['help', 'top'])"]
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from rigidmd.commands.cli import main; main(['help', 'top'])",
+    ]
     settings = {"env": os.environ | {"PAGER": "sed s/^/paged:/", "TERM": "xterm"}, "timeout": 60}
     if not terminal:
         out = subprocess.run(command, **settings, capture_output=True, text=True).stdout
         assert out.startswith("# ") and "paged:" not in out
         return
     leader, follower = pty.openpty()
-    process = subprocess.Popen(command, env=settings["env"], stdin=follower, stdout=follower, stderr=follower)
+    process = subprocess.Popen(
+        command, env=settings["env"], stdin=follower, stdout=follower, stderr=follower
+    )
     os.close(follower)
     out = b""
     while b"\n" not in out:

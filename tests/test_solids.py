@@ -1,4 +1,5 @@
-"""Homogeneous solids: moments against integrals over their volume, outlines on their surface, Lamb's added mass."""
+"""Homogeneous solids: moments against integrals over their volume, outlines on their surface,
+Lamb's added mass."""
 
 import numpy as np
 import pytest
@@ -30,7 +31,8 @@ def gauss(low, high):
 
 
 def of_revolution(profile, low, high):
-    """Weights and points of a body of revolution about axis 3 whose radius at height z is profile(z)."""
+    """Weights and points of a body of revolution about axis 3 whose radius at height z is
+    profile(z)."""
     z, along = gauss(low, high)
     r, across = gauss(0, 1)
     angle = 2 * np.pi * np.arange(8) / 8
@@ -48,7 +50,8 @@ def cuboid(lengths):
 
 
 def cloud(shape):
-    """Weights and points that integrate over the solid of DIMENSIONS, wherever its coordinates are easiest."""
+    """Weights and points that integrate over the solid of DIMENSIONS, wherever its coordinates are
+    easiest."""
     d = DIMENSIONS[shape]
     match shape:
         case "cylinder":
@@ -56,7 +59,9 @@ def cloud(shape):
         case "cone":  # on its tip
             return of_revolution(lambda z: d["radius_m"] * z / d["height_m"], 0, d["height_m"])
         case "sphere":
-            return of_revolution(lambda z: np.sqrt(d["radius_m"] ** 2 - z**2), -d["radius_m"], d["radius_m"])
+            return of_revolution(
+                lambda z: np.sqrt(d["radius_m"] ** 2 - z**2), -d["radius_m"], d["radius_m"]
+            )
         case "cuboid":
             return cuboid(d["lengths_m"])
         case "ellipsoid":
@@ -67,14 +72,17 @@ def cloud(shape):
             return weight, points * [1, 1, 0]
         case "ring":
             angle = 0.3 + 2 * np.pi * np.arange(7) / 7
-            return np.ones(7), d["radius_m"] * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+            return np.ones(7), d["radius_m"] * np.stack(
+                [np.cos(angle), np.sin(angle), 0 * angle], axis=-1
+            )
         case "rod":
             weight, points = cuboid([1, 1, d["length_m"]])
             return weight, points * [0, 0, 1]
 
 
 def off_the_surface(shape, points):
-    """How far points are from the surface of the solid of DIMENSIONS, in a measure that is 0 on it."""
+    """How far points are from the surface of the solid of DIMENSIONS, in a measure that is 0 on
+    it."""
     d = DIMENSIONS[shape]
     r, z = np.hypot(points[:, 0], points[:, 1]), points[:, 2]
     match shape:
@@ -117,19 +125,29 @@ def test_moments_are_integrals_over_the_solid(shape):
 @pytest.mark.parametrize("shape", DIMENSIONS)
 def test_volumes_are_integrals_too(shape):
     weight, _ = cloud(shape)
-    step = {"cuboid": 1.0, "ellipsoid": 2 * np.pi / 8 * np.prod(DIMENSIONS["ellipsoid"]["semi_axes_m"])}
+    step = {
+        "cuboid": 1.0,
+        "ellipsoid": 2 * np.pi / 8 * np.prod(DIMENSIONS["ellipsoid"]["semi_axes_m"]),
+    }
     unit = SOLIDS[shape]
     volume = unit.volume * unit.scale(DIMENSIONS[shape]).prod()
     thin = shape in ("disk", "ring", "rod")
-    assert volume == pytest.approx(0.0 if thin else weight.sum() * step.get(shape, 2 * np.pi / 8), rel=1e-12)
+    assert volume == pytest.approx(
+        0.0 if thin else weight.sum() * step.get(shape, 2 * np.pi / 8), rel=1e-12
+    )
 
 
-# --- bodies of several solids ----------------------------------------------------------------------------------------
+# --- bodies of several solids ---------------------------------------------------------------------
 
 EULER = [20.0, 50.0, -30.0]
 #: One solid of each shape, at two tilts and more.
 PARTS = [
-    {"shape": "cone", "density_kg_m3": 3.0, "axis": [1.0, 2.0, -2.0], "position_m": [0.3, -1.0, 2.0]},
+    {
+        "shape": "cone",
+        "density_kg_m3": 3.0,
+        "axis": [1.0, 2.0, -2.0],
+        "position_m": [0.3, -1.0, 2.0],
+    },
     {"shape": "cuboid", "mass_kg": 0.7, "euler_angles_deg": EULER, "position_m": [-2.0, 0.4, 0.1]},
     {"shape": "ellipsoid", "density_kg_m3": 0.5, "euler_angles_deg": [-100.0, 130.0, 75.0]},
     {"shape": "cylinder", "mass_kg": 1.9, "axis": [0.0, -3.0, 0.0], "position_m": [0.0, 0.0, -4.0]},
@@ -152,41 +170,61 @@ def points_of(part):
     weight, points = cloud(part["shape"])
     mass = part.get("mass_kg") or part["density_kg_m3"] * VOLUMES[part["shape"]]
     masses = mass * weight / weight.sum()
-    axis = np.array([part.get("axis", [0.0, 0.0, 1.0])]) / np.linalg.norm(part.get("axis", [0.0, 0.0, 1.0]))
+    axis = np.array([part.get("axis", [0.0, 0.0, 1.0])]) / np.linalg.norm(
+        part.get("axis", [0.0, 0.0, 1.0])
+    )
     rotation, _ = Rotation.align_vectors(axis, [[0.0, 0.0, 1.0]])
     if "euler_angles_deg" in part:
         rotation = Rotation.from_euler("ZXZ", part["euler_angles_deg"], degrees=True)
-    return masses, rotation.apply(points - masses @ points / mass) + part.get("position_m", [0.0, 0.0, 0.0])
+    return masses, rotation.apply(points - masses @ points / mass) + part.get(
+        "position_m", [0.0, 0.0, 0.0]
+    )
 
 
 @pytest.mark.parametrize("pinned", [False, True])
-@pytest.mark.parametrize("parts", [PARTS, PARTS[:2], PARTS[3:5], PARTS[6:7] * 2], ids=["all", "two", "tilted", "rods"])
+@pytest.mark.parametrize(
+    "parts", [PARTS, PARTS[:2], PARTS[3:5], PARTS[6:7] * 2], ids=["all", "two", "tilted", "rods"]
+)
 def test_a_body_of_solids_is_the_integral_over_them(parts, pinned):
     system = build_body(Scene.from_dict({"body": {"solids": parts, "pinned": pinned}, "run": RUN}))
-    masses, points = (np.concatenate(columns) for columns in zip(*map(points_of, parts), strict=True))
+    masses, points = (
+        np.concatenate(columns) for columns in zip(*map(points_of, parts), strict=True)
+    )
     centre = masses @ points / masses.sum()
     assert system.mass == pytest.approx(masses.sum(), rel=1e-12)
     assert system.centre == pytest.approx(centre if pinned else np.zeros(3), abs=1e-12)
     tensor = system.axes @ np.diag(system.inertia) @ system.axes.T
     expected = inertia_tensor(masses, points if pinned else points - centre)
     assert tensor == pytest.approx(expected, abs=1e-12 * np.abs(expected).max())
-    outline = system.points[pinned:] + (0 if pinned else centre)  # the first point of a pinned body is its pivot
+    outline = system.points[pinned:] + (
+        0 if pinned else centre
+    )  # the first point of a pinned body is its pivot
     first = outline[: len(SOLIDS[parts[0]["shape"]].outline)] - parts[0]["position_m"]
     if "axis" in parts[0]:  # reaches as far along its axis as it is long
-        height = DIMENSIONS[parts[0]["shape"]].get("height_m", DIMENSIONS[parts[0]["shape"]].get("length_m"))
+        height = DIMENSIONS[parts[0]["shape"]].get(
+            "height_m", DIMENSIONS[parts[0]["shape"]].get("length_m")
+        )
         axis = np.array(parts[0]["axis"]) / np.linalg.norm(parts[0]["axis"])
         assert np.ptp(first @ axis) == pytest.approx(height, rel=1e-12)
         if parts[0]["shape"] == "cone":
-            assert (first @ axis).min() == pytest.approx(-0.75 * height, rel=1e-12)  # from its tip to its base
+            assert (first @ axis).min() == pytest.approx(
+                -0.75 * height, rel=1e-12
+            )  # from its tip to its base
 
 
 def test_a_t_handle_has_the_moments_of_its_two_cylinders():
     system = build_body(Scene.read(ROOT / "systems" / "t_handle.toml"))
-    (m, r, h), (n, s, k) = (2700 * np.pi * 0.006**2 * 0.08, 0.006, 0.08), (2700 * np.pi * 0.005**2 * 0.05, 0.005, 0.05)
+    (m, r, h), (n, s, k) = (
+        (2700 * np.pi * 0.006**2 * 0.08, 0.006, 0.08),
+        (2700 * np.pi * 0.005**2 * 0.05, 0.005, 0.05),
+    )
     reduced = m * n / (m + n) * 0.031**2
     along, across = m * r * r / 2, m * (3 * r * r + h * h) / 12
-    expected = [along + n * (3 * s * s + k * k) / 12 + reduced, across + n * s * s / 2,
-                across + n * (3 * s * s + k * k) / 12 + reduced]  # fmt: skip
+    expected = [
+        along + n * (3 * s * s + k * k) / 12 + reduced,
+        across + n * s * s / 2,
+        across + n * (3 * s * s + k * k) / 12 + reduced,
+    ]
     assert system.mass == pytest.approx(m + n, rel=1e-14)
     assert system.inertia == pytest.approx(expected, rel=1e-13)
     assert (system.axes == np.eye(3)).all()
@@ -196,7 +234,9 @@ def test_one_solid_among_solids_is_the_solid():
     one = {"shape": "cone", "radius_m": 0.03, "height_m": 0.06}
     table = {"mass_kg": 0.2, "solid": one, "pinned": True, "centre_of_mass_m": [0.0, 0.0, 0.045]}
     parts = {"solids": [one | {"mass_kg": 0.2, "position_m": [0.0, 0.0, 0.045]}], "pinned": True}
-    single, several = (build_body(Scene.from_dict({"body": body, "run": RUN})) for body in (table, parts))
+    single, several = (
+        build_body(Scene.from_dict({"body": body, "run": RUN})) for body in (table, parts)
+    )
     assert several.inertia == pytest.approx(single.inertia, rel=1e-15)
     assert several.points == pytest.approx(single.points, abs=1e-17)
     assert several.inertia[0] == several.inertia[1]
@@ -240,7 +280,8 @@ def test_added_mass_of_a_sphere_is_half_the_fluid_it_displaces():
 
 @pytest.mark.parametrize("ratio", [1.5, 2.0, 10.0])
 def test_added_mass_of_prolate_spheroids_in_closed_form(ratio):
-    """Lamb, Hydrodynamics, art. 114-115: k1, k2, k' in parts of the displaced fluid's mass and moment of inertia."""
+    """Lamb, Hydrodynamics, art. 114-115: k1, k2, k' in parts of the displaced fluid's mass and
+    moment of inertia."""
     e2 = 1 - 1 / ratio**2
     e = e2**0.5
     alpha = 2 * (1 - e2) / e**3 * (np.arctanh(e) - e)
@@ -248,12 +289,18 @@ def test_added_mass_of_prolate_spheroids_in_closed_form(ratio):
     turning = e2**2 * (beta - alpha) / ((2 - e2) * (2 * e2 - (2 - e2) * (beta - alpha)))
     mass, inertia = added_mass_of_ellipsoid([ratio, 1.0, 1.0], 1.0)
     displaced = 4 / 3 * np.pi * ratio
-    assert mass / displaced == pytest.approx([alpha / (2 - alpha), beta / (2 - beta), beta / (2 - beta)], rel=1e-12)
-    assert inertia[1:] / (displaced * (1 + ratio**2) / 5) == pytest.approx(np.full(2, turning), rel=1e-12)
+    assert mass / displaced == pytest.approx(
+        [alpha / (2 - alpha), beta / (2 - beta), beta / (2 - beta)], rel=1e-12
+    )
+    assert inertia[1:] / (displaced * (1 + ratio**2) / 5) == pytest.approx(
+        np.full(2, turning), rel=1e-12
+    )
     assert inertia[0] == 0
 
 
-@pytest.mark.parametrize("semi_axes", [(1.0, 2.0, 3.5), (0.02, 1.0, 0.3), (4e-9, 1e-9, 2e-9), (50.0, 1.0, 8.0)])
+@pytest.mark.parametrize(
+    "semi_axes", [(1.0, 2.0, 3.5), (0.02, 1.0, 0.3), (4e-9, 1e-9, 2e-9), (50.0, 1.0, 8.0)]
+)
 def test_added_mass_of_general_ellipsoids_is_lambs_formula(semi_axes):
     a, b, c = semi_axes
     size = max(semi_axes)
@@ -275,17 +322,25 @@ def test_added_mass_of_general_ellipsoids_is_lambs_formula(semi_axes):
 
     def turning(b, c, beta, gamma):
         return (
-            displaced / 5 * (b**2 - c**2) ** 2 * (gamma - beta) / (2 * (b**2 - c**2) + (b**2 + c**2) * (beta - gamma))
+            displaced
+            / 5
+            * (b**2 - c**2) ** 2
+            * (gamma - beta)
+            / (2 * (b**2 - c**2) + (b**2 + c**2) * (beta - gamma))
         )
 
     expected = [turning(b, c, beta, gamma), turning(c, a, gamma, alpha), turning(a, b, alpha, beta)]
-    assert inertia / displaced / size**2 == pytest.approx(np.array(expected) / displaced / size**2, rel=1e-8)
+    assert inertia / displaced / size**2 == pytest.approx(
+        np.array(expected) / displaced / size**2, rel=1e-8
+    )
 
 
 def test_added_mass_of_a_thin_disk():
     mass, inertia = added_mass_of_ellipsoid([0.5, 0.5, 0.5e-9], 3.0)
     assert mass[2] == pytest.approx(8 / 3 * 3.0 * 0.5**3, rel=1e-8)
-    assert inertia[:2] == pytest.approx(np.full(2, 16 / 45 * 3.0 * 0.5**5), rel=1e-8)  # Lamb, art. 108
+    assert inertia[:2] == pytest.approx(
+        np.full(2, 16 / 45 * 3.0 * 0.5**5), rel=1e-8
+    )  # Lamb, art. 108
     assert inertia[2] == 0
     assert mass[0] == pytest.approx(0, abs=1e-8)
 
@@ -294,15 +349,21 @@ def test_added_mass_of_a_thin_disk():
 def test_added_inertia_of_almost_equal_axes_keeps_its_digits(difference):
     b, c = 1 + difference, 1 - difference
     _, inertia = added_mass_of_ellipsoid([1.0, b, c], 1.0)
-    # Next to the sphere near = 2/5, far = 4/15, alpha = 2/3: the moment is displaced mass (b² - c²)² / 15.
+    # Next to the sphere near = 2/5, far = 4/15, alpha = 2/3: the moment is displaced mass (b² -
+    # c²)² / 15.
     leading = 4 / 3 * np.pi / 15 * ((b - c) * (b + c)) ** 2
     assert inertia[0] == pytest.approx(leading, rel=10 * difference**2 + 1e-14, abs=0)
 
 
 def test_added_inertia_passes_smoothly_through_equal_axes():
-    """Lamb's own differences are good to 1e-11 where b and c differ by 1e-4: there both forms must agree."""
+    """Lamb's own differences are good to 1e-11 where b and c differ by 1e-4: there both forms must
+    agree."""
     a, b, c = 3.0, 1.0001, 1.0
-    beta, gamma = (2 / 3 * a * b * c * elliprd(*others) for others in ((a**2, c**2, b**2), (a**2, b**2, c**2)))
-    expected = (b**2 - c**2) ** 2 * (gamma - beta) / (2 * (b**2 - c**2) + (b**2 + c**2) * (beta - gamma))
+    beta, gamma = (
+        2 / 3 * a * b * c * elliprd(*others) for others in ((a**2, c**2, b**2), (a**2, b**2, c**2))
+    )
+    expected = (
+        (b**2 - c**2) ** 2 * (gamma - beta) / (2 * (b**2 - c**2) + (b**2 + c**2) * (beta - gamma))
+    )
     _, inertia = added_mass_of_ellipsoid([a, b, c], 1.0)
     assert inertia[0] == pytest.approx(4 / 3 * np.pi * a * b * c / 5 * expected, rel=1e-10)

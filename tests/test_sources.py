@@ -1,4 +1,5 @@
-"""What the keys of compiled code depend on: the definitions that a kernel reaches, and nothing else."""
+"""What the keys of compiled code depend on: the definitions that a kernel reaches, and nothing
+else."""
 
 import os
 import re
@@ -79,7 +80,9 @@ def test_a_kernel_reaches_its_implementations_for_the_classes_of_its_arguments()
 
     loop = node_of(pair_loop._sum_forces.function)
     argon, charges = node_of(lennard_jones.LennardJonesOneKind), node_of(coulomb.ReactionField)
-    implemented = {one.kind: one.function for one in implementations if one.of == node_of(pair_loop.pair)}
+    implemented = {
+        one.kind: one.function for one in implementations if one.of == node_of(pair_loop.pair)
+    }
     assert {argon, charges} <= implemented.keys()
     assert implemented[argon] not in sources._reached([loop])
     reached = sources._reached([loop, argon])
@@ -99,16 +102,23 @@ def test_an_edited_docstring_compiles_nothing_and_an_edited_number_does(tmp_path
     ignored = shutil.ignore_patterns("docs", "__pycache__", "models")
     shutil.copytree(ROOT / "rigidmd", tmp_path / "rigidmd", ignore=ignored)
     path = tmp_path / "rigidmd" / "forces" / "neighbors" / "sites.py"
-    environment = os.environ | {"RIGIDMD_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+    environment = os.environ | {
+        "RIGIDMD_CACHE": str(tmp_path / "cache"),
+        "PYTHONPATH": str(tmp_path),
+    }
 
     def asked() -> str:
         command = [sys.executable, "-c", ASKED]
-        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
+        )
         return done.stdout.strip()
 
     text = path.read_text()
     assert [asked(), asked()] == ["1 0", "1 1"]
-    edited = text.replace('"""Number of blocks', '"""\n    The number of blocks').replace("# Up to", "# For up to")
+    edited = text.replace('"""Number of blocks', '"""\n    The number of blocks').replace(
+        "# Up to", "# For up to"
+    )
     assert edited != text
     path.write_text(f"# A line above.\n{edited}")
     assert asked() == "1 1"

@@ -39,14 +39,24 @@ def check(result: CaseResult) -> None:
 
 #: Cases whose scenes nothing else compiles.
 APART = (
-    "water_steps", "head_on", "overlaps", "bare_charges", "near_linear_molecules", "tip4p_steps", "sleeping_top",
-    "densities", "no_numbers",
-)  # fmt: skip
+    "water_steps",
+    "head_on",
+    "overlaps",
+    "bare_charges",
+    "near_linear_molecules",
+    "tip4p_steps",
+    "sleeping_top",
+    "densities",
+    "no_numbers",
+)
 
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(case.name, marks=[pytest.mark.soak] if case.name in APART else []) for case in selected_cases(None)],
+    [
+        pytest.param(case.name, marks=[pytest.mark.soak] if case.name in APART else [])
+        for case in selected_cases(None)
+    ],
 )
 def test_quick(name):
     (result,) = run_cases([name], quick=True)
@@ -96,7 +106,9 @@ def test_verdicts(outcome, verdict):
 )
 @pytest.mark.parametrize("start", [1e-3, 1.0, 50.0])
 def test_the_longest_step_is_found_by_bisection(beyond, way, start):
-    limit = longest_step(lambda step: Outcome(reported_error=1e-4) if step <= 0.73 else beyond, start)
+    limit = longest_step(
+        lambda step: Outcome(reported_error=1e-4) if step <= 0.73 else beyond, start
+    )
     assert 0.73 / 1.11 < limit.longest <= 0.73
     assert limit.beyond == way == failure(beyond)
 
@@ -108,7 +120,9 @@ def test_a_step_that_never_fails_and_one_that_never_holds():
 
 def test_an_undetected_error_beyond_the_step_limit_is_a_failure():
     result = CaseResult("made_up", 1, "A case")
-    limit = longest_step(lambda step: Outcome(reported_error=1e-4 if step < 1 else 5e-4), 0.1, bound=2e-4)
+    limit = longest_step(
+        lambda step: Outcome(reported_error=1e-4 if step < 1 else 5e-4), 0.1, bound=2e-4
+    )
     result.limits.append(limit)
     assert limit.beyond == UNDETECTED
     assert result.failures
@@ -125,7 +139,11 @@ def test_the_command_writes_its_files_and_does_not_overwrite(tmp_path, capsys):
     assert {line["verdict"] for line in lines} == {"right"}
     assert all(float(line["error"]) <= float(line["allowed"]) for line in lines)
     page = (tmp_path / "out" / "stability.html").read_text()
-    assert "largest |Q - Q of the body itself|" in page and "<script" not in page and "src=" not in page
+    assert (
+        "largest |Q - Q of the body itself|" in page
+        and "<script" not in page
+        and "src=" not in page
+    )
     assert page.count('id="case-inertia_scale"') == 1 and 'href="#case-inertia_scale"' in page
     assert main(arguments) == 2
     assert "--force" in capsys.readouterr().err

@@ -1,4 +1,5 @@
-"""The state: on disk and back, what damaged files are told, and that nothing of a run is anywhere else."""
+"""The state: on disk and back, what damaged files are told, and that nothing of a run is anywhere
+else."""
 
 import numpy as np
 import pytest
@@ -37,7 +38,9 @@ def same_bits(a, b):
 def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
     system, engine, state = built({"spce": 5, "argon": 2}, 20.0, 1)
     row = VERLET.with_thermostat(
-        VelocityRescaling(constant_ramp(BOLTZMANN * 300), 0.1, system.freedom.total, key_of(1, THERMOSTAT))
+        VelocityRescaling(
+            constant_ramp(BOLTZMANN * 300), 0.1, system.freedom.total, key_of(1, THERMOSTAT)
+        )
     )
     move(engine, state, row, 0.001, 7)
     assert state.energy_ledger[HEAT] != 0
@@ -50,10 +53,13 @@ def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
 
 @pytest.mark.parametrize("steps", [(10, 7, 3), (20,)])
 def test_another_engine_goes_on_where_the_state_is(tmp_path, steps):
-    """Time, heat and random numbers go on from the state alone; points, whose sums have one order, to the bit."""
+    """Time, heat and random numbers go on from the state alone; points, whose sums have one order,
+    to the bit."""
     system, _, start = built({"argon": 2}, 30.0, 2)
     row = VERLET.with_thermostat(
-        VelocityRescaling(constant_ramp(BOLTZMANN * 100), 0.05, system.freedom.total, key_of(1, THERMOSTAT))
+        VelocityRescaling(
+            constant_ramp(BOLTZMANN * 100), 0.05, system.freedom.total, key_of(1, THERMOSTAT)
+        )
     )
     whole = start.copy()
     move(system.engine(), whole, row, 0.003, 20)
@@ -79,8 +85,11 @@ def test_time_is_counted_from_where_steps_changed():
 @pytest.mark.parametrize("solver", ["rk4", "dop853"])
 @pytest.mark.parametrize("form", ["matrix", "quaternion", "euler_angles"])
 def test_a_solver_of_the_textbooks_equations_goes_on_from_its_state(solver, form):
-    """What it evolves, the present step of DOP853 included, is in the state: a new engine gives the same bits."""
-    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.integrator": solver, "run.formulation": form})
+    """What it evolves, the present step of DOP853 included, is in the state: a new engine gives the
+    same bits."""
+    scene = Scene.read(
+        ROOT / "systems" / "heavy_top_3.toml", {"run.integrator": solver, "run.formulation": form}
+    )
     system = build_body(scene)
     method = system.method
     assert isinstance(method, Solver)
@@ -95,7 +104,11 @@ def test_a_solver_of_the_textbooks_equations_goes_on_from_its_state(solver, form
 
 def test_a_run_changes_neither_its_system_nor_its_start():
     simulation = Simulation(
-        small_scene({"spce": 8}, 20.0, stages=[{"duration_ps": 0.01, "integrator": "auto", "energy_error_kT": 1e-2}])
+        small_scene(
+            {"spce": 8},
+            20.0,
+            stages=[{"duration_ps": 0.01, "integrator": "auto", "energy_error_kT": 1e-2}],
+        )
     )
     system, before = simulation.system, simulation.system.state.copy()
     asked = system.scene
@@ -105,7 +118,10 @@ def test_a_run_changes_neither_its_system_nor_its_start():
 
 DAMAGES = {
     "no state": (lambda s: s.pop("velocity"), "it holds no velocity"),
-    "later": (lambda s: s.update(schema=99), r"written by a later rigidmd \(version 99 of the format"),
+    "later": (
+        lambda s: s.update(schema=99),
+        r"written by a later rigidmd \(version 99 of the format",
+    ),
     "shape": (lambda s: s.update(position=s["position"][:3]), "position: damaged"),
     "nan": (lambda s: s.update(books=np.full(3, np.nan)), "books: damaged"),
     "species": (lambda s: s.update(species=s["species"] + 5), "species: damaged"),
@@ -131,7 +147,17 @@ def test_a_damaged_state_is_refused_in_words(tmp_path, damage):
 def test_a_state_of_the_first_version_is_read(tmp_path):
     """It had neither a version nor books; time and work were of one number each."""
     state = state_of(np.ones((2, 3)), cell=10 * np.eye(3))
-    old = {key: getattr(state, key) for key in ("position", "velocity", "rotation", "angular_momentum_body", "cell")}
-    np.savez(tmp_path / "s.npz", species_names=["argon"], species=[0, 0], time=np.ones(1), work=np.zeros(1), **old)
+    old = {
+        key: getattr(state, key)
+        for key in ("position", "velocity", "rotation", "angular_momentum_body", "cell")
+    }
+    np.savez(
+        tmp_path / "s.npz",
+        species_names=["argon"],
+        species=[0, 0],
+        time=np.ones(1),
+        work=np.zeros(1),
+        **old,
+    )
     saved = read_state(tmp_path / "s.npz")
     assert same_bits(saved.state[:5], state[:5]) and saved.state.time[NOW] == 0

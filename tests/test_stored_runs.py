@@ -1,4 +1,5 @@
-"""Runs and sweeps that have ended, opened from Python: their results, and folders that stay as they are."""
+"""Runs and sweeps that have ended, opened from Python: their results, and folders that stay as they
+are."""
 
 import re
 import shutil
@@ -15,22 +16,35 @@ from rigidmd.errors import OutputError
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
 
-STAGES = [{"ensemble": "nvt", "duration_ps": 0.02, "temperature_K": 90.0}, {"name": "nve", "duration_ps": 0.1}]
+STAGES = [
+    {"ensemble": "nvt", "duration_ps": 0.02, "temperature_K": 90.0},
+    {"name": "nve", "duration_ps": 0.1},
+]
 
 
 def argon(trajectory="trajectory.xtc", **output):
-    output = {"log_interval_ps": 0.004, "trajectory_interval_ps": 0.004, "trajectory": trajectory} | output
+    output = {
+        "log_interval_ps": 0.004,
+        "trajectory_interval_ps": 0.004,
+        "trajectory": trajectory,
+    } | output
     return small_scene({"argon": 20}, 20.0, stages=STAGES, output=output)
 
 
 def top():
-    return Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.trajectory": "top.xyz"})
+    return Scene.read(
+        ROOT / "systems" / "heavy_top_3.toml",
+        {"run.duration_s": 0.05, "output.trajectory": "top.xyz"},
+    )
 
 
 def snapshot(folder):
     """Bytes and times of change of everything in a folder, and of the folder itself."""
     paths = [folder, *sorted(folder.rglob("*"))]
-    return {path: (path.stat().st_mtime_ns, path.is_file() and sha256(path.read_bytes()).digest()) for path in paths}
+    return {
+        path: (path.stat().st_mtime_ns, path.is_file() and sha256(path.read_bytes()).digest())
+        for path in paths
+    }
 
 
 @pytest.fixture(scope="module", params=["trajectory.xtc", "trajectory.gsd"])
@@ -56,14 +70,20 @@ def test_a_run_is_what_it_returned(run):
     assert not results.interrupted
     assert results.to_dataframe().shape == returned.to_dataframe().shape
     frames, expected = results.universe().trajectory, returned.universe().trajectory
-    assert [frame.time for frame in frames] == pytest.approx([frame.time for frame in expected], abs=1e-12)
+    assert [frame.time for frame in frames] == pytest.approx(
+        [frame.time for frame in expected], abs=1e-12
+    )
     assert frames[-1].positions == pytest.approx(expected[-1].positions)
     last, before_it = results.atoms()[:3], results.atoms(-2)
     assert last.positions == pytest.approx(returned.atoms()[:3].positions, abs=0)
-    assert results.atoms().get_potential_energy() == pytest.approx(returned.atoms().get_potential_energy())
+    assert results.atoms().get_potential_energy() == pytest.approx(
+        returned.atoms().get_potential_energy()
+    )
     assert before_it.positions == pytest.approx(returned.atoms(-2).positions)
     g = rigidmd.analysis.rdf(results, "argon", "argon")
-    assert (g["g argon-argon"] == rigidmd.analysis.rdf(returned, "argon", "argon")["g argon-argon"]).all()
+    assert (
+        g["g argon-argon"] == rigidmd.analysis.rdf(returned, "argon", "argon")["g argon-argon"]
+    ).all()
     assert rigidmd.view.plot(results, "temperature").axes
     assert "nve: 50 steps" in results._repr_html_()
     assert snapshot(folder) == before
@@ -88,7 +108,12 @@ def test_a_run_that_goes_on_is_read_so_far(tmp_path):
         seen.append((moment.time, rigidmd.read_run(folder)))
 
     stages = [STAGES[0] | {"duration_ps": 0.05}]
-    scene = small_scene({"argon": 20}, 20.0, stages=stages, output={"log_interval_ps": 0.01, "checkpoint_minutes": 0})
+    scene = small_scene(
+        {"argon": 20},
+        20.0,
+        stages=stages,
+        output={"log_interval_ps": 0.01, "checkpoint_minutes": 0},
+    )
     Simulation(scene, folder, observers=Every(0.03, look)).run()
     time, results = seen[1]
     assert 0 <= results["time"][-1] <= time
@@ -96,7 +121,9 @@ def test_a_run_that_goes_on_is_read_so_far(tmp_path):
     assert results.summary["stages"] == []
     assert "This run has not ended" in results.summary["notes"][0]
     assert "is not available" in results.summary["notes"][1]
-    with pytest.raises(OutputError, match=r"the final state is not available: .* holds no checkpoint"):
+    with pytest.raises(
+        OutputError, match=r"the final state is not available: .* holds no checkpoint"
+    ):
         _ = results.state
     assert "This run has not ended" in results._repr_html_()
 
@@ -149,7 +176,9 @@ def test_a_sweep_is_read(tmp_path):
     assert list(found.runs) == list(table.runs) == ["temperature_K=80", "temperature_K=90"]
     first, second = (rigidmd.read_run(path) for path in found.runs.values())
     assert first["temperature"][0] < second["temperature"][0]
-    with pytest.raises(TypeError, match=r"takes the results of a run, or a list of them, not <Table.*table\.runs"):
+    with pytest.raises(
+        TypeError, match=r"takes the results of a run, or a list of them, not <Table.*table\.runs"
+    ):
         rigidmd.analysis.rdf(found)
     assert snapshot(folder) == before
 
@@ -165,7 +194,9 @@ def test_what_is_no_run(tmp_path, run):
         damaged = Path(shutil.copytree(run[0], tmp_path / name))
         (damaged / name).write_bytes((damaged / name).read_bytes()[:40])
         if name == "final.npz":
-            with pytest.raises(OutputError, match=r"the final state is not available: .*final\.npz"):
+            with pytest.raises(
+                OutputError, match=r"the final state is not available: .*final\.npz"
+            ):
                 _ = rigidmd.read_run(damaged).state
         else:
             with pytest.raises(OutputError, match=re.escape(name)) as error:
@@ -181,7 +212,8 @@ def test_an_analysis_of_a_path_names_read_run(run):
     folder = run[0]
     for path in (folder, str(folder)):
         with pytest.raises(
-            TypeError, match=rf"rigidmd\.analysis\.rdf\(rigidmd\.read_run\('{re.escape(str(folder))}'\)\)"
+            TypeError,
+            match=rf"rigidmd\.analysis\.rdf\(rigidmd\.read_run\('{re.escape(str(folder))}'\)\)",
         ):
             rigidmd.analysis.rdf(path)
     with pytest.raises(TypeError, match="not None"):

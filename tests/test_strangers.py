@@ -1,4 +1,5 @@
-"""Input that was made to break: each is refused at once, with what is wrong, where and what was expected."""
+"""Input that was made to break: each is refused at once, with what is wrong, where and what was
+expected."""
 
 import io
 import os
@@ -65,33 +66,101 @@ def own_molecule(position="[0.0, 0.0, 1.0]", more=""):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("count = 20", f"count = {2**63}", "line 6: molecules.0.count: is a whole number of more than 64 bits"),
+        (
+            "count = 20",
+            f"count = {2**63}",
+            "line 6: molecules.0.count: is a whole number of more than 64 bits",
+        ),
         ("count = 20", "count = 1e30", "line 6: molecules.0.count: is 1e+30, must be an integer"),
-        ("count = 20", f"count = {'9' * 5000}", "a whole number of more than 64 bits (at line 6, column 1)"),
-        ("lengths_A = 20.0", f"lengths_A = 1{'0' * 400}", "line 2: box.lengths_A: is a whole number of more than 64 bits"),
-        ("lengths_A = 20.0", "lengths_A = 1e-300", "line 2: box.lengths_A: is 1e-300, must be 0 or between 1e-30"),
+        (
+            "count = 20",
+            f"count = {'9' * 5000}",
+            "a whole number of more than 64 bits (at line 6, column 1)",
+        ),
+        (
+            "lengths_A = 20.0",
+            f"lengths_A = 1{'0' * 400}",
+            "line 2: box.lengths_A: is a whole number of more than 64 bits",
+        ),
+        (
+            "lengths_A = 20.0",
+            "lengths_A = 1e-300",
+            "line 2: box.lengths_A: is 1e-300, must be 0 or between 1e-30",
+        ),
         ("lengths_A = 20.0", "lengths_A = 1e-20", "must be 0.5 Å at least"),
         ("lengths_A = 20.0", "lengths_A = 1e10", "must not be longer than 1e+09 Å"),
         ("count = 20", f"count = 20\nx = {DEEP}", "more than 32 deep"),
         ("count = 20", f"count = 20\nx = {'{a=' * 1000}1{'}' * 1000}", "more than 32 deep"),
         ("count = 20", f"count = 20\nx = {'[' * 50}1{']' * 50}", "line 7: molecules.0.x.0.0"),
-        ("[start]", f"[{'.'.join('a' * 100_000)}]", "a key of more than 32 parts (at line 12, column 1)"),
-        ("[[stages]]", own_molecule("[0.0, 0.0, 1e200]"), "line 11: molecules.1.sites.0.position_A.2: is 1e+200, must be"),
-        ("[[stages]]", own_molecule(more=", charge_e = 1e300"), "charge_e: is 1e+300, must be 0 or between"),
-        ('model = "spce"', 'file = "a\\u0000.toml"', "line 5: molecules.0.file: is 'a\\x00.toml': control characters"),
-        ('model = "spce"', f'file = "{"a" * 300}.toml"', "line 5: molecules.0.file: cannot be read: File name too long"),
-        ('model = "spce"', 'file = "loop.toml"', "cannot be read: Too many levels of symbolic links: "),
-        ('model = "spce"', 'file = "pipe.toml"', "line 5: molecules.0.file: is a pipe, a socket or a device"),
-        ('model = "spce"', 'model = "spce"\nname = "\\u001b[31mred"', "line 6: molecules.0.name: is '\\x1b[31mred'"),
-        ("[start]", '"\\u001b[31mx" = 1\n[start]', "\\x1b[31mx: has a control character in its name"),
+        (
+            "[start]",
+            f"[{'.'.join('a' * 100_000)}]",
+            "a key of more than 32 parts (at line 12, column 1)",
+        ),
+        (
+            "[[stages]]",
+            own_molecule("[0.0, 0.0, 1e200]"),
+            "line 11: molecules.1.sites.0.position_A.2: is 1e+200, must be",
+        ),
+        (
+            "[[stages]]",
+            own_molecule(more=", charge_e = 1e300"),
+            "charge_e: is 1e+300, must be 0 or between",
+        ),
+        (
+            'model = "spce"',
+            'file = "a\\u0000.toml"',
+            "line 5: molecules.0.file: is 'a\\x00.toml': control characters",
+        ),
+        (
+            'model = "spce"',
+            f'file = "{"a" * 300}.toml"',
+            "line 5: molecules.0.file: cannot be read: File name too long",
+        ),
+        (
+            'model = "spce"',
+            'file = "loop.toml"',
+            "cannot be read: Too many levels of symbolic links: ",
+        ),
+        (
+            'model = "spce"',
+            'file = "pipe.toml"',
+            "line 5: molecules.0.file: is a pipe, a socket or a device",
+        ),
+        (
+            'model = "spce"',
+            'model = "spce"\nname = "\\u001b[31mred"',
+            "line 6: molecules.0.name: is '\\x1b[31mred'",
+        ),
+        (
+            "[start]",
+            '"\\u001b[31mx" = 1\n[start]',
+            "\\x1b[31mx: has a control character in its name",
+        ),
         ("count = 20", 'count = 20\n"int" = 1', "line 7: molecules.0.int: unknown key"),
-        ("count = 20", "count = 20\n'a' = True", "line 7: molecules.0.a: is True, must be written true"),
+        (
+            "count = 20",
+            "count = 20\n'a' = True",
+            "line 7: molecules.0.a: is True, must be written true",
+        ),
         ("count = 20", "count = 20\n() = True", "is not TOML"),
-        ("[[stages]]", own_molecule(more=", sigma_A = 9e25, epsilon_K = 1.0"), "sigma_A of 9e+25 Å with epsilon overflows"),
-        ("[start]", '[forces]\nelectrostatics = "ewald"\newald_k_max = 1000\n[start]', "8e+09 k-vectors, more than 2e+07"),
-        ("20.0", '[20.0, 20.0, 1e6]\n[forces]\nelectrostatics = "pme"', "an edge of 1e+06 Å is too long for a grid"),
+        (
+            "[[stages]]",
+            own_molecule(more=", sigma_A = 9e25, epsilon_K = 1.0"),
+            "sigma_A of 9e+25 Å with epsilon overflows",
+        ),
+        (
+            "[start]",
+            '[forces]\nelectrostatics = "ewald"\newald_k_max = 1000\n[start]',
+            "8e+09 k-vectors, more than 2e+07",
+        ),
+        (
+            "20.0",
+            '[20.0, 20.0, 1e6]\n[forces]\nelectrostatics = "pme"',
+            "an edge of 1e+06 Å is too long for a grid",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_scene_that_was_made_to_break(old, new, expected, capsys, tmp_path):
     os.symlink("loop.toml", tmp_path / "loop.toml")
     os.mkfifo(tmp_path / "pipe.toml")
@@ -106,13 +175,24 @@ def test_a_scene_that_was_made_to_break(old, new, expected, capsys, tmp_path):
     ("old", "new", "expected"),
     [
         ("[0.0, 0.001, 0.0]", "[]", "frame: angular_velocity_rad_s is an empty list"),
-        ("[0.0, 0.001, 0.0]", "[]\ntimes_s = [0.0, 1.0]", "frame: angular_velocity_rad_s is an empty list"),
-        ("[frame]\nangular_velocity_rad_s = [0.0, 0.001, 0.0]", "[changing_inertia]\ninertia_kg_m2 = []\ntimes_s = [0.0, 1.0]",
-         "changing_inertia: inertia_kg_m2 is an empty list"),
+        (
+            "[0.0, 0.001, 0.0]",
+            "[]\ntimes_s = [0.0, 1.0]",
+            "frame: angular_velocity_rad_s is an empty list",
+        ),
+        (
+            "[frame]\nangular_velocity_rad_s = [0.0, 0.001, 0.0]",
+            "[changing_inertia]\ninertia_kg_m2 = []\ntimes_s = [0.0, 1.0]",
+            "changing_inertia: inertia_kg_m2 is an empty list",
+        ),
     ],
-)  # fmt: skip
+)
 def test_an_empty_list_of_a_body(old, new, expected, capsys, tmp_path):
-    text = SATELLITE.replace("inertia_kg_m2 = [1.0, 2.0, 2.5]\n", "") if "changing" in new else SATELLITE
+    text = (
+        SATELLITE.replace("inertia_kg_m2 = [1.0, 2.0, 2.5]\n", "")
+        if "changing" in new
+        else SATELLITE
+    )
     assert expected in refusal(capsys, tmp_path, text.replace(old, new))
 
 
@@ -123,7 +203,10 @@ def test_an_empty_list_of_a_body(old, new, expected, capsys, tmp_path):
         (f"{'.'.join('a' * 50_000)}=1", "is a key of more than 32 parts"),
         (f"box.lengths_A={'9' * 4500}", "--set box.lengths_A: is "),
         ("molecules.²=1", "molecules has entries 0 to 0"),
-        ("molecules.0.count=9223372036854775808", "--set molecules.0.count: is a whole number of more than 64 bits"),
+        (
+            "molecules.0.count=9223372036854775808",
+            "--set molecules.0.count: is a whole number of more than 64 bits",
+        ),
         ('structure.file="a\\u0000"', "--set structure.file: is "),
     ],
 )
@@ -146,7 +229,14 @@ def test_twenty_thousand_faults_are_told_at_once(what, capsys, tmp_path):
 
 def test_lines_are_found_among_lists_within_lists():
     text = "a.b = 1\n[[x]]\nk = 1\n[[x.y]]\n[[x.y]]\nk = 2\n[[x]]\n[[x.y]]\nk = 3\n[x.z]\nk = 4\n"
-    found = [["a", "b"], ["x", 0, "k"], ["x", 0, "y", 1, "k"], ["x", 1, "y", 0, "k"], ["x", 1, "z", "k"], ["x", 1, "q"]]
+    found = [
+        ["a", "b"],
+        ["x", 0, "k"],
+        ["x", 0, "y", 1, "k"],
+        ["x", 1, "y", 0, "k"],
+        ["x", 1, "z", "k"],
+        ["x", 1, "q"],
+    ]
     assert [line_of(keys, text) for keys in found] == [1, 3, 6, 9, 11, 7]
     assert line_of(["none"], text) is None
 
@@ -179,14 +269,29 @@ def test_control_characters_of_a_model_are_not_printed(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("name", "old", "new", "expected"),
     [
-        ("x.xyz", "6\n", "100000000000\n", "x.xyz: line 1 promises 100000000000 atoms, 6 are there: truncated?"),
+        (
+            "x.xyz",
+            "6\n",
+            "100000000000\n",
+            "x.xyz: line 1 promises 100000000000 atoms, 6 are there: truncated?",
+        ),
         ("x.xyz", "6\n", "²\n", "x.xyz: line 1: expected the number of atoms, found '²'"),
-        ("x.gro", "\n6\n", f"\n{'9' * 5000}\n", "x.gro: line 2: expected the number of atoms, found '999"),
+        (
+            "x.gro",
+            "\n6\n",
+            f"\n{'9' * 5000}\n",
+            "x.gro: line 2: expected the number of atoms, found '999",
+        ),
         ("x.gro", "\n6\n", "\n²\n", "x.gro: line 2: expected the number of atoms, found '²'"),
         ("x.data", "6 atoms", "100000000000 atoms", "x.data: line 3 promises 100000000000 atoms"),
         ("x.cif", "1.0\n", "full\n", "x.cif: some of its sites have the occupancy full"),
         ("x.xyz", "O 2.0 ", "O 1e200 ", "x.xyz: an atom is at 1e+200 Å, farther than 1e+09 Å"),
-        ("y.xyz", '"18.0', '"0.1', "y.xyz: its box: with its edges of 0.1, 18, 18 Å it is 0.1 Å thick"),
+        (
+            "y.xyz",
+            '"18.0',
+            '"0.1',
+            "y.xyz: its box: with its edges of 0.1, 18, 18 Å it is 0.1 Å thick",
+        ),
         ("x.gro", "   OW", "\x1b[31m", "x.gro: atom 1 has a name with control characters"),
     ],
 )
@@ -194,18 +299,23 @@ def test_a_structure_that_was_made_to_break(name, old, new, expected, capsys, tm
     text = STRUCTURES[name].replace("    O", "   OW")
     assert old in text
     (tmp_path / name).write_text(text.replace(old, new, 1))
-    scene = FROM_FILE.replace("FILE", name).replace("[box]\nlengths_A = 18.0\n" if name == "y.xyz" else "none", "")
+    scene = FROM_FILE.replace("FILE", name).replace(
+        "[box]\nlengths_A = 18.0\n" if name == "y.xyz" else "none", ""
+    )
     assert expected in refusal(capsys, tmp_path, scene)
 
 
 @pytest.mark.parametrize(
-    "cell", [np.array([[18.0, 0, 0], [18, 0, 0], [0, 0, 18]]), np.diag([18, np.inf, 18]), -18 * np.eye(3)]
+    "cell",
+    [np.array([[18.0, 0, 0], [18, 0, 0], [0, 0, 18]]), np.diag([18, np.inf, 18]), -18 * np.eye(3)],
 )
 def test_a_state_with_a_cell_that_is_none(cell, tmp_path):
     turn = np.tile(np.eye(3), (2, 1, 1))
     state = state_of(np.array([[0.0, 0, 0], [5, 5, 5]]), None, turn, None, cell)
     write_state(tmp_path / "final.npz", SavedState(state, ["spce"], np.zeros(2, int), None))
-    (tmp_path / "scene.toml").write_text(FROM_FILE.replace("FILE", "final.npz").replace("lengths_A = 18.0", ""))
+    (tmp_path / "scene.toml").write_text(
+        FROM_FILE.replace("FILE", "final.npz").replace("lengths_A = 18.0", "")
+    )
     with pytest.raises(StructureError, match="cell: damaged"):
         build(Scene.read(tmp_path / "scene.toml"))
 
@@ -215,7 +325,9 @@ def test_a_state_that_unpacks_to_more_than_there_is(monkeypatch, tmp_path):
         archive.writestr("position.npy", bytes(10_000_000))
     (tmp_path / "scene.toml").write_text(FROM_FILE.replace("FILE", "final.npz"))
     monkeypatch.setattr(memory, "free_memory", lambda: 1e7)
-    with pytest.raises(StructureError, match=r"not enough memory: reading its 0.01 GB needs 0.02 GB of memory"):
+    with pytest.raises(
+        StructureError, match=r"not enough memory: reading its 0.01 GB needs 0.02 GB of memory"
+    ):
         build(Scene.read(tmp_path / "scene.toml"))
 
 
@@ -232,7 +344,9 @@ def test_a_state_that_unpacks_to_more_than_there_is(monkeypatch, tmp_path):
 def test_a_setting_of_the_machine_that_cannot_be(name, value, expected, tmp_path):
     (tmp_path / "scene.toml").write_text(GOOD)
     command = [sys.executable, "-m", "rigidmd", "check", "scene.toml"]
-    found = subprocess.run(command, cwd=tmp_path, env=os.environ | {name: value}, capture_output=True, text=True)
+    found = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | {name: value}, capture_output=True, text=True
+    )
     assert (found.returncode, found.stdout) == (2, "")
     assert found.stderr == f"rigidmd: {name} is {value!r}, {found.stderr.split(', ', 1)[1]}"
     assert expected in found.stderr
@@ -244,13 +358,18 @@ def test_a_setting_of_the_machine_that_cannot_be(name, value, expected, tmp_path
         ({"NUMBA_DISABLE_JIT": "1"}, "NUMBA_DISABLE_JIT is set: Numba would compile nothing"),
         ({"NUMBA_OPT": "abc"}, "NUMBA_OPT is 'abc', which Numba cannot read: unset it"),
         ({"NUMBA_DEBUG_CACHE": "x"}, "NUMBA_DEBUG_CACHE is 'x', which Numba cannot read: unset it"),
-        ({"NUMBA_CPU_NAME": "generic", "RIGIDMD_SIMD_BITS": "256"}, "vectors have at most 128 bits on generic"),
+        (
+            {"NUMBA_CPU_NAME": "generic", "RIGIDMD_SIMD_BITS": "256"},
+            "vectors have at most 128 bits on generic",
+        ),
     ],
 )
 def test_a_setting_with_which_nothing_can_be_compiled(settings, expected, tmp_path):
     (tmp_path / "scene.toml").write_text(GOOD)
     command = [sys.executable, "-m", "rigidmd", "check", "scene.toml"]
-    found = subprocess.run(command, cwd=tmp_path, env=os.environ | settings, capture_output=True, text=True)
+    found = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | settings, capture_output=True, text=True
+    )
     assert (found.returncode, found.stdout, found.stderr.count("\n")) == (2, "", 1)
     assert expected in found.stderr
 
@@ -260,7 +379,9 @@ def test_a_setting_with_which_nothing_can_be_compiled(settings, expected, tmp_pa
 def test_a_limit_of_memory_that_is_too_low_for_libraries(kilobytes, tmp_path):
     (tmp_path / "scene.toml").write_text(GOOD)
     command = f"ulimit -v {kilobytes}; exec {sys.executable} -m rigidmd check scene.toml"
-    found = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    found = subprocess.run(
+        ["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
     assert (found.returncode, found.stdout, found.stderr.count("\n")) == (2, "", 1)
     assert "not enough memory" in found.stderr
     assert "ulimit -v" in found.stderr
@@ -284,17 +405,24 @@ def test_a_terminal_without_the_letters_ends_no_command(monkeypatch, tmp_path):
             GOOD.replace("count = 20", f"count = {10**12}"),
             "not enough memory: a system of 1000000000000 molecules with",
         ),
-        (GOOD.replace("count = 20", f"count = {2**63 - 1}"), "not enough memory: a system of 9223372036854775807"),
+        (
+            GOOD.replace("count = 20", f"count = {2**63 - 1}"),
+            "not enough memory: a system of 9223372036854775807",
+        ),
         (
             GOOD + '[forces]\nelectrostatics = "pme"\npme_grid = [4096, 4096, 4096]\n',
             "a single array of it needs 275 GB",
         ),
     ],
 )
-def test_a_scene_beyond_the_machine_is_refused_with_numbers(text, expected, capsys, monkeypatch, tmp_path):
+def test_a_scene_beyond_the_machine_is_refused_with_numbers(
+    text, expected, capsys, monkeypatch, tmp_path
+):
     monkeypatch.chdir(tmp_path)
     for free in (memory, room):
-        monkeypatch.setattr(free, "free_memory", lambda: 8e9)  # between commands what is free changes
+        monkeypatch.setattr(
+            free, "free_memory", lambda: 8e9
+        )  # between commands what is free changes
     message = refusal(capsys, tmp_path, text, commands=("check", "energy", "run"))
     assert expected in message
     assert "and this machine has 8 GB free" in message
@@ -303,47 +431,78 @@ def test_a_scene_beyond_the_machine_is_refused_with_numbers(text, expected, caps
 
 def test_the_memory_of_a_run_is_compared_before_it_is_used(monkeypatch, tmp_path):
     scene = Scene.from_dict(
-        {"box": {"lengths_A": 60.0, "periodic": False}, "molecules": [{"model": "spce", "count": 2000}],
-         "start": {"temperature_K": 300.0}, "stages": [{"duration_ps": 0.01}]}
-    )  # fmt: skip
+        {
+            "box": {"lengths_A": 60.0, "periodic": False},
+            "molecules": [{"model": "spce", "count": 2000}],
+            "start": {"temperature_K": 300.0},
+            "stages": [{"duration_ps": 0.01}],
+        }
+    )
     assert isinstance(scene, MolecularScene)
     needed = room.bytes_of(build(scene))
     assert needed > 5e6
     monkeypatch.setattr(memory, "free_memory", lambda: needed / 0.94)
     build(scene)
     monkeypatch.setattr(memory, "free_memory", lambda: needed / 0.96)
-    with pytest.raises(SceneError, match=r"not enough memory: the run needs .* and this machine has .* GB free"):
+    with pytest.raises(
+        SceneError, match=r"not enough memory: the run needs .* and this machine has .* GB free"
+    ):
         build(scene)
 
 
 def test_a_body_with_more_samples_than_there_is_room_for(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "free_memory", lambda: 8e9)
-    text = SATELLITE.replace("timestep_s = 0.01", "timestep_s = 1e-8").replace("interval_s = 0.1", "interval_s = 1e-8")
+    text = SATELLITE.replace("timestep_s = 0.01", "timestep_s = 1e-8").replace(
+        "interval_s = 0.1", "interval_s = 1e-8"
+    )
     message = refusal(capsys, tmp_path, text)
-    assert "not enough memory: a run with 1e+08 samples needs 270 GB of memory, and this machine has 8 GB" in message
+    assert (
+        "not enough memory: a run with 1e+08 samples needs 270 GB of memory, and this machine has 8 GB"
+        in message
+    )
 
 
 @pytest.mark.parametrize(
     ("changes", "lines", "gigabytes"),
     [
         ({"stages.0.duration_ps": 2e5, "output.log_interval_ps": 0.002}, "1e+08", "87.1 GB"),
-        ({"stages.0.duration_ps": 2e5, "output.log_interval_ps": 1e-6}, "2e+08", "174 GB"),  # a line each step
+        (
+            {"stages.0.duration_ps": 2e5, "output.log_interval_ps": 1e-6},
+            "2e+08",
+            "174 GB",
+        ),  # a line each step
         ({"stages.0.duration_ps": 2e6, "output.trajectory_interval_ps": 0.002}, "2e+07", "167 GB"),
-        ({"stages.0.duration_ps": 2e7, "stages.0.timestep_fs": "", "stages.0.integrator": "auto",
-          "stages.0.energy_error_kT": 1e-3}, "2e+08", "180 GB"),
+        (
+            {
+                "stages.0.duration_ps": 2e7,
+                "stages.0.timestep_fs": "",
+                "stages.0.integrator": "auto",
+                "stages.0.energy_error_kT": 1e-3,
+            },
+            "2e+08",
+            "180 GB",
+        ),
     ],
-)  # fmt: skip
-def test_molecules_with_more_samples_than_there_is_room_for(changes, lines, gigabytes, capsys, monkeypatch, tmp_path):
+)
+def test_molecules_with_more_samples_than_there_is_room_for(
+    changes, lines, gigabytes, capsys, monkeypatch, tmp_path
+):
     monkeypatch.setattr(memory, "free_memory", lambda: 8e9)
     options = [part for key, value in changes.items() for part in ("--set", f"{key}={value}")]
     message = refusal(capsys, tmp_path, GOOD, *options)
-    assert f"a run with {lines} lines in its log needs {gigabytes} of memory, and this machine has 8 GB" in message
+    assert (
+        f"a run with {lines} lines in its log needs {gigabytes} of memory, and this machine has 8 GB"
+        in message
+    )
     assert "lengthen output.log_interval_ps" in message
 
 
 def a_sample(k: int, own: tuple[float, ...] = ()) -> Sample:
     values = {name: k + column / 64 for column, name in enumerate(COLUMNS)}
-    return Sample(**values | {"step": k, "time": k / 4, "stage": k // 5, "stage_name": "ab"[k // 5]}, user_energies=own)
+    return Sample(
+        **values | {"step": k, "time": k / 4, "stage": k // 5, "stage_name": "ab"[k // 5]},
+        user_energies=own,
+    )
 
 
 def test_samples_give_back_what_was_added():
@@ -361,7 +520,9 @@ def test_samples_give_back_what_was_added():
     assert len(samples.of_stage(2)) == 0
     for since in range(10):
         for moment in np.arange(-0.1, 2.6, 0.05):
-            assert samples.latest(moment, since) == max([k for k in range(since, 10) if k / 4 <= moment], default=since)
+            assert samples.latest(moment, since) == max(
+                [k for k in range(since, 10) if k / 4 <= moment], default=since
+            )
     column = samples["time"]
     samples.append(a_sample(9, (0.0, 0.0)))  # columns are copies
     assert len(column) == 10
@@ -373,7 +534,10 @@ def test_samples_give_back_what_was_added():
         (lambda table: table[:, 1:], "shape"),
         (lambda table: table.ravel(), "shape"),
         (lambda table: np.where(table == 1.0, 7.0, table), "have stages that are not in the scene"),
-        (lambda table: np.where(table == 1.0, np.nan, table), "have stages that are not in the scene"),
+        (
+            lambda table: np.where(table == 1.0, np.nan, table),
+            "have stages that are not in the scene",
+        ),
         (lambda table: np.where(table == 6.0, 6.5, table), "steps that are not whole numbers"),
         (lambda table: np.where(table == 6.0, 1e300, table), "steps that are not whole numbers"),
         (lambda table: np.where(table == 6.0, np.inf, table), "steps that are not whole numbers"),
@@ -406,7 +570,9 @@ def test_what_is_free_is_no_more_than_the_limits():
     assert 1e9 < float(found.stdout) < 3e9
 
 
-@pytest.mark.parametrize(("most", "square"), [((5, 6, 7), None), ((3, 0, 4), 20), ((0, 0, 3), None), ((0, 0, 0), None)])
+@pytest.mark.parametrize(
+    ("most", "square"), [((5, 6, 7), None), ((3, 0, 4), 20), ((0, 0, 3), None), ((0, 0, 0), None)]
+)
 def test_waves_in_columns_are_all_waves(most, square):
     found = vectors.k_vectors_up_to(most, square)
     axes = [np.arange(-m, m + 1) for m in most]
@@ -424,7 +590,10 @@ def test_waves_in_columns_are_all_waves(most, square):
 
 @pytest.mark.parametrize(
     ("options", "expected"),
-    [(["--until", "9" * 40 + "ps"], "more than 1e+12 steps away"), (["-o", "a" * 300], "File name too long")],
+    [
+        (["--until", "9" * 40 + "ps"], "more than 1e+12 steps away"),
+        (["-o", "a" * 300], "File name too long"),
+    ],
 )
 def test_an_end_or_a_folder_that_cannot_be(options, expected, capsys, tmp_path):
     assert expected in refusal(capsys, tmp_path, GOOD, *options, commands=("run",))
@@ -442,14 +611,18 @@ def test_an_end_with_more_digits_than_a_number_has(capsys):
 
 def site_scene(**site):
     return {
-        "box": {"lengths_A": 20.0}, "start": {"temperature_K": 100.0}, "stages": [{"duration_ps": 0.002}],
+        "box": {"lengths_A": 20.0},
+        "start": {"temperature_K": 100.0},
+        "stages": [{"duration_ps": 0.002}],
         "molecules": [{"name": "a", "count": 2, "sites": [{"name": "A", "mass_u": 40.0} | site]}],
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("element", ["x\ny", "", "o", "Ar Ne", "<b>", "Q" * 5000, "Uue"])
 def test_an_element_is_a_chemical_symbol(element):
-    with pytest.raises(SceneError, match=r"element: is '.*', must be a chemical symbol such as O, or X") as error:
+    with pytest.raises(
+        SceneError, match=r"element: is '.*', must be a chemical symbol such as O, or X"
+    ) as error:
         Scene.from_dict(site_scene(element=element))
     assert len(str(error.value)) < 400
 
@@ -472,7 +645,9 @@ def test_names_have_one_line_and_at_most_100_characters(place, name, tmp_path):
     if place == "stage":
         data["stages"][0]["name"] = name
     if place == "model":
-        (tmp_path / "m.toml").write_text(tomli_w.dumps({"name": name, "sites": data["molecules"][0]["sites"]}))
+        (tmp_path / "m.toml").write_text(
+            tomli_w.dumps({"name": name, "sites": data["molecules"][0]["sites"]})
+        )
         data["molecules"][0] = {"file": "m.toml", "count": 2}
     with pytest.raises(RigidMDError, match=r"name|parameters") as error:
         build(Scene.from_dict(data, tmp_path))
@@ -496,7 +671,8 @@ PACKAGES = (
 
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory):
-    """A folder with a module of every name, each of which leaves a mark, and with configuration files of libraries."""
+    """A folder with a module of every name, each of which leaves a mark, and with configuration
+    files of libraries."""
     folder = tmp_path_factory.mktemp("hostile")
     mark = f"open({str(folder / 'MARK')!r}, 'a').write(__name__ + ' ')\n"
     for name in sys.stdlib_module_names:
@@ -509,12 +685,15 @@ def hostile(tmp_path_factory):
     (folder / "matplotlibrc").write_text(
         "figure.facecolor: red\nfont.size: 40\nbackend: none_such\nlines.linewidth: x\n"
     )
-    (folder / ".numba_config.yaml").write_text("opt: 0\nboundscheck: 1\ndisable_jit: 1\ncpu_name: generic\n")
+    (folder / ".numba_config.yaml").write_text(
+        "opt: 0\nboundscheck: 1\ndisable_jit: 1\ncpu_name: generic\n"
+    )
     return folder
 
 
 def command_in(folder, *words, **environment):
-    """A command as the program `rigidmd` runs it, which does not put the working directory on the search path."""
+    """A command as the program `rigidmd` runs it, which does not put the working directory on the
+    search path."""
     done = subprocess.run(
         [sys.executable, "-P", "-m", "rigidmd", *words],
         cwd=folder,
@@ -534,9 +713,23 @@ def test_nothing_in_the_working_directory_is_executed_or_obeyed(hostile, tmp_pat
     for folder in (hostile, tmp_path):
         shutil.copy(ROOT / "systems" / "heavy_top_3.toml", folder / "top.toml")
         command_in(folder, "run", "top.toml", "-o", "run", *SHORT_TOP)
-    command_in(hostile, "sweep", "top.toml", "-o", "sweep", "--set", "run.duration_s=0.01,0.02", "--jobs", "2")
+    command_in(
+        hostile,
+        "sweep",
+        "top.toml",
+        "-o",
+        "sweep",
+        "--set",
+        "run.duration_s=0.01,0.02",
+        "--jobs",
+        "2",
+    )
     assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
-    same = [path.name for path in (tmp_path / "run").iterdir() if path.suffix in (".png", ".csv", ".svg")]
+    same = [
+        path.name
+        for path in (tmp_path / "run").iterdir()
+        if path.suffix in (".png", ".csv", ".svg")
+    ]
     assert len(same) >= 3
     for name in same:
         assert (hostile / "run" / name).read_bytes() == (tmp_path / "run" / name).read_bytes(), name
@@ -595,13 +788,18 @@ def test_a_liquid_is_compiled_by_nothing_in_the_working_directory(hostile, tmp_p
 
 
 def test_the_second_compiling_process_imports_nothing_from_the_working_directory(hostile):
-    """And so the one that reads a frame, and that of a point of a sweep: all are made by `python_process`."""
-    made = python_process("-c", "import pickle, json, struct, numpy, rigidmd.compile; print(rigidmd.__file__)")
+    """And so the one that reads a frame, and that of a point of a sweep: all are made by
+    `python_process`."""
+    made = python_process(
+        "-c", "import pickle, json, struct, numpy, rigidmd.compile; print(rigidmd.__file__)"
+    )
     done = subprocess.run(**made, cwd=hostile, capture_output=True, text=True)
     assert Path(done.stdout.strip()) == Path(rigidmd.__file__), done.stderr
     assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
     settings = "import rigidmd.compile, numba; print(numba.config.OPT, numba.config.DISABLE_JIT, numba.config.CPU_NAME)"
-    done = subprocess.run(**python_process("-c", settings), cwd=hostile, capture_output=True, text=True)
+    done = subprocess.run(
+        **python_process("-c", settings), cwd=hostile, capture_output=True, text=True
+    )
     assert done.stdout.strip() == f"{numba.config.OPT} 0 {numba.config.CPU_NAME}", done.stderr
 
 

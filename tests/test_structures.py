@@ -57,7 +57,10 @@ TOLERANCE = 0.15
 def chiral() -> Molecule:
     """CHFClBr, left-handed; its mirror image must not be taken for it."""
     corners = {"H": (1, 1, 1), "F": (1, -1, -1), "Cl": (-1, 1, -1), "Br": (-1, -1, 1)}
-    lengths, masses = {"H": 1.09, "F": 1.36, "Cl": 1.76, "Br": 1.94}, {"H": 1.0, "F": 19.0, "Cl": 35.4, "Br": 79.9}
+    lengths, masses = (
+        {"H": 1.09, "F": 1.36, "Cl": 1.76, "Br": 1.94},
+        {"H": 1.0, "F": 19.0, "Cl": 35.4, "Br": 79.9},
+    )
     sites = [Site(name="C", element="C", mass_u=12.0, position_A=(0.0, 0.0, 0.0))]
     for e, corner in corners.items():
         place = tuple(float(lengths[e] * x / np.sqrt(3)) for x in corner)
@@ -69,7 +72,8 @@ def tetrachloromethane() -> Molecule:
     """Half of the orders of its chlorines have all distances right and are mirror images."""
     corners = 1.766 / np.sqrt(3) * np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
     sites = [
-        Site(name=f"CL{k}", element="Cl", mass_u=35.45, position_A=tuple(map(float, x))) for k, x in enumerate(corners)
+        Site(name=f"CL{k}", element="Cl", mass_u=35.45, position_A=tuple(map(float, x)))
+        for k, x in enumerate(corners)
     ]
     carbon = Site(name="C", element="C", mass_u=12.011, position_A=(0.0, 0.0, 0.0))
     return molecule("tetrachloromethane", (carbon, *sites), residue_names=("CCL4",))
@@ -80,13 +84,19 @@ def benzene() -> Molecule:
     sites = []
     for e, radius, mass in (("C", 1.397, 12.011), ("H", 2.483, 1.008)):
         for k in range(6):
-            place = (radius * float(np.cos(k * np.pi / 3)), radius * float(np.sin(k * np.pi / 3)), 0.0)
+            place = (
+                radius * float(np.cos(k * np.pi / 3)),
+                radius * float(np.sin(k * np.pi / 3)),
+                0.0,
+            )
             sites.append(Site(name=f"{e}{k + 1}", element=e, mass_u=mass, position_A=place))
     return molecule("benzene", tuple(sites), residue_names=("BNZ",))
 
 
 def ion(element: str, mass: float) -> Molecule:
-    return molecule(element, (Site(name=element, element=element, mass_u=mass, position_A=(0.0, 0.0, 0.0)),))
+    return molecule(
+        element, (Site(name=element, element=element, mass_u=mass, position_A=(0.0, 0.0, 0.0)),)
+    )
 
 
 SPECIES = {
@@ -105,17 +115,23 @@ SPECIES = {
 class Truth:
     """Molecules that are known: on a lattice so wide that none touch, turned at random."""
 
-    def __init__(self, kinds: Sequence[str | Molecule], seed: int = 0, edges=(14.0, 15.0, 16.0), cell=None):
+    def __init__(
+        self, kinds: Sequence[str | Molecule], seed: int = 0, edges=(14.0, 15.0, 16.0), cell=None
+    ):
         rng = np.random.default_rng(seed)
         self.species = [SPECIES[kind] if isinstance(kind, str) else kind for kind in kinds]
         self.cell = np.diag(edges) if cell is None else np.array(cell)
         side = int(np.ceil(np.cbrt(len(kinds))))
-        grid = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)[: len(kinds)]
+        grid = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)[
+            : len(kinds)
+        ]
         self.centre = ((grid + 0.1 * rng.random(grid.shape)) / side) @ self.cell
         self.rotation = random_rotations(rng, len(kinds))
         self.velocity = rng.standard_normal((len(kinds), 3))
         self.omega = 5 * rng.standard_normal((len(kinds), 3))  # lab
-        for k, m in enumerate(self.species):  # a linear body does not turn about its axis, a point not at all
+        for k, m in enumerate(
+            self.species
+        ):  # a linear body does not turn about its axis, a point not at all
             body = self.rotation[k].T @ self.omega[k]
             self.omega[k] = self.rotation[k] @ (body * (m.inertia > 0))
 
@@ -136,12 +152,16 @@ class Truth:
 
     def angular_momentum_body(self):
         return np.array(
-            [m.inertia * (q.T @ w) for m, q, w in zip(self.species, self.rotation, self.omega, strict=True)]
+            [
+                m.inertia * (q.T @ w)
+                for m, q, w in zip(self.species, self.rotation, self.omega, strict=True)
+            ]
         )
 
 
 def same_molecules(found, truth: Truth, species: list[Molecule], error: float, cell=None):
-    """Every molecule is found once, all sites of all kinds in place modulo the lattice. Returns the pairing."""
+    """Every molecule is found once, all sites of all kinds in place modulo the lattice. Returns the
+    pairing."""
     cell = truth.cell if cell is None else cell
 
     def apart(a, b):
@@ -163,8 +183,11 @@ def same_molecules(found, truth: Truth, species: list[Molecule], error: float, c
     return partner
 
 
-def gro(atoms, box, digits=3, velocities=False, names=None, residues=True, residue_names=None) -> str:
-    """A .gro of (name, element, molecule, position in Å, velocity in Å/ps); box as its last line, nm."""
+def gro(
+    atoms, box, digits=3, velocities=False, names=None, residues=True, residue_names=None
+) -> str:
+    """A .gro of (name, element, molecule, position in Å, velocity in Å/ps); box as its last line,
+    nm."""
     width = digits + 5
     lines = ["t", str(len(atoms))]
     for i, (name, _, k, x, v) in enumerate(atoms):
@@ -199,14 +222,22 @@ def pdb(atoms, cryst, names=None, element_column=True, number=None, residue="HOH
 
 
 def cryst1(cell) -> str:
-    return "CRYST1" + "".join(f"{x:9.3f}" for x in np.diag(cell)) + "".join(f"{a:7.2f}" for a in (90, 90, 90)) + " P 1"
+    return (
+        "CRYST1"
+        + "".join(f"{x:9.3f}" for x in np.diag(cell))
+        + "".join(f"{a:7.2f}" for a in (90, 90, 90))
+        + " P 1"
+    )
 
 
 def xyz(atoms, cell, names=None) -> str:
     """Extended .xyz, a name or else the element in the first column."""
-    lattice = f'Lattice="{" ".join(f"{x:.12f}" for x in np.ravel(cell))}"' if cell is not None else ""
+    lattice = (
+        f'Lattice="{" ".join(f"{x:.12f}" for x in np.ravel(cell))}"' if cell is not None else ""
+    )
     rows = [
-        f"{names[name] if names else element} {x[0]:.10f} {x[1]:.10f} {x[2]:.10f}" for name, element, _, x, _ in atoms
+        f"{names[name] if names else element} {x[0]:.10f} {x[1]:.10f} {x[2]:.10f}"
+        for name, element, _, x, _ in atoms
     ]
     return "\n".join([str(len(rows)), lattice, *rows]) + "\n"
 
@@ -221,7 +252,9 @@ def wrapped(atoms, cell):
     return [(name, e, k, wrap(x), v) for name, e, k, x, v in atoms]
 
 
-def read(tmp_path: Path, text: str, name: str, species=("spce",), cell=None, periodic=True, **options):
+def read(
+    tmp_path: Path, text: str, name: str, species=("spce",), cell=None, periodic=True, **options
+):
     (tmp_path / name).write_text(text)
     models = [SPECIES[s] if isinstance(s, str) else s for s in species]
     return read_structure(tmp_path / name, models, cell, periodic, TOLERANCE, **options)
@@ -237,46 +270,190 @@ def density(count, mass, volume):
 
 
 ICE_IH_VOLUME = 7.82**2 * 7.36 * np.sqrt(3) / 2
-# file, model, scene's box, count, g/cm³, rms and largest distance from the template in Å, note; or a message
+# file, model, scene's box, count, g/cm³, rms and largest distance from the template in Å, note; or
+# a message
 REFERENCE = [
-    ("structures/spc216.gro", "spce", None, 216, density(216, WATER, 18.6206**3), 0.0038, 0.0116, ""),
-    ("structures/spc216.gro", "tip4p2005", None, 216, 1.0008, 0.0492, 0.0675, "216 sites without mass are missing in the file"),
-    ("structures/tip4p.gro", "tip4p2005", None, 216, density(216, WATER, 18.6824**3), 0.0040, 0.0109, ""),
-    ("structures/tip4p.gro", "spce", None, 216, 0.9909, 0.0492, 0.0685, "216 sites without mass (MW) are in no model"),
-    ("structures/openmm_spce_box.pdb", "spce", None, 895, density(895, WATER, 30.0**3), 0.0004, 0.0013, ""),
-    ("structures/openmm_tip3p_box.pdb", "tip3p", None, 895, density(895, WATER, 30.0**3), 0.0004, 0.0013, ""),
     (
-        "structures/genice_ice1h_tip4p_seed42.gro", "tip4p2005", None,
-        192, density(192, WATER, 23.4685163 * 14.7071453 * 18.0730370), 0.0040, 0.0111, "",
+        "structures/spc216.gro",
+        "spce",
+        None,
+        216,
+        density(216, WATER, 18.6206**3),
+        0.0038,
+        0.0116,
+        "",
     ),
-    ("structures/genice_ice1h_tip4p_seed42.gro", "spce", None, 192, 0.9208, 0.0488, 0.0682, "(MW) are in no model"),
-    ("structures/chemfiles_water_297_frame1.pdb", "spce", None, 99, density(99, WATER, 15.0**3), 0.0490, 0.0608, ""),
+    (
+        "structures/spc216.gro",
+        "tip4p2005",
+        None,
+        216,
+        1.0008,
+        0.0492,
+        0.0675,
+        "216 sites without mass are missing in the file",
+    ),
+    (
+        "structures/tip4p.gro",
+        "tip4p2005",
+        None,
+        216,
+        density(216, WATER, 18.6824**3),
+        0.0040,
+        0.0109,
+        "",
+    ),
+    (
+        "structures/tip4p.gro",
+        "spce",
+        None,
+        216,
+        0.9909,
+        0.0492,
+        0.0685,
+        "216 sites without mass (MW) are in no model",
+    ),
+    (
+        "structures/openmm_spce_box.pdb",
+        "spce",
+        None,
+        895,
+        density(895, WATER, 30.0**3),
+        0.0004,
+        0.0013,
+        "",
+    ),
+    (
+        "structures/openmm_tip3p_box.pdb",
+        "tip3p",
+        None,
+        895,
+        density(895, WATER, 30.0**3),
+        0.0004,
+        0.0013,
+        "",
+    ),
+    (
+        "structures/genice_ice1h_tip4p_seed42.gro",
+        "tip4p2005",
+        None,
+        192,
+        density(192, WATER, 23.4685163 * 14.7071453 * 18.0730370),
+        0.0040,
+        0.0111,
+        "",
+    ),
+    (
+        "structures/genice_ice1h_tip4p_seed42.gro",
+        "spce",
+        None,
+        192,
+        0.9208,
+        0.0488,
+        0.0682,
+        "(MW) are in no model",
+    ),
+    (
+        "structures/chemfiles_water_297_frame1.pdb",
+        "spce",
+        None,
+        99,
+        density(99, WATER, 15.0**3),
+        0.0490,
+        0.0608,
+        "",
+    ),
     ("structures/chemfiles_water_297_frame1.pdb", "tip3p", None, 99, 0.8775, 0.0004, 0.0013, ""),
-    ("structures/N2_alpha_nitrogen.cif", "nitrogen", None, 4, density(4, 28.0134, 5.644**3), 0.0171, 0.0171, "24 symmetry operations in the file"),
     (
-        "structures/ice_XI_like_8water_P1.cif", "spce", None,
-        8, density(8, WATER, 4.452382 * 7.70757 * 7.278858), 0.0244, 0.0332, "x,y,z is the only symmetry operation",
+        "structures/N2_alpha_nitrogen.cif",
+        "nitrogen",
+        None,
+        4,
+        density(4, 28.0134, 5.644**3),
+        0.0171,
+        0.0171,
+        "24 symmetry operations in the file",
     ),
-    ("structures/H2O_ice_Ih.cif", "tip4p2005", None, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built from"),
-    # All its hydrogens are there (an ordered model of 1933), 0.82 Å from their oxygens.
-    ("structures/H2O_ice_Ih.cif", "tip4p2005", inf, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built from"),
-    ("structures/H2O_ice_Ih.cif", "spce", inf, "is not spce: an atom is 0.173 Å from the rigid template"),
-    ("awkward/two_water_gro.gro", "spce", None, 2, density(2, WATER, 100.0**3), 0.0041, 0.0063, ""),
-    ("awkward/two_water_gro_nonames.gro", "spce", None, 2, 5.983e-5, 0.0041, 0.0063, "A, B1, B2 are not elements"),
     (
-        "awkward/two_water_gro_widebox.gro", "spce", None,
-        2, density(2, WATER, 76.4092 * 79.1768 * 73.1922), 0.0041, 0.0063, "",
+        "structures/ice_XI_like_8water_P1.cif",
+        "spce",
+        None,
+        8,
+        density(8, WATER, 4.452382 * 7.70757 * 7.278858),
+        0.0244,
+        0.0332,
+        "x,y,z is the only symmetry operation",
+    ),
+    (
+        "structures/H2O_ice_Ih.cif",
+        "tip4p2005",
+        None,
+        12,
+        density(12, WATER, ICE_IH_VOLUME),
+        0.0843,
+        0.1305,
+        "built from",
+    ),
+    # All its hydrogens are there (an ordered model of 1933), 0.82 Å from their oxygens.
+    (
+        "structures/H2O_ice_Ih.cif",
+        "tip4p2005",
+        inf,
+        12,
+        density(12, WATER, ICE_IH_VOLUME),
+        0.0843,
+        0.1305,
+        "built from",
+    ),
+    (
+        "structures/H2O_ice_Ih.cif",
+        "spce",
+        inf,
+        "is not spce: an atom is 0.173 Å from the rigid template",
+    ),
+    ("awkward/two_water_gro.gro", "spce", None, 2, density(2, WATER, 100.0**3), 0.0041, 0.0063, ""),
+    (
+        "awkward/two_water_gro_nonames.gro",
+        "spce",
+        None,
+        2,
+        5.983e-5,
+        0.0041,
+        0.0063,
+        "A, B1, B2 are not elements",
+    ),
+    (
+        "awkward/two_water_gro_widebox.gro",
+        "spce",
+        None,
+        2,
+        density(2, WATER, 76.4092 * 79.1768 * 73.1922),
+        0.0041,
+        0.0063,
+        "",
     ),
     ("awkward/short-cryst1.pdb", "spce", None, 3, density(3, WATER, 15.0**3), 0.0489, 0.0601, ""),
-    ("awkward/water4_tinker.arc", "spce", None, "ASE, which reads this format, ends with RuntimeError"),
-    ("awkward/water_spc_99_chem.cssr", "spce", None, "its format is unknown to ASE; there are .cif .data .ent .extxyz .g96 "),
+    (
+        "awkward/water4_tinker.arc",
+        "spce",
+        None,
+        "ASE, which reads this format, ends with RuntimeError",
+    ),
+    (
+        "awkward/water_spc_99_chem.cssr",
+        "spce",
+        None,
+        "its format is unknown to ASE; there are .cif .data .ent .extxyz .g96 ",
+    ),
     ("awkward/triclinic-1.lmp", "spce", None, "holds no atoms"),
     ("awkward/missing_atomname.gro", "spce", None, "has atoms named (no name)"),
     ("awkward/missing_atomname.gro", "argon", None, "has atoms named (no name)"),
-]  # fmt: skip
+]
 
 
-@pytest.mark.parametrize("case", REFERENCE, ids=lambda case: f"{Path(case[0]).name}-{case[1]}-{case[2]}")
+@pytest.mark.parametrize(
+    "case", REFERENCE, ids=lambda case: f"{Path(case[0]).name}-{case[1]}-{case[2]}"
+)
 def test_reference_files(reference, case):
     file, model, edge, *expected = case
     cell = None if edge in (None, inf) else edge * np.eye(3)
@@ -304,7 +481,11 @@ def test_reference_files(reference, case):
 
 
 def test_the_table_names_every_reference_file(reference):
-    there = {f"{folder}/{p.name}" for folder in ("structures", "awkward") for p in (reference / folder).iterdir()}
+    there = {
+        f"{folder}/{p.name}"
+        for folder in ("structures", "awkward")
+        for p in (reference / folder).iterdir()
+    }
     assert there == {case[0] for case in REFERENCE}
 
 
@@ -324,7 +505,9 @@ NAMES = [
 
 @pytest.mark.parametrize("names", NAMES, ids=lambda names: "-".join(names.values()))
 @pytest.mark.parametrize("ending", ["gro", "pdb", "xyz"])
-@pytest.mark.parametrize(("there", "wanted"), [("spce", "spce"), ("tip4p2005", "tip4p2005"), ("tip4p2005", "spce")])
+@pytest.mark.parametrize(
+    ("there", "wanted"), [("spce", "spce"), ("tip4p2005", "tip4p2005"), ("tip4p2005", "spce")]
+)
 def test_names_of_water(names, ending, there, wanted, tmp_path):
     truth = Truth([there] * 8)
     atoms = truth.atoms()
@@ -356,10 +539,14 @@ def oxygens_of_all_first(truth):
 
 
 def between_the_oxygens(truth):
-    return sorted(truth.atoms(massless=False), key=lambda atom: (atom[2], "HW1 OW HW2".index(atom[0])))
+    return sorted(
+        truth.atoms(massless=False), key=lambda atom: (atom[2], "HW1 OW HW2".index(atom[0]))
+    )
 
 
-@pytest.mark.parametrize("order", [without_massless, hydrogens_first, oxygens_of_all_first, between_the_oxygens])
+@pytest.mark.parametrize(
+    "order", [without_massless, hydrogens_first, oxygens_of_all_first, between_the_oxygens]
+)
 @pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("ending", ["gro", "gro without residues", "pdb", "xyz", "cif"])
 def test_order_of_atoms(order, split, ending, tmp_path):
@@ -380,14 +567,27 @@ def test_order_of_atoms(order, split, ending, tmp_path):
         text = gro(atoms, box_of(truth.cell), digits=9, residues=ending == "gro")
     found = read(tmp_path, text, f"a.{ending.split()[0]}", species)
     same_molecules(found, truth, species, error)
-    assert any("9 sites without mass are missing in the file (tip4p2005): built" in note for note in found.notes)
+    assert any(
+        "9 sites without mass are missing in the file (tip4p2005): built" in note
+        for note in found.notes
+    )
     if order is oxygens_of_all_first and ending in ("gro", "pdb"):
         assert any("found by bonding distance" in note for note in found.notes)
 
 
 def test_names_begin_with_an_element_of_the_scene_if_they_can():
     water = frozenset({"O", "H"})
-    names = {"OW": "O", "HO": "H", "1HW": "H", "M": "X", "MW": "X", "CL": "Cl", "B1": "B", "": "", "17": ""}
+    names = {
+        "OW": "O",
+        "HO": "H",
+        "1HW": "H",
+        "M": "X",
+        "MW": "X",
+        "CL": "Cl",
+        "B1": "B",
+        "": "",
+        "17": "",
+    }
     assert {name: element_of(name, water) for name in names} == names
     assert element_of("Na", frozenset("N")) == "Na"  # nobody writes a nitrogen so
     assert element_of("NA", frozenset({"N", "Na"})) == "Na"
@@ -400,7 +600,12 @@ def test_ions_among_waters(ending, tmp_path):
     upper = {"Na": "NA", "Cl": "CL"} | {name: name for name in ("OW", "HW1", "HW2")}
     species = [SPECIES[name] for name in ("spce", "sodium", "chloride", "nitrogen")]
     text = {
-        "gro": gro(truth.atoms(), box_of(truth.cell), names=upper, residue_names={1: "NA", 2: "CL", 4: "CL"}),
+        "gro": gro(
+            truth.atoms(),
+            box_of(truth.cell),
+            names=upper,
+            residue_names={1: "NA", 2: "CL", 4: "CL"},
+        ),
         "pdb": pdb(truth.atoms(), cryst1(truth.cell), upper, residue="MIX"),
         "xyz": xyz(oxygens_of_all_first(truth), truth.cell),
     }
@@ -411,7 +616,9 @@ def alike_by_name(molecule: Molecule, naming: str) -> Molecule:
     """The molecule with names that some of its sites share."""
     names = {
         "elements": molecule.elements,
-        "hydrogens": [f"{e}{k}" if e not in ("H", "Cl") else e for k, e in enumerate(molecule.elements)],
+        "hydrogens": [
+            f"{e}{k}" if e not in ("H", "Cl") else e for k, e in enumerate(molecule.elements)
+        ],
         "one": ["A"] * len(molecule.elements),
     }[naming]
     return dataclasses.replace(molecule, site_names=tuple(names))
@@ -422,13 +629,18 @@ def alike_by_name(molecule: Molecule, naming: str) -> Molecule:
 @pytest.mark.parametrize("ending", ["gro", "pdb", "xyz"])
 def test_sites_that_share_names(naming, order, ending, tmp_path):
     """Names decide only where they are unique; elements and geometry decide among the rest."""
-    species = [alike_by_name(SPECIES[k], naming) for k in ("benzene", "tip4p2005", "tetrachloromethane", "chiral")]
+    species = [
+        alike_by_name(SPECIES[k], naming)
+        for k in ("benzene", "tip4p2005", "tetrachloromethane", "chiral")
+    ]
     truth = Truth(3 * species, 21, edges=(27.0, 28.0, 29.0))
     atoms, rng = truth.atoms(order == "as in the template"), np.random.default_rng(2)
     if order == "shuffled":
         rng.shuffle(atoms)
     elif order == "shuffled within":
-        atoms = [atoms[i] for i in sorted(range(len(atoms)), key=lambda i: (atoms[i][2], rng.random()))]
+        atoms = [
+            atoms[i] for i in sorted(range(len(atoms)), key=lambda i: (atoms[i][2], rng.random()))
+        ]
     called = {m.name: m.residue_names[0][:4] for m in species}
     if ending == "gro":  # only names give the element here
         if naming == "one":
@@ -446,19 +658,30 @@ def test_sites_that_share_names(naming, order, ending, tmp_path):
 def test_a_unique_name_decides_between_sites_that_look_alike(named, tmp_path):
     """Whichever of the two ends of a symmetric molecule has the name of the charged end."""
     x = {"A": 1.16, "B": -1.16}
-    sites = [Site(name=n, element="O", mass_u=16.0, position_A=(at, 0.0, 0.0)) for n, at in x.items()]
-    sites += [Site(name="C", element="C", mass_u=12.0, position_A=(0.0, y, 0.0)) for y in (0.7, -0.7)]
+    sites = [
+        Site(name=n, element="O", mass_u=16.0, position_A=(at, 0.0, 0.0)) for n, at in x.items()
+    ]
+    sites += [
+        Site(name="C", element="C", mass_u=12.0, position_A=(0.0, y, 0.0)) for y in (0.7, -0.7)
+    ]
     other = "B" if named == "A" else "A"
     rows = [("C", 5, 5.7, 5), (named, 6.16, 5, 5), ("C", 5, 4.3, 5), (other, 3.84, 5, 5)]
     atoms = [(name, "", 0, np.array(place, float), None) for name, *place in rows]
-    found = read(tmp_path, gro(atoms, "2 2 2", 6), "a.gro", [molecule("m", tuple(sites), residue_names=("SOL",))])
+    found = read(
+        tmp_path,
+        gro(atoms, "2 2 2", 6),
+        "a.gro",
+        [molecule("m", tuple(sites), residue_names=("SOL",))],
+    )
     assert found.residual_max < 1e-4
     model = molecule("m", tuple(sites))
     a = found.position[0] + found.rotation[0] @ model.positions_body[model.site_names.index("A")]
     assert a == pytest.approx([6.16 if named == "A" else 3.84, 5, 5], abs=1e-4)
 
 
-@pytest.mark.parametrize("pair", [("isobutane", "trans-butane"), ("CH3CH2OH", "CH3OCH3"), ("left", "right")])
+@pytest.mark.parametrize(
+    "pair", [("isobutane", "trans-butane"), ("CH3CH2OH", "CH3OCH3"), ("left", "right")]
+)
 def test_isomers_and_mirror_images_among_each_other(pair, tmp_path):
     """Of one composition, without names but the elements, every molecule in an order of its own."""
 
@@ -468,8 +691,12 @@ def test_isomers_and_mirror_images_among_each_other(pair, tmp_path):
             x, _, z = known.positions.T
             known.positions[:, :2] += 0.35 * np.sin(np.stack([1.3 * z, 1.3 * z + x], axis=1))
             known.positions[:, 0] *= 1 if name == "left" else -1
-        columns = zip(known.symbols, known.get_masses().tolist(), known.positions.tolist(), strict=True)
-        sites = tuple(Site(name=e, element=e, mass_u=m, position_A=(x, y, z)) for e, m, (x, y, z) in columns)
+        columns = zip(
+            known.symbols, known.get_masses().tolist(), known.positions.tolist(), strict=True
+        )
+        sites = tuple(
+            Site(name=e, element=e, mass_u=m, position_A=(x, y, z)) for e, m, (x, y, z) in columns
+        )
         return molecule(name, sites)
 
     species = [isomer(name) for name in pair]
@@ -483,16 +710,27 @@ def test_isomers_and_mirror_images_among_each_other(pair, tmp_path):
 
 def test_the_deviation_of_sites_that_share_names_is_that_of_their_best_order(tmp_path):
     truth = Truth([alike_by_name(SPECIES["benzene"], "elements")] * 2)
-    atoms = [(n, e, k, x + ([0.5, 0, 0] if i == 11 else 0), v) for i, (n, e, k, x, v) in enumerate(truth.atoms())]
+    atoms = [
+        (n, e, k, x + ([0.5, 0, 0] if i == 11 else 0), v)
+        for i, (n, e, k, x, v) in enumerate(truth.atoms())
+    ]
     text = gro(atoms[::-1], box_of(truth.cell), residue_names={0: "BNZ", 1: "BNZ"})
-    with pytest.raises(StructureError, match=r"molecule 2 .* is not benzene: an atom is 0\.[34]\d\d Å from the rigid"):
+    with pytest.raises(
+        StructureError,
+        match=r"molecule 2 .* is not benzene: an atom is 0\.[34]\d\d Å from the rigid",
+    ):
         read(tmp_path, text, "a.gro", truth.species[:1])
 
 
 def united_propene(names=("CH3", "CH", "CH2"), **values) -> Molecule:
-    """CH3-CH=CH2 of united atoms, three of one element, whose ends differ by 0.2 Å. values: of the second end"""
+    """CH3-CH=CH2 of united atoms, three of one element, whose ends differ by 0.2 Å. values: of the
+    second end"""
     angle = np.radians(124.0)
-    places = ((1.54, 0.0, 0.0), (0.0, 0.0, 0.0), (1.33 * float(np.cos(angle)), 1.33 * float(np.sin(angle)), 0.0))
+    places = (
+        (1.54, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (1.33 * float(np.cos(angle)), 1.33 * float(np.sin(angle)), 0.0),
+    )
     epsilons = (98.0, 47.0, values.pop("epsilon_K", 85.0))
     masses = (15.035, 13.019, values.pop("mass_u", 14.027))
     sites = [
@@ -525,27 +763,39 @@ def test_the_best_order_is_taken(names, order, digits, tmp_path):
 
 
 def test_orders_are_the_best_of_all(tmp_path):
-    """Molecules that are bent, in random orders of the atoms: no order of those of one element fits better."""
+    """Molecules that are bent, in random orders of the atoms: no order of those of one element fits
+    better."""
     from itertools import permutations, product
 
     rng = np.random.default_rng(5)
     for name in ("CH3CH2OH", "C3H4_C2v", "CH3NO2", "NH3", "CH4", "C4H4O"):
         known = ase.build.molecule(name)
-        columns = zip(known.symbols, known.get_masses().tolist(), known.positions.tolist(), strict=True)
-        kind = molecule(name, tuple(Site(name=e, element=e, mass_u=m, position_A=tuple(x)) for e, m, x in columns))
+        columns = zip(
+            known.symbols, known.get_masses().tolist(), known.positions.tolist(), strict=True
+        )
+        kind = molecule(
+            name,
+            tuple(Site(name=e, element=e, mass_u=m, position_A=tuple(x)) for e, m, x in columns),
+        )
         elements = np.array(kind.elements)
         parts = [np.flatnonzero(elements == e) for e in dict.fromkeys(kind.elements)]
         for width in (0.02, 0.04):
             truth = Truth([kind], int(rng.integers(1000)))
-            atoms = [(n, e, k, x + width * rng.standard_normal(3), v) for n, e, k, x, v in truth.atoms()]
+            atoms = [
+                (n, e, k, x + width * rng.standard_normal(3), v) for n, e, k, x, v in truth.atoms()
+            ]
             rng.shuffle(atoms)
-            points = np.array([x for *_, x, _ in sorted(atoms, key=lambda atom: kind.elements.index(atom[1]))])
+            points = np.array(
+                [x for *_, x, _ in sorted(atoms, key=lambda atom: kind.elements.index(atom[1]))]
+            )
             least = np.inf
             template = np.concatenate(parts)
             body, masses = kind.positions_body[template], kind.masses[template]
             for orders in product(*(permutations(range(len(part))) for part in parts)):
                 first = np.cumsum([0, *(len(part) for part in parts)])
-                order = np.concatenate([f + np.array(o) for f, o in zip(first[:-1], orders, strict=True)])
+                order = np.concatenate(
+                    [f + np.array(o) for f, o in zip(first[:-1], orders, strict=True)]
+                )
                 at = points[order] - masses @ points[order] / masses.sum()
                 u, _, vt = np.linalg.svd((masses[:, None] * at).T @ body)
                 u[:, 2] *= np.linalg.det(u @ vt)
@@ -555,9 +805,13 @@ def test_orders_are_the_best_of_all(tmp_path):
 
 
 def test_orders_that_fit_equally_well_are_named(tmp_path):
-    """Ends of one distance: where their parameters differ, the file decides by its order, and a note names it."""
+    """Ends of one distance: where their parameters differ, the file decides by its order, and a
+    note names it."""
     places = ((1.4, 0.0, 0.0), (0.0, 0.0, 0.0), (-0.7, 1.4 * np.sqrt(0.75), 0.0))
-    for values, noted in (({"epsilon_K": 98.0, "mass_u": 15.035}, False), ({"mass_u": 15.035}, True)):
+    for values, noted in (
+        ({"epsilon_K": 98.0, "mass_u": 15.035}, False),
+        ({"mass_u": 15.035}, True),
+    ):
         kind = united_propene(("A", "B", "C"), places=places, **values)
         truth = Truth([kind] * 4, 32)
         for order in ((0, 1, 2), (2, 1, 0)):
@@ -566,7 +820,10 @@ def test_orders_that_fit_equally_well_are_named(tmp_path):
             found = read(tmp_path, xyz(atoms, truth.cell), "a.xyz", [kind])
             assert found.residual_max < 1e-6
             ends = found.position + found.rotation @ kind.positions_body[0]
-            assert ends == pytest.approx(np.array([x for *_, x, _ in atoms[::3]]), abs=1e-6) or not noted
+            assert (
+                ends == pytest.approx(np.array([x for *_, x, _ in atoms[::3]]), abs=1e-6)
+                or not noted
+            )
             wanted = "4 molecules of propene: two orders of its atoms, in which different sites are exchanged"
             assert any(note.startswith(wanted) for note in found.notes) == noted
     named = [(n, "C", k, x, v) for n, _, k, x, v in truth.atoms()]
@@ -578,11 +835,15 @@ def test_names_that_fit_less_well_than_elements_are_noted(tmp_path):
     """Another program has numbered the atoms in the other direction."""
     kind = united_propene(("C1", "C2", "C3"))
     truth = Truth([kind] * 4, 33)
-    atoms = [({"C1": "C3", "C2": "C2", "C3": "C1"}[n], e, k, x, v) for n, e, k, x, v in truth.atoms()]
+    atoms = [
+        ({"C1": "C3", "C2": "C2", "C3": "C1"}[n], e, k, x, v) for n, e, k, x, v in truth.atoms()
+    ]
     text = gro(atoms, box_of(truth.cell), 6, residue_names=dict.fromkeys(range(4), "PPE"))
     found = read(tmp_path, text, "a.gro", [kind])
     assert any(
-        re.search(r"fits propene with 0\.1\d\d Å .rms., and another order of atoms with 0\.000 Å", n)
+        re.search(
+            r"fits propene with 0\.1\d\d Å .rms., and another order of atoms with 0\.000 Å", n
+        )
         for n in found.notes
     )
 
@@ -590,23 +851,36 @@ def test_names_that_fit_less_well_than_elements_are_noted(tmp_path):
 # a property: nothing that leaves the molecules what they are changes what is read
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
-    kinds=st.lists(st.sampled_from(["spce", "tip4p2005", "nitrogen", "argon", "chiral", "benzene", "tetrachloromethane"]), min_size=1, max_size=8),
+    kinds=st.lists(
+        st.sampled_from(
+            ["spce", "tip4p2005", "nitrogen", "argon", "chiral", "benzene", "tetrachloromethane"]
+        ),
+        min_size=1,
+        max_size=8,
+    ),
     seed=st.integers(0, 2**31),
     slant=st.booleans(),
     mirrored=st.booleans(),
-)  # fmt: skip
-def test_turned_shifted_wrapped_and_shuffled_atoms_are_the_same_molecules(kinds, seed, slant, mirrored, tmp_path):
-    kinds = [kind if kind != "tip4p2005" or "spce" not in kinds else "spce" for kind in kinds]  # those two look alike
+)
+def test_turned_shifted_wrapped_and_shuffled_atoms_are_the_same_molecules(
+    kinds, seed, slant, mirrored, tmp_path
+):
+    kinds = [
+        kind if kind != "tip4p2005" or "spce" not in kinds else "spce" for kind in kinds
+    ]  # those two look alike
     rng = np.random.default_rng(seed)
     cell = np.diag([17.0, 19.0, 21.0]) + (np.tril(rng.uniform(-8, 8, (3, 3)), -1) if slant else 0.0)
     truth = Truth(kinds, seed, cell=cell)
     rotation = random_rotations(rng, 1)[0]
     shift = rng.uniform(-50, 50, 3)
     atoms = [
-        (name, e, k, (x + shift + rng.integers(-3, 4, 3) @ cell) @ rotation.T, v) for name, e, k, x, v in truth.atoms(False)
-    ]  # fmt: skip
+        (name, e, k, (x + shift + rng.integers(-3, 4, 3) @ cell) @ rotation.T, v)
+        for name, e, k, x, v in truth.atoms(False)
+    ]
     rng.shuffle(atoms)
     written = cell @ rotation.T * ([[1], [1], [-1]] if mirrored else 1)
     species = [SPECIES[kind] for kind in sorted(set(kinds))]
@@ -624,7 +898,12 @@ def test_a_turned_cell_turns_velocities_too(tmp_path):
     truth.species[3] = SPECIES["spce"]
     rotation = random_rotations(np.random.default_rng(5), 1)[0]
     atoms = truth.atoms()
-    plain = ase.Atoms([a[1] for a in atoms], [rotation @ a[3] for a in atoms], cell=truth.cell @ rotation.T, pbc=True)
+    plain = ase.Atoms(
+        [a[1] for a in atoms],
+        [rotation @ a[3] for a in atoms],
+        cell=truth.cell @ rotation.T,
+        pbc=True,
+    )
     plain.set_velocities([rotation @ a[4] / 98.22694788464063 for a in atoms])
     ase.io.write(tmp_path / "a.extxyz", plain)
     found = read(tmp_path, (tmp_path / "a.extxyz").read_text(), "b.extxyz", species)
@@ -688,30 +967,46 @@ def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
     """The state has the box as it was described anew; the scene still has its own words for it."""
     box = {"lengths_A": 24.0, "angles_deg": [90.0, 59.0, 90.0]}
     system = build(small_scene({"argon": 4}, None, box=box))
-    assert any("box: its lattice is given by the cell with edges 24.0000, 24.0000, 23.63" in n for n in system.notes)
+    assert any(
+        "box: its lattice is given by the cell with edges 24.0000, 24.0000, 23.63" in n
+        for n in system.notes
+    )
     write_state(tmp_path / "final.npz", system.saved(system.state))
-    data = {"box": box, "structure": {"file": "final.npz"}, "molecules": [{"model": "argon"}],
-            "start": {"temperature_K": 90.0}, "stages": [{"duration_ps": 1.0}]}  # fmt: skip
+    data = {
+        "box": box,
+        "structure": {"file": "final.npz"},
+        "molecules": [{"model": "argon"}],
+        "start": {"temperature_K": 90.0},
+        "stages": [{"duration_ps": 1.0}],
+    }
     again = build(Scene.from_dict(data, tmp_path))
     assert not any("box of the scene is used" in note for note in again.notes)
-    assert any("the scene's box: its lattice is given by" in note and "c' = c - a" in note for note in again.notes)
+    assert any(
+        "the scene's box: its lattice is given by" in note and "c' = c - a" in note
+        for note in again.notes
+    )
 
 
 @pytest.mark.parametrize(("numbers", "codes"), [((5, 5), "AB"), ((5, 5), " A"), ((7, 8), "  ")])
 def test_insertion_codes_separate_the_residues_of_a_pdb(numbers, codes, tmp_path):
-    """Two waters of one number, as of a hydrate: residues, not bonding distances, are the molecules."""
+    """Two waters of one number, as of a hydrate: residues, not bonding distances, are the
+    molecules."""
     truth = Truth(["spce"] * 2, 5)
     labels = [f"{number:4d}{code}" for number, code in zip(numbers, codes, strict=True)]
     lines = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"{k:4d}").splitlines()
     for k, label in enumerate(labels):
-        lines = [line[:22] + label + line[27:] if line[22:26] == f"{k:4d}" else line for line in lines]
+        lines = [
+            line[:22] + label + line[27:] if line[22:26] == f"{k:4d}" else line for line in lines
+        ]
     found = read(tmp_path, "\n".join(lines), "a.pdb")
     same_molecules(found, truth, [SPECIES["spce"]], 0.002)
     assert found.notes == ()
     assert found.number.tolist() == list(numbers)
 
 
-@pytest.mark.parametrize(("group", "is_reported"), [("P 1", False), ("P1", False), ("", False), ("P 21 21 21", True)])
+@pytest.mark.parametrize(
+    ("group", "is_reported"), [("P 1", False), ("P1", False), ("", False), ("P 21 21 21", True)]
+)
 def test_the_space_group_of_a_pdb_is_reported(group, is_reported, tmp_path):
     truth = Truth(["spce"] * 2, 5)
     text = pdb(truth.atoms(), cryst1(truth.cell).removesuffix(" P 1") + f" {group:<11}{1:4d}")
@@ -727,11 +1022,16 @@ def test_a_pdb_that_is_cut_off_says_so(tmp_path):
     lines = (tmp_path / "whole.pdb").read_text().splitlines(keepends=True)
     last = max(k for k, line in enumerate(lines) if line.startswith(("ATOM", "HETATM")))
     (tmp_path / "cut.pdb").write_text("".join(lines[: last - 5]))
-    told = {name: read_structure(tmp_path / name, system.species, None, True, TOLERANCE, None) for name in
-            ("whole.pdb", "cut.pdb")}  # fmt: skip
+    told = {
+        name: read_structure(tmp_path / name, system.species, None, True, TOLERANCE, None)
+        for name in ("whole.pdb", "cut.pdb")
+    }
     assert [len(found.position) for found in told.values()] == [8, 6]
     assert not any("truncated" in note for note in told["whole.pdb"].notes)
-    assert any("it ends with an atom, without END: is it truncated?" in note for note in told["cut.pdb"].notes)
+    assert any(
+        "it ends with an atom, without END: is it truncated?" in note
+        for note in told["cut.pdb"].notes
+    )
 
 
 def test_a_state_is_not_taken_for_one_of_another_model_of_that_name(tmp_path):
@@ -740,16 +1040,23 @@ def test_a_state_is_not_taken_for_one_of_another_model_of_that_name(tmp_path):
     write_state(tmp_path / "water.npz", system.saved(system.state))
 
     def read_as(other, name="water.npz"):
-        species = dataclasses.replace(build(small_scene({other: 8}, 20.0)).species[0], name="tip4p2005")
+        species = dataclasses.replace(
+            build(small_scene({other: 8}, 20.0)).species[0], name="tip4p2005"
+        )
         return read_structure(tmp_path / name, [species], None, True, TOLERANCE, None)
 
     assert len(read_as("tip4p2005").position) == 8
-    with pytest.raises(StructureError, match=r"holds another tip4p2005 than the scene \(.*number of sites: 4, here 3"):
+    with pytest.raises(
+        StructureError,
+        match=r"holds another tip4p2005 than the scene \(.*number of sites: 4, here 3",
+    ):
         read_as("spce")
     with pytest.raises(StructureError, match=r"mass, u: 18.0154, here 39.948"):
         read_as("argon")
     saved = system.saved(system.state)
-    points = system.state._replace(rotation=np.zeros((0, 3, 3)), angular_momentum_body=np.zeros((0, 3)))
+    points = system.state._replace(
+        rotation=np.zeros((0, 3, 3)), angular_momentum_body=np.zeros((0, 3))
+    )
     write_state(tmp_path / "points.npz", saved._replace(state=points, models=None))
     with pytest.raises(StructureError, match="has no rotations, but tip4p2005 can rotate"):
         read_as("tip4p2005", "points.npz")
@@ -763,18 +1070,30 @@ def test_molecules_of_a_slanted_cell_are_made_whole(tmp_path):
     atoms = wrapped(truth.atoms(), truth.cell)
     plain = ase.Atoms([a[1] for a in atoms], [a[3] for a in atoms], cell=truth.cell, pbc=True)
     for name in ("b.gro", "b.cif", "b.lmp"):
-        ase.io.write(tmp_path / name, plain, **({"format": "lammps-data", "masses": True} if name == "b.lmp" else {}))
+        ase.io.write(
+            tmp_path / name,
+            plain,
+            **({"format": "lammps-data", "masses": True} if name == "b.lmp" else {}),
+        )
         found = read(tmp_path, (tmp_path / name).read_text(), name, periodic=False)
         assert found.residual_max < 0.02
         same_molecules(found, truth, [SPECIES["spce"]], 0.02)
-    leaning = read(tmp_path, text, "a.xyz")  # c lies on top of b: the same lattice by a cell that leans less
-    assert leaning.cell == pytest.approx(np.array([[12.0, 0, 0], [-3.0, 11.0, 0], [-5.0, -4.0, 12.0]]))
-    assert any("its lattice is given by the cell with edges 12.0000, 11.4018, 13.6015" in n for n in leaning.notes)
+    leaning = read(
+        tmp_path, text, "a.xyz"
+    )  # c lies on top of b: the same lattice by a cell that leans less
+    assert leaning.cell == pytest.approx(
+        np.array([[12.0, 0, 0], [-3.0, 11.0, 0], [-5.0, -4.0, 12.0]])
+    )
+    assert any(
+        "its lattice is given by the cell with edges 12.0000, 11.4018, 13.6015" in n
+        for n in leaning.notes
+    )
     same_molecules(leaning, truth, [SPECIES["spce"]], 1e-6)
 
 
 def test_a_cell_with_room_for_a_cut_off_is_found(tmp_path):
-    """c of this cell stands 2 Å high, yet the lattice is that of a cube: turned, the box is upright and has room."""
+    """c of this cell stands 2 Å high, yet the lattice is that of a cube: turned, the box is upright
+    and has room."""
     cell = 14.0 * np.array([[1.0, 0, 0], [2.0, 1.0, 0], [7.0, 6.0, 1.0]]) @ standard_turn(3).T
     truth = Truth(["spce"] * 8, 6, edges=(14.0, 14.0, 14.0))
     turned = [(n, e, k, x @ standard_turn(3).T, v) for n, e, k, x, v in truth.atoms()]
@@ -798,10 +1117,13 @@ ROUND_CELLS = {
 @pytest.mark.parametrize("kind", ROUND_CELLS)
 @pytest.mark.parametrize("edge", [16.0, 18.4217])
 def test_round_boxes_keep_their_cells_in_all_formats(kind, edge, tmp_path):
-    """Whatever digits a file has: lengths and angles to 0.01 degrees, vectors to 3, 5 or 8 digits."""
+    """Whatever digits a file has: lengths and angles to 0.01 degrees, vectors to 3, 5 or 8
+    digits."""
     cell = edge * np.array(ROUND_CELLS[kind])
     truth = Truth(["spce"] * 4, 6, cell=cell)
-    plain = ase.Atoms([a[1] for a in truth.atoms()], [a[3] for a in truth.atoms()], cell=cell, pbc=True)
+    plain = ase.Atoms(
+        [a[1] for a in truth.atoms()], [a[3] for a in truth.atoms()], cell=cell, pbc=True
+    )
     ase.io.write(tmp_path / "a.pdb", plain)
     texts = {"a.pdb": (tmp_path / "a.pdb").read_text()}
     for digits in (3, 5, 8):
@@ -820,7 +1142,8 @@ def test_round_boxes_keep_their_cells_in_all_formats(kind, edge, tmp_path):
 
 @pytest.mark.parametrize("kind", ROUND_CELLS)
 def test_another_cell_of_a_lattice_does_not_depend_on_digits(kind):
-    """Cells with long edges are replaced by one of many that are equally good, always by the same one."""
+    """Cells with long edges are replaced by one of many that are equally good, always by the same
+    one."""
     rng, edges = np.random.default_rng(7), 16.0 * np.array(ROUND_CELLS[kind])
     for _ in range(15):
         basis = np.eye(3, dtype=int)
@@ -855,7 +1178,9 @@ def test_residuals_are_those_of_the_best_fit(tmp_path):
     truth = Truth(["spce", "nitrogen", "argon", "benzene", "spce"], 21)
     species = [SPECIES[name] for name in ("spce", "nitrogen", "argon", "benzene")]
     rng = np.random.default_rng(1)
-    atoms = [(name, e, k, x + 0.02 * rng.standard_normal(3), v) for name, e, k, x, v in truth.atoms()]
+    atoms = [
+        (name, e, k, x + 0.02 * rng.standard_normal(3), v) for name, e, k, x, v in truth.atoms()
+    ]
     found = read(tmp_path, xyz(wrapped(atoms, truth.cell), truth.cell), "a.xyz", species)
     squares = []
     for k, m in enumerate(truth.species):
@@ -880,24 +1205,36 @@ def test_a_mirror_image_is_another_molecule(tmp_path):
     ):
         read(tmp_path, xyz(mirrored, truth.cell), "a.xyz", ["chiral"])
     image = dataclasses.replace(
-        SPECIES["chiral"], name="other_hand", positions_body=SPECIES["chiral"].positions_body * [-1, 1, 1]
+        SPECIES["chiral"],
+        name="other_hand",
+        positions_body=SPECIES["chiral"].positions_body * [-1, 1, 1],
     )
-    found = read(tmp_path, xyz(mirrored[:5] + truth.atoms()[5:], truth.cell), "a.xyz", ["chiral", image])
+    found = read(
+        tmp_path, xyz(mirrored[:5] + truth.atoms()[5:], truth.cell), "a.xyz", ["chiral", image]
+    )
     assert found.species.tolist() == [1, 0, 0, 0]
 
 
 def test_a_mirror_image_within_the_tolerance_is_noted(tmp_path):
-    """A molecule that is hardly chiral: half of a racemic crystal fits, and less well than its mirror image does."""
-    sites = [Site(name=e, element=e, mass_u=m, position_A=x) for e, m, x in (
-        ("C", 12.0, (0.0, 0.0, 0.0)), ("O", 16.0, (1.5, 0.0, 0.0)), ("N", 14.0, (-0.5, 1.4, 0.0)), ("F", 19.0, (-0.5, -1.4, 0.25)),
-    )]  # fmt: skip
+    """A molecule that is hardly chiral: half of a racemic crystal fits, and less well than its
+    mirror image does."""
+    sites = [
+        Site(name=e, element=e, mass_u=m, position_A=x)
+        for e, m, x in (
+            ("C", 12.0, (0.0, 0.0, 0.0)),
+            ("O", 16.0, (1.5, 0.0, 0.0)),
+            ("N", 14.0, (-0.5, 1.4, 0.0)),
+            ("F", 19.0, (-0.5, -1.4, 0.25)),
+        )
+    ]
     kind = molecule("nearly_flat", tuple(sites))
     truth = Truth([kind] * 4, 34)
     atoms = [(n, e, k, x * ([-1, 1, 1] if k == 2 else 1), v) for n, e, k, x, v in truth.atoms()]
     found = read(tmp_path, xyz(atoms, truth.cell), "a.xyz", [kind])
     assert found.residual_max > 0.05
     assert any(
-        re.search(r"fits nearly_flat with 0\.\d+ Å .rms., and its mirror image with 0\.000 Å", n) for n in found.notes
+        re.search(r"fits nearly_flat with 0\.\d+ Å .rms., and its mirror image with 0\.000 Å", n)
+        for n in found.notes
     )
     assert read(tmp_path, xyz(truth.atoms(), truth.cell), "a.xyz", [kind]).notes == ()
 
@@ -921,7 +1258,10 @@ def test_pairs_within_a_radius_in_any_cell():
         images = np.stack(np.meshgrid(*[np.arange(-10, 11)] * 3), -1).reshape(-1, 3) @ cell
         step = points[:, None] - points
         wanted = {
-            (i, j) for i in range(15) for j in range(i) if np.linalg.norm(step[i, j] + images, axis=1).min() <= radius
+            (i, j)
+            for i in range(15)
+            for j in range(i)
+            if np.linalg.norm(step[i, j] + images, axis=1).min() <= radius
         }
         assert 0 < len(wanted) < 105
         i, j, step = pairs_within(points + rng.integers(-5, 6, (15, 3)) @ cell, cell, radius)
@@ -932,10 +1272,15 @@ def test_pairs_within_a_radius_in_any_cell():
 
 
 def test_nearest_images_in_any_cell():
-    """Also in a cell whose edges lie so near to each other that rounded fractions give another image."""
+    """Also in a cell whose edges lie so near to each other that rounded fractions give another
+    image."""
     rng = np.random.default_rng(1)
     images = np.stack(np.meshgrid(*[np.arange(-25, 26)] * 3), -1).reshape(-1, 3)
-    for cell in (np.diag([4.0, 5.0, 6.0]), [[10.0, 0, 0], [9.9, 2.0, 0], [3.0, 1.5, 7.0]], [[5.0, 0, 0], [4.0, 5.0, 0], [-8.0, 7.0, 5.0]]):  # fmt: skip
+    for cell in (
+        np.diag([4.0, 5.0, 6.0]),
+        [[10.0, 0, 0], [9.9, 2.0, 0], [3.0, 1.5, 7.0]],
+        [[5.0, 0, 0], [4.0, 5.0, 0], [-8.0, 7.0, 5.0]],
+    ):
         vectors = rng.uniform(-12, 12, (10, 3))
         shortest = np.linalg.norm(vectors[:, None] + images @ np.array(cell), axis=2).min(axis=1)
         found = nearest_images(vectors, np.array(cell))
@@ -945,10 +1290,12 @@ def test_nearest_images_in_any_cell():
 
 
 @pytest.mark.parametrize(
-    "counts", [{"spce": 40}, {"spce": 30, "argon": 15}, {"benzene_trappe": 15}, {"hf_jorgensen": 40}]
+    "counts",
+    [{"spce": 40}, {"spce": 30, "argon": 15}, {"benzene_trappe": 15}, {"hf_jorgensen": 40}],
 )
 def test_close_sites_are_those_of_all_pairs(counts):
-    """Benzene is larger than its sites: there all sites are searched, of water those of molecules that are close."""
+    """Benzene is larger than its sites: there all sites are searched, of water those of molecules
+    that are close."""
     system, _, state = built(counts, 14.0, 1, spread=1.2, forces={"cutoff_A": 6.0})
     wanted = (0.9, every_site), (2.4, lambda m: np.flatnonzero(m.epsilon > 0))
     at, owner = system.site_positions(state), system.sites.molecule
@@ -973,7 +1320,8 @@ def rod(*labels: str, length=1.3) -> Molecule:
     return molecule("rod", tuple(sites), residue_names=("ROD",))
 
 
-#: Unit cells that are shorter than half of their molecules: upright, and with edges that lean on each other.
+#: Unit cells that are shorter than half of their molecules: upright, and with edges that lean on
+#: each other.
 SHORT_CELLS = {
     "upright": [[7.0, 0, 0], [0, 5.0, 0], [0, 0, 6.0]],
     "leaning": [[5.0, 0, 0], [3.0, 6.0, 0], [-4.0, 5.0, 7.0]],
@@ -984,10 +1332,13 @@ SHORT_CELLS = {
 @pytest.mark.parametrize("ending", ["xyz", "gro", "gro without residues", "cif"])
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_molecules_longer_than_the_cell(cell, ending, shuffled, tmp_path):
-    """They pass through faces more than once; no two of their atoms are nearest images but neighbours."""
+    """They pass through faces more than once; no two of their atoms are nearest images but
+    neighbours."""
     rng, cell = np.random.default_rng(3), np.array(SHORT_CELLS[cell])
     kind = rod("N", "C", "C", "C", "C", "O")
-    for seed in range(100):  # an orientation in which its atoms keep a distance from those of its images
+    for seed in range(
+        100
+    ):  # an orientation in which its atoms keep a distance from those of its images
         truth = Truth([kind], seed, cell=cell)
         at = np.array([x for *_, x, _ in truth.atoms()])
         images = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3), -1).reshape(-1, 3)
@@ -1020,7 +1371,9 @@ def test_polymers_are_no_molecules(elements, tmp_path):
     kind = rod(*elements)
     cell = np.diag([1.3 * len(elements), 8.0, 9.0])
     rows = [("", e, 0, np.array([1.3 * k + 0.4, 2.0, 3.0]), None) for k, e in enumerate(elements)]
-    with pytest.raises(StructureError, match=r"molecule 1 .*\(C2( O)?\) is bonded to its own image .* a polymer"):
+    with pytest.raises(
+        StructureError, match=r"molecule 1 .*\(C2( O)?\) is bonded to its own image .* a polymer"
+    ):
         read(tmp_path, xyz(rows, cell), "a.xyz", [kind])
     cell[0, 0] += 2.0  # molecules in a row
     assert len(read(tmp_path, xyz(rows, cell), "a.xyz", [kind]).species) == 1
@@ -1033,11 +1386,18 @@ def test_further_digits_and_velocities_of_a_gro(tmp_path):
     truth = Truth(["tip4p2005"] * 5, 8)
     species = [SPECIES["tip4p2005"]]
     for digits, error in ((3, 0.02), (6, 2e-5), (9, 2e-8)):
-        found = read(tmp_path, gro(truth.atoms(), box_of(truth.cell), digits, velocities=True), "a.gro", species)
+        found = read(
+            tmp_path,
+            gro(truth.atoms(), box_of(truth.cell), digits, velocities=True),
+            "a.gro",
+            species,
+        )
         same_molecules(found, truth, species, error)
         assert found.velocity == pytest.approx(truth.velocity, abs=2 * error)
         # of inertia below 3 u Å² and arms below 1 Å
-        assert found.angular_momentum_body == pytest.approx(truth.angular_momentum_body(), abs=40 * error)
+        assert found.angular_momentum_body == pytest.approx(
+            truth.angular_momentum_body(), abs=40 * error
+        )
 
 
 def test_velocities_of_some_atoms(tmp_path):
@@ -1047,18 +1407,24 @@ def test_velocities_of_some_atoms(tmp_path):
         text = gro(truth.atoms(), box_of(truth.cell), velocities=True).splitlines()
         return "\n".join(line[:44] if drop(line) else line for line in text) + "\n"
 
-    found = read(tmp_path, lines(lambda line: "MW" in line), "a.gro", ["tip4p2005"])  # they follow from the others
+    found = read(
+        tmp_path, lines(lambda line: "MW" in line), "a.gro", ["tip4p2005"]
+    )  # they follow from the others
     assert found.velocity == pytest.approx(truth.velocity, abs=0.02)
     text = lines(lambda line: "2SOL    HW1" in line)
     found = read(tmp_path, text, "b.gro", ["tip4p2005"])
     assert found.velocity is None
-    assert found.notes == ("1 of its atoms have no velocity (the first is atom 6): no velocity is used",)
+    assert found.notes == (
+        "1 of its atoms have no velocity (the first is atom 6): no velocity is used",
+    )
     data = small_scene({"tip4p2005": 5}, None).model_dump(exclude={"start"}) | {
         "box": {},
         "structure": {"file": "b.gro", "velocities": True},
         "forces": {"cutoff_A": 5.0},
     }
-    with pytest.raises(StructureError, match=r"no velocities of all atoms; 1 of its .*the first is atom 6"):
+    with pytest.raises(
+        StructureError, match=r"no velocities of all atoms; 1 of its .*the first is atom 6"
+    ):
         build(Scene.from_dict(data, tmp_path))
 
 
@@ -1072,10 +1438,15 @@ def test_velocities_in_a_column_without_units_are_not_used(column, tmp_path):
     assert found.velocity is None
     note = f"its velocities in the column {column} have no units and are not used (ASE writes momenta instead)"
     assert found.notes == (note,)
-    data = {"structure": {"file": "a.xyz", "velocities": True}, "molecules": [{"model": "argon"}],
-            "forces": {"cutoff_A": 5.0}, "stages": [{"duration_ps": 1.0}]}  # fmt: skip
+    data = {
+        "structure": {"file": "a.xyz", "velocities": True},
+        "molecules": [{"model": "argon"}],
+        "forces": {"cutoff_A": 5.0},
+        "stages": [{"duration_ps": 1.0}],
+    }
     with pytest.raises(
-        StructureError, match=rf"no velocities of all atoms; its velocities in the column {column} have no"
+        StructureError,
+        match=rf"no velocities of all atoms; its velocities in the column {column} have no",
     ):
         build(Scene.from_dict(data, tmp_path))
 
@@ -1098,12 +1469,17 @@ def test_one_of_several_frames(ending, tmp_path):
         same_molecules(found, truth, [SPECIES["spce"]], 0.02)
         assert np.diag(found.cell) == pytest.approx(np.diag(truth.cell), abs=2e-3)
     with pytest.raises(
-        StructureError, match=r"holds 3 structures.*select one by structure.frame .1 to 3, -1 for the last"
+        StructureError,
+        match=r"holds 3 structures.*select one by structure.frame .1 to 3, -1 for the last",
     ):
         read(tmp_path, text, f"a.{ending}")
-    with pytest.raises(StructureError, match=r"structure.frame is 4: it holds 3, 1 is the first and -1 the last"):
+    with pytest.raises(
+        StructureError, match=r"structure.frame is 4: it holds 3, 1 is the first and -1 the last"
+    ):
         read(tmp_path, text, f"a.{ending}", frame=4)
-    one = read(tmp_path, frames_of(ending, truths[:1]), f"b.{ending}")  # a single MODEL is no choice
+    one = read(
+        tmp_path, frames_of(ending, truths[:1]), f"b.{ending}"
+    )  # a single MODEL is no choice
     assert len(one.species) == 2
 
 
@@ -1120,16 +1496,23 @@ def lammps(truth, first_line, velocity_unit, molecule_ids=True) -> str:
         for i, (_, e, k, x, _) in enumerate(atoms, 1)
     ]
     lines += ["", "Velocities", ""]
-    lines += [f"{i} " + " ".join(f"{c / velocity_unit:.12f}" for c in v) for i, (*_, v) in enumerate(atoms, 1)]
+    lines += [
+        f"{i} " + " ".join(f"{c / velocity_unit:.12f}" for c in v)
+        for i, (*_, v) in enumerate(atoms, 1)
+    ]
     return "\n".join(lines) + "\n"
 
 
 @pytest.mark.parametrize("molecule_ids", [True, False])
-@pytest.mark.parametrize(("units", "velocity_unit"), [("real", 1000.0), ("metal", 1.0), (None, 1.0)])
+@pytest.mark.parametrize(
+    ("units", "velocity_unit"), [("real", 1000.0), ("metal", 1.0), (None, 1.0)]
+)
 def test_lammps_data(units, velocity_unit, molecule_ids, tmp_path):
     truth = Truth(["spce", "argon", "spce"], 12)
     species = [SPECIES["argon"], SPECIES["spce"]]
-    first = "LAMMPS data file via write_data, version 1, timestep = 0" + (f", units = {units}" if units else "")
+    first = "LAMMPS data file via write_data, version 1, timestep = 0" + (
+        f", units = {units}" if units else ""
+    )
     found = read(tmp_path, lammps(truth, first, velocity_unit, molecule_ids), "a.data", species)
     partner = same_molecules(found, truth, species, 1e-7)
     if units:
@@ -1141,9 +1524,15 @@ def test_lammps_data(units, velocity_unit, molecule_ids, tmp_path):
 
 def repartitioned(truth, labels=("", ""), section="") -> str:
     """Data of waters with mass moved from oxygen to hydrogen, as for long time steps."""
-    text = lammps(truth, "x, units = real", 1.0).replace("3 atom types", "2 atom types").replace("3 39.948\n", "")
+    text = (
+        lammps(truth, "x, units = real", 1.0)
+        .replace("3 atom types", "2 atom types")
+        .replace("3 39.948\n", "")
+    )
     words = [f" # {label}" if label else "" for label in labels]
-    text = text.replace("1 15.9994", f"1 9.9994{words[0]}").replace("2 1.008", f"2 4.00794{words[1]}")
+    text = text.replace("1 15.9994", f"1 9.9994{words[0]}").replace(
+        "2 1.008", f"2 4.00794{words[1]}"
+    )
     return text.replace("Masses", f"{section}Masses")
 
 
@@ -1158,21 +1547,31 @@ def test_lammps_atom_types_by_name(tmp_path):
     ways = [
         (text, {"1": "O", "2": "H"}),
         (text, {"1": "OW", "2": "HW1"}),
-        (text.replace("2 4.00794\n", "2 4.00794 # He\n"), {"1": "O", "2": "H"}),  # the scene counts for more
+        (
+            text.replace("2 4.00794\n", "2 4.00794 # He\n"),
+            {"1": "O", "2": "H"},
+        ),  # the scene counts for more
         (repartitioned(truth, ("O", "H")), None),
         (repartitioned(truth, ("OW", "HW2")), None),
         (repartitioned(truth, section="Atom Type Labels\n\n1 OW\n2 HW1\n\n"), None),
     ]
     helium = ion("He", 4.0026)  # weighs as much as this hydrogen, and counts for less than its name
-    begun = repartitioned(truth, ("Oxygen", "HW"))  # names that only begin like elements count for less than masses
+    begun = repartitioned(
+        truth, ("Oxygen", "HW")
+    )  # names that only begin like elements count for less than masses
     for file, atom_types, others in [(*way, [helium]) for way in ways] + [(begun, None, [])]:
         found = read(tmp_path, file, "a.data", ["spce", *others], atom_types=atom_types)
         same_molecules(found, truth, [SPECIES["spce"]], 1e-6)
-        assert any("masses of the scene are used, not the masses in the file" in note for note in found.notes)
+        assert any(
+            "masses of the scene are used, not the masses in the file" in note
+            for note in found.notes
+        )
     found = read(tmp_path, text.replace("9.9994", "15.9994").replace("4.00794", "1.008"), "a.data")
     assert not any("masses" in note for note in found.notes)
     heavy = with_masses(SPECIES["spce"], {"O": 9.9994, "H": 4.00794})
-    assert len(read(tmp_path, text, "a.data", [heavy]).species) == 4  # or by masses that the scene has too
+    assert (
+        len(read(tmp_path, text, "a.data", [heavy]).species) == 4
+    )  # or by masses that the scene has too
 
 
 def test_the_element_of_a_site_counts_for_more_than_that_of_its_file(tmp_path):
@@ -1195,7 +1594,9 @@ def test_the_element_of_a_site_counts_for_more_than_that_of_its_file(tmp_path):
     site = {"name": "1", "sigma_A": 3.73, "epsilon_K": 148.0}
     for entry, element in ((site, "O"), (site | {"element": "C"}, "C")):
         molecules = [{"file": "methane.data", "sites": [entry], "count": 5}]
-        assert build(small_scene({}, 20.0, tmp_path, molecules=molecules)).species[0].elements == (element,)
+        assert build(small_scene({}, 20.0, tmp_path, molecules=molecules)).species[0].elements == (
+            element,
+        )
 
 
 def test_lammps_atom_types_without_masses_and_with_massless_sites(tmp_path):
@@ -1205,8 +1606,12 @@ def test_lammps_atom_types_without_masses_and_with_massless_sites(tmp_path):
     text = text[:begin] + text[end:]
     numbers = {"O": 1, "H": 2, "X": 3, "Ar": 4}
     for i, (_, element, *_) in enumerate(truth.atoms(), 1):
-        text = re.sub(rf"^({i} \d+) \d+ 0.0 ", rf"\1 {numbers[element]} 0.0 ", text, flags=re.MULTILINE)
-    with pytest.raises(StructureError, match=r"no section Masses.*name its atom types by structure.atom_types"):
+        text = re.sub(
+            rf"^({i} \d+) \d+ 0.0 ", rf"\1 {numbers[element]} 0.0 ", text, flags=re.MULTILINE
+        )
+    with pytest.raises(
+        StructureError, match=r"no section Masses.*name its atom types by structure.atom_types"
+    ):
         read(tmp_path, text, "a.data", ["tip4p2005", "argon"])
     for massless in ("MW", "X"):
         atom_types = {"1": "O", "2": "H", "3": massless, "4": "Ar"}
@@ -1218,11 +1623,17 @@ def test_lammps_atom_types_without_masses_and_with_massless_sites(tmp_path):
     ("atom_types", "message"),
     [
         ({"1": "O"}, r"structure.atom_types has no name for type 2"),
-        ({"1": "O", "2": "H", "7": "H", "OW": "O"}, r"structure.atom_types: unknown type 7, OW; there are 1, 2"),
-        ({"1": "O", "2": "hw1"}, r"structure.atom_types.2 = 'hw1' is not a site or element .* there are OW, HW1, HW2, O, H; did you mean HW1\?"),
+        (
+            {"1": "O", "2": "H", "7": "H", "OW": "O"},
+            r"structure.atom_types: unknown type 7, OW; there are 1, 2",
+        ),
+        (
+            {"1": "O", "2": "hw1"},
+            r"structure.atom_types.2 = 'hw1' is not a site or element .* there are OW, HW1, HW2, O, H; did you mean HW1\?",
+        ),
         ({"1": "H", "2": "O"}, r"molecule 1 .* has atoms H O2, expected spce \(O H2\)"),
     ],
-)  # fmt: skip
+)
 def test_atom_types_that_do_not_fit_the_file(atom_types, message, tmp_path):
     with pytest.raises(StructureError, match=message):
         read(tmp_path, repartitioned(WATERS), "a.data", atom_types=atom_types)
@@ -1232,7 +1643,13 @@ def test_atom_types_of_a_scene(tmp_path):
     (tmp_path / "a.data").write_text(repartitioned(Truth(["spce"] * 8, 5)))
     structure = {"file": "a.data", "atom_types": {"1": "O", "2": "H"}}
     scene = small_scene(
-        {}, None, tmp_path, molecules=[{"model": "spce"}], box={}, structure=structure, forces={"cutoff_A": 6.0}
+        {},
+        None,
+        tmp_path,
+        molecules=[{"model": "spce"}],
+        box={},
+        structure=structure,
+        forces={"cutoff_A": 6.0},
     )
     assert len(build(scene).model.species) == 8
 
@@ -1267,10 +1684,17 @@ def test_long_pdbs_whose_numbers_run_out(tmp_path):
     truth = Truth(["spce"] * 8, 13)
     text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"A{k:03d}")  # hybrid-36
     same_molecules(read(tmp_path, text, "a.pdb"), truth, [SPECIES["spce"]], 0.002)
-    text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"   {k // 2}")  # two of each number, in two chains
-    lines = [line.replace(" A   ", " B   ") if (k - 1) % 6 < 3 else line for k, line in enumerate(text.splitlines())]
+    text = pdb(
+        truth.atoms(), cryst1(truth.cell), number=lambda k: f"   {k // 2}"
+    )  # two of each number, in two chains
+    lines = [
+        line.replace(" A   ", " B   ") if (k - 1) % 6 < 3 else line
+        for k, line in enumerate(text.splitlines())
+    ]
     assert read(tmp_path, "\n".join(lines) + "\n", "c.pdb").notes == ()
-    text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: "****")  # GROMACS and others beyond 9999
+    text = pdb(
+        truth.atoms(), cryst1(truth.cell), number=lambda k: "****"
+    )  # GROMACS and others beyond 9999
     same_molecules(read(tmp_path, text, "b.pdb"), truth, [SPECIES["spce"]], 0.002)
 
 
@@ -1285,7 +1709,11 @@ def test_what_this_engine_writes_it_reads(ending, tmp_path):
     file.close()
     write_topology(tmp_path / "t.gro", system, moved, wrapped=True)
     write_state(tmp_path / "t.npz", system.saved(moved))
-    for name, frame, error in ((f"t.{ending}", -1, 2e-3), ("t.gro", None, 0.02), ("t.npz", None, 0.0)):
+    for name, frame, error in (
+        (f"t.{ending}", -1, 2e-3),
+        ("t.gro", None, 0.02),
+        ("t.npz", None, 0.0),
+    ):
         found = read_structure(tmp_path / name, system.species, None, True, TOLERANCE, frame)
         step = found.position - moved.position
         assert np.abs(step - 20 * np.round(step / 20)).max() <= error
@@ -1303,7 +1731,10 @@ def test_heavy_water_starts_like_light(there, wanted, ending, tmp_path):
         "pdb": pdb(atoms, cryst1(truth.cell)),
         "xyz": xyz(atoms, truth.cell),
     }
-    sites = [Site(**site | {"element": site["element"].replace("H", wanted)}) for site in SPECIES["spce"].sites()]
+    sites = [
+        Site(**site | {"element": site["element"].replace("H", wanted)})
+        for site in SPECIES["spce"].sites()
+    ]
     water = molecule("spce", tuple(sites), residue_names=("SOL", "HOH"))
     found = read(tmp_path, text[ending], f"a.{ending}", [water])
     assert found.residual_max < 0.02
@@ -1365,7 +1796,9 @@ def test_a_crystal_is_repeated_from_its_cell(tmp_path):
 
 
 def test_a_disordered_crystal_is_refused(tmp_path):
-    with pytest.raises(StructureError, match=r"occupied only partly \(H1 0.5\): the crystal is disordered"):
+    with pytest.raises(
+        StructureError, match=r"occupied only partly \(H1 0.5\): the crystal is disordered"
+    ):
         read(tmp_path, cif(0.5), "ice.cif")
 
 
@@ -1382,7 +1815,9 @@ def test_a_disordered_crystal_is_refused(tmp_path):
 def test_no_box(box, note, tmp_path):
     truth = Truth(["spce"] * 3, 14)
     text = gro(truth.atoms(), box)
-    with pytest.raises(StructureError, match=r"has no box.*give \[box\] lengths_A, or periodic = false"):
+    with pytest.raises(
+        StructureError, match=r"has no box.*give \[box\] lengths_A, or periodic = false"
+    ):
         read(tmp_path, text, "a.gro")
     found = read(tmp_path, text, "a.gro", cell=np.diag([14.0, 15.0, 16.0]))
     same_molecules(found, truth, [SPECIES["spce"]], 0.02)
@@ -1393,9 +1828,16 @@ def test_no_box(box, note, tmp_path):
 def test_placeholder_boxes(tmp_path):
     truth = Truth(["spce"] * 3, 14)
     text = pdb(truth.atoms(), cryst1(np.eye(3)))
-    with pytest.raises(StructureError, match=r"has no box .its cell, a cube of 1 Å, stands for none"):
+    with pytest.raises(
+        StructureError, match=r"has no box .its cell, a cube of 1 Å, stands for none"
+    ):
         read(tmp_path, text, "a.pdb")
-    same_molecules(read(tmp_path, text, "a.pdb", cell=np.diag([14.0, 15.0, 16.0])), truth, [SPECIES["spce"]], 0.002)
+    same_molecules(
+        read(tmp_path, text, "a.pdb", cell=np.diag([14.0, 15.0, 16.0])),
+        truth,
+        [SPECIES["spce"]],
+        0.002,
+    )
 
 
 def test_the_scene_may_want_another_box_than_the_file(tmp_path):
@@ -1418,16 +1860,35 @@ def test_a_slab_has_no_box_of_its_own(tmp_path):
 
 
 def data_of(
-    truth, style="full", masses="1 15.9994\n2 1.008", types=("1", "2"), header="Atoms # STYLE\n", head=""
+    truth,
+    style="full",
+    masses="1 15.9994\n2 1.008",
+    types=("1", "2"),
+    header="Atoms # STYLE\n",
+    head="",
 ) -> str:
     """LAMMPS data of waters with these columns."""
-    order = {"molecular": "{i} {m} {t} {x}", "charge": "{i} {t} {q} {x}", "atomic": "{i} {t} {x}", "full": "{i} {m} {t} {q} {x}",
-             "hybrid full": "{i} {t} {x} {m} {q}", "sphere": "{i} {t} 1.0 1.0 {x}"}[style]  # fmt: skip
+    order = {
+        "molecular": "{i} {m} {t} {x}",
+        "charge": "{i} {t} {q} {x}",
+        "atomic": "{i} {t} {x}",
+        "full": "{i} {m} {t} {q} {x}",
+        "hybrid full": "{i} {t} {x} {m} {q}",
+        "sphere": "{i} {t} 1.0 1.0 {x}",
+    }[style]
     rows = [
-        order.format(i=i, m=k + 1, t=types[e == "H"], q=0.41 if e == "H" else -0.82, x=" ".join(f"{c:.10f}" for c in x))
+        order.format(
+            i=i,
+            m=k + 1,
+            t=types[e == "H"],
+            q=0.41 if e == "H" else -0.82,
+            x=" ".join(f"{c:.10f}" for c in x),
+        )
         for i, (_, e, k, x, _) in enumerate(truth.atoms(), 1)
     ]
-    edges = "".join(f"0 {x:.9f} {axis}lo {axis}hi\n" for x, axis in zip(np.diag(truth.cell), "xyz", strict=True))
+    edges = "".join(
+        f"0 {x:.9f} {axis}lo {axis}hi\n" for x, axis in zip(np.diag(truth.cell), "xyz", strict=True)
+    )
     section = f"Masses\n\n{masses}\n\n" if masses else ""
     return (
         f"made by hand\n\n{head}{len(rows)} atoms\n2 atom types\n{edges}\n{section}{header.replace('STYLE', style)}"
@@ -1444,18 +1905,29 @@ DATA = {
     "no style, atomic": data_of(WATER_DATA, "atomic", header="Atoms\n\n"),
     "no empty line": data_of(WATER_DATA, "full", header="Atoms\n"),
     "columns as comment": data_of(WATER_DATA, header="Atoms  # id mol type q x y z\n\n"),
-    "long names of columns": data_of(WATER_DATA, header="Atoms  # atom-ID molecule-ID atom-type q x y z\n\n"),
+    "long names of columns": data_of(
+        WATER_DATA, header="Atoms  # atom-ID molecule-ID atom-type q x y z\n\n"
+    ),
     "upper case": data_of(WATER_DATA, header="Atoms # Full\n\n"),
     "hybrid": data_of(WATER_DATA, "hybrid full"),
     "sphere": data_of(WATER_DATA, "sphere"),
-    "comments": data_of(WATER_DATA, head="# a comment\n").replace("24 atoms", "24 atoms  # all of them").replace("xlo xhi", "xlo xhi # Å"),
+    "comments": data_of(WATER_DATA, head="# a comment\n")
+    .replace("24 atoms", "24 atoms  # all of them")
+    .replace("xlo xhi", "xlo xhi # Å"),
     "indented": "\n".join(f"  {line}" for line in data_of(WATER_DATA).splitlines()),
     "labels of masses": data_of(WATER_DATA, types=LABELS, masses="OW 15.9994\nHW 1.008"),
-    "labels everywhere": data_of(WATER_DATA, types=LABELS, masses="OW 15.9994\nHW 1.008", header="Atom Type Labels\n\n1 OW\n2 HW\n\nAtoms # full\n\n"),
-    "labels of atoms": data_of(WATER_DATA, types=LABELS, header="Atom Type Labels\n\n1 OW\n2 HW\n\nAtoms # full\n\n"),
+    "labels everywhere": data_of(
+        WATER_DATA,
+        types=LABELS,
+        masses="OW 15.9994\nHW 1.008",
+        header="Atom Type Labels\n\n1 OW\n2 HW\n\nAtoms # full\n\n",
+    ),
+    "labels of atoms": data_of(
+        WATER_DATA, types=LABELS, header="Atom Type Labels\n\n1 OW\n2 HW\n\nAtoms # full\n\n"
+    ),
     "labels without masses": data_of(WATER_DATA, types=LABELS, masses=""),
     "exponents": data_of(WATER_DATA).replace(".0000000000", "D+00"),
-}  # fmt: skip
+}
 
 
 #: Tilts xy, xz, yz of LAMMPS' boxes: the extremes of the bounds of dumps are at different corners.
@@ -1483,11 +1955,15 @@ def test_tilted_boxes_of_lammps_data(tilts, bounds, general, tmp_path):
     text = data_of(truth)
     box = re.search(r"0 .* xlo xhi\n.*\n.* zlo zhi\n", text)[0]
     lines = [
-        f"{low} {low + edge} {axis}lo {axis}hi\n" for low, edge, axis in zip(bounds, (15, 16, 17), "xyz", strict=True)
+        f"{low} {low + edge} {axis}lo {axis}hi\n"
+        for low, edge, axis in zip(bounds, (15, 16, 17), "xyz", strict=True)
     ]
     lines.append(f"{xy} {xz} {yz} xy xz yz\n")
     if general:
-        lines = [f"{' '.join(map(str, edge))} {name}vec\n" for edge, name in zip(truth.cell, "abc", strict=True)]
+        lines = [
+            f"{' '.join(map(str, edge))} {name}vec\n"
+            for edge, name in zip(truth.cell, "abc", strict=True)
+        ]
     found = read(tmp_path, text.replace(box, "".join(lines)), "a.data")
     assert found.cell == pytest.approx(truth.cell)
     same_molecules(found, truth, [SPECIES["spce"]], 1e-7)
@@ -1496,19 +1972,40 @@ def test_tilted_boxes_of_lammps_data(tilts, bounds, general, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (data_of(WATER_DATA, "sphere", header="Atoms\n\n"), r"line 16: the meaning of the 7 columns .* 'Atoms # molecular'"),
-        (data_of(WATER_DATA, "molecular", header="Atoms # full\n\n"), r"line 16: an atom of style 'full' has 7 columns .*, found 6"),
+        (
+            data_of(WATER_DATA, "sphere", header="Atoms\n\n"),
+            r"line 16: the meaning of the 7 columns .* 'Atoms # molecular'",
+        ),
+        (
+            data_of(WATER_DATA, "molecular", header="Atoms # full\n\n"),
+            r"line 16: an atom of style 'full' has 7 columns .*, found 6",
+        ),
         (data_of(WATER_DATA).replace("24 atoms\n", ""), "has no line with the number of atoms"),
-        (data_of(WATER_DATA).replace("24 atoms\n", "23 atoms\n"), "line 3 promises 23 atoms, the section Atoms has 24"),
-        (data_of(WATER_DATA).replace("2 1.008", "3 1.008"), "its section Masses has no mass of type 2"),
-        (data_of(WATER_DATA).replace("2 1.008", "2 light"), "line 12: expected a type and its mass, found 'light'"),
+        (
+            data_of(WATER_DATA).replace("24 atoms\n", "23 atoms\n"),
+            "line 3 promises 23 atoms, the section Atoms has 24",
+        ),
+        (
+            data_of(WATER_DATA).replace("2 1.008", "3 1.008"),
+            "its section Masses has no mass of type 2",
+        ),
+        (
+            data_of(WATER_DATA).replace("2 1.008", "2 light"),
+            "line 12: expected a type and its mass, found 'light'",
+        ),
         (data_of(WATER_DATA, masses=""), "has no section Masses"),
         (data_of(WATER_DATA) + "25 9 1\n", "line 3 promises 24 atoms, the section Atoms has 25"),
-        (data_of(WATER_DATA, header="Atoms # bond\n\n"), "line 16: an atom of style 'bond' has 6 columns .*, found 7"),
-        (data_of(WATER_DATA).replace("\n3 1 2 ", "\n3 x 2 "), r"line 17: expected an atom .id mol type q x y z., found '3 x 2"),
+        (
+            data_of(WATER_DATA, header="Atoms # bond\n\n"),
+            "line 16: an atom of style 'bond' has 6 columns .*, found 7",
+        ),
+        (
+            data_of(WATER_DATA).replace("\n3 1 2 ", "\n3 x 2 "),
+            r"line 17: expected an atom .id mol type q x y z., found '3 x 2",
+        ),
         (data_of(WATER_DATA).replace("xlo xhi", "xlo"), "a line 'LOW HIGH xlo xhi' is missing"),
     ],
-)  # fmt: skip
+)
 def test_lammps_data_that_cannot_be_read_say_where(text, message, tmp_path):
     with pytest.raises(StructureError, match=message):
         read(tmp_path, text, "a.data")
@@ -1523,7 +2020,9 @@ def test_images_of_lammps_atoms(tmp_path):
     found = read(tmp_path, "\n".join(lines), "a.data")
     assert found.cell == pytest.approx(truth.cell)
     partner = same_molecules(found, truth, [SPECIES["spce"]], 1e-7)
-    assert found.position == pytest.approx(truth.centre[partner] + np.array([1, -2, 3]) @ truth.cell, abs=1e-6)
+    assert found.position == pytest.approx(
+        truth.centre[partner] + np.array([1, -2, 3]) @ truth.cell, abs=1e-6
+    )
 
 
 def dump_of(truth, columns, flags="pp pp pp", units="") -> str:
@@ -1540,10 +2039,17 @@ def dump_of(truth, columns, flags="pp pp pp", units="") -> str:
             "label": {"O": "OW", "H": "HW", "X": "MW"}[e],
             "mass": {"O": 15.9994, "H": 1.008, "X": 1e-8}[e],
         }
-        values |= dict(zip(("x", "y", "z"), x, strict=True)) | dict(zip(("xs", "ys", "zs"), scaled, strict=True))
-        values |= dict(zip(("xu", "yu", "zu"), x, strict=True)) | dict(zip(("vx", "vy", "vz"), v / 1000, strict=True))
+        values |= dict(zip(("x", "y", "z"), x, strict=True)) | dict(
+            zip(("xs", "ys", "zs"), scaled, strict=True)
+        )
+        values |= dict(zip(("xu", "yu", "zu"), x, strict=True)) | dict(
+            zip(("vx", "vy", "vz"), v / 1000, strict=True)
+        )
         rows.append(
-            " ".join(f"{values[c]:.12g}" if isinstance(values[c], float) else str(values[c]) for c in columns.split())
+            " ".join(
+                f"{values[c]:.12g}" if isinstance(values[c], float) else str(values[c])
+                for c in columns.split()
+            )
         )
     xy, xz, yz = cell[1, 0], cell[2, 0], cell[2, 1]
     low, high = np.array([1.0, 2, 3]), np.array([1.0, 2, 3]) + np.diag(cell)
@@ -1554,9 +2060,17 @@ def dump_of(truth, columns, flags="pp pp pp", units="") -> str:
         f"{a:.12f} {b:.12f}" + (f" {t:.12f}" if slanted else "")
         for a, b, t in zip(low, high, (xy, xz, yz), strict=True)
     )
-    head = (f"ITEM: UNITS\n{units}\n" if units else "") + f"ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n{len(rows)}\n"
+    head = (
+        f"ITEM: UNITS\n{units}\n" if units else ""
+    ) + f"ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n{len(rows)}\n"
     box = f"ITEM: BOX BOUNDS {'xy xz yz ' if slanted else ''}{flags}\n{bounds}\n"
-    return head + box + f"ITEM: ATOMS {columns}\n" + "\n".join(rows[::-1] if "id" in columns else rows) + "\n"
+    return (
+        head
+        + box
+        + f"ITEM: ATOMS {columns}\n"
+        + "\n".join(rows[::-1] if "id" in columns else rows)
+        + "\n"
+    )
 
 
 @pytest.mark.parametrize(
@@ -1586,7 +2100,9 @@ def test_lammps_dumps(columns, tilts, tmp_path):
     told = not {"element", "mass", "label", "typelabel"} & set(columns.split())
     species = [SPECIES["tip4p2005"]]
     for frame, there in ((1, truth), (2, second)):
-        found = read_structure(path, species, None, True, TOLERANCE, frame, atom_types=names if told else None)
+        found = read_structure(
+            path, species, None, True, TOLERANCE, frame, atom_types=names if told else None
+        )
         partner = same_molecules(found, there, species, 1e-6)
         assert found.cell == pytest.approx(there.cell, abs=1e-6)
         if "vx" in columns:
@@ -1597,10 +2113,15 @@ def test_lammps_dumps(columns, tilts, tmp_path):
             read_structure(path, species, None, True, TOLERANCE, 1)
 
 
-@pytest.mark.parametrize("columns", ["id typelabel x y z", "id type typelabel x y z", "id label x y z"])
+@pytest.mark.parametrize(
+    "columns", ["id typelabel x y z", "id type typelabel x y z", "id label x y z"]
+)
 def test_labels_of_a_dump_are_named_by_atom_types(columns, tmp_path):
     text = dump_of(WATER_DATA, columns).replace(" OW ", " water_O ").replace(" HW ", " +h ")
-    with pytest.raises(StructureError, match=r"has atoms named .h, water_O, .* structure.atom_types gives them names"):
+    with pytest.raises(
+        StructureError,
+        match=r"has atoms named .h, water_O, .* structure.atom_types gives them names",
+    ):
         read(tmp_path, text, "a.dump")
     found = read(tmp_path, text, "a.dump", atom_types={"water_O": "O", "+h": "H"})
     same_molecules(found, WATER_DATA, [SPECIES["spce"]], 1e-6)
@@ -1609,14 +2130,26 @@ def test_labels_of_a_dump_are_named_by_atom_types(columns, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("ITEM: ATOMS id type x y z", "ITEM: ATOMS id type q"), "line 9: has no columns of coordinates"),
-        (("ITEM: NUMBER OF ATOMS\n24", "ITEM: NUMBER OF ATOMS\n25"), "line 4 promises 25 atoms, 24 are there"),
-        (("ITEM: ATOMS id type x y z", "ITEM: ATOMS id type x y z ix"), "line 10: expected 6 columns"),
+        (
+            ("ITEM: ATOMS id type x y z", "ITEM: ATOMS id type q"),
+            "line 9: has no columns of coordinates",
+        ),
+        (
+            ("ITEM: NUMBER OF ATOMS\n24", "ITEM: NUMBER OF ATOMS\n25"),
+            "line 4 promises 25 atoms, 24 are there",
+        ),
+        (
+            ("ITEM: ATOMS id type x y z", "ITEM: ATOMS id type x y z ix"),
+            "line 10: expected 6 columns",
+        ),
         (
             ("ITEM: ATOMS id type x y z", "ITEM: ATOMS id q x y z"),
             "line 9: has no column that names its atoms: type, typel",
         ),
-        (("ITEM: NUMBER OF ATOMS", "ITEM: NUMBER"), "line 1: expected ITEM: NUMBER OF ATOMS, BOX BOUNDS and ATOMS"),
+        (
+            ("ITEM: NUMBER OF ATOMS", "ITEM: NUMBER"),
+            "line 1: expected ITEM: NUMBER OF ATOMS, BOX BOUNDS and ATOMS",
+        ),
         (("pp pp pp", "pp pp ff"), "its cell is periodic along a, b only"),
     ],
 )
@@ -1630,16 +2163,21 @@ def test_lammps_dumps_that_cannot_be_read_say_where(change, message, tmp_path):
 def test_velocities_of_a_dump_without_units_are_not_used(tmp_path):
     found = read(tmp_path, dump_of(WATER_DATA, "id element x y z vx vy vz"), "a.dump")
     assert found.velocity is None
-    assert found.notes == ("it does not name its units (dump_modify units yes): its velocities are not used",)
+    assert found.notes == (
+        "it does not name its units (dump_modify units yes): its velocities are not used",
+    )
 
 
 def wide_pdb(atoms, cell, serial, shift) -> str:
-    """A .pdb whose numbers are as wide as printf makes them. serial: of the first atom; shift: Å."""
+    """A .pdb whose numbers are as wide as printf makes them. serial: of the first atom; shift:
+    Å."""
     lines = [cryst1(cell)]
     for i, (name, element, k, x, _) in enumerate(atoms):
         number = serial + i if isinstance(serial, int) else serial
         place = "".join(f"{c:8.3f}" for c in x + shift)
-        lines.append(f"HETATM{number:>5}  {name:<3} HOH A{k + 9998:>4}    {place}  1.00  0.00          {element:>2}")
+        lines.append(
+            f"HETATM{number:>5}  {name:<3} HOH A{k + 9998:>4}    {place}  1.00  0.00          {element:>2}"
+        )
     return "\n".join([*lines, "END"]) + "\n"
 
 
@@ -1662,11 +2200,17 @@ def test_coordinates_of_a_pdb_that_are_not_in_columns(tmp_path):
         for i, (n, _, k, x, _) in enumerate(truth.atoms())
     ]
     same_molecules(
-        read(tmp_path, "\n".join([cryst1(truth.cell), *rows, "END"]), "a.pdb"), truth, [SPECIES["spce"]], 1e-5
+        read(tmp_path, "\n".join([cryst1(truth.cell), *rows, "END"]), "a.pdb"),
+        truth,
+        [SPECIES["spce"]],
+        1e-5,
     )
-    stars = pdb(truth.atoms(), cryst1(truth.cell)).replace(f"{truth.atoms()[0][3][0]:8.3f}", "********")
+    stars = pdb(truth.atoms(), cryst1(truth.cell)).replace(
+        f"{truth.atoms()[0][3][0]:8.3f}", "********"
+    )
     with pytest.raises(
-        StructureError, match=r"line 2: expected an atom of a .pdb with coordinates in columns 31 to 54, found"
+        StructureError,
+        match=r"line 2: expected an atom of a .pdb with coordinates in columns 31 to 54, found",
     ):
         read(tmp_path, stars, "b.pdb")
 
@@ -1723,23 +2267,28 @@ def spoiled(text, how):
             )
         case "exponents":
             return "\n".join(
-                re.sub(r"(\d\.\d+)(?=\s|$)", r"\1D+00", line) if k > 1 else line for k, line in enumerate(lines)
+                re.sub(r"(\d\.\d+)(?=\s|$)", r"\1D+00", line) if k > 1 else line
+                for k, line in enumerate(lines)
             )
         case "empty lines before":
             return "\n \n\n" + text
         case "empty lines after":
             return text + "\n  \n\n"
         case "tabs":
-            return "\n".join(line.replace(" ", "\t") if k > 1 else line for k, line in enumerate(lines))
+            return "\n".join(
+                line.replace(" ", "\t") if k > 1 else line for k, line in enumerate(lines)
+            )
         case "types":
             return "\n".join(
-                line.replace("O", "1").replace("H", "2") if k > 1 else line for k, line in enumerate(lines)
+                line.replace("O", "1").replace("H", "2") if k > 1 else line
+                for k, line in enumerate(lines)
             )
     return text
 
 
 @pytest.mark.parametrize(
-    "how", ["atomic numbers", "exponents", "empty lines before", "empty lines after", "tabs", "types"]
+    "how",
+    ["atomic numbers", "exponents", "empty lines before", "empty lines after", "tabs", "types"],
 )
 @pytest.mark.parametrize("extended", [False, True])
 def test_xyz_of_other_programs(how, extended, tmp_path):
@@ -1755,7 +2304,9 @@ def test_xyz_of_other_programs(how, extended, tmp_path):
         atom_types={"1": "O", "2": "H"} if how == "types" else None,
     )
     same_molecules(found, truth, [SPECIES["spce"]], 1e-6)
-    (tmp_path / "a.xyz").write_text(spoiled("3\n\nO 0.0 0.0 0.0\nH 1.0 0.0 0.0\nH 0.0 1.0 0.0\n", how))
+    (tmp_path / "a.xyz").write_text(
+        spoiled("3\n\nO 0.0 0.0 0.0\nH 1.0 0.0 0.0\nH 0.0 1.0 0.0\n", how)
+    )
     if how != "types":
         names, elements, *_ = read_geometry(tmp_path / "a.xyz")
         assert names == elements == ["O", "H", "H"]
@@ -1771,14 +2322,23 @@ def test_frames_with_empty_lines_between_them(ending, gap, tmp_path):
         same_molecules(found, truths[frame - (frame > 0)], [SPECIES["spce"]], 0.02)
     with pytest.raises(StructureError, match=r"holds 3 structures"):
         read(tmp_path, text, f"a.{ending}")
-    with pytest.raises(StructureError, match=r"line \d+: expected the number of atoms|is truncated|promises|no atoms"):
-        read(tmp_path, f"{text}nonsense\nnonsense\nnonsense\n" if ending != "pdb" else "nonsense", f"b.{ending}")
+    with pytest.raises(
+        StructureError,
+        match=r"line \d+: expected the number of atoms|is truncated|promises|no atoms",
+    ):
+        read(
+            tmp_path,
+            f"{text}nonsense\nnonsense\nnonsense\n" if ending != "pdb" else "nonsense",
+            f"b.{ending}",
+        )
 
 
 def text_in(ending) -> str:
     truth = Truth(["spce"] * 4, 29)
     if ending == "cif":
-        plain = ase.Atoms([a[1] for a in truth.atoms()], [a[3] for a in truth.atoms()], cell=truth.cell, pbc=True)
+        plain = ase.Atoms(
+            [a[1] for a in truth.atoms()], [a[3] for a in truth.atoms()], cell=truth.cell, pbc=True
+        )
         written = io.BytesIO()
         ase.io.write(written, plain, format="cif")
         return written.getvalue().decode()
@@ -1787,7 +2347,9 @@ def text_in(ending) -> str:
     if ending == "dump":
         return dump_of(truth, "id element x y z")
     if ending == "vasp":
-        plain = ase.Atoms([a[1] for a in truth.atoms()], [a[3] for a in truth.atoms()], cell=truth.cell, pbc=True)
+        plain = ase.Atoms(
+            [a[1] for a in truth.atoms()], [a[3] for a in truth.atoms()], cell=truth.cell, pbc=True
+        )
         written = io.StringIO()
         ase.io.write(written, plain, format="vasp")
         return written.getvalue()
@@ -1838,7 +2400,13 @@ def test_a_format_is_known_by_how_a_file_begins(name, ending, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "model"),
-    [("SOD", "na_spce"), ("POT", "k_spce"), ("CES", "cs_spce"), ("CLA", "cl_spce"), ("LIT", "li_spce")],
+    [
+        ("SOD", "na_spce"),
+        ("POT", "k_spce"),
+        ("CES", "cs_spce"),
+        ("CLA", "cl_spce"),
+        ("LIT", "li_spce"),
+    ],
 )
 @pytest.mark.parametrize("named", [False, True])
 def test_ions_by_the_names_of_charmm(name, model, named, tmp_path):
@@ -1847,15 +2415,31 @@ def test_ions_by_the_names_of_charmm(name, model, named, tmp_path):
     if named:
         ion = dataclasses.replace(ion, residue_names=("ION",))
     rows = [(name if k % 2 else n, e, k, x, v) for n, e, k, x, v in truth.atoms()]
-    text = gro(rows, box_of(truth.cell), 6, residue_names={1: "ION" if named else name, 3: "ION" if named else name})
-    same_molecules(read(tmp_path, text, "a.gro", ["spce", ion]), truth, [SPECIES["spce"], ion], 1e-4)
+    text = gro(
+        rows,
+        box_of(truth.cell),
+        6,
+        residue_names={1: "ION" if named else name, 3: "ION" if named else name},
+    )
+    same_molecules(
+        read(tmp_path, text, "a.gro", ["spce", ion]), truth, [SPECIES["spce"], ion], 1e-4
+    )
     lines = pdb(rows, cryst1(truth.cell), element_column=False, residue=name).splitlines()
-    lines = [line if name in line[12:16] else line.replace(f" {name} A", " SOL A") for line in lines]
-    same_molecules(read(tmp_path, "\n".join(lines), "a.pdb", ["spce", ion]), truth, [SPECIES["spce"], ion], 2e-3)
+    lines = [
+        line if name in line[12:16] else line.replace(f" {name} A", " SOL A") for line in lines
+    ]
+    same_molecules(
+        read(tmp_path, "\n".join(lines), "a.pdb", ["spce", ion]),
+        truth,
+        [SPECIES["spce"], ion],
+        2e-3,
+    )
 
 
 def test_an_atom_of_any_name_in_the_residue_of_a_point(tmp_path):
-    bead = molecule("bead", (Site(name="B1", mass_u=72.0, position_A=(0.0, 0.0, 0.0)),), residue_names=("W",))
+    bead = molecule(
+        "bead", (Site(name="B1", mass_u=72.0, position_A=(0.0, 0.0, 0.0)),), residue_names=("W",)
+    )
     truth = Truth([bead] * 3 + ["argon"], 31)
     rows = [("SC5" if k < 3 else n, e, k, x, v) for n, e, k, x, v in truth.atoms()]
     text = gro(rows, box_of(truth.cell), 6, residue_names={0: "W", 1: "W", 2: "W", 3: "AR"})
@@ -1868,7 +2452,9 @@ def test_an_atom_of_any_name_in_the_residue_of_a_point(tmp_path):
 
 def as_gen(rows, cell) -> str:
     kinds = list(dict.fromkeys(name for name, _ in rows))
-    lines = [f"{k} {kinds.index(name) + 1} {x} {y} {z}" for k, (name, (x, y, z)) in enumerate(rows, 1)]
+    lines = [
+        f"{k} {kinds.index(name) + 1} {x} {y} {z}" for k, (name, (x, y, z)) in enumerate(rows, 1)
+    ]
     edges = "\n".join(" ".join(map(str, edge)) for edge in cell)
     return "\n".join([f"{len(rows)} S", " ".join(kinds), *lines, "0 0 0", edges, ""])
 
@@ -1888,7 +2474,10 @@ def as_g96(rows, cell, velocity=None) -> str:
 
 def as_dl_poly(rows, cell) -> str:
     edges = "\n".join("".join(f"{x:20.10f}" for x in edge) for edge in cell)
-    atoms = "\n".join(f"{name:<8}{k:10d}\n{''.join(f'{x:20.10f}' for x in at)}" for k, (name, at) in enumerate(rows, 1))
+    atoms = "\n".join(
+        f"{name:<8}{k:10d}\n{''.join(f'{x:20.10f}' for x in at)}"
+        for k, (name, at) in enumerate(rows, 1)
+    )
     return f"water\n         0         2\n{edges}\n{atoms}\n"
 
 
@@ -1920,14 +2509,18 @@ FORMATS = {
 def test_massless_sites_in_formats_that_know_elements(file, massless, tmp_path):
     truth = Truth(["tip4p2005"] * 3, 40)
     names = {"OW": "O", "HW1": "H", "HW2": "H", "MW": massless}
-    text = FORMATS[file]([(names[name], tuple(x)) for name, _, _, x, _ in truth.atoms()], truth.cell)
+    text = FORMATS[file](
+        [(names[name], tuple(x)) for name, _, _, x, _ in truth.atoms()], truth.cell
+    )
     same_molecules(read(tmp_path, text, file, ("tip4p2005",)), truth, [SPECIES["tip4p2005"]], 1e-4)
 
 
 @pytest.mark.parametrize("file", FORMATS)
 def test_deuterium_in_formats_that_know_elements(file, tmp_path):
     truth = Truth(["spce"] * 3, 41)
-    text = FORMATS[file]([(e.replace("H", "D"), tuple(x)) for _, e, _, x, _ in truth.atoms()], truth.cell)
+    text = FORMATS[file](
+        [(e.replace("H", "D"), tuple(x)) for _, e, _, x, _ in truth.atoms()], truth.cell
+    )
     same_molecules(read(tmp_path, text, file), truth, [SPECIES["spce"]], 1e-4)
 
 
@@ -1957,14 +2550,21 @@ def test_velocities_and_frames_of_g96(tmp_path):
         assert found.velocity == pytest.approx(truth.velocity[partner], abs=1e-4)
     for old, new, message in (
         ("BOX", "BOX\n1 2 3 4", "expected the box, 3 or 9 numbers"),
-        ("    1 MIX   OW         1", "    1                   ", "expected residue number, residue name, atom name"),
+        (
+            "    1 MIX   OW         1",
+            "    1                   ",
+            "expected residue number, residue name, atom name",
+        ),
         ("END\nBOX", "BOX", "three numbers of VELOCITY from column 25"),
     ):
         with pytest.raises(StructureError, match=message):
             read(tmp_path, texts[0].replace(old, new), "a.g96")
     with pytest.raises(StructureError, match="its block POSITION has no END: truncated"):
         read(tmp_path, texts[0][: texts[0].index("END\nVEL")], "a.g96")
-    with pytest.raises(StructureError, match="names an atom Zz, but ASE, which reads this format, knows elements only"):
+    with pytest.raises(
+        StructureError,
+        match="names an atom Zz, but ASE, which reads this format, knows elements only",
+    ):
         read(tmp_path, as_gen([("Zz", (0, 0, 0))], np.diag([9.0] * 3)), "a.gen")
 
 
@@ -1979,22 +2579,40 @@ WATERS = Truth(["spce"] * 4)
 GRO = gro(WATERS.atoms(), box_of(WATERS.cell))
 DAMAGED = {
     "cut.gro": (cut(GRO, 8), r"line 2 promises 12 atoms and a box, 5 are there: truncated\?"),
-    "cut_in_line.gro": (cut(GRO, 13) + GRO.splitlines()[13][:30] + "\n1 1 1\n", r"line 14: expected an atom of a .gro"),
-    "no_number.gro": (GRO.replace("\n12\n", "\ntwelve\n"), r"line 2: expected the number of atoms, found 'twelve'"),
+    "cut_in_line.gro": (
+        cut(GRO, 13) + GRO.splitlines()[13][:30] + "\n1 1 1\n",
+        r"line 14: expected an atom of a .gro",
+    ),
+    "no_number.gro": (
+        GRO.replace("\n12\n", "\ntwelve\n"),
+        r"line 2: expected the number of atoms, found 'twelve'",
+    ),
     "too_few.gro": (
         GRO.replace("\n12\n", "\n11\n"),
         r"line 14: expected the box, 3 or 9 numbers .is the number of atoms right",
     ),
     "no_box.gro": (cut(GRO, 14), r"promises 12 atoms and a box, 11 are there"),
-    "box.gro": (cut(GRO, 14) + "1.4 1.5\n", r"line 15: expected the box, 3 or 9 numbers .*found '1.4 1.5'"),
-    "nan.gro": (GRO.replace(GRO.splitlines()[4][20:28], "     nan"), r"atom 3 has a position that is not a finite"),
-    "nan_box.gro": (cut(GRO, 14) + "1.4 nan 1.4\n", r"its box has an edge that is not a finite number"),
+    "box.gro": (
+        cut(GRO, 14) + "1.4 1.5\n",
+        r"line 15: expected the box, 3 or 9 numbers .*found '1.4 1.5'",
+    ),
+    "nan.gro": (
+        GRO.replace(GRO.splitlines()[4][20:28], "     nan"),
+        r"atom 3 has a position that is not a finite",
+    ),
+    "nan_box.gro": (
+        cut(GRO, 14) + "1.4 nan 1.4\n",
+        r"its box has an edge that is not a finite number",
+    ),
     "empty.gro": ("", "holds no atoms"),
     "cut.pdb": (
         cryst1(WATERS.cell) + "\nATOM      1  O   HOH A   1       1.000   2.0\n",
         "line 2: expected an atom of a .pdb",
     ),
-    "edges_only.pdb": ("CRYST1   14.000   15.000   16.000\n" + pdb(WATERS.atoms(), ""), "line 1: CRYST1 needs three"),
+    "edges_only.pdb": (
+        "CRYST1   14.000   15.000   16.000\n" + pdb(WATERS.atoms(), ""),
+        "line 1: CRYST1 needs three",
+    ),
     "alternate.pdb": (
         "ATOM      1  O  AHOH A   1       1.000   2.000   3.000\nATOM      2  O  BHOH A   1       1.000   2.000   3.100\n",
         "alternate locations A, B",
@@ -2005,15 +2623,33 @@ DAMAGED = {
         '3\nLattice="9 0 0 0 9 0 0"\nO 0 0 0\nH 0 0 0\nH 0 0 0\n',
         "line 2: expected nine numbers of Lattice",
     ),
-    "columns.xyz": ("1\nProperties=species:S:1:pos:R:3:vel:R:3\nO 0 0 0\n", "line 3: expected 7 columns, species:S:1"),
-    "decimals.xyz": ("1\n\nO 0,1 0,2 0,3\n", "line 3: expected an atom of an .xyz: name, x, y, z, found"),
-    "nameless.xyz": ('1\nLattice="9 0 0 0 9 0 0 0 9" Properties=pos:R:3\n0 0 0\n', "has no atoms with mass"),
+    "columns.xyz": (
+        "1\nProperties=species:S:1:pos:R:3:vel:R:3\nO 0 0 0\n",
+        "line 3: expected 7 columns, species:S:1",
+    ),
+    "decimals.xyz": (
+        "1\n\nO 0,1 0,2 0,3\n",
+        "line 3: expected an atom of an .xyz: name, x, y, z, found",
+    ),
+    "nameless.xyz": (
+        '1\nLattice="9 0 0 0 9 0 0 0 9" Properties=pos:R:3\n0 0 0\n',
+        "has no atoms with mass",
+    ),
     "empty.cif": (" \n", "holds no atoms: it is empty"),
-    "words.xyz": ("3\n\nO a b c\nH 0 0 0\nH 0 0 0\n", "line 3: expected an atom of an .xyz: .* found 'a b c'"),
-    "cut.data": (cut(lammps(WATERS, "x", 1.0), 24), r"line 3 promises 12 atoms, 7 are there: truncated\?"),
+    "words.xyz": (
+        "3\n\nO a b c\nH 0 0 0\nH 0 0 0\n",
+        "line 3: expected an atom of an .xyz: .* found 'a b c'",
+    ),
+    "cut.data": (
+        cut(lammps(WATERS, "x", 1.0), 24),
+        r"line 3 promises 12 atoms, 7 are there: truncated\?",
+    ),
     "no_masses.data": (lammps(WATERS, "x", 1.0).replace("Masses", "Madness"), "no section Masses"),
     "cut.cif": (cut(cif(), 8), "holds no atoms"),
-    "cut_in_atoms.cif": (cif()[:-12], r"line 9: this is not valid CIF: Wrong number of values in loop _atom_site"),
+    "cut_in_atoms.cif": (
+        cif()[:-12],
+        r"line 9: this is not valid CIF: Wrong number of values in loop _atom_site",
+    ),
     "binary.gro": ("\x00\x01", "line 2: expected the number of atoms"),
     "strange.foo": ("x", "format is unknown to ASE"),
 }
@@ -2028,7 +2664,10 @@ def test_damaged_files_get_a_message(name, tmp_path):
 
 def test_titles_in_any_encoding(tmp_path):
     (tmp_path / "a.gro").write_bytes(GRO.replace("t\n", "Gefrierpunkt 0 °C\n", 1).encode("latin-1"))
-    assert len(read_structure(tmp_path / "a.gro", [SPECIES["spce"]], None, True, TOLERANCE).species) == 4
+    assert (
+        len(read_structure(tmp_path / "a.gro", [SPECIES["spce"]], None, True, TOLERANCE).species)
+        == 4
+    )
     (tmp_path / "a.gro").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(StructureError, match="line 2: expected the number of atoms"):
         read_structure(tmp_path / "a.gro", [SPECIES["spce"]], None, True, TOLERANCE)
@@ -2045,11 +2684,15 @@ def test_coordinates_in_other_units(unit, angstrom, tmp_path):
 def test_species_that_the_scene_lacks(tmp_path):
     truth = Truth(["spce", "nitrogen", "spce", "argon"], 17)
     with pytest.raises(
-        StructureError, match=r"atoms named Ar, N, which are in no molecule of the scene: spce \(O H2\)"
+        StructureError,
+        match=r"atoms named Ar, N, which are in no molecule of the scene: spce \(O H2\)",
     ):
         read(tmp_path, xyz(truth.atoms(), truth.cell), "a.xyz")
     text = gro(truth.atoms(), box_of(truth.cell), residue_names={1: "N2", 3: "AR"})
-    with pytest.raises(StructureError, match=r"molecule 2 \(atoms 4 to 5, residue 'N2'\) has atoms N2, expected spce"):
+    with pytest.raises(
+        StructureError,
+        match=r"molecule 2 \(atoms 4 to 5, residue 'N2'\) has atoms N2, expected spce",
+    ):
         read(tmp_path, text, "a.gro")
 
 
@@ -2061,22 +2704,32 @@ def test_of_two_species_the_one_that_fits_is_taken(file_model, tmp_path):
     found = read(tmp_path, text, "a.xyz", ["spce", "tip4p2005"])
     same_molecules(found, truth, [SPECIES["spce"], SPECIES["tip4p2005"]], 1e-6)
     other = {"spce": "tip4p2005", "tip4p2005": "spce"}[file_model]
-    assert f"3 molecules taken for {file_model} and not {other}, which fits less well" in found.notes
+    assert (
+        f"3 molecules taken for {file_model} and not {other}, which fits less well" in found.notes
+    )
 
 
 @pytest.mark.parametrize("stretch", [1.0, 1.03])
 def test_like_species_need_residue_names(stretch, tmp_path):
     """Two models of one geometry, and a geometry between those of two models."""
     other = dataclasses.replace(SPECIES["tip4p2005"], name="tip4p_ice", residue_names=())
-    species = [SPECIES["tip4p2005"], other] if stretch == 1.0 else [SPECIES["spce"], SPECIES["tip4p2005"]]
+    species = (
+        [SPECIES["tip4p2005"], other] if stretch == 1.0 else [SPECIES["spce"], SPECIES["tip4p2005"]]
+    )
     truth = Truth(["tip4p2005"] * 3, 18)
     atoms = truth.atoms(massless=False)
     if stretch != 1.0:
-        means = [0.5 * (a + b) for a, b in zip(*(m.positions_body[:3] for m in species), strict=True)]
-        atoms = [
-            (n, e, k, truth.centre[k] + truth.rotation[k] @ means[i % 3], v) for i, (n, e, k, _, v) in enumerate(atoms)
+        means = [
+            0.5 * (a + b) for a, b in zip(*(m.positions_body[:3] for m in species), strict=True)
         ]
-    with pytest.raises(StructureError, match=r"molecule 1 .atoms 1 to 3, .* may be .* or .*: give them residue_names"):
+        atoms = [
+            (n, e, k, truth.centre[k] + truth.rotation[k] @ means[i % 3], v)
+            for i, (n, e, k, _, v) in enumerate(atoms)
+        ]
+    with pytest.raises(
+        StructureError,
+        match=r"molecule 1 .atoms 1 to 3, .* may be .* or .*: give them residue_names",
+    ):
         read(tmp_path, xyz(atoms, truth.cell), "a.xyz", species)
 
 

@@ -25,7 +25,12 @@ PAST = {
     "support.py": (["rigidmd"], "is the door"),
     "test_compile.py": (["rigidmd.compile", "rigidmd.forces.terms"], OPEN),
     "test_program.py": (
-        ["rigidmd.compile", "rigidmd.dynamics.step_loop", "rigidmd.engines.cpu.program", "rigidmd.forces.neighbors"],
+        [
+            "rigidmd.compile",
+            "rigidmd.dynamics.step_loop",
+            "rigidmd.engines.cpu.program",
+            "rigidmd.forces.neighbors",
+        ],
         OPEN,
     ),
     "test_sources.py": (["rigidmd.compile.sources", "rigidmd.forces"], OPEN),
@@ -36,7 +41,10 @@ PAST = {
         ["rigidmd.compile", "rigidmd.core.state", "rigidmd.forces.terms"],
         "a new field as a file of the package",
     ),
-    "test_forces.py": (["rigidmd.compile", "rigidmd.forces"], "a new pair potential as a file of the package"),
+    "test_forces.py": (
+        ["rigidmd.compile", "rigidmd.forces"],
+        "a new pair potential as a file of the package",
+    ),
     "test_run.py": (
         ["rigidmd.commands.arguments", "rigidmd.compile.cache"],
         "a command in a file of its own, and a compiler that is called",
@@ -59,7 +67,8 @@ FILES = sorted(TESTS.rglob("*.py"))
 
 
 def inner_imports(source):
-    """(line, module) of all imports of inner modules in Python text, and in the text of scripts inside of it."""
+    """(line, module) of all imports of inner modules in Python text, and in the text of scripts
+    inside of it."""
     for node in ast.walk(ast.parse(source)):
         found = []
         if isinstance(node, ast.Import):
@@ -70,11 +79,18 @@ def inner_imports(source):
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             script = re.findall(r"(?:^|[\n;] *)(?:from|import) (rigidmd[\w.]*)", node.value)
             found = [name for name in script if is_module(name)]
-        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") in ("setattr", "delattr"):
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") in (
+            "setattr",
+            "delattr",
+        ):
             asked = node.args[0]
             if isinstance(asked, ast.Constant) and str(asked.value).startswith("rigidmd."):
                 found = [str(asked.value).rpartition(".")[0]]
-        yield from ((node.lineno, name) for name in found if name.split(".")[0] == "rigidmd" and name not in PUBLIC)
+        yield from (
+            (node.lineno, name)
+            for name in found
+            if name.split(".")[0] == "rigidmd" and name not in PUBLIC
+        )
 
 
 def is_module(name):
@@ -84,7 +100,8 @@ def is_module(name):
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(TESTS).as_posix())
 def test_tests_take_inner_names_from_support(path):
-    """A module that moves then changes a line of support.py. What is to go past it is listed in PAST with its reason."""
+    """A module that moves then changes a line of support.py. What is to go past it is listed in
+    PAST with its reason."""
     allowed, _ = PAST.get(path.name, ([], None))
     strange = sorted(
         f"{path.relative_to(ROOT)}:{line}: {module}"
@@ -109,7 +126,11 @@ def names_wanted():
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.ImportFrom) and node.module == "support":
                 wanted.update(alias.name for alias in node.names)
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and "from support import" in node.value:
+            elif (
+                isinstance(node, ast.Constant)
+                and isinstance(node.value, str)
+                and "from support import" in node.value
+            ):
                 for names in re.findall(r"from support import ([\w, ]+)", node.value):
                     wanted.update(names.split(", "))
     return wanted
@@ -123,6 +144,8 @@ def test_names_of_support_are_there_once_and_wanted():
     for name in listed:
         assert getattr(support, name) is not None, name
     wanted = names_wanted()
-    assert sorted(name for name in listed if not wanted[name]) == [], "no test imports them: strike them out"
+    assert sorted(name for name in listed if not wanted[name]) == [], (
+        "no test imports them: strike them out"
+    )
     with pytest.raises(AttributeError, match=r"support\.py has no 'nothing'"):
         _ = support.nothing

@@ -1,4 +1,5 @@
-"""Sweeps: what is asked for, points in processes of their own, stops of every kind, tables, clusters, bad input."""
+"""Sweeps: what is asked for, points in processes of their own, stops of every kind, tables,
+clusters, bad input."""
 
 import csv
 import json
@@ -99,7 +100,10 @@ def table(folder):
 
 
 def states(folder):
-    return {point["folder"]: point["state"] for point in json.loads((folder / "sweep.json").read_text())["points"]}
+    return {
+        point["folder"]: point["state"]
+        for point in json.loads((folder / "sweep.json").read_text())["points"]
+    }
 
 
 def written(folder):
@@ -112,7 +116,9 @@ def same_runs(first, second):
     names = sorted(path.parent.name for path in first.glob("*/log.csv"))
     assert names == sorted(path.parent.name for path in second.glob("*/log.csv"))
     files = ("log.csv", "trajectory.xtc")
-    return all((first / n / f).read_bytes() == (second / n / f).read_bytes() for n in names for f in files)
+    return all(
+        (first / n / f).read_bytes() == (second / n / f).read_bytes() for n in names for f in files
+    )
 
 
 # What is asked for
@@ -132,13 +138,14 @@ def same_runs(first, second):
         ("a={b=1,c=[2,3]},{b=2,c=[4,5]}", ("a",), ({"b": 1, "c": [2, 3]}, {"b": 2, "c": [4, 5]})),
         ("a,b.c=1,2", ("a", "b.c"), (1, 2)),
     ],
-)  # fmt: skip
+)
 def test_values_of_a_key(text, keys, values):
     assert parse_axis(text) == Axis(keys, values)
 
 
 @pytest.mark.parametrize(
-    ("text", "value"), [("a=3", 3), ("a=[1,2]", [1, 2]), ("a=", None), ('a="1,2"', "1,2"), ("a=x.gro", "x.gro")]
+    ("text", "value"),
+    [("a=3", 3), ("a=[1,2]", [1, 2]), ("a=", None), ('a="1,2"', "1,2"), ("a=x.gro", "x.gro")],
 )
 def test_one_value_is_the_same_for_all_points(text, value):
     assert parse_axis(text) == Axis(("a",), (value,), swept=False)
@@ -147,12 +154,19 @@ def test_one_value_is_the_same_for_all_points(text, value):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("seed", "is not KEY=VALUE"), ("=1,2", "is not KEY=VALUE"), ("a,=1,2", "is not KEY=VALUE"),
-        ("seed=1,,2", "empty value"), ("seed=1,", "empty value"), ("seed=4..1", "the range 4..1 is empty"),
-        ("seed=0.1..0.5", "not a range of whole numbers"), ("seed=1..10000000", "more than 100000 values"),
-        ("a=[1,2", "] is missing"), ("a=1]", "] closes nothing"), ('a="x,y', '" is missing'),
+        ("seed", "is not KEY=VALUE"),
+        ("=1,2", "is not KEY=VALUE"),
+        ("a,=1,2", "is not KEY=VALUE"),
+        ("seed=1,,2", "empty value"),
+        ("seed=1,", "empty value"),
+        ("seed=4..1", "the range 4..1 is empty"),
+        ("seed=0.1..0.5", "not a range of whole numbers"),
+        ("seed=1..10000000", "more than 100000 values"),
+        ("a=[1,2", "] is missing"),
+        ("a=1]", "] closes nothing"),
+        ('a="x,y', '" is missing'),
     ],
-)  # fmt: skip
+)
 def test_values_that_are_none(text, expected):
     with pytest.raises(SceneError, match=re.escape(expected)):
         parse_axis(text)
@@ -160,17 +174,34 @@ def test_values_that_are_none(text, expected):
 
 def test_names_of_points():
     short = short_keys(["stages.0.temperature_K", "seed"])
-    assert point_name({"stages.0.temperature_K": 280.0, "seed": 1}, short) == "temperature_K=280_seed=1"
+    assert (
+        point_name({"stages.0.temperature_K": 280.0, "seed": 1}, short)
+        == "temperature_K=280_seed=1"
+    )
     assert list(short_keys(["stages.0.timestep_fs", "stages.1.timestep_fs"]).values()) == [
-        "0.timestep_fs", "1.timestep_fs",
-    ]  # fmt: skip
+        "0.timestep_fs",
+        "1.timestep_fs",
+    ]
     assert value_name([30, 30.5, 31]) == "30x30.5x31"
-    assert (value_name(True), value_name(1e-5), value_name(0.1), value_name("spce")) == ("true", "1e-05", "0.1", "spce")
-    strange = [value_name(text) for text in ("../../etc", "..", "", "a b", "a/b", "a-b", "x" * 500, "é\n", "-")]
-    assert all(re.fullmatch(r"[\w.+\-]{0,60}", name) and not name.startswith(".") for name in strange)
+    assert (value_name(True), value_name(1e-5), value_name(0.1), value_name("spce")) == (
+        "true",
+        "1e-05",
+        "0.1",
+        "spce",
+    )
+    strange = [
+        value_name(text)
+        for text in ("../../etc", "..", "", "a b", "a/b", "a-b", "x" * 500, "é\n", "-")
+    ]
+    assert all(
+        re.fullmatch(r"[\w.+\-]{0,60}", name) and not name.startswith(".") for name in strange
+    )
     assert len({*strange}) == len(strange)
     long = [
-        point_name({f"key{k}": f"{'x' * 30}{end}" for k in range(9)}, {f"key{k}": f"key{k}" for k in range(9)})
+        point_name(
+            {f"key{k}": f"{'x' * 30}{end}" for k in range(9)},
+            {f"key{k}": f"key{k}" for k in range(9)},
+        )
         for end in "ab"
     ]
     assert long[0] != long[1]
@@ -199,7 +230,10 @@ def test_a_sweep_is_a_folder_a_point_a_table_and_a_figure(finished):
     names = [f"temperature_K={t}_seed={s}" for t in (90, 120) for s in (1, 2)]
     assert states(finished) == dict.fromkeys(names, "finished")
     rows = table(finished)
-    assert [(row["start.temperature_K"], row["runs"]) for row in rows] == [("90", "2"), ("120", "2")]
+    assert [(row["start.temperature_K"], row["runs"]) for row in rows] == [
+        ("90", "2"),
+        ("120", "2"),
+    ]
     for row, temperature in zip(rows, (90, 120), strict=True):
         found = []
         for seed in (1, 2):
@@ -232,16 +266,25 @@ def test_the_energy_of_a_molecule_has_its_share_of_the_error(finished):
     found = summarise_run(replace(record, columns=columns))
     energy, error = found["Potential Energy (kJ/mole)"]
     assert error > 0.1
-    assert found["Potential Energy per molecule (kJ/mole)"] == pytest.approx((energy / 20, error / 20))
+    assert found["Potential Energy per molecule (kJ/mole)"] == pytest.approx(
+        (energy / 20, error / 20)
+    )
 
 
 def test_what_has_finished_is_not_run_again(copied, argon, capsys):
     before = written(copied)
-    assert cli.main(["sweep", str(argon), *GRID[2:], *GRID[:2], "-o", str(copied)]) == 0  # keys in any order
+    assert (
+        cli.main(["sweep", str(argon), *GRID[2:], *GRID[:2], "-o", str(copied)]) == 0
+    )  # keys in any order
     assert "4 skipped" in capsys.readouterr().out
     assert written(copied) == before
     # one value more, of a key that is varied
-    assert cli.main(["sweep", str(argon), *GRID[:2], "--set", "seed=3", "-o", str(copied), "--jobs", "1"]) == 0
+    assert (
+        cli.main(
+            ["sweep", str(argon), *GRID[:2], "--set", "seed=3", "-o", str(copied), "--jobs", "1"]
+        )
+        == 0
+    )
     assert "2 finished, 0 failed, 4 skipped" in capsys.readouterr().out
     assert {name: time for name, time in written(copied).items() if name in before} == before
     assert [row["runs"] for row in table(copied)] == ["3", "3"]
@@ -264,12 +307,18 @@ def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
     assert cli.main(["analyse", str(copied), "--only", "rdf,structure_factor"]) == 0
     assert "temperature_K = 90: 2 runs" in capsys.readouterr().out
     mean = copied / "temperature_K=90"
-    own = [np.genfromtxt(copied / f"temperature_K=90_seed={k}" / "rdf.csv", delimiter=",", names=True) for k in (1, 2)]
+    own = [
+        np.genfromtxt(copied / f"temperature_K=90_seed={k}" / "rdf.csv", delimiter=",", names=True)
+        for k in (1, 2)
+    ]
     both = np.genfromtxt(mean / "rdf.csv", delimiter=",", names=True)
     g, error = (name for name in both.dtype.names if name.startswith("g_"))
     assert both[g] == pytest.approx((own[0][g] + own[1][g]) / 2, abs=1e-7)
     assert both[error] == pytest.approx(np.abs(own[0][g] - own[1][g]) / 2, abs=1e-7)
-    assert json.loads((mean / "analysis.json").read_text())["analyses"].keys() == {"rdf", "structure_factor"}
+    assert json.loads((mean / "analysis.json").read_text())["analyses"].keys() == {
+        "rdf",
+        "structure_factor",
+    }
     with (copied / "analysis.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["runs"] for row in rows] == ["2", "2"]
@@ -278,12 +327,18 @@ def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
     (copied / "notes.txt").write_text("mine")
     (copied / "temperature_K=90_seed=1" / "mine.txt").write_text("mine")
     with ExitStack() as stack:
-        assert sweeping.open_sweep(stack, argon, [Axis(("seed",), (1, 2))], copied, force=True).left == 2
+        assert (
+            sweeping.open_sweep(stack, argon, [Axis(("seed",), (1, 2))], copied, force=True).left
+            == 2
+        )
     assert [path.name for path in copied.iterdir() if path.is_dir()] == ["temperature_K=90_seed=1"]
     assert [path.name for path in (copied / "temperature_K=90_seed=1").iterdir()] == ["mine.txt"]
-    assert {path.name for path in copied.iterdir() if path.is_file() and not path.name.startswith(".")} == {
-        "notes.txt", "sweep.json",
-    }  # fmt: skip
+    assert {
+        path.name for path in copied.iterdir() if path.is_file() and not path.name.startswith(".")
+    } == {
+        "notes.txt",
+        "sweep.json",
+    }
     assert states(copied) == {"seed=1": "waiting", "seed=2": "waiting"}
 
 
@@ -294,21 +349,36 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(limits, "MOST_PANELS", 2)  # drawing takes most of the time
     folder = tmp_path / "steps"
     swept = ["--set", f"{STEP}=5,10,20", "--set", "start.temperature_K=90,120"]
-    fixed = ["--set", "stages.0.duration_ps=2", "--set", "output.log_interval_ps=0.02", "-o", str(folder)]
+    fixed = [
+        "--set",
+        "stages.0.duration_ps=2",
+        "--set",
+        "output.log_interval_ps=0.02",
+        "-o",
+        str(folder),
+    ]
     with ExitStack() as stack:
         axes = [parse_axis(text) for text in (*swept[1::2][:2], fixed[1], fixed[3])]
         there = sweeping.open_sweep(stack, argon, axes, folder, step=STEP)
         for point in there.manifest.points:
-            Simulation(Scene.read(argon, there.manifest.overrides(point)), folder / point.folder).run(progress=False)
+            Simulation(
+                Scene.read(argon, there.manifest.overrides(point)), folder / point.folder
+            ).run(progress=False)
     assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
     assert re.search(r"first peak \(Å\) .*\d ± \d", capsys.readouterr().out)
     assert cli.main(["sweep", str(argon), *swept, *fixed, "--extrapolate", STEP]) == 0
     said = capsys.readouterr().out
-    assert "averages at a step of 0, from errors of order dt² (velocity_verlet) in stages.0.timestep_fs" in said
+    assert (
+        "averages at a step of 0, from errors of order dt² (velocity_verlet) in stages.0.timestep_fs"
+        in said
+    )
     assert "sweep.png, extrapolation.csv, extrapolation.png, extrapolation.html" in said
     with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
         rows = {(row["start.temperature_K"], row["average"]): row for row in csv.DictReader(file)}
-    means = {(row["start.temperature_K"], row[STEP]): float(row["Temperature (K)"]) for row in table(folder)}
+    means = {
+        (row["start.temperature_K"], row[STEP]): float(row["Temperature (K)"])
+        for row in table(folder)
+    }
     for temperature in ("90", "120"):
         assert any(at == temperature and "first peak (Å)" in name for at, name in rows)
         row = rows[temperature, "Temperature (K)"]
@@ -321,13 +391,16 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
 
 
 def test_values_of_replicas_together_are_extrapolated(argon, tmp_path):
-    """Not the means of the values of single runs: heights of peaks differ, and diffusion has none there."""
+    """Not the means of the values of single runs: heights of peaks differ, and diffusion has none
+    there."""
     folder = tmp_path / "steps"
     swept = {STEP: [5, 10], "seed": [1, 2, 3], "stages.0.duration_ps": 2.0}
     with ExitStack() as stack:
         there = sweeping.open_sweep(stack, argon, sweeping.axes_of(swept), folder, step=STEP)
         for point in there.manifest.points:
-            Simulation(Scene.read(argon, there.manifest.overrides(point)), folder / point.folder).run(progress=False)
+            Simulation(
+                Scene.read(argon, there.manifest.overrides(point)), folder / point.folder
+            ).run(progress=False)
     assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
     with (folder / "analysis.csv").open(encoding="utf-8") as file:
         together = {float(row[STEP]): row for row in csv.DictReader(file)}
@@ -338,23 +411,34 @@ def test_values_of_replicas_together_are_extrapolated(argon, tmp_path):
         biased = float(limit["limit"]) + float(limit[f"bias at {step:g} fs"])
         assert biased == pytest.approx(float(row[name]), rel=1e-6)
         tables = [
-            json.loads((folder / point.folder / "analysis.json").read_text())["analyses"]["rdf"]["values"]
+            json.loads((folder / point.folder / "analysis.json").read_text())["analyses"]["rdf"][
+                "values"
+            ]
             for point in there.manifest.points
             if point.values[STEP] == step
         ]
-        singles = [next(value for value in values if "height" in value["name"])["value"] for values in tables]
+        singles = [
+            next(value for value in values if "height" in value["name"])["value"]
+            for values in tables
+        ]
         assert abs(np.mean(singles) - float(row[name])) > 1e-4
 
 
 def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path):
     """By dt⁴ for srkn_4: 1, 16, 81 times the slope."""
     folder = tmp_path / "steps"
-    fixed = {"stages.0.duration_ps": 2.0, "output.log_interval_ps": 0.02, "stages.0.integrator": "srkn_4"}
+    fixed = {
+        "stages.0.duration_ps": 2.0,
+        "output.log_interval_ps": 0.02,
+        "stages.0.integrator": "srkn_4",
+    }
     with ExitStack() as stack:
         axes = sweeping.axes_of({STEP: [5, 10, 20]} | fixed)
         there = sweeping.open_sweep(stack, argon, axes, folder, step=STEP)
         for point in there.manifest.points:
-            Simulation(Scene.read(argon, there.manifest.overrides(point)), folder / point.folder).run(progress=False)
+            Simulation(
+                Scene.read(argon, there.manifest.overrides(point)), folder / point.folder
+            ).run(progress=False)
         found = limits.extrapolate_sweep(folder, there.manifest, STEP)
     assert "dt⁴ (srkn_4)" in found.title
     assert {limit.fit.order for limit in found.limits} == {4}
@@ -374,30 +458,57 @@ def test_a_file_of_one_point_that_changes_is_noticed(tmp_path, monkeypatch):
         before = sweeping.open_sweep(stack, scene, axes, tmp_path / "s").manifest
     (tmp_path / "b.xyz").write_text("2\n\nAr 0 0 0\nAr 0 0 6\n")
     with (
-        pytest.raises(OutputError, match=r"another scene: a file that file=b.xyz reads has changed"),
+        pytest.raises(
+            OutputError, match=r"another scene: a file that file=b.xyz reads has changed"
+        ),
         ExitStack() as stack,
     ):
         sweeping.open_sweep(stack, scene, axes, tmp_path / "s")
     (tmp_path / "b.xyz").write_text("2\n\nAr 0 0 0\nAr 0 0 5\n")
     with ExitStack() as stack:
         after = sweeping.open_sweep(stack, scene, axes, tmp_path / "s").manifest
-    assert [point.scene_sha256 for point in after.points] == [point.scene_sha256 for point in before.points]
+    assert [point.scene_sha256 for point in after.points] == [
+        point.scene_sha256 for point in before.points
+    ]
 
 
 def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):
     (scene := tmp_path / "argon.toml").write_text(ARGON + "[[stages]]\nduration_ps = 1\n")
     steps = ["--set", "stages.0.timestep_fs=2,4"]
     for arguments, expected in (
-        ([*steps, "--extrapolate", "stages.nve.timestep_fs"], "is not varied; this sweep varies stages.0.timestep_fs"),
-        (["--set", "seed=1,2", "--extrapolate", "seed"], "seed is not the time step of a stage of molecules"),
-        ([*steps, "--extrapolate", "stages.0.timestep_fs", "--to", "slurm", "--walltime", "1:00:00"], "needs results"),
-        ([*steps, "--extrapolate", "stages.0.timestep_fs"], "is not the step of the stage whose averages are taken"),
+        (
+            [*steps, "--extrapolate", "stages.nve.timestep_fs"],
+            "is not varied; this sweep varies stages.0.timestep_fs",
+        ),
+        (
+            ["--set", "seed=1,2", "--extrapolate", "seed"],
+            "seed is not the time step of a stage of molecules",
+        ),
+        (
+            [
+                *steps,
+                "--extrapolate",
+                "stages.0.timestep_fs",
+                "--to",
+                "slurm",
+                "--walltime",
+                "1:00:00",
+            ],
+            "needs results",
+        ),
+        (
+            [*steps, "--extrapolate", "stages.0.timestep_fs"],
+            "is not the step of the stage whose averages are taken",
+        ),
     ):
         assert cli.main(["sweep", str(scene), *arguments, "-o", str(tmp_path / "none")]) == 2
         assert expected in capsys.readouterr().err
         assert not (tmp_path / "none").exists()
     point = finished / "temperature_K=90_seed=1"
-    assert cli.main(["analyse", str(point), "--extrapolate", "stages.0.timestep_fs", "--only", "rdf"]) == 2
+    assert (
+        cli.main(["analyse", str(point), "--extrapolate", "stages.0.timestep_fs", "--only", "rdf"])
+        == 2
+    )
     assert "needs a sweep over a time step" in capsys.readouterr().err
 
 
@@ -413,7 +524,10 @@ def test_analyses_of_a_sweep_go_on_without_a_damaged_point(copied, capsys, monke
     assert cli.main(["analyse", str(copied), "--only", "rdf,viscosity,structure_factor"]) == 1
     said = capsys.readouterr().out
     assert re.search(r"temperature_K=90_seed=1: skipped: .*cannot be read as a trajectory", said)
-    assert "rdf: skipped: an error of rigidmd, please report it: ZeroDivisionError: of no use (test_sweep.py:" in said
+    assert (
+        "rdf: skipped: an error of rigidmd, please report it: ZeroDivisionError: of no use (test_sweep.py:"
+        in said
+    )
     assert "viscosity: skipped: a viscosity needs the pressure tensor" in said
     with (copied / "analysis.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -456,16 +570,24 @@ timestep_fs = 5
     with ExitStack() as stack:
         there = sweeping.open_sweep(stack, scene, [parse_axis(f"{together}=90,110")], folder)
         for point in there.manifest.points:
-            Simulation(Scene.read(scene, there.manifest.overrides(point)), folder / point.folder).run(progress=False)
+            Simulation(
+                Scene.read(scene, there.manifest.overrides(point)), folder / point.folder
+            ).run(progress=False)
     assert cli.main(["sweep", str(scene), "-o", str(folder), "--collect"]) == 0
     said = capsys.readouterr().out
     assert "density: Density (g/mL)" in said
     for row, point in zip(table(folder), there.manifest.points, strict=True):
         stage = json.loads((folder / point.folder / "summary.json").read_text())["stages"][0]
-        assert float(row["density: Density (g/mL)"]) == pytest.approx(stage["density_g_cm3"], rel=1e-6)
+        assert float(row["density: Density (g/mL)"]) == pytest.approx(
+            stage["density_g_cm3"], rel=1e-6
+        )
         if stage["density_error_g_cm3"] is not None:
-            assert float(row["density: Density (g/mL) error"]) == pytest.approx(stage["density_error_g_cm3"], rel=1e-6)
-        assert float(row["density: Temperature (K)"]) == pytest.approx(stage["temperature_K"], rel=1e-6)
+            assert float(row["density: Density (g/mL) error"]) == pytest.approx(
+                stage["density_error_g_cm3"], rel=1e-6
+            )
+        assert float(row["density: Temperature (K)"]) == pytest.approx(
+            stage["temperature_K"], rel=1e-6
+        )
         assert "Density (g/mL) error" not in row  # it is constant in the last stage
 
 
@@ -474,7 +596,11 @@ timestep_fs = 5
     [
         ("stages.density.temperature_K", [], "temperature of stages.density (K)"),
         ("box.density_g_cm3", ["box.density_g_cm3"], "density of box (g/cm³)"),
-        ("stages.0.timestep_fs", ["stages.0.timestep_fs", "seed"], "timestep of stages.0 (fs)\ntogether with seed"),
+        (
+            "stages.0.timestep_fs",
+            ["stages.0.timestep_fs", "seed"],
+            "timestep of stages.0 (fs)\ntogether with seed",
+        ),
         ("molecules.0.count", [], "count of molecules.0"),
         ("seed", [], "seed"),
         ("stages.0.pressure_bar", [], "pressure of stages.0 (bar)"),
@@ -485,15 +611,27 @@ def test_axes_have_units_and_name_the_keys_that_vary_together(key, together, lab
 
 
 def test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run():
-    assert SweepRow({}, {1: {"x": (1.0, 0.5)}, 2: {"x": (3.0, 0.5)}})["x"] == (2.0, pytest.approx(1.0))
+    assert SweepRow({}, {1: {"x": (1.0, 0.5)}, 2: {"x": (3.0, 0.5)}})["x"] == (
+        2.0,
+        pytest.approx(1.0),
+    )
     assert SweepRow({}, {1: {"x": (1.0, 0.5)}, 2: {}})["x"] == (1.0, 0.5)
-    assert SweepRow({}, {1: {"x": (0.1, 0.0)}, 2: {"x": (0.1, 0.0)}, 3: {"x": (0.1, 0.0)}})["x"] == (0.1, None)
+    assert SweepRow({}, {1: {"x": (0.1, 0.0)}, 2: {"x": (0.1, 0.0)}, 3: {"x": (0.1, 0.0)}})[
+        "x"
+    ] == (0.1, None)
 
 
 def test_bodies_and_words(tmp_path, capsys):
     """A body has no seeds; a key whose values are words has places on the axis."""
     scene = ROOT / "systems" / "heavy_top_3.toml"
-    fixed = ["--set", "run.duration_s=0.02", "--set", "output.figures=false", "--set", "output.trajectory=false"]
+    fixed = [
+        "--set",
+        "run.duration_s=0.02",
+        "--set",
+        "output.figures=false",
+        "--set",
+        "output.trajectory=false",
+    ]
     arguments = [
         "sweep",
         str(scene),
@@ -517,14 +655,21 @@ def test_bodies_and_words(tmp_path, capsys):
 def test_from_python(argon, finished, copied):
     found = rigidmd.sweep(argon, {"start.temperature_K": [90, 120], "seed": range(1, 3)}, copied)
     assert found["start.temperature_K"].tolist() == [90, 120]
-    assert found["Temperature (K)"] == pytest.approx([float(row["Temperature (K)"]) for row in table(finished)])
+    assert found["Temperature (K)"] == pytest.approx(
+        [float(row["Temperature (K)"]) for row in table(finished)]
+    )
     assert (found.error("Temperature (K)") > 0).all()
     assert list(found.to_dataframe()["runs"]) == [2, 2]
     with pytest.raises(KeyError, match="there are"):
         found["no"]
     shown = found._repr_html_()
     temperatures = [row["Temperature (K)"] for row in table(finished)]
-    for text in ("start.temperature_K", "<td>120</td>", "Temperature (K)", *(x.split(".")[0] for x in temperatures)):
+    for text in (
+        "start.temperature_K",
+        "<td>120</td>",
+        "Temperature (K)",
+        *(x.split(".")[0] for x in temperatures),
+    ):
         assert text in shown
     with pytest.raises(OutputError, match="pmf needs a sweep over the distance of a restraint"):
         rigidmd.pmf(found)
@@ -541,7 +686,10 @@ def test_values_of_numpy_in_a_sweep(argon, tmp_path):
         "start.temperature_K": np.array([90.5, 100.25]),
         "stages.0.duration_ps": np.float32(0.5),
     }
-    listed = {"seed": (np.int64(k) for k in (1, 2)), "start.temperature_K": list(arrays["start.temperature_K"])}
+    listed = {
+        "seed": (np.int64(k) for k in (1, 2)),
+        "start.temperature_K": list(arrays["start.temperature_K"]),
+    }
     wanted = sweeping.axes_of(numbers)
     assert sweeping.axes_of(arrays) == wanted
     assert sweeping.axes_of(listed) == wanted[:2]
@@ -604,8 +752,18 @@ def test_a_killed_worker_loses_its_point_alone_and_a_signal_stops_all(argon, who
 def test_points_that_fail_are_told_and_repeated(argon, tmp_path, capsys):
     """A time step that is far too long ends a run."""
     folder = tmp_path / "sweep"
-    arguments = ["sweep", str(argon), "--set", "stages.0.timestep_fs=5,100000", "--set", "stages.0.duration_ps=300",
-                 "--set", "watch.stable_step=false", "-o", str(folder)]  # fmt: skip
+    arguments = [
+        "sweep",
+        str(argon),
+        "--set",
+        "stages.0.timestep_fs=5,100000",
+        "--set",
+        "stages.0.duration_ps=300",
+        "--set",
+        "watch.stable_step=false",
+        "-o",
+        str(folder),
+    ]
     assert cli.main(arguments) == 1
     assert states(folder) == {"timestep_fs=5": "finished", "timestep_fs=100000": "failed"}
     said = capsys.readouterr().out
@@ -616,8 +774,20 @@ def test_points_that_fail_are_told_and_repeated(argon, tmp_path, capsys):
 def test_a_wall_time_that_is_over_leaves_the_rest(argon, tmp_path, capsys):
     """Two points that nobody has the time for."""
     folder = tmp_path / "sweep"
-    arguments = ["sweep", str(argon), "--set", "seed=1,2", "--set", "stages.0.duration_ps=1e7", "--set",
-                 "output.trajectory=false", "--set", "output.log_interval_ps=100", "-o", str(folder)]  # fmt: skip
+    arguments = [
+        "sweep",
+        str(argon),
+        "--set",
+        "seed=1,2",
+        "--set",
+        "stages.0.duration_ps=1e7",
+        "--set",
+        "output.trajectory=false",
+        "--set",
+        "output.log_interval_ps=100",
+        "-o",
+        str(folder),
+    ]
     assert cli.main([*arguments, "--walltime", "0:00:03"]) == 75
     assert set(states(folder).values()) <= {"interrupted", "waiting"}
     assert "the same command continues" in capsys.readouterr().out
@@ -652,11 +822,15 @@ def test_a_scene_that_changes_meanwhile_is_not_run(argon, tmp_path):
 
 
 def test_one_point_of_a_kind_compiles_before_the_others(argon, tmp_path):
-    manifest = long_sweep(argon, tmp_path / "sweep", **{"stages.0.integrator": ["velocity_verlet", "pefrl"]})
+    manifest = long_sweep(
+        argon, tmp_path / "sweep", **{"stages.0.integrator": ["velocity_verlet", "pefrl"]}
+    )
     waiting = Waiting(manifest, manifest.points)
     first = waiting.next()
     assert first is not None
-    assert waiting.next() is None  # the code of the first is not there yet, and one compiles at a time
+    assert (
+        waiting.next() is None
+    )  # the code of the first is not there yet, and one compiles at a time
     waiting.compiled(first)
     others = [waiting.next() for _ in range(3)]
     kinds = [point.values["stages.0.integrator"] for point in others]
@@ -674,13 +848,24 @@ def test_one_point_of_a_kind_compiles_before_the_others(argon, tmp_path):
 @pytest.mark.soak
 def test_a_sweep_that_is_killed_goes_on(argon, tmp_path):
     """3 temperatures, 8 seeds, two workers; parent and workers are killed in the middle."""
-    arguments = [str(argon), "--set", "start.temperature_K=90,100,110", "--set", "seed=1..8", "--set",
-                 "stages.0.duration_ps=100", "--jobs", "2"]  # fmt: skip
+    arguments = [
+        str(argon),
+        "--set",
+        "start.temperature_K=90,100,110",
+        "--set",
+        "seed=1..8",
+        "--set",
+        "stages.0.duration_ps=100",
+        "--jobs",
+        "2",
+    ]
     command = [sys.executable, "-m", "rigidmd", "sweep", *arguments, "-o", str(tmp_path / "parts")]
     parent = subprocess.Popen(command, start_new_session=True)
     while sum(state == "finished" for state in states_or_none(tmp_path / "parts").values()) < 6:
         time.sleep(0.1)
-    children = subprocess.run(["pgrep", "-P", str(parent.pid)], capture_output=True, text=True).stdout.split()
+    children = subprocess.run(
+        ["pgrep", "-P", str(parent.pid)], capture_output=True, text=True
+    ).stdout.split()
     assert len(children) == 2
     for number in (parent.pid, *map(int, children)):
         os.kill(number, signal.SIGKILL)
@@ -688,10 +873,14 @@ def test_a_sweep_that_is_killed_goes_on(argon, tmp_path):
     done = written(tmp_path / "parts")
     assert 6 <= len(done) < 24
     assert cli.main(["sweep", *arguments, "-o", str(tmp_path / "parts")]) == 0
-    assert {name: when for name, when in written(tmp_path / "parts").items() if name in done} == done
+    assert {
+        name: when for name, when in written(tmp_path / "parts").items() if name in done
+    } == done
     assert cli.main(["sweep", *arguments, "-o", str(tmp_path / "whole")]) == 0
     assert same_runs(tmp_path / "parts", tmp_path / "whole")
-    assert (tmp_path / "parts" / "sweep.csv").read_bytes() == (tmp_path / "whole" / "sweep.csv").read_bytes()
+    assert (tmp_path / "parts" / "sweep.csv").read_bytes() == (
+        tmp_path / "whole" / "sweep.csv"
+    ).read_bytes()
 
 
 def states_or_none(folder):
@@ -761,7 +950,10 @@ for part in spec.split(","):
     for k in range(int(first), int(last or first) + 1):
         subprocess.run(["bash", script], env=os.environ | {{"SLURM_ARRAY_TASK_ID": str(k)}})
 """
-    for name, text in (("sbatch", stub), ("rigidmd", f'#!/bin/bash\nexec {sys.executable} -m rigidmd "$@"\n')):
+    for name, text in (
+        ("sbatch", stub),
+        ("rigidmd", f'#!/bin/bash\nexec {sys.executable} -m rigidmd "$@"\n'),
+    ):
         (tmp_path / "bin" / name).write_text(text)
         (tmp_path / "bin" / name).chmod(0o755)
     monkeypatch.chdir(tmp_path)
@@ -770,7 +962,16 @@ for part in spec.split(","):
 
 
 def test_a_script_for_slurm(argon, finished, slurm, capsys):
-    arguments = ["sweep", str(argon), "--set", "seed=1..1", "--set", "start.temperature_K=120", "-o", "my sweep"]
+    arguments = [
+        "sweep",
+        str(argon),
+        "--set",
+        "seed=1..1",
+        "--set",
+        "start.temperature_K=120",
+        "-o",
+        "my sweep",
+    ]
     assert cli.main([*arguments, "--to", "slurm", "--walltime", "0:10:00"]) == 0
     script = Path("my sweep/sweep.sbatch")
     text = script.read_text()
@@ -782,14 +983,28 @@ def test_a_script_for_slurm(argon, finished, slurm, capsys):
     assert "1 of them finished" in capsys.readouterr().out
     ours, theirs = Path("my sweep") / "seed=1", finished / "temperature_K=120_seed=1"
     assert (ours / "log.csv").read_bytes() == (theirs / "log.csv").read_bytes()
-    assert cli.main([*arguments[:3], "seed=1..3", *arguments[4:], "--to", "slurm", "--walltime", "0:10:00"]) == 0
+    assert (
+        cli.main(
+            [*arguments[:3], "seed=1..3", *arguments[4:], "--to", "slurm", "--walltime", "0:10:00"]
+        )
+        == 0
+    )
     assert "#SBATCH --array=1-2\n" in script.read_text()
 
 
 @pytest.mark.soak
 def test_slurm_jobs_submit_themselves_again(argon, slurm):
     """Jobs whose time is up, until their points have finished."""
-    arguments = ["sweep", str(argon), "--set", "seed=1..2", "--set", "stages.0.duration_ps=2500", "-o", "sweep"]
+    arguments = [
+        "sweep",
+        str(argon),
+        "--set",
+        "seed=1..2",
+        "--set",
+        "stages.0.duration_ps=2500",
+        "-o",
+        "sweep",
+    ]
     assert cli.main([*arguments, "--to", "slurm", "--walltime", "0:00:08"]) == 0
     subprocess.run(["sbatch", "sweep/sweep.sbatch"], check=True)
     assert len(Path("jobs").read_text().splitlines()) > 2
@@ -817,13 +1032,19 @@ def test_words_for_slurm():
         (["--set", "seed=1,1"], "seed: 1 is listed 2 times"),
         (["--set", "start.temperature_K=90,90.0"], "90 is listed 2 times"),
         (["--set", "sed=1..3"], "did you mean seed?"),
-        (["--set", "seed=1..1000", "--set", "start.temperature_K=1..1000"], "these are 1000000 points"),
+        (
+            ["--set", "seed=1..1000", "--set", "start.temperature_K=1..1000"],
+            "these are 1000000 points",
+        ),
         (["--replicas", "3", "--set", "seed=1..3"], "leave out one of them"),
         (["--set", "seed=1..3", "--to", "slurm"], "needs --walltime"),
-        (["--set", "seed=1..3", "--to", "slurm", "--walltime", "1:00:00", "--collect"], "cannot be combined"),
+        (
+            ["--set", "seed=1..3", "--to", "slurm", "--walltime", "1:00:00", "--collect"],
+            "cannot be combined",
+        ),
         (["--set", "seed=1..3", "--trust", "nothing.py"], "there is no such file"),
     ],
-)  # fmt: skip
+)
 def test_bad_input(arguments, expected, argon, tmp_path, capsys):
     assert cli.main(["sweep", str(argon), *arguments, "-o", str(tmp_path / "sweep")]) == 2
     assert expected in capsys.readouterr().err
@@ -831,15 +1052,36 @@ def test_bad_input(arguments, expected, argon, tmp_path, capsys):
 
 
 def test_all_faults_of_all_points_at_once(argon, tmp_path, capsys):
-    arguments = ["--set", "start.temperature_K=-5,100,cold", "--set", "forces.cutoff_A=8,12", "-o", str(tmp_path / "s")]
+    arguments = [
+        "--set",
+        "start.temperature_K=-5,100,cold",
+        "--set",
+        "forces.cutoff_A=8,12",
+        "-o",
+        str(tmp_path / "s"),
+    ]
     assert cli.main(["sweep", str(argon), *arguments]) == 2
     said = capsys.readouterr().err
     assert "3 errors" in said
-    assert "at temperature_K = -5, cutoff_A = 8 and 1 more points: --set start.temperature_K: is -5" in said
+    assert (
+        "at temperature_K = -5, cutoff_A = 8 and 1 more points: --set start.temperature_K: is -5"
+        in said
+    )
     assert "at temperature_K = 100, cutoff_A = 12: forces.cutoff_A = 12 is longer than half" in said
     assert "at temperature_K = cold" in said
     assert (
-        cli.main(["sweep", str(argon), "--set", "seed=1,2", "--set", "forces.cutoff_A=12", "-o", str(tmp_path / "s")])
+        cli.main(
+            [
+                "sweep",
+                str(argon),
+                "--set",
+                "seed=1,2",
+                "--set",
+                "forces.cutoff_A=12",
+                "-o",
+                str(tmp_path / "s"),
+            ]
+        )
         == 2
     )
     assert capsys.readouterr().err.startswith(f"rigidmd: {argon}: forces.cutoff_A = 12")
@@ -888,11 +1130,19 @@ def test_a_manifest_names_no_folder_outside(copied, argon, capsys):
 def test_an_invalid_manifest_is_refused(copied, argon, capsys):
     whole = json.loads((copied / "sweep.json").read_text())
     for change in (
-        {"keys": []}, {"keys": {"seed": ["other"], "start.temperature_K": ["start.temperature_K"]}}, {"fixed": "x"},
-        {"common": 3}, {"name": None}, {"points": 3}, {"points": [3]}, {"trust": ["evil.py"]},
-        {"points": [whole["points"][0] | {"state": "done"}]}, {"points": [whole["points"][0] | {"values": {}}]},
-        {"points": [whole["points"][0] | {"seconds": "long"}]}, {"points": whole["points"][:1] * 2},
-    ):  # fmt: skip
+        {"keys": []},
+        {"keys": {"seed": ["other"], "start.temperature_K": ["start.temperature_K"]}},
+        {"fixed": "x"},
+        {"common": 3},
+        {"name": None},
+        {"points": 3},
+        {"points": [3]},
+        {"trust": ["evil.py"]},
+        {"points": [whole["points"][0] | {"state": "done"}]},
+        {"points": [whole["points"][0] | {"values": {}}]},
+        {"points": [whole["points"][0] | {"seconds": "long"}]},
+        {"points": whole["points"][:1] * 2},
+    ):
         (copied / "sweep.json").write_text(json.dumps(whole | change))
         for command in (["sweep", str(argon), *GRID, "-o"], ["analyse"]):
             assert cli.main([*command, str(copied)]) == 2, change

@@ -10,7 +10,12 @@ WATER = {
     "start": {"temperature_K": 298.0},
     "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figures": False},
 }
-CHAINS = {"ensemble": "nvt", "temperature_K": 298.0, "thermostat": "nose_hoover", "thermostat_time_ps": 0.05}
+CHAINS = {
+    "ensemble": "nvt",
+    "temperature_K": 298.0,
+    "thermostat": "nose_hoover",
+    "thermostat_time_ps": 0.05,
+}
 
 
 def test_chains_go_on_to_the_same_bits_in_double_precision(tmp_path):
@@ -25,6 +30,8 @@ def test_a_checkpoint_gives_back_all_of_a_state():
     state = system.state._replace(extra_variables=rng.standard_normal(12))
     for array in (state.position, state.velocity, state.angular_momentum_body, state.energy_ledger):
         array[:] = rng.standard_normal(array.shape)
-    found = state_from({name: array.copy() for name, array in zip(STORED_NAMES, state, strict=True)}, state)
+    found = state_from(
+        {name: array.copy() for name, array in zip(STORED_NAMES, state, strict=True)}, state
+    )
     for name, a, b in zip(state._fields, found, state, strict=True):
         assert a.tobytes() == b.tobytes(), name

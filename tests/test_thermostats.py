@@ -1,4 +1,5 @@
-"""Thermostats: exact distributions of free bodies, heat to the last digit, chains that conserve, the same bits."""
+"""Thermostats: exact distributions of free bodies, heat to the last digit, chains that conserve,
+the same bits."""
 
 from typing import NamedTuple
 
@@ -43,11 +44,17 @@ from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 VERLET, BAOAB = SCHEMES["velocity_verlet"], WITH_THERMOSTAT["baoab"]
 THERMAL = 300 * BOLTZMANN
-MIXTURE = {"argon": 300, "nitrogen": 300, "benzene_opls": 300, "spce": 300}  # point, linear, symmetric, asymmetric
+MIXTURE = {
+    "argon": 300,
+    "nitrogen": 300,
+    "benzene_opls": 300,
+    "spce": 300,
+}  # point, linear, symmetric, asymmetric
 
 
 def kinetic(system, state):
-    """Kinetic energy, and each square of a momentum over m or I (n, 3): NaN of axes without inertia."""
+    """Kinetic energy, and each square of a momentum over m or I (n, 3): NaN of axes without
+    inertia."""
     model = system.model
     mass, inertia = model.mass[model.species], model.inertia[model.species][: len(state.rotation)]
     moving = mass[:, None] * state.velocity**2
@@ -56,8 +63,13 @@ def kinetic(system, state):
     return 0.5 * moving.sum() + 0.5 * np.nansum(turning), moving, turning
 
 
-@pytest.mark.parametrize("bath", [Langevin(constant_ramp(THERMAL), 3.0, 7.0, key_of(2, THERMOSTAT)),
-                                  Andersen(constant_ramp(THERMAL), 0.3, key_of(2, THERMOSTAT))])  # fmt: skip
+@pytest.mark.parametrize(
+    "bath",
+    [
+        Langevin(constant_ramp(THERMAL), 3.0, 7.0, key_of(2, THERMOSTAT)),
+        Andersen(constant_ramp(THERMAL), 0.3, key_of(2, THERMOSTAT)),
+    ],
+)
 def test_free_bodies_of_every_kind_come_to_their_distribution(bath):
     system = build(small_scene(MIXTURE, 150.0, start={"temperature_K": 30.0}))
     state, engine = system.state.copy(), Engine(system.model, {})
@@ -74,7 +86,10 @@ def test_free_bodies_of_every_kind_come_to_their_distribution(bath):
                 own = squares[kind == name][:, k] / THERMAL
                 if np.isfinite(own).all():
                     assert stats.kstest(own, "chi2", args=(1,)).pvalue > 1e-4, (name, k)
-    assert np.isnan(turning[kind == "argon"]).all() and not state.angular_momentum_body[kind == "argon"].any()
+    assert (
+        np.isnan(turning[kind == "argon"]).all()
+        and not state.angular_momentum_body[kind == "argon"].any()
+    )
     assert (np.isnan(turning[kind == "nitrogen"]).sum(axis=1) == 1).all()
 
 
@@ -97,7 +112,9 @@ def test_friction_and_noise_of_many_molecules_are_those_of_each(first):
     expected = before.copy()
     expected[first:end] = keep * before[first:end] + size[first:end] * numbers.T[: end - first]
     assert after == pytest.approx(expected, rel=1e-14, abs=1e-14)
-    weight = np.hstack([np.repeat(model.mass[:, None], 3, axis=1), model.inverse_inertia])[model.species]
+    weight = np.hstack([np.repeat(model.mass[:, None], 3, axis=1), model.inverse_inertia])[
+        model.species
+    ]
     assert heat == pytest.approx(0.5 * (weight * (expected**2 - before**2)).sum(), rel=1e-12)
 
 
@@ -109,12 +126,16 @@ def test_friction_is_that_of_each_motion():
     move(Engine(system.model, {}), state, row, 0.01, 10)
     assert state.velocity == pytest.approx(system.state.velocity * np.exp(-0.2), rel=1e-13)
     size = np.linalg.norm(system.state.angular_momentum_body, axis=1)
-    assert np.linalg.norm(state.angular_momentum_body, axis=1) == pytest.approx(size * np.exp(-0.5), rel=1e-12)
+    assert np.linalg.norm(state.angular_momentum_body, axis=1) == pytest.approx(
+        size * np.exp(-0.5), rel=1e-12
+    )
 
 
 def test_collisions_come_after_their_mean_time():
     system = build(small_scene({"argon": 4000}, 200.0))
-    row = VERLET.with_thermostat(Andersen(constant_ramp(THERMAL), 0.5, key_of(4, THERMOSTAT)), halved=True)
+    row = VERLET.with_thermostat(
+        Andersen(constant_ramp(THERMAL), 0.5, key_of(4, THERMOSTAT)), halved=True
+    )
     state = system.state.copy()
     move(Engine(system.model, {}), state, row, 0.1, 3)
     kept = (state.velocity == system.state.velocity).all(axis=1).mean()
@@ -124,8 +145,12 @@ def test_collisions_come_after_their_mean_time():
 @pytest.fixture(scope="module")
 def liquid():
     """27 waters and 5 nitrogens, relieved, with momenta: system, state."""
-    system, engine, state = built({"spce": 27, "nitrogen": 5}, 12.0, spread=0.1, forces={
-        "cutoff_A": 5.0, "truncation": "smooth_switch", "switch_start_A": 3.0})  # fmt: skip
+    system, engine, state = built(
+        {"spce": 27, "nitrogen": 5},
+        12.0,
+        spread=0.1,
+        forces={"cutoff_A": 5.0, "truncation": "smooth_switch", "switch_start_A": 3.0},
+    )
     remove_overlaps(system, engine, state, THERMAL, 0.002)
     move(
         engine,
@@ -139,7 +164,9 @@ def liquid():
 
 def test_chains_conserve_the_energy_of_molecules_and_chains_to_order_two(liquid):
     system, start = liquid
-    bath = NoseHoover(constant_ramp(THERMAL), 0.05, 3, system.freedom.translation, system.freedom.rotation)
+    bath = NoseHoover(
+        constant_ramp(THERMAL), 0.05, 3, system.freedom.translation, system.freedom.rotation
+    )
     row, spreads = VERLET.with_thermostat(bath, halved=True), []
     for dt in (0.002, 0.001, 0.0005):
         engine = system.engine()
@@ -154,7 +181,9 @@ def test_chains_conserve_the_energy_of_molecules_and_chains_to_order_two(liquid)
 
 def test_chains_can_be_run_backwards(liquid):
     system, start = liquid
-    bath = NoseHoover(constant_ramp(THERMAL), 0.05, 4, system.freedom.translation, system.freedom.rotation)
+    bath = NoseHoover(
+        constant_ramp(THERMAL), 0.05, 4, system.freedom.translation, system.freedom.rotation
+    )
     row, engine = VERLET.with_thermostat(bath, halved=True), system.engine()
     state = engine.begin(start, row)
     move(engine, state, row, 0.001, 50)
@@ -170,11 +199,23 @@ def test_chains_can_be_run_backwards(liquid):
     assert state.extra_variables.reshape(2, 2, 4)[:, 0] == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize("thermostat", [
-    "langevin", *(pytest.param(name, marks=pytest.mark.soak) for name in ("velocity_rescaling", "nose_hoover", "andersen")),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "thermostat",
+    [
+        "langevin",
+        *(
+            pytest.param(name, marks=pytest.mark.soak)
+            for name in ("velocity_rescaling", "nose_hoover", "andersen")
+        ),
+    ],
+)
 def test_every_thermostat_draws_the_same_bits_for_any_number_of_threads(thermostat):
-    stage = {"ensemble": "nvt", "temperature_K": [300.0, 310.0], "thermostat": thermostat, "duration_ps": 0.02}
+    stage = {
+        "ensemble": "nvt",
+        "temperature_K": [300.0, 310.0],
+        "thermostat": thermostat,
+        "duration_ps": 0.02,
+    }
     scene = small_scene({"spce": 1000}, 32.0, stages=[stage], output={"trajectory": False})
     found = [Simulation(scene.model_copy(update={"threads": k})).run().state for k in (1, None)]
     assert all(a.tobytes() == b.tobytes() for a, b in zip(*found, strict=True))
@@ -183,7 +224,9 @@ def test_every_thermostat_draws_the_same_bits_for_any_number_of_threads(thermost
 
 def test_a_ramp_goes_from_its_begin_to_its_end():
     system = build(small_scene({"argon": 3000}, 150.0))
-    row = BAOAB.with_thermostat(Langevin(Ramp(THERMAL, 2 * THERMAL, 100.0), 50.0, 50.0, key_of(1, THERMOSTAT)))
+    row = BAOAB.with_thermostat(
+        Langevin(Ramp(THERMAL, 2 * THERMAL, 100.0), 50.0, 50.0, key_of(1, THERMOSTAT))
+    )
     state, engine = system.state.copy(), Engine(system.model, {})
     for part in (0.5, 1.0):
         move(engine, state, row, 0.02, 50)
@@ -195,7 +238,9 @@ def test_degrees_of_freedom_follow_the_thermostat():
     heat = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.004}
     stirred = heat | {"thermostat": "langevin", "friction_translation_per_ps": 200.0}
     stages = [stirred, heat, {"duration_ps": 0.004}]
-    scene = small_scene({"spce": 20}, 20.0, stages=stages, output={"trajectory": False, "log_interval_ps": 0.002})
+    scene = small_scene(
+        {"spce": 20}, 20.0, stages=stages, output={"trajectory": False, "log_interval_ps": 0.002}
+    )
     simulation = Simulation(scene)
     system = simulation.system
     assert [system.freedom_in(k).total for k in range(3)] == [120, 117, 117]
@@ -204,36 +249,96 @@ def test_degrees_of_freedom_follow_the_thermostat():
     own = results["stage"] == 0
     mass = system.model.mass[system.model.species].sum()
     assert results["momentum"][own][-1] ** 2 / (2 * mass) > KJ_PER_MOL
-    assert results["momentum"][~own].max() < 1e-9  # taken out before the stage that conserves it, and booked
+    assert (
+        results["momentum"][~own].max() < 1e-9
+    )  # taken out before the stage that conserves it, and booked
     assert np.abs(np.diff(results["conserved"])).max() < 0.05  # kJ/mol
 
 
 @pytest.mark.parametrize(
     ("stage", "message"),
     [
-        ({"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "berendsen"},
-         "samples no ensemble.*The thermostats are velocity_rescaling, langevin, nose_hoover, andersen, hybrid_monte_carlo$"),
-        ({"ensemble": "nvt", "temperature_K": 300.0, "friction_translation_per_ps": 1.0}, "would do nothing with velo"),
-        ({"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "langevin", "friction_translation_per_ps": 0.0},
-         "must be greater than 0"),
-        ({"ensemble": "nvt", "temperature_K": 300.0, "thermostat_time_ps": 0.0}, "must be greater than 0"),
+        (
+            {"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "berendsen"},
+            "samples no ensemble.*The thermostats are velocity_rescaling, langevin, nose_hoover, andersen, hybrid_monte_carlo$",
+        ),
+        (
+            {"ensemble": "nvt", "temperature_K": 300.0, "friction_translation_per_ps": 1.0},
+            "would do nothing with velo",
+        ),
+        (
+            {
+                "ensemble": "nvt",
+                "temperature_K": 300.0,
+                "thermostat": "langevin",
+                "friction_translation_per_ps": 0.0,
+            },
+            "must be greater than 0",
+        ),
+        (
+            {"ensemble": "nvt", "temperature_K": 300.0, "thermostat_time_ps": 0.0},
+            "must be greater than 0",
+        ),
         ({"ensemble": "nvt"}, "needs temperature_K"),
         ({"temperature_K": 300.0}, "would do nothing in an nve stage"),
         ({"integrator": "baoab"}, "contains a thermostat"),
         ({"ensemble": "npt", "temperature_K": 300.0}, "needs pressure_bar"),
-        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": [1.0, 1.0, 2.0]}, "'anisotropic'"),
-        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat": "berendsen"}, "samples no"),
+        (
+            {"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": [1.0, 1.0, 2.0]},
+            "'anisotropic'",
+        ),
+        (
+            {
+                "ensemble": "npt",
+                "temperature_K": 300.0,
+                "pressure_bar": 1.0,
+                "barostat": "berendsen",
+            },
+            "samples no",
+        ),
         ({"ensemble": "nph", "pressure_bar": 1.0, "integrator": "srkn_4"}, "made of Verlet steps"),
-        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat_time_ps": 0.0}, "greater than 0"),
-        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "thermostat": "langevin",
-          "barostat": "monte_carlo", "barostat_time_ps": 1.0}, "barostat_time_ps would do nothing with monte_carlo$"),
-        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "nose_hoover_links": 4},
-         "nose_hoover_links would do nothing with velocity_rescaling$"),
-        ({"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "barostat": "monte_carlo",
-          "barostat_time_ps": 1.0, "nose_hoover_links": 4},
-         "nose_hoover_links, barostat_time_ps would do nothing with velocity_rescaling and monte_carlo$"),
+        (
+            {
+                "ensemble": "npt",
+                "temperature_K": 300.0,
+                "pressure_bar": 1.0,
+                "barostat_time_ps": 0.0,
+            },
+            "greater than 0",
+        ),
+        (
+            {
+                "ensemble": "npt",
+                "temperature_K": 300.0,
+                "pressure_bar": 1.0,
+                "thermostat": "langevin",
+                "barostat": "monte_carlo",
+                "barostat_time_ps": 1.0,
+            },
+            "barostat_time_ps would do nothing with monte_carlo$",
+        ),
+        (
+            {
+                "ensemble": "npt",
+                "temperature_K": 300.0,
+                "pressure_bar": 1.0,
+                "nose_hoover_links": 4,
+            },
+            "nose_hoover_links would do nothing with velocity_rescaling$",
+        ),
+        (
+            {
+                "ensemble": "npt",
+                "temperature_K": 300.0,
+                "pressure_bar": 1.0,
+                "barostat": "monte_carlo",
+                "barostat_time_ps": 1.0,
+                "nose_hoover_links": 4,
+            },
+            "nose_hoover_links, barostat_time_ps would do nothing with velocity_rescaling and monte_carlo$",
+        ),
     ],
-)  # fmt: skip
+)
 def test_stages_that_cannot_be(stage, message):
     with pytest.raises(SceneError, match=message):
         small_scene({"argon": 20}, 30.0, stages=[{"duration_ps": 0.01} | stage])
@@ -252,7 +357,9 @@ def brake(thermostat, model, state, h, draw):
         for k in range(3):
             before = state.velocity[m, k]
             state.velocity[m, k] *= factor
-            state.energy_ledger[0] -= 0.5 * model.mass[model.species[m]] * (before**2 - state.velocity[m, k] ** 2)
+            state.energy_ledger[0] -= (
+                0.5 * model.mass[model.species[m]] * (before**2 - state.velocity[m, k] ** 2)
+            )
 
 
 class Swelling(NamedTuple):
@@ -282,7 +389,8 @@ def accept_swelling(barostat, model, state, workspace, h):
 
 
 def test_adding_a_thermostat_and_a_barostat(monkeypatch):
-    """A row in the table of scenes and a row in that of flows: all that knows their names follows."""
+    """A row in the table of scenes and a row in that of flows: all that knows their names
+    follows."""
     stage = {
         "ensemble": "npt",
         "temperature_K": 300.0,
@@ -295,36 +403,68 @@ def test_adding_a_thermostat_and_a_barostat(monkeypatch):
         small_scene({"argon": 20}, 40.0, stages=[stage])
     made = couplings.Coupling("a brake", "nobody", {"thermostat_time_ps": 0.25}, on_molecules=True)
     monkeypatch.setitem(couplings.THERMOSTATS, "braking", made)
-    made = couplings.Coupling("a balloon", "nobody", {"barostat_interval_ps": 0.01}, ("npt",), shapes=("isotropic",))
+    made = couplings.Coupling(
+        "a balloon", "nobody", {"barostat_interval_ps": 0.01}, ("npt",), shapes=("isotropic",)
+    )
     monkeypatch.setitem(couplings.BAROSTATS, "swelling", made)
-    monkeypatch.setitem(ramps.THERMOSTATS, "braking", lambda stage, *given: Braking(stage.thermostat_time))
-    monkeypatch.setitem(boxes.BAROSTATS, "swelling", lambda stage, given: Swelling(0.01, given.tail, given.key))
+    monkeypatch.setitem(
+        ramps.THERMOSTATS, "braking", lambda stage, *given: Braking(stage.thermostat_time)
+    )
+    monkeypatch.setitem(
+        boxes.BAROSTATS, "swelling", lambda stage, given: Swelling(0.01, given.tail, given.key)
+    )
     properties = schema()["$defs"]["Stage"]["properties"]
-    assert "braking" in properties["thermostat"]["enum"] and "swelling" in properties["barostat"]["enum"]
+    assert (
+        "braking" in properties["thermostat"]["enum"]
+        and "swelling" in properties["barostat"]["enum"]
+    )
     for wrong, message in (
-        ({"nose_hoover_links": 4, "barostat_time_ps": 1.0}, "nose_hoover_links, barostat_time_ps would do nothing with braking and swelling"),
-        ({"pressure_coupling": "flexible"}, "'swelling' allows only an isotropic pressure; cell_rescaling allows others"),
-        ({"ensemble": "nph", "temperature_K": None, "thermostat": None}, "'swelling' is for npt; nph has piston"),
-    ):  # fmt: skip
+        (
+            {"nose_hoover_links": 4, "barostat_time_ps": 1.0},
+            "nose_hoover_links, barostat_time_ps would do nothing with braking and swelling",
+        ),
+        (
+            {"pressure_coupling": "flexible"},
+            "'swelling' allows only an isotropic pressure; cell_rescaling allows others",
+        ),
+        (
+            {"ensemble": "nph", "temperature_K": None, "thermostat": None},
+            "'swelling' is for npt; nph has piston",
+        ),
+    ):
         with pytest.raises(SceneError, match=message):
-            small_scene({"argon": 20}, 40.0, stages=[{k: v for k, v in (stage | wrong).items() if v is not None}])
-    scene = rigidmd.resolve(small_scene({"argon": 20}, 40.0, forces={"lennard_jones": False}, stages=[stage]))
+            small_scene(
+                {"argon": 20},
+                40.0,
+                stages=[{k: v for k, v in (stage | wrong).items() if v is not None}],
+            )
+    scene = rigidmd.resolve(
+        small_scene({"argon": 20}, 40.0, forces={"lennard_jones": False}, stages=[stage])
+    )
     assert (scene.stages[0].thermostat_time_ps, scene.stages[0].barostat_time_ps) == (0.25, None)
     described = " ".join(describe_stage(scene.stages[0]))
-    assert "300 K by braking, 0.25 ps, 1 bar by swelling, isotropic, a move every 5 steps" in described
+    assert (
+        "300 K by braking, 0.25 ps, 1 bar by swelling, isotropic, a move every 5 steps" in described
+    )
     assert "not the total momentum" in described
     results = Simulation(scene).run()
-    assert results["kinetic"][-1] == pytest.approx(results["kinetic"][0] * np.exp(-2 * 0.02 / 0.25), rel=1e-9)
+    assert results["kinetic"][-1] == pytest.approx(
+        results["kinetic"][0] * np.exp(-2 * 0.02 / 0.25), rel=1e-9
+    )
     assert results["volume"][-1] == pytest.approx(results["volume"][0] * np.exp(2 * 0.03), rel=1e-9)
     assert results["conserved"][-1] == pytest.approx(results["conserved"][0], rel=1e-9)
 
 
 @pytest.mark.parametrize(
     ("kinds", "physics"),
-    [(couplings.THERMOSTATS, "dynamics/thermostats.py"), (couplings.BAROSTATS, "dynamics/barostats.py")],
+    [
+        (couplings.THERMOSTATS, "dynamics/thermostats.py"),
+        (couplings.BAROSTATS, "dynamics/barostats.py"),
+    ],
 )
 def test_adding_a_thermostat_or_barostat_takes_two_files(kinds, physics):
-    """No other file has their names: but those of other engines, and langevin's where it is the default with baoab."""
+    """No other file has their names: but those of other engines, and langevin's where it is the
+    default with baoab."""
     allowed = {"scene/couplings.py", physics, "assemble/defaults.py"}
     package = ROOT / "rigidmd"
     for path in package.rglob("*.py"):
@@ -334,4 +474,7 @@ def test_adding_a_thermostat_or_barostat_takes_two_files(kinds, physics):
             assert not [name for name in kinds if f'"{name}"' in text and name != "langevin"], where
     documents = (package / "docs" / "guides" / "ensembles.md").read_text(encoding="utf-8")
     for name, kind in kinds.items():
-        assert f'`"{name}"`' in documents and kind.source.split(",")[0].split(" 20")[0].split(" 19")[0] in documents
+        assert (
+            f'`"{name}"`' in documents
+            and kind.source.split(",")[0].split(" 20")[0].split(" 19")[0] in documents
+        )

@@ -1,4 +1,5 @@
-"""Threads: that each block is done once, whoever asks, and that those who wait leave their cores to others."""
+"""Threads: that each block is done once, whoever asks, and that those who wait leave their cores to
+others."""
 
 import os
 import signal
@@ -14,9 +15,26 @@ import pytest
 from support import ROOT, SCHEMES, small_scene
 
 from rigidmd import Every, Simulation, run_together
-from rigidmd.compile import Code, call_blocks, kernel, load_arguments, pack_arguments, set_threads, task
+from rigidmd.compile import (
+    Code,
+    call_blocks,
+    kernel,
+    load_arguments,
+    pack_arguments,
+    set_threads,
+    task,
+)
 from rigidmd.compile.machine import MOST_THREADS
-from rigidmd.compile.thread_pool import FIRST_WORKER, RANGE_JOBS, SLEEPS, _pause, _pool, _read, _run_ranges, _write  # noqa: F401
+from rigidmd.compile.thread_pool import (  # noqa: F401
+    FIRST_WORKER,
+    RANGE_JOBS,
+    SLEEPS,
+    _pause,
+    _pool,
+    _read,
+    _run_ranges,
+    _write,
+)
 from rigidmd.errors import SimulationError
 
 
@@ -71,13 +89,14 @@ def test_every_block_is_done_once(threads, blocks, work):
 
 def test_every_block_is_done_once_by_many_more_threads():
     """As on a machine with 24 cores. Few blocks are usual: a small PME grid has three."""
-    script = (
-        "from test_threads import counted; assert all((counted(n, 10, 2000)[:, 0] == 2000).all() for n in range(1, 9))"
-    )
+    script = "from test_threads import counted; assert all((counted(n, 10, 2000)[:, 0] == 2000).all() for n in range(1, 9))"
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT / "tests", env=os.environ | {"NUMBA_NUM_THREADS": "24"},
-        capture_output=True, text=True,
-    )  # fmt: skip
+        [sys.executable, "-c", script],
+        cwd=ROOT / "tests",
+        env=os.environ | {"NUMBA_NUM_THREADS": "24"},
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -106,7 +125,9 @@ def _take_alone(cells, job, address, room, blocks, own, threads):
         (1, 16, [0] * 6, [0, 5, 4, 3, 2, 1]),  # more than twice as many
     ],
 )
-def test_each_thread_begins_with_its_share_and_goes_on_with_what_is_left(own, threads, claimed, expected):
+def test_each_thread_begins_with_its_share_and_goes_on_with_what_is_left(
+    own, threads, claimed, expected
+):
     cells, order = np.zeros(FIRST_WORKER, np.int64), np.zeros(7, np.int64)
     cells[RANGE_JOBS : RANGE_JOBS + 6] = claimed
     code = Code(note=(_note, order))
@@ -141,9 +162,14 @@ def test_two_calling_threads_at_once_each_have_their_blocks_done_once():
 
 def short_runs(count=2, seed=1, **own):
     """Runs of 500 argon for 1 ps, with a seed each."""
-    own = {"stages": [{"ensemble": "nve", "duration_ps": 1.0}], "start": {"temperature_K": 90.0}} | own
+    own = {
+        "stages": [{"ensemble": "nve", "duration_ps": 1.0}],
+        "start": {"temperature_K": 90.0},
+    } | own
     own = {"output": {"trajectory": False}} | own
-    return [Simulation(small_scene({"argon": 500}, 30.0, seed=seed + k, **own)) for k in range(count)]
+    return [
+        Simulation(small_scene({"argon": 500}, 30.0, seed=seed + k, **own)) for k in range(count)
+    ]
 
 
 def test_simulations_at_once_have_the_bits_of_each_alone():
@@ -152,7 +178,9 @@ def test_simulations_at_once_have_the_bits_of_each_alone():
     for a, b in zip(alone, together, strict=True):
         assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b.state, strict=True))
         assert b.summary["threads"] == 1
-    assert [r.state.step[0] for r in run_together(short_runs(3), jobs=1)] == [s.step[0] for s in alone]
+    assert [r.state.step[0] for r in run_together(short_runs(3), jobs=1)] == [
+        s.step[0] for s in alone
+    ]
 
 
 def test_simulations_on_all_threads_at_once_have_the_bits_of_each_alone():
@@ -176,15 +204,22 @@ def test_other_threads_of_python_go_on_while_steps_are_taken():
     engine, state = simulation.engine, simulation.state.copy()
     row = SCHEMES["velocity_verlet"]
     engine.advance(state, row, 1e-3, 1)
-    for attempt in range(1, 51):  # a busy machine may leave this thread aside during a call, not during all of them
-        mover, seen = threading.Thread(target=engine.advance, args=(state, row, 1e-3, 1000 * attempt)), set()
+    for attempt in range(
+        1, 51
+    ):  # a busy machine may leave this thread aside during a call, not during all of them
+        mover, seen = (
+            threading.Thread(target=engine.advance, args=(state, row, 1e-3, 1000 * attempt)),
+            set(),
+        )
         mover.start()
         while mover.is_alive():
             seen.add(int(state.step[0]))
             time.sleep(0)
         mover.join()
         assert state.step[0] == 1000 * attempt
-        if len(seen) >= 20:  # with Python's lock only the steps at which the compiled code returns could be seen
+        if (
+            len(seen) >= 20
+        ):  # with Python's lock only the steps at which the compiled code returns could be seen
             break
     assert len(seen) >= 20
 
@@ -205,7 +240,9 @@ def test_what_runs_together_is_stopped_together():
 
 def test_an_observer_may_end_a_run():
     scene = short_runs(1)[0].scene
-    simulation = Simulation(scene, observers=Every(0.2, lambda moment: moment.step and simulation.stop()))
+    simulation = Simulation(
+        scene, observers=Every(0.2, lambda moment: moment.step and simulation.stop())
+    )
     results = simulation.run()
     assert results.interrupted and results.signal is None
     assert results.state.time[0] == pytest.approx(0.2)
@@ -230,7 +267,8 @@ def test_a_second_ctrl_c_is_an_interrupt_and_all_runs_still_end():
 def test_each_run_writes_its_files_as_if_alone(tmp_path):
     runs = [
         Simulation(
-            small_scene({"argon": 100}, 20.0, seed=seed, output={"trajectory_interval_ps": 0.002}), tmp_path / str(seed)
+            small_scene({"argon": 100}, 20.0, seed=seed, output={"trajectory_interval_ps": 0.002}),
+            tmp_path / str(seed),
         )
         for seed in range(4)
     ]
@@ -242,7 +280,10 @@ def test_each_run_writes_its_files_as_if_alone(tmp_path):
 
 
 def test_one_that_fails_takes_no_other_with_it():
-    hot = {"start": {"temperature_K": 90.0}, "stages": [{"ensemble": "nve", "duration_ps": 1.0, "timestep_fs": 900.0}]}
+    hot = {
+        "start": {"temperature_K": 90.0},
+        "stages": [{"ensemble": "nve", "duration_ps": 1.0, "timestep_fs": 900.0}],
+    }
     runs = [*short_runs(1, **hot), *short_runs(1, seed=2)]
     with pytest.raises(SimulationError) as error:
         run_together(runs)
@@ -250,7 +291,9 @@ def test_one_that_fails_takes_no_other_with_it():
     assert runs[1].state.time[0] == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("twice", "jobs", "word"), [(True, None, "twice"), (False, 0, "at least one")])
+@pytest.mark.parametrize(
+    ("twice", "jobs", "word"), [(True, None, "twice"), (False, 0, "at least one")]
+)
 def test_what_cannot_run_together_is_refused(twice, jobs, word):
     runs = short_runs(1)
     with pytest.raises(ValueError, match=word):
@@ -275,7 +318,8 @@ def _run_meeting(code, at, most):
 
 
 def met(most: int) -> list[int]:
-    """For each of two blocks whether the other had begun before it ended: one thread does them one after another."""
+    """For each of two blocks whether the other had begun before it ended: one thread does them one
+    after another."""
     cells = np.zeros(4, np.int64)
     _run_meeting(Code(meet=(_meet, (cells.ctypes.data, most))), cells.ctypes.data, most)
     return cells[2:].tolist()
@@ -295,10 +339,13 @@ assert met(10**12) == [1, 1]
 
 
 def test_a_helper_helps_then_sleeps_and_is_woken():
-    """Two blocks that wait for each other need two threads. Where no helper comes, this hangs until its limit."""
+    """Two blocks that wait for each other need two threads. Where no helper comes, this hangs until
+    its limit."""
     path = os.pathsep.join(map(str, (ROOT, ROOT / "tests")))
     environment = os.environ | {"NUMBA_NUM_THREADS": "2", "PYTHONPATH": path}
-    done = subprocess.run([sys.executable, "-c", HELPER], env=environment, capture_output=True, text=True, timeout=240)
+    done = subprocess.run(
+        [sys.executable, "-c", HELPER], env=environment, capture_output=True, text=True, timeout=240
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -332,7 +379,9 @@ assert threading.active_count() == 1, threading.enumerate()
 
 def test_one_thread_that_is_asked_for_has_no_helpers():
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests")))}
-    done = subprocess.run([sys.executable, "-c", ALONE], env=environment, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE], env=environment, capture_output=True, text=True, timeout=120
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -347,13 +396,17 @@ assert (counted(64, 100, 2000)[:, 0] == 2000).all()
 def test_there_may_be_more_threads_than_cores_and_the_process_ends(threads):
     path = os.pathsep.join(map(str, (ROOT, ROOT / "tests")))
     environment = os.environ | {"NUMBA_NUM_THREADS": threads, "PYTHONPATH": path}
-    done = subprocess.run([sys.executable, "-c", MORE], env=environment, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", MORE], env=environment, capture_output=True, text=True, timeout=120
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_importing_changes_no_variable_of_threads(tmp_path):
     code = "import os; before = dict(os.environ); import rigidmd.compile; assert dict(os.environ) == before"
-    subprocess.run([sys.executable, "-c", code], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True)
+    subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True
+    )
 
 
 def test_benchmarks_measure_what_a_user_gets(monkeypatch):
@@ -366,7 +419,9 @@ def test_benchmarks_measure_what_a_user_gets(monkeypatch):
     assert environment()["PATH"] == os.environ["PATH"]
 
 
-@pytest.mark.parametrize(("asked", "words"), [(None, "2 threads"), (1, "1 thread"), (7, "2 threads")])
+@pytest.mark.parametrize(
+    ("asked", "words"), [(None, "2 threads"), (1, "1 thread"), (7, "2 threads")]
+)
 def test_check_says_how_many_threads_compute(asked, words):
     command = [sys.executable, "-m", "rigidmd", "check", "systems/water.toml"]
     command += [] if asked is None else ["--set", f"threads={asked}"]

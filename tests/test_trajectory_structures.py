@@ -1,4 +1,5 @@
-"""Trajectories as structure files: the last frame of an earlier run, of this engine or another, or a clear message."""
+"""Trajectories as structure files: the last frame of an earlier run, of this engine or another, or
+a clear message."""
 
 import shutil
 import sys
@@ -51,7 +52,8 @@ duration_ps = 0.01
 
 
 def make(folder, ending, **species):
-    """A trajectory of two frames with its topology; returns its path and the system of the second frame.
+    """A trajectory of two frames with its topology; returns its path and the system of the second
+    frame.
 
     species : a table of [[molecules]] in place of a shipped water
     """
@@ -107,22 +109,38 @@ def test_all_readers_find_the_frames_of_many_steps_and_boxes_that_change(tmp_pat
     found = read_frames(whole, len(sites[0]), 100)
     cells = np.linalg.norm(found.cells, axis=2)
     if ending != ".xyz":  # MDAnalysis reads no box of it
-        assert np.array([frame.dimensions[:3].copy() for frame in u.trajectory]) == pytest.approx(lengths, abs=6e-4)
+        assert np.array([frame.dimensions[:3].copy() for frame in u.trajectory]) == pytest.approx(
+            lengths, abs=6e-4
+        )
         plain = mda.Universe(str(tmp_path / "topology.gro"), str(whole), format=reader_of(ending))
-        assert np.array([frame.dimensions[:3].copy() for frame in plain.trajectory]) == pytest.approx(lengths, abs=6e-4)
+        assert np.array(
+            [frame.dimensions[:3].copy() for frame in plain.trajectory]
+        ) == pytest.approx(lengths, abs=6e-4)
     assert cells == pytest.approx(lengths, abs=6e-4)
-    assert np.array([frame.positions.copy() for frame in u.trajectory]) == pytest.approx(sites, abs=0.006)
+    assert np.array([frame.positions.copy() for frame in u.trajectory]) == pytest.approx(
+        sites, abs=0.006
+    )
     assert found.positions == pytest.approx(sites, abs=0.006)
     if ending in (".xyz", ".pdb", ".traj"):
         images = ase.io.read(whole, ":")
         assert len(images) == len(STEPS)
-        assert np.array([image.cell.lengths() for image in images]) == pytest.approx(lengths, abs=6e-4)
+        assert np.array([image.cell.lengths() for image in images]) == pytest.approx(
+            lengths, abs=6e-4
+        )
         massive = system.sites.mass > 0 if ending == ".traj" else slice(None)
-        assert np.array([image.positions for image in images]) == pytest.approx(sites[:, massive], abs=0.006)
+        assert np.array([image.positions for image in images]) == pytest.approx(
+            sites[:, massive], abs=0.006
+        )
     if ending == ".pdb":
-        assert [line[:6].strip() for line in whole.read_text().splitlines() if line.startswith(("CRYST1", "MODEL", "END"))] == [
-            "CRYST1", "MODEL", "ENDMDL",
-        ] * len(STEPS)  # fmt: skip
+        assert [
+            line[:6].strip()
+            for line in whole.read_text().splitlines()
+            if line.startswith(("CRYST1", "MODEL", "END"))
+        ] == [
+            "CRYST1",
+            "MODEL",
+            "ENDMDL",
+        ] * len(STEPS)
 
 
 @pytest.mark.parametrize(("model", "sites"), [("spce", 3), ("tip4p2005", 4), ("tip5p", 5)])
@@ -152,7 +170,8 @@ def test_each_molecule_of_a_universe_is_one_fragment(tmp_path, model, sites, kep
 @pytest.mark.parametrize("ending", EVERY_ENDING)
 @pytest.mark.parametrize("frame", [1, -1])
 def test_united_atoms_of_own_trajectories(tmp_path, ending, frame):
-    """Sites with mass and no element, and sites with neither, are found by their names in every format."""
+    """Sites with mass and no element, and sites with neither, are found by their names in every
+    format."""
     system = build(small_scene({"co2_2cljq": 4}, 20.0))
     moved = system.state.copy()
     moved.position[:] += [3.0, 1.0, -2.0]
@@ -163,7 +182,13 @@ def test_united_atoms_of_own_trajectories(tmp_path, ending, frame):
     file.close()
     write_topology(tmp_path / "topology.gro", system, moved, wrapped=True)
     found = read_structure(
-        path, [load_model("co2_2cljq")], None, True, 0.15, frame=frame, topology=tmp_path / "topology.gro"
+        path,
+        [load_model("co2_2cljq")],
+        None,
+        True,
+        0.15,
+        frame=frame,
+        topology=tmp_path / "topology.gro",
     )
     state = moved if frame == -1 else system.state
     step = (found.position - state.position) / 20.0
@@ -177,14 +202,23 @@ def test_times_in_single_precision_are_evened_where_they_can_be():
     assert np.diff(rounded).min() == 0
     assert without_rounding(rounded) == pytest.approx(times, abs=0.3)
     assert np.diff(without_rounding(rounded)) == pytest.approx(np.full(199, 0.1), rel=0.03)
-    for uneven in (np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.0, 1.0]), np.array([2.0]), np.array([])):
+    for uneven in (
+        np.array([0.0, 1.0, 3.0]),
+        np.array([0.0, 0.0, 1.0]),
+        np.array([2.0]),
+        np.array([]),
+    ):
         assert np.array_equal(without_rounding(uneven), uneven)
 
 
 @pytest.mark.parametrize(
     ("names", "ending"),
     [
-        pytest.param(names, ending, marks=[] if names[0] == "Q" or ending in (".xtc", ".gsd") else pytest.mark.soak)
+        pytest.param(
+            names,
+            ending,
+            marks=[] if names[0] == "Q" or ending in (".xtc", ".gsd") else pytest.mark.soak,
+        )
         for names in ("OW HW1 HW2 MW", "O H H M", "O H H H", "Q Q Q Q")
         for ending in (".xtc", ".trr", ".gsd", ".dcd", ".nc")
     ],
@@ -210,7 +244,9 @@ def test_the_last_frame_of_a_trajectory(ending, names, tmp_path):
     if ending in (".trr", ".gsd"):
         first = read_structure(path, system.species, None, True, 0.15, frame=1, topology=names)
         assert np.abs(first.position - system.state.position).max() < error
-        assert not [other.name for other in tmp_path.iterdir() if other.name.startswith(".")]  # no offsets beside it
+        assert not [
+            other.name for other in tmp_path.iterdir() if other.name.startswith(".")
+        ]  # no offsets beside it
 
 
 @pytest.mark.parametrize(
@@ -239,9 +275,14 @@ def test_what_cannot_be_a_start(ending, fault, said, tmp_path, capsys, monkeypat
         case "no names":
             (folder / "topology.gro").unlink()
         case "other names":
-            (folder / "topology.gro").write_text("t\n3\n" + "".join(
-                f"    1SOL  {name:>5}{k:>5}   0.000   0.000   0.{k}00\n" for k, name in enumerate(("OW", "HW1", "HW2"), 1)
-            ) + "   2.0 2.0 2.0\n")  # fmt: skip
+            (folder / "topology.gro").write_text(
+                "t\n3\n"
+                + "".join(
+                    f"    1SOL  {name:>5}{k:>5}   0.000   0.000   0.{k}00\n"
+                    for k, name in enumerate(("OW", "HW1", "HW2"), 1)
+                )
+                + "   2.0 2.0 2.0\n"
+            )
         case "noise":
             path.write_bytes(np.random.default_rng(1).bytes(4000))
         case "empty":
@@ -285,8 +326,11 @@ def test_damaged_gsd_as_structure(tmp_path):
     assert refused > 20
 
 
-def hoomd_frame(sites, *, names=None, centres=False, masses=None, cell=(20.0, 20.0, 20.0), whole=True):
-    """A frame as HOOMD writes them: waters of types A and B, wrapped, with or without central particles and images.
+def hoomd_frame(
+    sites, *, names=None, centres=False, masses=None, cell=(20.0, 20.0, 20.0), whole=True
+):
+    """A frame as HOOMD writes them: waters of types A and B, wrapped, with or without central
+    particles and images.
 
     sites (n, 3, 3), names : of types. masses : of oxygen, hydrogen and of central particles
     """
@@ -305,7 +349,10 @@ def hoomd_frame(sites, *, names=None, centres=False, masses=None, cell=(20.0, 20
         frame.particles.moment_inertia = np.array([[1.0, 2.0, 3.0]] * n + [[0.0] * 3] * (3 * n))
     if masses:
         oxygen, hydrogen, whole_mass = masses
-        frame.particles.mass = [*([whole_mass] * n if centres else []), *([oxygen, hydrogen, hydrogen] * n)]
+        frame.particles.mass = [
+            *([whole_mass] * n if centres else []),
+            *([oxygen, hydrogen, hydrogen] * n),
+        ]
     images = np.floor(position / cell)
     frame.particles.position = position - (images + 0.5) * cell
     if whole:
@@ -327,9 +374,12 @@ def test_molecules_of_hoomd(centres, whole, named_by, tmp_path):
     sites = truth + np.einsum("nij,sj->nsi", rotations, species.positions_body)
     mass, path = float(species.mass), tmp_path / "a.gsd"
     frame = hoomd_frame(
-        sites, names=("OW", "HW") if named_by == "types" else None, centres=centres, whole=whole,
+        sites,
+        names=("OW", "HW") if named_by == "types" else None,
+        centres=centres,
+        whole=whole,
         masses=(15.9994, 1.008, mass) if named_by == "masses" else (1.0, 1.0, mass),
-    )  # fmt: skip
+    )
     with gsd.hoomd.open(path, "w") as file:
         file.append(frame)
     atom_types = {"A": "O", "B": "H"} if named_by == "atom_types" else None
@@ -339,7 +389,9 @@ def test_molecules_of_hoomd(centres, whole, named_by, tmp_path):
     assert step == pytest.approx(np.round(step), abs=1e-5)
     if named_by == "atom_types":
         by_shape = read_structure(path, [species], None, True, 0.15)
-        assert by_shape.notes == ("the names of atoms A, B, B are not elements: assigned to spce by shape",)
+        assert by_shape.notes == (
+            "the names of atoms A, B, B are not elements: assigned to spce by shape",
+        )
         with pytest.raises(StructureError, match=r"structure.atom_types has no name for type B"):
             read_structure(path, [species], None, True, 0.15, atom_types={"A": "O"})
 
@@ -411,7 +463,8 @@ def test_a_topology_that_cannot_hold_positions_names_its_own_key(name, at, other
     state.position[:] += at
     limit = {"gro": "99999.9", "pdb": "9999.99"}[name[-3:]]
     with pytest.raises(
-        SimulationError, match=rf"beyond the {limit} Å that .{name[-3:]} .output.topology. can hold: {others}"
+        SimulationError,
+        match=rf"beyond the {limit} Å that .{name[-3:]} .output.topology. can hold: {others}",
     ):
         write_topology(tmp_path / name, system, state, wrapped=False)
     write_topology(tmp_path / name, system, state, wrapped=True)
@@ -425,12 +478,17 @@ def test_a_trajectory_is_no_molecule(tmp_path):
 def test_a_run_goes_on_from_a_trajectory(tmp_path):
     """With its velocities; both files are inputs, whose digests and copies are in the folder."""
     first = forty_waters(
-        NVT, output=FORTY_WATERS["output"] | {"trajectory": "trajectory.trr", "topology": "topology.pdb"}
+        NVT,
+        output=FORTY_WATERS["output"]
+        | {"trajectory": "trajectory.trr", "topology": "topology.pdb"},
     )
     before = Simulation(Scene.from_dict(first), tmp_path / "old").run()
-    again = forty_waters({k: v for k, v in NVT.items() if k not in ("ensemble", "temperature_K")}, box={}) | {
-        "molecules": [{"model": "spce"}], "structure": {"file": "old/trajectory.trr", "velocities": True},
-    }  # fmt: skip
+    again = forty_waters(
+        {k: v for k, v in NVT.items() if k not in ("ensemble", "temperature_K")}, box={}
+    ) | {
+        "molecules": [{"model": "spce"}],
+        "structure": {"file": "old/trajectory.trr", "velocities": True},
+    }
     del again["start"]
     results = Simulation(Scene.from_dict(again, tmp_path), tmp_path / "new").run()
     assert set(results.summary["input_sha256"]) == {"structure.file", "structure.topology"}
@@ -442,7 +500,15 @@ def test_a_run_goes_on_from_a_trajectory(tmp_path):
     assert repeated.state.position.tobytes() == results.state.position.tobytes()
     with pytest.raises(SceneError, match=r"structure\.topology"):
         Scene.from_dict(
-            again | {"structure": {"file": "old/trajectory.trr", "topology": "none.gro", "velocities": True}}, tmp_path
+            again
+            | {
+                "structure": {
+                    "file": "old/trajectory.trr",
+                    "topology": "none.gro",
+                    "velocities": True,
+                }
+            },
+            tmp_path,
         )
 
 
@@ -492,7 +558,8 @@ register(Format((".toy",), read=read, encoder=encoder, reader=Reader, velocities
 
 
 def test_adding_a_format_takes_one_file(tmp_path, monkeypatch):
-    """A module in the folder of formats: then runs write it and resume, results read it, and runs start from it."""
+    """A module in the folder of formats: then runs write it and resume, results read it, and runs
+    start from it."""
     (tmp_path / "formats").mkdir()
     (tmp_path / "formats" / "toy.py").write_text(TOY.replace("PACKAGE", "rigidmd"))
     (tmp_path / "scene.toml").write_text(
@@ -502,12 +569,16 @@ def test_adding_a_format_takes_one_file(tmp_path, monkeypatch):
     monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path / "formats")])
     try:
         formats.find_modules()
-        results = Simulation(small_scene({"tip4p2005": 4}, 20.0, output=output), tmp_path / "run").run()
+        results = Simulation(
+            small_scene({"tip4p2005": 4}, 20.0, output=output), tmp_path / "run"
+        ).run()
         times = [frame.time for frame in results.universe().trajectory]
         assert times == pytest.approx(np.arange(len(times)) * 0.002)
         assert len(times) > 2
         last = results.universe().trajectory[-1]
-        assert last.positions == pytest.approx(results.system.site_positions(results.state), abs=1e-5)
+        assert last.positions == pytest.approx(
+            results.system.site_positions(results.state), abs=1e-5
+        )
         assert results.atoms(1).positions.dtype == float
         shutil.copy(tmp_path / "run" / "x.toy", tmp_path / "start.toy")
         again = build(Scene.read(tmp_path / "scene.toml"))
@@ -517,5 +588,7 @@ def test_adding_a_format_takes_one_file(tmp_path, monkeypatch):
     finally:
         formats.BY_EXTENSION.pop(".toy", None)
         sys.modules.pop("rigidmd.io.formats.toy", None)
-    with pytest.raises(SceneError, match=r"must end in one of \.dcd \.gsd \.nc \.pdb \.traj \.trr \.xtc \.xyz"):
+    with pytest.raises(
+        SceneError, match=r"must end in one of \.dcd \.gsd \.nc \.pdb \.traj \.trr \.xtc \.xyz"
+    ):
         small_scene({"tip4p2005": 4}, 20.0, output=output)

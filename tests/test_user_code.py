@@ -1,4 +1,5 @@
-"""Doors: forces, pair laws and thermostats of users, from Python and from scenes; functions of vectors."""
+"""Doors: forces, pair laws and thermostats of users, from Python and from scenes; functions of
+vectors."""
 
 import functools
 import linecache
@@ -63,7 +64,11 @@ LJ = "4*eps*((sig/r)**12 - (sig/r)**6)"
 POINTS = {
     "box": {"lengths_A": 24},
     "molecules": [
-        {"name": "dot", "count": 100, "sites": [{"name": "D", "element": "Ar", "mass_u": 40, "position_A": [0, 0, 0]}]}
+        {
+            "name": "dot",
+            "count": 100,
+            "sites": [{"name": "D", "element": "Ar", "mass_u": 40, "position_A": [0, 0, 0]}],
+        }
     ],
     "start": {"temperature_K": 94},
     "stages": [{"duration_ps": 0.04, "timestep_fs": 4}],
@@ -75,14 +80,23 @@ def points(**sections) -> rigidmd.MolecularScene:
     return rigidmd.Scene.from_dict(POINTS | sections)
 
 
-# --- functions of vectors --------------------------------------------------------------------------------------------
+# --- functions of vectors -------------------------------------------------------------------------
 
 
 @kernel(from_python=True)
 def every_function(x, y, out):
     for i in range(0, len(x), lanes.lanes_of(x)):
         a, b = lanes.load(x, i), lanes.load(y, i)
-        found = (exp(a), log(a), math.pow(a, b), sin(b), cos(b), -(a**3), a**-2, math.sqrt(a) + abs(b))
+        found = (
+            exp(a),
+            log(a),
+            math.pow(a, b),
+            sin(b),
+            cos(b),
+            -(a**3),
+            a**-2,
+            math.sqrt(a) + abs(b),
+        )
         for k in range(8):
             lanes.store(out, k * len(x) + i, found[k])
 
@@ -96,7 +110,16 @@ def test_functions_of_vectors_are_right_to_the_last_digits(dtype, error):
     out = np.zeros(8 * n, dtype)
     every_function(x, y, out)
     a, b = x.astype(np.longdouble), y.astype(np.longdouble)
-    expected = [np.exp(a), np.log(a), a**b, np.sin(b), np.cos(b), -(a**3), a**-2, np.sqrt(a) + abs(b)]
+    expected = [
+        np.exp(a),
+        np.log(a),
+        a**b,
+        np.sin(b),
+        np.cos(b),
+        -(a**3),
+        a**-2,
+        np.sqrt(a) + abs(b),
+    ]
     for k, values in enumerate(expected):
         off = np.abs(out[k * n : (k + 1) * n] / values - 1)
         assert off[np.abs(values) < np.finfo(dtype).max].max() < error, k
@@ -115,7 +138,7 @@ def test_functions_of_vectors_at_the_ends_of_their_range():
     assert np.isnan(out[48:80].reshape(2, 16)[:, [7, 15]]).all()  # a sine of 1e14 would say nothing
 
 
-# --- formulas --------------------------------------------------------------------------------------------------------
+# --- formulas -------------------------------------------------------------------------------------
 
 FORMULAS = {
     "A*exp(-B*r) - C/r**6": {"A": 1e5, "B": 3.5, "C": 1e3},
@@ -151,8 +174,12 @@ def test_the_code_of_a_formula_has_the_energy_and_its_derivative(energy):
         v, force, slope = radial(r)
         assert (v, force) == pytest.approx((u, w * r), rel=1e-12)
         step = 1e-5
-        assert force == pytest.approx((radial(r - step)[0] - radial(r + step)[0]) / (2 * step), rel=1e-7, abs=1e-3)
-        assert slope == pytest.approx((radial(r + step)[1] - radial(r - step)[1]) / (2 * step), rel=1e-7, abs=1e-3)
+        assert force == pytest.approx(
+            (radial(r - step)[0] - radial(r + step)[0]) / (2 * step), rel=1e-7, abs=1e-3
+        )
+        assert slope == pytest.approx(
+            (radial(r + step)[1] - radial(r - step)[1]) / (2 * step), rel=1e-7, abs=1e-3
+        )
 
 
 def test_constants_become_numbers_of_the_formula_and_whole_powers_products():
@@ -213,8 +240,27 @@ def test_an_energy_that_is_not_real_is_refused_where_it_is_asked_for(energy, giv
         formula_of_text(energy).radial(given)(r)
 
 
-NUMBERS = ("0", "1", "2", "0.5", "1/3", "9", "200", "199", "1e8", "1e-8", "1e200", "999999999", "1" * 20, "1e-300", "pi",
-           "-1", "-7.5", "1e308", "9" * 300)  # fmt: skip
+NUMBERS = (
+    "0",
+    "1",
+    "2",
+    "0.5",
+    "1/3",
+    "9",
+    "200",
+    "199",
+    "1e8",
+    "1e-8",
+    "1e200",
+    "999999999",
+    "1" * 20,
+    "1e-300",
+    "pi",
+    "-1",
+    "-7.5",
+    "1e308",
+    "9" * 300,
+)
 #: Calls of Python that reading and differentiating a text may take: two seconds or so.
 MOST_CALLS = 5_000_000
 
@@ -277,8 +323,14 @@ def test_a_table_is_as_good_as_it_says():
     assert off < 3 * table.error < 1e-3
     for x in (3.0, 5.0, 8.0):
         step = 1e-5
-        assert radial(x)[1] == pytest.approx((radial(x - step)[0] - radial(x + step)[0]) / (2 * step), rel=1e-6)
-    for bad, word in ((([1, 2], [1, 2]), "8 distances"), ((r, r**2), "does not repel"), ((r[::-1], r), "ascending")):
+        assert radial(x)[1] == pytest.approx(
+            (radial(x - step)[0] - radial(x + step)[0]) / (2 * step), rel=1e-6
+        )
+    for bad, word in (
+        (([1, 2], [1, 2]), "8 distances"),
+        ((r, r**2), "does not repel"),
+        ((r[::-1], r), "ascending"),
+    ):
         with pytest.raises(FormulaError, match=word):
             formula_of_table(*bad, 9.0)
     with pytest.raises(FormulaError, match=r"ends at 10 Å, before the cutoff"):
@@ -305,9 +357,9 @@ def test_a_function_needs_to_say_what_its_parameters_are():
     def alone(p: Pair, r):
         return r
 
-    assert formula_of_function(lennard_jones).radial({"eps": 1.0, "sig": 3.0})(4.0)[0] == pytest.approx(
-        formula_of_text(LJ).radial({"eps": 1.0, "sig": 3.0})(4.0)[0]
-    )
+    assert formula_of_function(lennard_jones).radial({"eps": 1.0, "sig": 3.0})(4.0)[
+        0
+    ] == pytest.approx(formula_of_text(LJ).radial({"eps": 1.0, "sig": 3.0})(4.0)[0])
     with pytest.raises(FormulaError, match="annotate p with a NamedTuple"):
         formula_of_function(bare)
     with pytest.raises(FormulaError, match="not a function of Python"):
@@ -327,26 +379,32 @@ def test_a_law_ends_as_the_built_in_one(name):
     one = theirs.for_slots(8, np.float64)
     for r in (2.9, 7.4, 8.2, 8.99):
         expected = in_numbers(one, r * r)
-        assert at_distance(own, own.formula, end, r * r) == pytest.approx(expected, rel=1e-11, abs=1e-11)
+        assert at_distance(own, own.formula, end, r * r) == pytest.approx(
+            expected, rel=1e-11, abs=1e-11
+        )
 
 
 @pytest.mark.parametrize("name", TRUNCATIONS)
 def test_the_tail_of_a_law_is_that_of_the_built_in_one(name):
     theirs = built_in(np.zeros(10, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, 7.5)
     radial = formula_of_text(LJ).radial({"eps": 1.0, "sig": 3.4})
-    found = tail_of_pair(radial, np.array(truncation_terms(name, theirs.truncation, radial)), theirs.truncation)
+    found = tail_of_pair(
+        radial, np.array(truncation_terms(name, theirs.truncation, radial)), theirs.truncation
+    )
     assert 100 * np.array(found) == pytest.approx(np.array(tail(theirs)), rel=1e-8)
     with pytest.raises(ArithmeticError, match="too slowly"):
         tail_of_pair(formula_of_text("1/r**3").radial({}), np.zeros(4), theirs.truncation)
 
 
-# --- pair laws in a system -------------------------------------------------------------------------------------------
+# --- pair laws in a system ------------------------------------------------------------------------
 
 
 def same_as_built_in(counts, tolerance=1e-13, law=None, **forces):
     """A law equals the built-in Lennard-Jones of the same models, with mixing and ending."""
     scene = small_scene(counts, 25.0, forces={"electrostatics": "none", **forces})
-    system, engine, state = built(counts, 25.0, spread=0.0, forces={"electrostatics": "none", **forces})
+    system, engine, state = built(
+        counts, 25.0, spread=0.0, forces={"electrostatics": "none", **forces}
+    )
     expected_load, expected = engine.evaluate(state)
     given = {
         f"{m.name}.{name}": {"eps": m.epsilon[i] / KJ_PER_MOL, "sig": m.sigma[i]}
@@ -355,12 +413,18 @@ def same_as_built_in(counts, tolerance=1e-13, law=None, **forces):
         if m.epsilon[i] > 0
     }
     own = build(scene.with_user_code([(law or rigidmd.pair_law)(given)]))
-    load, tallies = own.engine_of({name: own.terms[name] for name in own.user_terms}, "double").evaluate(state)
+    load, tallies = own.engine_of(
+        {name: own.terms[name] for name in own.user_terms}, "double"
+    ).evaluate(state)
     (tally,) = tallies.values()
     assert tally.energy == pytest.approx(expected["lennard_jones"].energy, rel=tolerance)
-    assert tally.virial == pytest.approx(expected["lennard_jones"].virial, rel=tolerance, abs=tolerance * 1e5)
+    assert tally.virial == pytest.approx(
+        expected["lennard_jones"].virial, rel=tolerance, abs=tolerance * 1e5
+    )
     for mine, theirs in zip(load, expected_load, strict=True):
-        assert mine == pytest.approx(theirs, rel=tolerance, abs=tolerance * np.abs(theirs).max(initial=0.0))
+        assert mine == pytest.approx(
+            theirs, rel=tolerance, abs=tolerance * np.abs(theirs).max(initial=0.0)
+        )
 
 
 def from_text(given, **more):
@@ -382,7 +446,9 @@ def test_a_law_from_a_function_or_a_table_is_the_built_in_one():
     def from_table(given):
         (own,) = given.values()
         r = np.linspace(2.4, 9.5, 2000)
-        return rigidmd.pair_law(table=(r, 4 * own["eps"] * ((own["sig"] / r) ** 12 - (own["sig"] / r) ** 6)))
+        return rigidmd.pair_law(
+            table=(r, 4 * own["eps"] * ((own["sig"] / r) ** 12 - (own["sig"] / r) ** 6))
+        )
 
     same_as_built_in({"argon": 40, "nitrogen": 30}, 1e-12, law=from_function)
     same_as_built_in({"argon": 60}, 1e-6, law=from_table)
@@ -390,7 +456,11 @@ def test_a_law_from_a_function_or_a_table_is_the_built_in_one():
 
 def test_who_interacts_with_which_parameters():
     def numbers(law, counts={"argon": 3, "krypton": 3}, **forces):  # noqa: B006
-        law = build(small_scene(counts, 25.0, forces=forces).with_user_code([law])).terms["pair_law"].potential
+        law = (
+            build(small_scene(counts, 25.0, forces=forces).with_user_code([law]))
+            .terms["pair_law"]
+            .potential
+        )
         return law.parameters, law.interacts
 
     both = {"Ar": {"k": 1.0}, "Kr": {"k": 4.0}}
@@ -401,15 +471,19 @@ def test_who_interacts_with_which_parameters():
     assert parameters[0, 0, 1] == pytest.approx(250)
     parameters, _ = numbers(rigidmd.pair_law("k/r**9", both, pairs={("Kr", "Ar"): {"k": 7.0}}))
     assert parameters[0, 0, 1] == parameters[0, 1, 0] == pytest.approx(700)
-    parameters, interacts = numbers(rigidmd.pair_law("k/r**9", pairs={("argon.Ar", "Kr"): {"k": 7.0}}))
+    parameters, interacts = numbers(
+        rigidmd.pair_law("k/r**9", pairs={("argon.Ar", "Kr"): {"k": 7.0}})
+    )
     assert np.array_equal(interacts, [[0, 1], [1, 0]])
     # as in [[forces.pairs]]: a name means sites of that name, and elements only if no site has it
-    parameters, interacts = numbers(rigidmd.pair_law("k/r**9", {"AR": {"k": 1.0}, "argon.AR": {"k": 2.0}}))
+    parameters, interacts = numbers(
+        rigidmd.pair_law("k/r**9", {"AR": {"k": 1.0}, "argon.AR": {"k": 2.0}})
+    )
     assert parameters[0] == pytest.approx(200)
     assert interacts.shape == (1, 1)
-    one = build(small_scene({"argon": 3}, 25.0).with_user_code([rigidmd.pair_law("k/r**9", {"k": 2.0})])).terms[
-        "pair_law"
-    ]
+    one = build(
+        small_scene({"argon": 3}, 25.0).with_user_code([rigidmd.pair_law("k/r**9", {"k": 2.0})])
+    ).terms["pair_law"]
     assert one.potential.interacts.shape == (1, 1)
     with pytest.raises(SceneError, match=r"have no geometric mean"):
         numbers(rigidmd.pair_law("k/r**9", {"Ar": {"k": 1.0}, "Kr": {"k": -4.0}}))
@@ -422,7 +496,9 @@ def test_who_interacts_with_which_parameters():
     with pytest.raises(SceneError, match="mixing: q is not a parameter"):
         numbers(rigidmd.pair_law("k/r**9", both, mixing={"q": "arithmetic"}))
     with pytest.raises(SceneError, match="is given twice"):
-        numbers(rigidmd.pair_law("k/r**9", pairs={("AR", "KR"): {"k": 1.0}, ("KR", "AR"): {"k": 2.0}}))
+        numbers(
+            rigidmd.pair_law("k/r**9", pairs={("AR", "KR"): {"k": 1.0}, ("KR", "AR"): {"k": 2.0}})
+        )
     with pytest.raises(SceneError, match="switch_start_A would do nothing"):
         numbers(rigidmd.pair_law("k/r**9", both, truncation="shift", switch_start_A=7.0))
     with pytest.raises(SceneError, match=r"longer than half"):
@@ -433,7 +509,13 @@ def test_who_interacts_with_which_parameters():
 
 def test_parameters_may_come_from_the_model():
     sites = [
-        {"name": "D", "element": "Ar", "mass_u": 40, "position_A": [0, 0, 0], "parameters": {"k": 3.0, "other": 1.0}}
+        {
+            "name": "D",
+            "element": "Ar",
+            "mass_u": 40,
+            "position_A": [0, 0, 0],
+            "parameters": {"k": 3.0, "other": 1.0},
+        }
     ]
     scene = points(
         molecules=[{"name": "dot", "count": 10, "sites": sites}],
@@ -443,9 +525,12 @@ def test_parameters_may_come_from_the_model():
     assert "wall: k/r**9, 10 sites, cutoff 9 Å, shift" in describe(scene)
 
 
-# --- tables in files -------------------------------------------------------------------------------------------------
+# --- tables in files ------------------------------------------------------------------------------
 
-ARGON = {"sigma": 3.405, "epsilon": 119.8 * 8.31446261815324e-3}  # of the shipped model, Å and kJ/mol
+ARGON = {
+    "sigma": 3.405,
+    "epsilon": 119.8 * 8.31446261815324e-3,
+}  # of the shipped model, Å and kJ/mol
 
 
 def argon_energy(r):
@@ -467,11 +552,19 @@ def tabulated(folder, count=60, edge=19.0, **entry):
     """Argon with the table argon.csv, or without an entry with the built-in potential."""
     forces = {"cutoff_A": 9.0}
     if entry:
-        forces |= {"lennard_jones": False, "custom": [{"name": "argon", "table": "argon.csv"} | entry]}
+        forces |= {
+            "lennard_jones": False,
+            "custom": [{"name": "argon", "table": "argon.csv"} | entry],
+        }
     return small_scene(
-        {"argon": count}, edge, folder, forces=forces, stages=[{"duration_ps": 0.4, "timestep_fs": 4}],
-        start={"temperature_K": 90.0}, output={"trajectory": False, "figures": False, "log_interval_ps": 0.02},
-    )  # fmt: skip
+        {"argon": count},
+        edge,
+        folder,
+        forces=forces,
+        stages=[{"duration_ps": 0.4, "timestep_fs": 4}],
+        start={"temperature_K": 90.0},
+        output={"trajectory": False, "figures": False, "log_interval_ps": 0.02},
+    )
 
 
 @pytest.mark.parametrize("with_forces", [False, True])
@@ -479,8 +572,12 @@ def test_a_table_in_a_file_is_the_potential_that_it_lists(with_forces, tmp_path)
     write_argon_table(tmp_path / "argon.csv", with_forces=with_forces)
     scene = tabulated(tmp_path, sites=("AR",))
     text = describe(scene)
-    assert "argon: argon.csv of 700 energies from 2.6 to 9.2 Å, 60 sites, cutoff 9 Å, switch" in text
-    error = float(re.search(r"argon: the error of its spline is (\S+) of its deepest energy", text)[1])
+    assert (
+        "argon: argon.csv of 700 energies from 2.6 to 9.2 Å, 60 sites, cutoff 9 Å, switch" in text
+    )
+    error = float(
+        re.search(r"argon: the error of its spline is (\S+) of its deepest energy", text)[1]
+    )
     assert 1e-9 < error < 2e-5
     exact, of_table = (rigidmd.Simulation(one).run() for one in (tabulated(tmp_path), scene))
     start = [results["potential"][0] for results in (exact, of_table)]
@@ -492,7 +589,8 @@ def test_a_table_in_a_file_is_the_potential_that_it_lists(with_forces, tmp_path)
 
 
 def test_a_table_ends_in_a_wall(tmp_path):
-    """Nearer than the first row, value and slope are those of the first row, and the energy rises as r⁻¹²."""
+    """Nearer than the first row, value and slope are those of the first row, and the energy rises
+    as r⁻¹²."""
     write_argon_table(tmp_path / "argon.csv", first=3.1)
     law = rigidmd.pair_law(table=str(tmp_path / "argon.csv"))
     radial = law.formula(9.0).radial({"scale": 1.0})
@@ -503,7 +601,9 @@ def test_a_table_ends_in_a_wall(tmp_path):
     for r in (3.0, 2.5, 2.0, 1.6):
         wall = energy + 3.1 * force / 12 * ((3.1 / r) ** 12 - 1)
         assert radial(r)[0] == pytest.approx(wall * KJ_PER_MOL, rel=1e-3)
-        assert radial(r)[1] == pytest.approx((radial(r - 1e-5)[0] - radial(r + 1e-5)[0]) / 2e-5, rel=1e-5)
+        assert radial(r)[1] == pytest.approx(
+            (radial(r - 1e-5)[0] - radial(r + 1e-5)[0]) / 2e-5, rel=1e-5
+        )
     scene = tabulated(tmp_path, count=2, edge=30.0, sites=("AR",))
     _, engine, state = shaken(build(scene), 0, 0.0)
     for r in (2.2, 3.05, 4.0):
@@ -528,20 +628,26 @@ def test_a_run_with_a_table_resumes_with_the_same_bits_and_keeps_a_copy(tmp_path
 
 ROWS = "\n".join(f"{r:.3f} {argon_energy(r)[0]:.6g}" for r in np.arange(3.0, 9.3, 0.05))
 WRONG_TABLES = {
-    "r_nm energy_kJ_mol\n" + ROWS: r"argon.csv: line 1: the columns are r_nm, energy_kJ_mol; they must be r_A \(Å\)",
-    ROWS + "\n9.4": r"argon.csv: line 128: has 1 numbers, must have the same columns in all lines: r_A",
+    "r_nm energy_kJ_mol\n"
+    + ROWS: r"argon.csv: line 1: the columns are r_nm, energy_kJ_mol; they must be r_A \(Å\)",
+    ROWS
+    + "\n9.4": r"argon.csv: line 128: has 1 numbers, must have the same columns in all lines: r_A",
     ROWS + "\n9.4 nan": r"argon.csv: line 128: 9.4 nan has something else than finite numbers",
     ROWS + "\n9.4 abc": r"argon.csv: line 128: 9.4 abc has something else than finite numbers",
-    ROWS + "\n9.0 -0.1": r"argon.csv: line 128: r_A = 9 must be above 9.3 Å of the row before; sort the rows",
+    ROWS
+    + "\n9.0 -0.1": r"argon.csv: line 128: r_A = 9 must be above 9.3 Å of the row before; sort the rows",
     "-1 5\n" + ROWS: r"argon.csv: line 1: r_A = -1 must be above 0",
     "\n".join(ROWS.splitlines()[:7]): r"argon.csv: has 7 rows, needs 8 or more",
     "# nothing": r"argon.csv: has 0 rows",
     "\n".join(ROWS.splitlines()[:60]): r"ends at 5.95 Å, before the cutoff of 9 Å$",
-    "\n".join(f"{float(row.split()[0]) / 10} {row.split()[1]}" for row in ROWS.splitlines()): r"is it in nm\?",
+    "\n".join(
+        f"{float(row.split()[0]) / 10} {row.split()[1]}" for row in ROWS.splitlines()
+    ): r"is it in nm\?",
     "\n".join(ROWS.splitlines()[20:]): r"begins at 4 Å, where it does not repel",
-    "\n".join(f"{row} {-argon_energy(float(row.split()[0]))[1]:.6g}" for row in ROWS.splitlines()):
-        r"the forces are not -dE/dr. From 3 to 3.05 Å the energy changes by -\S+ kJ/mol, .*Have they another sign or unit\?",
-}  # fmt: skip
+    "\n".join(
+        f"{row} {-argon_energy(float(row.split()[0]))[1]:.6g}" for row in ROWS.splitlines()
+    ): r"the forces are not -dE/dr. From 3 to 3.05 Å the energy changes by -\S+ kJ/mol, .*Have they another sign or unit\?",
+}
 
 
 @pytest.mark.parametrize("text", WRONG_TABLES, ids=range(len(WRONG_TABLES)))
@@ -566,8 +672,12 @@ def test_all_errors_of_a_table_are_told_and_its_file_is_in_the_folder(tmp_path):
     (tmp_path / "argon.csv").write_text("\n".join(["1 x"] * 9) + "\n" + ROWS)
     with pytest.raises(SceneError) as refused:
         build(tabulated(tmp_path, sites=("AR",)))
-    assert [re.search(r"argon.csv: line (\d)", fault)[1] for fault in refused.value.errors] == [*"123456789"]
-    with pytest.raises(SceneError, match=r"forces.custom.0.table: '../argon.csv' is outside the scene's folder"):
+    assert [re.search(r"argon.csv: line (\d)", fault)[1] for fault in refused.value.errors] == [
+        *"123456789"
+    ]
+    with pytest.raises(
+        SceneError, match=r"forces.custom.0.table: '../argon.csv' is outside the scene's folder"
+    ):
         tabulated(tmp_path, table="../argon.csv")
     with pytest.raises(SceneError, match="there is no such file"):
         build(tabulated(tmp_path, table="other.csv"))
@@ -598,7 +708,7 @@ def test_a_law_that_makes_no_sense_is_told_at_once(arguments, word):
         rigidmd.pair_law(**arguments)
 
 
-# --- forces in Python ------------------------------------------------------------------------------------------------
+# --- forces in Python -----------------------------------------------------------------------------
 
 
 class Field(rigidmd.Force):
@@ -626,10 +736,18 @@ class Spring(rigidmd.Force):
 
 def test_a_field_on_sites_is_the_built_in_one():
     forces = {"electrostatics": "none"}
-    own = build(small_scene({"spce": 20, "argon": 3}, 20.0, forces=forces).with_user_code([Field()]))
-    theirs = build(small_scene({"spce": 20, "argon": 3}, 20.0, forces=forces, fields={"electric_V_per_nm": [0, 0, 1]}))
+    own = build(
+        small_scene({"spce": 20, "argon": 3}, 20.0, forces=forces).with_user_code([Field()])
+    )
+    theirs = build(
+        small_scene(
+            {"spce": 20, "argon": 3}, 20.0, forces=forces, fields={"electric_V_per_nm": [0, 0, 1]}
+        )
+    )
     load, tallies = own.engine_of({"field": own.terms["field"]}, "double").evaluate(own.state)
-    expected, told = theirs.engine_of({"e": theirs.terms["electric_field"]}, "double").evaluate(own.state)
+    expected, told = theirs.engine_of({"e": theirs.terms["electric_field"]}, "double").evaluate(
+        own.state
+    )
     assert tallies["field"].energy == pytest.approx(told["e"].energy, rel=1e-9)
     assert load.force == pytest.approx(expected.force, abs=1e-9)
     assert load.torque_body == pytest.approx(expected.torque_body, rel=1e-9, abs=1e-6)
@@ -690,12 +808,18 @@ class Faulty(rigidmd.Force):
 @pytest.mark.parametrize(
     "way, word",
     [
-        ("raises", r"on_molecules of the force faulty raised KeyError: 'charge', line \d+ of .*test_user_code.py"),
+        (
+            "raises",
+            r"on_molecules of the force faulty raised KeyError: 'charge', line \d+ of .*test_user_code.py",
+        ),
         ("shape", r"the force faulty returned forces of the shape \(3,\), not \(100, 3\)"),
         ("energy", "returned 'much' as its energy"),
         ("tuple", "returned ndarray; it must return a tuple"),
         ("virial", r"returned \[1.0, 2.0\] as its virial"),
-        ("nan", r"stopped at step \d \(.* ps\): the force faulty returned .*nan.* on molecule 7 \(dot\)"),
+        (
+            "nan",
+            r"stopped at step \d \(.* ps\): the force faulty returned .*nan.* on molecule 7 \(dot\)",
+        ),
     ],
 )
 def test_a_faulty_force_is_told_with_its_molecule_and_step(way, word):
@@ -746,9 +870,15 @@ class Halfway(Spring):
 @pytest.mark.parametrize(
     "force, word",
     [
-        (Wrong(), r"wrong: the force on molecule \d+ \(spce\) is not the derivative of the energy.* falls by -"),
+        (
+            Wrong(),
+            r"wrong: the force on molecule \d+ \(spce\) is not the derivative of the energy.* falls by -",
+        ),
         (Turned(), "turned: the torque on molecule"),
-        (Unstretched(), "spring: the component xx of its molecular virial is 0 kJ/mol.*tied_to_places = True"),
+        (
+            Unstretched(),
+            "spring: the component xx of its molecular virial is 0 kJ/mol.*tied_to_places = True",
+        ),
         (Sheared(), "the component xx of its molecular virial is 500"),
         (InPlace(), "read-only"),
         (Leaving(), "SystemExit: 0"),
@@ -766,7 +896,9 @@ def test_a_force_that_is_not_what_its_energy_says_stops_the_run_with_the_numbers
 
 def test_forces_from_python_exclude_what_they_cannot_go_with():
     stage = {"ensemble": "npt", "temperature_K": 94, "pressure_bar": 1, "duration_ps": 1}
-    with pytest.raises(SceneError, match="spring depend on absolute positions in it: keep the volume"):
+    with pytest.raises(
+        SceneError, match="spring depend on absolute positions in it: keep the volume"
+    ):
         rigidmd.Simulation(points(stages=[stage]), forces=[Spring()])
     top = rigidmd.Scene.read(ROOT / "systems" / "heavy_top_3.toml")
     with pytest.raises(SceneError, match="forces: for molecules; a single body takes applied"):
@@ -777,7 +909,7 @@ def test_forces_from_python_exclude_what_they_cannot_go_with():
         rigidmd.Simulation(points(), thermostat=3)
 
 
-# --- code in files ---------------------------------------------------------------------------------------------------
+# --- code in files --------------------------------------------------------------------------------
 
 MINE = """
 from typing import NamedTuple
@@ -818,7 +950,9 @@ def test_a_file_of_code_runs_only_where_it_is_trusted(tmp_path, monkeypatch, cap
     assert main(["energy", "s.toml", "--json"]) == 0  # this process trusts it by now
     import json
 
-    assert json.loads(capsys.readouterr().out)["components"]["trap"] == pytest.approx(spring["spring"][0], rel=1e-12)
+    assert json.loads(capsys.readouterr().out)["components"]["trap"] == pytest.approx(
+        spring["spring"][0], rel=1e-12
+    )
     # the file and its digest go with the run, which repeats
     (copy,) = (tmp_path / "runs" / "s").glob("input_*mine.py")
     assert copy.read_bytes() == (tmp_path / "mine.py").read_bytes()
@@ -834,7 +968,11 @@ def test_a_file_of_code_runs_only_where_it_is_trusted(tmp_path, monkeypatch, cap
 @pytest.mark.parametrize(
     "text, entry, word",
     [
-        ("import nosuchmodule", {"name": "x"}, "ModuleNotFoundError: No module named 'nosuchmodule'"),
+        (
+            "import nosuchmodule",
+            {"name": "x"},
+            "ModuleNotFoundError: No module named 'nosuchmodule'",
+        ),
         ("def f(:", {"name": "x"}, "line 1 raised SyntaxError"),
         (MINE, {"name": "tarp"}, "has no tarp; did you mean .*trap"),
         (MINE, {"name": "trap"}, r"trap\(...\) raised TypeError"),
@@ -845,7 +983,9 @@ def test_a_file_of_code_runs_only_where_it_is_trusted(tmp_path, monkeypatch, cap
 def test_a_file_that_is_no_use_is_told(text, entry, word, tmp_path):
     (tmp_path / "mine.py").write_text(text)
     rigidmd.trust(tmp_path / "mine.py")
-    scene = rigidmd.Scene.from_dict(POINTS | {"forces": {"custom": [{"module": "mine.py", **entry}]}}, tmp_path)
+    scene = rigidmd.Scene.from_dict(
+        POINTS | {"forces": {"custom": [{"module": "mine.py", **entry}]}}, tmp_path
+    )
     with pytest.raises(SceneError, match=word):
         build(scene)
 
@@ -901,11 +1041,13 @@ def test_a_law_of_a_function_sees_what_the_function_uses_when_the_law_is_made(mo
     for strength in (1.0, 5.0):
         monkeypatch.setitem(globals(), "STRENGTH", strength)
         own = rigidmd.pair_law(of_strength, {"D": One(2.0)}).formula(9.0).kind(2.0)
-        made.append(at_distance(CustomOneKind(20.0, Unmodified(20.0), own, (), end), own, end, 4.0)[0])
+        made.append(
+            at_distance(CustomOneKind(20.0, Unmodified(20.0), own, (), end), own, end, 4.0)[0]
+        )
     assert made == [pytest.approx(100.0), pytest.approx(500.0)]
 
 
-# --- thermostats -----------------------------------------------------------------------------------------------------
+# --- thermostats ----------------------------------------------------------------------------------
 
 
 class Halving(NamedTuple):
@@ -928,24 +1070,27 @@ def halve(bath, model, state, h, draw):
 
 def test_a_thermostat_of_ones_own_takes_the_place_of_that_of_the_stage():
     given = {"D": {"A": 1e5, "B": 4.0, "C": 1.0}}
-    scene = points(forces={"custom": [{"name": "soft", "energy": "A*exp(-B*r) - C/r**6", "parameters": given}]})
+    scene = points(
+        forces={"custom": [{"name": "soft", "energy": "A*exp(-B*r) - C/r**6", "parameters": given}]}
+    )
     results = rigidmd.Simulation(scene, thermostat=Halving(0.01)).run()
     assert results["kinetic"][-1] == pytest.approx(results["kinetic"][0] / 16, rel=0.02)
-    assert results["heat"][-1] == pytest.approx(results["energy"][-1] - results["energy"][0], rel=0.02)
+    assert results["heat"][-1] == pytest.approx(
+        results["energy"][-1] - results["energy"][0], rel=0.02
+    )
     assert any("thermostat: halving, from Python" in note for note in results.system.notes)
     assert results.system.scene.from_python == ("thermostat halving",)
 
 
 def with_error(line: str, name: str = "kick"):
-    """A thermostat of one line of code, for each molecule m, from a file of its own so that messages can quote it."""
+    """A thermostat of one line of code, for each molecule m, from a file of its own so that
+    messages can quote it."""
 
     class Shaky(NamedTuple):
         rate: float
         key: Key
 
-    source = (
-        f"def {name}(thermostat, model, state, h, draw):\n    for m in range(len(state.velocity)):\n        {line}\n"
-    )
+    source = f"def {name}(thermostat, model, state, h, draw):\n    for m in range(len(state.velocity)):\n        {line}\n"
     lines = source.splitlines(keepends=True)
     linecache.cache["shaky.py"] = (len(source), None, lines, "shaky.py")
     names = {"normals": normals, "SCRIPTS": SCRIPTS[0]}
@@ -957,16 +1102,34 @@ def with_error(line: str, name: str = "kick"):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("normals(draw, 0, m)", "line 3 of shaky.py: `normals(draw, 0, m)`): normals(key, draw, molecule, step) is called with"),
-        ("state.velocity[m] *= model.mass[m]", "kick (line 3 of shaky.py: `state.velocity[m] *= model.mass[m]`) has an index"),
-        ("state.velocity[m, 3] = 0.0", "kick (line 3 of shaky.py: `state.velocity[m, 3] = 0.0`) has an index beyond an array"),
-        ("state.velocities[m, 0] = 0.0", "line 3 of shaky.py: `state.velocities[m, 0] = 0.0`): Numba knows no attribute 'velocities'"),
+        (
+            "normals(draw, 0, m)",
+            "line 3 of shaky.py: `normals(draw, 0, m)`): normals(key, draw, molecule, step) is called with",
+        ),
+        (
+            "state.velocity[m] *= model.mass[m]",
+            "kick (line 3 of shaky.py: `state.velocity[m] *= model.mass[m]`) has an index",
+        ),
+        (
+            "state.velocity[m, 3] = 0.0",
+            "kick (line 3 of shaky.py: `state.velocity[m, 3] = 0.0`) has an index beyond an array",
+        ),
+        (
+            "state.velocities[m, 0] = 0.0",
+            "line 3 of shaky.py: `state.velocities[m, 0] = 0.0`): Numba knows no attribute 'velocities'",
+        ),
         ("state.velocity[m, 0] = thermostat.time", "Numba knows no attribute 'time' of Shaky"),
-        ("state.velocity[m, 0] = ramp(h)", "kick (line 1 of shaky.py) cannot be compiled: NameError: name 'ramp' is not defined"),
+        (
+            "state.velocity[m, 0] = ramp(h)",
+            "kick (line 1 of shaky.py) cannot be compiled: NameError: name 'ramp' is not defined",
+        ),
         ("state.velocity[m, 0] = SCRIPTS", "it uses SCRIPTS, which is not compiled"),
-        ("state.velocity[m, 0] = 0.0 / (h - h)", "kick (line 1 of shaky.py) makes momenta that are not finite"),
+        (
+            "state.velocity[m, 0] = 0.0 / (h - h)",
+            "kick (line 1 of shaky.py) makes momenta that are not finite",
+        ),
     ],
-)  # fmt: skip
+)
 def test_an_error_in_a_thermostat_names_its_line_and_the_cause(line, message):
     with pytest.raises(SceneError) as error:
         rigidmd.Simulation(points(), thermostat=with_error(line)).run()
@@ -983,7 +1146,10 @@ def test_an_index_beyond_an_array_in_a_compiled_force_names_its_line():
         for m in range(len(state.position)):
             load.force[m, 0] += term.strength[m]
 
-    with pytest.raises(SceneError, match=r"pull \(line \d+ of test_user_code.py: `load.force.*`\) has an index beyond"):
+    with pytest.raises(
+        SceneError,
+        match=r"pull \(line \d+ of test_user_code.py: `load.force.*`\) has an index beyond",
+    ):
         rigidmd.Simulation(points(), forces=[Pull(np.ones(3))]).run()
 
 
@@ -991,11 +1157,15 @@ def test_an_index_beyond_an_array_in_a_compiled_force_names_its_line():
     ("line", "note"),
     [
         ("state.velocity[m, 1] *= -1.0", None),
-        ("state.velocity[m, 1] *= 0.9; " + (heat := "state.energy_ledger[0] -= 20.0 * 0.19 / 0.81 * state.velocity[m, 1]**2"), None),
+        (
+            "state.velocity[m, 1] *= 0.9; "
+            + (heat := "state.energy_ledger[0] -= 20.0 * 0.19 / 0.81 * state.velocity[m, 1]**2"),
+            None,
+        ),
         ("state.velocity[m, 1] *= 0.9", "of it and adds 0 to state.energy_ledger[0]"),
         (f"state.velocity[m, 1] *= 0.9; {heat.replace('-=', '+=')}", "of it and adds 0."),
     ],
-)  # fmt: skip
+)
 def test_heat_that_is_not_in_the_ledger_has_a_note(line, note):
     system = build(points().with_user_code([], with_error(line)))
     notes = check_compiled_code(system, system.state)
@@ -1008,15 +1178,21 @@ def test_a_stop_names_the_code_of_the_user_that_acts_in_each_step():
     stages = [{"duration_ps": 0.04, "timestep_fs": 4, "integrator": "two_halves"}]
     system = build(points(integrators=rows, stages=stages).with_user_code([], Halving(0.01)))
     told = explain(system, FailedCheck("molecule 2 (dot) is lost", 1), [], 0.004, None)
-    assert "Likely cause: the thermostat halving, from Python or the integrator two_halves, from the scene" in told
+    assert (
+        "Likely cause: the thermostat halving, from Python or the integrator two_halves, from the scene"
+        in told
+    )
 
 
-# --- examples --------------------------------------------------------------------------------------------------------
+# --- examples -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, id=path.stem, marks=[pytest.mark.soak] if path.stem == "mie" else []) for path in SCRIPTS],
+    [
+        pytest.param(path, id=path.stem, marks=[pytest.mark.soak] if path.stem == "mie" else [])
+        for path in SCRIPTS
+    ],
 )
 def test_every_example_of_an_extension_runs_and_is_short(path, monkeypatch):
     from support import registry
@@ -1034,7 +1210,9 @@ def test_scripts_are_listed_and_copied(tmp_path, monkeypatch, capsys):
     assert all(f"  {path.stem} " in listed for path in SCRIPTS)
     assert main(["new", "mie"]) == 0
     assert "python mie.py" in capsys.readouterr().out
-    assert (tmp_path / "mie.py").read_bytes() == (ROOT / "systems" / "scripts" / "mie.py").read_bytes()
+    assert (tmp_path / "mie.py").read_bytes() == (
+        ROOT / "systems" / "scripts" / "mie.py"
+    ).read_bytes()
     assert main(["new", "mie", "-o", "mine.toml", "--force"]) == 2
     assert "must end in .py" in capsys.readouterr().err
 
@@ -1048,7 +1226,14 @@ def test_langevin_function_of_dipoles_in_a_field_in_python():
             "molecules": [{"model": "spce", "count": 200}],
             "forces": {"electrostatics": "none", "lennard_jones": False},
             "start": {"temperature_K": 300},
-            "stages": [{"ensemble": "nvt", "temperature_K": 300, "duration_ps": 100, "thermostat": "langevin"}],
+            "stages": [
+                {
+                    "ensemble": "nvt",
+                    "temperature_K": 300,
+                    "duration_ps": 100,
+                    "thermostat": "langevin",
+                }
+            ],
         }
     )
     results = rigidmd.Simulation(scene, forces=[Field()]).run()
@@ -1060,7 +1245,7 @@ def test_langevin_function_of_dipoles_in_a_field_in_python():
     assert energy.mean() / 200 == pytest.approx(-mu * mean, rel=0.01)
 
 
-# --- what is lost at a cutoff, and tables that say too little -----------------------------------------
+# --- what is lost at a cutoff, and tables that say too little -------------------------------------
 
 
 UMBRELLA = {"name": "umbrella", "energy": "0.5*k*(r - r0)**2", "sites": ["AR"]}
@@ -1075,18 +1260,47 @@ def of_law(truncation="plain", cutoff=9.0, temperature=298.0, **law):
 @pytest.mark.parametrize(
     ("scene", "words"),
     [
-        (of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}), "umbrella is 121 kJ/mol (49 kT at 298 K) at its cutoff"),
-        (of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}, temperature=596.0), "(24 kT at 596 K)"),
-        (of_law("shift", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}), "its force is -44 kJ/mol/Å"),
-        (of_law("smooth_switch", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}), "with truncation = smooth_switch"),
-        (of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 9.0}), "where it would change by 1.3e+02 kT"),
-        (of_law(name="charge", energy="q*q*1389/r", sites=["AR"], parameters={"q": 0.4}), "charge is 24.7 kJ/mol"),
-        (of_law(name="lj", energy="4*e*((s/r)**12 - (s/r)**6)", parameters={"e": 1.0, "s": 3.4}), None),
-        (of_law(name="lj", energy="4*e*((s/r)**12 - (s/r)**6)", parameters={"e": 1.0, "s": 3.4}, cutoff=5.0,
-                temperature=87.0), "lj is -0.356 kJ/mol (-0.49 kT at 87 K)"),
+        (
+            of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}),
+            "umbrella is 121 kJ/mol (49 kT at 298 K) at its cutoff",
+        ),
+        (
+            of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}, temperature=596.0),
+            "(24 kT at 596 K)",
+        ),
+        (
+            of_law("shift", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}),
+            "its force is -44 kJ/mol/Å",
+        ),
+        (
+            of_law("smooth_switch", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}),
+            "with truncation = smooth_switch",
+        ),
+        (
+            of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 9.0}),
+            "where it would change by 1.3e+02 kT",
+        ),
+        (
+            of_law(name="charge", energy="q*q*1389/r", sites=["AR"], parameters={"q": 0.4}),
+            "charge is 24.7 kJ/mol",
+        ),
+        (
+            of_law(name="lj", energy="4*e*((s/r)**12 - (s/r)**6)", parameters={"e": 1.0, "s": 3.4}),
+            None,
+        ),
+        (
+            of_law(
+                name="lj",
+                energy="4*e*((s/r)**12 - (s/r)**6)",
+                parameters={"e": 1.0, "s": 3.4},
+                cutoff=5.0,
+                temperature=87.0,
+            ),
+            "lj is -0.356 kJ/mol (-0.49 kT at 87 K)",
+        ),
         (of_law(name="wca", energy="e*(s/r)**12", parameters={"e": 1.0, "s": 3.4}), None),
     ],
-)  # fmt: skip
+)
 def test_what_a_potential_has_at_its_cutoff_is_told(scene, words):
     warnings = build(scene).warnings
     assert (warnings == []) == (words is None)
@@ -1103,7 +1317,9 @@ def lennard_jones_rows(step=0.02, without=(0.0, 0.0), factor=1.0):
 @pytest.mark.parametrize("with_forces", [False, True])
 def test_a_gap_in_a_table_is_refused(gap, with_forces):
     rows = lennard_jones_rows(without=gap)[: 3 if with_forces else 2]
-    with pytest.raises(ValueError, match=r"has a gap from 3\.|has a gap from 4 to 9|forces are not -dE/dr"):
+    with pytest.raises(
+        ValueError, match=r"has a gap from 3\.|has a gap from 4 to 9|forces are not -dE/dr"
+    ):
         rigidmd.pair_law(table=rows).formula(9.0)
 
 
@@ -1111,11 +1327,17 @@ def test_a_gap_in_a_table_is_refused(gap, with_forces):
     ("step", "with_forces"), [(0.02, False), (0.05, True), (0.1, False), (0.1, True), (0.15, True)]
 )
 def test_the_error_of_a_spline_is_what_it_says(step, with_forces):
-    """Compared with the exact energy where it is below ten wells; the estimate is within a factor of 6."""
-    formula = rigidmd.pair_law(table=lennard_jones_rows(step)[: 3 if with_forces else 2]).formula(9.0)
+    """Compared with the exact energy where it is below ten wells; the estimate is within a factor
+    of 6."""
+    formula = rigidmd.pair_law(table=lennard_jones_rows(step)[: 3 if with_forces else 2]).formula(
+        9.0
+    )
     radial, r = formula.radial({"scale": 1.0}), np.linspace(2.9, 8.99, 2001)
     r = r[argon_energy(r)[0] < 10 * ARGON["epsilon"]]
-    off = max(abs(radial(x)[0] / KJ_PER_MOL - argon_energy(x)[0]) for x in r.tolist()) / ARGON["epsilon"]
+    off = (
+        max(abs(radial(x)[0] / KJ_PER_MOL - argon_energy(x)[0]) for x in r.tolist())
+        / ARGON["epsilon"]
+    )
     assert off / 3 < formula.error < 6 * off
 
 
@@ -1131,11 +1353,16 @@ def test_a_spline_that_is_nonsense_is_refused_and_a_poor_one_told(tmp_path):
     r, energy, _ = lennard_jones_rows(0.02)
     wild = energy.copy()
     wild[120] = 1e6
-    with pytest.raises(ValueError, match=r"the error of its spline is .* of its deepest energy, .* must be below 0.1"):
+    with pytest.raises(
+        ValueError,
+        match=r"the error of its spline is .* of its deepest energy, .* must be below 0.1",
+    ):
         rigidmd.pair_law(table=(r, wild)).formula(9.0)
     np.savetxt(tmp_path / "argon.csv", np.column_stack(lennard_jones_rows(0.12)[:2]))
     [told] = build(tabulated(tmp_path, sites=("AR",))).warnings
-    assert re.match(r"argon the error of its spline is \d\.\de-02 of its deepest energy: use smaller", told)
+    assert re.match(
+        r"argon the error of its spline is \d\.\de-02 of its deepest energy: use smaller", told
+    )
 
 
 @pytest.mark.parametrize("value", ["1e300", "-1e31", "1e308"])

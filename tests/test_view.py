@@ -32,17 +32,30 @@ from rigidmd import Scene, Simulation
 from rigidmd.commands import cli
 
 CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
+    (
+        path
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (path := shutil.which(name))
+    ),
+    "",
 )
-in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed: what a browser shows is not tested")
-SHORT_WATER = {"stages.equilibration.duration_ps": 0.02, "stages.production.duration_ps": 0.02, "output.trajectory_interval_ps": 0.01,
-               "output.log_interval_ps": 0.004}  # fmt: skip
+in_browser = pytest.mark.skipif(
+    not CHROMIUM, reason="Chromium is not installed: what a browser shows is not tested"
+)
+SHORT_WATER = {
+    "stages.equilibration.duration_ps": 0.02,
+    "stages.production.duration_ps": 0.02,
+    "output.trajectory_interval_ps": 0.01,
+    "output.log_interval_ps": 0.004,
+}
 
 
 @pytest.fixture(scope="module")
 def top(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "top"
-    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.5, "output.figures": False})
+    scene = Scene.read(
+        ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.5, "output.figures": False}
+    )
     Simulation(scene, folder).run()
     return folder
 
@@ -56,20 +69,39 @@ def water(tmp_path_factory):
 
 def shown(page, out, at=None, size="420,700"):
     """The pixels of a page in a browser, (h, w, 3), at a time of its film."""
-    flags = ["--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
-             "--disable-component-update", "--disable-sync", "--enable-unsafe-swiftshader", "--hide-scrollbars"]  # fmt: skip
+    flags = [
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        "--enable-unsafe-swiftshader",
+        "--hide-scrollbars",
+    ]
     address = page.resolve().as_uri() + ("" if at is None else f"#t={at}")
     subprocess.run(
-        [CHROMIUM, *flags, f"--user-data-dir={out.parent / 'browser'}", f"--window-size={size}", f"--screenshot={out}",
-         address],
-        check=True, capture_output=True, timeout=120,
-    )  # fmt: skip
+        [
+            CHROMIUM,
+            *flags,
+            f"--user-data-dir={out.parent / 'browser'}",
+            f"--window-size={size}",
+            f"--screenshot={out}",
+            address,
+        ],
+        check=True,
+        capture_output=True,
+        timeout=120,
+    )
     return imread(out)[:, :, :3]
 
 
 def data_of(page):
     """The data of the film in a page."""
-    found = re.search(r'<script type="application/json" id="film-data">(.*?)</script>', page.read_text("utf-8"))
+    found = re.search(
+        r'<script type="application/json" id="film-data">(.*?)</script>', page.read_text("utf-8")
+    )
     return json.loads(found[1])
 
 
@@ -80,7 +112,9 @@ def numbers(text, kind):
 def is_alone(text):
     """Whether a page loads nothing from elsewhere."""
     own = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
-    return not re.search(r"<link|<script[^>]* src|<img[^>]* src=\"(?!data:)|url\((?!#)|@import|<image", own)
+    return not re.search(
+        r"<link|<script[^>]* src|<img[^>]* src=\"(?!data:)|url\((?!#)|@import|<image", own
+    )
 
 
 def test_a_report_tells_of_molecules(water, tmp_path, capsys):
@@ -88,12 +122,22 @@ def test_a_report_tells_of_molecules(water, tmp_path, capsys):
     assert cli.main(["report", str(water), "-o", str(page)]) == 0
     text = page.read_text("utf-8")
     assert is_alone(text)
-    for title in ("Means of each stage", "Plots", "Stability margins", "System and interactions", "Not used, and why",
-                  "Files", "How to repeat it"):  # fmt: skip
+    for title in (
+        "Means of each stage",
+        "Plots",
+        "Stability margins",
+        "System and interactions",
+        "Not used, and why",
+        "Files",
+        "How to repeat it",
+    ):
         assert f">{title}</h2>" in text
     record = read_record(water)
     own = record.columns["temperature"][record.columns["stage_name"] == "production"]
-    assert '<td>means</td><td class="wrap">over all 0.02 ps, too short to detect equilibration</td>' in text
+    assert (
+        '<td>means</td><td class="wrap">over all 0.02 ps, too short to detect equilibration</td>'
+        in text
+    )
     of_stage = text[text.index("<p>production: ") :]
     row = re.search(r"<td>temperature</td><td>([\d.]+) K \(too short for an error\)</td>", of_stage)
     assert float(row[1]) == pytest.approx(own.mean(), abs=0.5)
@@ -120,7 +164,9 @@ def test_the_film_of_a_body_is_its_motion(top, tmp_path):
     quaternion = np.stack([seen[key] for key in ("qw", "qx", "qy", "qz")], axis=-1)
     assert np.allclose(numbers(data["quaternion"], "<f4").reshape(-1, 4), quaternion, atol=1e-6)
     tip = numbers(data["path"], "<f4").reshape(-1, 3)[-1]
-    assert np.allclose(tip, data["sphere"] * np.array([seen[f"q{i}3"][-1] for i in (1, 2, 3)]), atol=1e-6)
+    assert np.allclose(
+        tip, data["sphere"] * np.array([seen[f"q{i}3"][-1] for i in (1, 2, 3)]), atol=1e-6
+    )
     assert is_alone(page.read_text("utf-8"))
     assert page.stat().st_size < 1e6
 
@@ -130,7 +176,9 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
     page = tmp_path / "water.html"
     assert cli.main(["view", str(water), "-o", str(page)]) == 0
     data, record = data_of(page), read_record(water)
-    seen = (numbers(data["positions"], "<i2").astype(float) + data["steps"]) * data["scale"] + data["low"]
+    seen = (numbers(data["positions"], "<i2").astype(float) + data["steps"]) * data["scale"] + data[
+        "low"
+    ]
     frames = molecule_film.frames_of(record, 100)
     assert np.allclose(seen.reshape(frames.positions.shape), frames.positions, atol=data["scale"])
     assert data["scale"] < 1e-3
@@ -162,7 +210,9 @@ def test_without_chemiscope_a_sentence_says_what_to_install(water, monkeypatch, 
 def test_a_browser_shows_a_top_that_moves(top, tmp_path):
     page = tmp_path / "top.html"
     assert cli.main(["view", str(top), "-o", str(page)]) == 0
-    one, other = (shown(page, tmp_path / f"{at}.png", at)[150:400] for at in (0.05, 0.1))  # half a turn
+    one, other = (
+        shown(page, tmp_path / f"{at}.png", at)[150:400] for at in (0.05, 0.1)
+    )  # half a turn
     red, green, blue = (np.stack([one, other])[..., k] for k in range(3))
     assert (blue > red + 0.15).mean() > 0.02  # its sides
     assert ((red > blue + 0.2) & (red > green + 0.2)).mean() > 0.005  # its painted side
@@ -185,13 +235,18 @@ def test_a_browser_shows_water_that_moves(water, tmp_path):
 @pytest.mark.soak
 def test_a_film_of_a_thousand_frames_of_water(tmp_path):
     pytest.importorskip("chemiscope", reason="chemiscope is not installed")
-    more = SHORT_WATER | {"stages.production.duration_ps": 2.0, "output.trajectory_interval_ps": 0.002}
+    more = SHORT_WATER | {
+        "stages.production.duration_ps": 2.0,
+        "output.trajectory_interval_ps": 0.002,
+    }
     Simulation(Scene.read(ROOT / "systems" / "water.toml", more), tmp_path / "run").run()
     page = tmp_path / "water.html"
     assert cli.main(["view", str(tmp_path / "run"), "-o", str(page)]) == 0
     assert page.stat().st_size < 30e6
     assert len(numbers(data_of(page)["time"], "<f8")) > 1000
-    pictures = [shown(page, tmp_path / f"{at}.png", at, "1200,800")[60:560, :600] for at in (0.1, 1.9)]
+    pictures = [
+        shown(page, tmp_path / f"{at}.png", at, "1200,800")[60:560, :600] for at in (0.1, 1.9)
+    ]
     assert (np.abs(pictures[0] - pictures[1]).max(axis=-1) > 0.2).mean() > 0.02
 
 
@@ -216,7 +271,10 @@ def test_damaged_files_of_a_run(name, text, said, top, tmp_path, capsys):
 def test_numbers_that_are_none_are_refused(top, tmp_path, capsys):
     shutil.copytree(top, tmp_path / "run")
     path = tmp_path / "run" / "motion.csv"
-    for cell, said in (("x", "has a cell that is not a number"), ("nan", "has a cell that is not a finite number")):
+    for cell, said in (
+        ("x", "has a cell that is not a number"),
+        ("nan", "has a cell that is not a finite number"),
+    ):
         head, line, *_ = (top / "motion.csv").read_text().splitlines()
         path.write_text(f"{head}\n{line}\n{','.join([cell, *line.split(',')[1:]])}\n")
         assert cli.main(["view", str(tmp_path / "run")]) == 2
@@ -226,14 +284,30 @@ def test_numbers_that_are_none_are_refused(top, tmp_path, capsys):
 def frames_in(path):
     """The frames of a .gif (f, h, w, 3), 0 to 1."""
     with Image.open(path) as film:
-        return np.array([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]) / 255
+        return (
+            np.array([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)])
+            / 255
+        )
 
 
 @pytest.mark.parametrize("kind", ["top", "water"])
 def test_a_film_moves(kind, request, tmp_path, capsys):
     path = tmp_path / "film.gif"
     plots = ["--plots"] if kind == "water" else []
-    assert cli.main(["film", str(request.getfixturevalue(kind)), "-o", str(path), "--seconds", "0.3", *plots]) == 0
+    assert (
+        cli.main(
+            [
+                "film",
+                str(request.getfixturevalue(kind)),
+                "-o",
+                str(path),
+                "--seconds",
+                "0.3",
+                *plots,
+            ]
+        )
+        == 0
+    )
     seen = frames_in(path)
     assert len(seen) == 4
     picture = seen[:, 80:, : seen.shape[1]]  # below the clock
@@ -257,21 +331,42 @@ def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # not installed
     assert film.default_name() == "film.gif"
     assert cli.main(["film", str(top), "-o", str(tmp_path / "film.mp4")]) == 2
-    assert "needs ffmpeg: install the program, or `pip install imageio-ffmpeg`" in capsys.readouterr().err
+    assert (
+        "needs ffmpeg: install the program, or `pip install imageio-ffmpeg`"
+        in capsys.readouterr().err
+    )
     program = tmp_path / "its-ffmpeg"
     program.write_text(
         f"#!{sys.executable}\nimport sys\nsys.stdin.buffer.read()\nopen(sys.argv[-1], 'wb').write(b'film')\n"
     )
     program.chmod(0o700)
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", types.SimpleNamespace(get_ffmpeg_exe=lambda: str(program)))
+    monkeypatch.setitem(
+        sys.modules, "imageio_ffmpeg", types.SimpleNamespace(get_ffmpeg_exe=lambda: str(program))
+    )
     assert film.default_name() == "film.mp4"
-    assert cli.main(["film", str(top), "-o", str(tmp_path / "its.mp4"), "--seconds", "0.2", "--height", "100"]) == 0
+    assert (
+        cli.main(
+            [
+                "film",
+                str(top),
+                "-o",
+                str(tmp_path / "its.mp4"),
+                "--seconds",
+                "0.2",
+                "--height",
+                "100",
+            ]
+        )
+        == 0
+    )
     assert (tmp_path / "its.mp4").read_bytes() == b"film"
     assert cli.main(["film", str(top), "-o", str(tmp_path / "film.avi")]) == 2
     assert "ends in .mp4 or .gif" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(not shutil.which("ffmpeg"), reason="ffmpeg is not installed: .mp4 is not tested")
+@pytest.mark.skipif(
+    not shutil.which("ffmpeg"), reason="ffmpeg is not installed: .mp4 is not tested"
+)
 def test_a_film_as_mp4(top, tmp_path):
     path = tmp_path / "top.mp4"
     assert cli.main(["film", str(top), "-o", str(path), "--seconds", "0.2"]) == 0
@@ -290,7 +385,9 @@ def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
     end, notes = film.loop_end()
     assert end == pytest.approx(0.39, abs=1e-9)
     assert "motion returns to its start at 0.39 s" in notes[0]
-    film.vectors = {name: values * (1 + 0.01 * film.time[:, None] / 0.39) for name, values in still.items()}
+    film.vectors = {
+        name: values * (1 + 0.01 * film.time[:, None] / 0.39) for name, values in still.items()
+    }
     end, notes = film.loop_end()  # alike in a picture
     assert end == pytest.approx(0.39, abs=1e-9)
     assert "motion nearly returns to its start at 0.39 s" in notes[0]
@@ -316,14 +413,18 @@ def test_a_folder_that_is_no_run(command, fault, said, water, tmp_path, capsys):
     elif fault != "nothing":
         shutil.copytree(water, folder)
         log = folder / "log.csv"
-        log.unlink() if fault == "no log" else log.write_text(log.read_text().splitlines()[0] + "\n")
+        log.unlink() if fault == "no log" else log.write_text(
+            log.read_text().splitlines()[0] + "\n"
+        )
     path = tmp_path / ("film.gif" if command == "film" else "page.html")
     assert cli.main([command, str(folder), "-o", str(path)]) == 2
     assert said in capsys.readouterr().err
     assert not path.exists()
 
 
-@pytest.mark.filterwarnings("ignore:Reader has no dt information")  # of MDAnalysis, for a file of one frame
+@pytest.mark.filterwarnings(
+    "ignore:Reader has no dt information"
+)  # of MDAnalysis, for a file of one frame
 @pytest.mark.parametrize("fault", ["missing", "other atoms", "other shapes", "noise", "empty"])
 def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(molecule_film, "chemiscope_script", lambda: "")
@@ -343,7 +444,11 @@ def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, c
             path.write_bytes(np.random.default_rng(1).bytes(5000))
         case "empty":
             path.write_bytes(b"")
-    said = {"missing": "is missing", "other atoms": "8 sites, must be 648", "other shapes": "have other shapes"}
+    said = {
+        "missing": "is missing",
+        "other atoms": "8 sites, must be 648",
+        "other shapes": "have other shapes",
+    }
     assert cli.main(["view", str(folder)]) == 2
     error = capsys.readouterr().err
     assert said.get(fault, "cannot be read as a trajectory") in error
@@ -405,12 +510,23 @@ def volume(mesh):
 
 @pytest.mark.parametrize("shape", ["cylinder", "cone", "cuboid", "sphere", "ellipsoid"])
 def test_the_drawn_surface_is_that_of_the_solid(shape):
-    sizes = {"radius_m": 2.0, "height_m": 3.0, "lengths_m": [1.0, 2.0, 3.0], "semi_axes_m": [1.0, 2.0, 3.0]}
+    sizes = {
+        "radius_m": 2.0,
+        "height_m": 3.0,
+        "lengths_m": [1.0, 2.0, 3.0],
+        "semi_axes_m": [1.0, 2.0, 3.0],
+    }
     given = {key: sizes[key] for key in SOLIDS[shape].dimensions}
     body = {"mass_kg": 1.0, "solid": {"shape": shape, **given}}
     scene = Scene.from_dict({"body": body, "run": {"duration_s": 1.0, "timestep_s": 0.1}})
     mesh = mesh_of(build_body(scene))
-    known = {"cylinder": np.pi * 12, "cone": np.pi * 4, "cuboid": 6, "sphere": np.pi * 32 / 3, "ellipsoid": np.pi * 8}
+    known = {
+        "cylinder": np.pi * 12,
+        "cone": np.pi * 4,
+        "cuboid": 6,
+        "sphere": np.pi * 32 / 3,
+        "ellipsoid": np.pi * 8,
+    }
     assert volume(mesh) == pytest.approx(known[shape], rel=0.04)
     assert 0 < sum(mesh.painted) < len(mesh.faces)
     outline = solid(shape, 1.0, given).outline
@@ -418,7 +534,8 @@ def test_the_drawn_surface_is_that_of_the_solid(shape):
 
 
 def inertia_of_mesh(mesh, mass):
-    """Centre (3,) and inertia tensor (3, 3) about it, of a homogeneous body inside a closed surface."""
+    """Centre (3,) and inertia tensor (3, 3) about it, of a homogeneous body inside a closed
+    surface."""
     products, first, whole = np.zeros((3, 3)), np.zeros(3), 0.0
     for face in mesh.faces:
         p = mesh.vertices[face]
@@ -435,21 +552,38 @@ def inertia_of_mesh(mesh, mass):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize(("across", "along"), [(1.0, 1.9), (1.0, 0.3), (1.0, 1.0)])
 @pytest.mark.parametrize("offset", [0.0, -3.0, 3.0])
-def test_a_symmetric_body_is_drawn_as_the_solid_of_revolution_of_its_inertia(axis, across, along, offset):
+def test_a_symmetric_body_is_drawn_as_the_solid_of_revolution_of_its_inertia(
+    axis, across, along, offset
+):
     moments, centre = np.full(3, across), np.zeros(3)
     moments[axis], centre[axis] = along, offset
-    body = {"mass_kg": 2.0, "inertia_kg_m2": moments.tolist(), "pinned": True, "centre_of_mass_m": centre.tolist()}
-    mesh = mesh_of(build_body(Scene.from_dict({"body": body, "run": {"duration_s": 1.0, "timestep_s": 0.1}})))
+    body = {
+        "mass_kg": 2.0,
+        "inertia_kg_m2": moments.tolist(),
+        "pinned": True,
+        "centre_of_mass_m": centre.tolist(),
+    }
+    mesh = mesh_of(
+        build_body(Scene.from_dict({"body": body, "run": {"duration_s": 1.0, "timestep_s": 0.1}}))
+    )
     assert mesh.stem == (offset != 0)
     if not mesh.stem:
         place, tensor = inertia_of_mesh(mesh, 2.0)
         assert np.allclose(place, centre, atol=1e-9)
-        assert np.allclose(tensor, np.diag(moments), rtol=0.05, atol=0.02)  # of polygons of 24 sides
+        assert np.allclose(
+            tensor, np.diag(moments), rtol=0.05, atol=0.02
+        )  # of polygons of 24 sides
         return
-    assert np.linalg.norm(mesh.vertices, axis=1).min() < 1e-12  # it reaches to the pivot, with a tip
+    assert (
+        np.linalg.norm(mesh.vertices, axis=1).min() < 1e-12
+    )  # it reaches to the pivot, with a tip
     flat = np.delete(mesh.vertices, axis, axis=1)
-    assert np.allclose(np.ptp(flat, axis=0), 2 * np.linalg.norm(flat, axis=1).max(), rtol=0.02)  # round about the axis
-    assert np.sign(mesh.vertices[:, axis]).sum() * np.sign(offset) > 0  # on the side of the centre of mass
+    assert np.allclose(
+        np.ptp(flat, axis=0), 2 * np.linalg.norm(flat, axis=1).max(), rtol=0.02
+    )  # round about the axis
+    assert (
+        np.sign(mesh.vertices[:, axis]).sum() * np.sign(offset) > 0
+    )  # on the side of the centre of mass
 
 
 @pytest.mark.parametrize(
@@ -463,7 +597,9 @@ def test_a_symmetric_body_is_drawn_as_the_solid_of_revolution_of_its_inertia(axi
     ],
 )
 def test_a_scene_chooses_what_a_body_is_drawn_as(drawn_as, about):
-    system = build_body(Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"output.drawn_as": drawn_as}))
+    system = build_body(
+        Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"output.drawn_as": drawn_as})
+    )
     mesh = mesh_of(system)
     assert mesh.about == about
     if about == "a cone":  # on its tip
@@ -475,12 +611,29 @@ def test_a_scene_chooses_what_a_body_is_drawn_as(drawn_as, about):
         assert np.allclose(np.diag(tensor), [0.66e-4, 0.66e-4, 1.2e-4], rtol=0.06)
 
 
-CYLINDER = {"shape": "cylinder", "radius_m": 1.0, "height_m": 2.0, "axis": [1.0, -1.0, 0.5], "mass_kg": 1.0}
+CYLINDER = {
+    "shape": "cylinder",
+    "radius_m": 1.0,
+    "height_m": 2.0,
+    "axis": [1.0, -1.0, 0.5],
+    "mass_kg": 1.0,
+}
 TILTED = [
-    {"shape": "cuboid", "lengths_m": [0.3, 1.0, 2.0], "euler_angles_deg": [20.0, 50.0, -30.0], "density_kg_m3": 1.0},
-    {"shape": "cone", "radius_m": 0.5, "height_m": 1.5, "axis": [1.0, 2.0, -2.0], "density_kg_m3": 1.0,
-     "position_m": [1.0, -1.0, 2.0]},
-]  # fmt: skip
+    {
+        "shape": "cuboid",
+        "lengths_m": [0.3, 1.0, 2.0],
+        "euler_angles_deg": [20.0, 50.0, -30.0],
+        "density_kg_m3": 1.0,
+    },
+    {
+        "shape": "cone",
+        "radius_m": 0.5,
+        "height_m": 1.5,
+        "axis": [1.0, 2.0, -2.0],
+        "density_kg_m3": 1.0,
+        "position_m": [1.0, -1.0, 2.0],
+    },
+]
 
 
 @pytest.mark.parametrize("pinned", [False, True])
@@ -488,7 +641,9 @@ TILTED = [
 def test_a_body_of_solids_is_drawn_as_its_solids(solids, pinned):
     """Of one density, the drawn surface has the centre and the inertia of the body."""
     parts = {} if solids is None else {"body.solids": solids}
-    system = build_body(Scene.read(ROOT / "systems" / "t_handle.toml", parts | {"body.pinned": pinned}))
+    system = build_body(
+        Scene.read(ROOT / "systems" / "t_handle.toml", parts | {"body.pinned": pinned})
+    )
     mesh = mesh_of(system)
     assert mesh.about == "its solids"
     place, tensor = inertia_of_mesh(mesh, system.mass)
@@ -496,8 +651,14 @@ def test_a_body_of_solids_is_drawn_as_its_solids(solids, pinned):
     known = system.axes @ np.diag(system.inertia) @ system.axes.T
     known = shifted_inertia(known, -system.mass, system.centre)
     assert np.allclose(tensor, known, atol=0.04 * known.max())
-    corners = [mesh.vertices[face] for face in mesh.faces]  # short, as those at the back are drawn first
-    sides = [np.linalg.norm(np.roll(face, -1, axis=0) - face, axis=1).max() for face in corners if len(face) == 4]
+    corners = [
+        mesh.vertices[face] for face in mesh.faces
+    ]  # short, as those at the back are drawn first
+    sides = [
+        np.linalg.norm(np.roll(face, -1, axis=0) - face, axis=1).max()
+        for face in corners
+        if len(face) == 4
+    ]
     assert max(sides) < 0.16 * mesh.reach
 
 
@@ -506,7 +667,10 @@ def test_a_body_of_solids_is_drawn_as_its_solids(solids, pinned):
     [
         (["output.drawn_as=tpo"], "did you mean top?"),
         (["output.drawn_as.shape=cone"], "a cone has height_m and radius_m, not none"),
-        (["output.drawn_as=top", "body.inertia_kg_m2=[3e-4,3.2e-4,1e-4]"], "a top has two equal moments of inertia"),
+        (
+            ["output.drawn_as=top", "body.inertia_kg_m2=[3e-4,3.2e-4,1e-4]"],
+            "a top has two equal moments of inertia",
+        ),
     ],
 )
 def test_a_shape_that_a_body_cannot_be_drawn_as(sets, expected, capsys):
@@ -516,7 +680,9 @@ def test_a_shape_that_a_body_cannot_be_drawn_as(sets, expected, capsys):
 
 
 @pytest.mark.parametrize(("seconds", "strobes"), [(0.2, True), (2.0, False)])
-def test_a_film_in_which_a_body_turns_too_far_between_frames_says_so(seconds, strobes, top, tmp_path):
+def test_a_film_in_which_a_body_turns_too_far_between_frames_says_so(
+    seconds, strobes, top, tmp_path
+):
     _, told = write_film(top, tmp_path / "top.gif", seconds, height=100)
     assert any("times between two frames" in sentence for sentence in told) == strobes
 
@@ -525,7 +691,10 @@ def test_a_body_without_a_solid_is_drawn_as_the_cuboid_of_its_inertia():
     lengths = np.array([1.0, 2.0, 3.0])
     inertia = 2.0 / 12 * (lengths @ lengths - lengths**2)
     scene = Scene.from_dict(
-        {"body": {"mass_kg": 2.0, "inertia_kg_m2": inertia.tolist()}, "run": {"duration_s": 1.0, "timestep_s": 0.1}}
+        {
+            "body": {"mass_kg": 2.0, "inertia_kg_m2": inertia.tolist()},
+            "run": {"duration_s": 1.0, "timestep_s": 0.1},
+        }
     )
     mesh = mesh_of(build_body(scene))
     assert np.allclose(np.ptp(mesh.vertices, axis=0), lengths)
@@ -561,22 +730,31 @@ def test_rotations_are_output(water_in_memory):
 
 
 def test_the_files_of_a_run_tell_the_same(tmp_path):
-    scene = Scene.read(ROOT / "systems" / "water.toml", SHORT_WATER | {"output.topology": "topology.pdb"})
+    scene = Scene.read(
+        ROOT / "systems" / "water.toml", SHORT_WATER | {"output.topology": "topology.pdb"}
+    )
     results = Simulation(scene, tmp_path / "run").run()
     u = results.universe()
     assert len(u.bonds) == 2 * 216
     assert u.atoms[0].charge == pytest.approx(-0.8476)
     assert u.atoms[0].mass == pytest.approx(15.9994)
     assert len(MDAnalysis.Universe(tmp_path / "run" / "topology.pdb").bonds) == 2 * 216  # CONECT
-    rotation, last = results.rotation, results.state.rotation  # rebuilt from positions rounded to 0.01 Å
+    rotation, last = (
+        results.rotation,
+        results.state.rotation,
+    )  # rebuilt from positions rounded to 0.01 Å
     assert rotation.shape == (len(u.trajectory), 216, 3, 3)
     assert np.abs(rotation[-1] - last).max() < 0.02
 
 
-@pytest.mark.filterwarnings("ignore:1 A.3 CRYST1 record")  # a body has no box, and MDAnalysis says so
+@pytest.mark.filterwarnings(
+    "ignore:1 A.3 CRYST1 record"
+)  # a body has no box, and MDAnalysis says so
 def test_a_body_has_its_edges_as_bonds(tmp_path):
     more = {"run.duration_s": 0.01, "output.figures": False}
-    results = Simulation(Scene.read(ROOT / "systems" / "heavy_top_3.toml", more), tmp_path / "run").run()
+    results = Simulation(
+        Scene.read(ROOT / "systems" / "heavy_top_3.toml", more), tmp_path / "run"
+    ).run()
     joined = {tuple(pair) for pair in results.universe().bonds.indices.tolist()}
     octahedron = {
         (i, j) for i in range(2, 8) for j in range(i + 1, 8) if j - i != 3
@@ -596,10 +774,20 @@ def test_a_body_has_its_edges_as_bonds(tmp_path):
         ({"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}}, 12),
         ({"solids": [CYLINDER, CYLINDER | {"position_m": [0.0, 5.0, 0.0]}]}, 36 + 1 + 36),
         (
-            {"solids": [CYLINDER, TILTED[0], TILTED[0] | {"position_m": [9.0, 0.0, 0.0]}], "pinned": True},
+            {
+                "solids": [CYLINDER, TILTED[0], TILTED[0] | {"position_m": [9.0, 0.0, 0.0]}],
+                "pinned": True,
+            },
             1 + 36 + 2 + 24,
         ),
-        ({"points": [{"mass_kg": 1.0, "position_m": [x, x * x, 0.0]} for x in (0.0, 1.0, 2.0, 3.0)]}, 3),
+        (
+            {
+                "points": [
+                    {"mass_kg": 1.0, "position_m": [x, x * x, 0.0]} for x in (0.0, 1.0, 2.0, 3.0)
+                ]
+            },
+            3,
+        ),
     ],
 )
 def test_edges_of_solids(body, edges):

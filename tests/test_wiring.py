@@ -1,4 +1,5 @@
-"""What a stage of a scene passes to the step: thermostats, barostats, ramps and counts of a mixture in their units."""
+"""What a stage of a scene passes to the step: thermostats, barostats, ramps and counts of a mixture
+in their units."""
 
 from math import pi
 
@@ -35,8 +36,13 @@ COUNTS = {"spce": 4, "nitrogen": 5, "argon": 3}
 TRANSLATION, ROTATION = 36, 22
 NVT = {"ensemble": "nvt", "temperature_K": [280.0, 310.0], "duration_ps": 0.5, "timestep_fs": 2.0}
 NPT = NVT | {"ensemble": "npt", "pressure_bar": [10.0, 500.0], "compressibility_per_bar": 8e-5}
-NPH = {"ensemble": "nph", "pressure_bar": [10.0, 500.0], "compressibility_per_bar": 8e-5, "duration_ps": 0.5,
-       "timestep_fs": 2.0}  # fmt: skip
+NPH = {
+    "ensemble": "nph",
+    "pressure_bar": [10.0, 500.0],
+    "compressibility_per_bar": 8e-5,
+    "duration_ps": 0.5,
+    "timestep_fs": 2.0,
+}
 FORCES = {"cutoff_A": 5.0}
 
 
@@ -56,17 +62,26 @@ TEMPERATURES = ramp(280 * KELVIN, 310 * KELVIN)
 
 def test_langevin_has_the_friction_of_each_motion():
     system = system_of(
-        NVT | {"thermostat": "langevin", "friction_translation_per_ps": 2.0, "friction_rotation_per_ps": 7.0}
+        NVT
+        | {
+            "thermostat": "langevin",
+            "friction_translation_per_ps": 2.0,
+            "friction_rotation_per_ps": 7.0,
+        }
     )
     bath = thermostat_of(system, 0)
     assert (bath.friction_translation, bath.friction_rotation) == (2.0, 7.0)
     assert bath.thermal_energy == TEMPERATURES
-    one = thermostat_of(system_of(NVT | {"thermostat": "langevin", "friction_translation_per_ps": 2.0}), 0)
+    one = thermostat_of(
+        system_of(NVT | {"thermostat": "langevin", "friction_translation_per_ps": 2.0}), 0
+    )
     assert (one.friction_translation, one.friction_rotation) == (2.0, 2.0)
 
 
 def test_chains_count_the_degrees_of_freedom_of_their_motion():
-    system = system_of(NVT | {"thermostat": "nose_hoover", "thermostat_time_ps": 0.3, "nose_hoover_links": 4})
+    system = system_of(
+        NVT | {"thermostat": "nose_hoover", "thermostat_time_ps": 0.3, "nose_hoover_links": 4}
+    )
     bath = thermostat_of(system, 0)
     assert (bath.freedom_translation, bath.freedom_rotation) == (TRANSLATION - 3, ROTATION)
     assert (bath.period, bath.links, bath.variables) == (0.3, 4, 16)
@@ -86,7 +101,13 @@ def test_andersen_has_its_time():
 
 @pytest.mark.parametrize(
     ("kind", "kept"),
-    [("velocity_rescaling", 3), ("nose_hoover", 3), ("langevin", 0), ("andersen", 0), ("hybrid_monte_carlo", 0)],
+    [
+        ("velocity_rescaling", 3),
+        ("nose_hoover", 3),
+        ("langevin", 0),
+        ("andersen", 0),
+        ("hybrid_monte_carlo", 0),
+    ],
 )
 def test_temperatures_count_the_total_momentum_where_the_thermostat_changes_it(kind, kept):
     system = system_of(NVT | {"thermostat": kind})
@@ -101,9 +122,12 @@ def test_every_thermostat_acts_for_a_whole_step():
 
 
 def test_stages_have_random_numbers_of_their_own():
-    """Steps count on through a run, so that no number is drawn twice; but a run of the second stage alone has others."""
+    """Steps count on through a run, so that no number is drawn twice; but a run of the second stage
+    alone has others."""
     system = system_of(NPT | {"thermostat": "langevin"}, NPT | {"thermostat": "langevin"})
-    keys = {key for k in (0, 1) for key in (thermostat_of(system, k).key, barostat_of(system, k).key)}
+    keys = {
+        key for k in (0, 1) for key in (thermostat_of(system, k).key, barostat_of(system, k).key)
+    }
     assert len(keys) == 4
     again = system_of(NPT | {"thermostat": "langevin"}, seed=2)
     assert not keys & {thermostat_of(again, 0).key, barostat_of(again, 0).key}
@@ -124,7 +148,8 @@ def pressed(pressure):
 
 @pytest.mark.parametrize("thermostat", ["velocity_rescaling", "langevin"])
 def test_a_monte_carlo_barostat_counts_the_molecules(thermostat):
-    """Centres of mass: one for each molecule, whether or not a thermostat keeps the total momentum."""
+    """Centres of mass: one for each molecule, whether or not a thermostat keeps the total
+    momentum."""
     system = system_of(MONTE_CARLO | {"thermostat": thermostat})
     box = barostat_of(system, 0)
     assert box.molecules == 12.0
@@ -133,10 +158,15 @@ def test_a_monte_carlo_barostat_counts_the_molecules(thermostat):
     pressed(box.pressure)
 
 
-@pytest.mark.parametrize(("thermostat", "at_rest"), [
-    ("velocity_rescaling", (1.0, 1.0, 1.0)), ("nose_hoover", (1.0, 1.0, 1.0)), ("langevin", (0.0, 0.0, 0.0)),
-    ("andersen", (0.0, 0.0, 0.0)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("thermostat", "at_rest"),
+    [
+        ("velocity_rescaling", (1.0, 1.0, 1.0)),
+        ("nose_hoover", (1.0, 1.0, 1.0)),
+        ("langevin", (0.0, 0.0, 0.0)),
+        ("andersen", (0.0, 0.0, 0.0)),
+    ],
+)
 def test_cell_rescaling_knows_whether_the_total_momentum_is_kept(thermostat, at_rest):
     """It is what makes N + 1 of N in the law of an ideal gas."""
     box = barostat_of(system_of(NPT | {"thermostat": thermostat, "barostat_time_ps": 0.4}), 0)
@@ -148,18 +178,25 @@ def test_cell_rescaling_knows_whether_the_total_momentum_is_kept(thermostat, at_
 
 
 def test_a_field_along_one_axis_leaves_the_momentum_of_the_others():
-    """Molecules with a net charge take momentum from a field along x; those along y and z keep theirs."""
+    """Molecules with a net charge take momentum from a field along x; those along y and z keep
+    theirs."""
     field = {"fields": {"electric_V_per_nm": [0.1, 0.0, 0.0]}}
     system = system_of(NVT, counts={"na_spce": 4, "argon": 3}, **field)
     assert system.model.keeps_momentum.tolist() == [False, True, True]
     assert system.freedom.translation == 21 - 2
 
 
-@pytest.mark.parametrize(("coupling", "coordinate"), [
-    ("semi_isotropic", (0, 0, 1, -1, -1, -1)), ("anisotropic", (0, 1, 2, -1, -1, -1)), ("flexible", (0, 1, 2, 3, 4, 5)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("coupling", "coordinate"),
+    [
+        ("semi_isotropic", (0, 0, 1, -1, -1, -1)),
+        ("anisotropic", (0, 1, 2, -1, -1, -1)),
+        ("flexible", (0, 1, 2, 3, 4, 5)),
+    ],
+)
 def test_a_stress_has_its_components_in_the_order_of_the_strain(coupling, coordinate):
-    """A scene lists xx, yy, zz, xy, xz, yz; the strain has (0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1)."""
+    """A scene lists xx, yy, zz, xy, xz, yz; the strain has (0, 0), (1, 1), (2, 2), (1, 0), (2, 0),
+    (2, 1)."""
     given = [1.0, 1.0, 3.0] if coupling == "semi_isotropic" else [1.0, 2.0, 3.0]
     given += [4.0, 5.0, 6.0] if coupling == "flexible" else []
     box = barostat_of(system_of(NPT | {"pressure_coupling": coupling, "pressure_bar": given}), 0)
@@ -185,7 +222,9 @@ def test_moves_of_the_box_come_at_their_interval():
 
 @pytest.mark.parametrize("thermostat", ["velocity_rescaling", "langevin"])
 def test_the_total_momentum_is_taken_out_at_its_interval_where_it_is_kept(thermostat):
-    own = row(system_of(NVT | {"thermostat": thermostat}, run={"remove_momentum_interval_ps": 0.05}), 0)
+    own = row(
+        system_of(NVT | {"thermostat": thermostat}, run={"remove_momentum_interval_ps": 0.05}), 0
+    )
     rests = [flow.every for flow in own.flows if flow.kind == REMOVE_MOMENTUM]
     assert rests == ([25] if thermostat == "velocity_rescaling" else [])
 
@@ -252,13 +291,18 @@ def pushed(system, seed=1):
     """Thermal momenta of a mixture, and a push along each axis."""
     rng, state = np.random.default_rng(seed), system.state.copy()
     mass = system.model.mass[system.model.species]
-    state.velocity[:] = rng.standard_normal((len(mass), 3)) / np.sqrt(mass)[:, None] + [0.3, -0.2, 0.5]
+    state.velocity[:] = rng.standard_normal((len(mass), 3)) / np.sqrt(mass)[:, None] + [
+        0.3,
+        -0.2,
+        0.5,
+    ]
     return state, mass
 
 
 @pytest.mark.parametrize("counts", [COUNTS, {"na_spce": 4, "argon": 3}])
 def test_a_mixture_is_brought_to_rest_by_one_velocity_for_all(counts):
-    """The common velocity is P/M; its energy P²/2M is accounted for. A field along x leaves what is along x."""
+    """The common velocity is P/M; its energy P²/2M is accounted for. A field along x leaves what is
+    along x."""
     field = {"fields": {"electric_V_per_nm": [0.1, 0.0, 0.0]}} if "na_spce" in counts else {}
     system = system_of(NVT, counts=counts, **field)
     state, mass = pushed(system)
@@ -267,26 +311,36 @@ def test_a_mixture_is_brought_to_rest_by_one_velocity_for_all(counts):
     kept = np.array([not field, True, True])
     BoundTask(advance._remove_momentum, (system.model, state))()
     assert (mass @ state.velocity)[kept] == pytest.approx(np.zeros(kept.sum()), abs=1e-12)
-    assert before - state.velocity == pytest.approx(np.tile(kept * momentum / mass.sum(), (len(mass), 1)))
+    assert before - state.velocity == pytest.approx(
+        np.tile(kept * momentum / mass.sum(), (len(mass), 1))
+    )
     energies = [0.5 * mass @ (v**2).sum(axis=1) for v in (before, state.velocity)]
     assert state.energy_ledger[REMOVED] == pytest.approx(energies[1] - energies[0])
 
 
 def test_a_mixture_starts_at_rest_and_at_its_temperature():
-    """The momenta of a start sum to zero though masses differ, and no species has more than its part by rule."""
-    system = system_of(NVT, counts={"spce": 40, "nitrogen": 50, "argon": 30}, box={"lengths_A": 40.0})
+    """The momenta of a start sum to zero though masses differ, and no species has more than its
+    part by rule."""
+    system = system_of(
+        NVT, counts={"spce": 40, "nitrogen": 50, "argon": 30}, box={"lengths_A": 40.0}
+    )
     state, mass = system.state.copy(), system.model.mass[system.model.species]
     draw_momenta(system.model, state, 300.0, np.random.default_rng(5))
     assert mass @ state.velocity == pytest.approx(np.zeros(3), abs=1e-9)
     freedom = system.freedom
-    assert mass @ (state.velocity**2).sum(axis=1) == pytest.approx(freedom.translation * 300 * KELVIN)
+    assert mass @ (state.velocity**2).sum(axis=1) == pytest.approx(
+        freedom.translation * 300 * KELVIN
+    )
     spin = state.angular_momentum_body**2 * system.model.inverse_inertia[system.model.species]
     assert spin.sum() == pytest.approx(freedom.rotation * 300 * KELVIN)
 
 
 def test_a_start_has_a_thermal_energy_about_each_axis():
-    """<L²/I> = kT about each of three unlike axes and about both of a line; <m v²> = kT of each species along each."""
-    system = system_of(NVT, counts={"spce": 40, "nitrogen": 50, "argon": 30}, box={"lengths_A": 40.0})
+    """<L²/I> = kT about each of three unlike axes and about both of a line; <m v²> = kT of each
+    species along each."""
+    system = system_of(
+        NVT, counts={"spce": 40, "nitrogen": 50, "argon": 30}, box={"lengths_A": 40.0}
+    )
     kind, inertia = system.model.species, system.model.inertia[system.model.species]
     over = np.divide(1.0, inertia, out=np.zeros_like(inertia), where=inertia > 0)
     rng, turning, moving = np.random.default_rng(8), [], []
@@ -295,8 +349,13 @@ def test_a_start_has_a_thermal_energy_about_each_axis():
         draw_momenta(system.model, state, 300.0, rng)
         turning.append(state.angular_momentum_body**2 * over)
         moving.append(state.velocity**2 * system.model.mass[kind][:, None])
-    for k, axes in enumerate(([1, 1, 1], [0, 1, 1], [0, 0, 0])):  # spce, nitrogen, argon: 6000 values at least
-        seen = [np.mean(values, axis=0)[kind == k].mean(axis=0) / (300 * KELVIN) for values in (turning, moving)]
+    for k, axes in enumerate(
+        ([1, 1, 1], [0, 1, 1], [0, 0, 0])
+    ):  # spce, nitrogen, argon: 6000 values at least
+        seen = [
+            np.mean(values, axis=0)[kind == k].mean(axis=0) / (300 * KELVIN)
+            for values in (turning, moving)
+        ]
         assert seen[0] == pytest.approx(np.array(axes), abs=0.07)  # four times sqrt(2/6000)
         assert seen[1] == pytest.approx(np.ones(3), abs=0.07)
 
@@ -316,12 +375,15 @@ def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
 
 
 def test_unbiased_temperatures_are_those_of_the_kinetic_energies_and_a_twelfth_of_the_forces():
-    """2K/(f k) of K + dt²/12 (sum F²/m), and of K + dt²/12 (sum n²/I), over the axes that have inertia."""
+    """2K/(f k) of K + dt²/12 (sum F²/m), and of K + dt²/12 (sum n²/I), over the axes that have
+    inertia."""
     system = system_of({"duration_ps": 0.1})
     state, mass = pushed(system)
     rng, dt = np.random.default_rng(3), 0.02
     inertia = system.model.inertia[system.model.species]
-    state.angular_momentum_body[:] = rng.standard_normal(inertia.shape) * np.sqrt(inertia * 300 * KELVIN)
+    state.angular_momentum_body[:] = rng.standard_normal(inertia.shape) * np.sqrt(
+        inertia * 300 * KELVIN
+    )
     found = observe(system, system.engine(), state, verlet_step=dt)
     over = np.divide(1.0, inertia, out=np.zeros_like(inertia), where=inertia > 0)
     moving = 0.5 * mass @ (state.velocity**2).sum(axis=1)

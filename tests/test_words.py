@@ -13,7 +13,7 @@ PACKAGE = ROOT / "rigidmd"
 
 #: Pattern of a word that is not used -> what to write instead. All are matched in lower case.
 REFUSED = {
-    r"waves?(?! (?:vectors?|numbers?)\b)": "k-vectors, reciprocal space",
+    r"waves?(?!\s+(?:vectors?|numbers?)\b)": "k-vectors, reciprocal space",
     r"endings?": "truncation, cutoff scheme; of a file name: extension",
     r"baths?": "thermostat",
     r"books?|booked|pays?|paid": "energy ledger: heat, work; accounted for",
@@ -37,7 +37,8 @@ REFUSED = {
     r"rooms?|doors?|houses?|whoever": "package, interface, architecture; memory, space",
     r"reliefs?|relieves?|relieved|relieving": "overlap removal",
 }
-#: Further ones, which the sources of kernels still have: their next change, which compiles all anew, mends them.
+#: Further ones, which the sources of kernels still have: their next change, which compiles all
+#: anew, mends them.
 REFUSED_OUTSIDE_KERNELS = {
     r"asks|asked": "request, require, call",
     r"in words|in a sentence": "with a message",
@@ -59,7 +60,9 @@ KERNELS = re.compile(
     r"rigidmd/(?:compile|mechanics|forces|dynamics|engines/(?:cpu|ode|protocol)|core/(?:integrators|state))\b"
 )
 EVERY = REFUSED | REFUSED_OUTSIDE_KERNELS
-WORDS = re.compile(rf"(?<![\w`./-])(?:{'|'.join(f'({pattern})' for pattern in EVERY)})(?![\w`/-])", re.IGNORECASE)
+WORDS = re.compile(
+    rf"(?<![\w`./-])(?:{'|'.join(f'({pattern})' for pattern in EVERY)})(?![\w`/-])", re.IGNORECASE
+)
 
 #: Uses that stay: they are names of the field or of keys.
 ALLOWED = re.compile(
@@ -77,11 +80,17 @@ ALLOWED = re.compile(
 )
 
 
+def squeezed(text):
+    """Text with one space for a line break and the margin after it."""
+    return re.sub(r"\s+", " ", text)
+
+
 def refused_in(text):
     """(position, word, better) of each refused word in plain text."""
     for match in WORDS.finditer(text):
-        around = text[max(0, match.start() - 40) : match.end() + 40]
-        at = match.start() - max(0, match.start() - 40)
+        before = squeezed(text[max(0, match.start() - 60) : match.start()])
+        around = before + squeezed(text[match.start() : match.end() + 60])
+        at = len(before)
         if not any(m.start() <= at < m.end() for m in ALLOWED.finditer(around)):
             yield match.start(), match.group(), list(EVERY.values())[match.lastindex - 1]
 
@@ -90,7 +99,8 @@ CODE = re.compile(r"```.*?```|`[^`\n]*`|<[^>\n]*>|https?://\S+|\]\([^)\s]*\)", r
 
 
 def without_code(text):
-    """Text in which quoted code and the targets of links are blank, so that positions and lines stay."""
+    """Text in which quoted code and the targets of links are blank, so that positions and lines
+    stay."""
     return CODE.sub(lambda m: re.sub(r"[^\n]", " ", m.group()), text)
 
 
@@ -100,24 +110,36 @@ def tree_of(path):
 
 
 def texts_of(path):
-    """(line, text) of docstrings, and of strings of several words, of a Python file; of the whole of a document; of
-    comments of a scene; of the text of a notebook."""
+    """(line, text) of docstrings, and of strings of several words, of a Python file; of the whole
+    of a document; of comments of a scene; of the text of a notebook."""
     source = path.read_text(encoding="utf-8")
     if path.suffix == ".toml":
-        yield from ((n, without_code(line.partition("#")[2])) for n, line in enumerate(source.splitlines(), 1))
+        yield from (
+            (n, without_code(line.partition("#")[2]))
+            for n, line in enumerate(source.splitlines(), 1)
+        )
         return
     if path.suffix == ".ipynb":
-        yield from ((1, without_code("".join(cell["source"]))) for cell in json.loads(source)["cells"])
+        yield from (
+            (1, without_code("".join(cell["source"]))) for cell in json.loads(source)["cells"]
+        )
         return
     if path.suffix == ".md":
         yield 1, without_code(source)
         return
     tree = tree_of(path)
-    inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in ast.walk(node)}
+    inner = {
+        id(part)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.JoinedStr)
+        for part in ast.walk(node)
+    }
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
             text = "".join(v.value if isinstance(v, ast.Constant) else "\0" for v in node.values)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner:
+        elif (
+            isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner
+        ):
             text = node.value
         else:
             continue
@@ -166,7 +188,8 @@ ALLOWED_NAMES: set[str] = set()
 
 
 def names_in(path):
-    """(line, name) of what a Python file defines: functions, classes, arguments, variables, attributes."""
+    """(line, name) of what a Python file defines: functions, classes, arguments, variables,
+    attributes."""
     for node in ast.walk(tree_of(path)):
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
             yield node.lineno, node.name
@@ -185,7 +208,10 @@ def refused_names_in(path):
 
 
 def refused_names(path):
-    return [f"{path.relative_to(ROOT)}:{name} has {', '.join(bad)}" for name, bad in refused_names_in(path)]
+    return [
+        f"{path.relative_to(ROOT)}:{name} has {', '.join(bad)}"
+        for name, bad in refused_names_in(path)
+    ]
 
 
 def comments_of(path):
@@ -197,7 +223,9 @@ def comments_of(path):
 def found_in(path, comments=False):
     """Lines 'file:line: word, write ...' of a file."""
     pieces = [*texts_of(path), *(comments_of(path) if comments and path.suffix == ".py" else ())]
-    later = REFUSED_OUTSIDE_KERNELS.values() if KERNELS.match(path.relative_to(ROOT).as_posix()) else ()
+    later = (
+        REFUSED_OUTSIDE_KERNELS.values() if KERNELS.match(path.relative_to(ROOT).as_posix()) else ()
+    )
     for line, text in pieces:
         for at, word, better in refused_in(text):
             if better not in later:
@@ -206,10 +234,16 @@ def found_in(path, comments=False):
 
 FILES = sorted(
     [
-        *(path for suffix in (".toml", ".py", ".ipynb") for path in (ROOT / "systems").rglob(f"*{suffix}")),
-        *PACKAGE.rglob("*.py"), *(PACKAGE / "docs").rglob("*.md"), ROOT / "README.md",
+        *(
+            path
+            for suffix in (".toml", ".py", ".ipynb")
+            for path in (ROOT / "systems").rglob(f"*{suffix}")
+        ),
+        *PACKAGE.rglob("*.py"),
+        *(PACKAGE / "docs").rglob("*.md"),
+        ROOT / "README.md",
     ]
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
@@ -226,9 +260,15 @@ def test_words_of_the_field(path):
         ("As told by the bath", ["told", "bath"]),
         ("A place in the box: see `place`", ["place"]),
         ("Turning on one's own", ["Turning", "one's own"]),
-        ("is no number, so many, and goes on beside it", ["is no number", "so many", "goes on", "beside"]),
+        (
+            "is no number, so many, and goes on beside it",
+            ["is no number", "so many", "goes on", "beside"],
+        ),
         ("With the cut-off of ewald. Of pme: in words", ["cut-off", "Of pme", "in words"]),
-        ("there are no atoms; sites are no atoms; 4 sites a molecule", ["are no atoms", "sites a molecule"]),
+        (
+            "there are no atoms; sites are no atoms; 4 sites a molecule",
+            ["are no atoms", "sites a molecule"],
+        ),
         ("This takes place in its own file; there is no such file", []),
         ("The law of cosines; a plane wave is turned off", []),
         ("[a page](looking.md) of the wave vector `waves`", []),
@@ -242,11 +282,20 @@ def test_which_names_are_refused(tmp_path):
     (path := tmp_path / "a.py").write_text(
         "class ToldForce:\n    def leaning(self, room_size, rotation): self.wave = 1\n"
     )
-    assert [name for _, name in names_in(path)] == ["ToldForce", "leaning", "self", "room_size", "rotation", "wave"]
+    assert [name for _, name in names_in(path)] == [
+        "ToldForce",
+        "leaning",
+        "self",
+        "room_size",
+        "rotation",
+        "wave",
+    ]
     assert [bad for _, bad in refused_names_in(path)] == [["told"], ["leaning"], ["room"], ["wave"]]
 
 
 if __name__ == "__main__":
     wanted = [ROOT / name for name in sys.argv[1:]] or [ROOT]
     for path in (path for path in FILES if any(path.is_relative_to(folder) for folder in wanted)):
-        print(*found_in(path, True), *(refused_names(path) if path.suffix == ".py" else ()), sep="\n")
+        print(
+            *found_in(path, True), *(refused_names(path) if path.suffix == ".py" else ()), sep="\n"
+        )

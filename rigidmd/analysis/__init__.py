@@ -1,9 +1,10 @@
-"""Analyses of runs of molecules, as functions of results: `rigidmd.analysis.rdf(results, "OW", "OW")`.
+"""Analyses of runs of molecules, as functions of results: `rigidmd.analysis.rdf(results, "OW",
+"OW")`.
 
-There is a function for each analysis of `rigidmd analyse --list`, and for each one added by `register`. It returns an
-`AnalysisResult`: values with errors, and curves. A list of results, of replicas, is analysed together. `start` (ps) is
-the first time used, by default the detected end of the equilibration. Other arguments are described by help() of the
-function. They raise OutputError.
+There is a function for each analysis of `rigidmd analyse --list`, and for each one added by
+`register`. It returns an `AnalysisResult`: values with errors, and curves. A list of results, of
+replicas, is analysed together. `start` (ps) is the first time used, by default the detected end of
+the equilibration. Other arguments are described by help() of the function. They raise OutputError.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +24,9 @@ registry.load_built_in()
 __all__ = ["analyse", "register", *registry.KNOWN]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
-def analyse(results: Results, name: str, /, start: float | None = None, **options: Any) -> AnalysisResult:
+def analyse(
+    results: Results, name: str, /, start: float | None = None, **options: Any
+) -> AnalysisResult:
     """The result of an analysis by its name, built-in or added by `register`."""
     (entry,) = selected([name])
     return _function_of_results(entry)(results, start=start, **options)
@@ -46,9 +49,16 @@ def _check_results(results: object, name: str) -> None:
         return
     of = f"rigidmd.analysis.{name}"
     if isinstance(results, str | Path):
-        raise TypeError(f"{of} takes the results of a run, not its path: {of}(rigidmd.read_run({str(results)!r}))")
-    of_sweep = "; of a sweep give a list of rigidmd.read_run(path) for the paths in table.runs.values()"
-    raise TypeError(f"{of} takes the results of a run, or a list of them, not {results!r:.80}{of_sweep}")
+        raise TypeError(
+            f"{of} takes the results of a run, not its path:"
+            f" {of}(rigidmd.read_run({str(results)!r}))"
+        )
+    of_sweep = (
+        "; of a sweep give a list of rigidmd.read_run(path) for the paths in table.runs.values()"
+    )
+    raise TypeError(
+        f"{of} takes the results of a run, or a list of them, not {results!r:.80}{of_sweep}"
+    )
 
 
 @cache
@@ -56,14 +66,19 @@ def _function_of_results(entry: Analysis) -> Callable[..., AnalysisResult]:
     """The function of frames as one of results, with its other parameters and its docstring."""
 
     def function(
-        results: Results | Sequence[Results], *arguments: Any, start: float | None = None, **options: Any
+        results: Results | Sequence[Results],
+        *arguments: Any,
+        start: float | None = None,
+        **options: Any,
     ) -> AnalysisResult:
         _check_results(results, entry.name)
         each = [results] if isinstance(results, Results) else results
         for one in each:
             if start not in one._analysis_frames:
                 one._analysis_frames[start] = frames_of_results(one, start)
-        return entry.function(Runs(tuple(one._analysis_frames[start] for one in each)), *arguments, **options)
+        return entry.function(
+            Runs(tuple(one._analysis_frames[start] for one in each)), *arguments, **options
+        )
 
     ours, (_, *more) = signature(function), signature(entry.function).parameters.values()
     given = [ours.parameters["results"], *more, ours.parameters["start"]]

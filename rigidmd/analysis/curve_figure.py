@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidmd.figures.style import COLORS, FAINT, INK, label_minor_ticks, new_figure, open_axis, panel_grid, thin_series
+from rigidmd.figures.style import (
+    COLORS,
+    FAINT,
+    INK,
+    label_minor_ticks,
+    new_figure,
+    open_axis,
+    panel_grid,
+    thin_series,
+)
 
 if TYPE_CHECKING:
     from rigidmd.analysis.result import Curve

@@ -1,4 +1,5 @@
-"""Analyses of the folder of a run, and their files: analysis.json, a CSV file and a figure for each curve."""
+"""Analyses of the folder of a run, and their files: analysis.json, a CSV file and a figure for each
+curve."""
 
 import csv
 import traceback
@@ -33,7 +34,8 @@ def write_results(
     failed: dict[str, str],
     figures: str = FIGURES[0],
 ) -> list[Path]:
-    """Write results; entries of other analyses in the folder stay. Returns the files. Raises OutputError.
+    """Write results; entries of other analyses in the folder stay. Returns the files. Raises
+    OutputError.
 
     frames_used : see `AnalysisOutput`; failed : analysis -> a sentence on why it has failed
     figures : type of the figures, one of FIGURES
@@ -47,21 +49,38 @@ def write_results(
             f"{curve.file}{end}" for curve in result.curves for end in (".csv", f".{figures}")
         ]
         for name in names:
-            if others := {new.setdefault(name, result.name), owner.get(name, result.name)} - {result.name}:
-                raise OutputError(f"{folder / name} is a file of the analysis {others.pop()}; rename {result.name}")
+            if others := {new.setdefault(name, result.name), owner.get(name, result.name)} - {
+                result.name
+            }:
+                raise OutputError(
+                    f"{folder / name} is a file of the analysis {others.pop()}; rename"
+                    f" {result.name}"
+                )
             is_ours = name in owner or (is_built_in(result.name) and name in marked)
             if (folder / name).exists() and not is_ours:
-                raise OutputError(f"{folder / name} exists and is not of an analysis; rename {result.name}")
+                raise OutputError(
+                    f"{folder / name} exists and is not of an analysis; rename {result.name}"
+                )
     add_to_folder(folder, [ANALYSIS, *new])
     entries, curves = {}, [curve for result in results for curve in result.curves]
     for name, entry in known.items():
-        entries[name] = entry.model_dump(by_alias=True) | {"values": [value._asdict() for value in entry.values]}
-    for result in [*results, *(AnalysisResult(name, name, notes=[reason]) for name, reason in failed.items())]:
+        entries[name] = entry.model_dump(by_alias=True) | {
+            "values": [value._asdict() for value in entry.values]
+        }
+    for result in [
+        *results,
+        *(AnalysisResult(name, name, notes=[reason]) for name, reason in failed.items()),
+    ]:
         entries[result.name] = {
-            "about": result.about, "values": [value._asdict() for value in result.values], "notes": result.notes,
-            "curves": [{key: getattr(curve, key) for key in _Curve.model_fields} for curve in result.curves],
-            "files": files.get(result.name, []), "stretch": frames_used,
-        }  # fmt: skip
+            "about": result.about,
+            "values": [value._asdict() for value in result.values],
+            "notes": result.notes,
+            "curves": [
+                {key: getattr(curve, key) for key in _Curve.model_fields} for curve in result.curves
+            ],
+            "files": files.get(result.name, []),
+            "stretch": frames_used,
+        }
     entries = dict(sorted(entries.items(), key=lambda entry: analysis_order(entry[0])))
     for curve in curves:
         columns = curve.table
@@ -70,7 +89,9 @@ def write_results(
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
     for curve in curves:
         write_figure(folder / f"{curve.file}.{figures}", partial(curve_figure, curve))
-        for other in {f"{curve.file}.{kind}" for kind in FIGURES} & owner.keys() & {*marked} - new.keys():
+        for other in (
+            {f"{curve.file}.{kind}" for kind in FIGURES} & owner.keys() & {*marked} - new.keys()
+        ):
             (folder / other).unlink(missing_ok=True)  # a figure of the results before
     return [path for name in (ANALYSIS, *new) if (path := folder / name).is_file()]
 
@@ -118,7 +139,8 @@ def read_table(folder: Path) -> dict[str, _Entry]:
 
 
 def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
-    """The results of analyses in the folder of a run, each with a phrase on the frames used. Raises OutputError."""
+    """The results of analyses in the folder of a run, each with a phrase on the frames used. Raises
+    OutputError."""
     found = []
     for name, entry in read_table(folder).items():
         curves, used = [], entry.frames_used
@@ -129,9 +151,18 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
                 raise OutputError(f"{path} cannot be read: it has no curve; analyse again")
             head, *rest = read.cells
             table = {title: read.numbers(title) for title in read.cells}
-            columns = {t: table[t] for t in rest if t.removesuffix(" error") not in table.keys() - {t}}
+            columns = {
+                t: table[t] for t in rest if t.removesuffix(" error") not in table.keys() - {t}
+            }
             errors = {t.removesuffix(" error"): table[t] for t in rest if t not in columns}
-            curves.append(Curve(**described.model_dump(), axis=(head, table[head]), columns=columns, errors=errors))
+            curves.append(
+                Curve(
+                    **described.model_dump(),
+                    axis=(head, table[head]),
+                    columns=columns,
+                    errors=errors,
+                )
+            )
         phrase = f"{used.frames} frames from {used.from_ps:g} to {used.to_ps:g} ps"
         found.append((AnalysisResult(name, entry.about, entry.values, curves, entry.notes), phrase))
     return found
@@ -159,17 +190,24 @@ def analyse_folder(
 ) -> AnalysisOutput:
     """Analyse the run in a folder and write the files into it.
 
-    An analysis that is not possible is left out with a sentence. Raises OutputError if none is possible.
+    An analysis that is not possible is left out with a sentence. Raises OutputError if none is
+    possible.
 
     names : of analyses, all if empty; start : of the frames, ps; viscosity : mPa s
     progress : called with the fraction done and the name of the present work
     figures : type of the figures, one of FIGURES
     """
     selected(names)  # before frames are read
-    reading = lambda fraction: progress(READING * fraction, "reading frames")  # noqa: E731
+
+    def reading(fraction):
+        return progress(READING * fraction, "reading frames")
+
     reading(0.0)
     frames = frames_of_folder(read_record(folder), start, reading)
-    rest = lambda fraction, name: progress(READING + (1 - READING) * fraction, name)  # noqa: E731
+
+    def rest(fraction, name):
+        return progress(READING + (1 - READING) * fraction, name)
+
     done = analyse_frames(folder, as_runs(frames), names, viscosity, rest, figures)
     if not done.results:
         raise OutputError(f"{folder}: {no_result_reason(done.failed)}")
@@ -184,7 +222,8 @@ def analyse_frames(
     progress: Callable[[float, str], object],
     figures: str,
 ) -> AnalysisOutput:
-    """Analyse frames, and write the files into a folder if there are results. See `analyse_folder`."""
+    """Analyse frames, and write the files into a folder if there are results. See
+    `analyse_folder`."""
     results, failed = run_analyses(runs, names, viscosity, progress)
     used = {
         "stage": runs.first.stage.label,
@@ -195,7 +234,9 @@ def analyse_frames(
         "notes": runs.first.notes,
     }
     if runs.are_several:
-        used["notes"] = [f"averages over {len(runs.members)} runs together, errors from their scatter"]
+        used["notes"] = [
+            f"averages over {len(runs.members)} runs together, errors from their scatter"
+        ]
     files = write_results(folder, used, results, failed, figures) if results else []
     progress(1.0, "")
     return AnalysisOutput(used, results, failed, files)
@@ -207,17 +248,22 @@ def run_analyses(
     viscosity: float | None = None,
     progress: Callable[[float, str], object] = lambda fraction, name: None,
 ) -> tuple[list[AnalysisResult], dict[str, str]]:
-    """The results of analyses, and a sentence on each that has failed: analysis -> why. No analysis ends the others."""
+    """The results of analyses, and a sentence on each that has failed: analysis -> why. No analysis
+    ends the others."""
     entries = selected(names)
     results, failed = [], {}
     for k, entry in enumerate(entries):
         progress(k / len(entries), entry.name)
         takes_viscosity = "viscosity_mPa_s" in signature(entry.function).parameters
         try:
-            results.append(entry.function(runs, **{"viscosity_mPa_s": viscosity} if takes_viscosity else {}))
+            results.append(
+                entry.function(runs, **{"viscosity_mPa_s": viscosity} if takes_viscosity else {})
+            )
         except OutputError as error:
             failed[entry.name] = str(error)
-        except Exception as error:  # an error of rigidmd, which should not cost the results of other analyses
+        except (
+            Exception
+        ) as error:  # an error of rigidmd, which should not cost the results of other analyses
             failed[entry.name] = _unexpected(error)
     return results, failed
 
@@ -232,5 +278,6 @@ def _unexpected(error: Exception) -> str:
     """An exception with its type and the line that raised it."""
     at = traceback.extract_tb(error.__traceback__)[-1]
     return (
-        f"an error of rigidmd, please report it: {type(error).__name__}: {error} ({Path(at.filename).name}:{at.lineno})"
+        f"an error of rigidmd, please report it: {type(error).__name__}: {error}"
+        f" ({Path(at.filename).name}:{at.lineno})"
     )

@@ -1,7 +1,9 @@
-"""The potential of mean force along a distance, from runs with harmonic restraints (umbrella windows), by MBAR.
+"""The potential of mean force along a distance, from runs with harmonic restraints (umbrella
+windows), by MBAR.
 
-The weights of all samples follow from the free energies f_k of the windows, which minimise a convex function (Shirts &
-Chodera 2008, J. Chem. Phys. 129, 124105, eq. C1). Errors are by bootstrap over decorrelated samples.
+The weights of all samples follow from the free energies f_k of the windows, which minimise a convex
+function (Shirts & Chodera 2008, J. Chem. Phys. 129, 124105, eq. C1). Errors are by bootstrap over
+decorrelated samples.
 """
 
 from collections.abc import Sequence
@@ -21,8 +23,8 @@ ABOUT = "potential of mean force along a restrained distance"
 WIDTH, LEAST_SAMPLES, LEAST_IN_BIN, RESAMPLED = 0.1, 10, 6, 50
 #: Fraction of the bins, at the largest distances, whose mean is the zero of the energy.
 OUTER = 0.1
-#: Overlap of neighbouring windows below which a window is missing between them (Klimovich, Shirts & Mobley 2015, J.
-#: Comput.-Aided Mol. Des. 29, 397), and the one below which nothing connects them.
+#: Overlap of neighbouring windows below which a window is missing between them (Klimovich, Shirts &
+#: Mobley 2015, J. Comput.-Aided Mol. Des. 29, 397), and the one below which nothing connects them.
 LITTLE_OVERLAP, NO_OVERLAP = 0.03, 1e-3
 
 
@@ -40,12 +42,17 @@ class Window(NamedTuple):
         return self.samples[:: max(1, round(inefficiency(off)))] if off.any() else self.samples[:1]
 
 
-def potential_of_mean_force(windows: Sequence[Window], thermal_energy: float, width: float = WIDTH) -> AnalysisResult:
-    """W(r) = -kT ln(P(r)/r²) and the free energy -kT ln P(r) of the distance r itself, each 0 at the largest distances.
+def potential_of_mean_force(
+    windows: Sequence[Window], thermal_energy: float, width: float = WIDTH
+) -> AnalysisResult:
+    """W(r) = -kT ln(P(r)/r²) and the free energy -kT ln P(r) of the distance r itself, each 0 at
+    the largest distances.
 
-    Two molecules without interaction have W = 0: the factor r² is the volume of a shell (Jacobian), 2 kT ln r.
+    Two molecules without interaction have W = 0: the factor r² is the volume of a shell (Jacobian),
+    2 kT ln r.
 
-    windows : at one temperature; thermal_energy : kT, kJ/mol; width : of bins, Å. Raises OutputError.
+    windows : at one temperature; thermal_energy : kT, kJ/mol; width : of bins, Å. Raises
+        OutputError.
     """
     windows = sorted(windows, key=lambda window: window.distance)
     samples = [window.decorrelated for window in windows]
@@ -71,7 +78,9 @@ def potential_of_mean_force(windows: Sequence[Window], thermal_energy: float, wi
         found.append(_profile(windows, drawn, thermal_energy, again, edges, kept))
     found = [profile for profile in found if np.isfinite(profile).all()]  # in some a bin is empty
     if len(found) < RESAMPLED // 2 or kept.sum() < 2:
-        raise OutputError("the windows have too few samples for a potential of mean force: run longer")
+        raise OutputError(
+            "the windows have too few samples for a potential of mean force: run longer"
+        )
     error = np.std(found, axis=0)
     r = centre[kept]
     outer = _outer(len(r))
@@ -82,11 +91,14 @@ def potential_of_mean_force(windows: Sequence[Window], thermal_energy: float, wi
     curve.add(titles[0], whole, error)
     curve.add(titles[1], whole - jacobian, error)
     k = int(whole.argmin())
-    value = Value("W lowest", "kJ/mol", float(whole[k]), float(error[k]), None, f"at r = {r[k]:.4g} Å")
+    value = Value(
+        "W lowest", "kJ/mol", float(whole[k]), float(error[k]), None, f"at r = {r[k]:.4g} Å"
+    )
     total = sum(len(window.samples) for window in windows)
     notes.append(
-        f"{len(windows)} windows, {sum(map(len, samples))} decorrelated of {total} samples; the zero is the mean from "
-        f"{r[outer][0]:.4g} to {r[-1]:.4g} Å; W = -kT ln(P(r)/r²), without r² it is the free energy of r"
+        f"{len(windows)} windows, {sum(map(len, samples))} decorrelated of {total} samples; the"
+        f" zero is the mean from {r[outer][0]:.4g} to {r[-1]:.4g} Å; W = -kT ln(P(r)/r²), without"
+        " r² it is the free energy of r"
     )
     return AnalysisResult(NAME, ABOUT, [value], [curve], notes)
 
@@ -97,7 +109,10 @@ def _biases(windows: Sequence[Window], x: np.ndarray, thermal_energy: float) -> 
 
 
 def _free_energies(
-    windows: Sequence[Window], samples: Sequence[np.ndarray], thermal_energy: float, start: np.ndarray
+    windows: Sequence[Window],
+    samples: Sequence[np.ndarray],
+    thermal_energy: float,
+    start: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Free energies (k,) of the windows in kT, 0 for the first, and their overlap matrix (k, k)."""
     bias = _biases(windows, np.concatenate(samples), thermal_energy)
@@ -120,7 +135,9 @@ def _free_energies(
 
     free = np.zeros(1)
     if len(windows) > 1:
-        found = minimize(function, start[1:] - start[0], jac=True, hess=curvature, method="trust-exact")
+        found = minimize(
+            function, start[1:] - start[0], jac=True, hess=curvature, method="trust-exact"
+        )
         free = np.append(0.0, found.x)
     part = fractions(free)[1]
     return free, part @ part.T / count
@@ -151,7 +168,8 @@ def _outer(bins: int) -> slice:
 
 
 def _overlap_notes(windows: Sequence[Window], overlap: np.ndarray) -> list[str]:
-    """Notes on neighbouring windows that share few samples. Raises OutputError if nothing connects two groups."""
+    """Notes on neighbouring windows that share few samples. Raises OutputError if nothing connects
+    two groups."""
     pairs = [(k, float(overlap[k, k + 1])) for k in range(len(windows) - 1)]
     if not pairs:
         return []
@@ -159,7 +177,12 @@ def _overlap_notes(windows: Sequence[Window], overlap: np.ndarray) -> list[str]:
     k, least = min(pairs, key=lambda pair: pair[1])
     where = f"the windows at {windows[k].distance:g} and {windows[k + 1].distance:g} Å"
     if gap < NO_OVERLAP:
-        raise OutputError(f"{where} have no common distances: add a window between them, or use softer restraints")
+        raise OutputError(
+            f"{where} have no common distances: add a window between them, or use softer restraints"
+        )
     if least < LITTLE_OVERLAP:
-        return [f"{where} hardly overlap ({least:.2g}, {LITTLE_OVERLAP:g} is enough): add a window between them"]
+        return [
+            f"{where} hardly overlap ({least:.2g}, {LITTLE_OVERLAP:g} is enough): add a window"
+            " between them"
+        ]
     return []

@@ -1,7 +1,7 @@
 """Distances between sites of different molecules, counted in bins: the loop behind g(r).
 
-Neither MDAnalysis nor freud leaves out the pairs within a molecule without a list of all pairs, which takes 0.1 to 2 s
-a frame for 4096 waters within 10 Å.
+Neither MDAnalysis nor freud leaves out the pairs within a molecule without a list of all pairs,
+which takes 0.1 to 2 s a frame for 4096 waters within 10 Å.
 """
 
 import numpy as np
@@ -21,9 +21,12 @@ def _count(code, content):
 
 @task()
 def _count_part(task_arguments, part):
-    """Add to counts (PARTS, bins) the pairs (i of first, j of second) of different owners that are closer than
-    edge * bins; fractions of the box, second sorted by cells of the grid, `start` where each begins."""
-    first, owner, second, owner_2, cell, grid, start, reach, edge, counts = load_arguments(task_arguments)
+    """Add to counts (PARTS, bins) the pairs (i of first, j of second) of different owners that are
+    closer than edge * bins; fractions of the box, second sorted by cells of the grid, `start` where
+    each begins."""
+    first, owner, second, owner_2, cell, grid, start, reach, edge, counts = load_arguments(
+        task_arguments
+    )
     bins = counts.shape[1]
     largest = (edge * bins) ** 2
     nx, ny, nz = grid
@@ -55,16 +58,25 @@ def heights(cell: np.ndarray) -> np.ndarray:
 
 
 def count_pairs(
-    first: np.ndarray, owner: np.ndarray, second: np.ndarray, owner_2: np.ndarray, cell: np.ndarray, edge: float,
+    first: np.ndarray,
+    owner: np.ndarray,
+    second: np.ndarray,
+    owner_2: np.ndarray,
+    cell: np.ndarray,
+    edge: float,
     bins: int,
-) -> np.ndarray:  # fmt: skip
-    """Number (bins,) of ordered pairs of sites (k, 3) and (l, 3), Å, of different molecules `owner`, by distance.
+) -> np.ndarray:
+    """Number (bins,) of ordered pairs of sites (k, 3) and (l, 3), Å, of different molecules
+    `owner`, by distance.
 
-    cell (3, 3), a along x and b in the plane of x and y; edge * bins is at most half its smallest height.
+    cell (3, 3), a along x and b in the plane of x and y; edge * bins is at most half its smallest
+    height.
     """
     inverse = np.linalg.inv(cell)
     finest = heights(cell) / (edge * bins / WITHIN)
-    grid = np.maximum(1, (finest / max(1.0, finest.prod() / (FOR_EACH * len(second))) ** (1 / 3)).astype(int))
+    grid = np.maximum(
+        1, (finest / max(1.0, finest.prod() / (FOR_EACH * len(second))) ** (1 / 3)).astype(int)
+    )
     reach = np.ceil(edge * bins * grid / heights(cell) - 1e-9).astype(int)
     inside, inside_2 = ((at @ inverse) % 1.0 for at in (first, second))
     inside[inside == 1.0] = 0.0
@@ -74,6 +86,17 @@ def count_pairs(
     start = np.searchsorted(cell_of[order], np.arange(grid.prod() + 1))
     counts = np.zeros((PARTS, bins), np.int64)
     sizes = tuple(map(int, grid)), tuple(map(int, reach))
-    content = (inside, owner, inside_2[order], owner_2[order], cell, sizes[0], start, sizes[1], edge, counts)
+    content = (
+        inside,
+        owner,
+        inside_2[order],
+        owner_2[order],
+        cell,
+        sizes[0],
+        start,
+        sizes[1],
+        edge,
+        counts,
+    )
     _count(Code(count=(_count_part, content)), content)
     return counts.sum(axis=0)

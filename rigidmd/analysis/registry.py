@@ -11,7 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.analysis.result import AnalysisResult, Curve, Value, converged_value, correlation_time_of, mean_of_series
+from rigidmd.analysis.result import (
+    AnalysisResult,
+    Curve,
+    Value,
+    converged_value,
+    correlation_time_of,
+    mean_of_series,
+)
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs, as_runs
 from rigidmd.core.files import unreadable_reason
@@ -35,7 +42,8 @@ KNOWN: dict[str, Analysis] = {}
 
 
 def built_in(about: str, position: float = inf) -> Callable[[Function], Function]:
-    """Register a built-in analysis under the name of its function of `Runs`, which takes the frames of one run too."""
+    """Register a built-in analysis under the name of its function of `Runs`, which takes the frames
+    of one run too."""
 
     def add(function: Function) -> Function:
         @wraps(function)
@@ -57,22 +65,26 @@ def load_built_in() -> None:
 
 
 def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], Any]:
-    """Register a user-defined analysis under the name of its function; `rigidmd analyse --only NAME` runs it.
+    """Register a user-defined analysis under the name of its function; `rigidmd analyse --only
+    NAME` runs it.
 
     @rigidmd.analysis.register
     def height(frames):
         "mean height of the centres (Å)"
         return frames.positions[:, :, 2].mean(axis=1)
 
-    The function gets a `rigidmd.analysis.rigid_frames.RigidFrames` (time, positions, Q, L, velocities, cell, ...) and
-    returns one number for each frame (f,), or a dictionary of such arrays, of which means, errors, a CSV file and a
-    figure are made. The first line of its docstring is the title. Raises OutputError if the name is not free.
+    The function gets a `rigidmd.analysis.rigid_frames.RigidFrames` (time, positions, Q, L,
+    velocities, cell, ...) and returns one number for each frame (f,), or a dictionary of such
+    arrays, of which means, errors, a CSV file and a figure are made. The first line of its
+    docstring is the title. Raises OutputError if the name is not free.
     """
     name = getattr(function, "__name__", "")
     if is_built_in(name):
         raise OutputError(f"{name} is an analysis of rigidmd; rename your function")
     if not name.isidentifier():
-        raise OutputError(f"an analysis has the name of its function; {name or function!r} is not a name: use def")
+        raise OutputError(
+            f"an analysis has the name of its function; {name or function!r} is not a name: use def"
+        )
     about = ((function.__doc__ or "").strip().splitlines() or [name])[0]
 
     @wraps(function)
@@ -80,11 +92,15 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
         """Means and errors of its values."""
         runs = as_runs(frames)
         every = [_series_of(function, name, run) for run in runs.members]
-        columns = {title: [of_run[title] for of_run in every if title in of_run] for title in every[0]}
+        columns = {
+            title: [of_run[title] for of_run in every if title in of_run] for title in every[0]
+        }
         found = AnalysisResult(name, about)
         for title, series in columns.items():
             if len(series) < len(every):
-                raise OutputError(f"the analysis {name} returned {title!r} for some of the runs only")
+                raise OutputError(
+                    f"the analysis {name} returned {title!r} for some of the runs only"
+                )
             value, error = mean_of_series(runs, series)
             if max(map(np.ptp, series)) == 0 and not error:
                 found.values.append(Value(title, "", value, None))  # a constant
@@ -92,9 +108,12 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
                 tau = correlation_time_of(runs, series)
                 found.values.append(converged_value(title, "", value, error, runs.span, tau))
         shown = {
-            title: np.mean([values[: runs.shortest] for values in series], axis=0) for title, series in columns.items()
+            title: np.mean([values[: runs.shortest] for values in series], axis=0)
+            for title, series in columns.items()
         }
-        found.curves.append(Curve(name, ("Time (ps)", runs.first.time[: runs.shortest]), about, shown))
+        found.curves.append(
+            Curve(name, ("Time (ps)", runs.first.time[: runs.shortest]), about, shown)
+        )
         return found
 
     KNOWN[name] = Analysis(name, about, analysis, inf, True)
@@ -131,12 +150,17 @@ def run_user_file(path: Path) -> None:
     except (Exception, SystemExit) as error:  # a user's file may raise anything
         raise OutputError(f"{path} raised {type(error).__name__}: {error}") from error
     if not any(entry.is_user and entry is not before.get(name) for name, entry in KNOWN.items()):
-        raise OutputError(f"{path} defines no analysis: put @rigidmd.analysis.register before a function of frames")
+        raise OutputError(
+            f"{path} defines no analysis: put @rigidmd.analysis.register before a function of"
+            " frames"
+        )
 
 
-def _series_of(function: Callable[[RigidFrames], Any], name: str, frames: RigidFrames) -> dict[str, np.ndarray]:
-    """What a user-defined analysis returns for the frames of a run: a number for each frame (f,) by title. Raises
-    OutputError."""
+def _series_of(
+    function: Callable[[RigidFrames], Any], name: str, frames: RigidFrames
+) -> dict[str, np.ndarray]:
+    """What a user-defined analysis returns for the frames of a run: a number for each frame (f,) by
+    title. Raises OutputError."""
     try:
         found = function(frames)
     except (Exception, SystemExit) as error:  # a user's function may raise anything
@@ -144,19 +168,23 @@ def _series_of(function: Callable[[RigidFrames], Any], name: str, frames: RigidF
     series = dict(found) if isinstance(found, Mapping) else {name: found}
     if not series:
         raise OutputError(f"the analysis {name} returned an empty dictionary")
-    return {str(title): _checked_series(name, title, given, len(frames)) for title, given in series.items()}
+    return {
+        str(title): _checked_series(name, title, given, len(frames))
+        for title, given in series.items()
+    }
 
 
 def _checked_series(name: str, title: object, given: Any, count: int) -> np.ndarray:
-    """What a user-defined analysis returned, as one number for each frame (f,). Raises OutputError."""
+    """What a user-defined analysis returned, as one number for each frame (f,). Raises
+    OutputError."""
     try:
         array = np.asarray(given, float)
     except (TypeError, ValueError):
         array = np.array([])
     if array.shape != (count,):
         raise OutputError(
-            f"the analysis {name} must return one number for each of the {count} frames, or a dictionary of such "
-            f"arrays; {title!r} has the shape {np.shape(given)}"
+            f"the analysis {name} must return one number for each of the {count} frames, or a"
+            f" dictionary of such arrays; {title!r} has the shape {np.shape(given)}"
         )
     if not np.isfinite(array).all():
         frame = np.isfinite(array).argmin() + 1

@@ -1,9 +1,10 @@
 """The integral of a correlation function from the spectrum of its series at low frequencies.
 
-The spectral density S(f) of a series is the Fourier transform of its correlation function, so that S(0) is twice the
-integral from 0 to infinity. A periodogram is S times independent random numbers of known distribution at all
-frequencies, however slowly the correlation decays. A fit of a model of relaxations to it therefore has no time to which
-an integral would have to be cut off (compare Ercole, Marcolongo & Baroni 2017, Sci. Rep. 7, 15835).
+The spectral density S(f) of a series is the Fourier transform of its correlation function, so that
+S(0) is twice the integral from 0 to infinity. A periodogram is S times independent random numbers
+of known distribution at all frequencies, however slowly the correlation decays. A fit of a model of
+relaxations to it therefore has no time to which an integral would have to be cut off (compare
+Ercole, Marcolongo & Baroni 2017, Sci. Rep. 7, 15835).
 """
 
 from typing import NamedTuple
@@ -12,19 +13,21 @@ import numpy as np
 
 #: Most relaxations of a model.
 MOST = 3
-#: Bands: the first frequencies are by themselves, later ones together with others within this ratio.
+#: Bands: the first frequencies are by themselves, later ones together with others within this
+#: ratio.
 ALONE, RATIO = 20, 1.08
 #: Least number of bands of a fit, and groups of bands whose sums of residuals give chi².
 LEAST_BANDS, GROUPS = 15, 12
-#: Parts of the highest frequency, up to which a model is fitted. The first that it describes is used.
+#: Parts of the highest frequency, up to which a model is fitted. The first that it describes is
+#: used.
 PARTS = (0.5, 0.25, 0.125, 0.0625, 0.03125)
-#: Longest relaxation time of a fit, as fractions of the sum of all runs and of one of them. Longer ones are fits to the
-#: noise of the lowest frequencies.
+#: Longest relaxation time of a fit, as fractions of the sum of all runs and of one of them. Longer
+#: ones are fits to the noise of the lowest frequencies.
 LONGEST, LONGEST_OF_RUN = 0.05, 0.25
 #: Iterations of a fit, and the change of the likelihood at which it ends.
 ITERATIONS, CLOSE = 200, 1e-6
-#: Factor on the error, which accounts for the choice among models and frequencies. Measured with relaxations of 0.03 to
-#: 2.5 ps in series of 40 to 800 ps.
+#: Factor on the error, which accounts for the choice among models and frequencies. Measured with
+#: relaxations of 0.03 to 2.5 ps in series of 40 to 800 ps.
 ERROR_FACTOR = 1.15
 
 
@@ -33,7 +36,9 @@ class Bands(NamedTuple):
 
     frequency: np.ndarray  # mean of each band
     density: np.ndarray  # mean of each band: twice the integral of the correlation at frequency 0
-    freedom: np.ndarray  # half the number of degrees of freedom of the chi² distribution of each mean
+    freedom: (
+        np.ndarray
+    )  # half the number of degrees of freedom of the chi² distribution of each mean
 
 
 class Relaxations(NamedTuple):
@@ -71,7 +76,8 @@ def longest_time(runs: int, length: float) -> float:
 def spectral_bands(runs: list[np.ndarray], interval: float) -> Bands:
     """The mean spectral density of series (n, d) of several runs, sampled at an interval, in bands.
 
-    The means of the series are known to be 0, so that frequency 0 counts. Longer runs are cut to the shortest.
+    The means of the series are known to be 0, so that frequency 0 counts. Longer runs are cut to
+    the shortest.
     """
     count = min(map(len, runs))
     powers = [np.mean(np.abs(np.fft.rfft(series[:count], axis=0)) ** 2, axis=1) for series in runs]
@@ -89,11 +95,11 @@ def spectral_bands(runs: list[np.ndarray], interval: float) -> Bands:
 
 
 def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
-    """Integral from 0 to infinity of the correlation function of series (n, d) of mean 0, mean over d and runs; None if
-    the series are too short for a fit.
+    """Integral from 0 to infinity of the correlation function of series (n, d) of mean 0, mean over
+    d and runs; None if the series are too short for a fit.
 
-    Models of one to three relaxations and a constant are fitted by their likelihood; their limits are averaged with
-    Akaike's weights, and differences between them are a part of the error.
+    Models of one to three relaxations and a constant are fitted by their likelihood; their limits
+    are averaged with Akaike's weights, and differences between them are a part of the error.
     """
     bands, span = spectral_bands(runs, interval), interval * min(map(len, runs))
     longest = longest_time(len(runs), span)
@@ -106,7 +112,10 @@ def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
         fits = [_fit(some, count, longest) for count in range(1, MOST + 1)]
         best = min(fits, key=lambda fit: fit.score)
         weights = np.exp([0.5 * (best.score - fit.score) for fit in fits])
-        limits, errors = (np.array(values) for values in zip(*((fit.limit, fit.error) for fit in fits), strict=True))
+        limits, errors = (
+            np.array(values)
+            for values in zip(*((fit.limit, fit.error) for fit in fits), strict=True)
+        )
         value = float(np.average(limits, weights=weights))
         error = float(np.sqrt(np.average(errors**2 + (limits - value) ** 2, weights=weights)))
         found = Limit(value, ERROR_FACTOR * error, best, highest)
@@ -116,10 +125,13 @@ def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
 
 
 def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
-    """The most likely model with a number of relaxations, by Fisher's scoring in the logarithms of its parameters, with
-    the damping of Levenberg and Marquardt."""
+    """The most likely model with a number of relaxations, by Fisher's scoring in the logarithms of
+    its parameters, with the damping of Levenberg and Marquardt."""
     squares = (2 * np.pi * bands.frequency) ** 2
-    top, low = float(np.average(bands.density[:6], weights=bands.freedom[:6])), float(bands.density[-1])
+    top, low = (
+        float(np.average(bands.density[:6], weights=bands.freedom[:6])),
+        float(bands.density[-1]),
+    )
     shortest = 0.5 / (2 * np.pi * float(bands.frequency[-1]))
     times = np.geomspace(4 * shortest, max(8 * shortest, longest / 3), count + 2)[1:-1]
     bottom = np.log([*[1e-4 * top] * count, *[shortest] * count, 1e-5 * top])
@@ -128,7 +140,11 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
 
     def model(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Density (b,) and its relative slopes with all parameters (b, p)."""
-        parts, times, rest = np.exp(parameters[:count]), np.exp(parameters[count:-1]), np.exp(parameters[-1])
+        parts, times, rest = (
+            np.exp(parameters[:count]),
+            np.exp(parameters[count:-1]),
+            np.exp(parameters[-1]),
+        )
         below = 1 + squares[:, None] * times**2
         density = (parts / below).sum(axis=1) + rest
         slopes = np.column_stack(
@@ -147,7 +163,9 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
         weighted = slopes * bands.freedom[:, None]
         downhill = weighted.T @ (bands.density / density - 1)
         fisher = weighted.T @ slopes
-        step = np.linalg.lstsq(fisher + damping * np.diag(np.diag(fisher) + 1e-9), downhill, rcond=None)[0]
+        step = np.linalg.lstsq(
+            fisher + damping * np.diag(np.diag(fisher) + 1e-9), downhill, rcond=None
+        )[0]
         tried = np.clip(parameters + np.clip(step, -1.0, 1.0), bottom, ceiling)
         density_there, slopes_there = model(tried)
         after = surprise(density_there)
@@ -157,15 +175,26 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
                 break
             continue
         gain, before = before - after, after
-        parameters, density, slopes, damping = tried, density_there, slopes_there, max(0.2 * damping, 1e-7)
+        parameters, density, slopes, damping = (
+            tried,
+            density_there,
+            slopes_there,
+            max(0.2 * damping, 1e-7),
+        )
         if gain < CLOSE:
             break
     weighted = slopes * bands.freedom[:, None]
-    parts, times, rest = np.exp(parameters[:count]), np.exp(parameters[count:-1]), float(np.exp(parameters[-1]))
+    parts, times, rest = (
+        np.exp(parameters[:count]),
+        np.exp(parameters[count:-1]),
+        float(np.exp(parameters[-1])),
+    )
     of_limit = np.concatenate([parts, np.zeros(count), [rest]])
     variance = float(of_limit @ np.linalg.pinv(weighted.T @ slopes, hermitian=True) @ of_limit)
     residual = bands.freedom * (bands.density / density - 1)
     groups = np.array_split(np.arange(len(residual)), GROUPS)
     chi2 = sum(float(residual[group].sum() ** 2 / bands.freedom[group].sum()) for group in groups)
     score = 2 * before + 2 * (2 * count + 1)
-    return Relaxations(0.5 * rest, 0.5 * parts, times, 0.5 * np.sqrt(max(0.0, variance)), score, chi2)
+    return Relaxations(
+        0.5 * rest, 0.5 * parts, times, 0.5 * np.sqrt(max(0.0, variance)), score, chi2
+    )

@@ -10,7 +10,12 @@ import numpy as np
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Measured, Runs
 from rigidmd.core.display import Displayed
-from rigidmd.core.statistics import correlation_time, error_of_mean, format_with_error, mean_and_error
+from rigidmd.core.statistics import (
+    correlation_time,
+    error_of_mean,
+    format_with_error,
+    mean_and_error,
+)
 from rigidmd.io.run_files import Bounded
 from rigidmd.run.rigid_fit import Kind
 
@@ -22,8 +27,9 @@ if TYPE_CHECKING:
 #: Blocks of frames whose scatter gives errors. The error of an error is one third.
 BLOCKS = 5
 MAX_GROUPS = 10  # groups of molecules at most, whose scatter gives errors too
-#: Least length of a run for a value in correlation times of the whole system. For those of single molecules, of which
-#: there are many, it is `BLOCKS`, because each block should be one correlation time long.
+#: Least length of a run for a value in correlation times of the whole system. For those of single
+#: molecules, of which there are many, it is `BLOCKS`, because each block should be one correlation
+#: time long.
 MIN_CORRELATION_TIMES = 20.0
 
 
@@ -76,7 +82,10 @@ class Curve:
 
     def __repr__(self) -> str:
         """Short: the numbers of a curve would flood a screen."""
-        return f"<Curve {self.file}: {', '.join(self.columns)} against {self.axis[0]}, {len(self.axis[1])} points>"
+        return (
+            f"<Curve {self.file}: {', '.join(self.columns)} against {self.axis[0]},"
+            f" {len(self.axis[1])} points>"
+        )
 
     @property
     def table(self) -> dict[str, np.ndarray]:
@@ -96,8 +105,8 @@ class Curve:
 class AnalysisResult(Displayed):
     """The result of an analysis: values, curves, notes. A notebook displays them with a figure.
 
-    result["g OW-OW"] is a column of its curves, result.value("D of spce") a value; result.plot() is a figure,
-    result.to_dataframe() a table.
+    result["g OW-OW"] is a column of its curves, result.value("D of spce") a value; result.plot() is
+    a figure, result.to_dataframe() a table.
     """
 
     name: str
@@ -120,26 +129,36 @@ class AnalysisResult(Displayed):
         for value in self.values:
             if name in ("", value.name):
                 return value
-        raise KeyError(f"no value {name!r}; there are {', '.join(value.name for value in self.values)}")
+        raise KeyError(
+            f"no value {name!r}; there are {', '.join(value.name for value in self.values)}"
+        )
 
     def plot(self, curve: str = "") -> "Picture":
-        """A Matplotlib figure of its curves, which a notebook displays and `savefig` writes, as PNG, SVG or PDF by the
-        extension. Bands are of one standard error.
+        """A Matplotlib figure of its curves, which a notebook displays and `savefig` writes, as
+        PNG, SVG or PDF by the extension. Bands are of one standard error.
 
-        curve : name of one of `curves`; default: a panel for each. Raises KeyError, ValueError without curves
+        curve : name of one of `curves`; default: a panel for each. Raises KeyError, ValueError
+            without curves
         """
-        from rigidmd.analysis.curve_figure import curve_figure, curves_figure  # Matplotlib is slow to import
+        from rigidmd.analysis.curve_figure import (  # Matplotlib is slow to import
+            curve_figure,
+            curves_figure,
+        )
 
         if not self.curves:
-            raise ValueError(f"the analysis {self.name} has no curves: {'; '.join(map(str, self.values))}")
+            raise ValueError(
+                f"the analysis {self.name} has no curves: {'; '.join(map(str, self.values))}"
+            )
         if curve or len(self.curves) == 1:
             return curve_figure(self._curve(curve))
         return curves_figure(self.curves, self.about)
 
     def to_dataframe(self, curve: str = "") -> "pandas.DataFrame":
-        """The columns of a curve with their errors, as in its CSV file; of an analysis without curves its values.
+        """The columns of a curve with their errors, as in its CSV file; of an analysis without
+        curves its values.
 
-        curve : name of one of `curves`; default: the first. Raises KeyError, ImportError without pandas
+        curve : name of one of `curves`; default: the first. Raises KeyError, ImportError without
+            pandas
         """
         try:
             import pandas
@@ -154,7 +173,9 @@ class AnalysisResult(Displayed):
         for curve in self.curves:
             if name in ("", curve.file):
                 return curve
-        raise KeyError(f"no curve {name!r}; there are {', '.join(curve.file for curve in self.curves)}")
+        raise KeyError(
+            f"no curve {name!r}; there are {', '.join(curve.file for curve in self.curves)}"
+        )
 
     def __str__(self) -> str:
         curves = [f"{', '.join(curve.columns)} against {curve.axis[0]}" for curve in self.curves]
@@ -164,23 +185,33 @@ class AnalysisResult(Displayed):
     __repr__ = __str__
 
 
-def too_short(name: str, unit: str, value: float, error: float | None, why: str, tau: float | None = None) -> Value:
-    """No value, because the run is too short: why it is, and the value so far. tau : correlation time (ps)"""
+def too_short(
+    name: str, unit: str, value: float, error: float | None, why: str, tau: float | None = None
+) -> Value:
+    """No value, because the run is too short: why it is, and the value so far. tau : correlation
+    time (ps)"""
     so_far = f"{format_with_error(value, error)}{'' if unit in ('', '1') else f' {unit}'}"
     return Value(name, unit, None, None, tau, f"{why}. So far: {so_far}")
 
 
 def converged_value(
-    name: str, unit: str, value: float, error: float | None, span: float, correlation: float, note: str = "",
+    name: str,
+    unit: str,
+    value: float,
+    error: float | None,
+    span: float,
+    correlation: float,
+    note: str = "",
     least: float = MIN_CORRELATION_TIMES,
-) -> Value:  # fmt: skip
-    """A value from a run of length `span`, which has to be `least` correlation times long (both ps)."""
+) -> Value:
+    """A value from a run of length `span`, which has to be `least` correlation times long (both
+    ps)."""
     if not correlation > 0 or not isfinite(value):
         return Value(name, unit, None, None, None, "the frames give no correlation time")
     if (lengths := span / correlation) < least:
         why = (
-            f"{span:.3g} ps are {lengths:.2g} correlation times of {correlation:.3g} ps, too short for a value; "
-            f"{least:g} of them are {least * correlation:.3g} ps"
+            f"{span:.3g} ps are {lengths:.2g} correlation times of {correlation:.3g} ps, too short"
+            f" for a value; {least:g} of them are {least * correlation:.3g} ps"
         )
         return too_short(name, unit, value, error, why, correlation)
     if error is None or not isfinite(error):
@@ -198,8 +229,8 @@ def _unchanged(values: np.ndarray) -> np.ndarray:
 def with_block_error(
     runs: Runs, measure: Callable[[RigidFrames], np.ndarray], conclude: Array = _unchanged
 ) -> Measured:
-    """An array computed from frames, and its standard error: of one run from blocks of at least two frames, of
-    several from their scatter.
+    """An array computed from frames, and its standard error: of one run from blocks of at least two
+    frames, of several from their scatter.
 
     measure : means over some frames; conclude : function of the means over all of them
     """
@@ -213,15 +244,23 @@ def with_block_error(
 
 
 def with_group_error(
-    runs: Runs, kind: Kind, measure: Callable[[RigidFrames, Kind], np.ndarray], conclude: Array = _unchanged
+    runs: Runs,
+    kind: Kind,
+    measure: Callable[[RigidFrames, Kind], np.ndarray],
+    conclude: Array = _unchanged,
 ) -> Measured:
-    """An array computed from the molecules of a species, and its standard error: of one run the larger of two, from
-    blocks of frames and from groups of molecules; of several runs from their scatter. Blocks are too similar in a gas,
-    groups where molecules move together."""
+    """An array computed from the molecules of a species, and its standard error: of one run the
+    larger of two, from blocks of frames and from groups of molecules; of several runs from their
+    scatter. Blocks are too similar in a gas, groups where molecules move together."""
     whole, error = with_block_error(runs, lambda part: measure(part, kind), conclude)
     if (count := min(MAX_GROUPS, len(kind.index))) > 1 and not runs.are_several:
-        groups = (kind._replace(index=kind.index[k::count], sites=kind.sites[k::count]) for k in range(count))
-        error = np.fmax(error, error_of_mean([conclude(measure(runs.first, group)) for group in groups]))
+        groups = (
+            kind._replace(index=kind.index[k::count], sites=kind.sites[k::count])
+            for k in range(count)
+        )
+        error = np.fmax(
+            error, error_of_mean([conclude(measure(runs.first, group)) for group in groups])
+        )
     return whole, error
 
 

@@ -1,6 +1,8 @@
-"""Frames of a run as rigid bodies, fitted to the positions and velocities of sites: the input of all analyses.
+"""Frames of a run as rigid bodies, fitted to the positions and velocities of sites: the input of
+all analyses.
 
-They are from the folder of a run or from results in memory, by default from where production begins.
+They are from the folder of a run or from results in memory, by default from where production
+begins.
 """
 
 from collections.abc import Callable, Iterator
@@ -35,9 +37,11 @@ class RigidFrames:
     f frames, n molecules; Å, ps, u:
     time (f,), cell (f, 3, 3) rows a, b, c, infinite edges without a box
     positions (f, n, 3) centres of mass, lab frame; Q (f, n, 3, 3) body to lab, principal axes
-    velocities (f, n, 3) lab frame, L (f, n, 3) angular momentum along the body's axes; None where no frame has them
+    velocities (f, n, 3) lab frame, L (f, n, 3) angular momentum along the body's axes; None where
+    no frame has them
     columns : samples of the same time by their names in `results[...]`
-    tensor : (l, 7) rows of pressure_tensor.csv, ps and bar, of the same time; None if the run wrote none
+    tensor : (l, 7) rows of pressure_tensor.csv, ps and bar, of the same time; None if the run wrote
+        none
     notes : on the choice and the correction of frames
     """
 
@@ -74,7 +78,9 @@ class RigidFrames:
     def interval(self) -> float | None:
         """Time between frames, ps; None if they are not evenly spaced."""
         gaps = np.diff(self.time)
-        rounding = 2 * float(np.spacing(np.float32(np.abs(self.time).max())))  # files hold times in single precision
+        rounding = 2 * float(
+            np.spacing(np.float32(np.abs(self.time).max()))
+        )  # files hold times in single precision
         if len(gaps) == 0 or gaps.min() <= 0 or np.ptp(gaps) > EVEN * gaps.max() + rounding:
             return None
         return self.span / len(gaps)
@@ -105,7 +111,8 @@ class RigidFrames:
 
     @cached_property
     def paths(self) -> np.ndarray:
-        """Paths of centres (f, n, 3), Å, without scaling by a barostat: sums of displacements in each cell."""
+        """Paths of centres (f, n, 3), Å, without scaling by a barostat: sums of displacements in
+        each cell."""
         if not self.has_box or np.ptp(self.cell, axis=0).max() == 0.0:
             return self.positions
         inside = np.einsum("fni,fij->fnj", self.positions, np.linalg.inv(self.cell))
@@ -115,7 +122,8 @@ class RigidFrames:
     def sites(self, name: str, frames: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Positions (f, k, 3) of the sites called `name`, and the indices (k,) of their molecules.
 
-        name : of a site (HW1, or HW for HW1 and HW2), element, or species (centres of mass). Raises OutputError.
+        name : of a site (HW1, or HW for HW1 and HW2), element, or species (centres of mass). Raises
+            OutputError.
         """
         at, molecules = [], []
         for kind in self.kinds:
@@ -133,20 +141,32 @@ class RigidFrames:
                 molecules.append(np.repeat(kind.index, len(chosen)))
         if not at:
             species = self.system.species
-            known = [*dict.fromkeys([n for m in species for n in m.site_names] + [m.name for m in species])]
-            raise OutputError(f"unknown site {name!r}{did_you_mean(name, known) or ';'} there are {', '.join(known)}")
+            known = [
+                *dict.fromkeys(
+                    [n for m in species for n in m.site_names] + [m.name for m in species]
+                )
+            ]
+            raise OutputError(
+                f"unknown site {name!r}{did_you_mean(name, known) or ';'} there are"
+                f" {', '.join(known)}"
+            )
         return np.concatenate(at, axis=1), np.concatenate(molecules)
 
     def __getitem__(self, frames: slice) -> "RigidFrames":
         """Some of the frames, with all samples."""
         return replace(
-            self, time=self.time[frames], cell=self.cell[frames], positions=self.positions[frames], Q=self.Q[frames],
+            self,
+            time=self.time[frames],
+            cell=self.cell[frames],
+            positions=self.positions[frames],
+            Q=self.Q[frames],
             velocities=None if self.velocities is None else self.velocities[frames],
             L=None if self.L is None else self.L[frames],
-        )  # fmt: skip
+        )
 
     def copied(self) -> "RigidFrames":
-        """These frames in memory of their own, so that the frames of which they are a part can be freed."""
+        """These frames in memory of their own, so that the frames of which they are a part can be
+        freed."""
         return replace(
             self,
             positions=self.positions.copy(),
@@ -157,16 +177,25 @@ class RigidFrames:
 
 
 def sites_named(molecule: Molecule, name: str) -> list[int]:
-    """Sites of a molecule with this name, or else with this name before a number, or else of this element."""
+    """Sites of a molecule with this name, or else with this name before a number, or else of this
+    element."""
     found = [k for k, site in enumerate(molecule.site_names) if site == name]
-    found = found or [k for k, site in enumerate(molecule.site_names) if site.rstrip("0123456789") == name]
-    return found or [k for k, element in enumerate(molecule.elements) if element == name and name != "X"]
+    found = found or [
+        k for k, site in enumerate(molecule.site_names) if site.rstrip("0123456789") == name
+    ]
+    return found or [
+        k for k, element in enumerate(molecule.elements) if element == name and name != "X"
+    ]
 
 
 def fit_frames(
-    system: System, sites: np.ndarray, velocities: np.ndarray | None, cells: np.ndarray, wrapped: bool,
+    system: System,
+    sites: np.ndarray,
+    velocities: np.ndarray | None,
+    cells: np.ndarray,
+    wrapped: bool,
     progress: Callable[[float], object] = lambda fraction: None,
-) -> tuple[Bodies, list[str]]:  # fmt: skip
+) -> tuple[Bodies, list[str]]:
     """Bodies of frames, each array with a first axis (f,), and notes. Raises OutputError.
 
     sites (f, s, 3); velocities alike or None; cells (f, 3, 3)
@@ -176,7 +205,9 @@ def fit_frames(
     fit, n, f = RigidFit(system), len(system.model.species), len(sites)
     rotating = n if len(system.state.rotation) else 0
     position, Q = np.empty((f, n, 3)), np.empty((f, rotating, 3, 3))
-    velocity, L = (None, None) if velocities is None else (np.empty((f, n, 3)), np.empty((f, rotating, 3)))
+    velocity, L = (
+        (None, None) if velocities is None else (np.empty((f, n, 3)), np.empty((f, rotating, 3)))
+    )
     for k, frame in enumerate(sites):
         try:
             found = fit.bodies(frame, None if velocities is None else velocities[k])
@@ -193,8 +224,9 @@ def fit_frames(
         moves -= np.round(moves)
         if (far := float(np.abs(moves).max())) > MAX_WRAPPED_MOVE:
             raise OutputError(
-                f"molecules move by {far:.2f} of the box between two frames, in which they are wrapped: their paths "
-                "cannot be determined. Write output.positions = 'unwrapped', or frames more often"
+                f"molecules move by {far:.2f} of the box between two frames, in which they are"
+                " wrapped: their paths cannot be determined. Write output.positions = 'unwrapped',"
+                " or frames more often"
             )
         inside[1:] = inside[0] + np.cumsum(moves, axis=0)
         position = np.einsum("fni,fij->fnj", inside, cells)
@@ -207,9 +239,12 @@ MOST_NUMBERS = 150_000_000
 
 
 def frames_of_folder(
-    record: Record, start: float | None = None, progress: Callable[[float], object] = lambda fraction: None
+    record: Record,
+    start: float | None = None,
+    progress: Callable[[float], object] = lambda fraction: None,
 ) -> RigidFrames:
-    """The frames of a run of molecules in a folder, from `start` (ps) on, or from where production begins.
+    """The frames of a run of molecules in a folder, from `start` (ps) on, or from where production
+    begins.
 
     progress : called with the fraction done. Raises OutputError.
     """
@@ -242,22 +277,27 @@ def frames_of_results(results: Results, start: float | None = None) -> RigidFram
     if not frames:
         raise OutputError("this run has no frames (output.trajectory = false) to analyse")
     count, cells = len(frames), np.array([frame.cell for frame in frames])
-    positions, velocities = (np.array([getattr(frame, of) for frame in frames]) for of in ("positions", "velocities"))
-    stored = Frames(np.array([frame.time for frame in frames]), positions, cells, count, 1, False, velocities)
+    positions, velocities = (
+        np.array([getattr(frame, of) for frame in frames]) for of in ("positions", "velocities")
+    )
+    stored = Frames(
+        np.array([frame.time for frame in frames]), positions, cells, count, 1, False, velocities
+    )
     columns = {name: results[name] for name in results.units}
     return _rigid_frames(system, columns, stored, results._tensor, start, [], lambda fraction: None)
 
 
 def production_samples(record: Record) -> tuple[Stage, np.ndarray]:
-    """The last stage that is not a minimisation, and which samples are of its production. Raises OutputError."""
+    """The last stage that is not a minimisation, and which samples are of its production. Raises
+    OutputError."""
     stage, _, last, begin, shown = _last_stage(record.system, record.columns)
     time = record.columns["time"]
     return stage, shown & (time >= begin) & (time <= last)
 
 
 def earlier_production(record: Record) -> Iterator[tuple[Stage, np.ndarray]]:
-    """The stages of motion before the last one whose set points do not change, and which samples are of the
-    equilibrated part of each. Raises OutputError."""
+    """The stages of motion before the last one whose set points do not change, and which samples
+    are of the equilibrated part of each. Raises OutputError."""
     columns, last = record.columns, _last_stage(record.system, record.columns)[0]
     for k, stage in enumerate(record.system.scene.stages):
         if stage is last:
@@ -265,26 +305,36 @@ def earlier_production(record: Record) -> Iterator[tuple[Stage, np.ndarray]]:
         of_stage = np.flatnonzero(columns["stage"] == k)
         if stage.is_minimisation or stage.ramps or not len(of_stage):
             continue
-        start = equilibrated_from({name: values[of_stage] for name, values in columns.items()}, stage)
+        start = equilibrated_from(
+            {name: values[of_stage] for name, values in columns.items()}, stage
+        )
         samples = np.zeros(len(columns["stage"]), bool)
         samples[of_stage[start:]] = True
         yield stage, samples
 
 
 def _rigid_frames(
-    system: System, columns: dict[str, np.ndarray], stored: Frames, tensor: np.ndarray | None,
-    start: float | None, notes: list[str], progress: Callable[[float], object],
-) -> RigidFrames:  # fmt: skip
+    system: System,
+    columns: dict[str, np.ndarray],
+    stored: Frames,
+    tensor: np.ndarray | None,
+    start: float | None,
+    notes: list[str],
+    progress: Callable[[float], object],
+) -> RigidFrames:
     stage, first, last, detected, shown = _last_stage(system, columns)
     begin = detected if start is None else start
     if start is None:
-        notes.append(f"production begins at {begin:g} ps, as detected in the stage from {first:g} to {last:g} ps")
+        notes.append(
+            f"production begins at {begin:g} ps, as detected in the stage from {first:g} to"
+            f" {last:g} ps"
+        )
     elif start < first:
         notes.append(f"frames before {first:g} ps are of an earlier stage")
     if not stage.keeps_momentum:
         notes.append(
-            f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and rotation, and "
-            "changes spectra and viscosity; use nve or velocity_rescaling for these"
+            f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and"
+            " rotation, and changes spectra and viscosity; use nve or velocity_rescaling for these"
         )
     slack = 1e-6 * max(abs(last), 1.0)
     keep = np.flatnonzero((stored.time >= begin - slack) & (stored.time <= last + slack))
@@ -292,32 +342,49 @@ def _rigid_frames(
     keep, times = (of[np.diff(times, append=np.inf) > 0] for of in (keep, times))
     if len(keep) < 2:
         raise OutputError(
-            f"from {begin:g} ps on there {'is' if len(keep) == 1 else 'are'} {len(keep)} of {len(stored.time)} "
-            "frames; an analysis needs at least two: run longer, or write frames more often (trajectory_interval_ps)"
+            f"from {begin:g} ps on there {'is' if len(keep) == 1 else 'are'} {len(keep)} of"
+            f" {len(stored.time)} frames; an analysis needs at least two: run longer, or write"
+            " frames more often (trajectory_interval_ps)"
         )
     velocities = None if stored.velocities is None else stored.velocities[keep]
     cells = np.tile(NO_CELL, (len(keep), 1, 1)) if stored.cells is None else stored.cells[keep]
     wrapped = system.scene.output.positions == "wrapped"
-    bodies, corrections = fit_frames(system, stored.positions[keep], velocities, cells, wrapped, progress)
+    bodies, corrections = fit_frames(
+        system, stored.positions[keep], velocities, cells, wrapped, progress
+    )
     samples = shown & (columns["time"] >= begin - slack) & (columns["time"] <= last + slack)
     if tensor is not None:
         tensor = tensor[(tensor[:, 0] >= begin - slack) & (tensor[:, 0] <= last + slack)]
     return RigidFrames(
-        system, stage, times, cells, bodies.position, bodies.Q, bodies.velocity, bodies.L,
-        {name: values[samples] for name, values in columns.items()}, tensor, [*notes, *corrections],
-    )  # fmt: skip
+        system,
+        stage,
+        times,
+        cells,
+        bodies.position,
+        bodies.Q,
+        bodies.velocity,
+        bodies.L,
+        {name: values[samples] for name, values in columns.items()},
+        tensor,
+        [*notes, *corrections],
+    )
 
 
 def _last_stage(system: System, columns: dict[str, np.ndarray]):
-    """The last moving stage with samples, its begin, end and equilibrated part, ps, and its samples of motion (l,)."""
+    """The last moving stage with samples, its begin, end and equilibrated part, ps, and its samples
+    of motion (l,)."""
     time, stages = columns["time"], system.scene.stages
     if all(stage.is_minimisation for stage in stages):
-        raise OutputError("this run is a minimisation, in which no time passes: there is nothing to average")
+        raise OutputError(
+            "this run is a minimisation, in which no time passes: there is nothing to average"
+        )
     shown = moving(stages, columns["stage"])
     for k in reversed(range(len(stages))):
         of_stage = np.flatnonzero(shown & (columns["stage"] == k))
         if len(of_stage) and time[of_stage[-1]] > (first := time[max(0, of_stage[0] - 1)]):
-            start = equilibrated_from({name: values[of_stage] for name, values in columns.items()}, stages[k])
+            start = equilibrated_from(
+                {name: values[of_stage] for name, values in columns.items()}, stages[k]
+            )
             begin = time[of_stage[start]] if start or stages[k].volume else first
             return stages[k], float(first), float(time[of_stage[-1]]), float(begin), shown
     raise OutputError("the run has not reached a stage after its minimisations")

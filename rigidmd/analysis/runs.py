@@ -1,4 +1,5 @@
-"""Frames of several independent runs of one system, analysed together: replicas. A single run is one of them."""
+"""Frames of several independent runs of one system, analysed together: replicas. A single run is
+one of them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,8 @@ Measured = tuple[np.ndarray, np.ndarray]
 class Runs:
     """The frames of independent runs of one system; at least one.
 
-    Averages are over the frames of all runs, and limits of length apply to the sum of their lengths.
+    Averages are over the frames of all runs, and limits of length apply to the sum of their
+    lengths.
     """
 
     members: tuple[RigidFrames, ...]
@@ -72,7 +74,8 @@ class Runs:
 
     @cached_property
     def interval(self) -> float | None:
-        """Time between frames, ps; None if they are not evenly spaced, or differently in different runs."""
+        """Time between frames, ps; None if they are not evenly spaced, or differently in different
+        runs."""
         found = [run.interval for run in self.members]
         known = [interval for interval in found if interval is not None]
         if len(known) < len(found) or np.ptp(known) > EVEN * max(known):
@@ -96,18 +99,26 @@ class Runs:
 
     def mean(self, values: Sequence[Any]) -> np.ndarray:
         """Mean of a value (...) of each run, weighted by the number of its frames."""
-        return np.average(np.asarray(values, float), axis=0, weights=[len(run) for run in self.members])
+        return np.average(
+            np.asarray(values, float), axis=0, weights=[len(run) for run in self.members]
+        )
 
     def estimate(self, values: Sequence[Any], conclude: Callable[[np.ndarray], Any]) -> Measured:
-        """What follows from the mean of a value of each run, and its standard error by leaving out one run after
-        another (jackknife). Without further conclusions this is the standard error of the mean over runs.
+        """What follows from the mean of a value of each run, and its standard error by leaving out
+        one run after another (jackknife). Without further conclusions this is the standard error of
+        the mean over runs.
 
         conclude : function of the mean of `values`, which may be nonlinear
         """
-        parts, weights = np.asarray(values, float), np.array([len(run) for run in self.members], float)
+        parts, weights = (
+            np.asarray(values, float),
+            np.array([len(run) for run in self.members], float),
+        )
         whole = np.asarray(conclude(np.average(parts, axis=0, weights=weights)), float)
         others = [np.arange(len(parts)) != k for k in range(len(parts))]
-        without = [conclude(np.average(parts[rest], axis=0, weights=weights[rest])) for rest in others]
+        without = [
+            conclude(np.average(parts[rest], axis=0, weights=weights[rest])) for rest in others
+        ]
         count = len(parts)
         return whole, sqrt(count - 1) * np.std(np.asarray(without, float), axis=0)
 

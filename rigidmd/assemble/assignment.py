@@ -11,14 +11,16 @@ from rigidmd.io.formats.bonds import shortest_links
 from rigidmd.mechanics.rotation import align
 from rigidmd.scene.models import Molecule
 
-#: Atoms are bonded up to this multiple of the template's longest bond between such atoms. Hydrogen bonds of water are
-#: at least 1.6 times as long as its bonds.
+#: Atoms are bonded up to this multiple of the template's longest bond between such atoms. Hydrogen
+#: bonds of water are at least 1.6 times as long as its bonds.
 BOND_REACH = 1.25
-#: Two orders fit equally well if their rms deviations differ by less than this factor and this fraction of the radius.
+#: Two orders fit equally well if their rms deviations differ by less than this factor and this
+#: fraction of the radius.
 EQUAL, EQUAL_OF_RADIUS = 1.2, 1e-4
 #: A template is linear if no atom is farther from its axis than this fraction of its radius.
 LINEAR = 0.01
-#: Atoms that fix an orientation are at least this fraction of the largest possible distance from centre and axis.
+#: Atoms that fix an orientation are at least this fraction of the largest possible distance from
+#: centre and axis.
 WIDE = 0.4
 MOST_STARTS = 4000  # orientations from which orders are searched
 FIRST_STARTS = 32  # the most likely ones, after which the search may end
@@ -45,11 +47,15 @@ class Assignment(NamedTuple):
 
     order: np.ndarray  # (m, s) atom of each site
     fit: TemplateFit
-    rival: np.ndarray  # (m,) rms of the best order in which an atom is a site with other parameters, Å; inf if none
+    rival: (
+        np.ndarray
+    )  # (m,) rms of the best order in which an atom is a site with other parameters, Å; inf if none
 
     def of(self, rows: np.ndarray) -> "Assignment":
         """That of some of the molecules."""
-        return Assignment(self.order[rows], TemplateFit(*(values[rows] for values in self.fit)), self.rival[rows])
+        return Assignment(
+            self.order[rows], TemplateFit(*(values[rows] for values in self.fit)), self.rival[rows]
+        )
 
     def with_better(self, rows: np.ndarray, others: "Assignment", limit: float) -> "Assignment":
         """The same with others in place of some rows where these fit within a limit."""
@@ -68,7 +74,8 @@ def massive_sites(molecule: Molecule) -> np.ndarray:
 
 
 def fit_template(points: np.ndarray, molecule: Molecule) -> TemplateFit:
-    """Best rigid fit of a template to whole molecules (m, s, 3), with coinciding centres of mass."""
+    """Best rigid fit of a template to whole molecules (m, s, 3), with coinciding centres of
+    mass."""
     sites = massive_sites(molecule)
     masses, template = molecule.masses[sites], molecule.positions_body[sites]
     centre = points[:, 0] + np.einsum("s,nsk->nk", masses, points - points[:, :1]) / masses.sum()
@@ -79,8 +86,8 @@ def fit_template(points: np.ndarray, molecule: Molecule) -> TemplateFit:
 
 
 def bond_reach(points: np.ndarray, classes: np.ndarray) -> np.ndarray:
-    """Largest lengths (s, s) of bonds between atoms of a template with these points (s, 3), Å. Bonds are its shortest
-    links, and all pairs of the same classes (s,); other pairs have 0."""
+    """Largest lengths (s, s) of bonds between atoms of a template with these points (s, 3), Å.
+    Bonds are its shortest links, and all pairs of the same classes (s,); other pairs have 0."""
     count = classes.max() + 1
     longest = np.zeros((count, count))
     for i, j in shortest_links(points):
@@ -99,10 +106,11 @@ def numbered(keys: Iterable[Hashable]) -> np.ndarray:
 class Orders:
     """The orders in which a template may fit atoms, of which those of one class may be exchanged.
 
-    An order is found from an orientation: two atoms that may be two sites of the template (one, if it is linear) and
-    the mean position of all atoms give one, and the atoms are assigned to the sites at the least sum of squares (the
-    linear assignment problem); orientation and order are refined in turn. All pairs of atoms are tried at which
-    distances agree within the limit. Symmetric templates fit in several orders.
+    An order is found from an orientation: two atoms that may be two sites of the template (one, if
+    it is linear) and the mean position of all atoms give one, and the atoms are assigned to the
+    sites at the least sum of squares (the linear assignment problem); orientation and order are
+    refined in turn. All pairs of atoms are tried at which distances agree within the limit.
+    Symmetric templates fit in several orders.
 
     molecule, classes (s,) of its sites with mass
     limit : largest deviation of an atom, Å
@@ -117,7 +125,8 @@ class Orders:
         self.reach = bond_reach(self._template, classes)
 
     def best(self, points: np.ndarray) -> Assignment:
-        """The best orders for whole molecules (m, s, 3). If several fit equally well, the given order is kept."""
+        """The best orders for whole molecules (m, s, 3). If several fit equally well, the given
+        order is kept."""
         order = np.tile(np.arange(points.shape[1]), (len(points), 1))
         found = self._best_of_alike(points, order)
         if self._is_fixed:
@@ -132,16 +141,21 @@ class Orders:
             # files are regular: this order fits most other molecules as well
             order = np.tile(other, (len(open_), 1))
             others = self._best_of_alike(points[open_], order)
-            before = np.where(found.fit.deviation[open_] <= self.limit, found.fit.rms[open_], np.inf)
+            before = np.where(
+                found.fit.deviation[open_] <= self.limit, found.fit.rms[open_], np.inf
+            )
             worse = np.flatnonzero(before > self.equal_to(others.fit.rms))
             found = found.with_better(open_[worse], others.of(worse), self.limit)
-            fits = (found.fit.deviation[open_] <= self.limit) & (found.fit.rms[open_] <= self._certain)
+            fits = (found.fit.deviation[open_] <= self.limit) & (
+                found.fit.rms[open_] <= self._certain
+            )
             fits[0] = True  # nothing better was found
             open_ = open_[~fits]
         return found
 
     def search(self, points: np.ndarray, limit: float) -> np.ndarray | None:
-        """The best order (s,) for a molecule (s, 3) in which no atom deviates by more than a limit, Å, or None."""
+        """The best order (s,) for a molecule (s, 3) in which no atom deviates by more than a limit,
+        Å, or None."""
         best, least = None, np.inf
         centred = points - points.mean(axis=0)
         for starts in self._starts(centred, 2 * limit):
@@ -156,8 +170,8 @@ class Orders:
 
     @cached_property
     def _certain(self) -> float:
-        """Deviation, Å, at which no two atoms of a class are mistaken for each other, so that all orders that fit
-        follow from one by `_alike`."""
+        """Deviation, Å, at which no two atoms of a class are mistaken for each other, so that all
+        orders that fit follow from one by `_alike`."""
         i, j = np.triu_indices(len(self.classes), 1)
         same = self.classes[i] == self.classes[j]
         distances = np.linalg.norm(self._template[i[same]] - self._template[j[same]], axis=1)
@@ -165,8 +179,9 @@ class Orders:
 
     @cached_property
     def _alike(self) -> np.ndarray:
-        """Orders (k, s) of the sites in which the template fits itself twice as far off as the limit, the given one
-        first, without those that change nothing: exact symmetries under which parameters are the same."""
+        """Orders (k, s) of the sites in which the template fits itself twice as far off as the
+        limit, the given one first, without those that change nothing: exact symmetries under which
+        parameters are the same."""
         count = len(self.classes)
         same = np.arange(count)[None]
         if self._is_fixed:
@@ -180,8 +195,8 @@ class Orders:
         return np.concatenate([same, orders[changes][fit.square[changes].argsort(kind="stable")]])
 
     def _keeps_parameters(self, orders: np.ndarray, fit: TemplateFit) -> np.ndarray:
-        """Whether sites (k, s) of a template in other orders, fitted to it, have the parameters of those that they
-        replace, massless ones included."""
+        """Whether sites (k, s) of a template in other orders, fitted to it, have the parameters of
+        those that they replace, massless ones included."""
         keys = self._parameters
         sites = massive_sites(self.molecule)
         kept = (keys[sites][orders] == keys[sites]).all(axis=1)
@@ -190,21 +205,32 @@ class Orders:
             at = self.molecule.positions_body[massless]
             moved = fit.centre[:, None] + np.einsum("kij,sj->ksi", fit.rotation, at)
             distance = np.linalg.norm(moved[:, :, None] - at, axis=3)
-            close = distance <= 2 * fit.deviation[:, None, None] + EQUAL_OF_RADIUS * self.molecule.radius
+            close = (
+                distance
+                <= 2 * fit.deviation[:, None, None] + EQUAL_OF_RADIUS * self.molecule.radius
+            )
             kept &= (close & (keys[massless][:, None] == keys[massless])).any(axis=2).all(axis=1)
         return kept
 
     @cached_property
     def _parameters(self) -> np.ndarray:
-        """A number for each site of the molecule (s,), the same for sites with the same parameters."""
+        """A number for each site of the molecule (s,), the same for sites with the same
+        parameters."""
         m = self.molecule
         custom = [tuple(sorted(values.items())) for values in m.parameters] or [()] * len(m.masses)
-        values = (m.masses.tolist(), m.charges.tolist(), m.sigma.tolist(), m.epsilon.tolist(), custom)
+        values = (
+            m.masses.tolist(),
+            m.charges.tolist(),
+            m.sigma.tolist(),
+            m.epsilon.tolist(),
+            custom,
+        )
         return numbered(zip(*values, strict=True))
 
     @cached_property
     def _variants(self) -> np.ndarray:
-        """A number for each of the orders `_alike` (k,), the same if each atom has the same parameters in them."""
+        """A number for each of the orders `_alike` (k,), the same if each atom has the same
+        parameters in them."""
         alike, keys = self._alike, self._parameters[massive_sites(self.molecule)]
         placed = np.empty_like(alike)
         np.put_along_axis(placed, alike, np.broadcast_to(keys, alike.shape), axis=1)
@@ -212,16 +238,25 @@ class Orders:
         kept = self._keeps_parameters(alike, fit) | (placed != keys).any(axis=1)
         # a symmetry of the atoms that is none of the massless sites is a variant of its own
         return numbered(
-            [(*row, k * (not keeps)) for k, (row, keeps) in enumerate(zip(placed.tolist(), kept, strict=True))]
+            [
+                (*row, k * (not keeps))
+                for k, (row, keeps) in enumerate(zip(placed.tolist(), kept, strict=True))
+            ]
         )
 
     def _best_of_alike(self, points: np.ndarray, order: np.ndarray) -> Assignment:
-        """The best of the orders (m, s) and those like them, and how well the best unlike one fits."""
+        """The best of the orders (m, s) and those like them, and how well the best unlike one
+        fits."""
         molecule = np.arange(len(points))
-        fits = [fit_template(points[molecule[:, None], order[:, alike]], self.molecule) for alike in self._alike]
+        fits = [
+            fit_template(points[molecule[:, None], order[:, alike]], self.molecule)
+            for alike in self._alike
+        ]
         if len(fits) == 1:
             return Assignment(order, fits[0], np.full(len(points), np.inf))
-        rms = np.array([np.where(fit.deviation <= self.limit, fit.rms, np.inf) for fit in fits])  # (k, m)
+        rms = np.array(
+            [np.where(fit.deviation <= self.limit, fit.rms, np.inf) for fit in fits]
+        )  # (k, m)
         of_variant = np.full((self._variants.max() + 1, len(points)), np.inf)
         np.minimum.at(of_variant, self._variants, rms)
         given_fits = of_variant[0] <= self.equal_to(of_variant.min(axis=0))
@@ -230,15 +265,18 @@ class Orders:
         best = np.where(rms[0] <= self.equal_to(rms.min(axis=0)), 0, rms.argmin(axis=0))
         of_variant[variant, molecule] = np.inf
         fit = TemplateFit(*(np.stack(parts)[best, molecule] for parts in zip(*fits, strict=True)))
-        return Assignment(np.take_along_axis(order, self._alike[best], axis=1), fit, of_variant.min(axis=0))
+        return Assignment(
+            np.take_along_axis(order, self._alike[best], axis=1), fit, of_variant.min(axis=0)
+        )
 
     def equal_to(self, least: np.ndarray) -> np.ndarray:
-        """Largest rms deviations (m,), Å, that are as good as the best ones, within the digits of files."""
+        """Largest rms deviations (m,), Å, that are as good as the best ones, within the digits of
+        files."""
         return EQUAL * least + EQUAL_OF_RADIUS * self.molecule.radius
 
     def _distances_agree(self, points: np.ndarray) -> np.ndarray:
-        """Which molecules (m, s, 3) have the same sorted distances between atoms of two classes as the template, within
-        twice the limit, as every molecule that fits does."""
+        """Which molecules (m, s, 3) have the same sorted distances between atoms of two classes as
+        the template, within twice the limit, as every molecule that fits does."""
         i, j = np.triu_indices(len(self.classes), 1)
         low, high = np.sort([self.classes[i], self.classes[j]], axis=0)
         pair = low * len(self.classes) + high
@@ -250,17 +288,21 @@ class Orders:
 
         wanted = sorted_distances(self._template[None])
         blocks = np.array_split(points, 1 + len(points) * len(i) // MOST_DISTANCES)
-        return np.concatenate([(np.abs(sorted_distances(b) - wanted) <= 2 * self.limit).all(axis=1) for b in blocks])
+        return np.concatenate(
+            [(np.abs(sorted_distances(b) - wanted) <= 2 * self.limit).all(axis=1) for b in blocks]
+        )
 
     @cached_property
     def _anchors(self) -> list[int]:
-        """Two sites that fix the orientation of the template, one if it is linear: far from its centre and from one
-        line, and of classes with few sites."""
+        """Two sites that fix the orientation of the template, one if it is linear: far from its
+        centre and from one line, and of classes with few sites."""
         distance = np.linalg.norm(self._centred, axis=1)
         size = np.bincount(self.classes)[self.classes]
         far = distance >= WIDE * distance.max()
         axis = self._centred / np.where(distance > 0, distance, 1.0)[:, None]
-        off_axis = np.linalg.norm(np.cross(axis[:, None], self._centred), axis=2)  # (s, s) of the second from the first
+        off_axis = np.linalg.norm(
+            np.cross(axis[:, None], self._centred), axis=2
+        )  # (s, s) of the second from the first
         off_axis[~far] = 0.0
         if off_axis.max() <= LINEAR * distance.max():
             return [int(np.where(far, size, np.inf).argmin())]
@@ -268,8 +310,8 @@ class Orders:
         return [int(k) for k in np.unravel_index(starts.argmin(), starts.shape)]
 
     def _starts(self, centred: np.ndarray, slack: float) -> Iterator[np.ndarray]:
-        """Orientations (k, 3, 3) of the template in which its anchors point at atoms (s, 3), whose distances differ by
-        no more than `slack`; the most likely ones first."""
+        """Orientations (k, 3, 3) of the template in which its anchors point at atoms (s, 3), whose
+        distances differ by no more than `slack`; the most likely ones first."""
         anchors = self._anchors
         wanted = np.linalg.norm(self._centred, axis=1)[anchors]
         off = np.abs(np.linalg.norm(centred, axis=1) - wanted[:, None])  # (anchors, s)
@@ -283,7 +325,9 @@ class Orders:
             np.fill_diagonal(apart, np.inf)
             mismatch = np.maximum(np.maximum(off[0][:, None], off[1]), apart).ravel()
             pairs = np.stack(np.unravel_index(np.arange(mismatch.size), apart.shape), axis=1)
-        likely = mismatch.argsort(kind="stable")[: np.count_nonzero(mismatch <= slack)][:MOST_STARTS]
+        likely = mismatch.argsort(kind="stable")[: np.count_nonzero(mismatch <= slack)][
+            :MOST_STARTS
+        ]
         size = max(FIRST_STARTS, MOST_DISTANCES // len(centred) ** 2)
         for first, last in pairwise([0, *range(FIRST_STARTS, len(likely), size), len(likely)]):
             if last > first:
@@ -295,14 +339,17 @@ class Orders:
         orders = self._assigned(centred, rotations)
         for _ in range(MOST_REFINEMENTS):
             orders = np.unique(orders, axis=0)
-            refined = self._assigned(centred, align(self._centred, centred[orders], np.ones(len(centred))))
+            refined = self._assigned(
+                centred, align(self._centred, centred[orders], np.ones(len(centred)))
+            )
             if np.array_equal(refined, orders):
                 break
             orders = refined
         return orders
 
     def _assigned(self, centred: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """The order of atoms (s, 3) in each orientation (k, 3, 3) that has the least sum of squared distances."""
+        """The order of atoms (s, 3) in each orientation (k, 3, 3) that has the least sum of squared
+        distances."""
         from scipy.optimize import linear_sum_assignment
 
         sites = np.einsum("kij,sj->ksi", rotations, self._centred)

@@ -4,7 +4,14 @@ from functools import cache
 
 import numpy as np
 
-from rigidmd.io.formats.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of, is_element
+from rigidmd.io.formats.atoms import (
+    CHARMM_IONS,
+    CHARMM_WATER,
+    SAME_MASS,
+    Atoms,
+    element_of,
+    is_element,
+)
 from rigidmd.scene.models import Molecule
 
 #: u; programs without massless sites give them a mass below this.
@@ -13,38 +20,57 @@ UNKNOWN = "X?"  # the kind of an atom with mass that is one of several sites wit
 
 
 def labels_of(molecule: Molecule) -> list[str]:
-    """Label of each site: its element, else its name. Atoms with the same label are interchangeable."""
-    return [e if e != "X" else name for e, name in zip(molecule.elements, molecule.site_names, strict=True)]
+    """Label of each site: its element, else its name. Atoms with the same label are
+    interchangeable."""
+    return [
+        e if e != "X" else name
+        for e, name in zip(molecule.elements, molecule.site_names, strict=True)
+    ]
 
 
 def kinds_of(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """The label of every atom: its element, or the name of a site; X for massless ones. "?" marks a guess.
+    """The label of every atom: its element, or the name of a site; X for massless ones. "?" marks a
+    guess.
 
-    An element in the file is accepted. A name counts if it is the name of a site or begins with an element of the
-    scene. If the file has masses, names of sites and elements have priority over the mass, and the mass over the
-    beginning of any other name.
+    An element in the file is accepted. A name counts if it is the name of a site or begins with an
+    element of the scene. If the file has masses, names of sites and elements have priority over the
+    mass, and the mass over the beginning of any other name.
     """
     by_name, by_mass = {}, []
     for molecule in species:
-        for name, label, mass in zip(molecule.site_names, labels_of(molecule), molecule.masses, strict=True):
+        for name, label, mass in zip(
+            molecule.site_names, labels_of(molecule), molecule.masses, strict=True
+        ):
             by_name.setdefault(name, set()).add(label if mass > 0 else "X")
             by_mass += [(mass, label)] if mass > 0 else []
     vocabulary = frozenset(label for _, label in by_mass)
     open_names = {name for name, labels in by_name.items() if len(labels) > 1}
     by_name = {name: labels.pop() for name, labels in by_name.items() if len(labels) == 1}
     site_names = set(by_name) - vocabulary
-    points = {name: labels_of(m)[0] for m in species if len(m.masses) == 1 for name in m.residue_names}
+    points = {
+        name: labels_of(m)[0] for m in species if len(m.masses) == 1 for name in m.residue_names
+    }
     shared = {name for m in species if len(m.masses) > 1 for name in m.residue_names}
     virtual = CHARMM_WATER[1] if set(CHARMM_WATER) <= set(atoms.names) else None
     hydrogen = next((h for h in ("H", "D", "T") if h in vocabulary), "")
 
     def isotope(element: str) -> str:
-        """The isotope of hydrogen in the scene, for others in the file: light water from a file of heavy water."""
-        return hydrogen if hydrogen and element in ("H", "D", "T") and element not in vocabulary else element
+        """The isotope of hydrogen in the scene, for others in the file: light water from a file of
+        heavy water."""
+        return (
+            hydrogen
+            if hydrogen and element in ("H", "D", "T") and element not in vocabulary
+            else element
+        )
 
     def without_element(mass: float) -> str:
-        """The site of this mass that has no element, such as a united atom; X, without mass, if there is none."""
-        near = {label for other, label in by_mass if abs(other - mass) <= SAME_MASS * mass and not is_element(label)}
+        """The site of this mass that has no element, such as a united atom; X, without mass, if
+        there is none."""
+        near = {
+            label
+            for other, label in by_mass
+            if abs(other - mass) <= SAME_MASS * mass and not is_element(label)
+        }
         return near.pop() if len(near) == 1 else UNKNOWN if near else "X"
 
     @cache
@@ -84,4 +110,7 @@ def kinds_of(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
     masses = np.zeros(len(atoms.names)) if atoms.masses is None else atoms.masses
     residues = [residue[1] if residue else None for residue in atoms.residue]
-    return [kind(*atom) for atom in zip(atoms.names, atoms.elements, masses.tolist(), residues, strict=True)]
+    return [
+        kind(*atom)
+        for atom in zip(atoms.names, atoms.elements, masses.tolist(), residues, strict=True)
+    ]

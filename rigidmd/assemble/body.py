@@ -1,6 +1,6 @@
-"""The system of a scene of a single body, and errors of keys that do not apply to the body or have no effect on it."""
+"""The system of a scene of a single body, and errors of keys that do not apply to the body or have
+no effect on it."""
 
-# isort: skip_file
 from collections.abc import Callable, Iterator, Sequence
 from itertools import permutations
 
@@ -20,25 +20,46 @@ from rigidmd.forces.body.resistance import NoResistance, Resistance
 from rigidmd.io.formats import format_of
 from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor, split_rotor
 from rigidmd.mechanics.inertia import (
-    Assembly, Part, added_mass_of_ellipsoid, assemble_solids, inertia_tensor, shifted_inertia, solid,
-)  # fmt: skip
+    Assembly,
+    Part,
+    added_mass_of_ellipsoid,
+    assemble_solids,
+    inertia_tensor,
+    shifted_inertia,
+    solid,
+)
 from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.mechanics.time_functions import (
-    TimeFunction, constant_function, has_constant_direction, integrate_function, interpolated_function,
-    is_constant_function, pulse_function, sum_functions, values_at,
-)  # fmt: skip
-from rigidmd.mechanics.translation import FluidTranslation, FreeTranslation, InertialFrame, NoTranslation, RotatingFrame
+    TimeFunction,
+    constant_function,
+    has_constant_direction,
+    integrate_function,
+    interpolated_function,
+    is_constant_function,
+    pulse_function,
+    sum_functions,
+    values_at,
+)
+from rigidmd.mechanics.translation import (
+    FluidTranslation,
+    FreeTranslation,
+    InertialFrame,
+    NoTranslation,
+    RotatingFrame,
+)
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import SolidPart, axis_of_symmetry
 from rigidmd.scene.body_forces import Fluid, Friction, Timed
 from rigidmd.scene.validation import not_none
 
 
-def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None = None) -> BodySystem:
+def build_body(
+    scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None = None
+) -> BodySystem:
     """The system of a scene. Raises SceneError with all errors.
 
-    applied : name -> function of a `Pose` that returns a force (3,) in N along the lab's axes, at the centre of mass,
-        and a torque (3,) in N m along the body's axes
+    applied : name -> function of a `Pose` that returns a force (3,) in N along the lab's axes, at
+        the centre of mass, and a torque (3,) in N m along the body's axes
     """
     mass, tensor, centre, points, names = inertia_of(scene)
     added_mass, added_inertia, displaced = carried_fluid(scene)
@@ -54,7 +75,12 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     if rotates and ((moments == 0) & (np.abs(spin) > 1e-12 * np.abs(spin).max(initial=0.0))).any():
         faults.append("start: the body rotates about an axis without inertia")
     faults += _integrator_errors(scene, bool(added_mass.any()), bool(applied))
-    taken = {"gravity", "buoyancy", "origin_acceleration", *(f"applied_{k}" for k in range(len(scene.applied)))}
+    taken = {
+        "gravity",
+        "buoyancy",
+        "origin_acceleration",
+        *(f"applied_{k}" for k in range(len(scene.applied))),
+    }
     why = "is the name of a force of the scene; choose another"
     faults += [f"applied: {name!r} {why}" for name in applied if name in taken]
     faults += _torque_errors(scene, axes, moments)
@@ -68,20 +94,36 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     if added_mass.any() and not scene.body.pinned:
         translation = FluidTranslation(mass, mass + added_mass)
     body = Body(translation, rotor, frame_of(scene), resistance_of(scene))
-    terms = terms_of(scene, mass, axes, centre, displaced) | {name: PythonForce() for name in applied}
+    terms = terms_of(scene, mass, axes, centre, displaced) | {
+        name: PythonForce() for name in applied
+    }
     system = BodySystem(
-        scene=scene, body=body, state=_first_state(scene, body, moments, axes, attitude, spin, rotates), terms=terms,
-        mass=mass, axes=axes, inertia=moments, centre=centre, points=points, point_names=names, applied=applied,
+        scene=scene,
+        body=body,
+        state=_first_state(scene, body, moments, axes, attitude, spin, rotates),
+        terms=terms,
+        mass=mass,
+        axes=axes,
+        inertia=moments,
+        centre=centre,
+        points=points,
+        point_names=names,
+        applied=applied,
         warnings=body_warnings(scene),
-    )  # fmt: skip
+    )
     if not has_finite_energy(system):
         reason = "are too large for floating-point numbers"
-        raise SceneError(scene.source, [f"the energy at the start: mass, moments of inertia or rates {reason}"])
+        raise SceneError(
+            scene.source, [f"the energy at the start: mass, moments of inertia or rates {reason}"]
+        )
     if scene.output.trajectory and system.translates:
         form = not_none(format_of(not_none(scene.output.topology)))
         if form.exceeded(system.site_positions(system.state)) is not None:
             reach = system.scale * np.abs(system.state.position).max()
-            fault = f"start.position_m is {reach:.3g} Å in the trajectory, which {scene.output.topology} cannot hold"
+            fault = (
+                f"start.position_m is {reach:.3g} Å in the trajectory, which"
+                f" {scene.output.topology} cannot hold"
+            )
             advice = "set output.trajectory_A_per_m to less, or output.trajectory = false"
             raise SceneError(scene.source, [f"{fault}: {advice}"])
     return system
@@ -91,13 +133,19 @@ def has_finite_energy(system: BodySystem) -> bool:
     """Whether the energies of a body at its start are numbers."""
     times, states = system.state.time[:1], State(*(array[None] for array in system.state))
     with np.errstate(over="ignore", invalid="ignore"):
-        return all(bool(np.isfinite(values).all()) for values in energies(system, times, states).values())
+        return all(
+            bool(np.isfinite(values).all()) for values in energies(system, times, states).values()
+        )
 
 
 def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
     """The state at the start; spin (3,) along the principal axes, relative to the frame."""
     start, time = scene.start, np.zeros(1)
-    frame = np.zeros(3) if isinstance(body.frame, InertialFrame) else values_at(body.frame.angular_velocity, time)[0]
+    frame = (
+        np.zeros(3)
+        if isinstance(body.frame, InertialFrame)
+        else values_at(body.frame.angular_velocity, time)[0]
+    )
     position = velocity = np.zeros((0, 3))
     rotation, momentum = np.zeros((0, 3, 3)), np.zeros((0, 3))
     principal_rotation = attitude @ axes
@@ -116,9 +164,14 @@ def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
 
 
 def _body_errors(
-    scene: BodyScene, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, added_mass: np.ndarray
+    scene: BodyScene,
+    centre: np.ndarray,
+    moments: np.ndarray,
+    axes: np.ndarray,
+    added_mass: np.ndarray,
 ) -> Iterator[str]:
-    """Messages on keys of any table that do not apply to this body, or would have no effect on it."""
+    """Messages on keys of any table that do not apply to this body, or would have no effect on
+    it."""
     fluid, rotates = scene.fluid, bool(moments.any())
     if not rotates:
         yield from _rotation_keys_of_point(scene)
@@ -138,27 +191,48 @@ def _body_errors(
     if scene.output.drawn_as == "top" and rotates:
         at_centre, _ = principal(inertia_at_centre(scene))
         if axis_of_symmetry(at_centre) is None:
-            these = f"these are {', '.join(f'{x:.4g}' for x in at_centre)} kg m²; name 'cuboid', 'ellipsoid' or a solid"
-            yield f"output.drawn_as: a top has two equal moments of inertia about its centre of mass, and {these}"
+            these = (
+                f"these are {', '.join(f'{x:.4g}' for x in at_centre)} kg m²; name 'cuboid',"
+                " 'ellipsoid' or a solid"
+            )
+            yield (
+                "output.drawn_as: a top has two equal moments of inertia about its centre of mass,"
+                f" and {these}"
+            )
     if scene.body.pinned:
         if scene.changing_inertia is not None and centre.any():
             yield "changing_inertia: the centre of mass must be at the pivot of a pinned body"
         if scene.gravity is not None and not centre.any() and rotates:
-            yield "gravity does nothing to a body pinned at its centre of mass; give body.centre_of_mass_m"
+            yield (
+                "gravity does nothing to a body pinned at its centre of mass; give"
+                " body.centre_of_mass_m"
+            )
         for k, entry in enumerate(scene.applied):
             if entry.force_N is not None and not any(entry.at_m or ()):
-                yield f"applied.{k}.force_N does nothing at the pivot; give its point of action, at_m"
+                yield (
+                    f"applied.{k}.force_N does nothing at the pivot; give its point of action, at_m"
+                )
 
 
 def _rotation_keys_of_point(scene: BodyScene) -> list[str]:
     """Messages on keys of rotation, which a point does not have."""
     start, none = scene.start, type(scene.start)()
-    named = [f"start.{key}" for key in type(start).model_fields if getattr(start, key) != getattr(none, key)]
+    named = [
+        f"start.{key}"
+        for key in type(start).model_fields
+        if getattr(start, key) != getattr(none, key)
+    ]
     idle = [key for key in named if key not in ("start.position_m", "start.velocity_m_s")]
     idle += [key for key in ("friction", "wheels") if getattr(scene, key)]
-    idle += [f"run.{key}" for key in ("formulation", "rotor") if getattr(scene.run, key) is not None]
+    idle += [
+        f"run.{key}" for key in ("formulation", "rotor") if getattr(scene.run, key) is not None
+    ]
     if scene.fluid is not None:
-        keys = ("linear_rotational_resistance_N_m_s", "quadratic_rotational_resistance_N_m_s2", "added_inertia_kg_m2")
+        keys = (
+            "linear_rotational_resistance_N_m_s",
+            "quadratic_rotational_resistance_N_m_s2",
+            "added_inertia_kg_m2",
+        )
         idle += [f"fluid.{key}" for key in keys if any(getattr(scene.fluid, key) or ())]
     if scene.output.axis is not None:
         idle.append("output.axis")
@@ -166,13 +240,17 @@ def _rotation_keys_of_point(scene: BodyScene) -> list[str]:
 
 
 def _keys_of_principal_axes(scene: BodyScene) -> Iterator[str]:
-    """Messages on keys along the body's axes, which must be principal axes unless all three values are equal."""
+    """Messages on keys along the body's axes, which must be principal axes unless all three values
+    are equal."""
     for name, section in (("friction", scene.friction), ("fluid", scene.fluid)):
         for key, value in section or ():
             if not isinstance(value, tuple) or key == "centre_of_buoyancy_m":
                 continue
             if len(set(value)) > 1 or (key == "dry_N_m" and any(value)):
-                why = "which are not principal axes of its inertia: give the body in its principal axes"
+                why = (
+                    "which are not principal axes of its inertia: give the body in its principal"
+                    " axes"
+                )
                 yield f"{name}.{key} is given along the body's axes, {why}"
 
 
@@ -182,38 +260,59 @@ def _torque_errors(scene: BodyScene, axes: np.ndarray, moments: np.ndarray) -> I
         if not moments.any() and (entry.torque_N_m is not None or entry.at_m is not None):
             yield f"applied.{k}: a point has no inertia, and a torque cannot rotate it"
         elif (moments == 0).any() and (entry.axes == "body" or entry.at_m is not None):
-            torques = np.atleast_2d(entry.torque_N_m if entry.torque_N_m is not None else np.zeros(3)) @ axes
+            torques = (
+                np.atleast_2d(entry.torque_N_m if entry.torque_N_m is not None else np.zeros(3))
+                @ axes
+            )
             arm = axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0))
             if torques[:, moments == 0].any() or arm[moments > 0].any():
                 yield f"applied.{k}: nothing resists a torque about the axis of a linear body"
 
 
 def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
-    """Messages on integrators that cannot move this body, or lose their order; immersed: the fluid adds mass;
-    has_functions: Python functions apply forces."""
+    """Messages on integrators that cannot move this body, or lose their order; immersed: the fluid
+    adds mass; has_functions: Python functions apply forces."""
     run, resistance = scene.run, resistance_of(scene)
     resisted = not isinstance(resistance, NoResistance)
     if run.is_auto:
         return []
     if run.integrator in SOLVERS:
-        what = f"dry friction is discontinuous where a body stops, which {run.integrator} cannot resolve"
-        return [f"run: {what}: use velocity_verlet"] if resisted and resistance.rotation_dry.any() else []
+        what = (
+            f"dry friction is discontinuous where a body stops, which {run.integrator} cannot"
+            " resolve"
+        )
+        return (
+            [f"run: {what}: use velocity_verlet"]
+            if resisted and resistance.rotation_dry.any()
+            else []
+        )
     scheme = run.scheme
     if resisted and min(scheme.kicks) < 0:
         forward = ", ".join(name for name, other in SCHEMES.items() if min(other.kicks) >= 0)
-        return [f"run: {run.integrator} has negative substeps, which a resistance does not allow: use one of {forward}"]
+        return [
+            f"run: {run.integrator} has negative substeps, which a resistance does not allow: use"
+            f" one of {forward}"
+        ]
     if scheme.has_gradient and (resisted or scene.applied or has_functions):
-        plain = [name for name, other in SCHEMES.items() if other.order > 2 and not other.has_gradient]
+        plain = [
+            name for name, other in SCHEMES.items() if other.order > 2 and not other.has_gradient
+        ]
         what = "the gradient of the forces, which resistance and applied forces do not have"
         return [f"run: {run.integrator} needs {what}; use one of {', '.join(plain)}"]
     frame = frame_of(scene)
-    axis_changes = isinstance(frame, RotatingFrame) and not has_constant_direction(frame.angular_velocity)
-    why = {"wheels": scene.wheels, "changing_inertia": scene.changing_inertia, "added mass": immersed}
+    axis_changes = isinstance(frame, RotatingFrame) and not has_constant_direction(
+        frame.angular_velocity
+    )
+    why = {
+        "wheels": scene.wheels,
+        "changing_inertia": scene.changing_inertia,
+        "added mass": immersed,
+    }
     why["a frame that changes its axis"] = axis_changes
     split = [name for name, other in SCHEMES.items() if not other.exact_rotor]
     return [
-        f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be of order 2; "
-        f"use one of {', '.join(split)} with rotor = 'split'"
+        f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be"
+        f" of order 2; use one of {', '.join(split)} with rotor = 'split'"
         for what, there in why.items()
         if there and scheme.exact_rotor
     ]
@@ -223,8 +322,11 @@ def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) ->
 ROUNDING = 1e-13
 
 
-def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Mass, inertia tensor about the centre of mass or pivot, its position, points to draw, names of the points."""
+def inertia_of(
+    scene: BodyScene,
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Mass, inertia tensor about the centre of mass or pivot, its position, points to draw, names
+    of the points."""
     body = scene.body
     centre = np.array(body.centre_of_mass_m or (0.0, 0.0, 0.0))
     mass = body.mass_kg or 0.0  # with points or solids: their sum, below
@@ -244,7 +346,9 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
         points, tensor = shape.outline, np.diag(shape.inertia)
     else:
         about_pivot = body.inertia_about == "pivot"
-        points = _equal_ellipsoid(mass, shifted_inertia(tensor, -mass, centre) if about_pivot else tensor)
+        points = _equal_ellipsoid(
+            mass, shifted_inertia(tensor, -mass, centre) if about_pivot else tensor
+        )
     if body.pinned:
         if body.inertia_about == "centre_of_mass":
             tensor = shifted_inertia(tensor, mass, centre)
@@ -257,7 +361,12 @@ def assembled(solids: Sequence[SolidPart]) -> Assembly:
     """The body of [[body.solids]], in their axes."""
     return assemble_solids(
         [
-            Part(part.mass, solid(part.shape, part.mass, part.dimensions), np.array(part.position_m), part.rotation)
+            Part(
+                part.mass,
+                solid(part.shape, part.mass, part.dimensions),
+                np.array(part.position_m),
+                part.rotation,
+            )
             for part in solids
         ]
     )
@@ -272,7 +381,8 @@ def inertia_at_centre(scene: BodyScene) -> np.ndarray:
 
 
 def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
-    """Centre and vertices (7, 3) of the homogeneous ellipsoid with this inertia tensor; one point without inertia."""
+    """Centre and vertices (7, 3) of the homogeneous ellipsoid with this inertia tensor; one point
+    without inertia."""
     moments, axes = np.linalg.eigh(tensor)
     half = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))
     if not half.any():
@@ -282,11 +392,14 @@ def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
 
 
 def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal moments (3,) and right-handed axes (3, 3) as columns, each as close to the body's axis as possible."""
+    """Principal moments (3,) and right-handed axes (3, 3) as columns, each as close to the body's
+    axis as possible."""
     if (np.abs(tensor - np.diag(np.diag(tensor))) <= ROUNDING * np.abs(tensor).max()).all():
         return _without_rounding(np.diag(tensor)), np.eye(3)
     moments, axes = np.linalg.eigh(tensor)
-    best = max(permutations(range(3)), key=lambda order: sum(abs(axes[k, order[k]]) for k in range(3)))
+    best = max(
+        permutations(range(3)), key=lambda order: sum(abs(axes[k, order[k]]) for k in range(3))
+    )
     moments, axes = np.maximum(moments, 0.0)[list(best)], axes[:, best]
     axes = axes * np.where(np.diag(axes) < 0, -1.0, 1.0)
     if np.linalg.det(axes) < 0:
@@ -295,7 +408,8 @@ def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _without_rounding(moments: np.ndarray) -> np.ndarray:
-    """Moments that differ from each other or from 0 by rounding, made equal or 0, so that the rotor is exact."""
+    """Moments that differ from each other or from 0 by rounding, made equal or 0, so that the rotor
+    is exact."""
     rounding = ROUNDING * moments.max()
     moments = np.where(moments < rounding, 0.0, moments)
     for i, j in ((0, 1), (1, 2), (2, 0)):
@@ -310,11 +424,17 @@ def carried_fluid(scene: BodyScene) -> tuple[np.ndarray, np.ndarray, float]:
     if fluid is None:
         return np.zeros(3), np.zeros(3), 0.0
     if fluid.density_kg_m3 is None:
-        mass, inertia = (np.array(added or np.zeros(3)) for added in (fluid.added_mass_kg, fluid.added_inertia_kg_m2))
+        mass, inertia = (
+            np.array(added or np.zeros(3))
+            for added in (fluid.added_mass_kg, fluid.added_inertia_kg_m2)
+        )
         return mass, inertia, fluid.displaced_mass_kg or 0.0
     shape = not_none(scene.body.solid)
     half = np.array(shape.semi_axes_m or (shape.radius_m,) * 3)
-    return *added_mass_of_ellipsoid(half, fluid.density_kg_m3), fluid.density_kg_m3 * 4 / 3 * np.pi * half.prod()
+    return (
+        *added_mass_of_ellipsoid(half, fluid.density_kg_m3),
+        fluid.density_kg_m3 * 4 / 3 * np.pi * half.prod(),
+    )
 
 
 def rotor_of(scene: BodyScene, moments: np.ndarray, added_inertia: np.ndarray, axes: np.ndarray):
@@ -323,14 +443,18 @@ def rotor_of(scene: BodyScene, moments: np.ndarray, added_inertia: np.ndarray, a
     changing = scene.changing_inertia
     inertia = constant_function(moments)
     if changing is not None:
-        inertia = interpolated_function(changing.times_s, np.array(changing.inertia_kg_m2) + added_inertia)
+        inertia = interpolated_function(
+            changing.times_s, np.array(changing.inertia_kg_m2) + added_inertia
+        )
     momenta = []
     for wheel in scene.wheels:
         axis = axes.T @ unit_vector(wheel.axis)
         motor = wheel.motor_torque_N_m
         torque = _time_function(wheel, np.multiply.outer(0.0 if motor is None else motor, axis))
         momenta.append(integrate_function(torque, wheel.momentum_kg_m2_s * axis))
-    return DrivenRotor(inertia, sum_functions(momenta) if momenta else constant_function(np.zeros(3)))
+    return DrivenRotor(
+        inertia, sum_functions(momenta) if momenta else constant_function(np.zeros(3))
+    )
 
 
 def _time_function(timed: Timed, values) -> TimeFunction:
@@ -344,11 +468,15 @@ def _time_function(timed: Timed, values) -> TimeFunction:
 
 def frame_of(scene: BodyScene):
     frame = scene.frame
-    if frame is None or (frame.angular_velocity_rad_s is None and frame.angular_acceleration_rad_s2 is None):
+    if frame is None or (
+        frame.angular_velocity_rad_s is None and frame.angular_acceleration_rad_s2 is None
+    ):
         return InertialFrame()
     rate = np.array(frame.angular_velocity_rad_s or (0.0, 0.0, 0.0))
     if frame.angular_acceleration_rad_s2 is not None:
-        return RotatingFrame(integrate_function(constant_function(frame.angular_acceleration_rad_s2), rate))
+        return RotatingFrame(
+            integrate_function(constant_function(frame.angular_acceleration_rad_s2), rate)
+        )
     return RotatingFrame(_time_function(frame, rate))
 
 
@@ -356,7 +484,9 @@ def resistance_of(scene: BodyScene):
     friction, fluid = scene.friction or Friction(), scene.fluid or Fluid()
     viscous = np.add(friction.viscous_N_m_s, fluid.linear_rotational_resistance_N_m_s)
     of_translation = fluid.linear_resistance_kg_s, fluid.quadratic_resistance_kg_m
-    parts = np.array([*of_translation, friction.dry_N_m, viscous, fluid.quadratic_rotational_resistance_N_m_s2])
+    parts = np.array(
+        [*of_translation, friction.dry_N_m, viscous, fluid.quadratic_rotational_resistance_N_m_s2]
+    )
     return Resistance(*parts) if parts.any() else NoResistance()
 
 
@@ -372,7 +502,9 @@ def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray
             terms["buoyancy"] = SteadyForce(-displaced * g, axes.T @ at)
     if scene.frame is not None and scene.frame.origin_acceleration_m_s2 is not None:
         force = _time_function(scene.frame, -mass * np.array(scene.frame.origin_acceleration_m_s2))
-        terms["origin_acceleration"] = _force(force, constant_function(np.zeros(3)), at_centre, False)
+        terms["origin_acceleration"] = _force(
+            force, constant_function(np.zeros(3)), at_centre, False
+        )
     for k, entry in enumerate(scene.applied):
         force, torque = (
             constant_function(np.zeros(3)) if given is None else _time_function(entry, given)
@@ -390,7 +522,13 @@ def _rotated(course: TimeFunction, matrix: np.ndarray) -> TimeFunction:
 
 
 def _force(force: TimeFunction, torque: TimeFunction, point: np.ndarray, follows_body: bool):
-    """The term of a force: with a potential energy if it is constant in the lab, else the ledger has its work."""
-    if not follows_body and is_constant_function(force) and is_constant_function(torque) and not torque.constant.any():
+    """The term of a force: with a potential energy if it is constant in the lab, else the ledger
+    has its work."""
+    if (
+        not follows_body
+        and is_constant_function(force)
+        and is_constant_function(torque)
+        and not torque.constant.any()
+    ):
         return SteadyForce(force.constant[0], point)
     return TimeDependentForce(force, torque, point, follows_body)

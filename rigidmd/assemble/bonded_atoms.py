@@ -16,8 +16,9 @@ SAME_PLACE = 1e-3
 def bonded_atoms(
     atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None
 ) -> tuple[list[list[int]], set[int]]:
-    """Groups of atoms with mass, in file order, linked by bonds as long as in the templates' spanning trees, and the
-    first atoms of groups without an end: bonded to their own images, as in polymers."""
+    """Groups of atoms with mass, in file order, linked by bonds as long as in the templates'
+    spanning trees, and the first atoms of groups without an end: bonded to their own images, as in
+    polymers."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -31,7 +32,9 @@ def bonded_atoms(
             one, other, length = number[i], number[j], float(np.linalg.norm(points[i] - points[j]))
             reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
     if UNKNOWN in numbers:
-        sites = [number for kind, number in numbers.items() if kind != UNKNOWN and not is_element(kind)]
+        sites = [
+            number for kind, number in numbers.items() if kind != UNKNOWN and not is_element(kind)
+        ]
         longest = reach[np.ix_(sites, sites)].max(initial=0.0)
         reach[numbers[UNKNOWN], [*sites, numbers[UNKNOWN]]] = longest
         reach[[*sites, numbers[UNKNOWN]], numbers[UNKNOWN]] = longest
@@ -41,7 +44,9 @@ def bonded_atoms(
     bonded = np.linalg.norm(step, axis=1) <= reach[number[i], number[j]]
     i, j, step = i[bonded], j[bonded], step[bonded]
     shape = (len(with_mass), len(with_mass))
-    count, label = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=shape), directed=False)
+    count, label = connected_components(
+        coo_array((np.ones(len(i)), (i, j)), shape=shape), directed=False
+    )
     runs = [[] for _ in range(count)]
     for atom, component in zip(with_mass, label, strict=True):
         runs[component].append(atom)
@@ -50,7 +55,8 @@ def bonded_atoms(
 
 
 def _endless(label: np.ndarray, i: np.ndarray, j: np.ndarray, step: np.ndarray) -> set[int]:
-    """Components (labels of atoms) whose bonds i, j with vectors step (b, 3) close a ring through the periodic cell."""
+    """Components (labels of atoms) whose bonds i, j with vectors step (b, 3) close a ring through
+    the periodic cell."""
     i, j, step = np.append(i, j), np.append(j, i), np.vstack([step, -step])
     position, reached = np.zeros((len(label), 3)), np.zeros(len(label), bool)
     reached[np.unique(label, return_index=True)[1]] = True

@@ -1,4 +1,5 @@
-"""The system of a scene of molecules: species, model, start, terms. All errors are collected and raised together.
+"""The system of a scene of molecules: species, model, start, terms. All errors are collected and
+raised together.
 
 The integrator of a stage: its scheme with the flows of the thermostat and the barostat.
 """
@@ -42,9 +43,11 @@ from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
 
 
 def build(scene: MolecularScene, user_code: bool = True) -> System:
-    """The system of a scene. Raises SceneError, StructureError or MoleculeError, with all errors found.
+    """The system of a scene. Raises SceneError, StructureError or MoleculeError, with all errors
+    found.
 
-    user_code : whether to run the code of users; without it their terms are missing, which analyses do not need
+    user_code : whether to run the code of users; without it their terms are missing, which analyses
+        do not need
     """
     scene, engine_notes = with_engine_defaults(scene)
     species = species_of(scene)
@@ -53,7 +56,11 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     warnings = scene_warnings(scene, species)
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
-    cell = "" if start.cell is None else f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
+    cell = (
+        ""
+        if start.cell is None
+        else f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
+    )
     if implausible := scene_errors(scene, species, counts, space):
         raise SceneError(scene.source, implausible)
     composition = Composition(species, counts, space, start.basis, cell, start.position)
@@ -61,13 +68,22 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     if faults := [*faults, *resolved.errors]:
         raise SceneError(scene.source, faults)
     written, scene = scene, resolved.scene
-    velocity = start.velocity if scene.structure is not None and scene.structure.velocities else None
-    mass, inertia = np.array([m.mass for m in species]), np.where(frozen[:, None], 0.0, [m.inertia for m in species])
+    velocity = (
+        start.velocity if scene.structure is not None and scene.structure.velocities else None
+    )
+    mass, inertia = (
+        np.array([m.mass for m in species]),
+        np.where(frozen[:, None], 0.0, [m.inertia for m in species]),
+    )
     rotor = split_rotor(inertia)
     model = Model(
-        index.astype(np.int32), mass, np.where(frozen, 0.0, 1 / mass), inertia, rotor.inverse_inertia,
+        index.astype(np.int32),
+        mass,
+        np.where(frozen, 0.0, 1 / mass),
+        inertia,
+        rotor.inverse_inertia,
         rotor if inertia.any() else NoRotor(),
-    )  # fmt: skip
+    )
     state = state_of(
         position=wrapped_between_walls(scene, space, start.position),
         rotation=start.rotation if any(m.inertia.any() for m in species) else None,
@@ -78,24 +94,47 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     acting.terms.update(field_terms(parts))
     model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
-    thermal = 0.0 if velocity is None else float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
+    thermal = (
+        0.0
+        if velocity is None
+        else float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
+    )
     free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
     scene, precision_reason = with_precision(scene, free, thermal / BOLTZMANN, acting.force_error)
     without_tail = ""
     if scene.forces.dispersion == "cutoff" and not scene.forces.tail_correction:
         is_choice = written.forces.tail_correction is False
-        without_tail = "forces.tail_correction is false" if is_choice else without_tail_reason(written, composition)
+        without_tail = (
+            "forces.tail_correction is false"
+            if is_choice
+            else without_tail_reason(written, composition)
+        )
     system = System(
-        scene=scene, species=species, model=model, space=space, state=state, terms=acting.terms,
-        freedom=count_degrees_of_freedom(model), constants=acting.constants, constant_pressure=acting.pressure,
-        tail=acting.tail, residue_number=number, from_lattice=scene.structure is None,
-        left_out=left_out(scene, acting.terms, model, space, any(m.charges.any() for m in species), without_tail),
-        precision_reason=precision_reason, force_error=acting.force_error,
-        notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)], warnings=warnings,
-    )  # fmt: skip
+        scene=scene,
+        species=species,
+        model=model,
+        space=space,
+        state=state,
+        terms=acting.terms,
+        freedom=count_degrees_of_freedom(model),
+        constants=acting.constants,
+        constant_pressure=acting.pressure,
+        tail=acting.tail,
+        residue_number=number,
+        from_lattice=scene.structure is None,
+        left_out=left_out(
+            scene, acting.terms, model, space, any(m.charges.any() for m in species), without_tail
+        ),
+        precision_reason=precision_reason,
+        force_error=acting.force_error,
+        notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
+        warnings=warnings,
+    )
     if user_code:
         if scene.from_python != scene.user_code.names:
-            raise SceneError(scene.source, [missing_user_code(scene.from_python, scene.user_code.names)])
+            raise SceneError(
+                scene.source, [missing_user_code(scene.from_python, scene.user_code.names)]
+            )
         if scene.forces.custom or scene.from_python:
             from rigidmd.assemble.user_code.binding import with_user_code
 
@@ -103,20 +142,36 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
             scene, model = system.scene, system.model
     if names := ", ".join(name.replace("_", " ") for name in system.position_dependent):
         why = f"changes the box, and {names} depend on absolute positions in it: keep the volume"
-        faults = [f"stages.{k}: {stage.ensemble} {why}" for k, stage in enumerate(scene.stages) if stage.changes_box]
+        faults = [
+            f"stages.{k}: {stage.ensemble} {why}"
+            for k, stage in enumerate(scene.stages)
+            if stage.changes_box
+        ]
         if faults:
             raise SceneError(scene.source, faults)
-    driven = [name for name, term in system.terms.items() if getattr(type(term), "time_dependent", False)]
-    if faults := [f"stages.{k}" for k, stage in enumerate(scene.stages) if stage.is_hybrid and driven]:
-        why = f"hybrid_monte_carlo needs an energy that does not depend on time, and {', '.join(driven)} do"
-        raise SceneError(scene.source, [f"{fault}: {why}: choose another thermostat" for fault in faults])
+    driven = [
+        name for name, term in system.terms.items() if getattr(type(term), "time_dependent", False)
+    ]
+    if faults := [
+        f"stages.{k}" for k, stage in enumerate(scene.stages) if stage.is_hybrid and driven
+    ]:
+        why = (
+            "hybrid_monte_carlo needs an energy that does not depend on time, and"
+            f" {', '.join(driven)} do"
+        )
+        raise SceneError(
+            scene.source, [f"{fault}: {why}: choose another thermostat" for fault in faults]
+        )
     check_memory(system)
     system.notes.extend([*scene.rounded_times(), *set_momenta(scene, model, state, start)])
     stuck = "nothing moves and no temperature is defined; use thermostat = 'langevin'"
     system.notes.extend(
         f"stages.{k}: the total momentum is conserved and zero, so that {stuck}"
         for k, stage in enumerate(scene.stages)
-        if not stage.is_minimisation and len(index) and system.freedom_in(k).total == 0 and mobile(model).any()
+        if not stage.is_minimisation
+        and len(index)
+        and system.freedom_in(k).total == 0
+        and mobile(model).any()
     )
     system.notes.extend(
         f"{m.name} was developed with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
@@ -126,8 +181,13 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     if scene.structure is None:
         system.notes.extend(f"box: {note}" for note in start.notes)
         return system
-    file, off = scene.structure.file, f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å"
-    system.notes.append(f"{len(index)} molecules read from {file}; distances of atoms from rigid templates: {off}")
+    file, off = (
+        scene.structure.file,
+        f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å",
+    )
+    system.notes.append(
+        f"{len(index)} molecules read from {file}; distances of atoms from rigid templates: {off}"
+    )
     system.notes.extend(f"{file}: {note}" for note in start.notes)
     if faults := overlaps(system):
         if not scene.stages[0].is_minimisation:
@@ -148,10 +208,11 @@ def interactions(parts: SystemParts) -> Interactions:
     return Interactions(
         {name: term for part in found for name, term in part.terms.items()},
         {name: value for part in found for name, value in part.constants.items()},
-        sum(part.pressure for part in found), sum_of_tails([part.tail for part in found if part.tail is not None]),
+        sum(part.pressure for part in found),
+        sum_of_tails([part.tail for part in found if part.tail is not None]),
         next((part.force_error for part in found if part.force_error is not None), None),
         tuple(note for part in found for note in part.notes),
-    )  # fmt: skip
+    )
 
 
 def field_terms(parts: SystemParts) -> dict[str, NamedTuple]:
@@ -159,10 +220,16 @@ def field_terms(parts: SystemParts) -> dict[str, NamedTuple]:
     faults: list[str] = []
     terms: dict[str, NamedTuple] = {}
     for name, (kind, entry, where) in parts.scene.fields.entries.items():
-        term = import_module(f"rigidmd.forces.fields.{kind.module}").term(parts, entry, where, faults)
+        term = import_module(f"rigidmd.forces.fields.{kind.module}").term(
+            parts, entry, where, faults
+        )
         if term is not None:
             terms[name] = term
-    if not faults and parts.scene.run.remove_momentum_interval_ps and not conserved_momentum(parts.model, terms).any():
+    if (
+        not faults
+        and parts.scene.run.remove_momentum_interval_ps
+        and not conserved_momentum(parts.model, terms).any()
+    ):
         why = "fields or frozen molecules change all components of the total momentum; leave it out"
         faults.append(f"run.remove_momentum_interval_ps: {why}")
     if faults:
@@ -192,13 +259,18 @@ def left_out(
     forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
     has_sums = any(name.endswith("_reciprocal") for name in terms)
     direct = has_sums and forces.electrostatics == "ewald" and forces.dispersion != "pme"
-    method, has_charges = forces.electrostatics, any(getattr(term, "acts_on_charges", False) for term in terms.values())
+    method, has_charges = (
+        forces.electrostatics,
+        any(getattr(term, "acts_on_charges", False) for term in terms.values()),
+    )
     reasons = {
         f"{title}: {'no site has it' if getattr(forces, key) else without}": key not in terms
         for key, (title, without) in POTENTIALS.items()
     } | {
         f"charges: {'electrostatics is none' if charged else 'no site has one'}": not has_charges,
-        f"sums over periodic images, Fourier transforms: electrostatics is {method}": has_charges and not has_sums,
+        f"sums over periodic images, Fourier transforms: electrostatics is {method}": (
+            has_charges and not has_sums
+        ),
         "Fourier transforms: electrostatics is ewald, a direct sum over k-vectors": direct,
         "rotation and torques: every molecule is a point": isinstance(model.rotor, NoRotor),
         "periodic images: no box": space.volume == inf,
@@ -206,16 +278,21 @@ def left_out(
         "barostat: no NPT or NPH stage": not any(stage.has_barostat for stage in scene.stages),
         "removal of the total momentum: run.remove_momentum_interval_ps is false": removal is False,
         f"tail correction: {without_tail}": bool(without_tail),
-    }  # fmt: skip
-    fields = [kind.title for name, kind in FIELDS.items() if not any(term.startswith(name) for term in terms)]
+    }
+    fields = [
+        kind.title
+        for name, kind in FIELDS.items()
+        if not any(term.startswith(name) for term in terms)
+    ]
     return [
         *(reason for reason, applies in reasons.items() if applies),
         *([f"{', '.join(fields)}: not in [fields]"] if fields else []),
-    ]  # fmt: skip
+    ]
 
 
 def integrator_of_stage(system: System, k: int) -> Scheme:
-    """The scheme of stage k, with its thermostat, its barostat and the removal of total momentum."""
+    """The scheme of stage k, with its thermostat, its barostat and the removal of total
+    momentum."""
     stage = system.scene.stages[k]
     found, thermostat = stage.scheme, system.thermostat
     if thermostat is not None and hasattr(thermostat, "for_stage"):
@@ -229,9 +306,15 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     if stage.has_barostat:
         barostat = barostat_of(system, k)
         in_steps = couplings.BAROSTATS[stage.barostat_kind].in_verlet_steps
-        found = found.with_piston(barostat) if in_steps else found.with_barostat(barostat, stage.moves_every)
+        found = (
+            found.with_piston(barostat)
+            if in_steps
+            else found.with_barostat(barostat, stage.moves_every)
+        )
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
-        found = found.with_momentum_removal(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
+        found = found.with_momentum_removal(
+            max(1, round(interval / (stage.timestep_fs * FEMTOSECOND)))
+        )
     return found
 
 
@@ -244,12 +327,20 @@ def thermostat_of(system: System, k: int) -> NamedTuple:
 def barostat_of(system: System, k: int) -> NamedTuple:
     stage, key = system.scene.stages[k], key_of(system.scene.seed, BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
-    pressure = Pressure(*(tuple(x * BAR for x in ends) for ends in stage.pressures), float(stage.steps))
+    pressure = Pressure(
+        *(tuple(x * BAR for x in ends) for ends in stage.pressures), float(stage.steps)
+    )
     x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
     given = Confinement(
-        _thermal(stage), pressure, stage.compressibility / BAR, system.state.volume, float(mobile(system.model).sum()),
-        (x, y, z), (0.0, 0.0) if system.tail is None else system.tail[:2], key,
-    )  # fmt: skip
+        _thermal(stage),
+        pressure,
+        stage.compressibility / BAR,
+        system.state.volume,
+        float(mobile(system.model).sum()),
+        (x, y, z),
+        (0.0, 0.0) if system.tail is None else system.tail[:2],
+        key,
+    )
     return BAROSTATS[stage.barostat_kind](stage, given)
 
 

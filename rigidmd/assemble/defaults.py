@@ -1,8 +1,10 @@
-"""The defaults of scenes. A system is built from a resolved scene, in which every default is filled in.
+"""The defaults of scenes. A system is built from a resolved scene, in which every default is filled
+in.
 
-A resolved scene runs to the same bits as the original scene. Three values stay open in it: an integrator "auto", which
-a pilot run chooses; the number of threads, on which results do not depend; and the grid of PME where another cell of
-the same lattice replaces a cell with a large tilt (see `SceneWithDefaults.pme_grid`).
+A resolved scene runs to the same bits as the original scene. Three values stay open in it: an
+integrator "auto", which a pilot run chooses; the number of threads, on which results do not depend;
+and the grid of PME where another cell of the same lattice replaces a cell with a large tilt (see
+`SceneWithDefaults.pme_grid`).
 """
 
 from importlib import import_module
@@ -24,14 +26,15 @@ from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.forces import ELECTROSTATICS, OPEN, PERIODIC, Forces
 
 CUTOFF = 9.0  # Å, in a periodic box
-#: Default with PME, ps. PME forces do not add up to zero exactly: in 1 ps 216 waters at an accuracy of 1e-4 gained a
-#: momentum of 26 u Å/ps; their thermal momentum is 980.
+#: Default with PME, ps. PME forces do not add up to zero exactly: in 1 ps 216 waters at an accuracy
+#: of 1e-4 gained a momentum of 26 u Å/ps; their thermal momentum is 980.
 REMOVE_MOMENTUM_INTERVAL = 1.0
 TOLERANCE = 1e-10  # of DOP853 and RADAU
 TRAJECTORY_RADIUS = 10.0  # Å, of a body
 #: Å, of a body in BODY_TOPOLOGY, whose columns are too narrow for coordinates below -999.
 FARTHEST = 900.0
-#: Largest entry of abs(QᵀQ - 1) of a body with schemes, which preserve it, and with ODE solvers, which do not.
+#: Largest entry of abs(QᵀQ - 1) of a body with schemes, which preserve it, and with ODE solvers,
+#: which do not.
 ORTHOGONALITY, ORTHOGONALITY_OF_SOLVERS = 1e-9, 0.1
 
 
@@ -42,7 +45,12 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
     notes, stages = [f"computed by {scene.engine.title}"], []
     for k, stage in enumerate(scene.stages):
         found = {}
-        if program.thermostat and stage.has_thermostat and stage.thermostat is None and not stage.thermostat_is_open:
+        if (
+            program.thermostat
+            and stage.has_thermostat
+            and stage.thermostat is None
+            and not stage.thermostat_is_open
+        ):
             why = f"because {program.name} has no velocity_rescaling"
             notes.append(f"stages.{k}: thermostat {program.thermostat}, {why}")
             found["thermostat"] = program.thermostat
@@ -56,20 +64,26 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
 
 
 class SceneWithDefaults(NamedTuple):
-    """A scene with its defaults filled in, and error messages. With errors some defaults may be missing."""
+    """A scene with its defaults filled in, and error messages. With errors some defaults may be
+    missing."""
 
     scene: MolecularScene
     errors: list[str]
-    #: Grid points along the edges of the box; forces.pme_grid of the scene refers to the edges of the given cell.
+    #: Grid points along the edges of the box; forces.pme_grid of the scene refers to the edges of
+    #: the given cell.
     pme_grid: Grid | None
 
 
 def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithDefaults:
-    """A scene of molecules with all defaults except `with_momentum_removal` and `with_precision`."""
+    """A scene of molecules with all defaults except `with_momentum_removal` and
+    `with_precision`."""
     scene, faults = _with_electrostatics(scene, composition)
     numbers, more = _cutoff_and_switch(scene.forces, composition)
     faults += more
-    found, of_method = Settings({}, faults), getattr(electrostatics_module(scene.forces), "settings", None)
+    found, of_method = (
+        Settings({}, faults),
+        getattr(electrostatics_module(scene.forces), "settings", None),
+    )
     if not faults and of_method is not None:
         found = of_method(scene.forces, composition, numbers["cutoff_A"], scene.engine.is_external)
         faults = found.errors
@@ -88,15 +102,24 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
     for k, stage in enumerate(scene.stages):
         if scene.engine.is_external and stage.ensemble == "npt" and stage.barostat is None:
             # the barostat of an external engine without a name has only a time constant
-            stages[k] = stages[k].model_copy(update={"barostat": None, "barostat_interval_ps": None})
+            stages[k] = stages[k].model_copy(
+                update={"barostat": None, "barostat_interval_ps": None}
+            )
     tables = {
-        "forces": scene.forces.model_copy(update=numbers | found.numbers), "output": output, "stages": tuple(stages),
-        # the folder of a run has a copy of the file under another name, which must not rename the species
+        "forces": scene.forces.model_copy(update=numbers | found.numbers),
+        "output": output,
+        "stages": tuple(stages),
+        # the folder of a run has a copy of the file under another name, which must not rename the
+        # species
         "molecules": tuple(
-            entry if entry.file is None else entry.model_copy(update={"name": composition.species[k].name})
+            (
+                entry
+                if entry.file is None
+                else entry.model_copy(update={"name": composition.species[k].name})
+            )
             for k, entry in enumerate(scene.molecules)
         ),
-    }  # fmt: skip
+    }
     if scene.structure is not None:
         tables["structure"] = scene.structure.model_copy(update={"topology": scene.topology})
     reads_velocities = scene.structure is not None and scene.structure.velocities
@@ -107,17 +130,24 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
 
 
 def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> MolecularScene:
-    """A scene with the default of run.remove_momentum_interval_ps. keeps_momentum (3,) : conserved components."""
+    """A scene with the default of run.remove_momentum_interval_ps. keeps_momentum (3,) : conserved
+    components."""
     if scene.run.remove_momentum_interval_ps is not None:
         return scene
-    conserved = ELECTROSTATICS[scene.forces.electrostatics].conserves_momentum and scene.forces.dispersion != "pme"
+    conserved = (
+        ELECTROSTATICS[scene.forces.electrostatics].conserves_momentum
+        and scene.forces.dispersion != "pme"
+    )
     removed = not conserved and keeps_momentum.any()
     run = {"remove_momentum_interval_ps": REMOVE_MOMENTUM_INTERVAL if removed else False}
     return scene.model_copy(update={"run": scene.run.model_copy(update=run)})
 
 
-def _with_electrostatics(scene: MolecularScene, composition: Composition) -> tuple[MolecularScene, list[str]]:
-    """A scene with its method of electrostatics, tail correction and cutoff scheme of charges, and error messages."""
+def _with_electrostatics(
+    scene: MolecularScene, composition: Composition
+) -> tuple[MolecularScene, list[str]]:
+    """A scene with its method of electrostatics, tail correction and cutoff scheme of charges, and
+    error messages."""
     forces, faults = scene.forces, []
     method = forces.electrostatics
     if method is None:
@@ -158,21 +188,26 @@ def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
 
 
 def is_homogeneous(composition: Composition) -> bool:
-    """Whether molecules fill a periodic box evenly. A slab or a droplet leaves a part of an edge without any centre of
-    mass, longer than two distances between neighbours, (V/n)^(1/3)."""
+    """Whether molecules fill a periodic box evenly. A slab or a droplet leaves a part of an edge
+    without any centre of mass, longer than two distances between neighbours, (V/n)^(1/3)."""
     space, position = composition.space, composition.position
     if space.volume == inf:
         return False
-    return bool(longest_gaps(space, position).max() <= 2 * (space.volume / len(position)) ** (1 / 3))
+    return bool(
+        longest_gaps(space, position).max() <= 2 * (space.volume / len(position)) ** (1 / 3)
+    )
 
 
 def electrostatics_module(forces: Forces) -> ModuleType | None:
-    """The module of `forces` with the method of electrostatics; None for electrostatics = "none"."""
+    """The module of `forces` with the method of electrostatics; None for electrostatics =
+    "none"."""
     name = ELECTROSTATICS[forces.electrostatics or "none"].module
     return import_module(f"rigidmd.forces.{name}") if name else None
 
 
-def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[str, Any], list[str]]:
+def _cutoff_and_switch(
+    forces: Forces, composition: Composition
+) -> tuple[dict[str, Any], list[str]]:
     """Cutoff and start of a switch as keys of [forces], and error messages."""
     space = composition.space
     given = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
@@ -183,28 +218,42 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[s
     for key, value in (("cutoff_A", cutoff), ("ewald_cutoff_A", forces.ewald_cutoff_A or 0.0)):
         if value > half:
             default = "" if getattr(forces, key) else " (the default)"
-            why = "which violates the minimum-image convention. Use a larger box or a shorter cutoff"
+            why = (
+                "which violates the minimum-image convention. Use a larger box or a shorter cutoff"
+            )
             faults.append(f"forces.{key} = {value:g}{default} is longer than {limit}, {why}")
     extents = {m.name: pdist(m.positions_body).max(initial=0.0) for m in composition.species}
-    faults += [f"a molecule of {m} is {x:.2f} Å long, more than {limit}" for m, x in extents.items() if x > half]
+    faults += [
+        f"a molecule of {m} is {x:.2f} Å long, more than {limit}"
+        for m, x in extents.items()
+        if x > half
+    ]
     if start is not None and start >= cutoff:
         faults.append(f"forces.switch_start_A = {start:g} is not below the cutoff of {cutoff:g} Å")
     if forces.tail_correction and space.volume == inf:
-        faults.append("forces.tail_correction needs a periodic box, filled by a uniform liquid beyond the cutoff")
+        faults.append(
+            "forces.tail_correction needs a periodic box, filled by a uniform liquid beyond the"
+            " cutoff"
+        )
     if (of_method := getattr(electrostatics_module(forces), "setting_errors", None)) is not None:
         faults += of_method(forces, space, cutoff)
     if start is None and cutoff < inf:
         schemes = (forces.truncation, forces.reaction_field_truncation or "")
-        start = next((default_switch_start(name, cutoff) for name in schemes if "switch" in name), None)
+        start = next(
+            (default_switch_start(name, cutoff) for name in schemes if "switch" in name), None
+        )
     return {"cutoff_A": given, "switch_start_A": start}, faults
 
 
 def body_with_defaults(scene: BodyScene, rotates: bool, radius: float) -> BodyScene:
-    """A scene of a single body with all defaults; rotates: it has an orientation; radius: of its trajectory, m."""
+    """A scene of a single body with all defaults; rotates: it has an orientation; radius: of its
+    trajectory, m."""
     run, watch = scene.run, scene.watch
     solver = run.integrator in SOLVERS
     if solver:
-        numbers: dict[str, Any] = {"formulation": (run.formulation or FORMULATION) if rotates else None}
+        numbers: dict[str, Any] = {
+            "formulation": (run.formulation or FORMULATION) if rotates else None
+        }
         if run.integrator != RK4:
             numbers["relative_tolerance"] = run.relative_tolerance or TOLERANCE
             numbers["absolute_tolerance"] = run.absolute_tolerance or TOLERANCE
@@ -217,5 +266,9 @@ def body_with_defaults(scene: BodyScene, rotates: bool, radius: float) -> BodySc
         "topology": scene.output.topology or (BODY_TOPOLOGY if reach < FARTHEST else TOPOLOGY),
     }
     if watch.orthogonality is None:
-        watch = watch.model_copy(update={"orthogonality": ORTHOGONALITY_OF_SOLVERS if solver else ORTHOGONALITY})
-    return scene.model_copy(update={"run": run, "output": scene.output.model_copy(update=output), "watch": watch})
+        watch = watch.model_copy(
+            update={"orthogonality": ORTHOGONALITY_OF_SOLVERS if solver else ORTHOGONALITY}
+        )
+    return scene.model_copy(
+        update={"run": run, "output": scene.output.model_copy(update=output), "watch": watch}
+    )

@@ -31,14 +31,23 @@ from rigidmd.units import BAR, KJ_PER_MOL
 
 #: Precision of forces, for reports. Times: docs/evidence/benchmarks.md.
 PRECISIONS = {
-    "double": f'double precision (precision = "mixed" takes half the time; forces have errors of {MIXED_ERROR:.0e})',
-    "mixed": f"mixed precision: single between sites, with errors of forces of {MIXED_ERROR:.0e}, else double",
+    "double": (
+        'double precision (precision = "mixed" takes half the time; forces have errors of'
+        f" {MIXED_ERROR:.0e})"
+    ),
+    "mixed": (
+        f"mixed precision: single between sites, with errors of forces of {MIXED_ERROR:.0e}, else"
+        " double"
+    ),
 }
 
 
 def describe(scene: MolecularScene | BodyScene, user_code: bool = True) -> str:
-    """How a scene would run. Raises the errors of `build` or `build_body`; user_code: see `build`."""
-    return describe_system(build(scene, user_code) if isinstance(scene, MolecularScene) else build_body(scene))
+    """How a scene would run. Raises the errors of `build` or `build_body`; user_code: see
+    `build`."""
+    return describe_system(
+        build(scene, user_code) if isinstance(scene, MolecularScene) else build_body(scene)
+    )
 
 
 def describe_system(system: System | BodySystem) -> str:
@@ -63,22 +72,40 @@ def _describe_body(system: BodySystem) -> str:
     if system.rotates:
         lines.append(f"  principal moments about {about}: {moments} kg m²")
     if not np.array_equal(system.axes, np.eye(3)):
-        lines.append(f"  principal axes (columns, body's axes): {np.array2string(system.axes, precision=6)}")
+        lines.append(
+            f"  principal axes (columns, body's axes): {np.array2string(system.axes, precision=6)}"
+        )
     if system.centre.any():
-        lines.append(f"  centre of mass from the pivot: {' '.join(f'{x:g}' for x in system.centre)} m")
+        lines.append(
+            f"  centre of mass from the pivot: {' '.join(f'{x:g}' for x in system.centre)} m"
+        )
     if system.rotates:
         pose = system.pose(0.0, system.state)
         angles = " ".join(f"{x:.6g}" for x in np.degrees(to_euler_angles(pose.rotation)))
         spin = float(np.linalg.norm(pose.angular_velocity_body))
-        period = f": period {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps" if spin else ""
-        lines.append(f"  starts at phi theta psi = {angles} degrees, rotating at {spin:.6g} rad/s{period}")
-    body = system.engine().model_for(system.method) if isinstance(system.method, Scheme) else system.body
+        period = (
+            f": period {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps"
+            if spin
+            else ""
+        )
+        lines.append(
+            f"  starts at phi theta psi = {angles} degrees, rotating at {spin:.6g} rad/s{period}"
+        )
+    body = (
+        system.engine().model_for(system.method)
+        if isinstance(system.method, Scheme)
+        else system.body
+    )
     parts = [words for part in body if part and not (words := _words(part)).startswith("no ")]
     lines.append(f"\ncompiled in: {', '.join(parts)}")
     lines += [f"  {name.replace('_', ' ')}: {_words(term)}" for name, term in system.terms.items()]
     lines += ["left out:", *(f"  {reason}" for reason in system.left_out)]
-    how = f"{run.integrator}" + (f", {system.method.formulation}" if isinstance(system.method, Solver) else "")
-    lines.append(f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}")
+    how = f"{run.integrator}" + (
+        f", {system.method.formulation}" if isinstance(system.method, Solver) else ""
+    )
+    lines.append(
+        f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}"
+    )
     every = max(1, round(not_none(scene.output.interval_s) / run.timestep_s))
     lines += [f"a sample every {every * run.timestep_s:g} s", *system.notes]
     return "\n".join(lines)
@@ -89,17 +116,28 @@ def _describe_molecules(system: System) -> str:
     lines = [f"{scene.name}: {len(system.model.species)} molecules, {system.site_count} sites"]
     for k, m in enumerate(system.species):
         count = int((system.model.species == k).sum())
-        freely = "frozen" if system.model.inverse_mass[k] == 0 else f"{m.degrees_of_freedom} degrees of freedom each"
+        freely = (
+            "frozen"
+            if system.model.inverse_mass[k] == 0
+            else f"{m.degrees_of_freedom} degrees of freedom each"
+        )
         lines.append(f"  {count} {m.name}: {m.description}, {freely}")
     charges = np.array([m.charge for m in system.species])[system.model.species]
     if abs(charges.sum()) > 1e-9 * np.abs(charges).sum():
         lines.append(f"  net charge: {charges.sum():+.6g} e")
-    lines.append(f"  degrees of freedom: {free.total} = {free.translation} translation + {free.rotation} rotation")
+    lines.append(
+        f"  degrees of freedom: {free.total} = {free.translation} translation + {free.rotation}"
+        " rotation"
+    )
     box = "no box"
     if system.space.volume < inf:
         cell = cell_of(system.space)
         edges = " x ".join(f"{edge:.4f}" for edge in np.linalg.norm(cell, axis=1))
-        angles = "" if right_angled(cell) else f", angles {', '.join(f'{x:.4g}' for x in edges_and_angles(cell)[3:])}°"
+        angles = (
+            ""
+            if right_angled(cell)
+            else f", angles {', '.join(f'{x:.4g}' for x in edges_and_angles(cell)[3:])}°"
+        )
         box = f"box: {edges} Å{angles}, {system.density:.4f} g/cm³"
     lines += [f"  {box}", *(f"  {note}" for note in system.notes), "\ncompiled in:"]
     fields = scene.fields.entries
@@ -110,7 +148,10 @@ def _describe_molecules(system: System) -> str:
     if system.tail is not None:
         energy = system.tail.energy(system.space.volume) / KJ_PER_MOL / len(system.model.species)
         pressure = system.tail.pressure(system.space.volume) / BAR
-        lines.append(f"  tail correction: {energy:.4g} kJ/mol per molecule and {pressure:.4g} bar at this volume")
+        lines.append(
+            f"  tail correction: {energy:.4g} kJ/mol per molecule and {pressure:.4g} bar at this"
+            " volume"
+        )
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {_words(system.model.rotor)}")
     if system.thermostat is not None:
@@ -125,12 +166,17 @@ def _describe_molecules(system: System) -> str:
         part = "" if len(kept) == 3 else f" along {' and '.join(kept)}"
         lines.append(f"  total momentum: removed{part} every {interval:g} ps")
     if (system.external or system.user_terms) and len(kept) < 3:
-        lines.append(f"  total momentum: conserved {'along ' + ' and '.join(kept) if kept else 'nowhere'}")
+        lines.append(
+            f"  total momentum: conserved {'along ' + ' and '.join(kept) if kept else 'nowhere'}"
+        )
     lines += ["left out:", *(f"  {reason}" for reason in system.left_out), "\nstages:"]
     for k, stage in enumerate(scene.stages):
         steps, sampled = describe_stage(stage)
         lines += [f"  {k}: {steps}", f"     {sampled}"]
-    lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces, neighbour lists and samples")
+    lines.append(
+        f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces, neighbour lists and"
+        " samples"
+    )
     if not scene.engine.is_external:
         threads = usable_threads(scene.threads)
         how = PRECISIONS[scene.precision]
@@ -154,4 +200,7 @@ def _describe_term(system: System, term: NamedTuple) -> str:
         forces = system.scene.forces
         of_charges = isinstance(term.potential, ReactionField)
         reach += f", {forces.reaction_field_truncation if of_charges else forces.truncation}"
-    return f"{len(term.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"
+    return (
+        f"{len(term.group)} sites, {reach}, neighbour list with a skin of"
+        f" {system.scene.forces.skin_A:g} Å"
+    )

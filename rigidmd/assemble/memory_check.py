@@ -1,6 +1,7 @@
 """Compares the memory that a scene needs with the free memory, before any of it is used.
 
-NumPy's arrays of zeros take no memory before they are written, so the arrays of an engine can be made and added up.
+NumPy's arrays of zeros take no memory before they are written, so the arrays of an engine can be
+made and added up.
 """
 
 from math import prod
@@ -15,15 +16,16 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import not_none
 from rigidmd.units import FEMTOSECOND
 
-#: Bytes per molecule and site of a system while it is built; measured per site: 310 of argon, 500 of nitrogen, 640 of
-#: SPC/E, 690 of TIP4P.
+#: Bytes per molecule and site of a system while it is built; measured per site: 310 of argon, 500
+#: of nitrogen, 640 of SPC/E, 690 of TIP4P.
 BYTES_PER_MOLECULE, BYTES_PER_SITE = 200, 130
 #: Bytes per site if a trajectory is written, mostly by MDAnalysis; measured: 430 of SPC/E.
 BYTES_PER_TRAJECTORY_SITE = 430
-#: Bytes per sample of a body; measured: a snapshot of its state 1.9 kB, its columns at the end 0.85 kB.
+#: Bytes per sample of a body; measured: a snapshot of its state 1.9 kB, its columns at the end 0.85
+#: kB.
 BYTES_PER_SAMPLE = 2700
-#: Bytes per line of log.csv, which the run keeps as numbers (measured: 300 while it runs, 870 in the summary), and per
-#: frame of a file, whose time is kept.
+#: Bytes per line of log.csv, which the run keeps as numbers (measured: 300 while it runs, 870 in
+#: the summary), and per frame of a file, whose time is kept.
 BYTES_PER_LOG_LINE, BYTES_PER_FRAME = 870, 150
 ADVICE = "take fewer molecules, a smaller box or a shorter cutoff"
 
@@ -37,18 +39,29 @@ def _require(source: str, needed: float, what: str, advice: str) -> None:
 def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:
     """Raise SceneError if these numbers of molecules and of all their sites exceed the memory."""
     needed = BYTES_PER_MOLECULE * molecules + BYTES_PER_SITE * sites
-    _require(source, needed, f"a system of {molecules} molecules with {sites} sites", "take fewer molecules")
+    _require(
+        source,
+        needed,
+        f"a system of {molecules} molecules with {sites} sites",
+        "take fewer molecules",
+    )
 
 
 def check_memory_of_samples(scene: BodyScene) -> None:
     """Raise SceneError if the samples of a resolved scene of a body exceed the memory."""
     run, interval = scene.run, not_none(scene.output.interval_s)
     count = run.duration_s / (interval if run.is_auto else max(interval, run.timestep_s))
-    _require(scene.source, BYTES_PER_SAMPLE * count, f"a run with {count:.3g} samples", "lengthen output.interval_s")
+    _require(
+        scene.source,
+        BYTES_PER_SAMPLE * count,
+        f"a run with {count:.3g} samples",
+        "lengthen output.interval_s",
+    )
 
 
 def check_memory(system: System) -> None:
-    """Raise SceneError if a run of a system exceeds the memory: states, forces, lists, grids, samples."""
+    """Raise SceneError if a run of a system exceeds the memory: states, forces, lists, grids,
+    samples."""
     source = system.scene.source
     try:
         needed = bytes_of(system)
@@ -56,7 +69,10 @@ def check_memory(system: System) -> None:
         shape, dtype = getattr(error, "shape", ()), getattr(error, "dtype", np.uint8)
         needed = max(prod(shape) * np.dtype(dtype).itemsize, int(free_memory()))
         free = format_gigabytes(free_memory())
-        fault = f"a single array of it needs {format_gigabytes(needed)}, and this machine has {free} free"
+        fault = (
+            f"a single array of it needs {format_gigabytes(needed)}, and this machine has {free}"
+            " free"
+        )
         raise SceneError(source, [f"not enough memory: {fault}: {ADVICE}"]) from None
     lines, samples = _samples(system.scene)
     longer = "lengthen output.log_interval_ps and output.trajectory_interval_ps"
@@ -65,19 +81,28 @@ def check_memory(system: System) -> None:
 
 
 def _samples(scene: MolecularScene) -> tuple[float, float]:
-    """Number of lines of the log of a run, and the bytes of these lines and of the times of frames at its end."""
+    """Number of lines of the log of a run, and the bytes of these lines and of the times of frames
+    at its end."""
     output = scene.output
     lines, frames = (  # at the interval and at the ends of stages
-        sum(2 + s.duration / (every if s.is_auto else max(every, s.timestep_fs * FEMTOSECOND)) for s in scene.stages)
+        sum(
+            2 + s.duration / (every if s.is_auto else max(every, s.timestep_fs * FEMTOSECOND))
+            for s in scene.stages
+        )
         for every in (output.log_interval_ps, output.trajectory_interval_ps)
     )
-    return lines, BYTES_PER_LOG_LINE * lines + BYTES_PER_FRAME * (frames if output.trajectory else 0)
+    return lines, BYTES_PER_LOG_LINE * lines + BYTES_PER_FRAME * (
+        frames if output.trajectory else 0
+    )
 
 
 def bytes_of(system: System) -> int:
-    """Bytes of a run: three states (start, present, last good one), two loads (of steps and observations), samples."""
+    """Bytes of a run: three states (start, present, last good one), two loads (of steps and
+    observations), samples."""
     state = system.state
-    trajectory = BYTES_PER_TRAJECTORY_SITE * system.site_count if system.scene.output.trajectory else 0
+    trajectory = (
+        BYTES_PER_TRAJECTORY_SITE * system.site_count if system.scene.output.trajectory else 0
+    )
     arrays = 3 * array_bytes(state) + 2 * array_bytes(no_load(state))
     arrays += array_bytes((system.engine().new_workspaces(state), system.model))
     return arrays + trajectory + round(_samples(system.scene)[1])

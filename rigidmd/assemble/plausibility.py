@@ -17,12 +17,14 @@ from rigidmd.units import GRAM_PER_CM3, KJ_PER_MOL
 
 #: Distance of the minimum of a Lennard-Jones energy, over sigma.
 MINIMUM = 2 ** (1 / 6)
-#: A cutoff below this fraction of the minimum of every molecule is an error: nothing but overlaps is within it.
+#: A cutoff below this fraction of the minimum of every molecule is an error: nothing but overlaps
+#: is within it.
 SHORTEST_CUTOFF = 0.5
 #: Mass of a site over that of its element, and the mass of up to four hydrogens (u) that a united
 #: atom has too. Isotopes are within these limits.
 LIGHTEST, HEAVIEST, HYDROGENS = 0.85, 1.1, 4.1
-#: Angles (degrees) that are a multiple of this in radians, to this many degrees, are probably in radians.
+#: Angles (degrees) that are a multiple of this in radians, to this many degrees, are probably in
+#: radians.
 ROUND_ANGLE, ROUNDED = 5.0, 0.4
 ATMOSPHERE_PA, TO_ATMOSPHERE = 101325.0, 0.03
 COLDEST_LIQUID = 100.0  # K, of water that starts without a file
@@ -50,7 +52,9 @@ class Quantity(NamedTuple):
 
 
 PLAUSIBLE = {
-    "nearest distance": Quantity("Å", 0.5, 15.0, "are the positions in nm?", "are the positions in pm?"),
+    "nearest distance": Quantity(
+        "Å", 0.5, 15.0, "are the positions in nm?", "are the positions in pm?"
+    ),
     "largest sigma_A": Quantity("Å", 0.9, 15.0, "is it in nm?", "is it in pm?"),
     "largest epsilon": Quantity("kJ/mol", 0.0, 40.0, "", "is it in J/mol or in K?"),
     "charge_e": Quantity("e", 1e-6, 10.0, "is it in coulomb?", "is it in another unit?"),
@@ -58,16 +62,22 @@ PLAUSIBLE = {
     "pressure_bar": Quantity("bar", 0.0, 5e4, "", "is it in Pa?"),
     "electric_V_per_nm": Quantity("V/nm", 0.0, 100.0, "", "is it in V/m?"),
     "gravity": Quantity("m/s²", 0.0, 500.0, "", "is it in cm/s²?"),
-    "angles_deg": Quantity("°", 10.0, 170.0, "are they in radians?", "do three edges really lie in one plane?"),
-}  # fmt: skip
-
-
-REFUSED = {
-    "density": Quantity("g/cm³", 0.0, 25.0, "", "is it in kg/m³, or an edge in nm?", heaviest_site=300.0),
+    "angles_deg": Quantity(
+        "°", 10.0, 170.0, "are they in radians?", "do three edges really lie in one plane?"
+    ),
 }
 
 
-def scene_errors(scene: MolecularScene, species: list[Molecule], counts: np.ndarray, space: Space) -> list[str]:
+REFUSED = {
+    "density": Quantity(
+        "g/cm³", 0.0, 25.0, "", "is it in kg/m³, or an edge in nm?", heaviest_site=300.0
+    ),
+}
+
+
+def scene_errors(
+    scene: MolecularScene, species: list[Molecule], counts: np.ndarray, space: Space
+) -> list[str]:
     """Messages on numbers that no scene can mean. counts (k,) : molecules of each species"""
     mass = float(counts @ np.array([m.mass for m in species]))
     density = 0.0 if space.volume == inf else mass / space.volume / GRAM_PER_CM3
@@ -79,22 +89,27 @@ def scene_errors(scene: MolecularScene, species: list[Molecule], counts: np.ndar
     faults = [*filter(None, found)]
     contact = shortest_contact(species)
     cutoff = scene.forces.cutoff_A
-    if cutoff is not None and scene.forces.lennard_jones and cutoff < SHORTEST_CUTOFF * contact < inf:
+    if (
+        cutoff is not None
+        and scene.forces.lennard_jones
+        and cutoff < SHORTEST_CUTOFF * contact < inf
+    ):
         unit = "is it in nm? " if 10 * cutoff > contact else ""
         faults.append(
-            f"forces.cutoff_A is {cutoff:g} Å, and the sites of two molecules touch at {contact:.3g} Å: "
-            f"{unit}within it there are overlaps only"
+            f"forces.cutoff_A is {cutoff:g} Å, and the sites of two molecules touch at"
+            f" {contact:.3g} Å: {unit}within it there are overlaps only"
         )
     elif cutoff is not None and scene.forces.tail_correction and cutoff < contact < inf:
         faults.append(
-            f"forces.tail_correction needs a cutoff beyond the contact of two molecules, {contact:.3g} Å; cutoff_A is "
-            f"{cutoff:g}"
+            "forces.tail_correction needs a cutoff beyond the contact of two molecules,"
+            f" {contact:.3g} Å; cutoff_A is {cutoff:g}"
         )
     return faults
 
 
 def shortest_contact(species: list[Molecule]) -> float:
-    """Smallest distance of the minimum of the energy of two like molecules, by their largest sites, Å; inf without."""
+    """Smallest distance of the minimum of the energy of two like molecules, by their largest sites,
+    Å; inf without."""
     largest = [float(m.sigma.max(where=m.epsilon > 0, initial=0.0)) for m in species]
     return MINIMUM * min((x for x in largest if x > 0), default=inf)
 
@@ -108,12 +123,19 @@ def scene_warnings(scene: MolecularScene, species: list[Molecule]) -> list[str]:
     for k, stage in enumerate(scene.stages):
         for pressure in stage.pressures if stage.pressure_bar is not None else ():
             if any(abs(abs(x) - ATMOSPHERE_PA) < TO_ATMOSPHERE * ATMOSPHERE_PA for x in pressure):
-                warnings.append(f"stages.{k}.pressure_bar is {pressure[0]:g} bar: 1 atm is 101325 Pa, or 1.01325 bar")
+                warnings.append(
+                    f"stages.{k}.pressure_bar is {pressure[0]:g} bar: 1 atm is 101325 Pa, or"
+                    " 1.01325 bar"
+                )
     if scene.structure is None and any(m.group == "water" for m in species):
-        cold = [k for k, stage in enumerate(scene.stages) if 0 < max(stage.temperatures) < COLDEST_LIQUID]
+        cold = [
+            k
+            for k, stage in enumerate(scene.stages)
+            if 0 < max(stage.temperatures) < COLDEST_LIQUID
+        ]
         warnings += [
-            f"stages.{k}.temperature_K is {max(scene.stages[k].temperatures):g} K, for water that starts "
-            "as a liquid: is it in °C?"
+            f"stages.{k}.temperature_K is {max(scene.stages[k].temperatures):g} K, for water that"
+            " starts as a liquid: is it in °C?"
             for k in cold
         ]
     gravity = scene.fields.gravity_m_s2
@@ -121,7 +143,8 @@ def scene_warnings(scene: MolecularScene, species: list[Molecule]) -> list[str]:
 
 
 def _implausible(values: Iterable[tuple[str, float, str]]) -> list[str]:
-    """Sentences on values outside the limits of `PLAUSIBLE`: quantity, value and where it stands."""
+    """Sentences on values outside the limits of `PLAUSIBLE`: quantity, value and where it
+    stands."""
     found = (PLAUSIBLE[name].outside(value, where) for name, value, where in values)
     return [*dict.fromkeys(filter(None, found))]
 
@@ -129,7 +152,9 @@ def _implausible(values: Iterable[tuple[str, float, str]]) -> list[str]:
 def _scene_values(scene: MolecularScene) -> Iterator[tuple[str, float, str]]:
     """Quantity, value and key of numbers of a scene that do not depend on its molecules."""
     for k, stage in enumerate(scene.stages):
-        given = [x for ends in stage.pressures for x in ends] if stage.pressure_bar is not None else []
+        given = (
+            [x for ends in stage.pressures for x in ends] if stage.pressure_bar is not None else []
+        )
         largest = max(given, key=abs, default=0.0)
         if abs(abs(largest) - ATMOSPHERE_PA) >= TO_ATMOSPHERE * ATMOSPHERE_PA:
             yield "pressure_bar", largest, f"stages.{k}.pressure_bar"
@@ -149,8 +174,14 @@ def _molecule_values(m: Molecule) -> Iterator[tuple[str, float, str]]:
     """Quantity, value and description of numbers of a molecule."""
     position = m.positions_body[m.masses > 0]
     if len(position) > 1:
-        apart = np.linalg.norm(position[:, None] - position, axis=2) + np.diag(np.full(len(position), inf))
-        yield "nearest distance", float(apart.min()), f"{m.name}: the distance of its nearest sites with mass"
+        apart = np.linalg.norm(position[:, None] - position, axis=2) + np.diag(
+            np.full(len(position), inf)
+        )
+        yield (
+            "nearest distance",
+            float(apart.min()),
+            f"{m.name}: the distance of its nearest sites with mass",
+        )
     acting = m.epsilon > 0
     if acting.any():
         yield "largest sigma_A", float(m.sigma[acting].max()), f"{m.name}: its largest sigma_A"
@@ -167,9 +198,15 @@ def _mass_warnings(m: Molecule) -> list[str]:
 
     found = {}
     for name, element, mass in zip(m.site_names, m.elements, m.masses.tolist(), strict=True):
-        usual = float(atomic_masses[atomic_numbers[element]]) if atomic_numbers.get(element, 0) > 0 else 0.0
+        usual = (
+            float(atomic_masses[atomic_numbers[element]])
+            if atomic_numbers.get(element, 0) > 0
+            else 0.0
+        )
         if mass > 0 and usual and not LIGHTEST * usual <= mass <= HEAVIEST * usual + HYDROGENS:
-            found[element] = f"{m.name}: mass_u of {name} is {mass:g} u, and {element} has {usual:.4g} u"
+            found[element] = (
+                f"{m.name}: mass_u of {name} is {mass:g} u, and {element} has {usual:.4g} u"
+            )
     return list(found.values())
 
 
@@ -185,19 +222,24 @@ def gravity_warnings(key: str, acceleration: tuple[float, float, float]) -> list
 def body_warnings(scene: BodyScene) -> list[str]:
     """Warnings of numbers of a single body that are probably in another unit."""
     warnings = (
-        [] if scene.gravity is None else gravity_warnings("gravity.acceleration_m_s2", scene.gravity.acceleration_m_s2)
+        []
+        if scene.gravity is None
+        else gravity_warnings("gravity.acceleration_m_s2", scene.gravity.acceleration_m_s2)
     )
     for key in ("euler_angles_deg", "yaw_pitch_roll_deg"):
         angles: Any = getattr(scene.start, key)
         if angles is not None and any(map(in_radians, angles)) and max(map(abs, angles)) <= 2 * pi:
             shown = ", ".join(f"{x:g}" for x in angles)
             inside = ", ".join(f"{degrees(x):.4g}" for x in angles)
-            warnings.append(f"start.{key} is [{shown}]°: are these radians? They would be [{inside}]°")
+            warnings.append(
+                f"start.{key} is [{shown}]°: are these radians? They would be [{inside}]°"
+            )
     return warnings
 
 
 def in_radians(angle: float) -> bool:
-    """Whether an angle has fractions of a degree and is a round number of degrees if it is in radians."""
+    """Whether an angle has fractions of a degree and is a round number of degrees if it is in
+    radians."""
     inside = degrees(angle)
     near = ROUND_ANGLE * round(inside / ROUND_ANGLE)
     return angle % 1 != 0 and near != 0 and abs(inside - near) < ROUNDED

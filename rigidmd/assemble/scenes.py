@@ -1,4 +1,5 @@
-"""Public functions on scenes: with all defaults, to the start as an `ase.Atoms`, and from an `ase.Atoms`.
+"""Public functions on scenes: with all defaults, to the start as an `ase.Atoms`, and from an
+`ase.Atoms`.
 
 The atoms of such a scene are an embedded structure file, extended XYZ with every digit.
 """
@@ -32,29 +33,35 @@ SHAPES = {"FixLinearTriatomic", "FixInternals"}
 
 
 def resolve(scene: AnyScene) -> AnyScene:
-    """The same scene with all defaults, which runs to the same bits. The integrator "auto" stays until a run has chosen
-    one. Raises SceneError, and for molecules StructureError and MoleculeError."""
+    """The same scene with all defaults, which runs to the same bits. The integrator "auto" stays
+    until a run has chosen one. Raises SceneError, and for molecules StructureError and
+    MoleculeError."""
     return build_body(scene).scene if isinstance(scene, BodyScene) else build(scene).scene
 
 
 def atoms_of(scene: MolecularScene) -> "ase.Atoms":
-    """The start of a run as an `ase.Atoms`, before overlaps are removed: see `Results.atoms`. Raises as `resolve`."""
+    """The start of a run as an `ase.Atoms`, before overlaps are removed: see `Results.atoms`.
+    Raises as `resolve`."""
     system = build(scene)
     return atoms_of_system(system, system.state)
 
 
 def scene_from_atoms(
-    atoms: "ase.Atoms", models: str | Sequence[str | Mapping[str, Any]], **settings: Unpack[Settings]
+    atoms: "ase.Atoms",
+    models: str | Sequence[str | Mapping[str, Any]],
+    **settings: Unpack[Settings],
 ) -> MolecularScene:
     """The scene of an `ase.Atoms`, whose atoms become molecules like the atoms of a structure file.
 
-    Cell, periodicity (along all axes or none) and momenta are used. Massless sites, such as M of TIP4P, need not be
-    among the atoms. The scene contains the atoms; a run in a folder writes them there.
+    Cell, periodicity (along all axes or none) and momenta are used. Massless sites, such as M of
+    TIP4P, need not be among the atoms. The scene contains the atoms; a run in a folder writes them
+    there.
 
-    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene file
-    settings : the other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}], seed=3.
-        start={"temperature_K": 300} draws momenta instead of using the atoms' momenta. Default of stages: 1 ps of nve,
-        or a minimisation if neither atoms nor settings give momenta
+    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a
+        scene file
+    settings : the other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}],
+        seed=3. start={"temperature_K": 300} draws momenta instead of using the atoms' momenta.
+        Default of stages: 1 ps of nve, or a minimisation if neither atoms nor settings give momenta
 
     Raises SceneError. Atoms that do not match the models are found when the system is built.
     """
@@ -66,9 +73,15 @@ def scene_from_atoms(
     for key, table in filled.items():
         if not isinstance(table, Mapping):
             kind = type(table).__name__
-            faults.append(f"{key} is a {kind}, must be a dictionary like the table [{key}] of a scene file")
+            faults.append(
+                f"{key} is a {kind}, must be a dictionary like the table [{key}] of a scene file"
+            )
     structure, start, box = filled.values()
-    given = [key for key in ("file", "frame", "topology") if isinstance(structure, Mapping) and key in structure]
+    given = [
+        key
+        for key in ("file", "frame", "topology")
+        if isinstance(structure, Mapping) and key in structure
+    ]
     if faults := faults + [f"structure.{key} is given by the atoms" for key in given]:
         raise SceneError(SOURCE, faults)
     draws = start.get("temperature_K") is not None
@@ -77,15 +90,25 @@ def scene_from_atoms(
     if not atoms.pbc.any():
         box.setdefault("periodic", False)
     if "stages" not in data:
-        data["stages"] = [{"duration_ps": DURATION} if structure["velocities"] or draws else {"ensemble": "minimise"}]
+        data["stages"] = [
+            (
+                {"duration_ps": DURATION}
+                if structure["velocities"] or draws
+                else {"ensemble": "minimise"}
+            )
+        ]
     data["molecules"] = models_with_absolute_paths(models)
     data.setdefault("name", atoms.get_chemical_formula()[:40])
-    ignored = sorted({type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES)
+    ignored = sorted(
+        {type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES
+    )
     if ignored:
         advice = 'freeze molecules by the models, models=[{"model": "spce", "frozen": [1, 2]}]'
         what = f"the constraints of the atoms are ignored ({', '.join(ignored)})"
         warnings.warn(f"{what}: {advice}", RigidMDWarning, stacklevel=3)
-    return MolecularScene.from_dict(data, source=SOURCE, embedded_files={"structure.file": text_of(atoms).encode()})
+    return MolecularScene.from_dict(
+        data, source=SOURCE, embedded_files={"structure.file": text_of(atoms).encode()}
+    )
 
 
 def atoms_errors(atoms: Any) -> list[str]:
@@ -110,9 +133,16 @@ def atoms_errors(atoms: Any) -> list[str]:
         faults.append(f"they are periodic along {axes} only: {advice}")
     elif atoms.pbc.all():
         cell = atoms.cell.array
-        why = cell_error(cell) if np.isfinite(cell).all() else "it has an edge that is not a finite number"
+        why = (
+            cell_error(cell)
+            if np.isfinite(cell).all()
+            else "it has an edge that is not a finite number"
+        )
         if why:
-            faults.append(f"they are periodic, but their cell is invalid: {why}. Set atoms.cell, or atoms.pbc = False")
+            faults.append(
+                f"they are periodic, but their cell is invalid: {why}. Set atoms.cell, or atoms.pbc"
+                " = False"
+            )
     return faults
 
 
@@ -121,7 +151,9 @@ def text_of(atoms: "ase.Atoms") -> str:
     columns = [("species", "S", [[symbol] for symbol in atoms.get_chemical_symbols()])]
     columns.append(("pos", "R", _digits(atoms.positions)))
     columns += [("momenta", "R", _digits(atoms.get_momenta()))] if atoms.has("momenta") else []
-    columns += [("masses", "R", _digits(atoms.get_masses()[:, None]))] if atoms.has("masses") else []
+    columns += (
+        [("masses", "R", _digits(atoms.get_masses()[:, None]))] if atoms.has("masses") else []
+    )
     for name, kind in ((NAMES, "S"), (RESIDUE_NAMES, "S"), (RESIDUE_NUMBERS, "I")):
         values = [str(value) for value in atoms.arrays.get(name, ())]
         if values and all(value.isprintable() and len(value.split()) == 1 for value in values):
@@ -133,7 +165,10 @@ def text_of(atoms: "ase.Atoms") -> str:
         [edges] = _digits(atoms.cell.array.reshape(1, 9))
         edges = " ".join(text if "." in text else f"{float(text):.16e}" for text in edges)
         box = f'Lattice="{edges}" pbc="T T T"'
-    lines = (" ".join(word for row in rows for word in row) for rows in zip(*(c[2] for c in columns), strict=True))
+    lines = (
+        " ".join(word for row in rows for word in row)
+        for rows in zip(*(c[2] for c in columns), strict=True)
+    )
     return "\n".join([str(len(atoms)), f"{box} Properties={about}", *lines]) + "\n"
 
 
@@ -142,13 +177,20 @@ def _digits(values: np.ndarray) -> list[list[str]]:
     return [[repr(x) for x in row] for row in np.asarray(values, float).tolist()]
 
 
-def models_with_absolute_paths(models: str | Sequence[str | Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Tables [[molecules]] of models, with absolute paths, so that they do not depend on the working directory."""
+def models_with_absolute_paths(
+    models: str | Sequence[str | Mapping[str, Any]],
+) -> list[dict[str, Any]]:
+    """Tables [[molecules]] of models, with absolute paths, so that they do not depend on the
+    working directory."""
     found = []
     models = plain_values(models)
     for entry in models if isinstance(models, list) else [models]:
         if isinstance(entry, dict):
-            paths = {key: os.path.abspath(entry[key]) for key in SPECIES_FILES if isinstance(entry.get(key), str)}
+            paths = {
+                key: os.path.abspath(entry[key])
+                for key in SPECIES_FILES
+                if isinstance(entry.get(key), str)
+            }
             found.append(entry | paths)
         elif isinstance(entry, str) and entry.endswith(".toml"):
             found.append({"file": os.path.abspath(entry)})

@@ -1,6 +1,6 @@
-"""The species of a scene: their rigid molecules, frozen ones, models from a geometry and a table of parameters."""
+"""The species of a scene: their rigid molecules, frozen ones, models from a geometry and a table of
+parameters."""
 
-# isort: skip_file
 from collections import Counter
 from dataclasses import replace
 from itertools import count
@@ -14,12 +14,20 @@ from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms
 from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import (
-    Molecule, MoleculeFile, Site, find_site, load_model, molecule, molecule_of, read_molecule, read_parameters,
-    with_masses, with_parameters,
-)  # fmt: skip
+    Molecule,
+    MoleculeFile,
+    Site,
+    find_site,
+    load_model,
+    molecule,
+    molecule_of,
+    read_molecule,
+    read_parameters,
+    with_masses,
+    with_parameters,
+)
 from rigidmd.scene.species import Molecules, spans
 from rigidmd.scene.validation import ValidationError, not_none, validation_messages
-
 
 MOST_LISTED = 8  # entries of parameters in a message
 
@@ -34,7 +42,9 @@ def species_of(scene: MolecularScene) -> list[Molecule]:
             faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.errors]
     names = [m.name for m in found]
     twice = sorted({name for name in names if names.count(name) > 1})
-    faults += [f"molecules: {name} appears twice; give these species different names" for name in twice]
+    faults += [
+        f"molecules: {name} appears twice; give these species different names" for name in twice
+    ]
     if faults:
         raise SceneError(scene.source, faults)
     return found
@@ -46,7 +56,9 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
     elif entry.file is not None and entry.file.endswith(".toml"):
         found = read_molecule(scene.path(entry.file))
     else:
-        table = () if entry.parameters is None else read_parameters(scene.path(entry.parameters)).sites
+        table = (
+            () if entry.parameters is None else read_parameters(scene.path(entry.parameters)).sites
+        )
         if entry.file is None:
             sites = with_parameters(not_none(entry.sites), table)
         else:
@@ -55,13 +67,19 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
         found = molecule(entry.label, sites)
     if entry.masses_u is not None:
         found = with_masses(found, entry.masses_u)
-    changed = {"name": entry.name or found.name, "residue_names": entry.residue_names or found.residue_names}
+    changed = {
+        "name": entry.name or found.name,
+        "residue_names": entry.residue_names or found.residue_names,
+    }
     return replace(found, **changed)
 
 
-def sites_of_geometry(path: Path, given: tuple[Site, ...], table: tuple[Site, ...], where: str) -> tuple[Site, ...]:
-    """Sites with positions from a file and parameters from given entries or a table, by atom name or else by element.
-    `where` names the entries in messages. Raises StructureError with all errors."""
+def sites_of_geometry(
+    path: Path, given: tuple[Site, ...], table: tuple[Site, ...], where: str
+) -> tuple[Site, ...]:
+    """Sites with positions from a file and parameters from given entries or a table, by atom name
+    or else by element. `where` names the entries in messages. Raises StructureError with all
+    errors."""
     faults, sites, used = [], [], set()
     available = list(dict.fromkeys(site.name for site in (*given, *table))) or ["none"]
     listed = ", ".join(available[:MOST_LISTED]) + (", ..." if len(available) > MOST_LISTED else "")
@@ -69,13 +87,20 @@ def sites_of_geometry(path: Path, given: tuple[Site, ...], table: tuple[Site, ..
     for name, element, mass, position in zip(*read_geometry(path), strict=True):
         match, shared = find_site(given, name, element), find_site(table, name, element)
         if match is None and shared is None:
-            faults.append(f"atom {name}: no entry of {where} has this name or the name {element}; {hint}")
+            faults.append(
+                f"atom {name}: no entry of {where} has this name or the name {element}; {hint}"
+            )
             continue
         used.add(match.name if match else "")
         entries = [s for s in (match, shared) if s is not None]
         mass = next((s.mass_u for s in entries if s.mass_u is not None), float(mass))
         element = next((s.element for s in entries if s.element != "X"), element)
-        known = {"name": name[:5], "element": element, "mass_u": mass, "position_A": tuple(map(float, position))}
+        known = {
+            "name": name[:5],
+            "element": element,
+            "mass_u": mass,
+            "position_A": tuple(map(float, position)),
+        }
         sites.append(match.model_copy(update=known) if match else Site(**known))
     faults += [f"sites: {s.name} is not an atom of it" for s in given if s.name not in used]
     if faults:
@@ -86,7 +111,8 @@ def sites_of_geometry(path: Path, given: tuple[Site, ...], table: tuple[Site, ..
 def split_frozen(
     scene: MolecularScene, species: list[Molecule], index: np.ndarray, number: np.ndarray
 ) -> tuple[list[Molecule], np.ndarray, np.ndarray, list[str]]:
-    """Species, index (n,) into them, mask of frozen species, error messages. A partly frozen species becomes two."""
+    """Species, index (n,) into them, mask of frozen species, error messages. A partly frozen
+    species becomes two."""
     species, index, faults = list(species), index.copy(), []
     frozen = [entry.frozen is True for entry in scene.molecules]
     for k, entry in enumerate(scene.molecules):
@@ -109,28 +135,41 @@ def split_frozen(
 
 #: Factor on the sum of covalent radii up to which two atoms are bonded.
 SLACK = 1.25
-#: A sum of charges this close to a whole number is meant to be one; this close, it is one up to rounding.
+#: A sum of charges this close to a whole number is meant to be one; this close, it is one up to
+#: rounding.
 NEARLY, EXACTLY = 0.05, 1e-9
 
 
 def model_from_geometry(
     geometry: Path, parameters: Path | None, name: str | None
 ) -> tuple[MoleculeFile, Molecule, list[str]]:
-    """The model of a structure file with one molecule, with the positions in the file: its file, molecule, notes.
+    """The model of a structure file with one molecule, with the positions in the file: its file,
+    molecule, notes.
 
-    parameters : a table of parameters by atom name or element; without one the model has masses and no interactions
+    parameters : a table of parameters by atom name or element; without one the model has masses and
+        no interactions
     name : default: the name of the file. Raises StructureError or MoleculeError, with all errors.
     """
     notes, source = [], [f"geometry of {geometry.name}"]
     names, elements, *_ = read_geometry(geometry)
     if parameters is None:
-        sites = sites_of_geometry(geometry, (), tuple(Site(name=element) for element in dict.fromkeys(elements)), "")
-        notes.append("it has no interactions: give its sites charge_e, sigma_A and epsilon_kJ_mol, or use --parameters")
+        sites = sites_of_geometry(
+            geometry, (), tuple(Site(name=element) for element in dict.fromkeys(elements)), ""
+        )
+        notes.append(
+            "it has no interactions: give its sites charge_e, sigma_A and epsilon_kJ_mol, or use"
+            " --parameters"
+        )
     else:
         table = read_parameters(parameters)
         sites = sites_of_geometry(geometry, (), table.sites, "the table")
-        source.append(f"parameters of {parameters.name}" + (f": {table.source}" if table.source else ""))
-        used = [find_site(table.sites, *atom) for atom in dict.fromkeys(zip(names, elements, strict=True))]
+        source.append(
+            f"parameters of {parameters.name}" + (f": {table.source}" if table.source else "")
+        )
+        used = [
+            find_site(table.sites, *atom)
+            for atom in dict.fromkeys(zip(names, elements, strict=True))
+        ]
         if idle := [entry.name for entry in table.sites if entry not in used]:
             notes.append(f"{parameters}: no atom uses {', '.join(idle)}")
     sites = _numbered(sites)
@@ -138,10 +177,16 @@ def model_from_geometry(
         notes.append(f"names of atoms have five characters at most: {', '.join(long)} are cut")
     atoms = read_atoms(geometry)
     residues = {residue[1] for residue in atoms.residue if len(residue) > 1}
-    residues = [x for x in residues if len(residues) == 1 and x.isascii() and x.isprintable() and " " not in x]
+    residues = [
+        x
+        for x in residues
+        if len(residues) == 1 and x.isascii() and x.isprintable() and " " not in x
+    ]
     data = {"name": geometry.stem if name is None else name, "source": "; ".join(source)}
     try:
-        file = MoleculeFile.model_validate(data | {"residue_names": tuple(residues), "sites": sites})
+        file = MoleculeFile.model_validate(
+            data | {"residue_names": tuple(residues), "sites": sites}
+        )
     except ValidationError as error:
         raise MoleculeError(str(geometry), validation_messages(error, MoleculeFile)) from None
     found = molecule_of(file)
@@ -149,13 +194,18 @@ def model_from_geometry(
     whole = round(found.charge)
     off = abs(found.charge - whole)
     if off > EXACTLY:
-        nearly = f"nearly but not exactly {f'{whole:+d}' if whole else 0}" if off < NEARLY else "not a whole number"
+        nearly = (
+            f"nearly but not exactly {f'{whole:+d}' if whole else 0}"
+            if off < NEARLY
+            else "not a whole number"
+        )
         notes.append(f"the charges sum to {found.charge:+.6g} e, {nearly}")
     return file, found, notes
 
 
 def _numbered(sites: tuple[Site, ...]) -> tuple[Site, ...]:
-    """Sites with unique names: sites of the same name are numbered, C1, C2, ..., within five characters."""
+    """Sites with unique names: sites of the same name are numbered, C1, C2, ..., within five
+    characters."""
     times = Counter(site.name for site in sites)
     numbers = {name: count(1) for name in times}
     taken = {name for name in times if times[name] == 1}
@@ -171,19 +221,30 @@ def _numbered(sites: tuple[Site, ...]) -> tuple[Site, ...]:
 
 
 def _one_molecule(path: Path, atoms: Atoms, elements: list[str]) -> list[str]:
-    """Notes on parts of the molecule. Raises StructureError for several molecules, or one that its cell cuts."""
+    """Notes on parts of the molecule. Raises StructureError for several molecules, or one that its
+    cell cuts."""
     with_mass = [k for k, element in enumerate(elements) if element != "X"]
     symbols = ["H" if elements[k] in HEAVY_HYDROGEN else elements[k] for k in with_mass]
     part = _parts(symbols, atoms.position[with_mass], None)
     count, notes = part.max(initial=-1) + 1, []
     if atoms.cell is not None:
         if _parts(symbols, atoms.position[with_mass], atoms.cell).max(initial=-1) + 1 < count:
-            why = "its atoms are bonded through the faces of its cell: make the molecule whole, without a cell"
+            why = (
+                "its atoms are bonded through the faces of its cell: make the molecule whole,"
+                " without a cell"
+            )
             raise StructureError(str(path), [why])
         notes.append("its cell is ignored: the model is one rigid body of all its atoms")
     members = [Counter(symbols[k] for k in np.flatnonzero(part == group)) for group in range(count)]
-    if count > 1 and all(member == members[0] for member in members) and sum(members[0].values()) > 1:
-        formula = "".join(f"{element}{number if number > 1 else ''}" for element, number in sorted(members[0].items()))
+    if (
+        count > 1
+        and all(member == members[0] for member in members)
+        and sum(members[0].values()) > 1
+    ):
+        formula = "".join(
+            f"{element}{number if number > 1 else ''}"
+            for element, number in sorted(members[0].items())
+        )
         raise StructureError(str(path), [f"has {count} molecules {formula}: keep one"])
     if count > 1:
         parts = f"{count} parts without a bond between them"

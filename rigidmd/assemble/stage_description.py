@@ -1,4 +1,5 @@
-"""Descriptions of stages: steps, thermostat and barostat, sampled distribution, conserved quantities."""
+"""Descriptions of stages: steps, thermostat and barostat, sampled distribution, conserved
+quantities."""
 
 from rigidmd.scene.couplings import BAROSTATS, COMPRESSIBILITY, THERMOSTATS
 from rigidmd.scene.stage import Stage
@@ -11,35 +12,56 @@ DISTRIBUTIONS = {
     "nve": ("the microcanonical distribution", "energy"),
     "nph": ("the isoenthalpic distribution", "enthalpy with the energy of the piston"),
     "nvt": ("the canonical distribution, exp(-H/kT)", "energy less heat"),
-    "npt": ("the isothermal-isobaric distribution, exp(-(H + p V)/kT)", "energy less heat and the work of the box"),
+    "npt": (
+        "the isothermal-isobaric distribution, exp(-(H + p V)/kT)",
+        "energy less heat and the work of the box",
+    ),
 }
 
 
 def describe_stage(stage: Stage) -> list[str]:
-    """Two lines: steps, thermostat and barostat; sampled distribution and conserved quantities. For a minimisation: the
-    minimised quantity; the limits of convergence."""
+    """Two lines: steps, thermostat and barostat; sampled distribution and conserved quantities. For
+    a minimisation: the minimised quantity; the limits of convergence."""
     if stage.is_minimisation:
-        what, limits = "the potential energy", [f"forces of {stage.force_limit_kJ_mol_A:g} kJ/(mol Å)"]
+        what, limits = (
+            "the potential energy",
+            [f"forces of {stage.force_limit_kJ_mol_A:g} kJ/(mol Å)"],
+        )
         limits.append(f"torques of {stage.torque_limit_kJ_mol:g} kJ/mol")
         if stage.changes_box:
-            what = f"the enthalpy at {_pressure(stage)} bar, the cell {stage.pressure_coupling.replace('_', '-')}"
+            what = (
+                f"the enthalpy at {_pressure(stage)} bar, the cell"
+                f" {stage.pressure_coupling.replace('_', '-')}"
+            )
             limits.append(f"a pressure within {stage.pressure_limit_bar:g} bar")
         return [
             f"{stage.label}: to a minimum of {what}; no time passes and momenta do not change",
-            f"limits: {', '.join(limits[:-1])} and {limits[-1]}; at most {stage.most_iterations} iterations",
+            (
+                f"limits: {', '.join(limits[:-1])} and {limits[-1]}; at most"
+                f" {stage.most_iterations} iterations"
+            ),
         ]
     rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
-    text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
+    text = (
+        f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps,"
+        f" {stage.integrator}"
+    )
     if stage.is_auto:
         error = f"{stage.trajectory_error or 0:g} of Q or X"
         if stage.energy_error_kT:
-            error = f"{stage.energy_error_kT:g} kT per degree of freedom of the energy, over the stage (rms)"
+            error = (
+                f"{stage.energy_error_kT:g} kT per degree of freedom of the energy, over the stage"
+                " (rms)"
+            )
         elif stage.bias_kT:
             error = f"{stage.bias_kT:g} kT per degree of freedom of the average potential energy"
         choice = f"integrator and step chosen at its start for an error of {error}"
         text = f"{stage.label}: {stage.duration_ps:g} ps, {choice}"
     if stage.has_thermostat:
-        kind, described = stage.thermostat_kind, THERMOSTATS[stage.thermostat_kind].description(stage.thermostat_values)
+        kind, described = (
+            stage.thermostat_kind,
+            THERMOSTATS[stage.thermostat_kind].description(stage.thermostat_values),
+        )
         text += f", {_ramp(stage.temperatures)} K by {kind.replace('_', ' ')}, {described}"
     if stage.has_barostat:
         text += f", {_barostat(stage)}"
@@ -61,7 +83,9 @@ def _barostat(stage: Stage) -> str:
     if "barostat_time_ps" in values:
         text += f", {stage.barostat_time:g} ps"
     if "barostat_interval_ps" in values:
-        text += f", a move every {f'{stage.moves_every} steps' if stage.moves_every > 1 else 'step'}"
+        text += (
+            f", a move every {f'{stage.moves_every} steps' if stage.moves_every > 1 else 'step'}"
+        )
     water = ", of water" if stage.compressibility == COMPRESSIBILITY else ""
     return f"{text}; compressibility {stage.compressibility:g}/bar{water}"
 
@@ -80,9 +104,10 @@ def _ramp(ends: tuple[float, float]) -> str:
 def stage_notes(stages: tuple[Stage, ...]) -> list[str]:
     """Notes on compressibilities that no substance has."""
     return [
-        f"stages.{k}: compressibility_per_bar = {stage.compressibility:g} is outside the range of substances (diamond "
-        f"{STIFFEST:g}, water {COMPRESSIBILITY:g}, a gas at 1 bar 1): is it in another unit? The box will "
-        f"{'hardly move' if stage.compressibility < STIFFEST else 'try moves that are too long'}"
+        f"stages.{k}: compressibility_per_bar = {stage.compressibility:g} is outside the range of"
+        f" substances (diamond {STIFFEST:g}, water {COMPRESSIBILITY:g}, a gas at 1 bar 1): is it in"
+        " another unit? The box will"
+        f" {'hardly move' if stage.compressibility < STIFFEST else 'try moves that are too long'}"
         for k, stage in enumerate(stages)
         if stage.has_barostat and not STIFFEST / 10 <= stage.compressibility <= SOFTEST
     ]

@@ -27,13 +27,16 @@ from rigidmd.units import GRAM_PER_CM3
 
 
 def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Configuration:
-    """Positions and orientations from the structure file, or on a lattice, with the vacuum of the scene. Raises
-    SceneError, StructureError."""
+    """Positions and orientations from the structure file, or on a lattice, with the vacuum of the
+    scene. Raises SceneError, StructureError."""
     found = _without_vacuum(scene, species)
     if (length := scene.box.vacuum_A) is None or found.cell is None:
         return found
     if not np.array_equal(found.basis, SAME_BASIS):
-        raise SceneError(scene.source, ["box.vacuum_A: the cell has a large tilt; give an equivalent cell without"])
+        raise SceneError(
+            scene.source,
+            ["box.vacuum_A: the cell has a large tilt; give an equivalent cell without"],
+        )
     k, cell = "xyz".index(scene.box.vacuum_axis), found.cell.copy()
     added = length / np.linalg.norm(cell[k]) * cell[k]
     images = np.floor(found.position @ np.linalg.inv(cell)[:, k])
@@ -54,29 +57,48 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
         path = scene.path(start.file) if content is None else Path(start.file)
         try:
             found = read_structure(
-                path, species, cell, scene.box.periodic, start.tolerance, start.frame, start.repeat,
-                start.atom_types, None if scene.topology is None else scene.path(scene.topology), content,
-            )  # fmt: skip
+                path,
+                species,
+                cell,
+                scene.box.periodic,
+                start.tolerance,
+                start.frame,
+                start.repeat,
+                start.atom_types,
+                None if scene.topology is None else scene.path(scene.topology),
+                content,
+            )
         except StructureError as error:
             raise StructureError(scene.structure_source, error.errors) from None
         faults, present = [], np.bincount(found.species, minlength=len(species))
         for k, (entry, there) in enumerate(zip(scene.molecules, present, strict=True)):
             if entry.count is not None and entry.count != there:
-                faults.append(f"has {there} molecules of {species[k].name}, molecules.{k}.count is {entry.count}")
+                faults.append(
+                    f"has {there} molecules of {species[k].name}, molecules.{k}.count is"
+                    f" {entry.count}"
+                )
         if scene.structure.velocities and found.velocity is None:
             why = "".join(f"; {note}" for note in found.notes if "velocit" in note)
-            faults.append(f"has no velocities of all atoms{why}. Leave out structure.velocities = true")
+            faults.append(
+                f"has no velocities of all atoms{why}. Leave out structure.velocities = true"
+            )
         if faults:
             raise StructureError(scene.structure_source, faults)
         return found
-    n, sites = sum(counts), sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
+    n, sites = (
+        sum(counts),
+        sum(count * len(m.masses) for count, m in zip(counts, species, strict=True)),
+    )
     check_memory_of_molecules(scene.source, n, sites)
     cell, rng = not_none(cell), np.random.default_rng([scene.seed, LATTICE])
     found = Configuration(
         species=np.repeat(np.arange(len(species)), counts),
-        position=_start_lattice(scene, species, n, np.diag(cell), rng), rotation=random_rotations(rng, n),
-        velocity=None, angular_momentum_body=None, cell=cell if scene.box.periodic else None,
-    )  # fmt: skip
+        position=_start_lattice(scene, species, n, np.diag(cell), rng),
+        rotation=random_rotations(rng, n),
+        velocity=None,
+        angular_momentum_body=None,
+        cell=cell if scene.box.periodic else None,
+    )
     return with_reduced_cell(found, "its", may_rotate=False)
 
 
@@ -86,11 +108,15 @@ def output_errors(system: System) -> list[str]:
     if not output.trajectory:
         return []
     positions = system.site_positions(system.state, output.positions == "wrapped")
-    limits = {name: not_none(format_of(name)).exceeded(positions) for name in (output.topology, output.trajectory)}
+    limits = {
+        name: not_none(format_of(name)).exceeded(positions)
+        for name in (output.topology, output.trajectory)
+    }
     reach = np.abs(positions).max()
     advice = "name a file of another format, or set output.trajectory = false"
     return [
-        f"output: {name} cannot hold the position {reach:.3g} Å of the start, its limit is {limit:g} Å: {advice}"
+        f"output: {name} cannot hold the position {reach:.3g} Å of the start, its limit is"
+        f" {limit:g} Å: {advice}"
         for name, limit in limits.items()
         if limit is not None
     ]
@@ -107,24 +133,39 @@ def residue_numbers(configuration: Configuration) -> np.ndarray:
     return found
 
 
-def set_momenta(scene: MolecularScene, model: Model, state: State, start: Configuration) -> list[str]:
-    """Set the momenta of a state, in place: from the structure file, or drawn at a temperature. Returns notes."""
+def set_momenta(
+    scene: MolecularScene, model: Model, state: State, start: Configuration
+) -> list[str]:
+    """Set the momenta of a state, in place: from the structure file, or drawn at a temperature.
+    Returns notes."""
     if scene.structure is not None and scene.structure.velocities:
         state.velocity[:] = start.velocity
-        state.angular_momentum_body[:] = not_none(start.angular_momentum_body)[: len(state.angular_momentum_body)]
+        state.angular_momentum_body[:] = not_none(start.angular_momentum_body)[
+            : len(state.angular_momentum_body)
+        ]
         frozen = ~mobile(model)
         state.velocity[frozen] = 0.0
         state.angular_momentum_body[frozen[: len(state.rotation)]] = 0.0
         removed = remove_momentum(model, state.velocity)
         return ["the total momentum of the velocities in the file was removed"] if removed else []
-    draw_momenta(model, state, not_none(scene.start.temperature_K), np.random.default_rng([scene.seed, MOMENTA]))
+    draw_momenta(
+        model,
+        state,
+        not_none(scene.start.temperature_K),
+        np.random.default_rng([scene.seed, MOMENTA]),
+    )
     return []
 
 
 def _start_lattice(
-    scene: MolecularScene, species: list[Molecule], n: int, edges: np.ndarray, rng: np.random.Generator
+    scene: MolecularScene,
+    species: list[Molecule],
+    n: int,
+    edges: np.ndarray,
+    rng: np.random.Generator,
 ) -> np.ndarray:
-    """n random points (n, 3) of a nearly cubic lattice in a box with edges (3,), off the walls. Raises SceneError."""
+    """n random points (n, 3) of a nearly cubic lattice in a box with edges (3,), off the walls.
+    Raises SceneError."""
     low, high, faults = np.zeros(3), edges.copy(), []
     for axis, name in enumerate(AXES):
         across = [walls for walls in scene.fields.walls if walls.direction == axis]
@@ -137,12 +178,16 @@ def _start_lattice(
         elif high[axis] == inf:
             high[axis] = low[axis] + edges[axis]
         if not low[axis] < high[axis]:
-            faults.append(f"fields.walls: the walls across {name} leave no space for molecules between them")
+            faults.append(
+                f"fields.walls: the walls across {name} leave no space for molecules between them"
+            )
     if faults:
         raise SceneError(scene.source, faults)
     edges = high - low
     shape = _lattice_shape(edges, n)
-    points = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    points = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), axis=-1).reshape(
+        -1, 3
+    )
     return low + (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape
 
 
@@ -164,10 +209,11 @@ def _lattice_shape(edges: np.ndarray, n: int) -> np.ndarray:
     return shape
 
 
-#: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap: the repulsion there
-#: is 1750 epsilon, which does not occur in liquids.
+#: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap:
+#: the repulsion there is 1750 epsilon, which does not occur in liquids.
 OVERLAP = 0.6
-#: Sites of different molecules closer than this fraction of the smallest molecular radius overlap too.
+#: Sites of different molecules closer than this fraction of the smallest molecular radius overlap
+#: too.
 INSIDE = 0.2
 
 
@@ -179,10 +225,15 @@ def overlaps(system: System) -> list[str]:
     wanted = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
     sigma, faults = gather_per_molecule(cores, system.model.species), []
     for i, j, distance in close_pairs(system, system.state, *wanted):
-        if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if sigma[i] > 0 and sigma[j] > 0 else 0.0):
+        if distance <= max(
+            inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if sigma[i] > 0 and sigma[j] > 0 else 0.0
+        ):
             a, b = system.sites.molecule[[i, j]]
             names = " and ".join(str(system.sites.name[k]) for k in (i, j))
-            faults.append(f"molecules {a + 1} and {b + 1} overlap: {names} have a distance of {distance:.3f} Å")
+            faults.append(
+                f"molecules {a + 1} and {b + 1} overlap: {names} have a distance of"
+                f" {distance:.3f} Å"
+            )
     return faults[:5] + ([f"and {len(faults) - 5} more"] if len(faults) > 5 else [])
 
 
@@ -194,16 +245,25 @@ def every_site(molecule: Molecule) -> np.ndarray:
 def close_pairs(
     system: System, state: State, *wanted: tuple[float, Callable[[Molecule], np.ndarray]]
 ) -> list[tuple[int, int, float]]:
-    """Sites (i, j) of different molecules, not both frozen, within a radius, and their distances, Å. `wanted` are
-    radii, and functions for the indices of the sites of a molecule to which they apply."""
+    """Sites (i, j) of different molecules, not both frozen, within a radius, and their distances,
+    Å. `wanted` are radii, and functions for the indices of the sites of a molecule to which they
+    apply."""
     cell = state.cell if state.volume < inf else None
-    position, owner, free = system.site_positions(state), system.sites.molecule, mobile(system.model)
+    position, owner, free = (
+        system.site_positions(state),
+        system.sites.molecule,
+        mobile(system.model),
+    )
     near: dict[tuple[int, int], float] = {}
     for radius, sites_of in wanted:
-        chosen = system.of_sites(lambda m, sites_of=sites_of: np.isin(every_site(m), sites_of(m))).nonzero()[0]
+        chosen = system.of_sites(
+            lambda m, sites_of=sites_of: np.isin(every_site(m), sites_of(m))
+        ).nonzero()[0]
         i, j, step = pairs_within(position[chosen], cell, radius)
         i, j, distance = chosen[i], chosen[j], np.linalg.norm(step, axis=1)
         kept = (owner[i] != owner[j]) & (free[owner[i]] | free[owner[j]])
-        for *pair, length in zip(i[kept].tolist(), j[kept].tolist(), distance[kept].tolist(), strict=True):
+        for *pair, length in zip(
+            i[kept].tolist(), j[kept].tolist(), distance[kept].tolist(), strict=True
+        ):
             near[min(pair), max(pair)] = min(length, near.get((min(pair), max(pair)), inf))
     return [(*pair, near[pair]) for pair in sorted(near)]

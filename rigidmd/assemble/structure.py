@@ -1,6 +1,6 @@
-"""The starting configuration from a structure file: atoms become molecules of the scene, in its box."""
+"""The starting configuration from a structure file: atoms become molecules of the scene, in its
+box."""
 
-# isort: skip_file
 from collections.abc import Iterator
 from math import prod
 from pathlib import Path
@@ -16,19 +16,28 @@ from rigidmd.core.state import edges_and_angles
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
+from rigidmd.io.formats import has_types
 from rigidmd.io.formats.atoms import SAME_MASS, Atoms
 from rigidmd.io.formats.cells import (
-    basis_of, cell_error, describe_basis, describe_cell, least_skewed_cell, reduced_cell, right_angled, same_lattice,
+    basis_of,
+    cell_error,
+    describe_basis,
+    describe_cell,
+    least_skewed_cell,
+    reduced_cell,
+    right_angled,
+    same_lattice,
     standard_rotation,
-)  # fmt: skip
-from rigidmd.io.formats import has_types
+)
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import OTHER_UNITS, did_you_mean, not_none
 
 MOST_NAMED = 5  # molecules named in a message; further ones are counted
 ROUNDING = 1e-12  # of a rotated cell, relative to its longest edge
-SAME_BOX = 1e-4  # relative difference between the boxes of file and scene that rounding in files explains
+SAME_BOX = (
+    1e-4  # relative difference between the boxes of file and scene that rounding in files explains
+)
 #: Masses, moments and numbers of sites of one model agree to this fraction.
 SAME_MODEL = 1e-6
 CLOSE = 1.2  # factor by which nearest distances may differ from the bonds of the templates
@@ -51,26 +60,45 @@ class Configuration(NamedTuple):
 
 
 def read_structure(
-    path: Path, species: list[Molecule], wanted: np.ndarray | None, periodic: bool, tolerance: float,
-    frame: int | None = None, repeat: tuple[int, int, int] = (1, 1, 1), atom_types: dict[str, str] | None = None,
-    topology: Path | None = None, content: bytes | None = None,
-) -> Configuration:  # fmt: skip
+    path: Path,
+    species: list[Molecule],
+    wanted: np.ndarray | None,
+    periodic: bool,
+    tolerance: float,
+    frame: int | None = None,
+    repeat: tuple[int, int, int] = (1, 1, 1),
+    atom_types: dict[str, str] | None = None,
+    topology: Path | None = None,
+    content: bytes | None = None,
+) -> Configuration:
     """The molecules of a structure file. Raises StructureError.
 
-    wanted : cell (3, 3) of the scene, or None to use the cell of the file. tolerance, frame, repeat, atom_types,
-    topology : see Scene.structure. content : of a file that is not on disk, see `Scene.embedded_files`
+    wanted : cell (3, 3) of the scene, or None to use the cell of the file. tolerance, frame,
+        repeat, atom_types,
+    topology : see Scene.structure. content : of a file that is not on disk, see
+        `Scene.embedded_files`
     """
     if path.suffix == ".npz":
-        if needless := [f"structure.{key}" for key, value in (("frame", frame), ("atom_types", atom_types)) if value]:
-            raise StructureError(str(path), [f"holds one state with its names: leave out {' and '.join(needless)}"])
+        if needless := [
+            f"structure.{key}"
+            for key, value in (("frame", frame), ("atom_types", atom_types))
+            if value
+        ]:
+            raise StructureError(
+                str(path), [f"holds one state with its names: leave out {' and '.join(needless)}"]
+            )
         found = _read_state(path, species)
         if periodic and wanted is None:
             _check_box(path, found.cell, [])
     else:
-        found = _read_molecules(path, species, wanted, periodic, tolerance, frame, atom_types, topology, content)
+        found = _read_molecules(
+            path, species, wanted, periodic, tolerance, frame, atom_types, topology, content
+        )
     cell = None if not periodic else found.cell if wanted is None else wanted
     if cell is not None and found.cell is not None and not same_lattice(found.cell, cell, SAME_BOX):
-        found = found._replace(notes=(*found.notes, "the box of the scene is used, not the box of the file"))
+        found = found._replace(
+            notes=(*found.notes, "the box of the scene is used, not the box of the file")
+        )
     if cell is not None and (fault := cell_error(cell)):
         raise StructureError(str(path), [f"its box: {fault}"])
     found = found._replace(cell=cell)
@@ -79,26 +107,33 @@ def read_structure(
         sites = sum(n * len(m.masses) for n, m in zip(count, species, strict=True))
         check_memory_of_molecules(str(path), sum(count), sites)
         found = _repeated(found, repeat)
-    return with_reduced_cell(found, "its" if wanted is None else "the scene's box: its", may_rotate=wanted is None)
+    return with_reduced_cell(
+        found, "its" if wanted is None else "the scene's box: its", may_rotate=wanted is None
+    )
 
 
 def with_reduced_cell(found: Configuration, whose: str, may_rotate: bool) -> Configuration:
-    """The same configuration in a cell with small tilts; rotated, if this allows a longer cutoff. `whose` is the owner
-    of the lattice, for the note."""
+    """The same configuration in a cell with small tilts; rotated, if this allows a longer cutoff.
+    `whose` is the owner of the lattice, for the note."""
     if found.cell is None:
         return found
-    cell, rotation = least_skewed_cell(found.cell) if may_rotate else (reduced_cell(found.cell), np.eye(3))
+    cell, rotation = (
+        least_skewed_cell(found.cell) if may_rotate else (reduced_cell(found.cell), np.eye(3))
+    )
     if np.array_equal(cell, found.cell):
         return found
     basis = basis_of(cell @ rotation, found.cell)
     used = f"{describe_cell(cell)}, {describe_basis(basis)}"
-    note = f"{whose} lattice is given by the cell with {used}, in place of {describe_cell(found.cell)}"
+    note = (
+        f"{whose} lattice is given by the cell with {used}, in place of {describe_cell(found.cell)}"
+    )
     if not np.array_equal(rotation, np.eye(3)):
         note += "; rotated, contents included"
         found = found._replace(
-            position=found.position @ rotation.T, rotation=rotation @ found.rotation,
+            position=found.position @ rotation.T,
+            rotation=rotation @ found.rotation,
             velocity=None if found.velocity is None else found.velocity @ rotation.T,
-        )  # fmt: skip
+        )
     return found._replace(cell=cell, notes=(*found.notes, note), basis=basis)
 
 
@@ -111,21 +146,40 @@ def _repeated(found: Configuration, repeat: tuple[int, int, int]) -> Configurati
         return None if values is None else np.tile(values, (len(shifts), *[1] * (values.ndim - 1)))
 
     return found._replace(
-        species=tiled(found.species), number=tiled(found.number),
-        position=(found.position + shifts[:, None]).reshape(-1, 3), rotation=tiled(found.rotation),
-        velocity=tiled(found.velocity), angular_momentum_body=tiled(found.angular_momentum_body),
+        species=tiled(found.species),
+        number=tiled(found.number),
+        position=(found.position + shifts[:, None]).reshape(-1, 3),
+        rotation=tiled(found.rotation),
+        velocity=tiled(found.velocity),
+        angular_momentum_body=tiled(found.angular_momentum_body),
         cell=cell * np.array(repeat)[:, None],
-        notes=(*found.notes, f"its {len(found.species)} molecules are repeated {' x '.join(map(str, repeat))} times"),
-    )  # fmt: skip
+        notes=(
+            *found.notes,
+            f"its {len(found.species)} molecules are repeated {' x '.join(map(str, repeat))} times",
+        ),
+    )
 
 
 def _read_molecules(
-    path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types, topology, content
+    path: Path,
+    species: list[Molecule],
+    wanted,
+    periodic: bool,
+    tolerance: float,
+    frame,
+    atom_types,
+    topology,
+    content,
 ) -> Configuration:
     known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
     hint = f"is not a site or element of the scene's molecules; there are {', '.join(known)}"
-    if unknown := [(number, name) for number, name in (atom_types or {}).items() if name not in (*known, "X")]:
-        faults = [f"structure.atom_types.{k} = {name!r} {hint}{did_you_mean(name, known)}" for k, name in unknown]
+    if unknown := [
+        (number, name) for number, name in (atom_types or {}).items() if name not in (*known, "X")
+    ]:
+        faults = [
+            f"structure.atom_types.{k} = {name!r} {hint}{did_you_mean(name, known)}"
+            for k, name in unknown
+        ]
         raise StructureError(str(path), faults)
     atoms = read_atoms(path, frame, atom_types, topology, content)
     notes = list(atoms.notes)
@@ -135,9 +189,14 @@ def _read_molecules(
         if not np.array_equal(rotation, np.eye(3)):
             velocity = None if atoms.velocity is None else atoms.velocity @ rotation.T
             atoms = atoms._replace(position=atoms.position @ rotation.T, velocity=velocity)
-            notes.append("its cell was rotated, contents included, so that a is along x and b in the xy plane")
+            notes.append(
+                "its cell was rotated, contents included, so that a is along x and b in the xy"
+                " plane"
+            )
         if orientation < 0:
-            notes.append("its cell is left-handed: -c replaces c, which does not change the lattice")
+            notes.append(
+                "its cell is left-handed: -c replaces c, which does not change the lattice"
+            )
         if right_angled(cell):
             upright = np.diag(np.linalg.norm(cell, axis=1))
             if np.abs(upright - cell).max() > ROUNDING * cell.max():
@@ -149,12 +208,19 @@ def _read_molecules(
         _check_box(path, atoms.cell, notes)
     if atoms.cell is not None and periodic and (fault := cell_error(atoms.cell)):
         raise StructureError(str(path), [f"its box: {fault}"])
-    matched = match(atoms, species, atoms.cell if atoms.cell is not None or not periodic else wanted, tolerance)
+    matched = match(
+        atoms, species, atoms.cell if atoms.cell is not None or not periodic else wanted, tolerance
+    )
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
         if atom_types is None and has_types(path) and matched[0].startswith("has atoms named"):
             matched[0] += ". If these are types, structure.atom_types gives them names"
-        faults = _unknown_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
+        faults = (
+            _unknown_masses(atoms, species)
+            + matched[:MOST_NAMED]
+            + more
+            + _other_units(atoms, species)
+        )
         faults += [f"as read: {note}" for note in atoms.notes]
         raise StructureError(str(path), faults)
     if len(matched.species) == 0:
@@ -163,11 +229,17 @@ def _read_molecules(
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive_sites(molecule)) for molecule in species])[matched.species]
     return Configuration(
-        species=matched.species, position=matched.fit.centre, rotation=matched.fit.rotation, velocity=velocity,
-        angular_momentum_body=angular, cell=atoms.cell,
+        species=matched.species,
+        position=matched.fit.centre,
+        rotation=matched.fit.rotation,
+        velocity=velocity,
+        angular_momentum_body=angular,
+        cell=atoms.cell,
         residual_rms=float(np.sqrt(matched.fit.square @ sizes / sizes.sum())),
-        residual_max=float(matched.fit.deviation.max()), number=matched.number, notes=tuple(notes),
-    )  # fmt: skip
+        residual_max=float(matched.fit.deviation.max()),
+        number=matched.number,
+        notes=tuple(notes),
+    )
 
 
 def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
@@ -182,41 +254,60 @@ def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
     ]
     there = f"the scene's molecules ({', '.join(f'{mass:g}' for mass in masses)} u)"
     advice = "set structure.atom_types, or these masses by masses_u"
-    return [f"its atom types {', '.join(unknown)} have masses of no site of {there}: {advice}"] if unknown else []
+    return (
+        [f"its atom types {', '.join(unknown)} have masses of no site of {there}: {advice}"]
+        if unknown
+        else []
+    )
 
 
 def _notes(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> Iterator[str]:
-    """Notes on massless sites, whose positions follow from the template and not from the file, and on masses in the
-    file that differ from the masses of the scene."""
+    """Notes on massless sites, whose positions follow from the template and not from the file, and
+    on masses in the file that differ from the masses of the scene."""
     lacking = [len(molecule.masses) - len(massive_sites(molecule)) for molecule in species]
     there, expected = sum(matched.massless.values()), int(np.array(lacking)[matched.species].sum())
     if there > expected:
-        yield f"{there - expected} sites without mass ({', '.join(matched.massless)}) are in no model: left out"
+        yield (
+            f"{there - expected} sites without mass ({', '.join(matched.massless)}) are in no"
+            " model: left out"
+        )
     elif there < expected:
-        names = ", ".join(molecule.name for molecule, count in zip(species, lacking, strict=True) if count)
+        names = ", ".join(
+            molecule.name for molecule, count in zip(species, lacking, strict=True) if count
+        )
         what = f"{expected - there} sites without mass are missing in the file ({names})"
         yield f"{what}: built from the rigid template"
     others = {}
     for k, molecule in enumerate(species if atoms.masses is not None else ()):
         for s, site in enumerate(massive_sites(molecule)):
-            members = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
+            members = np.array(
+                [matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int
+            )
             mass = float(molecule.masses[site])
             for i in members[np.abs(atoms.masses[members] - mass) > SAME_MASS * mass]:
-                others[f"{atoms.names[i]} {atoms.masses[i]:g} and {molecule.site_names[site]} {mass:g} u"] = None
+                others[
+                    f"{atoms.names[i]} {atoms.masses[i]:g} and {molecule.site_names[site]}"
+                    f" {mass:g} u"
+                ] = None
     if listed := "; ".join(others):
-        yield f"the masses of the scene are used, not the masses in the file ({listed}): masses_u changes them"
+        yield (
+            f"the masses of the scene are used, not the masses in the file ({listed}): masses_u"
+            " changes them"
+        )
 
 
 def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
     """Raise StructureError for a start without a box."""
     if cell is None:
         why = f" ({'; '.join(notes)})" if notes else ""
-        raise StructureError(str(path), [f"has no box{why}: give [box] lengths_A, or periodic = false"])
+        raise StructureError(
+            str(path), [f"has no box{why}: give [box] lengths_A, or periodic = false"]
+        )
 
 
 def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], notes: list[str]):
-    """Velocities (n, 3) and body angular momenta (n, 3) with the momenta of the atoms, or None. About axes without
-    inertia (linear bodies, points) the angular momentum is 0."""
+    """Velocities (n, 3) and body angular momenta (n, 3) with the momenta of the atoms, or None.
+    About axes without inertia (linear bodies, points) the angular momentum is 0."""
     if atoms.velocity is None:
         return None, None
     without = np.array(np.isnan(atoms.velocity).any(axis=1))
@@ -240,25 +331,32 @@ def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], n
 
 
 def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """A message if the nearest distances match the bonds of the molecules in another unit than Å."""
+    """A message if the nearest distances match the bonds of the molecules in another unit than
+    Å."""
     from scipy.spatial import KDTree
     from scipy.spatial.distance import pdist
 
-    bonds = [pdist(m.positions_body[massive_sites(m)]).min() for m in species if len(massive_sites(m)) > 1]
+    bonds = [
+        pdist(m.positions_body[massive_sites(m)]).min()
+        for m in species
+        if len(massive_sites(m)) > 1
+    ]
     if not bonds or len(atoms.position) < 2:
         return []
     nearest = float(np.median(KDTree(atoms.position).query(atoms.position, 2)[0][:, 1]))
     low, high = min(bonds) / CLOSE, max(bonds) * CLOSE
     fitting = [unit for unit, size in OTHER_UNITS["A"].items() if low <= nearest * size <= high]
     return [
-        f"the coordinates seem to be in {unit}, not in Å as in this format: the nearest distance is {nearest:.3g}"
+        f"the coordinates seem to be in {unit}, not in Å as in this format: the nearest distance is"
+        f" {nearest:.3g}"
         for unit in fitting
         if "Å" not in fitting
     ]
 
 
 def _other_model(molecule: Molecule, saved: np.ndarray) -> str:
-    """The difference between a molecule and a saved one with this `Molecule.fingerprint`; empty if there is none."""
+    """The difference between a molecule and a saved one with this `Molecule.fingerprint`; empty if
+    there is none."""
     here = np.array(molecule.fingerprint)
     names = ("mass, u", "moment of inertia 1, u Å²", "moment 2", "moment 3", "number of sites")
     size = np.array([here[0], *[max(here[1:4].max(), saved[1:4].max())] * 3, 1.0])
@@ -275,7 +373,9 @@ def _read_state(path: Path, species: list[Molecule]) -> Configuration:
     saved = read_state(path)
     known = [molecule.name for molecule in species]
     if missing := [name for name in saved.names if name not in known]:
-        raise StructureError(str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"])
+        raise StructureError(
+            str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"]
+        )
     of_name = {molecule.name: molecule for molecule in species}
     models = () if saved.models is None else zip(saved.names, saved.models, strict=True)
     faults = [fault for name, model in models if (fault := _other_model(of_name[name], model))]
@@ -286,9 +386,11 @@ def _read_state(path: Path, species: list[Molecule]) -> Configuration:
     if faults:
         raise StructureError(str(path), faults)
     return Configuration(
-        species=np.array([known.index(name) for name in saved.names])[saved.species], position=state.position,
-        rotation=state.rotation if has_rotations else np.tile(np.eye(3), (n, 1, 1)), velocity=state.velocity,
+        species=np.array([known.index(name) for name in saved.names])[saved.species],
+        position=state.position,
+        rotation=state.rotation if has_rotations else np.tile(np.eye(3), (n, 1, 1)),
+        velocity=state.velocity,
         angular_momentum_body=state.angular_momentum_body if has_rotations else np.zeros((n, 3)),
         cell=state.cell if np.isfinite(state.cell).all() else None,
         number=saved.residue_number,
-    )  # fmt: skip
+    )

@@ -1,8 +1,9 @@
-"""Estimates for time steps without compiled code: the fastest motions in a liquid, steps that are too long for them,
-and the precision of forces that suits the error of a step.
+"""Estimates for time steps without compiled code: the fastest motions in a liquid, steps that are
+too long for them, and the precision of forces that suits the error of a step.
 
-A motion of angular frequency w has the rms amplitude sqrt(kT/m)/w at a temperature T. The amplitudes of the fastest
-motions of molecules in liquids are much alike, so w follows from masses, moments of inertia and temperature.
+A motion of angular frequency w has the rms amplitude sqrt(kT/m)/w at a temperature T. The
+amplitudes of the fastest motions of molecules in liquids are much alike, so w follows from masses,
+moments of inertia and temperature.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,27 +21,30 @@ from rigidmd.scene.models import Molecule
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND
 
-#: Rms amplitudes of the fastest motions of a liquid at its temperature, as angles and in diameters. Measured by
-#: `stiffest_mode` after 3 ps: 0.11 rad in SPC/E, 0.10 in TIP4P/2005, 0.12 in methanol, 0.09 in nitrogen, 0.05 in CO2
-#: and benzene; 0.019 diameters in argon, 0.020 in benzene, 0.017 in CO2, 0.006 in water.
+#: Rms amplitudes of the fastest motions of a liquid at its temperature, as angles and in diameters.
+#: Measured by `stiffest_mode` after 3 ps: 0.11 rad in SPC/E, 0.10 in TIP4P/2005, 0.12 in methanol,
+#: 0.09 in nitrogen, 0.05 in CO2 and benzene; 0.019 diameters in argon, 0.020 in benzene, 0.017 in
+#: CO2, 0.006 in water.
 SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
-#: Rms error of forces in mixed precision, relative to the rms force. Measured for a liquid with a cutoff of 9 Å: 3.2e-6
-#: for 512 SPC/E with PME, 3.3e-6 for 216 TIP4P/2005 with a reaction field, 1.4e-6 for 500 argon; the largest 1e-5.
+#: Rms error of forces in mixed precision, relative to the rms force. Measured for a liquid with a
+#: cutoff of 9 Å: 3.2e-6 for 512 SPC/E with PME, 3.3e-6 for 216 TIP4P/2005 with a reaction field,
+#: 1.4e-6 for 500 argon; the largest 1e-5.
 MIXED_ERROR = 3e-6
 #: Least error of Ewald sums that grids in single precision allow, e²/Å².
 MIXED_EWALD_ERROR = 3e-6
-#: Largest error of a step, as a fraction of the forces, without a warning: 6 fs for water with velocity Verlet.
-#: What is advised instead has half of it.
+#: Largest error of a step, as a fraction of the forces, without a warning: 6 fs for water with
+#: velocity Verlet. What is advised instead has half of it.
 INACCURATE = 0.1
 #: A step that is this many times shorter than the longest stable one is probably in another unit.
 NEEDLESS = 1000
-#: precision = "auto" is mixed where the error of the time step is at least this many times that of mixed precision. The
-#: limits of a minimisation in mixed precision are, too.
+#: precision = "auto" is mixed where the error of the time step is at least this many times that of
+#: mixed precision. The limits of a minimisation in mixed precision are, too.
 MARGIN = 30
 
 
 def _trace(scheme: Scheme, square: np.ndarray) -> np.ndarray:
-    """Trace (k,) of the matrix by which a step multiplies (x, v dt) of a harmonic motion with (w dt)² (k,)."""
+    """Trace (k,) of the matrix by which a step multiplies (x, v dt) of a harmonic motion with (w
+    dt)² (k,)."""
     x, v = np.tile(np.eye(2)[:, :, None], square.size)  # rows of the matrix
     for flow in scheme.flows:
         if flow.kind == KICK:
@@ -52,8 +56,9 @@ def _trace(scheme: Scheme, square: np.ndarray) -> np.ndarray:
 
 @cache
 def stable_angle(method: Scheme | Solver) -> float:
-    """Largest w dt at which a harmonic motion of angular frequency w stays bounded, for this and all smaller steps:
-    while |trace| <= 2 (docs/theory/dynamics.md). Infinite for solvers that choose their own steps."""
+    """Largest w dt at which a harmonic motion of angular frequency w stays bounded, for this and
+    all smaller steps: while |trace| <= 2 (docs/theory/dynamics.md). Infinite for solvers that
+    choose their own steps."""
     if isinstance(method, Solver):
         return 2 * sqrt(2) if method.name == RK4 else inf
     angle = np.linspace(0, 30, 30_001)
@@ -62,15 +67,18 @@ def stable_angle(method: Scheme | Solver) -> float:
 
 
 def step_error(scheme: Scheme, angle: float) -> float:
-    """The error of a step as an error of the forces: a harmonic motion with w dt = `angle` is followed as if its force
-    constant were wrong by this fraction, (angle)²/12 for velocity Verlet. Infinite for an unstable step."""
+    """The error of a step as an error of the forces: a harmonic motion with w dt = `angle` is
+    followed as if its force constant were wrong by this fraction, (angle)²/12 for velocity Verlet.
+    Infinite for an unstable step."""
     if angle >= stable_angle(scheme):
         return inf
     followed = np.arccos(np.clip(_trace(scheme, np.array([angle**2]))[0] / 2, -1, 1))
     return abs(float(followed / angle) ** 2 - 1) if angle > 0 else 0.0
 
 
-def error_of_step(species: list[Molecule], temperature: float, scheme: Scheme, timestep_fs: float) -> float:
+def error_of_step(
+    species: list[Molecule], temperature: float, scheme: Scheme, timestep_fs: float
+) -> float:
     """`step_error` for the fastest motion of these molecules at a temperature, K; 0 without one."""
     fastest = fastest_motion(species, temperature)
     return 0.0 if fastest is None else step_error(scheme, timestep_fs * FEMTOSECOND / fastest.time)
@@ -94,18 +102,24 @@ def fastest_motion(species: list[Molecule], temperature: float) -> FastMotion | 
     """The fastest motion at a temperature, K; None without molecules or temperature."""
     found, thermal = [], BOLTZMANN * temperature
     for m in species if thermal > 0 else ():
-        diameter = max((sigma for sigma, depth in zip(m.sigma, m.epsilon, strict=True) if depth > 0), default=inf)
+        diameter = max(
+            (sigma for sigma, depth in zip(m.sigma, m.epsilon, strict=True) if depth > 0),
+            default=inf,
+        )
         lightest = min((moment for moment in m.inertia if moment > 0), default=inf)
         moving, rotating = diameter * sqrt(m.mass / thermal), sqrt(lightest / thermal)
         found += [
             FastMotion(SWING_DIAMETERS * moving, SWING_DIAMETERS, "diameters", m.name, "moves"),
-            FastMotion(SWING_RAD * rotating, SWING_RAD, "rad", m.name, "rotates about its lightest axis"),
+            FastMotion(
+                SWING_RAD * rotating, SWING_RAD, "rad", m.name, "rotates about its lightest axis"
+            ),
         ]
     return min(found, key=attrgetter("time"), default=None)
 
 
 def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
-    """The stages other than minimisations with a given step: index, stage and temperature, K; 0 if it is not known."""
+    """The stages other than minimisations with a given step: index, stage and temperature, K; 0 if
+    it is not known."""
     temperature = scene.start.temperature_K or 0.0
     for k, stage in enumerate(scene.stages):
         temperature = max(stage.temperatures) or temperature
@@ -114,28 +128,38 @@ def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
 
 
 def step_warnings(scene: MolecularScene) -> list[str]:
-    """Warnings of time steps that are unstable, inaccurate or needlessly short for these molecules in a liquid, and of
-    orders that truncated forces do not allow. A step is unstable if a molecule at its thermal speed moves or rotates in
-    it by more than `stable_angle` amplitudes."""
+    """Warnings of time steps that are unstable, inaccurate or needlessly short for these molecules
+    in a liquid, and of orders that truncated forces do not allow. A step is unstable if a molecule
+    at its thermal speed moves or rotates in it by more than `stable_angle` amplitudes."""
     warnings, forces = [], scene.forces
     ends = forces.cutoff_A is not None or scene.box.periodic
     jumps = ends and forces.lennard_jones and forces.truncation in ("plain", "shift")
     for k, stage, _ in _given_steps(scene):
         if (order := stage.scheme.order) > 2 and jumps:
-            lost = f"lost where forces jump to 0 at the cutoff, as with forces.truncation = {forces.truncation!r}"
+            lost = (
+                "lost where forces jump to 0 at the cutoff, as with forces.truncation ="
+                f" {forces.truncation!r}"
+            )
             advice = "Use truncation = 'smooth_switch'"
             warnings.append(f"stages.{k}: {stage.integrator} is of order {order}, {lost}. {advice}")
     return [*warnings, *_sentences_on_steps(scene, _step_warning)]
 
 
 def accuracy_warnings(scene: MolecularScene) -> list[str]:
-    """Those of `step_warnings` on steps that are stable and inaccurate, which a run does not notice."""
+    """Those of `step_warnings` on steps that are stable and inaccurate, which a run does not
+    notice."""
     return [*_sentences_on_steps(scene, _accuracy_warning)]
 
 
-def _sentences_on_steps(scene: MolecularScene, about: Callable[[Stage, FastMotion, float], str]) -> Iterator[str]:
+def _sentences_on_steps(
+    scene: MolecularScene, about: Callable[[Stage, FastMotion, float], str]
+) -> Iterator[str]:
     """What a function writes on the step of each stage, if the scene watches steps."""
-    species = [m for m, entry in zip(species_of(scene), scene.molecules, strict=True) if entry.frozen is not True]
+    species = [
+        m
+        for m, entry in zip(species_of(scene), scene.molecules, strict=True)
+        if entry.frozen is not True
+    ]
     for k, stage, temperature in _given_steps(scene):
         fastest = fastest_motion(species, temperature)
         if fastest is None or not scene.watch.stable_step:
@@ -145,21 +169,25 @@ def _sentences_on_steps(scene: MolecularScene, about: Callable[[Stage, FastMotio
 
 
 def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
-    """What is wrong with the step of a stage for a motion at a temperature, K; empty if nothing is."""
+    """What is wrong with the step of a stage for a motion at a temperature, K; empty if nothing
+    is."""
     time, size, unit, name, does = fastest
     longest, dt = fastest.longest_step(stage), stage.timestep_fs * FEMTOSECOND
     limit = f"{longest / FEMTOSECOND:.3g} fs"
     if dt > longest:
         return (
-            f"is too long for {name} at {temperature:g} K: in a step it {does} by {dt / time * size:.2g} {unit} (rms); "
-            f"{stage.integrator} is stable up to {limit} where, as in liquids, the stiffest motions swing by {size:g} "
-            f"{unit}"
+            f"is too long for {name} at {temperature:g} K: in a step it {does} by"
+            f" {dt / time * size:.2g} {unit} (rms); {stage.integrator} is stable up to {limit}"
+            f" where, as in liquids, the stiffest motions swing by {size:g} {unit}"
         )
     if sentence := _accuracy_warning(stage, fastest, temperature):
         return sentence
     if longest < inf and dt * NEEDLESS < longest:
         cause = "is it in ps?" if dt * 1000 * NEEDLESS >= longest else "is it in another unit?"
-        return f"is {longest / dt:.0f} times shorter than {stage.integrator} needs for {name}, {limit}: {cause}"
+        return (
+            f"is {longest / dt:.0f} times shorter than {stage.integrator} needs for {name},"
+            f" {limit}: {cause}"
+        )
     return ""
 
 
@@ -174,9 +202,9 @@ def _accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> 
     while step_error(stage.scheme, better / fastest.time) > INACCURATE / 2:
         better *= 0.95
     return (
-        f"is inaccurate for {fastest.molecule} at {temperature:g} K: it {fastest.does} as if forces were "
-        f"wrong by {error:.0%}, which shifts temperatures and averages. "
-        f"At {better / FEMTOSECOND:.2g} fs it is {INACCURATE / 2:.0%}"
+        f"is inaccurate for {fastest.molecule} at {temperature:g} K: it {fastest.does} as if forces"
+        f" were wrong by {error:.0%}, which shifts temperatures and averages. At"
+        f" {better / FEMTOSECOND:.2g} fs it is {INACCURATE / 2:.0%}"
     )
 
 
@@ -188,11 +216,11 @@ def precision_for(error: float) -> Literal["double", "mixed"]:
 def with_precision(
     scene: MolecularScene, species: list[Molecule], temperature: float, force_error: float | None
 ) -> tuple[MolecularScene, str]:
-    """A scene with its precision and, for "auto", the reason: mixed if the error of the time step hides that of single
-    precision in every stage, else double.
+    """A scene with its precision and, for "auto", the reason: mixed if the error of the time step
+    hides that of single precision in every stage, else double.
 
-    species : those that are not frozen; temperature : of velocities from a file, K; force_error : of an Ewald sum, of
-    the force on a site, u Å/ps²
+    species : those that are not frozen; temperature : of velocities from a file, K; force_error :
+    of an Ewald sum, of the force on a site, u Å/ps²
     """
     if scene.precision != "auto":
         return scene, ""
@@ -200,12 +228,19 @@ def with_precision(
         k: error_of_step(species, found or temperature, stage.scheme, stage.timestep_fs)
         for k, stage, found in _given_steps(scene)
     }
-    seeks = [k for k, stage in enumerate(scene.stages) if stage.is_auto and not (stage.bias_kT or stage.is_hybrid)]
+    seeks = [
+        k
+        for k, stage in enumerate(scene.stages)
+        if stage.is_auto and not (stage.bias_kT or stage.is_hybrid)
+    ]
     precision, why = "double", "no stage has a given time step"
     if scene.engine.is_external:
         why = f"{scene.engine.title} computes the forces of the run"
     elif force_error is not None and force_error < MIXED_EWALD_ERROR * COULOMB:
-        why = f"the Ewald sum is good to {force_error / COULOMB:.1e} e²/Å², finer than single precision"
+        why = (
+            f"the Ewald sum is good to {force_error / COULOMB:.1e} e²/Å², finer than single"
+            " precision"
+        )
     elif seeks:
         why = f"stages.{seeks[0]} chooses its step for a small error"
     elif errors:
@@ -217,7 +252,10 @@ def with_precision(
         why = f"the error of {step}, about {errors[k]:.0e} of the forces, is {times} times {single}"
         why += "" if precision == "mixed" else f", and not {MARGIN} times"
         if ratio == inf:
-            why = f"{step} is unstable for motions of these molecules, which hides the error of single precision"
+            why = (
+                f"{step} is unstable for motions of these molecules, which hides the error of"
+                " single precision"
+            )
         elif ratio == 0:
             why = "the fastest motion of these molecules is not known"
     return scene.model_copy(update={"precision": precision}), why

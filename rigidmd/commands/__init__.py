@@ -1,4 +1,5 @@
-"""The command line: cli.py lists the commands; each has a module with its arguments, its call and what it prints."""
+"""The command line: cli.py lists the commands; each has a module with its arguments, its call and
+what it prints."""
 
 #: Added to the number of a signal that ends a command: exit code 130 for Ctrl-C, 143 for SIGTERM.
 BY_SIGNAL = 128

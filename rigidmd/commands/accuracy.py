@@ -2,33 +2,67 @@
 
 from pathlib import Path
 
-from rigidmd.commands.arguments import SCENE, Options, argument, command, output_folder, read_scene, write_study
+from rigidmd.commands.arguments import (
+    SCENE,
+    Options,
+    argument,
+    command,
+    output_folder,
+    read_scene,
+    write_study,
+)
 
 
 @command(
-    100, "measure the error and the run time of integrators at several time steps",
+    100,
+    "measure the error and the run time of integrators at several time steps",
     "rigidmd accuracy heavy_top_3.toml --integrators velocity_verlet,srkn_6\n"
     "  rigidmd accuracy heavy_top_3.toml --integrators rk4,rk4_quaternion,rk4_euler_angles\n"
     "  rigidmd accuracy liquid.toml --averages --sample-ps 50 --timesteps 1,2,4,6,8 "
     "--integrators baoab,velocity_verlet+nose_hoover",
     *SCENE,
-    argument("--integrators", metavar="A,B,...",
-        help="integrators (default: the scene's and those that suit it; for a body also general ODE solvers, "
-        "each with Q as a matrix, a quaternion and Euler angles: rk4, rk4_quaternion, rk4_euler_angles, dop853, "
-        "dop853_quaternion, dop853_euler_angles). If the scene sets run.formulation, rk4, dop853 and radau use it, "
-        "and rk4_matrix uses the matrix"),
+    argument(
+        "--integrators",
+        metavar="A,B,...",
+        help=(
+            "integrators (default: the scene's and those that suit it; for a body also general ODE"
+            " solvers, each with Q as a matrix, a quaternion and Euler angles: rk4, rk4_quaternion,"
+            " rk4_euler_angles, dop853, dop853_quaternion, dop853_euler_angles). If the scene sets"
+            " run.formulation, rk4, dop853 and radau use it, and rk4_matrix uses the matrix"
+        ),
+    ),
     argument("--timesteps", metavar="X,Y,...", help="time steps, fs for molecules, s for a body"),
-    argument("--span", type=float, metavar="T", help="length of each run (default: 0.1 ps; a body's run)"),
-    argument("--repeats", type=int, default=3, metavar="N", help="timings of each run (default: 3); 1 shows no spread"),
-    argument("--averages", action="store_true",
-        help="molecules only: measure the bias of averages instead, by samples of the last stage under its thermostat "
-        "(nvt, npt) with every integrator at every step. --integrators then accepts names with a thermostat, "
-        "baoab+langevin (default: the method of the stage, baoab+langevin, velocity_verlet+velocity_rescaling, "
-        "velocity_verlet+nose_hoover), and --timesteps default to fractions of the longest stable one"),
-    argument("--sample-ps", type=float, metavar="PS",
-        help="with --averages: time sampled with every step, after a fifth of it (default: 20)"),
-    *output_folder("runs/NAME-accuracy"), writes=True,
-)  # fmt: skip
+    argument(
+        "--span", type=float, metavar="T", help="length of each run (default: 0.1 ps; a body's run)"
+    ),
+    argument(
+        "--repeats",
+        type=int,
+        default=3,
+        metavar="N",
+        help="timings of each run (default: 3); 1 shows no spread",
+    ),
+    argument(
+        "--averages",
+        action="store_true",
+        help=(
+            "molecules only: measure the bias of averages instead, by samples of the last stage"
+            " under its thermostat (nvt, npt) with every integrator at every step. --integrators"
+            " then accepts names with a thermostat, baoab+langevin (default: the method of the"
+            " stage, baoab+langevin, velocity_verlet+velocity_rescaling,"
+            " velocity_verlet+nose_hoover), and --timesteps default to fractions of the longest"
+            " stable one"
+        ),
+    ),
+    argument(
+        "--sample-ps",
+        type=float,
+        metavar="PS",
+        help="with --averages: time sampled with every step, after a fifth of it (default: 20)",
+    ),
+    *output_folder("runs/NAME-accuracy"),
+    writes=True,
+)
 def _accuracy(options: Options) -> int:
     from rigidmd.errors import SceneError
     from rigidmd.studies.accuracy import accuracy, averages_report
@@ -38,25 +72,39 @@ def _accuracy(options: Options) -> int:
     folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-accuracy"
     integrators = options.integrators.split(",") if options.integrators else None
     try:
-        timesteps = [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
+        timesteps = (
+            [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
+        )
     except ValueError:
-        raise SceneError("--timesteps", [f"{options.timesteps!r} is not a list of numbers such as 1,2,4"]) from None
+        raise SceneError(
+            "--timesteps", [f"{options.timesteps!r} is not a list of numbers such as 1,2,4"]
+        ) from None
     if options.averages:
         sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
         write_study(
-            folder, options.force, averages_report.FILES, "compiling, and running what comes before the last stage",
+            folder,
+            options.force,
+            averages_report.FILES,
+            "compiling, and running what comes before the last stage",
             lambda progress: measure_averages(scene, integrators, timesteps, sample, progress),
-            lambda found: [averages_report.table_text(found), "", *averages_report.bias_conclusions(found)],
+            lambda found: [
+                averages_report.table_text(found),
+                "",
+                *averages_report.bias_conclusions(found),
+            ],
             averages_report.write_averages,
-        )  # fmt: skip
+        )
         return 0
     if options.sample_ps is not None:
         raise SceneError("--sample-ps", ["it needs --averages"])
     settings = integrators, timesteps, options.span, options.repeats
     write_study(
-        folder, options.force, accuracy.FILES, "compiling and running the reference",
+        folder,
+        options.force,
+        accuracy.FILES,
+        "compiling and running the reference",
         lambda progress: accuracy.measure_accuracy(scene, *settings, progress),
         lambda found: [*accuracy.recommendations(found), "", accuracy.table_text(found)],
         accuracy.write_accuracy,
-    )  # fmt: skip
+    )
     return 0

@@ -20,24 +20,69 @@ class _List(argparse.Action):
 
 
 @command(
-    120, "measure g(r), diffusion, orientation, dielectric constant, viscosity and more in a run, each with its error",
+    120,
+    "measure g(r), diffusion, orientation, dielectric constant, viscosity and more in a run, each"
+    " with its error",
     "rigidmd analyse runs/water --only rdf,diffusion --from 10ps",
-    argument("folder", metavar="RUN", help="folder of a run, or of a sweep: means and errors over its runs"),
-    argument("--only", type=lambda text: [name.strip() for name in text.split(",") if name.strip()], default=[],
-        metavar="NAMES", help="these analyses, separated by commas (default: all); `--list` names them"),
-    argument("--from", dest="start", type=time_ps, metavar="TIME",
-        help="use frames from this time of the run on, such as 10ps (default: where it is found to be equilibrated)"),
-    argument("--viscosity", type=number(float, 1e-300, 1e12, "a viscosity above 0"), metavar="VALUE",
-        help="viscosity in mPa s for the correction of D for the size of the box (default: measured in the run)"),
-    argument("--figures", choices=["png", "svg", "pdf"], default="png", help="type of the figures (default: png)"),
-    argument("--extrapolate", metavar="KEY",
-        help="of a sweep: extrapolate all averages and values to a step of 0 over this time step, which the sweep "
-        "varies, such as stages.1.timestep_fs"),
-    argument("--trust", action="append", default=[], metavar="FILE.py",
-        help="run this Python file first, which may define analyses with @rigidmd.analysis; may be repeated"),
+    argument(
+        "folder",
+        metavar="RUN",
+        help="folder of a run, or of a sweep: means and errors over its runs",
+    ),
+    argument(
+        "--only",
+        type=lambda text: [name.strip() for name in text.split(",") if name.strip()],
+        default=[],
+        metavar="NAMES",
+        help="these analyses, separated by commas (default: all); `--list` names them",
+    ),
+    argument(
+        "--from",
+        dest="start",
+        type=time_ps,
+        metavar="TIME",
+        help=(
+            "use frames from this time of the run on, such as 10ps (default: where it is found to"
+            " be equilibrated)"
+        ),
+    ),
+    argument(
+        "--viscosity",
+        type=number(float, 1e-300, 1e12, "a viscosity above 0"),
+        metavar="VALUE",
+        help=(
+            "viscosity in mPa s for the correction of D for the size of the box (default: measured"
+            " in the run)"
+        ),
+    ),
+    argument(
+        "--figures",
+        choices=["png", "svg", "pdf"],
+        default="png",
+        help="type of the figures (default: png)",
+    ),
+    argument(
+        "--extrapolate",
+        metavar="KEY",
+        help=(
+            "of a sweep: extrapolate all averages and values to a step of 0 over this time step,"
+            " which the sweep varies, such as stages.1.timestep_fs"
+        ),
+    ),
+    argument(
+        "--trust",
+        action="append",
+        default=[],
+        metavar="FILE.py",
+        help=(
+            "run this Python file first, which may define analyses with @rigidmd.analysis; may be"
+            " repeated"
+        ),
+    ),
     argument("--list", action=_List, nargs=0, help="list the analyses"),
-    scene="this run", writes=True,
-)  # fmt: skip
+    scene="this run",
+    writes=True,
+)
 def _analyse(options: Options) -> int:
     from rigidmd.analysis import mean_force
     from rigidmd.analysis.files import analyse_folder
@@ -56,7 +101,9 @@ def _analyse(options: Options) -> int:
             progress(1.0, "")
             for of in found:
                 runs = f"{of.runs} run{'s' if of.runs > 1 else ''}"
-                files = f"{len(of.files)} files in {of.files[0].parent}" if of.files else "no results"
+                files = (
+                    f"{len(of.files)} files in {of.files[0].parent}" if of.files else "no results"
+                )
                 print(f"{of.title or folder}: {runs}, {files}")
                 _print_results(of.results, of.failed)
                 print()
@@ -67,17 +114,26 @@ def _analyse(options: Options) -> int:
             return FAILED if options.only and any(of.failed for of in found) else 0
         if mean_force.NAME in options.only:
             raise OutputError(
-                f"pmf needs a sweep over the distance of a restraint, and {folder} is the folder of a run"
+                f"pmf needs a sweep over the distance of a restraint, and {folder} is the folder of"
+                " a run"
             )
         if options.extrapolate is not None:
-            raise OutputError(f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run")
+            raise OutputError(
+                f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run"
+            )
         done = analyse_folder(folder, *request, progress, options.figures)
     used = done.frames_used
-    print(f"{options.folder}: {used['frames']} frames from {used['from_ps']:g} to {used['to_ps']:g} ps")
+    print(
+        f"{options.folder}: {used['frames']} frames from {used['from_ps']:g} to"
+        f" {used['to_ps']:g} ps"
+    )
     for note in used["notes"]:
         print(f"  {note}")
     _print_results(done.results, done.failed)
-    print(f"{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd report` shows them")
+    print(
+        f"{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd"
+        " report` shows them"
+    )
     return FAILED if options.only and done.failed else 0
 
 

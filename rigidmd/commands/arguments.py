@@ -29,23 +29,28 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {}  # the commands of the imported modules, by name
 
 
-def command(position: int, about: str, example: str, *arguments: Argument, **options: Any) -> Callable:
+def command(
+    position: int, about: str, example: str, *arguments: Argument, **options: Any
+) -> Callable:
     """Register a function as the command of its name, without underscores around it.
 
-    position : in the list of `rigidmd --help`; options : those that no argument sets, such as `writes=True` of a
-    command whose results are files, not what it prints
+    position : in the list of `rigidmd --help`; options : those that no argument sets, such as
+    `writes=True` of a command whose results are files, not what it prints
     The function is called with the options, and returns the exit code.
     """
 
     def register(call: Callable[[Options], int]) -> Callable[[Options], int]:
-        COMMANDS[call.__name__.strip("_")] = Command(position, about, example, arguments, options, call)
+        COMMANDS[call.__name__.strip("_")] = Command(
+            position, about, example, arguments, options, call
+        )
         return call
 
     return register
 
 
 def argument(*names: str, **settings: Any) -> Argument:
-    """An argument of a command, by its names and the settings of `argparse.ArgumentParser.add_argument`."""
+    """An argument of a command, by its names and the settings of
+    `argparse.ArgumentParser.add_argument`."""
     return lambda parser: parser.add_argument(*names, **settings)
 
 
@@ -68,14 +73,18 @@ def time_ps(text: str) -> float:
     """Picoseconds in a time such as 200ps."""
     found = re.fullmatch(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) ?(fs|ps|ns|us)", text)
     if found is None or float(found[1]) == inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time with a unit, such as 200ps or 1.5ns")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a time with a unit, such as 200ps or 1.5ns"
+        )
     return float(found[1]) * {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6}[found[2]]
 
 
 def seconds(text: str) -> float:
     """Seconds in H:MM:SS, MM:SS or D-H:MM:SS."""
     found = re.fullmatch(r"(?:(?:(\d+)-)?(\d+):)?(\d+):(\d\d)", text)
-    days, hours, minutes, rest = (float(part or 0) for part in (found.groups() if found else [inf] * 4))
+    days, hours, minutes, rest = (
+        float(part or 0) for part in (found.groups() if found else [inf] * 4)
+    )
     found_seconds = 86400 * days + 3600 * hours + 60 * minutes + rest
     if found_seconds == inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not H:MM:SS, such as 3:50:00")
@@ -92,25 +101,44 @@ def output_folder(default: str, earlier: str = "earlier results") -> tuple[Argum
 
 #: For the Python files of forces of a scene.
 TRUST = argument(
-    "--trust", action="append", default=[], metavar="FILE.py",
-    help="let [[forces.custom]] of the scene run this Python file, or a copy of it; it is code and can do whatever "
-    "you can; may be repeated",
-)  # fmt: skip
+    "--trust",
+    action="append",
+    default=[],
+    metavar="FILE.py",
+    help=(
+        "let [[forces.custom]] of the scene run this Python file, or a copy of it; it is code and"
+        " can do whatever you can; may be repeated"
+    ),
+)
 #: SCENE, --set and --trust, which `read_scene` reads.
 SCENE = (
     argument("scene", metavar="SCENE", help="scene file (TOML)"),
-    argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
-        help="override a key of the scene by its dotted path (an entry of a list by its number, counted from 0, or a "
-        "stage by its name); KEY= without a value removes the key; may be repeated"),
+    argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help=(
+            "override a key of the scene by its dotted path (an entry of a list by its number,"
+            " counted from 0, or a stage by its name); KEY= without a value removes the key; may be"
+            " repeated"
+        ),
+    ),
     TRUST,
-)  # fmt: skip
+)
 
 
-def add_engine(parser: argparse.ArgumentParser, default: str = "the scene's", itself: bool = True) -> None:
-    """Add the options that set the table [engine] of a scene; itself : rigidmd is one of the engines."""
+def add_engine(
+    parser: argparse.ArgumentParser, default: str = "the scene's", itself: bool = True
+) -> None:
+    """Add the options that set the table [engine] of a scene; itself : rigidmd is one of the
+    engines."""
     *names, last = [*(["rigidmd"] if itself else []), *runnable()]
     known = f"{', '.join(names)} or {last}"
-    parser.add_argument("--engine", metavar="NAME", help=f"engine to use, {known}: engine.name (default: {default})")
+    parser.add_argument(
+        "--engine", metavar="NAME", help=f"engine to use, {known}: engine.name (default: {default})"
+    )
     for key, option in engine_options().items():
         kind, metavar = (int, "N") if option.values is int else (str, "NAME")
         values = f" ({', '.join(option.values)})" if isinstance(option.values, tuple) else ""
@@ -147,7 +175,8 @@ def run_folder(output: str) -> tuple[Argument, Argument, Argument]:
 
 
 def file_about_run(options: Options, default: str, extensions: tuple[str, ...]) -> Path:
-    """The file to write, by default in the folder of the run, where it may be replaced. Raises OutputError."""
+    """The file to write, by default in the folder of the run, where it may be replaced. Raises
+    OutputError."""
     from rigidmd.io.folder import add_to_folder, check_is_run
     from rigidmd.io.write import check_target
 
@@ -161,12 +190,19 @@ def file_about_run(options: Options, default: str, extensions: tuple[str, ...]) 
 
 
 def write_study(
-    folder: Path, force: bool, files: tuple[str, ...], begins: str, measure: Callable[[Callable], Any],
-    describe: Callable[[Any], list[str]], write: Callable[[Path, Any, str], list[Path]],
-) -> Any:  # fmt: skip
-    """Measure something, print it and write its files into a folder, which is locked meanwhile. Returns what was found.
+    folder: Path,
+    force: bool,
+    files: tuple[str, ...],
+    begins: str,
+    measure: Callable[[Callable], Any],
+    describe: Callable[[Any], list[str]],
+    write: Callable[[Path, Any, str], list[Path]],
+) -> Any:
+    """Measure something, print it and write its files into a folder, which is locked meanwhile.
+    Returns what was found.
 
-    files : names of all files that `write` may write; begins : what begins when the arguments have been checked
+    files : names of all files that `write` may write; begins : what begins when the arguments have
+        been checked
     """
     from rigidmd.io.folder import FolderLock, check_folder, make_folder
 
@@ -184,4 +220,7 @@ def write_study(
 def print_page(path: Path, notes: list[str]) -> None:
     for note in notes:
         print(note)
-    print(f"{path}: {path.stat().st_size / 1e6:.2g} MB; open it in a browser: {shlex.quote(str(path.resolve()))}")
+    print(
+        f"{path}: {path.stat().st_size / 1e6:.2g} MB; open it in a browser:"
+        f" {shlex.quote(str(path.resolve()))}"
+    )

@@ -8,12 +8,25 @@ from rigidmd.errors import SceneError
 
 
 @command(
-    70, "describe a run without running it", "rigidmd check water_nitrogen.toml", *SCENE, add_engine,
-    argument("--program", action="store_true",
-        help="also print the rows of a step: what is done, in which order, on how many blocks"),
-    argument("--profile", action="store_true",
-        help="also measure how much of the time of a step each row of the forces takes, from the start"),
-)  # fmt: skip
+    70,
+    "describe a run without running it",
+    "rigidmd check water_nitrogen.toml",
+    *SCENE,
+    add_engine,
+    argument(
+        "--program",
+        action="store_true",
+        help="also print the rows of a step: what is done, in which order, on how many blocks",
+    ),
+    argument(
+        "--profile",
+        action="store_true",
+        help=(
+            "also measure how much of the time of a step each row of the forces takes, from the"
+            " start"
+        ),
+    ),
+)
 def _check(options: Options) -> int:
     from rigidmd.assemble.describe import describe_system
     from rigidmd.scene import BodyScene
@@ -25,7 +38,9 @@ def _check(options: Options) -> int:
 
         if options.program or options.profile:
             option = "--program" if options.program else "--profile"
-            raise SceneError(scene.source, [f"{option} is for molecules; the step of a body is one loop"])
+            raise SceneError(
+                scene.source, [f"{option} is for molecules; the step of a body is one loop"]
+            )
         body = build_body(scene)
         print(describe_system(body))
         warnings = [*body.warnings, *body_step_warnings(body)]
@@ -69,7 +84,9 @@ def _print_profile(scene: Any) -> None:
     from rigidmd.run import Simulation
     from rigidmd.units import FEMTOSECOND
 
-    stages = [k for k, stage in enumerate(scene.stages) if not stage.is_minimisation and not stage.is_auto]
+    stages = [
+        k for k, stage in enumerate(scene.stages) if not stage.is_minimisation and not stage.is_auto
+    ]
     if not stages or scene.forces.custom:
         problem = "--profile needs a stage with a time step, and forces that are not user-defined"
         raise SceneError(scene.source, [problem])
@@ -78,5 +95,8 @@ def _print_profile(scene: Any) -> None:
     system, stage = simulation.system, scene.stages[stages[0]]
     scheme = integrator_of_stage(system, stages[0])
     profile = profile_of(system.engine(), state, scheme, stage.timestep_fs * FEMTOSECOND)
-    print(f"\ntime of a step of stages.{stages[0]} ({stage.label}) and of its rows, {simulation.threads} threads:")
+    print(
+        f"\ntime of a step of stages.{stages[0]} ({stage.label}) and of its rows,"
+        f" {simulation.threads} threads:"
+    )
     print(describe_profile(profile))

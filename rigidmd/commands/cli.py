@@ -1,7 +1,8 @@
 """`rigidmd`: the parsing of the command line, the messages and exit codes of errors.
 
-All modules of this package are imported; their functions with the decorator `command` are the commands. They compute
-nothing. Modules import what they need inside functions, so that `rigidmd --help` loads none of it.
+All modules of this package are imported; their functions with the decorator `command` are the
+commands. They compute nothing. Modules import what they need inside functions, so that `rigidmd
+--help` loads none of it.
 """
 
 import argparse
@@ -28,7 +29,7 @@ EXAMPLES = """examples:
   rigidmd run water.toml                    run it; results go to runs/water
   rigidmd run water.toml --set stages.production.timestep_fs=4 -o runs/water4
   rigidmd energy water.toml --unit kcal/mol
-  rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml      one body: a top, with figures of its motion
+  rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml    one body: a top, with figures
   rigidmd help                              the chapters of the documentation
 """
 
@@ -47,20 +48,31 @@ class CommandLine(Wording):
 
 
 #: What the loader of shared libraries and the system report where memory does not suffice.
-OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory", "can't start new thread")
+OUT_OF_MEMORY = (
+    "failed to map segment",
+    "cannot allocate memory",
+    "Cannot allocate memory",
+    "can't start new thread",
+)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command. Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 signal."""
+    """Run one command. Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or
+    143 signal."""
     from rigidmd.core.process import check_address_space, without_local_settings
 
     options = argparse.Namespace()
-    # Nothing of what is imported is garbage: the search for it took a quarter of a short run, most of it at the exit.
+    # Nothing of what is imported is garbage: the search for it took a quarter of a short run, most
+    # of it at the exit.
     gc.set_threshold(10_000, 50)
     atexit.register(gc.freeze)
 
     def show(message, category, *where, **more):
-        warn(str(message)) if issubclass(category, RigidMDWarning) else others(message, category, *where, **more)
+        (
+            warn(str(message))
+            if issubclass(category, RigidMDWarning)
+            else others(message, category, *where, **more)
+        )
 
     try:
         open_streams()
@@ -75,19 +87,30 @@ def main(arguments: list[str] | None = None) -> int:
         return FAILED if isinstance(error, SimulationError) else BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         return 0
-    except (KeyboardInterrupt, Exception) as error:  # libraries raise errors of many types for the causes below
+    except (
+        KeyboardInterrupt,
+        Exception,
+    ) as error:  # libraries raise errors of many types for the causes below
         causes: list[BaseException] = [error]
         while cause := causes[-1].__cause__ or causes[-1].__context__:
             causes.append(cause)
         if any(isinstance(cause, KeyboardInterrupt) for cause in causes):
             print("rigidmd: interrupted", file=sys.stderr)
             return INTERRUPTED
-        if any(isinstance(cause, MemoryError) for cause in causes):  # zipfile, too, raises another one instead
+        if any(
+            isinstance(cause, MemoryError) for cause in causes
+        ):  # zipfile, too, raises another one instead
             what = getattr(options, "scene", "this")
-            print(f"rigidmd: {what}: not enough memory{_free()}; take fewer molecules or samples", file=sys.stderr)
+            print(
+                f"rigidmd: {what}: not enough memory{_free()}; take fewer molecules or samples",
+                file=sys.stderr,
+            )
             return BAD_INPUT
         if any(words in str(cause) for cause in causes for words in OUT_OF_MEMORY):
-            print("rigidmd: not enough memory to load the program; raise the limit (ulimit -v)", file=sys.stderr)
+            print(
+                "rigidmd: not enough memory to load the program; raise the limit (ulimit -v)",
+                file=sys.stderr,
+            )
             return BAD_INPUT
         raise
 
@@ -103,7 +126,8 @@ def _free() -> str:
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
-    """The options of a command line; an unknown command or option ends the process with a suggestion."""
+    """The options of a command line; an unknown command or option ends the process with a
+    suggestion."""
     parser, commands = _parser()
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in commands:
@@ -119,16 +143,29 @@ def _parse(words: list[str]) -> argparse.Namespace:
 
 def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
     """The parser of a command line, and those of its commands by name."""
-    about = "Molecular dynamics of rigid molecules, and the motion of single rigid bodies, from a scene file."
+    about = (
+        "Molecular dynamics of rigid molecules, and the motion of single rigid bodies, from a scene"
+        " file."
+    )
     form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("rigidmd", description=about, epilog=EXAMPLES, formatter_class=form)
+    parser = argparse.ArgumentParser(
+        "rigidmd", description=about, epilog=EXAMPLES, formatter_class=form
+    )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for found in iter_modules(package.__path__):
         import_module(f"{package.__name__}.{found.name}")
     for name, command in sorted(COMMANDS.items(), key=lambda item: item[1].position):
-        description, epilog = command.about[0].upper() + command.about[1:] + ".", f"example:\n  {command.example}"
-        texts = {"help": command.about, "description": description, "epilog": epilog, "formatter_class": form}
+        description, epilog = (
+            command.about[0].upper() + command.about[1:] + ".",
+            f"example:\n  {command.example}",
+        )
+        texts = {
+            "help": command.about,
+            "description": description,
+            "epilog": epilog,
+            "formatter_class": form,
+        }
         of_command = commands.add_parser(name, **texts)
         of_command.set_defaults(command=command.call, **{"writes": False} | command.options)
         for add in command.arguments:

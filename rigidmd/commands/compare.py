@@ -8,13 +8,14 @@ from rigidmd.commands.arguments import Options, argument, command
 
 
 @command(
-    50, "report where two runs diverge and how their inputs and versions differ; exit code 0 if they are the same to "
-    "the last bit, else 1",
+    50,
+    "report where two runs diverge and how their inputs and versions differ; exit code 0 if they"
+    " are the same to the last bit, else 1",
     "rigidmd compare runs/water runs/water2",
     argument("first", metavar="RUN", help="folder of a run"),
     argument("second", metavar="RUN", help="folder of another run"),
     argument("--json", action="store_true", help="print JSON"),
-)  # fmt: skip
+)
 def _compare(options: Options) -> int:
     from rigidmd.studies.compare import compare, describe_run_comparison
 

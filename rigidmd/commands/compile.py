@@ -10,9 +10,15 @@ FIRST_SCENE = "water"
 
 @command(
     75,
-    "compile what a scene needs without running it, such as before a course or on the login node of a cluster",
+    "compile what a scene needs without running it, such as before a course or on the login node of"
+    " a cluster",
     "rigidmd compile water.toml",
-    argument("scene", metavar="SCENE", nargs="?", help=f"scene file (default: the shipped {FIRST_SCENE}.toml)"),
+    argument(
+        "scene",
+        metavar="SCENE",
+        nargs="?",
+        help=f"scene file (default: the shipped {FIRST_SCENE}.toml)",
+    ),
     *SCENE[1:],
 )
 def _compile(options: Options) -> int:

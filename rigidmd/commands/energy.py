@@ -7,12 +7,22 @@ from rigidmd.commands.arguments import SCENE, Options, argument, command, read_s
 
 
 @command(
-    60, "energies and forces of the start", "rigidmd energy water_dimer.toml --json", *SCENE,
-    argument("--unit", choices=["kJ/mol", "kcal/mol", "eV", "K"], help="unit of energy (kJ/mol; J for a body)"),
+    60,
+    "energies and forces of the start",
+    "rigidmd energy water_dimer.toml --json",
+    *SCENE,
+    argument(
+        "--unit",
+        choices=["kJ/mol", "kcal/mol", "eV", "K"],
+        help="unit of energy (kJ/mol; J for a body)",
+    ),
     argument("--json", action="store_true", help="print JSON"),
-    argument("--accuracy", action="store_true",
-        help="also measure the error of the Coulomb forces (Ewald sums and PME)"),
-)  # fmt: skip
+    argument(
+        "--accuracy",
+        action="store_true",
+        help="also measure the error of the Coulomb forces (Ewald sums and PME)",
+    ),
+)
 def _energy(options: Options) -> int:
     from rigidmd.errors import SceneError
     from rigidmd.run import Simulation
@@ -24,7 +34,10 @@ def _energy(options: Options) -> int:
         if options.accuracy:
             raise SceneError(scene.source, ["--accuracy needs molecules with Ewald sums"])
         if options.unit is not None:
-            raise SceneError(scene.source, [f"--unit {options.unit} is for molecules; the energy of a body is in J"])
+            raise SceneError(
+                scene.source,
+                [f"--unit {options.unit} is for molecules; the energy of a body is in J"],
+            )
         found, unit = Simulation(scene).start_energy(), "J"
     else:
         unit = options.unit or "kJ/mol"
@@ -39,7 +52,9 @@ def _energy(options: Options) -> int:
 
 
 def _print_molecules(name: str, found: dict[str, Any], unit: str) -> None:
-    removal = f", after {found['relief_steps']} steps of overlap removal" if found["relief_steps"] else ""
+    removal = (
+        f", after {found['relief_steps']} steps of overlap removal" if found["relief_steps"] else ""
+    )
     print(f"{name}: energies of the start, {found['molecules']} molecules{removal}")
     for note in found["notes"]:
         print(f"  {note}")
@@ -69,7 +84,10 @@ def _print_molecules(name: str, found: dict[str, Any], unit: str) -> None:
 def _print_body(name: str, found: dict[str, Any]) -> None:
     print(f"{name}: energy of the start")
     _print_rows([(key, found[key], "J") for key in ("kinetic", "potential", "energy")], ">22.15g")
-    for key, what, unit in (("force_N", "force (lab)", "N"), ("torque_body_N_m", "torque (body)", "N m")):
+    for key, what, unit in (
+        ("force_N", "force (lab)", "N"),
+        ("torque_body_N_m", "torque (body)", "N m"),
+    ):
         if found[key] is not None:
             print(f"  {what:<22}{' '.join(f'{x:>22.15g}' for x in found[key])} {unit}")
 

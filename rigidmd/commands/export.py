@@ -8,13 +8,19 @@ from rigidmd.engines.registry import programs
 
 
 @command(
-    80, "write a scene as a folder that runs on another engine by itself",
-    "rigidmd export water_pme.toml --to lammps -o water_lammps", *SCENE,
+    80,
+    "write a scene as a folder that runs on another engine by itself",
+    "rigidmd export water_pme.toml --to lammps -o water_lammps",
+    *SCENE,
     lambda parser: parser.add_argument(
-        "--to", required=True, choices=[name for name, of in programs().items() if of.writer], help="the engine"
+        "--to",
+        required=True,
+        choices=[name for name, of in programs().items() if of.writer],
+        help="the engine",
     ),
-    *output_folder("NAME-ENGINE", "an earlier export"), writes=True,
-)  # fmt: skip
+    *output_folder("NAME-ENGINE", "an earlier export"),
+    writes=True,
+)
 def _export(options: Options) -> int:
     from rigidmd.studies.other_engines import export
 

@@ -8,13 +8,17 @@ from rigidmd.commands.streams import announce
 
 
 @command(
-    160, "run shipped bodies and write a page with a picture of each, which links to its animation",
+    160,
+    "run shipped bodies and write a page with a picture of each, which links to its animation",
     "rigidmd gallery heavy_top_3 intermediate_axis",
-    argument("names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)"),
+    argument(
+        "names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)"
+    ),
     argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)"),
     argument("--force", action="store_true", help="replace an earlier gallery in that folder"),
-    scene="the gallery", writes=True,
-)  # fmt: skip
+    scene="the gallery",
+    writes=True,
+)
 def _gallery(options: Options) -> int:
     from rigidmd.io.write import check_target
     from rigidmd.view.run_page import INDEX, selected_bodies, write_gallery

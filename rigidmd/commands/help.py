@@ -4,9 +4,16 @@ from rigidmd.commands.arguments import Options, argument, command
 
 
 @command(
-    190, "list the chapters of the documentation, or print one", "rigidmd help water",
-    argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, on a terminal with $PAGER; or a word"),
-)  # fmt: skip
+    190,
+    "list the chapters of the documentation, or print one",
+    "rigidmd help water",
+    argument(
+        "chapter",
+        nargs="?",
+        metavar="CHAPTER",
+        help="chapter to print, on a terminal with $PAGER; or a word",
+    ),
+)
 def _help(options: Options) -> int:
     import os
     from pydoc import pager
@@ -16,10 +23,18 @@ def _help(options: Options) -> int:
 
     if options.chapter is not None:
         os.environ.setdefault("LESS", "FRX")  # `less` then ends at once after a text of one screen
-        pager(f"{chapter_text(options.chapter)}\n")  # $PAGER or `less` on a terminal, else plain text
+        pager(
+            f"{chapter_text(options.chapter)}\n"
+        )  # $PAGER or `less` on a terminal, else plain text
         return 0
-    print("chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` describes a command):")
+    print(
+        "chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` describes a"
+        " command):"
+    )
     for folder, found in contents().items():
-        lines = [fill(f"  {name:<14}  {about}", 120, subsequent_indent=" " * 18) for name, about in found.items()]
+        lines = [
+            fill(f"  {name:<14}  {about}", 120, subsequent_indent=" " * 18)
+            for name, about in found.items()
+        ]
         print(f"\n{folder}", *lines, sep="\n")
     return 0

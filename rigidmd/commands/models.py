@@ -9,19 +9,46 @@ from rigidmd.errors import MoleculeError
 
 
 @command(
-    170, "list the molecular models that rigidmd ships, show or draw one, or write a custom model",
-    "rigidmd models tip4p2005 --draw -o water.svg\n  rigidmd models --from dye.xyz --parameters table.toml -o dye.toml",
-    argument("model", nargs="?", metavar="NAME", help="model to show, or the .toml file of a custom model"),
+    170,
+    "list the molecular models that rigidmd ships, show or draw one, or write a custom model",
+    "rigidmd models tip4p2005 --draw -o water.svg\n  rigidmd models --from dye.xyz --parameters"
+    " table.toml -o dye.toml",
+    argument(
+        "model",
+        nargs="?",
+        metavar="NAME",
+        help="model to show, or the .toml file of a custom model",
+    ),
     argument("--draw", action="store_true", help="draw it to NAME.png"),
-    argument("--from", dest="geometry", metavar="FILE",
-        help="write a custom model: a structure file with one molecule, of any format that a scene reads"),
-    argument("--parameters", metavar="TABLE",
-        help="with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom or element"),
+    argument(
+        "--from",
+        dest="geometry",
+        metavar="FILE",
+        help=(
+            "write a custom model: a structure file with one molecule, of any format that a scene"
+            " reads"
+        ),
+    ),
+    argument(
+        "--parameters",
+        metavar="TABLE",
+        help=(
+            "with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom"
+            " or element"
+        ),
+    ),
     argument("--name", metavar="NAME", dest="custom_name", help="with --from: name of the model"),
-    argument("-o", "--output", metavar="FILE",
-        help="picture file: .png, .svg or .pdf; with --from the file of the model (default: the structure's, .toml)"),
+    argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        help=(
+            "picture file: .png, .svg or .pdf; with --from the file of the model (default: the"
+            " structure's, .toml)"
+        ),
+    ),
     argument("--force", action="store_true", help="replace that file"),
-)  # fmt: skip
+)
 def _models(options: Options) -> int:
     from rigidmd.assemble.plausibility import molecule_warnings
     from rigidmd.scene.models import available_models, load_model, read_molecule
@@ -31,7 +58,9 @@ def _models(options: Options) -> int:
         return _write_model(options)
     if options.parameters is not None or options.custom_name is not None:
         given = "--parameters" if options.parameters is not None else "--name"
-        raise MoleculeError("models", [f"{given} belongs to --from FILE, which writes a custom model"])
+        raise MoleculeError(
+            "models", [f"{given} belongs to --from FILE, which writes a custom model"]
+        )
     draws = options.draw or options.output is not None
     if options.model is None:
         if draws:
@@ -39,7 +68,11 @@ def _models(options: Options) -> int:
         print(models_table([load_model(name) for name in available_models()]))
         print("\n`rigidmd models NAME` shows one in full; --draw draws it")
         return 0
-    found = read_molecule(Path(options.model)) if options.model.endswith(".toml") else load_model(options.model)
+    found = (
+        read_molecule(Path(options.model))
+        if options.model.endswith(".toml")
+        else load_model(options.model)
+    )
     for warning in molecule_warnings(found) if options.model.endswith(".toml") else ():
         warn(warning)
     if not draws:
@@ -59,14 +92,23 @@ def _write_model(options: Options) -> int:
     from rigidmd.io.write import check_target
 
     if options.model is not None:
-        problem = f"--from writes a custom model: leave out {options.model}, or name the model by --name"
+        problem = (
+            f"--from writes a custom model: leave out {options.model}, or name the model by --name"
+        )
         raise MoleculeError("models", [problem])
-    geometry, parameters = Path(options.geometry), Path(options.parameters) if options.parameters else None
+    geometry, parameters = (
+        Path(options.geometry),
+        Path(options.parameters) if options.parameters else None,
+    )
     path = Path(options.output or f"{geometry.stem}.toml")
     if options.draw:
-        raise MoleculeError("models", [f"--from writes a model; draw it afterwards: rigidmd models {path} --draw"])
+        raise MoleculeError(
+            "models", [f"--from writes a model; draw it afterwards: rigidmd models {path} --draw"]
+        )
     file, found, notes = model_from_geometry(geometry, parameters, options.custom_name)
-    check_target(path, (".toml",), options.force, "model", [geometry, *([parameters] if parameters else [])])
+    check_target(
+        path, (".toml",), options.force, "model", [geometry, *([parameters] if parameters else [])]
+    )
     write_model(path, file)
     print(f"{path}: {found.name}, {found.description}; {file.source}")
     for note in [*notes, *molecule_warnings(found)]:

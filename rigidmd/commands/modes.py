@@ -5,7 +5,16 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from rigidmd.commands.arguments import SCENE, Options, argument, command, number, output_folder, read_scene, write_study
+from rigidmd.commands.arguments import (
+    SCENE,
+    Options,
+    argument,
+    command,
+    number,
+    output_folder,
+    read_scene,
+    write_study,
+)
 
 if TYPE_CHECKING:
     from rigidmd.studies.normal_modes import NormalModes
@@ -16,17 +25,35 @@ ROWS = 8
 
 
 @command(
-    65, "normal modes of rigid molecules at a minimum of the energy: frequencies, infrared intensities, zero-point and "
-    "free energy, the longest stable step",
-    "rigidmd modes water_dimer.toml --animate 10 && rigidmd view runs/water_dimer-modes", *SCENE,
+    65,
+    "normal modes of rigid molecules at a minimum of the energy: frequencies, infrared intensities,"
+    " zero-point and free energy, the longest stable step",
+    "rigidmd modes water_dimer.toml --animate 10 && rigidmd view runs/water_dimer-modes",
+    *SCENE,
     argument("--no-minimise", action="store_true", help="require that the start is a minimum"),
-    argument("--count", type=COUNT, metavar="N",
-        help="only the N lowest and N highest modes, by Lanczos (default: all, or 20 if there are more than 6000)"),
-    argument("--gamma", action="store_true",
-        help="only the modes at the Gamma point of the unit cell that structure.repeat repeats"),
-    argument("--animate", type=COUNT, metavar="K", help="also write mode K as a run, for `view` and `film`"),
-    *output_folder("runs/NAME-modes"), writes=True,
-)  # fmt: skip
+    argument(
+        "--count",
+        type=COUNT,
+        metavar="N",
+        help=(
+            "only the N lowest and N highest modes, by Lanczos (default: all, or 20 if there are"
+            " more than 6000)"
+        ),
+    ),
+    argument(
+        "--gamma",
+        action="store_true",
+        help="only the modes at the Gamma point of the unit cell that structure.repeat repeats",
+    ),
+    argument(
+        "--animate",
+        type=COUNT,
+        metavar="K",
+        help="also write mode K as a run, for `view` and `film`",
+    ),
+    *output_folder("runs/NAME-modes"),
+    writes=True,
+)
 def _modes(options: Options) -> int:
     from rigidmd.studies.normal_modes import FILE, animation_files, normal_modes, write_animation
 
@@ -57,22 +84,49 @@ def _modes(options: Options) -> int:
         yield f"  {perf_counter() - begin:.3g} s"
 
     folder = Path(options.output or f"runs/{scene.name}-modes")
-    write_study(folder, options.force, names, "minimising", compute, lambda found: list(describe(found)), write)
+    write_study(
+        folder,
+        options.force,
+        names,
+        "minimising",
+        compute,
+        lambda found: list(describe(found)),
+        write,
+    )
     return 0
 
 
 def _describe(found: "NormalModes") -> Iterator[str]:
     table, at, total, last = found.table(), found.wavenumber, found.total, len(found.rate) - 1
-    unstable, warm, is_whole = at[found.rate < 0], found.temperature, len(at) == len(found.coordinates.index)
+    unstable, warm, is_whole = (
+        at[found.rate < 0],
+        found.temperature,
+        len(at) == len(found.coordinates.index),
+    )
     point = "a saddle point" if len(unstable) else "a minimum"
-    yield f"{found.system.scene.name}: normal modes at {point} of the energy, {found.energy:.8g} kJ/mol"
+    yield (
+        f"{found.system.scene.name}: normal modes at {point} of the energy, {found.energy:.8g}"
+        " kJ/mol"
+    )
     why = f" ({found.ended})" if found.ended else ""
-    yield f"  largest force {found.force:.1e} kJ/(mol Å), largest torque {found.torque:.1e} kJ/mol{why}"
+    yield (
+        f"  largest force {found.force:.1e} kJ/(mol Å), largest torque {found.torque:.1e}"
+        f" kJ/mol{why}"
+    )
     if found.cells:
-        yield f"  modes at the Gamma point: equal displacements in all {found.cells} unit cells, intensities of one"
-    yield f"  {len(at)} of {total} modes: {(found.rate == 0).sum()} zero modes, {len(unstable)} unstable modes"
+        yield (
+            f"  modes at the Gamma point: equal displacements in all {found.cells} unit cells,"
+            " intensities of one"
+        )
+    yield (
+        f"  {len(at)} of {total} modes: {(found.rate == 0).sum()} zero modes, {len(unstable)}"
+        " unstable modes"
+    )
     if len(unstable):
-        yield f"  unstable: {', '.join(f'{x:.4g}' for x in unstable)} cm⁻¹; displace the molecules and repeat"
+        yield (
+            f"  unstable: {', '.join(f'{x:.4g}' for x in unstable)} cm⁻¹; displace the molecules"
+            " and repeat"
+        )
     for kind in ("translation", "libration"):
         if len(of := [x for k, x in enumerate(at) if x > 0 and found.kind(k) == kind]):
             yield f"  {kind}s: {len(of)}, from {of[0]:.4g} to {of[-1]:.4g} cm⁻¹"
@@ -80,10 +134,16 @@ def _describe(found: "NormalModes") -> Iterator[str]:
         yield f"  zero-point energy of the rigid model {found.free_energy(0):.6g} kJ/mol"
     if is_whole and warm:
         quantum, classical = found.free_energy(warm), found.free_energy(warm, quantum=False)
-        yield f"  free energy of the vibrations at {warm:g} K: {quantum:.6g} kJ/mol, classical {classical:.6g} kJ/mol"
+        yield (
+            f"  free energy of the vibrations at {warm:g} K: {quantum:.6g} kJ/mol, classical"
+            f" {classical:.6g} kJ/mol"
+        )
     if not found.cells:  # of the whole crystal other modes may be faster
         _, kind, *_, part, _, where = table.values(last)
         mode = f"mode {total}: {kind} of {part:.3g} molecules, largest in {where}"
-        yield f"  longest stable step of velocity Verlet {found.longest_step_fs:.3g} fs, set by {mode}"
+        yield (
+            f"  longest stable step of velocity Verlet {found.longest_step_fs:.3g} fs, set by"
+            f" {mode}"
+        )
     shown = [k for k in table.rows if k < ROWS or k > last - ROWS]
     yield "\n" + table._replace(rows=shown).text()

@@ -7,11 +7,13 @@ from rigidmd.commands.arguments import Options, argument, command
 
 
 @command(
-    20, "copy a shipped scene, notebook or script to start from", "rigidmd new water -o mine.toml",
+    20,
+    "copy a shipped scene, notebook or script to start from",
+    "rigidmd new water -o mine.toml",
     argument("name", metavar="NAME", help="which one; `rigidmd examples` lists them"),
     argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)"),
     argument("--force", action="store_true", help="replace that file"),
-)  # fmt: skip
+)
 def _new(options: Options) -> int:
     from rigidmd.core.shipped import copy_example, find_example, series_of
     from rigidmd.scene import Scene
@@ -21,7 +23,10 @@ def _new(options: Options) -> int:
     read = Scene.read(example.path).inputs.values() if example.kind == "scene" else ()
     written = copy_example(example, path, options.force, read)
     if example.name != options.name:
-        print(f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}); this is {example.name}")
+        print(
+            f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}); this is"
+            f" {example.name}"
+        )
     print(f"{path}: {example.about}")
     if inputs := [str(file) for file in written[1:]]:
         print(f"files that it reads, copied to the same folder: {', '.join(inputs)}")
@@ -31,7 +36,10 @@ def _new(options: Options) -> int:
         print(f"  python {quoted}    runs it; `rigidmd help extending` explains it")
         return 0
     if example.kind == "notebook":
-        print("  open it in Jupyter, VS Code or any program for notebooks: pip install chemiscope jupyterlab pandas")
+        print(
+            "  open it in Jupyter, VS Code or any program for notebooks: pip install chemiscope"
+            " jupyterlab pandas"
+        )
         print(f"  jupyter lab {quoted}")
         return 0
     print(f"  rigidmd check {quoted}    describes the run without running it")

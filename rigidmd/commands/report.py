@@ -6,10 +6,13 @@ from rigidmd.commands.arguments import Options, command, file_about_run, print_p
 
 
 @command(
-    138, "write one page about a run: means with errors, plots, margins, files, how to repeat it",
+    138,
+    "write one page about a run: means with errors, plots, margins, files, how to repeat it",
     "rigidmd report runs/water",
-    *run_folder("page (default: report.html in the folder of the run)"), scene="this run", writes=True,
-)  # fmt: skip
+    *run_folder("page (default: report.html in the folder of the run)"),
+    scene="this run",
+    writes=True,
+)
 def _report(options: Options) -> int:
     from rigidmd.view.run_page import REPORT, write_report
 

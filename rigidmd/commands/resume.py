@@ -7,10 +7,17 @@ from rigidmd.commands.run import DURATION, run
 
 
 @command(
-    40, "continue a run that was stopped", "rigidmd resume runs/water --until 200ps",
-    argument("folder", metavar="DIR", help="folder of the run"), TRUST, *DURATION,
-    overrides=[], force=False, resume=True, writes=True,
-)  # fmt: skip
+    40,
+    "continue a run that was stopped",
+    "rigidmd resume runs/water --until 200ps",
+    argument("folder", metavar="DIR", help="folder of the run"),
+    TRUST,
+    *DURATION,
+    overrides=[],
+    force=False,
+    resume=True,
+    writes=True,
+)
 def _resume(options: Options) -> int:
     from rigidmd.io.folder import SCENE, check_is_run
 

@@ -4,35 +4,70 @@ import shlex
 from pathlib import Path
 
 from rigidmd.commands import BY_SIGNAL, OUT_OF_TIME
-from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene, seconds, time_ps
+from rigidmd.commands.arguments import (
+    SCENE,
+    Options,
+    add_engine,
+    argument,
+    command,
+    read_scene,
+    seconds,
+    time_ps,
+)
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import SceneError
 
 #: Options of a run that begins or continues.
 DURATION = (
-    argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)"),
-    argument("--walltime", type=seconds, metavar="H:MM:SS",
-        help="stop shortly before this time is up, with a checkpoint and exit code 75"),
-    argument("--until", type=time_ps, metavar="TIME",
-        help="let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a finished run"),
-)  # fmt: skip
+    argument(
+        "--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)"
+    ),
+    argument(
+        "--walltime",
+        type=seconds,
+        metavar="H:MM:SS",
+        help="stop shortly before this time is up, with a checkpoint and exit code 75",
+    ),
+    argument(
+        "--until",
+        type=time_ps,
+        metavar="TIME",
+        help=(
+            "let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a"
+            " finished run"
+        ),
+    ),
+)
 
 
 @command(
-    30, "run a scene", "rigidmd run water.toml -o runs/water", *SCENE,
+    30,
+    "run a scene",
+    "rigidmd run water.toml -o runs/water",
+    *SCENE,
     argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)"),
     argument("--force", action="store_true", help="replace an earlier run in that folder"),
-    argument("--resume", action="store_true",
-        help="continue from the last checkpoint in that folder, with bitwise identical results; without one, start"),
-    add_engine, *DURATION, writes=True,
-)  # fmt: skip
+    argument(
+        "--resume",
+        action="store_true",
+        help=(
+            "continue from the last checkpoint in that folder, with bitwise identical results;"
+            " without one, start"
+        ),
+    ),
+    add_engine,
+    *DURATION,
+    writes=True,
+)
 def run(options: Options) -> int:
     from rigidmd.scene import BodyScene
 
     scene = read_scene(options)
     if options.threads is not None:
         if isinstance(scene, BodyScene):
-            raise SceneError(scene.source, ["--threads is for molecules; a single body uses one thread"])
+            raise SceneError(
+                scene.source, ["--threads is for molecules; a single body uses one thread"]
+            )
         scene = read_scene(options, threads=options.threads)
     if options.until is not None:
         scene = scene.with_end(options.until)
@@ -44,7 +79,13 @@ def run(options: Options) -> int:
     from rigidmd.run import Simulation
 
     simulation = Simulation(
-        scene, folder, options.force, say=announce, warn=warn, resume=options.resume, walltime=options.walltime
+        scene,
+        folder,
+        options.force,
+        say=announce,
+        warn=warn,
+        resume=options.resume,
+        walltime=options.walltime,
     )
     print(simulation.introduction(), flush=True)
     results = simulation.run(progress=True)
@@ -54,7 +95,11 @@ def run(options: Options) -> int:
     if results.interrupted:
         print(f"  `rigidmd resume {quoted}` continues it")
     else:
-        more = "report` the page alone" if isinstance(scene, BodyScene) else f"analyse {quoted}` measures it"
+        more = (
+            "report` the page alone"
+            if isinstance(scene, BodyScene)
+            else f"analyse {quoted}` measures it"
+        )
         print(f"  `rigidmd view {quoted}` shows its animation on a page, `rigidmd {more}")
     if results.out_of_time:
         return OUT_OF_TIME

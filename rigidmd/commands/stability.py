@@ -8,18 +8,32 @@ from rigidmd.commands.arguments import Options, argument, command, output_folder
 
 @command(
     110,
-    "try to break the engine: named cases, each compared with a known answer; exit code 1 if an error is undetected",
+    "try to break the engine: named cases, each compared with a known answer; exit code 1 if an"
+    " error is undetected",
     "rigidmd stability --quick --case near_linear --case water_steps",
     argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes"),
     argument("--case", action="append", metavar="NAME", help="only this case; may be repeated"),
-    *output_folder("runs/stability"), scene="stability", writes=True,
-)  # fmt: skip
+    *output_folder("runs/stability"),
+    scene="stability",
+    writes=True,
+)
 def _stability(options: Options) -> int:
-    from rigidmd.studies.stability.report import FILES, conclusions, run_cases, table_text, write_stability
+    from rigidmd.studies.stability.report import (
+        FILES,
+        conclusions,
+        run_cases,
+        table_text,
+        write_stability,
+    )
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
     results = write_study(
-        folder, options.force, FILES, "", lambda progress: list(run_cases(options.case, options.quick, progress)),
-        lambda results: [table_text(results), "", *conclusions(results)], write_stability,
-    )  # fmt: skip
+        folder,
+        options.force,
+        FILES,
+        "",
+        lambda progress: list(run_cases(options.case, options.quick, progress)),
+        lambda results: [table_text(results), "", *conclusions(results)],
+        write_stability,
+    )
     return FAILED if any(result.failures for result in results) else 0

@@ -1,4 +1,5 @@
-"""Standard output and standard error: messages, progress, and streams that are closed, full, or without a reader."""
+"""Standard output and standard error: messages, progress, and streams that are closed, full, or
+without a reader."""
 
 import contextlib
 import io
@@ -20,7 +21,8 @@ def warn(message: str) -> None:
 
 @contextlib.contextmanager
 def progress_bar(begins: str = "") -> Iterator[Callable]:
-    """A bar on a terminal, which disappears at its end: a function of the fraction that is done and a description.
+    """A bar on a terminal, which disappears at its end: a function of the fraction that is done and
+    a description.
 
     begins : what begins at the fraction 0, when all arguments have been checked
     """
@@ -40,8 +42,9 @@ def progress_bar(begins: str = "") -> Iterator[Callable]:
 
 
 def open_streams() -> None:
-    """Open what was closed before the start, so that no file of a run gets the number of a standard stream. What the
-    encoding of a terminal lacks is written as an escape and does not end the run."""
+    """Open what was closed before the start, so that no file of a run gets the number of a standard
+    stream. What the encoding of a terminal lacks is written as an escape and does not end the
+    run."""
     for number in (0, 1, 2):
         try:
             os.fstat(number)
@@ -56,7 +59,8 @@ def open_streams() -> None:
 
 @contextlib.contextmanager
 def checked_streams(lasting: bool) -> Iterator[None]:
-    """Within it a stream that cannot be written raises OutputError, or BrokenPipeError if its reader has gone.
+    """Within it a stream that cannot be written raises OutputError, or BrokenPipeError if its
+    reader has gone.
 
     lasting : raise neither; the stream goes silent
     """
@@ -68,7 +72,8 @@ def checked_streams(lasting: bool) -> Iterator[None]:
 
 
 class _Checked:
-    """A text stream that goes silent when it cannot be written, and raises an error unless it is a lasting one."""
+    """A text stream that goes silent when it cannot be written, and raises an error unless it is a
+    lasting one."""
 
     def __init__(self, stream: TextIO, lasting: bool):
         self._stream, self._lasting = stream, lasting
@@ -91,7 +96,9 @@ class _Checked:
             yield
         except OSError as error:
             # further output goes to the null device, with what the stream still holds
-            with contextlib.suppress(OSError, ValueError):  # a stream in memory has no number, and does not fail
+            with contextlib.suppress(
+                OSError, ValueError
+            ):  # a stream in memory has no number, and does not fail
                 nowhere = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(nowhere, self._stream.fileno())
                 os.close(nowhere)

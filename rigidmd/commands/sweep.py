@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigidmd.commands import BY_SIGNAL, FAILED, INTERRUPTED, OUT_OF_TIME
-from rigidmd.commands.arguments import TRUST, Options, argument, command, number, output_folder, seconds
+from rigidmd.commands.arguments import (
+    TRUST,
+    Options,
+    argument,
+    command,
+    number,
+    output_folder,
+    seconds,
+)
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import OutputError, visible
 
@@ -23,33 +31,90 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
 
 
 @command(
-    130, "run a scene at many points, a folder each, with a table and a figure of means and errors",
-    "rigidmd sweep water.toml --set stages.equilibration.temperature_K=280,290,300 --set seed=1..8 --jobs 2\n"
-    "  rigidmd sweep water.toml --replicas 8\n"
-    "  rigidmd sweep water.toml --set stages.2.timestep_fs=1,2,4 --extrapolate stages.2.timestep_fs --replicas 8\n"
-    "  rigidmd sweep water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
+    130,
+    "run a scene at many points, a folder each, with a table and a figure of means and errors",
+    "rigidmd sweep water.toml --set stages.equilibration.temperature_K=280,290,300 --set seed=1..8"
+    " --jobs 2\n  rigidmd sweep water.toml --replicas 8\n  rigidmd sweep water.toml --set"
+    " stages.2.timestep_fs=1,2,4 --extrapolate stages.2.timestep_fs --replicas 8\n  rigidmd sweep"
+    " water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
     argument("scene", metavar="SCENE", help="scene file (TOML)"),
-    argument("--set", action="append", default=[], metavar="KEY=A,B,...", dest="sets",
-        help="values of a key of the scene (entries of a list are counted from 0); KEY=1..8 for whole numbers; "
-        "KEY=VALUE the same for all; KEY,KEY=A,B for keys that vary together; may be repeated: all combinations run"),
-    argument("--replicas", type=number(int, 2, 10000, "a number of replicas from 2 on"), metavar="N",
-        help="run N seeds, from the scene's seed on: errors from their scatter"),
+    argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=A,B,...",
+        dest="sets",
+        help=(
+            "values of a key of the scene (entries of a list are counted from 0); KEY=1..8 for"
+            " whole numbers; KEY=VALUE the same for all; KEY,KEY=A,B for keys that vary together;"
+            " may be repeated: all combinations run"
+        ),
+    ),
+    argument(
+        "--replicas",
+        type=number(int, 2, 10000, "a number of replicas from 2 on"),
+        metavar="N",
+        help="run N seeds, from the scene's seed on: errors from their scatter",
+    ),
     *output_folder("runs/NAME-sweep", "an earlier sweep"),
-    argument("--jobs", type=COUNT, metavar="N", help="points at a time (default: as many as fill all cores)"),
-    argument("--threads", type=COUNT, metavar="N", help="threads of each point (default: cores over jobs)"),
-    argument("--walltime", type=seconds, metavar="H:MM:SS",
-        help="stop shortly before this time is up, with checkpoints and exit code 75; with --to slurm of each job"),
-    argument("--scheduler", metavar="ADDRESS",
-        help="run on a cluster of dask.distributed: tcp://HOST:8786, or `local` for one that is started here"),
-    argument("--to", choices=["slurm"], help="run nothing, and write a script for an array of jobs, a point each"),
-    argument("--collect", action="store_true", help="run nothing, and write table and figure of existing results"),
-    argument("--extrapolate", metavar="KEY",
-        help="extrapolate all averages to a step of 0, with their errors, over this time step of the last stage, which "
-        "--set varies; `rigidmd analyse` has the same option for what it measures"),
-    argument("--point", type=number(int, 0, inf, "the number of a point, from 0 on"), metavar="K",
-        help="run point K of an existing sweep, counted from 0"),
-    TRUST, overrides=[], writes=True,
-)  # fmt: skip
+    argument(
+        "--jobs",
+        type=COUNT,
+        metavar="N",
+        help="points at a time (default: as many as fill all cores)",
+    ),
+    argument(
+        "--threads",
+        type=COUNT,
+        metavar="N",
+        help="threads of each point (default: cores over jobs)",
+    ),
+    argument(
+        "--walltime",
+        type=seconds,
+        metavar="H:MM:SS",
+        help=(
+            "stop shortly before this time is up, with checkpoints and exit code 75; with --to"
+            " slurm of each job"
+        ),
+    ),
+    argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help=(
+            "run on a cluster of dask.distributed: tcp://HOST:8786, or `local` for one that is"
+            " started here"
+        ),
+    ),
+    argument(
+        "--to",
+        choices=["slurm"],
+        help="run nothing, and write a script for an array of jobs, a point each",
+    ),
+    argument(
+        "--collect",
+        action="store_true",
+        help="run nothing, and write table and figure of existing results",
+    ),
+    argument(
+        "--extrapolate",
+        metavar="KEY",
+        help=(
+            "extrapolate all averages to a step of 0, with their errors, over this time step of the"
+            " last stage, which --set varies; `rigidmd analyse` has the same option for what it"
+            " measures"
+        ),
+    ),
+    argument(
+        "--point",
+        type=number(int, 0, inf, "the number of a point, from 0 on"),
+        metavar="K",
+        help="run point K of an existing sweep, counted from 0",
+    ),
+    TRUST,
+    overrides=[],
+    writes=True,
+)
 def _sweep(options: Options) -> int:
     from contextlib import ExitStack
 
@@ -63,7 +128,10 @@ def _sweep(options: Options) -> int:
     with ExitStack() as stack:
         if options.collect and not options.sets and options.replicas is None:
             if folder is None:
-                raise OutputError("--collect needs -o, the folder of the sweep, or the --set that it was made with")
+                raise OutputError(
+                    "--collect needs -o, the folder of the sweep, or the --set that it was made"
+                    " with"
+                )
             return _collect(open_existing_sweep(folder, stack), options.extrapolate)
         scene, axes = Path(options.scene), parse_axes(options.sets)
         more = options.replicas, options.trust, options.force, options.extrapolate
@@ -86,15 +154,25 @@ def _check(options: Options) -> None:
         raise OutputError("--to slurm needs --walltime, the time of each job: --walltime 4:00:00")
     if options.point is not None and not options.output:
         raise OutputError("--point needs -o, the folder of the sweep")
-    alone = [name for name in ("to", "collect", "point", "scheduler") if getattr(options, name) not in (None, False)]
+    alone = [
+        name
+        for name in ("to", "collect", "point", "scheduler")
+        if getattr(options, name) not in (None, False)
+    ]
     if len(alone) > 1:
         raise OutputError(f"--{alone[0]} and --{alone[1]} cannot be combined")
     if options.point is not None and (options.sets or options.replicas or options.force):
-        raise OutputError("--point uses the settings in the folder; leave out --set, --replicas and --force")
+        raise OutputError(
+            "--point uses the settings in the folder; leave out --set, --replicas and --force"
+        )
     if options.extrapolate is not None and (options.point is not None or options.to is not None):
-        raise OutputError("--extrapolate needs results; when all points have ended, use it with --collect")
+        raise OutputError(
+            "--extrapolate needs results; when all points have ended, use it with --collect"
+        )
     if options.collect and options.force:
-        raise OutputError("--collect only reads existing results; leave out --force, which removes them")
+        raise OutputError(
+            "--collect only reads existing results; leave out --force, which removes them"
+        )
 
 
 def _run(options: Options, sweep: "OpenSweep") -> int:
@@ -108,7 +186,9 @@ def _run(options: Options, sweep: "OpenSweep") -> int:
         threads = options.threads or 1  # a thread of a worker of dask for each point
     count = len(manifest.points)
     before = count - sweep.left
-    print(f"{manifest.name}: {count} points in {folder}, {before} of them finished before", flush=True)
+    print(
+        f"{manifest.name}: {count} points in {folder}, {before} of them finished before", flush=True
+    )
     if sweep.left:
         if options.scheduler is None:
             runner, where = Pool(jobs, threads), f"{jobs if jobs > 1 else 'one'} at a time"
@@ -117,7 +197,9 @@ def _run(options: Options, sweep: "OpenSweep") -> int:
             where = f"on the cluster {options.scheduler}"
         print(f"  {where}, {threads} thread{'s' if threads > 1 else ''} each", flush=True)
         with progress_of(sweep.left, "points", True) as bar:
-            outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _shown_on(bar))
+            outcome = run_points(
+                folder, manifest, runner, options.walltime, options.trust, _shown_on(bar)
+            )
     _print_results(sweep, options.extrapolate)
     ended = f"{len(outcome.finished)} finished, {len(outcome.failed)} failed, {before} skipped"
     print(f"  {ended}, {len(outcome.left)} left; {outcome.seconds:.3g} s")
@@ -135,7 +217,8 @@ def _run(options: Options, sweep: "OpenSweep") -> int:
 
 
 def _shown_on(bar: "Bar") -> Callable[[str, str, Any], None]:
-    """A function that shows messages of points: fractions as progress, warnings once each, failures at once."""
+    """A function that shows messages of points: fractions as progress, warnings once each, failures
+    at once."""
     from tqdm import tqdm
 
     from rigidmd.studies.sweep.sweeping import ProgressOfPoints
@@ -149,9 +232,15 @@ def _shown_on(bar: "Bar") -> Callable[[str, str, Any], None]:
         if kind in ("ended", "died"):
             why = value if kind == "died" else value["message"]
             line = f"  {name}: {visible(why)}" if why else ""
-        elif value not in shown and (kind == "warned" or (kind == "announced" and value.startswith("compiling"))):
+        elif value not in shown and (
+            kind == "warned" or (kind == "announced" and value.startswith("compiling"))
+        ):
             shown.add(value)
-            line = f"rigidmd: warning: {name}: {visible(value)}" if kind == "warned" else f"  {name}: {value} ..."
+            line = (
+                f"rigidmd: warning: {name}: {visible(value)}"
+                if kind == "warned"
+                else f"  {name}: {value} ..."
+            )
         if line:
             tqdm.write(line, file=sys.stderr)
 
@@ -170,7 +259,9 @@ def _print_results(sweep: "OpenSweep", step: str | None) -> None:
     names = ["sweep.json", *(path.name for path in files)]
     names += [] if step is None else print_limits(sweep.folder, sweep.manifest, step)
     count = len(sweep.manifest.points)
-    print(f"\n  files in {sweep.folder}: {', '.join(names)}, and a folder for each of {count} points")
+    print(
+        f"\n  files in {sweep.folder}: {', '.join(names)}, and a folder for each of {count} points"
+    )
     if any(row.runs for row in table.rows):
         print(f"  `rigidmd analyse {shlex.quote(str(sweep.folder))}` measures all of them")
 
@@ -189,7 +280,10 @@ def print_limits(folder: Path, manifest: "Manifest", step: str) -> list[str]:
 
 def _collect(sweep: "OpenSweep", step: str | None) -> int:
     count = len(sweep.manifest.points)
-    print(f"{sweep.manifest.name}: {count} points in {sweep.folder}, {count - sweep.left} of them finished")
+    print(
+        f"{sweep.manifest.name}: {count} points in {sweep.folder}, {count - sweep.left} of them"
+        " finished"
+    )
     _print_results(sweep, step)
     return FAILED if sweep.left else 0
 
@@ -201,7 +295,10 @@ def _run_point(options: Options) -> int:
     from rigidmd.studies.sweep.sweeping import run_point
 
     show = {"warned": warn, "announced": announce}
-    send = lambda kind, value: show[kind](value) if kind in show else None  # noqa: E731
+
+    def send(kind, value):
+        return show[kind](value) if kind in show else None
+
     folder, scene = Path(options.output), Path(options.scene)
     name, ended = run_point(folder, options.point, scene, options.walltime, options.trust, send)
     print(f"{name}: {ended['state']}, {ended['seconds']:.3g} s")

@@ -10,22 +10,33 @@ from rigidmd.engines.registry import runnable
 
 def _engine(parser: argparse.ArgumentParser) -> None:
     first, *_ = runnable()
-    precise = [f"; {name} with {key} {value}" for name, of in runnable().items() for key, value in of.precise.items()]
+    precise = [
+        f"; {name} with {key} {value}"
+        for name, of in runnable().items()
+        for key, value in of.precise.items()
+    ]
     add_engine(parser, f"the scene's, or {first}{''.join(precise)}", itself=False)
 
 
 @command(
-    90, "compute a scene on two engines and compare energies by term, forces, virial, and a short run; exit code 0 if "
-    "they agree, else 1",
+    90,
+    "compute a scene on two engines and compare energies by term, forces, virial, and a short run;"
+    " exit code 0 if they agree, else 1",
     "rigidmd verify water_pme.toml --engine lammps --ranks 2",
-    *SCENE, _engine, argument("--json", action="store_true", help="print JSON"),
-)  # fmt: skip
+    *SCENE,
+    _engine,
+    argument("--json", action="store_true", help="print JSON"),
+)
 def _verify(options: Options) -> int:
     from rigidmd.scene import MolecularScene
     from rigidmd.studies.other_engines import verify
 
     scene = read_scene(options)
-    if options.engine is None and isinstance(scene, MolecularScene) and not scene.engine.is_external:
+    if (
+        options.engine is None
+        and isinstance(scene, MolecularScene)
+        and not scene.engine.is_external
+    ):
         options.engine, *_ = runnable()
     if options.engine in runnable():
         for key, value in runnable()[options.engine].precise.items():

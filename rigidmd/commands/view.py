@@ -6,10 +6,13 @@ from rigidmd.commands.arguments import Options, command, file_about_run, print_p
 
 
 @command(
-    140, "write one page with the animation of a run, which opens in any browser without a network",
+    140,
+    "write one page with the animation of a run, which opens in any browser without a network",
     "rigidmd view runs/water -o water.html",
-    *run_folder("page (default: view.html in the folder of the run)"), scene="this run", writes=True,
-)  # fmt: skip
+    *run_folder("page (default: view.html in the folder of the run)"),
+    scene="this run",
+    writes=True,
+)
 def _view(options: Options) -> int:
     from rigidmd.view.run_page import VIEW, write_view
 

@@ -3,13 +3,20 @@
 The names that the author of a term needs are exported here; `simd` has the vectors.
 """
 
-# isort: skip_file
 # ruff: noqa: F401  (other packages import these names from here)
 from rigidmd.compile import settings  # before Numba is loaded
 from rigidmd.compile.code import (
-    BoundTask, Code, CompiledTask, TaskArguments, call, call_blocks, compile_together, load_arguments,
-    pack_arguments, task,
-)  # fmt: skip
+    BoundTask,
+    Code,
+    CompiledTask,
+    TaskArguments,
+    call,
+    call_blocks,
+    compile_together,
+    load_arguments,
+    pack_arguments,
+    task,
+)
 from rigidmd.compile.kernels import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 from rigidmd.compile.program import ALWAYS, Pass, Program, Rows, run_passes, run_row

@@ -1,17 +1,20 @@
 """The cache of compiled code: its folder and its index.
 
-Numba's disk cache checks only the file of the function itself: after a change of a function in another file, callers
-would run the old code. So each index is named by a digest of the definitions that its kernel reaches (`sources`), and
-the folder by one of this package, the version of Numba and its settings. An edited docstring compiles nothing, a
-changed function what calls it. The environment variable `RIGIDMD_CACHE` sets another parent folder.
+Numba's disk cache checks only the file of the function itself: after a change of a function in
+another file, callers would run the old code. So each index is named by a digest of the definitions
+that its kernel reaches (`sources`), and the folder by one of this package, the version of Numba and
+its settings. An edited docstring compiles nothing, a changed function what calls it. The
+environment variable `RIGIDMD_CACHE` sets another parent folder.
 
-The cache holds machine code and pickles, which are executed. It is therefore used only if this user, or root, owns its
-folders and files and nobody else may write to them. Without such a folder, code is stored in a temporary one, which
-only this process uses. A cache that fails costs time and nothing else.
+The cache holds machine code and pickles, which are executed. It is therefore used only if this
+user, or root, owns its folders and files and nobody else may write to them. Without such a folder,
+code is stored in a temporary one, which only this process uses. A cache that fails costs time and
+nothing else.
 
-Private parts of Numba, each tested by tests/test_compile.py: a `FunctionCache` reads its folder from
-`numba.config.CACHE_DIR` when it is created, in a subfolder named by `get_suitable_cache_subpath`. Its class and that of
-its index, an `IndexDataCacheFile`, may be changed. The methods of `CacheIndex` load and save its index and data.
+Private parts of Numba, each tested by tests/test_compile.py: a `FunctionCache` reads its folder
+from `numba.config.CACHE_DIR` when it is created, in a subfolder named by
+`get_suitable_cache_subpath`. Its class and that of its index, an `IndexDataCacheFile`, may be
+changed. The methods of `CacheIndex` load and save its index and data.
 """
 
 import atexit
@@ -52,7 +55,8 @@ OTHERS_WRITE = 0o022  # permissions of group and others
 
 @functools.cache
 def compiler_digest() -> str:
-    """Hexadecimal digest of this package, Numba's version and settings, and the width of vectors."""
+    """Hexadecimal digest of this package, Numba's version and settings, and the width of
+    vectors."""
     settings = f"{numba.__version__} {SIMD_BITS} {CODE_SETTINGS} {sources.package_digest()}"
     return hashlib.sha256(settings.encode()).hexdigest()[:16]
 
@@ -71,7 +75,8 @@ class CacheFolders(NamedTuple):
 
 
 def _base_folder() -> Path | None:
-    """The folder of the caches for all versions of the sources; None if this user has no home folder."""
+    """The folder of the caches for all versions of the sources; None if this user has no home
+    folder."""
     if named := os.environ.get("RIGIDMD_CACHE"):
         return Path(named).absolute()
     import platformdirs
@@ -140,7 +145,8 @@ def _temporary_folder() -> str | None:
 
 
 def _remove_unused(base: Path) -> None:
-    """Remove the folders that were not used for a month, and in the others the files of which this is true."""
+    """Remove the folders that were not used for a month, and in the others the files of which this
+    is true."""
     for folder in base.iterdir():
         if not re.fullmatch(r"kernels-[0-9a-f]{16}", folder.name) or not folder.is_dir():
             continue
@@ -171,7 +177,10 @@ def describe_cache() -> str:
     """Whether compiled code is stored, for messages."""
     if is_persistent():
         return "kept on disk: the next run starts at once"
-    return f"not kept, as {cache_folders().problem}: the next run compiles again; RIGIDMD_CACHE names another folder"
+    return (
+        f"not kept, as {cache_folders().problem}: the next run compiles again; RIGIDMD_CACHE names"
+        " another folder"
+    )
 
 
 @contextlib.contextmanager
@@ -193,7 +202,8 @@ _announcements: list[Callable[[], None]] = []
 
 @contextlib.contextmanager
 def compiling_announced(announce: Callable[[], None]) -> Iterator[None]:
-    """Within the block, `announce` is called once before something is compiled; never if all code is stored."""
+    """Within the block, `announce` is called once before something is compiled; never if all code
+    is stored."""
     _announcements.append(announce)
     try:
         yield
@@ -207,7 +217,9 @@ def _announce_compiling() -> None:
         _announcements.pop()()
 
 
-_warn_once = functools.cache(functools.partial(warnings.warn, category=RigidMDWarning, stacklevel=2))
+_warn_once = functools.cache(
+    functools.partial(warnings.warn, category=RigidMDWarning, stacklevel=2)
+)
 
 
 class UnreadableError(Exception):
@@ -217,15 +229,16 @@ class UnreadableError(Exception):
 class CacheIndex(IndexDataCacheFile):
     """Index of a cache: compiled functions by the types of their arguments.
 
-    Each index belongs to the definitions that its function reaches, with the classes in the types of its arguments, so
-    that an index can be read where these classes are. Code for types of modules from outside of the
-    package is stored only if the name of the module follows from its source (`core.user_modules`). Changes of other
-    modules are not noticed, so that old code would run. An index that this process cannot read is not replaced: other
-    processes may be able to read it.
-    The files of machine code have random names. Numba numbers them, and two processes that compiled at the same time
-    for different types wrote to the same file, after which every run crashed. Every file begins with a checksum; a
-    damaged file is ignored, and its code is compiled again. A folder for all users is also read, see
-    `cache_folders`.
+    Each index belongs to the definitions that its function reaches, with the classes in the types
+    of its arguments, so that an index can be read where these classes are. Code for types of
+    modules from outside of the
+    package is stored only if the name of the module follows from its source (`core.user_modules`).
+    Changes of other modules are not noticed, so that old code would run. An index that this process
+    cannot read is not replaced: other processes may be able to read it.
+    The files of machine code have random names. Numba numbers them, and two processes that compiled
+    at the same time for different types wrote to the same file, after which every run crashed.
+    Every file begins with a checksum; a damaged file is ignored, and its code is compiled again. A
+    folder for all users is also read, see `cache_folders`.
     """
 
     function: Callable | None = None  # whose code it has
@@ -259,7 +272,8 @@ class CacheIndex(IndexDataCacheFile):
             return None
 
     def _index_for(self, key) -> "CacheIndex | None":
-        """The index for the types of a key and the present sources; None if their code is not stored."""
+        """The index for the types of a key and the present sources; None if their code is not
+        stored."""
         classes = set(_classes_in(getattr(key[0], "args", key[0])))
         outside = {one.__module__ for one in classes if not _is_of_package(one.__module__)}
         if not all(name.startswith(GENERATED_PREFIX) for name in outside):
@@ -298,12 +312,15 @@ class CacheIndex(IndexDataCacheFile):
             file.write(hashlib.sha256(content).digest() + content)
 
     def _read(self, path: str):
-        """The content of a file. Raises OSError, or UnreadableError if this process lacks a type in it."""
+        """The content of a file. Raises OSError, or UnreadableError if this process lacks a type in
+        it."""
         with open(path, "rb") as file:
             with contextlib.suppress(OSError):
                 os.utime(path)  # it is in use
             if reason := untrusted_reason(os.fstat(file.fileno())):
-                message = f"compiled code in {Path(path).parent} is not used, as a file in it {reason}"
+                message = (
+                    f"compiled code in {Path(path).parent} is not used, as a file in it {reason}"
+                )
                 _warn_once(message)
                 raise OSError(message)
             data = file.read()
@@ -327,14 +344,18 @@ def _classes_in(kind) -> Iterator[type]:
         if isinstance(kind, types.BaseNamedTuple):
             yield kind.instance_class
     else:  # types of `compile`: `CodeType`, `TaskArguments`, `Record`
-        inner = (*getattr(kind, "task_types", ()), *([kind.content] if hasattr(kind, "content") else ()))
+        inner = (
+            *getattr(kind, "task_types", ()),
+            *([kind.content] if hasattr(kind, "content") else ()),
+        )
     for part in inner:
         yield from _classes_in(part)
 
 
 @functools.cache
 def _is_of_package(module: str) -> bool:
-    """Whether every process has a module: its file lies in the package. Its name alone does not show that."""
+    """Whether every process has a module: its file lies in the package. Its name alone does not
+    show that."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return module == "builtins" or (file is not None and Path(file).is_relative_to(sources.PACKAGE))
 
@@ -351,14 +372,16 @@ class KernelCache(FunctionCache):
             _warn_once(f"compiled code is not kept, as {reason}; the next run compiles again")
 
 
-#: Held while a setting of Numba is changed. A thread that holds it must not wait for another lock: Numba may hold one.
+#: Held while a setting of Numba is changed. A thread that holds it must not wait for another lock:
+#: Numba may hold one.
 _config_lock = threading.Lock()
 
 
 def open_cache(function: Callable) -> FunctionCache | NullCache:
     """The cache of a function in the folder of rigidmd; other users of Numba keep their folder.
 
-    Without a usable folder, nothing is stored. Numba alone would then use a folder next to the source of the function.
+    Without a usable folder, nothing is stored. Numba alone would then use a folder next to the
+    source of the function.
     """
     folder = cache_folder()
     if folder is None or not _make_subfolder(folder, function):
@@ -380,7 +403,8 @@ def open_cache(function: Callable) -> FunctionCache | NullCache:
 
 
 def _index_of(function: Callable, opened: FunctionCache) -> CacheIndex:
-    """The index of a function. Of one of the package its definitions decide, not the line, time and size of a file."""
+    """The index of a function. Of one of the package its definitions decide, not the line, time and
+    size of a file."""
     name, stamp = opened._impl.filename_base, opened._cache_file._source_stamp
     if _is_of_package(function.__module__) and "<locals>" not in function.__qualname__:
         name, stamp = re.sub(r"-\d+\.py", ".py", name), ""
@@ -390,7 +414,8 @@ def _index_of(function: Callable, opened: FunctionCache) -> CacheIndex:
 
 
 def _make_subfolder(folder: str, function: Callable) -> bool:
-    """Make the folder for the functions of a source file, before Numba makes it; whether it can be used."""
+    """Make the folder for the functions of a source file, before Numba makes it; whether it can be
+    used."""
     subfolder = Path(folder) / _CacheLocator.get_suitable_cache_subpath(inspect.getfile(function))
     try:
         subfolder.mkdir(mode=0o700, exist_ok=True)

@@ -1,4 +1,5 @@
-"""Tasks: machine code that is called by address. Each address carries the type for which the code was compiled."""
+"""Tasks: machine code that is called by address. Each address carries the type for which the code
+was compiled."""
 
 import contextlib
 import ctypes
@@ -33,11 +34,12 @@ from rigidmd.errors import SettingError
 LONGEST_WAIT = 120.0
 
 
-# --- tasks -----------------------------------------------------------------------------------------------------------
+# --- tasks ----------------------------------------------------------------------------------------
 
 
 class TaskArguments(types.Type):
-    """Numba type of the address of a task's arguments, a value of any type whose named tuples are records."""
+    """Numba type of the address of a task's arguments, a value of any type whose named tuples are
+    records."""
 
     def __init__(self, content):
         self.content = by_reference(content)
@@ -45,7 +47,8 @@ class TaskArguments(types.Type):
 
     @property
     def key(self):
-        """The type of the arguments. The name does not identify it: classes of the same name have the same."""
+        """The type of the arguments. The name does not identify it: classes of the same name have
+        the same."""
         return self.content
 
 
@@ -78,8 +81,9 @@ def load_arguments(typing, task_arguments):
 class CompiledTask:
     """A function of (task_arguments, block) that compiled code calls by address, see `Code`.
 
-    Numba compiles a function that is called by name again into every caller, and into their callers: the pair loop five
-    times on the way up to the loop over steps, for every kind of scene. Called by address, it is compiled once.
+    Numba compiles a function that is called by name again into every caller, and into their
+    callers: the pair loop five times on the way up to the loop over steps, for every kind of scene.
+    Called by address, it is compiled once.
     """
 
     def __init__(self, function, **options):
@@ -88,15 +92,19 @@ class CompiledTask:
         self.compiled = {}
 
     def address(self, arguments_type: TaskArguments) -> int:
-        """Address of the machine code for arguments of this type, which is compiled or read from the cache.
+        """Address of the machine code for arguments of this type, which is compiled or read from
+        the cache.
 
-        Processes that need the same code compile it once: the others wait, and read it from the cache.
+        Processes that need the same code compile it once: the others wait, and read it from the
+        cache.
         """
         if not self.is_ready(arguments_type):
             digest = hashlib.sha256(repr((self.name, arguments_type)).encode()).hexdigest()[:16]
             with lock_in_cache(digest, LONGEST_WAIT):
                 code = compile_callback(self.function, (arguments_type, types.intp), self.options)
-            self.compiled.setdefault(arguments_type, code)  # the code of another thread may already be in use
+            self.compiled.setdefault(
+                arguments_type, code
+            )  # the code of another thread may already be in use
         return self.compiled[arguments_type].address
 
     def is_ready(self, arguments_type: TaskArguments) -> bool:
@@ -104,18 +112,23 @@ class CompiledTask:
         if arguments_type not in self.compiled:
             thread_pool.start_workers()
             with contextlib.suppress(NotStored):
-                code = compile_callback(self.function, (arguments_type, types.intp), self.options, stored_only=True)
+                code = compile_callback(
+                    self.function, (arguments_type, types.intp), self.options, stored_only=True
+                )
                 self.compiled.setdefault(arguments_type, code)
         return arguments_type in self.compiled
 
 
 def task(*, count_references=True):
     """Decorator that makes a `CompiledTask` of a function, with the options of `kernel`."""
-    return lambda function: CompiledTask(function, **compiler_options(count_references=count_references))
+    return lambda function: CompiledTask(
+        function, **compiler_options(count_references=count_references)
+    )
 
 
 def addresses_of(pairs: Sequence[tuple[CompiledTask, TaskArguments]]) -> np.ndarray:
-    """Addresses (n,) of the machine code of tasks for types of arguments, which is compiled or read from the cache.
+    """Addresses (n,) of the machine code of tasks for types of arguments, which is compiled or read
+    from the cache.
 
     While tasks are only collected (`compile_together`), the addresses are 0.
     """
@@ -127,9 +140,11 @@ def addresses_of(pairs: Sequence[tuple[CompiledTask, TaskArguments]]) -> np.ndar
 
 
 class Code:
-    """Machine code of named tasks, each for arguments of one type; `call` and `call_blocks` check that type.
+    """Machine code of named tasks, each for arguments of one type; `call` and `call_blocks` check
+    that type.
 
-    Code(fill=(_fill, pairs), sites=(_sites, (pairs, sites, state))) compiles the tasks, or reads them from the cache.
+    Code(fill=(_fill, pairs), sites=(_sites, (pairs, sites, state))) compiles the tasks, or reads
+    them from the cache.
     """
 
     def __init__(self, **tasks: tuple[CompiledTask, object]):
@@ -144,7 +159,8 @@ class Code:
         return int(self._addresses[self._names.index(name)])
 
     def to_struct(self, content: object) -> NumbaStruct:
-        """Arguments in memory, for every task. Raises TypingError if one was compiled for another type."""
+        """Arguments in memory, for every task. Raises TypingError if one was compiled for another
+        type."""
         struct = NumbaStruct(content)
         for name in self._names:
             self.numba_type.index_of(name, TaskArguments(struct.kind))
@@ -152,7 +168,8 @@ class Code:
 
 
 class CodeType(types.Type):
-    """Numba type of a `Code`: its tasks, and the type of arguments that each accepts. Its value is `address_value`."""
+    """Numba type of a `Code`: its tasks, and the type of arguments that each accepts. Its value is
+    `address_value`."""
 
     bitwidth = 64
 
@@ -161,8 +178,8 @@ class CodeType(types.Type):
         # a digest, because this name becomes part of the name of every function compiled for it
         digest = hashlib.sha256(repr(task_types).encode()).hexdigest()[:16]
         super().__init__(f"code({digest})")
-        # The same in every process, because types are pickled. Numba needs the hash in every call from Python, and
-        # hashing all these types takes half a millisecond.
+        # The same in every process, because types are pickled. Numba needs the hash in every call
+        # from Python, and hashing all these types takes half a millisecond.
         self._hash = int(digest[:15], 16)
 
     def __hash__(self):
@@ -173,12 +190,15 @@ class CodeType(types.Type):
         return self.task_types
 
     def index_of(self, name: str, kind: TaskArguments) -> int:
-        """Index of a task's address. Raises TypingError if the task is unknown or accepts another type of arguments."""
+        """Index of a task's address. Raises TypingError if the task is unknown or accepts another
+        type of arguments."""
         names = [known for known, _ in self.task_types]
         if name not in names:
             raise TypingError(f"unknown task {name}; the tasks are {', '.join(names)}")
         if self.task_types[names.index(name)][1] != kind:
-            raise TypingError(f"{name} was compiled for {self.task_types[names.index(name)][1]}, not for {kind}")
+            raise TypingError(
+                f"{name} was compiled for {self.task_types[names.index(name)][1]}, not for {kind}"
+            )
         return names.index(name)
 
 
@@ -195,12 +215,15 @@ def _unbox_code(kind, value, context):
     number = context.pyapi.object_getattr_string(value, "address_value")
     address = context.pyapi.long_as_ulonglong(number)
     context.pyapi.decref(number)
-    return NativeValue(address, is_error=cgutils.is_not_null(context.builder, context.pyapi.err_occurred()))
+    return NativeValue(
+        address, is_error=cgutils.is_not_null(context.builder, context.pyapi.err_occurred())
+    )
 
 
 @intrinsic(prefer_literal=True)
 def address_of(typing, code, name, task_arguments):
-    """Address of the machine code of a task, for arguments of the type for which it was compiled."""
+    """Address of the machine code of a task, for arguments of the type for which it was
+    compiled."""
     if not isinstance(name, types.StringLiteral):
         raise TypingError("the name of a task must be a literal")
     index = code.index_of(name.literal_value, task_arguments)
@@ -216,8 +239,8 @@ def address_of(typing, code, name, task_arguments):
 class BoundTask:
     """A task with its arguments, for Python to call without holding its lock.
 
-    A call takes a microsecond. Numba's dispatcher would inspect every array in every call, and after a segment of
-    computing neither they nor that code are in the cache of the core.
+    A call takes a microsecond. Numba's dispatcher would inspect every array in every call, and
+    after a segment of computing neither they nor that code are in the cache of the core.
 
     content : a tuple; its arrays are kept, and their present values are the input of the task
     """
@@ -225,7 +248,9 @@ class BoundTask:
     def __init__(self, task: CompiledTask, content: tuple):
         code = Code(task=(task, content))
         self._content = code.to_struct(content)
-        self._function = ctypes.CFUNCTYPE(None, ctypes.c_ssize_t, ctypes.c_ssize_t)(code.address("task"))
+        self._function = ctypes.CFUNCTYPE(None, ctypes.c_ssize_t, ctypes.c_ssize_t)(
+            code.address("task")
+        )
 
     def __call__(self) -> None:
         self._function(self._content.address, 0)
@@ -233,7 +258,8 @@ class BoundTask:
 
 @chosen_by_type(inline=True, prefer_literal=True)
 def call(code, name, task_arguments):
-    """Call a task for block 0 by its name, a literal. Arguments of another type are a compilation error."""
+    """Call a task for block 0 by its name, a literal. Arguments of another type are a compilation
+    error."""
     return lambda code, name, task_arguments: thread_pool.call_address(
         address_of(code, name, task_arguments), task_arguments, 0
     )
@@ -253,12 +279,16 @@ def call_blocks(code, name, task_arguments, blocks):
     return call_blocks
 
 
-# --- two processes that compile --------------------------------------------------------------------------------------
+# --- two processes that compile -------------------------------------------------------------------
 
-#: Held while codes are compiled together: of several runs at once, one compiles and the others read its result.
+#: Held while codes are compiled together: of several runs at once, one compiles and the others read
+#: its result.
 _compiling = threading.RLock()
-#: Tasks of each `Code` while they are only collected and not compiled, in this thread; None otherwise.
-_collected: ContextVar[list[tuple[CompiledTask, TaskArguments]] | None] = ContextVar("collected", default=None)
+#: Tasks of each `Code` while they are only collected and not compiled, in this thread; None
+#: otherwise.
+_collected: ContextVar[list[tuple[CompiledTask, TaskArguments]] | None] = ContextVar(
+    "collected", default=None
+)
 #: Least number of tasks for a second process; for fewer, importing the package there takes longer.
 FEWEST_TASKS = 3
 #: Program of the second process.
@@ -268,10 +298,11 @@ SECOND_PROGRAM = "from rigidmd.compile import code; code.compile_requested()"
 def compile_together(make: Callable[[], object]) -> None:
     """Compile every `Code` that a function makes, in two processes if that saves time.
 
-    Python and LLVM compile one function at a time per process. A second process begins with the last task, and this one
-    with the first: on two idle cores the first steps of 216 waters come after 37 s instead of 54 s. The environment
-    variable `RIGIDMD_COMPILERS` is the number of processes, 1 or 2. The function is first called only to collect the
-    tasks and types of its codes. These have no addresses, so it must not call them.
+    Python and LLVM compile one function at a time per process. A second process begins with the
+    last task, and this one with the first: on two idle cores the first steps of 216 waters come
+    after 37 s instead of 54 s. The environment variable `RIGIDMD_COMPILERS` is the number of
+    processes, 1 or 2. The function is first called only to collect the tasks and types of its
+    codes. These have no addresses, so it must not call them.
     """
     if (named := os.environ.get("RIGIDMD_COMPILERS", "2")) not in ("1", "2"):
         raise SettingError(f"RIGIDMD_COMPILERS is {named[:40]!r}, must be 1 or 2")
@@ -284,7 +315,9 @@ def compile_together(make: Callable[[], object]) -> None:
             make()
         finally:
             _collected.reset(before)
-        missing = [(*one.name, kind) for one, kind in dict.fromkeys(collected) if not one.is_ready(kind)]
+        missing = [
+            (*one.name, kind) for one, kind in dict.fromkeys(collected) if not one.is_ready(kind)
+        ]
         if len(missing) >= FEWEST_TASKS:
             with second_process(missing):
                 make()
@@ -292,14 +325,17 @@ def compile_together(make: Callable[[], object]) -> None:
 
 @contextlib.contextmanager
 def second_process(wanted: Sequence[tuple[str, str, TaskArguments]]) -> Iterator[None]:
-    """Within the block a second process compiles tasks (module, name, type), unless their types cannot be pickled."""
+    """Within the block a second process compiles tasks (module, name, type), unless their types
+    cannot be pickled."""
     process = None
     with contextlib.suppress(OSError, pickle.PicklingError, TypeError, AttributeError):
         content = pickle.dumps(wanted)
         process = subprocess.Popen(
-            **python_process("-c", SECOND_PROGRAM), stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            **python_process("-c", SECOND_PROGRAM),
+            stdin=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C goes to this process, which then ends the other
-        )  # fmt: skip
+        )
         assert process.stdin is not None
         process.stdin.write(content)
         process.stdin.close()

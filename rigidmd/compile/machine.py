@@ -1,7 +1,8 @@
-"""The target processor of Numba, the width of its vectors, its threads, the number of blocks of work, and pointers.
+"""The target processor of Numba, the width of its vectors, its threads, the number of blocks of
+work, and pointers.
 
-LLVM has only opaque pointers, and llvmlite is removing typed ones. The pointers of Numba are still typed, and llvmlite
-0.44, the oldest one supported, has an LLVM that needs typed pointers.
+LLVM has only opaque pointers, and llvmlite is removing typed ones. The pointers of Numba are still
+typed, and llvmlite 0.44, the oldest one supported, has an LLVM that needs typed pointers.
 """
 
 import os
@@ -13,7 +14,8 @@ from numba.core.registry import cpu_target
 
 from rigidmd.errors import SettingError
 
-#: Whether LLVM accepts opaque pointers. llvmlite has this attribute up to version 0.44, where the default is False.
+#: Whether LLVM accepts opaque pointers. llvmlite has this attribute up to version 0.44, where the
+#: default is False.
 OPAQUE: bool = getattr(llvmlite, "opaque_pointers_enabled", True)
 
 
@@ -23,8 +25,13 @@ def pointer_to(kind: ir.Type) -> ir.PointerType:
 
 
 def cast_pointer(builder, pointer, kind: ir.Type):
-    """A pointer for loads and stores of a type. Numba's pointers may have another type; opaque ones need no cast."""
-    return pointer if getattr(pointer.type, "is_opaque", True) else builder.bitcast(pointer, ir.PointerType(kind))
+    """A pointer for loads and stores of a type. Numba's pointers may have another type; opaque ones
+    need no cast."""
+    return (
+        pointer
+        if getattr(pointer.type, "is_opaque", True)
+        else builder.bitcast(pointer, ir.PointerType(kind))
+    )
 
 
 def field_address(builder, pointer, struct: ir.Type, index: int):
@@ -32,13 +39,16 @@ def field_address(builder, pointer, struct: ir.Type, index: int):
     pointer = cast_pointer(builder, pointer, struct)
     places = [ir.IntType(32)(0), ir.IntType(32)(index)]
     address = builder.gep(pointer, places, source_etype=struct)
-    if not getattr(address.type, "is_opaque", True):  # llvmlite 0.44 gives it the type of the struct's address
+    if not getattr(
+        address.type, "is_opaque", True
+    ):  # llvmlite 0.44 gives it the type of the struct's address
         address.type = ir.PointerType(struct.elements[index])
     return address
 
 
 class _FunctionPointer(ir.instructions.CastInstr):
-    """An opaque pointer to a function: llvmlite asks the pointer for the type of the function that it calls."""
+    """An opaque pointer to a function: llvmlite asks the pointer for the type of the function that
+    it calls."""
 
     function_type = None
 
@@ -53,16 +63,29 @@ def function_at(builder, address, function_type: ir.FunctionType):
 
 #: LLVM names of the target: this machine, or the one set by NUMBA_CPU_NAME and NUMBA_CPU_FEATURES.
 TRIPLE, PROCESSOR, _FEATURES = cpu_target.target_context.codegen().magic_tuple()
-PROCESSOR_FEATURES = tuple(sorted(name[1:] for name in _FEATURES.split(",") if name.startswith("+")))
+PROCESSOR_FEATURES = tuple(
+    sorted(name[1:] for name in _FEATURES.split(",") if name.startswith("+"))
+)
 IS_X86 = TRIPLE.startswith("x86_64")
 #: Other settings of Numba that change its code: environment variable -> value.
 CODE_SETTINGS = {
-    f"NUMBA_{name}": repr(getattr(numba.config, "DEBUGINFO_DEFAULT" if name == "DEBUGINFO" else name, None))
-    for name in (
-        "OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO", "DISABLE_INTEL_SVML",
-        "LLVM_REFPRUNE_PASS", "LLVM_REFPRUNE_FLAGS", "EXTEND_VARIABLE_LIFETIMES", "ENABLE_PROFILING", "DEBUG_NRT",
+    f"NUMBA_{name}": repr(
+        getattr(numba.config, "DEBUGINFO_DEFAULT" if name == "DEBUGINFO" else name, None)
     )
-}  # fmt: skip
+    for name in (
+        "OPT",
+        "LOOP_VECTORIZE",
+        "SLP_VECTORIZE",
+        "BOUNDSCHECK",
+        "DEBUGINFO",
+        "DISABLE_INTEL_SVML",
+        "LLVM_REFPRUNE_PASS",
+        "LLVM_REFPRUNE_FLAGS",
+        "EXTEND_VARIABLE_LIFETIMES",
+        "ENABLE_PROFILING",
+        "DEBUG_NRT",
+    )
+}
 BLOCKS = 16  # least number of blocks of work, each run by any thread: enough for 16 threads
 MOST_BLOCKS = 128
 WIDTHS = ("128", "256", "512")  # possible widths of vectors, bits
@@ -71,8 +94,8 @@ WIDTHS = ("128", "256", "512")  # possible widths of vectors, bits
 def _widest() -> int:
     """Bits of the widest vectors of the target processor: those that LLVM uses for 16 integers.
 
-    Features that a processor name implies are not listed, so the width is read from code that LLVM makes; wider
-    intrinsics would abort the process.
+    Features that a processor name implies are not listed, so the width is read from code that LLVM
+    makes; wider intrinsics would abort the process.
     """
     module = ir.Module()
     vector = ir.VectorType(ir.IntType(32), 16)
@@ -81,7 +104,9 @@ def _widest() -> int:
     value = builder.load(add.args[0], typ=vector)
     builder.store(builder.add(value, value), add.args[0])
     builder.ret_void()
-    target = binding.Target.from_triple(TRIPLE).create_target_machine(cpu=PROCESSOR, features=_FEATURES)
+    target = binding.Target.from_triple(TRIPLE).create_target_machine(
+        cpu=PROCESSOR, features=_FEATURES
+    )
     code = target.emit_assembly(binding.parse_assembly(str(module)))
     return 512 if "%zmm" in code else 256 if "%ymm" in code else 128
 
@@ -92,9 +117,13 @@ def _simd_bits() -> int:
     if not named:
         return widest
     if named not in WIDTHS:
-        raise SettingError(f"RIGIDMD_SIMD_BITS is {named[:40]!r}, must be one of {', '.join(WIDTHS)}")
+        raise SettingError(
+            f"RIGIDMD_SIMD_BITS is {named[:40]!r}, must be one of {', '.join(WIDTHS)}"
+        )
     if int(named) > widest:
-        raise SettingError(f"RIGIDMD_SIMD_BITS is {named}, but vectors have at most {widest} bits on {PROCESSOR}")
+        raise SettingError(
+            f"RIGIDMD_SIMD_BITS is {named}, but vectors have at most {widest} bits on {PROCESSOR}"
+        )
     return int(named)
 
 

@@ -1,8 +1,10 @@
 """Programs: tables of passes, which one runner executes.
 
-A pass is the address of a task, the address of its arguments, the number of its blocks, and bits for when it
-acts. Python makes the table from what a scene has. The runner is compiled once for everything: it calls row after
-row, and stops where a pass sets a status. The types of the arguments choose the code of a pass, and nothing above it.
+A pass is the address of a task, the address of its arguments, the number of its blocks, and bits
+for when it
+acts. Python makes the table from what a scene has. The runner is compiled once for everything: it
+calls row after row, and stops where a pass sets a status. The types of the arguments choose the
+code of a pass, and nothing above it.
 """
 
 from collections.abc import Sequence
@@ -31,7 +33,8 @@ class Pass(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The passes of a program as compiled code reads them. A pass that fails writes a code into `status`."""
+    """The passes of a program as compiled code reads them. A pass that fails writes a code into
+    `status`."""
 
     address: np.ndarray  # (rows,) intp, of the machine code
     arguments: np.ndarray  # (rows,) intp, of the arguments
@@ -52,7 +55,9 @@ class Program:
         self._uses = uses
         used = self._used(passes)
         self._kinds = [TaskArguments(numba.typeof(one.content)) for one in used]
-        addresses = addresses_of([(one.task, kind) for one, kind in zip(used, self._kinds, strict=True)])
+        addresses = addresses_of(
+            [(one.task, kind) for one, kind in zip(used, self._kinds, strict=True)]
+        )
         when = np.array([one.when for one in used], np.intp)
         self.rows = Rows(addresses, np.zeros_like(when), np.ones_like(when), when, status)
         self._bound: dict[int, list[NumbaStruct]] = {}
@@ -67,7 +72,9 @@ class Program:
         for one, struct, kind in zip(self._used(passes), structs, self._kinds, strict=True):
             if TaskArguments(struct.kind) != kind:
                 name = one.task.name[1]
-                raise TypeError(f"{name} was compiled for {kind}, not for {TaskArguments(struct.kind)}")
+                raise TypeError(
+                    f"{name} was compiled for {kind}, not for {TaskArguments(struct.kind)}"
+                )
         target[:] = [struct.address for struct in structs]
         self.rows.blocks[:] = [one.blocks for one in self._used(passes)]
         self._bound[id(target)] = structs
@@ -94,8 +101,8 @@ def _call_row(rows, arguments, k):
 
 @kernel
 def run_passes(rows, arguments, when):
-    """Call the passes that act at `when`, bits; returns the first status that is not 0, or 0. arguments : their
-    addresses, of `rows` or others"""
+    """Call the passes that act at `when`, bits; returns the first status that is not 0, or 0.
+    arguments : their addresses, of `rows` or others"""
     rows.status[0] = 0
     for k in range(len(rows.address)):
         if rows.when[k] & when == 0:

@@ -1,13 +1,15 @@
 """Values in memory, and records: named tuples that compiled code reads where they are.
 
-A record is the address of a named tuple. An attribute is one load, and a nested named tuple is an address again, so
-that a function costs what it uses of its arguments: passed by value, each of the forty arrays of a term would become
-seven numbers in every function between the task and the loop. No kernel changes a field of a record, so its loads are
-marked invariant, and a store through an array does not force a loop to load the array's address again.
+A record is the address of a named tuple. An attribute is one load, and a nested named tuple is an
+address again, so that a function costs what it uses of its arguments: passed by value, each of the
+forty arrays of a term would become seven numbers in every function between the task and the loop.
+No kernel changes a field of a record, so its loads are marked invariant, and a store through an
+array does not force a loop to load the array's address again.
 
-Private parts of Numba, tested by tests/test_compile.py: the values of tuples and of `ArrayModel` are C structs, which
-`NumbaStruct` fills. A call from Python would instead compile code that unpacks every array of every argument, a second
-of compiling for the forty arrays of a term, and every call would run all of it.
+Private parts of Numba, tested by tests/test_compile.py: the values of tuples and of `ArrayModel`
+are C structs, which `NumbaStruct` fills. A call from Python would instead compile code that unpacks
+every array of every argument, a second of compiling for the forty arrays of a term, and every call
+would run all of it.
 """
 
 import ctypes
@@ -29,7 +31,11 @@ C_TYPES = {
     types.boolean: ctypes.c_bool,
     types.float64: ctypes.c_double,
     types.float32: ctypes.c_float,
-} | {kind: getattr(ctypes, f"c_{kind.name}") for kind in sorted(types.integer_domain, key=str) if kind.bitwidth <= 64}
+} | {
+    kind: getattr(ctypes, f"c_{kind.name}")
+    for kind in sorted(types.integer_domain, key=str)
+    if kind.bitwidth <= 64
+}
 
 
 class Record(types.Type):
@@ -41,7 +47,8 @@ class Record(types.Type):
 
     @property
     def key(self):
-        """The type of the named tuple. The name does not identify it: classes of the same name have the same."""
+        """The type of the named tuple. The name does not identify it: classes of the same name have
+        the same."""
         return self.content
 
     def __len__(self) -> int:
@@ -118,10 +125,11 @@ def stored_by_reference(context, builder, kind: types.Type, value):
 
 
 class NumbaStruct:
-    """Task arguments in memory as compiled code reads them, at `address`, with records for named tuples.
+    """Task arguments in memory as compiled code reads them, at `address`, with records for named
+    tuples.
 
-    Its arrays are kept here, and not reference-counted. Raises TypeError if the value contains anything but numbers,
-    arrays, None, codes, and tuples of these.
+    Its arrays are kept here, and not reference-counted. Raises TypeError if the value contains
+    anything but numbers, arrays, None, codes, and tuples of these.
     """
 
     def __init__(self, value: Any):
@@ -137,7 +145,9 @@ class NumbaStruct:
             self._records.append(record)
             return ctypes.c_void_p(ctypes.addressof(record))
         if isinstance(kind, types.BaseTuple):
-            return _tuple_struct(self._reference(part, one) for part, one in zip(kind.types, value, strict=True))
+            return _tuple_struct(
+                self._reference(part, one) for part, one in zip(kind.types, value, strict=True)
+            )
         return c_value(kind, value)
 
 
@@ -148,7 +158,9 @@ def c_value(kind: types.Type, value: Any) -> Any:
         sizes = value.size, value.itemsize, value.ctypes.data
         return struct(None, None, *sizes, numbers(*value.shape), numbers(*value.strides))
     if isinstance(kind, types.BaseTuple):
-        return _tuple_struct(c_value(part, one) for part, one in zip(kind.types, value, strict=True))
+        return _tuple_struct(
+            c_value(part, one) for part, one in zip(kind.types, value, strict=True)
+        )
     if hasattr(value, "address_value"):
         return ctypes.c_int64(value.address_value)
     if kind is types.none:
@@ -174,5 +186,9 @@ def array_struct(dimensions: int) -> type[ctypes.Structure]:
     """The C struct of an array, with the fields of Numba's `ArrayModel` in the same order."""
     numbers = ctypes.c_ssize_t * dimensions
     owners = ("meminfo", ctypes.c_void_p), ("parent", ctypes.c_void_p)
-    content = ("nitems", ctypes.c_ssize_t), ("itemsize", ctypes.c_ssize_t), ("data", ctypes.c_void_p)
+    content = (
+        ("nitems", ctypes.c_ssize_t),
+        ("itemsize", ctypes.c_ssize_t),
+        ("data", ctypes.c_void_p),
+    )
     return _struct((*owners, *content, ("shape", numbers), ("strides", numbers)))

@@ -1,18 +1,19 @@
-"""Mathematics for vectors: math.exp, log, pow, sin, cos, sqrt, fabs, and -x, x**y, abs(x); fast 1/x and 1/sqrt(x).
+"""Mathematics for vectors: math.exp, log, pow, sin, cos, sqrt, fabs, and -x, x**y, abs(x); fast 1/x
+and 1/sqrt(x).
 
-A formula written with Python's `math` serves single numbers and vectors alike. In double precision the results are
-accurate to about the last digit, in single precision to 2e-7; x**n with a constant integer n is a product, with the
-rounding error of each factor.
+A formula written with Python's `math` serves single numbers and vectors alike. In double precision
+the results are accurate to about the last digit, in single precision to 2e-7; x**n with a constant
+integer n is a product, with the rounding error of each factor.
 
 Sums of a number and its rounding error must not be reassociated: no kernel has fast-math flags.
 
 Of Numba's private parts this file uses a template of types, for powers with a constant exponent.
 
-Methods: reduction of the argument by parts of ln 2 and pi/2 (Cody & Waite 1980), the logarithm with s = f/(2 + f) as in
-fdlibm, powers from a logarithm in two doubles (Dekker 1971); polynomials are truncated series.
+Methods: reduction of the argument by parts of ln 2 and pi/2 (Cody & Waite 1980), the logarithm with
+s = f/(2 + f) as in fdlibm, powers from a logarithm in two doubles (Dekker 1971); polynomials are
+truncated series.
 """
 
-# isort: skip_file
 import math
 import operator
 from functools import partial
@@ -26,15 +27,27 @@ from numba.extending import intrinsic, lower_builtin
 from rigidmd.compile.kernels import chosen_by_type
 from rigidmd.compile.machine import IS_X86, SIMD_BITS
 from rigidmd.compile.simd_types import (
-    LANE_COUNTS, Lanes, call_llvm, define, emit_broadcast, emit_numbers, emitted, horner, shuffle, suffix, to_double,
+    LANE_COUNTS,
+    Lanes,
+    call_llvm,
+    define,
+    emit_broadcast,
+    emit_numbers,
+    emitted,
+    horner,
+    shuffle,
+    suffix,
+    to_double,
     to_single,
-)  # fmt: skip
+)
 
-#: ln 2 in two parts, by the bits of a number; the first ends in zero bits, so that whole multiples of it are exact.
+#: ln 2 in two parts, by the bits of a number; the first ends in zero bits, so that whole multiples
+#: of it are exact.
 LN2 = {64: (0.693147180369123816490, 1.90821492927058770002e-10), 32: (0.693359375, -2.12194440e-4)}
 #: pi/2 in three doubles.
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17, -1.4973849048591833e-33)
-#: Arguments of sin and cos beyond this give NaN, because neighbouring numbers differ by a good part of a period.
+#: Arguments of sin and cos beyond this give NaN, because neighbouring numbers differ by a good part
+#: of a period.
 LONGEST_ANGLE = 1e13
 
 
@@ -43,15 +56,26 @@ class VectorOperations:
 
     def __init__(self, builder, lanes: Lanes):
         self.builder = builder
-        self.add, self.sub, self.mul, self.div = builder.fadd, builder.fsub, builder.fmul, builder.fdiv
-        self.negative, self.choose, self.compare = builder.fneg, builder.select, builder.fcmp_ordered
+        self.add, self.sub, self.mul, self.div = (
+            builder.fadd,
+            builder.fsub,
+            builder.fmul,
+            builder.fdiv,
+        )
+        self.negative, self.choose, self.compare = (
+            builder.fneg,
+            builder.select,
+            builder.fcmp_ordered,
+        )
         self.bits, self.count = lanes.dtype.bitwidth, lanes.count
         self.is_double = self.bits == 64
         self.type = ir.VectorType(ir.DoubleType() if self.is_double else ir.FloatType(), self.count)
         self.whole = ir.VectorType(ir.IntType(self.bits), self.count)
         self.fraction_bits = 52 if self.is_double else 23
         self.bias = 1023 if self.is_double else 127
-        self.magic = 1.5 * 2.0**self.fraction_bits  # added to a number, it leaves the nearest integer in the last bits
+        self.magic = (
+            1.5 * 2.0**self.fraction_bits
+        )  # added to a number, it leaves the nearest integer in the last bits
 
     def number(self, x: float):
         return ir.Constant(self.type, [x] * self.count)
@@ -76,7 +100,9 @@ class VectorOperations:
         """The nearest integers of small numbers: as numbers, and as integers."""
         moved = self.add(a, self.number(self.magic))
         origin = self.builder.bitcast(self.number(self.magic), self.whole)
-        return self.sub(moved, self.number(self.magic)), self.builder.sub(self.as_bits(moved), origin)
+        return self.sub(moved, self.number(self.magic)), self.builder.sub(
+            self.as_bits(moved), origin
+        )
 
     def of_integer(self, k):
         """Small integers as numbers."""
@@ -198,7 +224,9 @@ def _in_double(v: VectorOperations, emit, *values):
     if v.is_double:
         return emit(v, *values)
     wide = VectorOperations(v.builder, Lanes(types.float64, v.count))
-    return v.builder.fptrunc(emit(wide, *(v.builder.fpext(value, wide.type) for value in values)), v.type)
+    return v.builder.fptrunc(
+        emit(wide, *(v.builder.fpext(value, wide.type) for value in values)), v.type
+    )
 
 
 #: Vector versions of Python's functions: emit(operations, value).
@@ -220,7 +248,9 @@ def _lower(emit, context, builder, signature, arguments):
 
 
 for _function, _emit in FUNCTIONS.items():
-    define(_function, lambda x: x if isinstance(x, Lanes) else None, partial(_lower, _emit), (Lanes,))
+    define(
+        _function, lambda x: x if isinstance(x, Lanes) else None, partial(_lower, _emit), (Lanes,)
+    )
 
 
 def _integer_power(v: VectorOperations, x, n: int):
@@ -238,7 +268,8 @@ def _integer_power(v: VectorOperations, x, n: int):
 
 
 class _PowerType(AbstractTemplate):
-    """Types of powers. A constant exponent n has its value in its type, so that integer powers are products."""
+    """Types of powers. A constant exponent n has its value in its type, so that integer powers are
+    products."""
 
     def generic(self, args, kws):
         x, y = args
@@ -251,7 +282,10 @@ class _PowerType(AbstractTemplate):
 
 def _power(context, builder, signature, arguments):
     lanes, (of_x, of_y) = signature.return_type, signature.args
-    v, x = VectorOperations(builder, lanes), emit_broadcast(context, builder, arguments[0], of_x, lanes)
+    v, x = (
+        VectorOperations(builder, lanes),
+        emit_broadcast(context, builder, arguments[0], of_x, lanes),
+    )
     if isinstance(of_y, types.IntegerLiteral):
         return _integer_power(v, x, of_y.literal_value)
     return _in_double(v, real_power, x, emit_broadcast(context, builder, arguments[1], of_y, lanes))
@@ -260,24 +294,34 @@ def _power(context, builder, signature, arguments):
 for _function in (operator.pow, operator.ipow, math.pow):
     _kind = {"key": _function, "prefer_literal": _function is not math.pow}
     infer_global(_function)(type(f"{_function.__name__}_of_lanes", (_PowerType,), _kind))
-    for _kinds in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes), (Lanes, types.IntegerLiteral)):
+    for _kinds in (
+        (Lanes, Lanes),
+        (Lanes, types.Number),
+        (types.Number, Lanes),
+        (Lanes, types.IntegerLiteral),
+    ):
         lower_builtin(_function, *_kinds)(_power)
 
 
-# --- inverses and roots ----------------------------------------------------------------------------------------------
+# --- inverses and roots ---------------------------------------------------------------------------
 
 #: Whether this machine has the instruction of `simd.permute_two`, and estimates of 14 bits.
 HAS_AVX512 = SIMD_BITS == 512
-#: Flags with which LLVM may replace a division or a root by the hardware's estimate and a Newton step.
+#: Flags with which LLVM may replace a division or a root by the hardware's estimate and a Newton
+#: step.
 ESTIMATE_FLAGS = ("afn", "arcp", "contract", "nsz", "reassoc")
 
 
 def _square_root(builder, value):
-    return call_llvm(builder, f"llvm.sqrt.{suffix(value.type)}", value.type, value, flags=ESTIMATE_FLAGS)
+    return call_llvm(
+        builder, f"llvm.sqrt.{suffix(value.type)}", value.type, value, flags=ESTIMATE_FLAGS
+    )
 
 
 def _inverse_value(builder, value):
-    return builder.fdiv(ir.Constant(value.type, [1.0] * value.type.count), value, flags=ESTIMATE_FLAGS)
+    return builder.fdiv(
+        ir.Constant(value.type, [1.0] * value.type.count), value, flags=ESTIMATE_FLAGS
+    )
 
 
 @intrinsic
@@ -288,7 +332,8 @@ def square_root(typing, x):
 
 @intrinsic
 def _approximate_inverse_root(typing, x):
-    """1/sqrt(x) in float32; LLVM may use the hardware estimate and a Newton step, with an error of 2e-7."""
+    """1/sqrt(x) in float32; LLVM may use the hardware estimate and a Newton step, with an error of
+    2e-7."""
     return emitted(x(x), lambda b, value: _inverse_value(b, _square_root(b, value)))
 
 
@@ -298,7 +343,8 @@ def _approximate_inverse(typing, x):
     return emitted(x(x), _inverse_value)
 
 
-#: Coefficients of e, e², ... in (1 - e)^-p - 1, for 1/x (p = 1), 1/sqrt(x) (p = 1/2) and 1/sqrt(x)³ (p = 3/2).
+#: Coefficients of e, e², ... in (1 - e)^-p - 1, for 1/x (p = 1), 1/sqrt(x) (p = 1/2) and 1/sqrt(x)³
+#: (p = 3/2).
 INVERSE_SERIES, ROOT_SERIES = (1.0, 1.0, 1.0), (1 / 2, 3 / 8, 5 / 16, 35 / 128)
 CUBE_SERIES = (3 / 2, 15 / 8, 35 / 16, 315 / 128)
 
@@ -306,7 +352,8 @@ CUBE_SERIES = (3 / 2, 15 / 8, 35 / 16, 315 / 128)
 def _series_terms(x) -> int:
     """Number of terms of a series that correct the estimates of a type; 0 if it has no estimates.
 
-    The next term is below half the last digit: e is at most 1.2e-4 with AVX-512, 7.4e-4 with older instructions.
+    The next term is below half the last digit: e is at most 1.2e-4 with AVX-512, 7.4e-4 with older
+    instructions.
     """
     if not IS_X86 or x.count not in (2, 4, 8, 16):
         return 0
@@ -325,7 +372,14 @@ def _estimate(name):
             if _fills_avx512(x):
                 everywhere = ir.Constant(ir.IntType(max(8, x.count)), -1)
                 kind = {types.float32: "ps", types.float64: "pd"}[x.dtype]
-                return call_llvm(builder, f"llvm.x86.avx512.{name}14.{kind}.512", value.type, value, value, everywhere)
+                return call_llvm(
+                    builder,
+                    f"llvm.x86.avx512.{name}14.{kind}.512",
+                    value.type,
+                    value,
+                    value,
+                    everywhere,
+                )
             value = builder.fptrunc(value, ir.VectorType(ir.FloatType(), x.count))
             if x.count == 2:
                 value = shuffle(builder, value, value, (0, 1, 0, 1))
@@ -340,8 +394,8 @@ def _estimate(name):
     return estimated
 
 
-#: 1/sqrt(x) and 1/x of a vector by the estimates of the hardware, with relative errors up to 2^-14 with AVX-512, else
-#: 1.5 2^-12. The second is used with AVX-512 only.
+#: 1/sqrt(x) and 1/x of a vector by the estimates of the hardware, with relative errors up to 2^-14
+#: with AVX-512, else 1.5 2^-12. The second is used with AVX-512 only.
 _estimate_inverse_root = intrinsic(_estimate("rsqrt"))
 _estimate_inverse = intrinsic(_estimate("rcp"))
 
@@ -351,13 +405,16 @@ def _horner(typing, coefficients, x):
     """Sum of coefficients[k] x^k."""
 
     def emit(context, builder, signature, arguments):
-        return horner(builder, emit_numbers(context, builder, arguments[0], coefficients, x), arguments[1])
+        return horner(
+            builder, emit_numbers(context, builder, arguments[0], coefficients, x), arguments[1]
+        )
 
     return x(coefficients, x), emit
 
 
-# The series are explicit, because LLVM's choice depends on the processor: for some it computes a root and divides, for
-# others it corrects an estimate of float32 by one step, with errors of the cube up to 5.8e-7 instead of 1.9e-7.
+# The series are explicit, because LLVM's choice depends on the processor: for some it computes a
+# root and divides, for others it corrects an estimate of float32 by one step, with errors of the
+# cube up to 5.8e-7 instead of 1.9e-7.
 @chosen_by_type(inline=True)
 def inverse_square_root(x):
     """1/sqrt(x), accurate to about the last digit."""
@@ -377,7 +434,8 @@ def inverse_square_root(x):
         return lambda x: _approximate_inverse_root(x)
 
     def refined(x):
-        # One step of third order takes the float32 result from 24 bits to 53; a float64 root and division are slower.
+        # One step of third order takes the float32 result from 24 bits to 53; a float64 root and
+        # division are slower.
         y = to_double(_approximate_inverse_root(to_single(x)))
         e = 1.0 - x * y * y
         return y + y * e * (0.5 + 0.375 * e)
@@ -387,16 +445,21 @@ def inverse_square_root(x):
 
 @chosen_by_type(inline=True)
 def inverse_root_and_cube(x):
-    """1/sqrt(x), and two numbers whose product is 1/sqrt(x)³, each accurate to about the last digit.
+    """1/sqrt(x), and two numbers whose product is 1/sqrt(x)³, each accurate to about the last
+    digit.
 
     The caller multiplies the two in a multiply-add. An unused root costs nothing.
     """
     if isinstance(x, Lanes) and _series_terms(x):
-        series, root_series = (1.0, *CUBE_SERIES[: _series_terms(x)]), ROOT_SERIES[: _series_terms(x)]
+        series, root_series = (
+            (1.0, *CUBE_SERIES[: _series_terms(x)]),
+            ROOT_SERIES[: _series_terms(x)],
+        )
 
         def from_estimate(x):
-            # The cube of a corrected root would take one multiplication more; pairs with a reaction field then take 5 %
-            # longer (AVX-512). The root from the cube would have two more rounding errors, visible in energies.
+            # The cube of a corrected root would take one multiplication more; pairs with a reaction
+            # field then take 5 % longer (AVX-512). The root from the cube would have two more
+            # rounding errors, visible in energies.
             y = _estimate_inverse_root(x)
             y2 = y * y
             e = 1.0 - x * y2

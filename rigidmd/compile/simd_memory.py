@@ -1,7 +1,8 @@
 """Loads and stores of SIMD vectors: of neighbouring numbers, and of records, one in each lane.
 
-A transposed load of records, rows of an array (n, 3) or (n, 3, 3), loads a square block as one vector per record and
-transposes it in registers. The remaining numbers of a record are loaded one by one.
+A transposed load of records, rows of an array (n, 3) or (n, 3, 3), loads a square block as one
+vector per record and transposes it in registers. The remaining numbers of a record are loaded one
+by one.
 """
 
 from math import prod
@@ -23,8 +24,8 @@ def lane_count(dtype) -> int:
 
 
 def zeros(shape: int | tuple[int, ...], dtype) -> np.ndarray:
-    """Like np.zeros, aligned to vectors. NumPy aligns to 16 bytes, so that vectors of 64 bytes would cross cache lines,
-    which costs the pair loop 3 to 4 %."""
+    """Like np.zeros, aligned to vectors. NumPy aligns to 16 bytes, so that vectors of 64 bytes
+    would cross cache lines, which costs the pair loop 3 to 4 %."""
     shape = (shape,) if isinstance(shape, int) else shape
     size = prod(shape) * np.dtype(dtype).itemsize
     vector = SIMD_BITS // 8
@@ -33,12 +34,16 @@ def zeros(shape: int | tuple[int, ...], dtype) -> np.ndarray:
     return memory[start : start + size].view(dtype).reshape(shape)
 
 
-# --- vectors ---------------------------------------------------------------------------------------------------------
+# --- vectors --------------------------------------------------------------------------------------
 
 
 def is_contiguous(array, dimensions: int | None = None) -> bool:
     """Whether a Numba type is a contiguous array, of this number of dimensions."""
-    return isinstance(array, types.Array) and array.layout == "C" and array.ndim == (dimensions or array.ndim)
+    return (
+        isinstance(array, types.Array)
+        and array.layout == "C"
+        and array.ndim == (dimensions or array.ndim)
+    )
 
 
 def _element(context, builder, array_type, array, index):
@@ -55,7 +60,9 @@ def emit_load(context, builder, array_type, array, index, kind):
 
 def emit_store(context, builder, array_type, array, index, value):
     """Write a vector to memory from array[index] on."""
-    address = cast_pointer(builder, _element(context, builder, array_type, array, index), value.type)
+    address = cast_pointer(
+        builder, _element(context, builder, array_type, array, index), value.type
+    )
     builder.store(value, address, align=array_type.dtype.bitwidth // 8)
 
 
@@ -94,7 +101,8 @@ def load_eight(typing, array, index):
 
 @intrinsic
 def load_scalar(typing, array, index):
-    """array[index] for an index >= 0, without Numba's test for negative ones at each access in the pair loop."""
+    """array[index] for an index >= 0, without Numba's test for negative ones at each access in the
+    pair loop."""
     if not is_contiguous(array, 1):
         return None
 
@@ -109,7 +117,9 @@ def load_scalar(typing, array, index):
 def broadcast(typing, number, array):
     """A vector of the type of an array with the same number in every lane."""
     lanes = lanes_like(array)
-    return lanes(number, array), lambda context, b, _, given: emit_broadcast(context, b, given[0], number, lanes)
+    return lanes(number, array), lambda context, b, _, given: emit_broadcast(
+        context, b, given[0], number, lanes
+    )
 
 
 @kernel(inline=True, count_references=False)
@@ -131,7 +141,8 @@ def store(typing, array, index, lanes):
 
 @intrinsic
 def store_even_lanes(typing, array, index, x):
-    """Write the integer parts, 0 to 127, of lanes 0, 2, 4, ... of a vector to an array of bytes from an index on.
+    """Write the integer parts, 0 to 127, of lanes 0, 2, 4, ... of a vector to an array of bytes
+    from an index on.
 
     Lane 1 must equal lane 0, lane 3 lane 2, and so on.
     """
@@ -144,7 +155,8 @@ def store_even_lanes(typing, array, index, x):
         whole = builder.fptosi(value, ir.VectorType(ir.IntType(32), x.count))
         # two equal lanes are one number of 64 bits, whose lowest byte is stored: no lanes are moved
         half = builder.trunc(
-            builder.bitcast(whole, ir.VectorType(ir.IntType(64), count)), ir.VectorType(ir.IntType(8), count)
+            builder.bitcast(whole, ir.VectorType(ir.IntType(64), count)),
+            ir.VectorType(ir.IntType(8), count),
         )
         emit_store(context, builder, array, target, index, half)
         return context.get_dummy_value()
@@ -154,10 +166,12 @@ def store_even_lanes(typing, array, index, x):
 
 @intrinsic
 def align_stack(typing):
-    """Align the stack of the calling function, so that vectors spilled from registers do not cross cache lines.
+    """Align the stack of the calling function, so that vectors spilled from registers do not cross
+    cache lines.
 
-    LLVM decides whether to align it before it knows which vectors it spills. Without this, the alignment differed
-    between processes: forces of PME in double precision took between 1.3 and 2.2 ns per lane.
+    LLVM decides whether to align it before it knows which vectors it spills. Without this, the
+    alignment differed between processes: forces of PME in double precision took between 1.3 and 2.2
+    ns per lane.
     """
 
     def emit(context, builder, signature, arguments):
@@ -170,7 +184,7 @@ def align_stack(typing):
     return types.void(), emit
 
 
-# --- records ---------------------------------------------------------------------------------------------------------
+# --- records --------------------------------------------------------------------------------------
 
 
 def _transpose(builder, rows: list) -> list:
@@ -190,10 +204,16 @@ def _transpose(builder, rows: list) -> list:
 
 def _pointers(context, builder, array, value, first, size: int, count: int):
     """Pointers to the numbers of records first ... first + count - 1, [record][number]."""
-    data, kind = context.make_array(array)(context, builder, value).data, context.get_data_type(array.dtype)
+    data, kind = (
+        context.make_array(array)(context, builder, value).data,
+        context.get_data_type(array.dtype),
+    )
     start = builder.mul(first, first.type(size))
     return [
-        [builder.gep(data, [builder.add(start, first.type(size * n + k))], source_etype=kind) for k in range(size)]
+        [
+            builder.gep(data, [builder.add(start, first.type(size * n + k))], source_etype=kind)
+            for k in range(size)
+        ]
         for n in range(count)
     ]
 
@@ -211,7 +231,10 @@ def _loader(size: int):
             pointers = _pointers(context, builder, array, *arguments, size, count)
             columns, whole = [], size - size % count
             for k in range(0, whole, count):
-                rows = [builder.load(cast_pointer(builder, p[k], kind), align=align, typ=kind) for p in pointers]
+                rows = [
+                    builder.load(cast_pointer(builder, p[k], kind), align=align, typ=kind)
+                    for p in pointers
+                ]
                 columns += _transpose(builder, rows)
             for k in range(whole, size):
                 column = ir.Constant(kind, ir.Undefined)
@@ -243,7 +266,9 @@ def _storer(size: int):
                     builder.store(row, cast_pointer(builder, pointers[n][k], row.type), align=align)
             for k in range(whole, size):
                 for n in range(count):
-                    builder.store(builder.extract_element(vectors[k], ir.IntType(32)(n)), pointers[n][k])
+                    builder.store(
+                        builder.extract_element(vectors[k], ir.IntType(32)(n)), pointers[n][k]
+                    )
             return context.get_dummy_value()
 
         return types.void(array, types.intp, types.UniTuple(lanes, size)), emit
@@ -251,8 +276,9 @@ def _storer(size: int):
     return intrinsic(store)
 
 
-#: (x, y, z) of records first, first + 1, ... of a contiguous array (n, 3), one record in each lane; and the nine
-#: numbers, row by row, of records of an array (n, 3, 3). Both have the arguments (array, first).
+#: (x, y, z) of records first, first + 1, ... of a contiguous array (n, 3), one record in each lane;
+#: and the nine numbers, row by row, of records of an array (n, 3, 3). Both have the arguments
+#: (array, first).
 load_vectors, load_matrices = _loader(3), _loader(9)
 #: Write such numbers, of one record from each lane: (array, first, numbers).
 store_vectors, store_matrices = _storer(3), _storer(9)

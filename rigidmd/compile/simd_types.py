@@ -1,7 +1,8 @@
 """The Numba types of SIMD vectors and masks, and their operators; `simd` has the functions.
 
-Their values are LLVM vectors. All code is portable LLVM IR and is compiled to AVX-512, AVX2, SSE or NEON. Of Numba's
-private parts these files use `cgutils` and the models of arrays and tuples, of llvmlite the builder of LLVM IR.
+Their values are LLVM vectors. All code is portable LLVM IR and is compiled to AVX-512, AVX2, SSE or
+NEON. Of Numba's private parts these files use `cgutils` and the models of arrays and tuples, of
+llvmlite the builder of LLVM IR.
 """
 
 import operator
@@ -15,7 +16,11 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 from rigidmd.compile.machine import SIMD_BITS
 
 #: Number of lanes of a vector on this machine, by the type of its numbers.
-LANE_COUNTS = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}
+LANE_COUNTS = {
+    types.float32: SIMD_BITS // 32,
+    types.float64: SIMD_BITS // 64,
+    types.int32: SIMD_BITS // 32,
+}
 
 
 class Lanes(types.Type):
@@ -45,10 +50,12 @@ class Mask(types.Type):
 @register_model(Mask)
 class VectorModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, ir.VectorType(manager[kind.dtype].get_value_type(), kind.count))
+        super().__init__(
+            manager, kind, ir.VectorType(manager[kind.dtype].get_value_type(), kind.count)
+        )
 
 
-# --- LLVM ------------------------------------------------------------------------------------------------------------
+# --- LLVM -----------------------------------------------------------------------------------------
 
 
 def suffix(kind: ir.Type) -> str:
@@ -60,12 +67,16 @@ def suffix(kind: ir.Type) -> str:
 def call_llvm(builder, name: str, result: ir.Type, *arguments, flags=()):
     """Call an LLVM intrinsic."""
     kind = ir.FunctionType(result, [a.type for a in arguments])
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments, fastmath=flags)
+    return builder.call(
+        cgutils.get_or_insert_function(builder.module, kind, name), arguments, fastmath=flags
+    )
 
 
 def shuffle(builder, a, b, lanes):
     """A vector of these lanes of a and b; lanes of b are numbered after those of a."""
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes)))
+    return builder.shuffle_vector(
+        a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes))
+    )
 
 
 def emitted(signature, emit):
@@ -77,7 +88,9 @@ def _conversion(dtype):
     def converted(typing, x):
         lanes = Lanes(dtype, x.count)
         change = ir.IRBuilder.fptrunc if dtype.bitwidth < x.dtype.bitwidth else ir.IRBuilder.fpext
-        return lanes(x), lambda context, builder, _, given: change(builder, *given, context.get_value_type(lanes))
+        return lanes(x), lambda context, builder, _, given: change(
+            builder, *given, context.get_value_type(lanes)
+        )
 
     return intrinsic(converted)
 
@@ -86,7 +99,7 @@ def _conversion(dtype):
 to_single, to_double = _conversion(types.float32), _conversion(types.float64)
 
 
-# --- operators -------------------------------------------------------------------------------------------------------
+# --- operators ------------------------------------------------------------------------------------
 
 
 def _common(a, b) -> Lanes | None:
@@ -97,7 +110,8 @@ def _common(a, b) -> Lanes | None:
 
 
 def emit_broadcast(context, builder, value, kind, lanes):
-    """A value as a vector, or as a number if `lanes` is a type of numbers; a scalar is copied to every lane."""
+    """A value as a vector, or as a number if `lanes` is a type of numbers; a scalar is copied to
+    every lane."""
     if kind == lanes or not isinstance(lanes, Lanes):
         return context.cast(builder, value, kind, lanes)
     number = context.cast(builder, value, kind, lanes.dtype)
@@ -115,7 +129,8 @@ def emit_numbers(context, builder, values, kind, lanes) -> list:
 
 
 def define(function, typer, emit, *kinds) -> None:
-    """Define a function of Python for Numba types: its result by `typer`, its code by emit(context, builder, ...)."""
+    """Define a function of Python for Numba types: its result by `typer`, its code by emit(context,
+    builder, ...)."""
     type_callable(function)(lambda context: typer)
     for kind in kinds:
         lower_builtin(function, *kind)(emit)
@@ -130,14 +145,17 @@ def _define_operators(functions, emit, result=lambda lanes: lanes) -> None:
 
     def lower(context, builder, signature, arguments):
         lanes, pairs = _common(*signature.args), zip(arguments, signature.args, strict=True)
-        return emit(builder, *(emit_broadcast(context, builder, value, kind, lanes) for value, kind in pairs))
+        return emit(
+            builder,
+            *(emit_broadcast(context, builder, value, kind, lanes) for value, kind in pairs),
+        )
 
     for function in functions:
         define(function, typer, lower, (Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes))
 
 
-# A product and a sum in one expression are a multiply-add, rounded once. This is chosen here and not by LLVM, so that
-# the results of a kernel follow from its source alone.
+# A product and a sum in one expression are a multiply-add, rounded once. This is chosen here and
+# not by LLVM, so that the results of a kernel follow from its source alone.
 
 
 def _is_product(value) -> bool:
@@ -181,16 +199,27 @@ _define_operators([operator.mul, operator.imul], ir.IRBuilder.fmul)
 _define_operators([operator.truediv, operator.itruediv], ir.IRBuilder.fdiv)
 
 
-_define_operators([max], lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
-_define_operators([min], lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
+_define_operators(
+    [max], lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b)
+)
+_define_operators(
+    [min], lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b)
+)
 
 
 def _compare(sign, builder, a, b):
-    compare = builder.icmp_signed if isinstance(a.type.element, ir.IntType) else builder.fcmp_ordered
+    compare = (
+        builder.icmp_signed if isinstance(a.type.element, ir.IntType) else builder.fcmp_ordered
+    )
     return compare(sign, a, b)
 
 
-for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.eq, "==")):
+for _function, _sign in (
+    (operator.lt, "<"),
+    (operator.le, "<="),
+    (operator.gt, ">"),
+    (operator.eq, "=="),
+):
     _define_operators([_function], partial(_compare, _sign), lambda lanes: Mask(lanes.count))
 
 
@@ -199,4 +228,9 @@ def _logic(emit, context, builder, signature, arguments):
 
 
 for _function, _emit in ((operator.and_, ir.IRBuilder.and_), (operator.or_, ir.IRBuilder.or_)):
-    define(_function, lambda a, b: a if isinstance(a, Mask) and a == b else None, partial(_logic, _emit), (Mask, Mask))
+    define(
+        _function,
+        lambda a, b: a if isinstance(a, Mask) and a == b else None,
+        partial(_logic, _emit),
+        (Mask, Mask),
+    )

@@ -1,10 +1,11 @@
 """What machine code is made from: the definitions that a kernel reaches, for the keys of the cache.
 
-A definition is a top-level function, class or constant of a module. A kernel reaches the names in its syntax tree, and
-theirs in turn; of a class, its fields and constants, but no methods. It reaches a function that implements another one
-for a class (`implements`) if it reaches both, so that the classes in the types of its arguments count. Docstrings,
-comments and layout are not part of a definition, so that editing them compiles nothing. The package `compile` is one
-definition, because Numba finds its lowering functions by types and not by names.
+A definition is a top-level function, class or constant of a module. A kernel reaches the names in
+its syntax tree, and theirs in turn; of a class, its fields and constants, but no methods. It
+reaches a function that implements another one for a class (`implements`) if it reaches both, so
+that the classes in the types of its arguments count. Docstrings, comments and layout are not part
+of a definition, so that editing them compiles nothing. The package `compile` is one definition,
+because Numba finds its lowering functions by types and not by names.
 """
 
 import ast
@@ -28,12 +29,14 @@ COMPILER = "rigidmd.compile"
 #: Two checkouts have different sources.
 PACKAGE_NAME = hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:16]
 
-#: A definition: the name of its module and its name. The name of a module alone stands for all of it.
+#: A definition: the name of its module and its name. The name of a module alone stands for all of
+#: it.
 Node = tuple[str, str]
 
 
 class Implementation(NamedTuple):
-    """A function that implements another one; for arguments of a class, or for types that it chooses itself."""
+    """A function that implements another one; for arguments of a class, or for types that it
+    chooses itself."""
 
     of: Node
     kind: Node | None
@@ -44,7 +47,8 @@ implementations: list[Implementation] = []
 
 
 def register_implementation(of: Callable, kinds: tuple[type, ...], function: Callable) -> None:
-    """Note that a function implements another one, for classes or, without any, for types that it chooses."""
+    """Note that a function implements another one, for classes or, without any, for types that it
+    chooses."""
     nodes = [node_of(kind) for kind in kinds] or [None]
     implementations.extend(Implementation(node_of(of), kind, node_of(function)) for kind in nodes)
 
@@ -55,7 +59,8 @@ def node_of(value: Any) -> Node:
 
 
 class Definition(NamedTuple):
-    """The digest of a syntax tree, and the names in it: `name`, or `module.name` for an attribute."""
+    """The digest of a syntax tree, and the names in it: `name`, or `module.name` for an
+    attribute."""
 
     digest: str
     names: list[str]
@@ -82,8 +87,12 @@ def _closure_digest(roots: frozenset[Node], _implementations: int) -> str:
 def package_digest() -> str:
     """Hexadecimal digest of the package that compiles."""
     names = sorted(path.stem for path in Path(__file__).parent.glob("*.py"))
-    digests = [source_of(COMPILER if name == "__init__" else f"{COMPILER}.{name}") for name in names]
-    content = json.dumps([{k: d.digest for k, d in source.definitions.items()} for source in digests])
+    digests = [
+        source_of(COMPILER if name == "__init__" else f"{COMPILER}.{name}") for name in names
+    ]
+    content = json.dumps(
+        [{k: d.digest for k, d in source.definitions.items()} for source in digests]
+    )
     return hashlib.sha256(content.encode()).hexdigest()
 
 
@@ -93,7 +102,11 @@ def _reached(roots: Iterable[Node]) -> set[Node]:
     while fresh:
         reached |= fresh
         fresh = {node for one in fresh for node in _references(one)}
-        fresh |= {i.function for i in implementations if i.of in reached and (i.kind is None or i.kind in reached)}
+        fresh |= {
+            i.function
+            for i in implementations
+            if i.of in reached and (i.kind is None or i.kind in reached)
+        }
         fresh -= reached
     return reached
 
@@ -118,7 +131,8 @@ def _references(node: Node) -> tuple[Node, ...]:
 
 
 def _resolved(module: str, name: str) -> list[Node]:
-    """The definitions that a name in a module stands for; none outside of the package, or in `compile`."""
+    """The definitions that a name in a module stands for; none outside of the package, or in
+    `compile`."""
     first, _, attribute = name.partition(".")
     source = source_of(module)
     if first in source.definitions:
@@ -138,13 +152,18 @@ def _resolved(module: str, name: str) -> list[Node]:
 
 
 def _references_of_values(module: str) -> Iterator[Node]:
-    """The definitions of the package that a module outside of it uses: its values that come from there."""
+    """The definitions of the package that a module outside of it uses: its values that come from
+    there."""
     for value in list(vars(sys.modules.get(module, ModuleType(module))).values()):
         value = getattr(value, "py_func", value)
         origin = getattr(value, "__module__", None)
         if isinstance(value, ModuleType) and value.__name__ in _package_modules():
             yield from ((value.__name__, name) for name in source_of(value.__name__).definitions)
-        elif isinstance(origin, str) and origin in _package_modules() and hasattr(value, "__qualname__"):
+        elif (
+            isinstance(origin, str)
+            and origin in _package_modules()
+            and hasattr(value, "__qualname__")
+        ):
             yield node_of(value)
 
 
@@ -155,10 +174,11 @@ def _package_modules() -> frozenset[str]:
     return frozenset(".".join(path.parts).removesuffix(".__init__") for path in paths)
 
 
-# --- reading ---------------------------------------------------------------------------------------------------------
+# --- reading --------------------------------------------------------------------------------------
 
 
-#: Module -> time of change and size of its file, and its content as lists; what another process has read.
+#: Module -> time of change and size of its file, and its content as lists; what another process has
+#: read.
 _stored: dict[str, list] = {}
 
 
@@ -180,7 +200,8 @@ def source_of(module: str) -> Source:
 
 
 def read_stored(folder: Path) -> None:
-    """Read what other processes have stored in a folder, and store there at the end what this one reads."""
+    """Read what other processes have stored in a folder, and store there at the end what this one
+    reads."""
     path = folder / f"sources-{PACKAGE_NAME}.json"
     with suppress(OSError, ValueError), path.open(encoding="utf-8") as file:
         if not untrusted_reason(os.fstat(file.fileno())):
@@ -197,13 +218,16 @@ def _store(path: Path) -> None:
 
 
 def read_source(text: str) -> Source:
-    """The definitions and imports of the text of a module. Statements that define nothing are one definition, ""."""
+    """The definitions and imports of the text of a module. Statements that define nothing are one
+    definition, ""."""
     parts: dict[str, list[ast.AST]] = {}
     imports: dict[str, list[str]] = {}
     tree = _WithoutDocstrings().visit(ast.parse(text))
     for statement in ast.walk(tree):
         if isinstance(statement, ast.ImportFrom) and not statement.level:
-            imports |= {a.asname or a.name: [statement.module or "", a.name] for a in statement.names}
+            imports |= {
+                a.asname or a.name: [statement.module or "", a.name] for a in statement.names
+            }
         elif isinstance(statement, ast.Import):
             imports |= {a.asname or a.name.partition(".")[0]: [a.name, ""] for a in statement.names}
     for statement in tree.body:
@@ -218,8 +242,14 @@ def _defined(statement: ast.stmt) -> list[str]:
     """The names that a top-level statement defines."""
     if isinstance(statement, ast.FunctionDef | ast.ClassDef):
         return [statement.name]
-    targets = statement.targets if isinstance(statement, ast.Assign) else [getattr(statement, "target", None)]
-    names = [n.id for target in targets if target for n in ast.walk(target) if isinstance(n, ast.Name)]
+    targets = (
+        statement.targets
+        if isinstance(statement, ast.Assign)
+        else [getattr(statement, "target", None)]
+    )
+    names = [
+        n.id for target in targets if target for n in ast.walk(target) if isinstance(n, ast.Name)
+    ]
     return names if isinstance(statement, ast.Assign | ast.AnnAssign) and names else [""]
 
 
@@ -233,11 +263,15 @@ def _definition(statements: list[ast.AST]) -> Definition:
     # a module that is named only with attributes is not reached as a whole
     dotted = {name.partition(".")[0] for name in names if "." in name}
     text = "\n".join(ast.dump(statement) for statement in statements)
-    return Definition(hashlib.sha256(text.encode()).hexdigest()[:16], [name for name in names if name not in dotted])
+    return Definition(
+        hashlib.sha256(text.encode()).hexdigest()[:16],
+        [name for name in names if name not in dotted],
+    )
 
 
 class _WithoutDocstrings(ast.NodeTransformer):
-    """Removes texts that are statements, and the methods of classes, which compiled code does not call."""
+    """Removes texts that are statements, and the methods of classes, which compiled code does not
+    call."""
 
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
         text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)

@@ -1,21 +1,26 @@
-"""A pool of threads that run the blocks of a task, without OpenMP: one per core, waiting inside compiled code.
+"""A pool of threads that run the blocks of a task, without OpenMP: one per core, waiting inside
+compiled code.
 
-The calling thread is in the loop over steps. The worker threads are Python threads that never leave `_run_worker` and
-do not hold Python's lock. The calling thread publishes a task, its arguments and the number of blocks, and runs blocks
-itself. Workers that are awake run blocks too, until none is left. Each thread begins with its own work range, which is
-the same in every task, so that data that it has computed are still in the cache of its core; then it continues with
-ranges that other threads have not begun. The calling thread does not wait for workers that have begun no range, for
-example because their core is busy with another program. So a task costs a few transfers of a cache line between cores,
-not the start of a parallel region and a barrier of all threads at its end.
+The calling thread is in the loop over steps. The worker threads are Python threads that never leave
+`_run_worker` and do not hold Python's lock. The calling thread publishes a task, its arguments and
+the number of blocks, and runs blocks itself. Workers that are awake run blocks too, until none is
+left. Each thread begins with its own work range, which is the same in every task, so that data that
+it has computed are still in the cache of its core; then it continues with ranges that other threads
+have not begun. The calling thread does not wait for workers that have begun no range, for example
+because their core is busy with another program. So a task costs a few transfers of a cache line
+between cores, not the start of a parallel region and a barrier of all threads at its end.
 
-If the pool is busy, with another calling thread or because a block itself has blocks, the calling thread runs all its
-blocks alone. The blocks of a task, not the threads, determine the bits of a result.
+If the pool is busy, with another calling thread or because a block itself has blocks, the calling
+thread runs all its blocks alone. The blocks of a task, not the threads, determine the bits of a
+result.
 
-Measured once on two shared cores against the threading layers of Numba (`prange` over the blocks): an empty task of 16
-blocks takes 0.6 µs, with OpenMP 1.9 µs and with the work queue 70 µs. With OpenMP 500 argon atoms make 14 % fewer steps
-per second and 512 waters 22 %; with the work queue 8 and 4 times fewer.
+Measured once on two shared cores against the threading layers of Numba (`prange` over the blocks):
+an empty task of 16 blocks takes 0.6 µs, with OpenMP 1.9 µs and with the work queue 70 µs. With
+OpenMP 500 argon atoms make 14 % fewer steps per second and 512 waters 22 %; with the work queue 8
+and 4 times fewer.
 
-Atomic operations and the calls of Python's locks are LLVM IR that llvmlite builds; nothing of Numba is private.
+Atomic operations and the calls of Python's locks are LLVM IR that llvmlite builds; nothing of Numba
+is private.
 """
 
 import ctypes
@@ -34,26 +39,46 @@ from rigidmd.compile.kernels import compile_callback, compiler_options, kernel
 from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS, function_at, pointer_to
 
 INT64 = ir.IntType(64)
-# Indices of 64-bit cells in the memory of the pool. A cache line has 8; different threads write to different lines.
-RUN_TASK, WORKERS, POLLS = 0, 1, 2  # address of `_run_task`; workers in use; polls of a waiting thread before it sleeps
+# Indices of 64-bit cells in the memory of the pool. A cache line has 8; different threads write to
+# different lines.
+RUN_TASK, WORKERS, POLLS = (
+    0,
+    1,
+    2,
+)  # address of `_run_task`; workers in use; polls of a waiting thread before it sleeps
 BUSY = 8  # 1 while a calling thread uses the pool
 JOB = 16  # even number of the present job; odd while a job is being written
-ADDRESS, ARGUMENTS, BLOCKS = 24, 25, 26  # the job: address of its task, address of its arguments, number of blocks
+ADDRESS, ARGUMENTS, BLOCKS = (
+    24,
+    25,
+    26,
+)  # the job: address of its task, address of its arguments, number of blocks
 DONE = 32  # number of its ranges that are finished
-CALLER_SLEEPS, CALLER_LOCK = 40, 41  # 1 while the calling thread sleeps; the lock on which it sleeps
+CALLER_SLEEPS, CALLER_LOCK = (
+    40,
+    41,
+)  # 1 while the calling thread sleeps; the lock on which it sleeps
 RANGE_JOBS = 48  # for each work range, the last job in which a thread began it
 MOST_RANGES = MOST_BLOCKS  # if there are more blocks, a work range has several
-FIRST_WORKER, LINE = RANGE_JOBS + MOST_RANGES, 8  # a cache line for each worker: 1 while it sleeps, and its lock
+FIRST_WORKER, LINE = (
+    RANGE_JOBS + MOST_RANGES,
+    8,
+)  # a cache line for each worker: 1 while it sleeps, and its lock
 SLEEPS, LOCK = 0, 1
 SYMBOL = "rigidmd_thread_pool"
-ALLOCATE, ACQUIRE, RELEASE = "PyThread_allocate_lock", "PyThread_acquire_lock", "PyThread_release_lock"
-#: Time in seconds for which a waiting thread polls before it sleeps: longer than the time between two tasks, and too
-#: short to disturb other programs.
+ALLOCATE, ACQUIRE, RELEASE = (
+    "PyThread_allocate_lock",
+    "PyThread_acquire_lock",
+    "PyThread_release_lock",
+)
+#: Time in seconds for which a waiting thread polls before it sleeps: longer than the time between
+#: two tasks, and too short to disturb other programs.
 POLLING_TIME = 50e-6
 
 
 def _on_cell(emit_on, *values, result=types.int64):
-    """Signature and code of an intrinsic (address of the pool's memory, cell, *values), all integers."""
+    """Signature and code of an intrinsic (address of the pool's memory, cell, *values), all
+    integers."""
 
     def emit(context, builder, signature, arguments):
         address = builder.add(arguments[0], builder.mul(arguments[1], INT64(8)))
@@ -91,11 +116,14 @@ def _replace(typing, pool, cell, old, new):
 
 
 def _python_function(name: str, *more: ir.Constant):
-    """An intrinsic (address of a lock) that calls a C function of Python which does not need Python's lock."""
+    """An intrinsic (address of a lock) that calls a C function of Python which does not need
+    Python's lock."""
 
     def typed(typing, lock):
         def emit(context, builder, signature, arguments):
-            kind = ir.FunctionType(ir.IntType(32) if more else ir.VoidType(), [INT64, *(one.type for one in more)])
+            kind = ir.FunctionType(
+                ir.IntType(32) if more else ir.VoidType(), [INT64, *(one.type for one in more)]
+            )
             function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
             builder.call(function, [arguments[0], *more])
             return context.get_dummy_value()
@@ -126,7 +154,8 @@ def _pause(typing):
 
 @intrinsic
 def call_address(typing, address, task_arguments, block):
-    """Call the task at an address with a block and with arguments, or their address (a `NumbaStruct` has one)."""
+    """Call the task at an address with a block and with arguments, or their address (a
+    `NumbaStruct` has one)."""
 
     def emit(context, builder, signature, arguments):
         address, content, block = arguments
@@ -142,10 +171,11 @@ def call_address(typing, address, task_arguments, block):
 
 @kernel(count_references=False)
 def _run_ranges(pool, job, address, task_arguments, blocks, thread, threads):
-    """Run the ranges of a job that no thread has begun; returns whether the last one to finish was among them.
+    """Run the ranges of a job that no thread has begun; returns whether the last one to finish was
+    among them.
 
-    Even threads begin with their first range and go up, odd ones with their last and go down: two neighbouring threads
-    meet where they have computed the same data.
+    Even threads begin with their first range and go up, odd ones with their last and go down: two
+    neighbouring threads meet where they have computed the same data.
     """
     ranges = min(blocks, MOST_RANGES)
     last = False
@@ -153,7 +183,8 @@ def _run_ranges(pool, job, address, task_arguments, blocks, thread, threads):
     at = thread * ranges // threads if up else max(0, (thread + 1) * ranges // threads - 1)
     for _ in range(ranges):
         begun = _read(pool, RANGE_JOBS + at)
-        # A range of an earlier job has this number or a later one: all were begun before the next job was written.
+        # A range of an earlier job has this number or a later one: all were begun before the next
+        # job was written.
         if begun < job and _replace(pool, RANGE_JOBS + at, begun, job):
             for block in range(at * blocks // ranges, (at + 1) * blocks // ranges):
                 call_address(address, task_arguments, block)
@@ -168,12 +199,16 @@ def _run_worker(pool, index):
     polls = finished = 0
     while True:
         job, workers = _read(pool, JOB), _read(pool, WORKERS)
-        address, task_arguments, blocks = _read(pool, ADDRESS), _read(pool, ARGUMENTS), _read(pool, BLOCKS)
+        address, task_arguments, blocks = (
+            _read(pool, ADDRESS),
+            _read(pool, ARGUMENTS),
+            _read(pool, BLOCKS),
+        )
         # these values belong to this job if its number is still the same
         if job != finished and job % 2 == 0 and index < workers and _read(pool, JOB) == job:
-            if _run_ranges(pool, job, address, task_arguments, blocks, index + 1, workers + 1) and _replace(
-                pool, CALLER_SLEEPS, 1, 0
-            ):
+            if _run_ranges(
+                pool, job, address, task_arguments, blocks, index + 1, workers + 1
+            ) and _replace(pool, CALLER_SLEEPS, 1, 0):
                 _wake(_read(pool, CALLER_LOCK))
             finished = job
             polls = 0
@@ -229,19 +264,24 @@ def _poll(pool, count):
 
 @intrinsic
 def run_on_all_threads(typing, address, task_arguments, blocks):
-    """Call the task at an address for every block, on all threads; `task_arguments` as for `call_address`.
+    """Call the task at an address for every block, on all threads; `task_arguments` as for
+    `call_address`.
 
     `start_workers` must have been called.
     """
 
     def emit(context, builder, signature, arguments):
-        memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(builder.module, INT64, SYMBOL)
+        memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(
+            builder.module, INT64, SYMBOL
+        )
         kind = ir.FunctionType(ir.VoidType(), [INT64] * 4)
         run_task = function_at(builder, builder.load(memory, typ=INT64), kind)
         content = arguments[1]
         if not isinstance(content.type, ir.IntType):
             content = builder.ptrtoint(content, INT64)
-        builder.call(run_task, [builder.ptrtoint(memory, INT64), arguments[0], content, arguments[2]])
+        builder.call(
+            run_task, [builder.ptrtoint(memory, INT64), arguments[0], content, arguments[2]]
+        )
         return context.get_dummy_value()
 
     content = types.intp if isinstance(task_arguments, types.Integer) else task_arguments
@@ -253,19 +293,23 @@ class _ThreadPool:
 
     def __init__(self):
         memory = np.zeros(FIRST_WORKER + LINE * (MOST_THREADS + 1), np.int64)
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(memory))  # workers may still read it while Python exits
+        ctypes.pythonapi.Py_IncRef(
+            ctypes.py_object(memory)
+        )  # workers may still read it while Python exits
         self.cells = memory[-memory.ctypes.data % 64 // 8 :]
         llvmlite.binding.add_symbol(SYMBOL, self.cells.ctypes.data)
         for name in (ACQUIRE, RELEASE):
-            llvmlite.binding.add_symbol(name, ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p).value)
+            llvmlite.binding.add_symbol(
+                name, ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p).value
+            )
         self.wanted = MOST_THREADS
         self.started = 0
         self.code: list = []
         self._starting = threading.RLock()
 
     def start(self) -> None:
-        """Compile the loops of the pool, or read them from the cache. Start the missing workers, and use as many as are
-        wanted."""
+        """Compile the loops of the pool, or read them from the cache. Start the missing workers,
+        and use as many as are wanted."""
         with self._starting:
             if not self.code:
                 options = compiler_options(count_references=False)
@@ -276,15 +320,21 @@ class _ThreadPool:
                 self.cells[RUN_TASK] = self.code[0].address
                 self.cells[CALLER_LOCK] = _new_lock()
                 poll, count = self._c_function(2), 500
-                fastest = min(timeit.repeat(lambda: poll(self.cells.ctypes.data, count), number=1, repeat=3))
+                fastest = min(
+                    timeit.repeat(lambda: poll(self.cells.ctypes.data, count), number=1, repeat=3)
+                )
                 self.cells[POLLS] = max(1, int(count * POLLING_TIME / fastest))
             workers = self.wanted - 1
             for index in range(self.started, workers):
                 line = FIRST_WORKER + LINE * index
                 self.cells[line + LOCK] = _new_lock()
                 loop, arguments = self._c_function(1), (self.cells.ctypes.data, index)
-                threading.Thread(target=loop, args=arguments, name=f"rigidmd-{index + 1}", daemon=True).start()
-                while self.cells[line + SLEEPS] == 0:  # to start it needs Python's lock, which a run may hold later
+                threading.Thread(
+                    target=loop, args=arguments, name=f"rigidmd-{index + 1}", daemon=True
+                ).start()
+                while (
+                    self.cells[line + SLEEPS] == 0
+                ):  # to start it needs Python's lock, which a run may hold later
                     time.sleep(POLLING_TIME)
                 self.started += 1
             self.cells[WORKERS] = workers
@@ -298,7 +348,9 @@ class _ThreadPool:
         self.started, self._starting = 0, threading.RLock()
         self.cells[[WORKERS, BUSY, CALLER_SLEEPS]] = 0
         self.cells[FIRST_WORKER:] = 0
-        self.cells[RANGE_JOBS:FIRST_WORKER] = self.cells[JOB]  # nothing is left of a job that another thread had begun
+        self.cells[RANGE_JOBS:FIRST_WORKER] = self.cells[
+            JOB
+        ]  # nothing is left of a job that another thread had begun
         if self.code:
             self.cells[CALLER_LOCK] = _new_lock()
 
@@ -324,5 +376,7 @@ start_workers = _pool.start
 def set_threads(count: int) -> None:
     """Number of threads that compute, the calling thread included; results do not depend on it."""
     _pool.wanted = count
-    if _pool.code and count - 1 != _pool.cells[WORKERS]:  # not before the first task; also after a fork
+    if (
+        _pool.code and count - 1 != _pool.cells[WORKERS]
+    ):  # not before the first task; also after a fork
         _pool.start()

@@ -1,1 +1,2 @@
-"""Used by every package, without compiled code: the state, status codes, integrators, statistics, files, TOML."""
+"""Used by every package, without compiled code: the state, status codes, integrators, statistics,
+files, TOML."""

@@ -1,6 +1,7 @@
 """Display of values in notebooks. Packages above register functions for values of packages below.
 
-A module in `PROVIDERS` is imported when a value is first displayed; `rigidmd` names `rigidmd.view.notebook`.
+A module in `PROVIDERS` is imported when a value is first displayed; `rigidmd` names
+`rigidmd.view.notebook`.
 """
 
 from functools import singledispatch

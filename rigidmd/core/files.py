@@ -1,4 +1,5 @@
-"""Files that are written atomically, files that grow by whole records, and which files can be read."""
+"""Files that are written atomically, files that grow by whole records, and which files can be
+read."""
 
 import contextlib
 import errno
@@ -14,19 +15,25 @@ from pathlib import Path
 from rigidmd.errors import OutputError
 
 CHUNK = 1 << 20  # bytes read at a time
-#: Flags to open an existing file for appending; links are not followed, where the system supports that.
+#: Flags to open an existing file for appending; links are not followed, where the system supports
+#: that.
 APPEND_FLAGS = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
 
 
 def unreadable_reason(path: Path, largest: float = inf) -> str:
-    """Why a file cannot be read; empty if it can be. Pipes and devices are refused, because they may never end.
+    """Why a file cannot be read; empty if it can be. Pipes and devices are refused, because they
+    may never end.
 
     largest : greatest size in bytes
     """
     try:
         found = path.stat()
     except OSError as error:
-        return "there is no such file" if error.errno == errno.ENOENT else f"cannot be read: {error.strerror}"
+        return (
+            "there is no such file"
+            if error.errno == errno.ENOENT
+            else f"cannot be read: {error.strerror}"
+        )
     except ValueError:
         return "there is no such file: its name contains a zero byte"
     if stat.S_ISDIR(found.st_mode):
@@ -39,7 +46,8 @@ def unreadable_reason(path: Path, largest: float = inf) -> str:
 
 
 def untrusted_reason(found: os.stat_result) -> str:
-    """Why a file or folder may have been written by others than this user and root; empty if it cannot.
+    """Why a file or folder may have been written by others than this user and root; empty if it
+    cannot.
 
     found : of `os.lstat` or `os.fstat`. Systems without user numbers have no such check.
     """
@@ -55,12 +63,14 @@ def untrusted_reason(found: os.stat_result) -> str:
 
 
 class LostFileError(OutputError):
-    """A file of a run was removed, replaced or changed by another program while the run was writing it."""
+    """A file of a run was removed, replaced or changed by another program while the run was writing
+    it."""
 
 
 @contextlib.contextmanager
 def writing(path: Path, what: str = "written", hint: str = "") -> Iterator[None]:
-    """Within it an OSError becomes an OutputError: PATH cannot be `what`, the reason, and a hint."""
+    """Within it an OSError becomes an OutputError: PATH cannot be `what`, the reason, and a
+    hint."""
     try:
         yield
     except OSError as error:
@@ -69,8 +79,8 @@ def writing(path: Path, what: str = "written", hint: str = "") -> Iterator[None]
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """A temporary path in the folder of `path`, renamed to `path` when the block succeeds and removed when it fails. A
-    link at `path` is replaced; its target is not changed."""
+    """A temporary path in the folder of `path`, renamed to `path` when the block succeeds and
+    removed when it fails. A link at `path` is replaced; its target is not changed."""
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
     with writing(path):
         temporary.touch(exist_ok=False)  # with the permissions of any new file
@@ -93,7 +103,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def create_empty_file(path: Path) -> None:
-    """Create an empty file for a library that opens it by name; an existing file or link is removed first."""
+    """Create an empty file for a library that opens it by name; an existing file or link is removed
+    first."""
     path.unlink(missing_ok=True)
     path.touch(exist_ok=False)
 
@@ -108,16 +119,20 @@ def sync_file(path: Path) -> None:
 
 
 class AppendedFile:
-    """A file that grows by whole records. A record that cannot be written is removed. Methods raise OutputError.
+    """A file that grows by whole records. A record that cannot be written is removed. Methods raise
+    OutputError.
 
-    A new file replaces an existing one; an existing file is continued after `cut` has been called. Links are not
-    followed.
+    A new file replaces an existing one; an existing file is continued after `cut` has been called.
+    Links are not followed.
 
-    kept : an earlier value of the property `kept`, at which the file is continued; None begins a new file
+    kept : an earlier value of the property `kept`, at which the file is continued; None begins a
+        new file
     patched : offset and original value of bytes that `patch` replaces
     """
 
-    def __init__(self, path: Path, kept: Sequence[int] | None = None, patched: tuple[int, bytes] = (0, b"")):
+    def __init__(
+        self, path: Path, kept: Sequence[int] | None = None, patched: tuple[int, bytes] = (0, b"")
+    ):
         self._path = path
         self._size, self._sum = (0, 0) if kept is None else kept
         self._is_whole = True  # whether each record was appended to all records before it
@@ -125,7 +140,10 @@ class AppendedFile:
             if kept is None:
                 create_empty_file(path)
             elif path.is_symlink() or (reason := unreadable_reason(path)):
-                raise OutputError(f"{path}: {'is a link' if path.is_symlink() else reason}; the run cannot continue it")
+                raise OutputError(
+                    f"{path}: {'is a link' if path.is_symlink() else reason}; the run cannot"
+                    " continue it"
+                )
             self._file = os.fdopen(os.open(path, APPEND_FLAGS), "r+b", buffering=0)
             if why := "" if kept is None else self._difference(*patched):
                 self._file.close()
@@ -139,24 +157,29 @@ class AppendedFile:
 
     @property
     def kept(self) -> tuple[int, int]:
-        """Size in bytes, after flushing to the disk, and the CRC-32 of the appended records. Raises OutputError, see
-        `check` too."""
+        """Size in bytes, after flushing to the disk, and the CRC-32 of the appended records. Raises
+        OutputError, see `check` too."""
         with writing(self._path):
             os.fsync(self._file.fileno())
         self.check()
         return self._size, self._sum
 
     def check(self) -> None:
-        """Raise LostFileError if the file that is being written was removed, replaced or changed by another program."""
+        """Raise LostFileError if the file that is being written was removed, replaced or changed by
+        another program."""
         ours = os.fstat(self._file.fileno())
         try:
             found = self._path.lstat()
         except OSError:
             raise LostFileError(f"{self._path} was removed while the run was writing it") from None
         if (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino):
-            raise LostFileError(f"{self._path} was replaced by another file while the run was writing it")
+            raise LostFileError(
+                f"{self._path} was replaced by another file while the run was writing it"
+            )
         if not self._is_whole or ours.st_size != self._size:
-            raise LostFileError(f"{self._path} was changed by another program while the run was writing it")
+            raise LostFileError(
+                f"{self._path} was changed by another program while the run was writing it"
+            )
 
     def append(self, piece: bytes) -> None:
         """Append a record. A file that another program has cut is known to `check`."""

@@ -1,16 +1,19 @@
-"""Names of users: made safe for generated files that are code, made distinct, and compared with known names."""
+"""Names of users: made safe for generated files that are code, made distinct, and compared with
+known names."""
 
 import difflib
 import re
 from collections.abc import Iterable
 from itertools import chain, count
 
-#: Line ends, control characters and characters that Slurm interprets within quotes: not allowed in paths of scripts.
+#: Line ends, control characters and characters that Slurm interprets within quotes: not allowed in
+#: paths of scripts.
 UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\"\\]")
 
 
 def in_comment(text: str) -> str:
-    """A text in one line for comments and titles; characters with a meaning in some language become underscores."""
+    """A text in one line for comments and titles; characters with a meaning in some language become
+    underscores."""
     return re.sub(r"[^\w .,:;=()+/@-]", "_", text)
 
 
@@ -36,7 +39,8 @@ def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
 
 #: With more similar names than this, no suggestion is made from a common beginning or end.
 MOST_SUGGESTIONS = 8
-#: Limits of length and number of names beyond which none is suggested, because the comparison would take long.
+#: Limits of length and number of names beyond which none is suggested, because the comparison would
+#: take long.
 LONGEST_NAME, MOST_NAMES = 60, 1000
 
 
@@ -51,8 +55,9 @@ def suggestion(names: list[str]) -> str:
 
 
 def similar_names(name: str, known: Iterable[str]) -> list[str]:
-    """Known names that an unknown one may stand for: those that differ only in case and punctuation; else those that
-    begin with it, such as a key without its unit, or end with it; else the one with the most similar spelling."""
+    """Known names that an unknown one may stand for: those that differ only in case and
+    punctuation; else those that begin with it, such as a key without its unit, or end with it; else
+    the one with the most similar spelling."""
     known = list(known)
     if len(name) > LONGEST_NAME or len(known) > MOST_NAMES:
         return []

@@ -1,4 +1,5 @@
-"""Settings and memory of the process, which runs in several threads share, and other processes of Python."""
+"""Settings and memory of the process, which runs in several threads share, and other processes of
+Python."""
 
 import contextlib
 import os
@@ -12,14 +13,16 @@ from typing import Any
 
 from rigidmd.errors import SettingError
 
-#: Held while settings of the process change temporarily, and while a run compiles, which changes some too. A thread
-#: that holds it may wait for the locks of Numba and of `compile`, but not the other way round.
+#: Held while settings of the process change temporarily, and while a run compiles, which changes
+#: some too. A thread that holds it may wait for the locks of Numba and of `compile`, but not the
+#: other way round.
 PROCESS_LOCK = threading.RLock()
 
 
 @contextlib.contextmanager
 def ignore_warnings() -> Iterator[None]:
-    """Hide all warnings within the block. Python has one list of warning filters for all threads."""
+    """Hide all warnings within the block. Python has one list of warning filters for all
+    threads."""
     with PROCESS_LOCK, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -33,9 +36,9 @@ LOCAL_SETTINGS = (".numba_config.yaml", "matplotlibrc")
 def without_local_settings() -> Iterator[None]:
     """Within the block, libraries do not find their configuration files in the working directory.
 
-    A folder from others could otherwise change results by such a file, or stop a run. The libraries have no setting for
-    this. Both look for the file by `os.path.exists`, which is replaced for all threads. A program keeps it replaced
-    until its end.
+    A folder from others could otherwise change results by such a file, or stop a run. The libraries
+    have no setting for this. Both look for the file by `os.path.exists`, which is replaced for all
+    threads. A program keeps it replaced until its end.
     """
     exists = os.path.exists
 
@@ -52,8 +55,8 @@ def without_local_settings() -> Iterator[None]:
 def python_process(*arguments: str) -> dict[str, Any]:
     """Arguments of `subprocess.Popen` for a process of Python with the search path of this one.
 
-    The process does not import from the working directory (`-P`), where a file of others may be called `json.py`. It
-    finds this package in any case.
+    The process does not import from the working directory (`-P`), where a file of others may be
+    called `json.py`. It finds this package in any case.
     """
     entries = [os.path.abspath(entry) for entry in sys.path if entry]
     path = os.pathsep.join([*entries, str(Path(__file__).parents[2])])
@@ -64,16 +67,20 @@ try:
     import resource
 except ImportError:  # on Windows
     resource = None
-#: Bytes of address space to load all libraries. With less they fail in many ways, and OpenBLAS may hang.
+#: Bytes of address space to load all libraries. With less they fail in many ways, and OpenBLAS may
+#: hang.
 LIBRARY_BYTES = 1e9
 RESERVED = 0.05  # fraction of the free memory that is reserved for Python, machine code and files
 
 
 def free_memory() -> float:
-    """Free bytes of this machine, within the limits of container and process; infinite where the system has no data."""
+    """Free bytes of this machine, within the limits of container and process; infinite where the
+    system has no data."""
     free, group = _system_number("/proc/meminfo", "MemAvailable:") * 1024, "/sys/fs/cgroup/memory"
     for limit, used in ((".max", ".current"), ("/memory.limit_in_bytes", "/memory.usage_in_bytes")):
-        free = min(free, _system_number(f"{group}{limit}") - min(_system_number(f"{group}{used}"), 1e18))
+        free = min(
+            free, _system_number(f"{group}{limit}") - min(_system_number(f"{group}{used}"), 1e18)
+        )
     return max(0.0, min(free, address_space_left()))
 
 
@@ -82,7 +89,10 @@ def memory_shortage(needed: float, what: str) -> str:
     free = free_memory()
     if needed <= (1 - RESERVED) * free:
         return ""
-    return f"{what} needs {format_gigabytes(needed)} of memory, and this machine has {format_gigabytes(free)} free"
+    return (
+        f"{what} needs {format_gigabytes(needed)} of memory, and this machine has"
+        f" {format_gigabytes(free)} free"
+    )
 
 
 def format_gigabytes(size: float) -> str:
@@ -90,7 +100,8 @@ def format_gigabytes(size: float) -> str:
 
 
 def address_space_left() -> float:
-    """Bytes of address space left by the limit of this process (`ulimit -v`); infinite without a limit."""
+    """Bytes of address space left by the limit of this process (`ulimit -v`); infinite without a
+    limit."""
     if resource is None:
         return inf
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -99,12 +110,14 @@ def address_space_left() -> float:
 
 
 def check_address_space() -> None:
-    """Raise SettingError if the libraries cannot be loaded within the limit of this process (`ulimit -v`)."""
+    """Raise SettingError if the libraries cannot be loaded within the limit of this process
+    (`ulimit -v`)."""
     if "numba" in sys.modules or (left := address_space_left()) >= LIBRARY_BYTES:
         return
     raise SettingError(
-        f"not enough memory: the program and its libraries need {format_gigabytes(LIBRARY_BYTES)} of addresses, and "
-        f"the limit of this process leaves {format_gigabytes(left)}; raise it (ulimit -v)"
+        f"not enough memory: the program and its libraries need {format_gigabytes(LIBRARY_BYTES)}"
+        f" of addresses, and the limit of this process leaves {format_gigabytes(left)}; raise it"
+        " (ulimit -v)"
     )
 
 

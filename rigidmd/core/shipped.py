@@ -1,4 +1,5 @@
-"""Files that are shipped with the package: example scenes, notebooks, scripts, chapters of the documentation."""
+"""Files that are shipped with the package: example scenes, notebooks, scripts, chapters of the
+documentation."""
 
 import json
 import re
@@ -14,7 +15,8 @@ from rigidmd.core.plain_text import did_you_mean, similar_names, suggestion
 from rigidmd.errors import InputError, OutputError, option
 
 PACKAGE = Path(__file__).parent.parent
-#: In a wheel the scenes are inside the package; in a checkout or an editable install they are next to it.
+#: In a wheel the scenes are inside the package; in a checkout or an editable install they are next
+#: to it.
 SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
 DOCS = PACKAGE / "docs"
 NOTEBOOKS, SCRIPTS = "notebooks/*.ipynb", "scripts/*.py"
@@ -27,16 +29,38 @@ SECTIONS = {
     "start": ("installation", "why"),
     "tutorials": ("top", "water", "molecule", "notebook"),
     "guides": (
-        "npt", "time_step", "ensembles", "electrostatics", "structures", "tables", "slab", "analysis", "transport",
-        "normal_modes", "pmf", "replicas", "studies", "continuing", "resume", "stops", "troubleshooting", "pictures",
-        "ase", "calculators", "engines", "coming_from", "extending",
+        "npt",
+        "time_step",
+        "ensembles",
+        "electrostatics",
+        "structures",
+        "tables",
+        "slab",
+        "analysis",
+        "transport",
+        "normal_modes",
+        "pmf",
+        "replicas",
+        "studies",
+        "continuing",
+        "resume",
+        "stops",
+        "troubleshooting",
+        "pictures",
+        "ase",
+        "calculators",
+        "engines",
+        "coming_from",
+        "extending",
     ),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
     "evidence": ("benchmarks", "collection", "validation"),
     "project": ("contributing", "architecture", "changelog"),
-}  # fmt: skip
-CHAPTERS = {name: DOCS / folder / f"{name}.md" for folder, names in SECTIONS.items() for name in names}
+}
+CHAPTERS = {
+    name: DOCS / folder / f"{name}.md" for folder, names in SECTIONS.items() for name in names
+}
 
 
 class Example(NamedTuple):
@@ -53,46 +77,70 @@ class Example(NamedTuple):
 
 
 def examples(files: str = "*.toml") -> list[Example]:
-    """The shipped scenes, or the examples among other files, sorted by name; numbers within names by their value."""
+    """The shipped scenes, or the examples among other files, sorted by name; numbers within names
+    by their value."""
     found = []
     for path in SYSTEMS.glob(files):
         text = path.read_text(encoding="utf-8")
         is_body = path.suffix == ".toml" and "body" in tomllib.loads(text)
         first = "".join(json.loads(text)["cells"][0]["source"]) if path.suffix == ".ipynb" else text
         found.append(Example(path.stem, path, first.partition("\n")[0].removeprefix("# "), is_body))
-    return sorted(found, key=lambda one: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", one.name)])
+    return sorted(
+        found, key=lambda one: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", one.name)]
+    )
 
 
 def find_example(name: str) -> Example:
-    """The example of this name, or the first scene of a numbered series of this name. Raises InputError."""
-    known = {example.name: example for example in [*examples(), *examples(NOTEBOOKS), *examples(SCRIPTS)]}
+    """The example of this name, or the first scene of a numbered series of this name. Raises
+    InputError."""
+    known = {
+        example.name: example for example in [*examples(), *examples(NOTEBOOKS), *examples(SCRIPTS)]
+    }
     if name in known:
         return known[name]
     if series := series_of(name):
         return known[series[0]]
     stem = Path(name).stem
-    near = [other for other in known if f"{other}_".startswith(f"{stem}_")] or similar_names(stem, known)
+    near = [other for other in known if f"{other}_".startswith(f"{stem}_")] or similar_names(
+        stem, known
+    )
     hint = suggestion(near) or ";"
-    raise InputError("examples", [f"unknown scene {name!r}{hint} `rigidmd examples` lists all {len(known)}"])
+    raise InputError(
+        "examples", [f"unknown scene {name!r}{hint} `rigidmd examples` lists all {len(known)}"]
+    )
 
 
 def series_of(name: str) -> list[str]:
     """The scenes NAME_1, NAME_2, ...; empty if there are none."""
-    return [example.name for example in examples() if re.fullmatch(rf"{re.escape(name)}_\d+", example.name)]
+    return [
+        example.name
+        for example in examples()
+        if re.fullmatch(rf"{re.escape(name)}_\d+", example.name)
+    ]
 
 
-def copy_example(example: Example, path: Path, force: bool, read: Iterable[Path] = ()) -> list[Path]:
-    """Copy an example to `path`, with the files that it reads. Returns the paths written. Raises OutputError."""
+def copy_example(
+    example: Example, path: Path, force: bool, read: Iterable[Path] = ()
+) -> list[Path]:
+    """Copy an example to `path`, with the files that it reads. Returns the paths written. Raises
+    OutputError."""
     if path.suffix != example.path.suffix:
         other = f"{option('file')} names another file for the {example.kind}"
         raise OutputError(f"{path} must end in {example.path.suffix}: {other}")
     inputs = {path.parent / file.relative_to(example.path.parent): file for file in read}
     for target in (path, *inputs):
-        kept = target in inputs and target.is_file() and target.read_bytes() == inputs[target].read_bytes()
+        kept = (
+            target in inputs
+            and target.is_file()
+            and target.read_bytes() == inputs[target].read_bytes()
+        )
         if target.is_dir():
             raise OutputError(f"{target} is a folder; {option('file')} names another file")
         if target.exists() and not force and not kept:
-            raise OutputError(f"{target} exists; {option('force')} replaces it, {option('file')} names another file")
+            raise OutputError(
+                f"{target} exists; {option('force')} replaces it, {option('file')} names another"
+                " file"
+            )
     for target, source in {path: example.path, **inputs}.items():
         with writing(target):
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -110,18 +158,28 @@ def contents() -> dict[str, dict[str, str]]:
 
 
 def chapter_text(name: str) -> str:
-    """A chapter as plain text, without comments; pictures become name and path. Raises InputError."""
+    """A chapter as plain text, without comments; pictures become name and path. Raises
+    InputError."""
     if name not in CHAPTERS:
         word = re.compile(rf"\b{re.escape(name)}", re.IGNORECASE)
-        found = {chapter: len(word.findall(_plain(chapter))) for chapter in CHAPTERS if chapter != "changelog"}
+        found = {
+            chapter: len(word.findall(_plain(chapter)))
+            for chapter in CHAPTERS
+            if chapter != "changelog"
+        }
         named = [f"{chapter} ({count})" for chapter, count in found.items() if count]
-        where = f"the word is in {', '.join(named)}" if named else f"there are {', '.join(CHAPTERS)}"
-        raise InputError("help", [f"unknown chapter {name!r}{did_you_mean(name, CHAPTERS) or ';'} {where}"])
+        where = (
+            f"the word is in {', '.join(named)}" if named else f"there are {', '.join(CHAPTERS)}"
+        )
+        raise InputError(
+            "help", [f"unknown chapter {name!r}{did_you_mean(name, CHAPTERS) or ';'} {where}"]
+        )
     return _plain(name)
 
 
 def _plain(name: str) -> str:
-    """The text of a chapter. Shipped files are named as `rigidmd new` copies them, not by their paths."""
+    """The text of a chapter. Shipped files are named as `rigidmd new` copies them, not by their
+    paths."""
     text = re.sub(r"<!--.*?-->\n?", "", CHAPTERS[name].read_text(encoding="utf-8"), flags=re.DOTALL)
     copied = sorted(set(_SHIPPED.findall(text)))
     title, _, text = text.partition("\n")

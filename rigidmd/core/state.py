@@ -1,4 +1,5 @@
-"""The state: everything that evolves during a run, and nothing else. The load on its bodies, and status codes."""
+"""The state: everything that evolves during a run, and nothing else. The load on its bodies, and
+status codes."""
 
 from math import acos, degrees, hypot, inf
 from operator import mul
@@ -8,29 +9,38 @@ import numpy as np
 
 # Status codes of kernels. The largest one wins, and Python acts on it (engines.cpu).
 OK = 0
-NEEDS_PYTHON_FORCES = 1  # a Python function has to compute its force: do so and call the kernel again
+NEEDS_PYTHON_FORCES = (
+    1  # a Python function has to compute its force: do so and call the kernel again
+)
 LIST_FULL = 2  # a neighbour list needs more memory: enlarge it and call the kernel again
-CELL_CHANGED = 3  # the cell is now too small for the skin of a list: fit the list and call the kernel again
+CELL_CHANGED = (
+    3  # the cell is now too small for the skin of a list: fit the list and call the kernel again
+)
 BEHIND_WALL = 4  # a site is on a wall that it cannot pass, or behind it
 NOT_FINITE = 5  # a position is not a number, or too large to be meaningful
 
-#: Columns of `State.energy_ledger`, energies added so far: heat of thermostats, work of driving and braking forces and
-#: of barostats, and the (negative) kinetic energy of total momentum that was removed.
+#: Columns of `State.energy_ledger`, energies added so far: heat of thermostats, work of driving and
+#: braking forces and of barostats, and the (negative) kinetic energy of total momentum that was
+#: removed.
 HEAT, WORK, REMOVED = 0, 1, 2
-#: Columns of `State.time` and `State.step`: now, and where the present segment of equal steps began.
+#: Columns of `State.time` and `State.step`: now, and where the present segment of equal steps
+#: began.
 NOW, ORIGIN = 0, 1
 
-# A tally is a float64 array (10,): energy, then the molecular virial tensor sum F (x) R in rows (u Å²/ps²).
+# A tally is a float64 array (10,): energy, then the molecular virial tensor sum F (x) R in rows (u
+# Å²/ps²).
 # None instead of it compiles the kernels without energies.
 TALLY_SIZE = 10
 
 
 class State(NamedTuple):
-    """Everything that evolves. float64 except `step`; n bodies; molecules in Å, ps, u, single bodies in SI.
+    """Everything that evolves. float64 except `step`; n bodies; molecules in Å, ps, u, single
+    bodies in SI.
 
-    A scene of points has rotation (0, 3, 3) and angular_momentum_body (0, 3), because points do not rotate. A pinned
-    body has position and velocity (0, 3). Within a segment of equal steps the time is computed from the step,
-    time[ORIGIN] + (step[NOW] - step[ORIGIN]) dt, so a run in parts has exactly the times of an uninterrupted one.
+    A scene of points has rotation (0, 3, 3) and angular_momentum_body (0, 3), because points do not
+    rotate. A pinned body has position and velocity (0, 3). Within a segment of equal steps the time
+    is computed from the step, time[ORIGIN] + (step[NOW] - step[ORIGIN]) dt, so a run in parts has
+    exactly the times of an uninterrupted one.
     """
 
     position: np.ndarray  # (n, 3) centre of mass, lab frame, never wrapped
@@ -40,8 +50,12 @@ class State(NamedTuple):
     cell: np.ndarray  # (3, 3) rows a along x, b in the xy plane, c; infinite edges without a box
     time: np.ndarray  # (2,) now; when this segment of equal steps began
     step: np.ndarray  # (2,) int64, steps since the start; those when this segment began
-    energy_ledger: np.ndarray  # (3,) energies added so far, see HEAT; the energy less their sum is conserved
-    extra_variables: np.ndarray  # (m,) of a thermostat, a piston or an ODE formulation; (0,) in most runs
+    energy_ledger: (
+        np.ndarray
+    )  # (3,) energies added so far, see HEAT; the energy less their sum is conserved
+    extra_variables: (
+        np.ndarray
+    )  # (m,) of a thermostat, a piston or an ODE formulation; (0,) in most runs
 
     def copy(self) -> "State":
         """A state with copies of all arrays."""
@@ -70,34 +84,46 @@ class State(NamedTuple):
     @property
     def is_finite(self) -> bool:
         """Whether all variables are finite."""
-        return all(bool(np.isfinite(array).all()) for array in (*self[:4], self.energy_ledger, self.extra_variables))
+        return all(
+            bool(np.isfinite(array).all())
+            for array in (*self[:4], self.energy_ledger, self.extra_variables)
+        )
 
     def begin_segment(self, time: float | None = None) -> None:
-        """Begin a segment of equal steps, in place; `time` is the present time if it is known exactly."""
+        """Begin a segment of equal steps, in place; `time` is the present time if it is known
+        exactly."""
         self.time[:] = self.time[NOW] if time is None else time
         self.step[ORIGIN] = self.step[NOW]
 
 
-#: Names of a state's arrays in files, in the order of `State`; two differ, so that older files can be read.
+#: Names of a state's arrays in files, in the order of `State`; two differ, so that older files can
+#: be read.
 STORED_NAMES = (*State._fields[:7], "books", "bath")
 #: The cell of a scene without a box.
 NO_CELL = np.diag([inf, inf, inf])
 
 
 def edges_and_angles(cell: np.ndarray) -> list[float]:
-    """a, b, c (Å), alpha, beta, gamma (degrees) of a cell (3, 3). NumPy would take ten times as long."""
+    """a, b, c (Å), alpha, beta, gamma (degrees) of a cell (3, 3). NumPy would take ten times as
+    long."""
     a, b, c = cell.tolist()
     edges = [hypot(*edge) for edge in (a, b, c)]
     pairs = ((b, c, edges[1] * edges[2]), (c, a, edges[2] * edges[0]), (a, b, edges[0] * edges[1]))
-    angles = [degrees(acos(max(min(sum(map(mul, u, v)) / size, 1.0), -1.0))) for u, v, size in pairs]
+    angles = [
+        degrees(acos(max(min(sum(map(mul, u, v)) / size, 1.0), -1.0))) for u, v, size in pairs
+    ]
     return [*edges, *angles]
 
 
 def state_of(
-    position: np.ndarray | None = None, velocity: np.ndarray | None = None, rotation: np.ndarray | None = None,
-    angular_momentum_body: np.ndarray | None = None, cell: np.ndarray | None = None,
-) -> State:  # fmt: skip
-    """A state at time 0 with contiguous copies of these arrays; by default at rest and without a box.
+    position: np.ndarray | None = None,
+    velocity: np.ndarray | None = None,
+    rotation: np.ndarray | None = None,
+    angular_momentum_body: np.ndarray | None = None,
+    cell: np.ndarray | None = None,
+) -> State:
+    """A state at time 0 with contiguous copies of these arrays; by default at rest and without a
+    box.
 
     Without position it is a pinned body; without rotation, points.
     """
@@ -107,7 +133,9 @@ def state_of(
         position,
         np.zeros_like(position) if velocity is None else _array(velocity),
         rotation,
-        np.zeros((len(rotation), 3)) if angular_momentum_body is None else _array(angular_momentum_body),
+        np.zeros((len(rotation), 3))
+        if angular_momentum_body is None
+        else _array(angular_momentum_body),
         _array(NO_CELL if cell is None else cell),
         np.zeros(2),
         np.zeros(2, np.int64),

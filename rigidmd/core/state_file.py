@@ -12,7 +12,8 @@ from rigidmd.core.process import format_gigabytes, memory_shortage
 from rigidmd.core.state import NO_CELL, STORED_NAMES, State, state_of
 from rigidmd.errors import StructureError
 
-#: Version of the format. Version 1 (rigidmd 0.1) had neither a version number nor the arrays from `step` on.
+#: Version of the format. Version 1 (rigidmd 0.1) had neither a version number nor the arrays from
+#: `step` on.
 SCHEMA = 2
 LARGEST = 1e30  # largest magnitude of any number in a state
 NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
@@ -35,7 +36,14 @@ def write_state(path: Path, saved: SavedState) -> None:
     more = {name: array for name, array in more.items() if array is not None}
     with atomic_file(path) as temporary:
         arrays: dict[str, Any] = dict(zip(STORED_NAMES, saved.state, strict=True))
-        np.savez(temporary, schema=SCHEMA, species_names=np.array(saved.names), species=saved.species, **more, **arrays)
+        np.savez(
+            temporary,
+            schema=SCHEMA,
+            species_names=np.array(saved.names),
+            species=saved.species,
+            **more,
+            **arrays,
+        )
 
 
 def read_state(path: Path) -> SavedState:
@@ -55,18 +63,32 @@ def read_state(path: Path) -> SavedState:
     except Exception as error:  # zipfile, numpy and pickle refusals all mean the same to the user
         raise StructureError(str(path), [f"is not a state that rigidmd wrote: {error}"]) from None
     if schema > SCHEMA:
-        reason = f"was written by a later rigidmd (version {schema} of the format; this one reads up to {SCHEMA})"
+        reason = (
+            f"was written by a later rigidmd (version {schema} of the format; this one reads up to"
+            f" {SCHEMA})"
+        )
         raise StructureError(str(path), [reason])
     example = state_of()
     if schema == 1:
-        arrays = {key: arrays[key] for key in ("species", "residue_number", *STORED_NAMES[:5]) if key in arrays}
+        arrays = {
+            key: arrays[key]
+            for key in ("species", "residue_number", *STORED_NAMES[:5])
+            if key in arrays
+        }
         arrays |= dict(zip(STORED_NAMES[5:], example[5:], strict=True))
     if missing := [key for key in STORED_NAMES if key not in arrays]:
-        raise StructureError(str(path), [f"is not a state that rigidmd wrote: it holds no {', '.join(missing)}"])
+        raise StructureError(
+            str(path), [f"is not a state that rigidmd wrote: it holds no {', '.join(missing)}"]
+        )
     if bad := _damaged(arrays, names):
-        raise StructureError(str(path), [f"{', '.join(sorted(bad))}: damaged (wrong shape or values)"])
+        raise StructureError(
+            str(path), [f"{', '.join(sorted(bad))}: damaged (wrong shape or values)"]
+        )
     state = State(
-        *(np.asarray(arrays[k], like.dtype, order="C") for k, like in zip(STORED_NAMES, example, strict=True))
+        *(
+            np.asarray(arrays[k], like.dtype, order="C")
+            for k, like in zip(STORED_NAMES, example, strict=True)
+        )
     )
     return SavedState(state, names, species, arrays.get("residue_number"), arrays.get("models"))
 
@@ -75,14 +97,27 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
     """Names of arrays with a shape or values that no state has."""
     n = len(arrays["species"]) if arrays["species"].ndim else 0
     m = n if len(np.atleast_1d(arrays["rotation"])) else 0
-    shapes = {"species": (n,), "position": (n, 3), "velocity": (n, 3), "cell": (3, 3), "rotation": (m, 3, 3)}
+    shapes = {
+        "species": (n,),
+        "position": (n, 3),
+        "velocity": (n, 3),
+        "cell": (3, 3),
+        "rotation": (m, 3, 3),
+    }
     shapes |= {"angular_momentum_body": (m, 3), "time": (2,), "step": (2,), "books": (3,)}
     shapes |= {"bath": (arrays["bath"].size,)}
     shapes |= {"residue_number": (n,)} if "residue_number" in arrays else {}
     shapes |= {"models": (len(names), 5)} if "models" in arrays else {}
     bad = {*array_errors(arrays, shapes)}
-    bad |= {key for key in ("species", "residue_number") if key in arrays and arrays[key].dtype.kind != "i"}
-    if "species" not in bad and not ((arrays["species"] >= 0) & (arrays["species"] < len(names))).all():
+    bad |= {
+        key
+        for key in ("species", "residue_number")
+        if key in arrays and arrays[key].dtype.kind != "i"
+    }
+    if (
+        "species" not in bad
+        and not ((arrays["species"] >= 0) & (arrays["species"] < len(names))).all()
+    ):
         bad.add("species")
     return bad
 
@@ -90,7 +125,8 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
 def array_errors(
     arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]], exact: bool = True
 ) -> dict[str, str]:
-    """Name -> what is wrong with it, of the arrays of a state that have another shape, or values that no state has.
+    """Name -> what is wrong with it, of the arrays of a state that have another shape, or values
+    that no state has.
 
     exact : whether matrices must be rotations, not only numbers
     """
@@ -102,7 +138,9 @@ def array_errors(
         elif array.dtype.kind not in "fi":
             found[name] = f"is of the type {array.dtype}, not of real numbers"
         elif name == "cell" and not is_cell(array):
-            found[name] = "is not a cell with a along x, b in the xy plane and positive a_x, b_y, c_z"
+            found[name] = (
+                "is not a cell with a along x, b in the xy plane and positive a_x, b_y, c_z"
+            )
         elif name != "cell" and not (np.abs(array) <= LARGEST).all():  # NaN is not
             found[name] = "is not finite"
         elif name == "rotation" and exact and not are_rotations(array):
@@ -113,11 +151,16 @@ def array_errors(
 def are_rotations(matrices: np.ndarray) -> bool:
     """Whether matrices (n, 3, 3) are rotations, within NOT_A_ROTATION."""
     gap = np.swapaxes(matrices, 1, 2) @ matrices - np.eye(3)
-    return bool(np.abs(gap).max(initial=0.0) <= NOT_A_ROTATION and (np.linalg.det(matrices) > 0).all())
+    return bool(
+        np.abs(gap).max(initial=0.0) <= NOT_A_ROTATION and (np.linalg.det(matrices) > 0).all()
+    )
 
 
 def is_cell(cell: np.ndarray) -> bool:
-    """Whether a state may have this cell (3, 3): a along x, b in the xy plane; or the infinite edges of NO_CELL."""
+    """Whether a state may have this cell (3, 3): a along x, b in the xy plane; or the infinite
+    edges of NO_CELL."""
     if not np.isfinite(cell).all():
         return np.array_equal(cell, NO_CELL)
-    return bool((cell.diagonal() > 0).all() and not np.triu(cell, 1).any() and np.abs(cell).max() <= LARGEST)
+    return bool(
+        (cell.diagonal() > 0).all() and not np.triu(cell, 1).any() and np.abs(cell).max() <= LARGEST
+    )

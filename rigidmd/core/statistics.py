@@ -1,4 +1,5 @@
-"""Means and slopes of correlated samples with standard errors, for logs, summaries, analyses, sweeps and studies."""
+"""Means and slopes of correlated samples with standard errors, for logs, summaries, analyses,
+sweeps and studies."""
 
 from math import floor, isnan, log10, sqrt
 from typing import NamedTuple
@@ -6,24 +7,30 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: A series has an error if it has at least 8 samples and is at least 3 times as long as its longest correlated lag.
+#: A series has an error if it has at least 8 samples and is at least 3 times as long as its longest
+#: correlated lag.
 FEWEST_SAMPLES, LEAST_WINDOWS = 8, 3.0
-#: Number of batches, and the factor on the variance of their means. A Student distribution of 4 degrees of freedom has
-#: a variance of 2; taking the larger of two estimates already gives a part of that.
+#: Number of batches, and the factor on the variance of their means. A Student distribution of 4
+#: degrees of freedom has a variance of 2; taking the larger of two estimates already gives a part
+#: of that.
 BATCHES, BATCH_FACTOR = 5, 1.5
-#: Degrees of freedom subtracted in the window's estimate, f/(f - 2.5). A Student distribution would need f/(f - 2) if f
-#: did not depend on the estimate; here a short window and a small estimate coincide.
+#: Degrees of freedom subtracted in the window's estimate, f/(f - 2.5). A Student distribution would
+#: need f/(f - 2) if f did not depend on the estimate; here a short window and a small estimate
+#: coincide.
 LOST_FREEDOM = 2.5
-#: A beginning of a series is cut off if chance explains its difference from the rest with less than this
-#: two-sided probability. It is small, because the cut was chosen among many, and the quiet part that it may
-#: leave has too small an error. Degrees of freedom that are subtracted, as the correlation of few independent
-#: samples is underestimated.
+#: A beginning of a series is cut off if chance explains its difference from the rest with less than
+#: this
+#: two-sided probability. It is small, because the cut was chosen among many, and the quiet part
+#: that it may
+#: leave has too small an error. Degrees of freedom that are subtracted, as the correlation of few
+#: independent samples is underestimated.
 CUT_CHANCE, CUT_FREEDOM = 1e-4, 2.0
 
 
 def mean_and_error(values: ArrayLike) -> tuple[float | None, float | None]:
-    """Mean and standard error of evenly spaced samples (n,); None, None if a value is NaN. The error accounts for
-    correlation (theory chapter `errors`); it is None if the samples are too few, or all of them correlated."""
+    """Mean and standard error of evenly spaced samples (n,); None, None if a value is NaN. The
+    error accounts for correlation (theory chapter `errors`); it is None if the samples are too few,
+    or all of them correlated."""
     array = np.array(values, dtype=float)
     n = len(array)
     if n == 0 or np.isnan(array).any():
@@ -39,17 +46,21 @@ def mean_and_error(values: ArrayLike) -> tuple[float | None, float | None]:
         return average, None
     variance = centred @ centred / (n - 1)
     window = variance * ratio * freedom / (freedom - LOST_FREEDOM)
-    kept = max(0.25, 1 - ratio / n)  # fraction of the variance about the true mean that is left about the sample mean
+    kept = max(
+        0.25, 1 - ratio / n
+    )  # fraction of the variance about the true mean that is left about the sample mean
     return average, sqrt(max(window, BATCH_FACTOR * _batch_variance(centred)) / kept / n)
 
 
 def standard_error(values: ArrayLike) -> np.ndarray:
-    """Standard error (...) of the mean of independent runs (n, ...), n > 1: their standard deviation over sqrt(n)."""
+    """Standard error (...) of the mean of independent runs (n, ...), n > 1: their standard
+    deviation over sqrt(n)."""
     return np.std(np.asarray(values, float), axis=0, ddof=1) / sqrt(len(np.asarray(values)))
 
 
 def error_of_mean(parts: ArrayLike) -> np.ndarray:
-    """Standard error (...) of the mean of few independent values (n, ...), n > 1, see the theory chapter `errors`."""
+    """Standard error (...) of the mean of few independent values (n, ...), n > 1, see the theory
+    chapter `errors`."""
     return standard_error(parts) * student_factor(len(np.asarray(parts)) - 1)
 
 
@@ -85,7 +96,8 @@ def format_signed(value: float, error: float | None) -> str:
 
 
 def inefficiency(centred: np.ndarray) -> float:
-    """Statistical inefficiency of samples (n,) of mean zero: the number of samples per independent one."""
+    """Statistical inefficiency of samples (n,) of mean zero: the number of samples per independent
+    one."""
     return _window(centred)[0]
 
 
@@ -95,24 +107,28 @@ def correlation_time(values: np.ndarray, interval: float) -> float:
 
 
 def steady_from(values: np.ndarray) -> int:
-    """Index in the first half of a series (n,) from which on it is steady: that of `least_error_from`, if the mean of
-    the samples before it differs from the mean of the others by more than their errors explain; else 0."""
+    """Index in the first half of a series (n,) from which on it is steady: that of
+    `least_error_from`, if the mean of the samples before it differs from the mean of the others by
+    more than their errors explain; else 0."""
     start = least_error_from(values)
     return start if start and _begins_elsewhere(values, start) else 0
 
 
 def least_error_from(values: np.ndarray) -> int:
-    """Index in the first half of a series (n,) from which on its mean has the smallest standard error of independent
-    values: the marginal standard error rule (White 1997, Simulation 69, 323)."""
+    """Index in the first half of a series (n,) from which on its mean has the smallest standard
+    error of independent values: the marginal standard error rule (White 1997, Simulation 69,
+    323)."""
     left = np.arange(len(values), 0, -1)
-    sums, squares = (np.cumsum(x[::-1])[::-1] for x in (values - values.mean(), (values - values.mean()) ** 2))
+    sums, squares = (
+        np.cumsum(x[::-1])[::-1] for x in (values - values.mean(), (values - values.mean()) ** 2)
+    )
     error = (squares - sums**2 / left) / left.astype(float) ** 2
     return int(np.argmin(error[: len(values) // 2 + 1]))
 
 
 def _begins_elsewhere(values: np.ndarray, start: int) -> bool:
-    """Whether the mean before an index differs from the mean after it, by a test of Student with the variance and the
-    correlation of the second half of the series."""
+    """Whether the mean before an index differs from the mean after it, by a test of Student with
+    the variance and the correlation of the second half of the series."""
     from scipy import special  # slow to import
 
     late = values[len(values) // 2 :]
@@ -125,8 +141,9 @@ def _begins_elsewhere(values: np.ndarray, start: int) -> bool:
 
 
 def _window(centred: np.ndarray) -> tuple[float, int]:
-    """1 + 2 sum C(k) of samples (n,) of mean zero, and the last k of the sum: the initial monotone sequence (Geyer
-    1992), corrected for the sample mean (Wolff 2004, eq. 49). See the theory chapter `errors`."""
+    """1 + 2 sum C(k) of samples (n,) of mean zero, and the last k of the sum: the initial monotone
+    sequence (Geyer 1992), corrected for the sample mean (Wolff 2004, eq. 49). See the theory
+    chapter `errors`."""
     n = len(centred)
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2
     correlation = np.fft.irfft(power)[:n]
@@ -141,7 +158,8 @@ def _window(centred: np.ndarray) -> tuple[float, int]:
 
 
 def _batch_variance(centred: np.ndarray) -> float:
-    """n times the variance of the mean, from means of batches and the correlation of neighbouring ones."""
+    """n times the variance of the mean, from means of batches and the correlation of neighbouring
+    ones."""
     size = len(centred) // BATCHES
     means = centred[len(centred) - size * BATCHES :].reshape(BATCHES, size).mean(axis=1)
     means -= means.mean()
@@ -152,11 +170,12 @@ def _batch_variance(centred: np.ndarray) -> float:
     return size * square / (BATCHES - 1) * (1 + 2 * min(max(shared, 0.0), 0.5))
 
 
-#: The error that a choice of an integrator limits, in its reason. A summary adds the error of the run.
+#: The error that a choice of an integrator limits, in its reason. A summary adds the error of the
+#: run.
 ENERGY_ERROR = "error of the energy"
 FEW_BLOCKS, MANY_BLOCKS = 8, 64  # for slow and for fast noise
-#: Factor on the random walk, which is estimated from seven differences, and the least walk as a fraction of the walk
-#: that would explain all slow noise.
+#: Factor on the random walk, which is estimated from seven differences, and the least walk as a
+#: fraction of the walk that would explain all slow noise.
 WALK_FACTOR, LEAST_WALK = 1.4, 0.15
 
 
@@ -169,8 +188,9 @@ class Slope(NamedTuple):
 
 
 def slope(time: ArrayLike, value: ArrayLike) -> Slope:
-    """Slope of value (n,) against evenly spaced time (n,), with an error that accounts for a random walk as well as for
-    white noise: see "Energy drift and its error" in the theory chapter `errors`."""
+    """Slope of value (n,) against evenly spaced time (n,), with an error that accounts for a random
+    walk as well as for white noise: see "Energy drift and its error" in the theory chapter
+    `errors`."""
     time = np.asarray(time, dtype=float)
     value = np.asarray(value, dtype=float)
     n = len(time)

@@ -12,7 +12,8 @@ from typing import Any
 from rigidmd.core.files import unreadable_reason
 from rigidmd.errors import UNPRINTABLE, InputError
 
-#: Largest TOML file in bytes. Reading takes a second per megabyte; a molecule of 10,000 sites has one megabyte.
+#: Largest TOML file in bytes. Reading takes a second per megabyte; a molecule of 10,000 sites has
+#: one megabyte.
 LARGEST = 4_000_000
 DEEPEST = 32  # levels of nested tables and lists; scenes need six
 LEAST_WHOLE, LARGEST_WHOLE = -(2**63), 2**63 - 1  # whole numbers in TOML have 64 bits
@@ -36,7 +37,8 @@ def read_toml(path: Path, error_class: type[InputError]) -> tuple[dict[str, Any]
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The tables of a text. Raises TOMLDecodeError, also for depths and numbers that `tomllib` cannot read."""
+    """The tables of a text. Raises TOMLDecodeError, also for depths and numbers that `tomllib`
+    cannot read."""
     if long := _LONG_KEY.search(text):
         line = text.count("\n", 0, long.start()) + 1
         raise TOMLDecodeError(f"a key of more than {DEEPEST} parts (at line {line}, column 1)")
@@ -54,7 +56,8 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def plain_values(data: Any, depth: int = 0) -> Any:
-    """Tables from Python with the types of a file: str for paths and integer keys, numbers and lists for arrays."""
+    """Tables from Python with the types of a file: str for paths and integer keys, numbers and
+    lists for arrays."""
     match data:
         case _ if depth > DEEPEST + 1:  # reported by `impossible_values`
             return data
@@ -73,7 +76,8 @@ def plain_values(data: Any, depth: int = 0) -> Any:
 
 
 def values_in(data: Any) -> Iterator[tuple[list, Any]]:
-    """All values in nested tables and lists in their order, each with its path of keys, before the values in it."""
+    """All values in nested tables and lists in their order, each with its path of keys, before the
+    values in it."""
     rest: list[tuple[list, Any]] = [([], data)]
     while rest:
         keys, value = rest.pop()
@@ -84,8 +88,9 @@ def values_in(data: Any) -> Iterator[tuple[list, Any]]:
 
 
 def impossible_values(data: Any) -> list[tuple[list, str]]:
-    """Values that are not allowed in any table, each with its path of keys and what is wrong with it. These are tables
-    deeper than `DEEPEST`, whole numbers of more than 64 bits and texts with unprintable characters."""
+    """Values that are not allowed in any table, each with its path of keys and what is wrong with
+    it. These are tables deeper than `DEEPEST`, whole numbers of more than 64 bits and texts with
+    unprintable characters."""
     found: list[tuple[list, str]] = []
     for keys, value in values_in(data):
         match value:
@@ -97,7 +102,9 @@ def impossible_values(data: Any) -> list[tuple[list, str]]:
             case int() if not LEAST_WHOLE <= value <= LARGEST_WHOLE:
                 found.append((keys, "is a whole number of more than 64 bits"))
             case str() if UNPRINTABLE.search(value):
-                found.append((keys, f"is {shorten_repr(value)}: control characters are not allowed"))
+                found.append(
+                    (keys, f"is {shorten_repr(value)}: control characters are not allowed")
+                )
     return found
 
 
@@ -126,8 +133,19 @@ def describe_toml_error(error: TOMLDecodeError, text: str) -> str:
     lines = text.split("\n")
     line = lines[number - 1] if 0 < number <= len(lines) else ""
     # tomllib stops at the word, or within it, for example after the "inf" of "infinite"
-    bare = next((w[1] for w in re.finditer(r"[=\[,]\s*([A-Za-z][\w./-]*)", line) if w.start(1) < column <= w.end()), "")
-    keys = [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1:] if bare else []
+    bare = next(
+        (
+            w[1]
+            for w in re.finditer(r"[=\[,]\s*([A-Za-z][\w./-]*)", line)
+            if w.start(1) < column <= w.end()
+        ),
+        "",
+    )
+    keys = (
+        [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1:]
+        if bare
+        else []
+    )
     if not keys or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # a table header after an unclosed list
         return f"is not TOML: {error}"
     where = f"line {number}: {'.'.join(map(str, keys[0]))}: "
@@ -140,7 +158,8 @@ def describe_toml_error(error: TOMLDecodeError, text: str) -> str:
 
 
 def line_of(keys: list, text: str) -> int | None:
-    """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it; else None."""
+    """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it;
+    else None."""
     entries, tables = _index(text)
     heads = [tuple(keys[:n]) for n in range(1, len(keys) + 1)]
     if set_at := [entries[head] for head in heads if head in entries]:
@@ -150,7 +169,8 @@ def line_of(keys: list, text: str) -> int | None:
 
 @lru_cache(maxsize=2)
 def _index(text: str) -> tuple[dict[tuple, int], dict[tuple, int]]:
-    """Lines (from 1) of a TOML text: the first that sets each path of keys, and the last that opens each table."""
+    """Lines (from 1) of a TOML text: the first that sets each path of keys, and the last that opens
+    each table."""
     entries: dict[tuple, int] = {}
     tables: dict[tuple, int] = {}
     for number, table, entry in _lines(text):
@@ -162,7 +182,8 @@ def _index(text: str) -> tuple[dict[tuple, int], dict[tuple, int]]:
 
 
 def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
-    """Lines (from 1) of a TOML text that open a table or set a key: the table's path, and the key's in it or []."""
+    """Lines (from 1) of a TOML text that open a table or set a key: the table's path, and the key's
+    in it or []."""
     table: list = []
     counts: dict[tuple, int] = {}  # of tables in lists, by path with the list indices around them
     for number, line in enumerate(text.split("\n"), 1):
@@ -182,5 +203,6 @@ def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
 
 
 def _parts(key: str) -> list[str]:
-    """The parts of a dotted key, without quotes. A dot within quotes also divides; such a key has no line."""
+    """The parts of a dotted key, without quotes. A dot within quotes also divides; such a key has
+    no line."""
     return [part.strip("\"'") for part in key.split(".")]

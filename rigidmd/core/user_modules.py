@@ -1,8 +1,9 @@
 """Python modules of generated and user code, named by a digest of their source.
 
-The cache finds compiled code by the types of its arguments. With such names, a class from a changed file is a different
-type, and a class from the same text is the same type in every process. Code compiled for generated modules is cached on
-disk. Code compiled for user files is not, because it may contain values that they import or read.
+The cache finds compiled code by the types of its arguments. With such names, a class from a changed
+file is a different type, and a class from the same text is the same type in every process. Code
+compiled for generated modules is cached on disk. Code compiled for user files is not, because it
+may contain values that they import or read.
 """
 
 import hashlib

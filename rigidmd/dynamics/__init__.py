@@ -1,1 +1,2 @@
-"""Integration in time: the compiled loop over the flows of a scheme: kicks, drifts, thermostats, barostats."""
+"""Integration in time: the compiled loop over the flows of a scheme: kicks, drifts, thermostats,
+barostats."""

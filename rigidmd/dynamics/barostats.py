@@ -1,8 +1,10 @@
-"""Barostats: flows that change the cell at a pressure, each a pass of the step; a constant volume has none.
+"""Barostats: flows that change the cell at a pressure, each a pass of the step; a constant volume
+has none.
 
-See the theory chapter `sampling`. A lower triangular matrix T multiplies the cell (rows a, b, c) and the centres of
-mass from the right. The virial is W_ij = sum F_i R_j in `tally[1:]`. `apply_barostat` acts where a scheme has the flow
-BAROSTAT, `move_piston` where it has SCALE_BOX. The energy added to the molecules is in `state.energy_ledger[WORK]`.
+See the theory chapter `sampling`. A lower triangular matrix T multiplies the cell (rows a, b, c)
+and the centres of mass from the right. The virial is W_ij = sum F_i R_j in `tally[1:]`.
+`apply_barostat` acts where a scheme has the flow BAROSTAT, `move_piston` where it has SCALE_BOX.
+The energy added to the molecules is in `state.energy_ledger[WORK]`.
 """
 
 from math import exp, log, sqrt
@@ -35,7 +37,8 @@ WIDTH = 2.0
 #: Largest factor of the volume in a Monte Carlo move, and of its inverse. Boxes of one or two
 #: molecules draw larger ones.
 LARGEST_FACTOR = 10.0
-#: Largest drift of a move, as a strain; noise is added to it. It limits the effect of a bad start in one move.
+#: Largest drift of a move, as a strain; noise is added to it. It limits the effect of a bad start
+#: in one move.
 LONGEST_DRIFT = 0.01
 
 
@@ -48,20 +51,24 @@ class Pressure(NamedTuple):
 
 
 class CellRescaling(NamedTuple):
-    """Stochastic cell rescaling (Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107; anisotropic cells: Del Tatto,
-    Raiteri, Bernetti & Bussi 2022, Appl. Sci. 12, 1139), with an acceptance test: see the theory chapter `sampling`."""
+    """Stochastic cell rescaling (Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107; anisotropic
+    cells: Del Tatto, Raiteri, Bernetti & Bussi 2022, Appl. Sci. 12, 1139), with an acceptance test:
+    see the theory chapter `sampling`."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     pressure: Pressure
     rate: float  # compressibility over time constant, Å ps²/u/ps
     coordinate: tuple[int, int, int, int, int, int]  # of COUPLINGS
-    at_rest: tuple[float, float, float]  # 1 for each axis along which the total momentum is kept at zero, else 0
+    at_rest: tuple[
+        float, float, float
+    ]  # 1 for each axis along which the total momentum is kept at zero, else 0
     tail: tuple[float, float]  # dispersion beyond the cutoff: energy times V, pressure times V²
     key: Key
 
 
 class VolumeMoves(NamedTuple):
-    """Monte Carlo barostat (Åqvist et al. 2004, Chem. Phys. Lett. 384, 288), see the theory chapter `sampling`."""
+    """Monte Carlo barostat (Åqvist et al. 2004, Chem. Phys. Lett. 384, 288), see the theory chapter
+    `sampling`."""
 
     thermal_energy: Ramp
     pressure: Pressure
@@ -72,10 +79,12 @@ class VolumeMoves(NamedTuple):
 
 
 class Piston(NamedTuple):
-    """Isotropic volume with inertia and no noise (Andersen 1980, J. Chem. Phys. 72, 2384): constant enthalpy.
+    """Isotropic volume with inertia and no noise (Andersen 1980, J. Chem. Phys. 72, 2384): constant
+    enthalpy.
 
-    Pi is the last number of `state.extra_variables`. BAROSTAT is a kick of Pi, SCALE_BOX a change of V, each exact.
-    What P0 V and the piston gain is subtracted from `energy_ledger[WORK]`. See the theory chapter `sampling`.
+    Pi is the last number of `state.extra_variables`. BAROSTAT is a kick of Pi, SCALE_BOX a change
+    of V, each exact. What P0 V and the piston gain is subtracted from `energy_ledger[WORK]`. See
+    the theory chapter `sampling`.
     """
 
     pressure: Pressure
@@ -98,27 +107,40 @@ class Confinement(NamedTuple):
     key: Key
 
 
-#: Name of a barostat in `scene.couplings` -> the function that makes it for a stage from a `Confinement`.
+#: Name of a barostat in `scene.couplings` -> the function that makes it for a stage from a
+#: `Confinement`.
 BAROSTATS = {
     "cell_rescaling": lambda stage, given: CellRescaling(
-        given.thermal_energy, given.pressure, given.compressibility / stage.barostat_time,
-        COUPLINGS[stage.pressure_coupling], given.at_rest, given.tail, given.key
+        given.thermal_energy,
+        given.pressure,
+        given.compressibility / stage.barostat_time,
+        COUPLINGS[stage.pressure_coupling],
+        given.at_rest,
+        given.tail,
+        given.key,
     ),
     "monte_carlo": lambda stage, given: VolumeMoves(
-        given.thermal_energy, given.pressure,
-        WIDTH * sqrt(max(given.thermal_energy[:2]) * given.compressibility * given.volume), given.molecules, given.tail,
-        given.key
+        given.thermal_energy,
+        given.pressure,
+        WIDTH * sqrt(max(given.thermal_energy[:2]) * given.compressibility * given.volume),
+        given.molecules,
+        given.tail,
+        given.key,
     ),
     "piston": lambda stage, given: Piston(
-        given.pressure, given.compressibility * given.volume * (2 * np.pi / stage.barostat_time) ** 2, given.tail
+        given.pressure,
+        given.compressibility * given.volume * (2 * np.pi / stage.barostat_time) ** 2,
+        given.tail,
     ),
-}  # fmt: skip
+}
 
 
 class BarostatWorkspace(NamedTuple):
     """Arrays to make a move and to undo it if it is rejected."""
 
-    tally: np.ndarray  # (2, 10) energies and virials: now, before the move; virials only for a piston
+    tally: (
+        np.ndarray
+    )  # (2, 10) energies and virials: now, before the move; virials only for a piston
     strain: np.ndarray  # (3, 6) strain of the move, its drift, its variance
     matrices: np.ndarray  # (2, 3, 3) T and its inverse
     position: np.ndarray  # as in State
@@ -131,14 +153,21 @@ class BarostatWorkspace(NamedTuple):
 
 def barostat_workspace(state: State) -> BarostatWorkspace:
     return BarostatWorkspace(
-        np.zeros((2, TALLY_SIZE)), np.zeros((3, 6)), np.zeros((2, 3, 3)), state.position.copy(), state.velocity.copy(),
-        state.cell.copy(), no_load(state), np.zeros(1, np.int64), np.zeros(2, np.int64)
-    )  # fmt: skip
+        np.zeros((2, TALLY_SIZE)),
+        np.zeros((3, 6)),
+        np.zeros((2, 3, 3)),
+        state.position.copy(),
+        state.velocity.copy(),
+        state.cell.copy(),
+        no_load(state),
+        np.zeros(1, np.int64),
+        np.zeros(2, np.int64),
+    )
 
 
 def needed_tallies(barostat: tuple | None) -> int:
-    """What `compute_load` has to compute in a step in which a barostat acts: WITH_VIRIALS or WITH_ENERGIES; 0: no more
-    than in other steps."""
+    """What `compute_load` has to compute in a step in which a barostat acts: WITH_VIRIALS or
+    WITH_ENERGIES; 0: no more than in other steps."""
     if barostat is None:
         return 0
     return WITH_VIRIALS if isinstance(barostat, Piston) else WITH_ENERGIES
@@ -148,13 +177,16 @@ def needed_tallies(barostat: tuple | None) -> int:
 def compute_step_load(terms, state, load, registers, flows, which):
     """Forces and torques at the present positions; a status code.
 
-    which : FORCES_ONLY or WITH_ENERGIES (and virials). A step in which the barostat acts always computes virials, and
-        energies if the move depends on them
+    which : FORCES_ONLY or WITH_ENERGIES (and virials). A step in which the barostat acts always
+        computes virials, and energies if the move depends on them
     """
     registers.known[0] = 0
     if flows.tallies != 0:
         for k in range(len(flows.kind)):
-            if flows.kind[k] == BAROSTAT and (state.step[NOW] - state.step[ORIGIN] + 1) % flows.every[k] == 0:
+            if (
+                flows.kind[k] == BAROSTAT
+                and (state.step[NOW] - state.step[ORIGIN] + 1) % flows.every[k] == 0
+            ):
                 needed = which if which == WITH_ENERGIES else flows.tallies
                 return compute_load_and_virial(terms, state, load, registers, needed)
     return compute_load(terms, state, load, which)
@@ -162,8 +194,8 @@ def compute_step_load(terms, state, load, registers, flows, which):
 
 @kernel(inline=True)
 def compute_load_and_virial(terms, state, load, workspace, which):
-    """Forces, torques and virial at the present positions, with WITH_ENERGIES also energies; a status code. which :
-    WITH_ENERGIES or WITH_VIRIALS"""
+    """Forces, torques and virial at the present positions, with WITH_ENERGIES also energies; a
+    status code. which : WITH_ENERGIES or WITH_VIRIALS"""
     status = compute_load(terms, state, load, which)
     for k in range(TALLY_SIZE):
         workspace.tally[0, k] = 0.0
@@ -195,7 +227,9 @@ def apply_barostat(barostat, model, terms, state, load, workspace, progress, h, 
 def _apply_barostat(arguments, block):
     barostat, model, terms, state, load, workspace, registers, status = load_arguments(arguments)
     h, draw = registers.h[0], registers.draw[0]
-    status[0] = apply_barostat(barostat, model, terms, state, load, workspace, registers.progress, h, draw)
+    status[0] = apply_barostat(
+        barostat, model, terms, state, load, workspace, registers.progress, h, draw
+    )
 
 
 @task()
@@ -206,11 +240,21 @@ def _move_piston(arguments, block):
 
 
 def barostat_pass(
-    barostat: NamedTuple, model: NamedTuple, terms: TermTable, state: State, load: Load,
-    workspace: BarostatWorkspace, registers: Registers, status: np.ndarray,
-) -> Pass:  # fmt: skip
+    barostat: NamedTuple,
+    model: NamedTuple,
+    terms: TermTable,
+    state: State,
+    load: Load,
+    workspace: BarostatWorkspace,
+    registers: Registers,
+    status: np.ndarray,
+) -> Pass:
     """`apply_barostat` over the time in the registers."""
-    return Pass("barostat", _apply_barostat, (barostat, model, terms, state, load, workspace, registers, status))
+    return Pass(
+        "barostat",
+        _apply_barostat,
+        (barostat, model, terms, state, load, workspace, registers, status),
+    )
 
 
 def piston_pass(barostat: Piston, state: State, registers: Registers) -> Pass:
@@ -226,10 +270,14 @@ def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, dr
         progress[LOADED] = 1
     volume = volume_of(state.cell)
     virial = workspace.tally[0, 1] + workspace.tally[0, 5] + workspace.tally[0, 9]
-    pressure = (2 * translational_energy(model, state) + virial) / (3 * volume) + barostat.tail[1] / volume**2
+    pressure = (2 * translational_energy(model, state) + virial) / (3 * volume) + barostat.tail[
+        1
+    ] / volume**2
     before = state.extra_variables[-1]
     state.extra_variables[-1] += h * (pressure - target_pressure(barostat.pressure, state, 0))
-    state.energy_ledger[WORK] -= 0.5 * barostat.inverse_mass * (state.extra_variables[-1] ** 2 - before**2)
+    state.energy_ledger[WORK] -= (
+        0.5 * barostat.inverse_mass * (state.extra_variables[-1] ** 2 - before**2)
+    )
     return OK
 
 
@@ -271,8 +319,8 @@ def target_pressure(pressure, state, k):
 
 
 def propose_strain(barostat, model, state, workspace, h, draw):
-    """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and its inverse. Returns
-    whether the move is possible; one that is not counts as rejected."""
+    """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and
+    its inverse. Returns whether the move is possible; one that is not counts as rejected."""
     raise TypeError("compiled code only")
 
 
@@ -304,7 +352,8 @@ def propose_rescaling(barostat, model, state, workspace, h, draw):
 
 @kernel
 def drift(barostat, model, state, workspace, h, mean, variance):
-    """Write mean and variance of the strain of a move, by component (6,); 0 for a component that does not move."""
+    """Write mean and variance of the strain of a move, by component (6,); 0 for a component that
+    does not move."""
     volume = volume_of(state.cell)
     thermal = ramp_value(barostat.thermal_energy, state)
     for k in range(6):
@@ -318,14 +367,19 @@ def drift(barostat, model, state, workspace, h, mean, variance):
         for k in range(6):
             if barostat.coordinate[k] == c:
                 variance[k] = 2 * thermal * barostat.rate * h / (3 * volume * shared)
-                mean[k] = max(-LONGEST_DRIFT, min(LONGEST_DRIFT, variance[k] / (2 * thermal) * push))
+                mean[k] = max(
+                    -LONGEST_DRIFT, min(LONGEST_DRIFT, variance[k] / (2 * thermal) * push)
+                )
 
 
 @kernel
 def strain_force(barostat, model, state, workspace, k, volume, thermal):
-    """The generalised force on component k of the strain: minus the derivative of H + P0 V, u Å²/ps²."""
+    """The generalised force on component k of the strain: minus the derivative of H + P0 V, u
+    Å²/ps²."""
     i, j = COMPONENTS[k]
-    total = workspace.tally[0, 1 + 3 * j + i] - volume * target_pressure(barostat.pressure, state, k)
+    total = workspace.tally[0, 1 + 3 * j + i] - volume * target_pressure(
+        barostat.pressure, state, k
+    )
     for m in range(len(state.velocity)):
         total += model.mass[model.species[m]] * state.velocity[m, i] * state.velocity[m, j]
     if k < 3:
@@ -360,7 +414,9 @@ def log_acceptance_of_volume(barostat, model, state, workspace, h):
     before, after = volume_of(workspace.cell), volume_of(state.cell)
     work = target_pressure(barostat.pressure, state, 0) * (after - before)
     work = energy_gained(barostat, model, state, workspace) + work
-    return barostat.molecules * log(after / before) - work / ramp_value(barostat.thermal_energy, state)
+    return barostat.molecules * log(after / before) - work / ramp_value(
+        barostat.thermal_energy, state
+    )
 
 
 @implements(log_acceptance, CellRescaling)
@@ -370,7 +426,11 @@ def log_acceptance_of_rescaling(barostat, model, state, workspace, h):
     there, back = workspace.strain, np.zeros((2, 6))
     drift(barostat, model, state, workspace, h, back[0], back[1])
     target = barostat.pressure
-    x, y, z = target_pressure(target, state, 0), target_pressure(target, state, 1), target_pressure(target, state, 2)
+    x, y, z = (
+        target_pressure(target, state, 0),
+        target_pressure(target, state, 1),
+        target_pressure(target, state, 2),
+    )
     mean = (x + y + z) / 3
     work = energy_gained(barostat, model, state, workspace) + mean * (after - before)
     chance = log(after / before)
@@ -385,19 +445,23 @@ def log_acceptance_of_rescaling(barostat, model, state, workspace, h):
         work += deviation * 0.5 * (before + after) * 0.5 * (turn - turn_back)
         if k < 3:
             chance += barostat.at_rest[k] * turn
-        if barostat.coordinate[k] > used:  # coordinates are numbered in the order of their first component
+        if (
+            barostat.coordinate[k] > used
+        ):  # coordinates are numbered in the order of their first component
             used = barostat.coordinate[k]
             chance += 0.5 * (turn - there[1, k]) ** 2 / there[2, k] + 0.5 * log(there[2, k])
             chance -= 0.5 * (turn_back - back[0, k]) ** 2 / back[1, k] + 0.5 * log(back[1, k])
     if barostat.coordinate[3] >= 0:
-        # densities of T and of its inverse in the left invariant measure of lower triangular matrices
+        # densities of T and of its inverse in the left invariant measure of lower triangular
+        # matrices
         chance -= 2 * (log(matrix[1, 1]) + 2 * log(matrix[2, 2]))
     return chance - work / ramp_value(barostat.thermal_energy, state)
 
 
 @kernel
 def copy_moved(source, load, target, load_there, tally, tally_there):
-    """Copy what a move changes, from `source` to `target`: a state and a workspace, each with a load and a tally."""
+    """Copy what a move changes, from `source` to `target`: a state and a workspace, each with a
+    load and a tally."""
     copy(source.position, target.position)
     copy(source.velocity, target.velocity)
     copy(source.cell, target.cell)
@@ -418,7 +482,9 @@ def set_matrices(workspace):
     matrix[1, 0], matrix[2, 0], matrix[2, 1] = strain[3], strain[4], strain[5]
     inverse[1, 0] = -matrix[1, 0] * inverse[0, 0] * inverse[1, 1]
     inverse[2, 1] = -matrix[2, 1] * inverse[1, 1] * inverse[2, 2]
-    inverse[2, 0] = (matrix[1, 0] * matrix[2, 1] * inverse[1, 1] - matrix[2, 0]) * inverse[0, 0] * inverse[2, 2]
+    inverse[2, 0] = (
+        (matrix[1, 0] * matrix[2, 1] * inverse[1, 1] - matrix[2, 0]) * inverse[0, 0] * inverse[2, 2]
+    )
 
 
 @kernel
@@ -442,7 +508,8 @@ def multiply_rows(rows, matrix):
 
 @kernel
 def energy_gained(barostat, model, state, workspace):
-    """Change of potential and kinetic energy by the move (u Å²/ps²), with dispersion beyond the cutoff."""
+    """Change of potential and kinetic energy by the move (u Å²/ps²), with dispersion beyond the
+    cutoff."""
     gained = workspace.tally[0, 0] - workspace.tally[1, 0]
     gained += barostat.tail[0] * (1 / volume_of(state.cell) - 1 / volume_of(workspace.cell))
     for m in range(len(state.velocity)):

@@ -1,6 +1,6 @@
-"""The step loop of a single body, and its flows. The types choose each part, so only what a scene has is compiled."""
+"""The step loop of a single body, and its flows. The types choose each part, so only what a scene
+has is compiled."""
 
-# isort: skip_file
 from typing import NamedTuple
 
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
@@ -21,9 +21,19 @@ from rigidmd.mechanics.free_rotor import (
     rotate_by_vector,
 )
 from rigidmd.mechanics.translation import (
-    FluidTranslation, FreeTranslation, InertialFrame, NoTranslation, RotatingFrame, body_component, body_vector,
-    frame_rate, inertial_mass, lab_vector, rotate_with_frame, translate,
-)  # fmt: skip
+    FluidTranslation,
+    FreeTranslation,
+    InertialFrame,
+    NoTranslation,
+    RotatingFrame,
+    body_component,
+    body_vector,
+    frame_rate,
+    inertial_mass,
+    lab_vector,
+    rotate_with_frame,
+    translate,
+)
 
 
 class Body(NamedTuple):
@@ -37,8 +47,8 @@ class Body(NamedTuple):
 
 @kernel(from_python=True)
 def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until, progress):
-    """Take steps of dt of a body until state.step is `until`. Returns a status code, after which another call continues
-    exactly where this one stopped.
+    """Take steps of dt of a body until state.step is `until`. Returns a status code, after which
+    another call continues exactly where this one stopped.
 
     terms : a tuple of workspaces; flows : see `step_loop.FlowArrays`; progress : see `registers`
     gradient_workspace : None compiles no kicks with gradients
@@ -53,19 +63,32 @@ def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until
                     needed = 2
                 while progress[LOADED] < needed:
                     status = _evaluate(
-                        model, state, load, terms, flows, gradient_workspace, k, dt, progress[LOADED] == 1
+                        model,
+                        state,
+                        load,
+                        terms,
+                        flows,
+                        gradient_workspace,
+                        k,
+                        dt,
+                        progress[LOADED] == 1,
                     )
                     if status != OK:
                         return status
                     progress[LOADED] += 1
                 accumulate_work(model, terms, state, 0.5 * h)
-                kick_with_resistance(model.resistance, model.translation, model.rotor, model.frame, state, load, h)
+                kick_with_resistance(
+                    model.resistance, model.translation, model.rotor, model.frame, state, load, h
+                )
                 accumulate_work(model, terms, state, 0.5 * h)
             else:
                 time = state.time[NOW]
                 translate(model.translation, model.rotor, state, time, h)
                 rotate_with_frame(model.frame, state, time, h)
-                state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
+                state.time[NOW] = (
+                    state.time[ORIGIN]
+                    + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
+                )
                 progress[LOADED] = 0
                 if k == flows.last and (state.step[NOW] + 1) % ORTHOGONALITY_INTERVAL == 0:
                     restore_orthogonality(state.rotation, state.angular_momentum_body)
@@ -77,14 +100,17 @@ def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until
 
 @chosen_by_type
 def _evaluate(model, state, load, terms, flows, gradient_workspace, k, dt, known):
-    """The forces before kick k; or, if they are known, the addition of their gradient. A status code."""
+    """The forces before kick k; or, if they are known, the addition of their gradient. A status
+    code."""
     if not is_a(gradient_workspace, GradientWorkspace):
-        return lambda model, state, load, terms, flows, gradient_workspace, k, dt, known: compute_body_load(
-            terms, state, load
+        return lambda model, state, load, terms, flows, gradient_workspace, k, dt, known: (
+            compute_body_load(terms, state, load)
         )
 
     def with_gradient(model, state, load, terms, flows, gradient_workspace, k, dt, known):
-        return evaluate(model, state, load, terms, gradient_workspace, flows.gradient[k] * dt * dt, known)
+        return evaluate(
+            model, state, load, terms, gradient_workspace, flows.gradient[k] * dt * dt, known
+        )
 
     return with_gradient
 
@@ -96,7 +122,11 @@ def _displace_body(model, state, load, tau):
             state.position[k, i] += tau / model.translation.mass * load.force[k, i]
     for k in range(len(load.torque_body)):
         n, t = load.torque_body[k], state.time[NOW]
-        i0, i1, i2 = moments(model.rotor, t, 0)[0], moments(model.rotor, t, 1)[0], moments(model.rotor, t, 2)[0]
+        i0, i1, i2 = (
+            moments(model.rotor, t, 0)[0],
+            moments(model.rotor, t, 1)[0],
+            moments(model.rotor, t, 2)[0],
+        )
         rotate_by_vector(state.rotation[k], tau * i0 * n[0], tau * i1 * n[1], tau * i2 * n[2])
 
 
@@ -104,7 +134,11 @@ def _displace_body(model, state, load, tau):
 def _add_gyration_of_body(model, load, tau, gain):
     for b in range(len(load.torque_body)):
         n = load.torque_body[b]
-        i0, i1, i2 = moments(model.rotor, 0.0, 0)[0], moments(model.rotor, 0.0, 1)[0], moments(model.rotor, 0.0, 2)[0]
+        i0, i1, i2 = (
+            moments(model.rotor, 0.0, 0)[0],
+            moments(model.rotor, 0.0, 1)[0],
+            moments(model.rotor, 0.0, 2)[0],
+        )
         gain.torque_body[b, 0] += tau * (i1 - i2) * n[1] * n[2]
         gain.torque_body[b, 1] += tau * (i2 - i0) * n[2] * n[0]
         gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
@@ -112,8 +146,8 @@ def _add_gyration_of_body(model, load, tau, gain):
 
 @chosen_by_type(inline=True)
 def accumulate_work(model, terms, state, h):
-    """Add the work of time-dependent terms over h to the energy ledger, half before a kick and half after it: their
-    power at the present velocity."""
+    """Add the work of time-dependent terms over h to the energy ledger, half before a kick and half
+    after it: their power at the present velocity."""
     if not any(getattr(term.instance_class, "time_dependent", False) for term in terms.types):
         return lambda model, terms, state, h: None
 
@@ -126,7 +160,8 @@ def accumulate_work(model, terms, state, h):
 
 @kernel
 def relative_motion(model, state):
-    """(velocity along lab axes, omega along body axes) relative to the frame, as tuples; 0 where the body has none."""
+    """(velocity along lab axes, omega along body axes) relative to the frame, as tuples; 0 where
+    the body has none."""
     W = frame_rate(model.frame, state.time[NOW])
     velocity = omega = (0.0, 0.0, 0.0)
     if len(state.position):
@@ -134,13 +169,29 @@ def relative_motion(model, state):
         velocity = (V[0], V[1], V[2])
         if len(state.rotation):
             q = state.rotation[0]
-            a = body_component(q, V, 0) * model.translation.mass / inertial_mass(model.translation, 0)
-            b = body_component(q, V, 1) * model.translation.mass / inertial_mass(model.translation, 1)
-            c = body_component(q, V, 2) * model.translation.mass / inertial_mass(model.translation, 2)
+            a = (
+                body_component(q, V, 0)
+                * model.translation.mass
+                / inertial_mass(model.translation, 0)
+            )
+            b = (
+                body_component(q, V, 1)
+                * model.translation.mass
+                / inertial_mass(model.translation, 1)
+            )
+            c = (
+                body_component(q, V, 2)
+                * model.translation.mass
+                / inertial_mass(model.translation, 2)
+            )
             velocity = lab_vector(q, a, b, c)
         x = state.position[0]
         u, v, w = velocity
-        velocity = u - W[1] * x[2] + W[2] * x[1], v - W[2] * x[0] + W[0] * x[2], w - W[0] * x[1] + W[1] * x[0]
+        velocity = (
+            u - W[1] * x[2] + W[2] * x[1],
+            v - W[2] * x[0] + W[0] * x[2],
+            w - W[0] * x[1] + W[1] * x[0],
+        )
     if len(state.rotation):
         q = state.rotation[0]
         L = state.angular_momentum_body[0]

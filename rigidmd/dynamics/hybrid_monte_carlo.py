@@ -1,9 +1,10 @@
 """Trajectories of hybrid Monte Carlo: their start, and the Metropolis test of their end.
 
-A trajectory is some steps of any scheme. Its momenta are drawn anew, in whole or in part, and its end is accepted with
-the probability min(1, exp(-dH/kT)). Otherwise positions and orientations return to its start, momenta with the opposite
-sign. The scheme is reversible and keeps volumes in phase space, so exp(-H/kT) is sampled exactly, whatever the step is
-(Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216). See the theory chapter `sampling`.
+A trajectory is some steps of any scheme. Its momenta are drawn anew, in whole or in part, and its
+end is accepted with the probability min(1, exp(-dH/kT)). Otherwise positions and orientations
+return to its start, momenta with the opposite sign. The scheme is reversible and keeps volumes in
+phase space, so exp(-H/kT) is sampled exactly, whatever the step is (Duane, Kennedy, Pendleton &
+Roweth 1987, Phys. Lett. B 195, 216). See the theory chapter `sampling`.
 """
 
 from math import exp, inf, isnan, log
@@ -19,11 +20,11 @@ from rigidmd.dynamics.registers import AFTER_BAROSTAT, FAILED, LOADED, Registers
 from rigidmd.dynamics.thermostats import kinetic_energies_of, ramp_value
 from rigidmd.forces.terms import WITH_ENERGIES, TermTable, compute_load, copy
 
-#: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of min(1, exp(-dH/kT)),
-#: and of exp(-dH/kT), whose mean is 1 in equilibrium.
+#: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of
+#: min(1, exp(-dH/kT)), and of exp(-dH/kT), whose mean is 1 in equilibrium.
 ENDED, ACCEPTED, SIZES, CHANCES, WEIGHTS = range(5)
-#: Largest abs(dH)/kT in `SIZES` and -dH/kT in `WEIGHTS`, so that sums stay finite where a trajectory diverges and where
-#: energies fall from a bad start.
+#: Largest abs(dH)/kT in `SIZES` and -dH/kT in `WEIGHTS`, so that sums stay finite where a
+#: trajectory diverges and where energies fall from a bad start.
 LARGEST = 600.0
 
 
@@ -37,7 +38,9 @@ class TrajectoryWorkspace(NamedTuple):
     load: Load
     energies: np.ndarray  # (2,) potential, without constants, and kinetic, u Å²/ps²
     known: np.ndarray  # (1,) whether the potential energy belongs to the present positions
-    diverged: np.ndarray  # (1,) whether the present trajectory has diverged, so that it rests at its start
+    diverged: (
+        np.ndarray
+    )  # (1,) whether the present trajectory has diverged, so that it rests at its start
     sums: np.ndarray  # (5,) see ENDED
 
 
@@ -49,8 +52,8 @@ def trajectory_workspace(state: State) -> TrajectoryWorkspace:
 
 @kernel
 def potential_energy(terms, state, load, progress):
-    """Status code and potential energy of the present positions, with forces if these are unknown. progress : see
-    `dynamics.step_loop.advance`"""
+    """Status code and potential energy of the present positions, with forces if these are unknown.
+    progress : see `dynamics.step_loop.advance`"""
     if progress[LOADED] != 1 or terms.tallies_valid[0] == 0:
         progress[LOADED] = 0
         status = compute_load(terms, state, load, WITH_ENERGIES)
@@ -66,8 +69,9 @@ def potential_energy(terms, state, load, progress):
 @kernel
 def start_or_test_trajectory(
     thermostat, model, code, terms, state, load, blocks, workspace, registers, starts, draw
-):  # fmt: skip
-    """Keep the present state as the start of a trajectory; or accept it as its end, or return to the start. A status
+):
+    """Keep the present state as the start of a trajectory; or accept it as its end, or return to
+    the start. A status
     code. blocks : see `thermostat_workspace`"""
     progress = registers.progress
     potential = workspace.energies[0]
@@ -127,8 +131,8 @@ def _start_or_test(arguments, block):
 
 @task()
 def _rest(arguments, block):
-    """After forces that failed. If a trajectory diverges, it rests at its start, where the forces are unknown, until it
-    is rejected; the status becomes OK."""
+    """After forces that failed. If a trajectory diverges, it rests at its start, where the forces
+    are unknown, until it is rejected; the status becomes OK."""
     workspace, state, load, registers = load_arguments(arguments)
     if diverges(workspace, registers.failure[0]):
         rest_at_start(workspace, state, load)
@@ -144,23 +148,38 @@ def _know_potential(arguments, block):
 
 
 def trajectory_passes(
-    thermostat: NamedTuple, model: NamedTuple, code: Code, terms: TermTable, state: State, load: Load,
-    blocks: np.ndarray, workspace: TrajectoryWorkspace, registers: Registers, status: np.ndarray,
-) -> dict[int, Pass]:  # fmt: skip
-    """Kind of a flow -> its pass: the start and the test of a trajectory; what follows a move of the box; and, as
-    FAILED, what follows forces that failed."""
+    thermostat: NamedTuple,
+    model: NamedTuple,
+    code: Code,
+    terms: TermTable,
+    state: State,
+    load: Load,
+    blocks: np.ndarray,
+    workspace: TrajectoryWorkspace,
+    registers: Registers,
+    status: np.ndarray,
+) -> dict[int, Pass]:
+    """Kind of a flow -> its pass: the start and the test of a trajectory; what follows a move of
+    the box; and, as FAILED, what follows forces that failed."""
     everything = (thermostat, model, code, terms, state, load, blocks, workspace)
     return {
-        BEGIN_TRAJECTORY: Pass("start of a trajectory", _start_or_test, (everything, registers, status, True)),
-        END_TRAJECTORY: Pass("test of a trajectory", _start_or_test, (everything, registers, status, False)),
-        AFTER_BAROSTAT: Pass("potential energy of the box", _know_potential, (workspace, registers)),
+        BEGIN_TRAJECTORY: Pass(
+            "start of a trajectory", _start_or_test, (everything, registers, status, True)
+        ),
+        END_TRAJECTORY: Pass(
+            "test of a trajectory", _start_or_test, (everything, registers, status, False)
+        ),
+        AFTER_BAROSTAT: Pass(
+            "potential energy of the box", _know_potential, (workspace, registers)
+        ),
         FAILED: Pass("rest at the start", _rest, (workspace, state, load, registers)),
     }
 
 
 @kernel
 def copy_start(source, load, target, load_there):
-    """Copy what a trajectory changes, from `source` to `target`: a state and a workspace, each with a load."""
+    """Copy what a trajectory changes, from `source` to `target`: a state and a workspace, each with
+    a load."""
     copy(source.position, target.position)
     copy(source.velocity, target.velocity)
     copy(source.rotation, target.rotation)

@@ -1,4 +1,5 @@
-"""The constant part of a system of molecules; the counterpart of `State`, which is everything that changes."""
+"""The constant part of a system of molecules; the counterpart of `State`, which is everything that
+changes."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -19,7 +20,9 @@ class Model(NamedTuple):
     inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 about an axis without inertia
     inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
     rotor: SplitRotor | ExactRotor | NoRotor
-    keeps_momentum: np.ndarray = np.ones(3, bool)  # (3,) whether each component of the total momentum is conserved
+    keeps_momentum: np.ndarray = np.ones(
+        3, bool
+    )  # (3,) whether each component of the total momentum is conserved
 
 
 #: A total momentum below this fraction of the sum of |m v| is rounding.
@@ -45,8 +48,9 @@ def count_degrees_of_freedom(model: Model) -> DegreesOfFreedom:
 
 
 def conserved_momentum(model: Model, terms: Mapping[str, NamedTuple]) -> np.ndarray:
-    """Whether each component (3,) of the total momentum is conserved, as in `Model.keeps_momentum`. None is conserved
-    if there are frozen molecules. `changes_momentum` of a term lists the components that it changes."""
+    """Whether each component (3,) of the total momentum is conserved, as in `Model.keeps_momentum`.
+    None is conserved if there are frozen molecules. `changes_momentum` of a term lists the
+    components that it changes."""
     kept = np.full(3, bool(mobile(model).all()))
     for term in terms.values():
         kept &= ~getattr(term, "changes_momentum", np.zeros(3, bool))
@@ -59,8 +63,9 @@ def mobile(model: Model) -> np.ndarray:
 
 
 def remove_momentum(model: Model, velocity: np.ndarray) -> float:
-    """Subtract one velocity from all molecules, in place, so that conserved components of the total momentum are zero.
-    Returns the kinetic energy that this removes, u Å²/ps²; 0 if the momentum was zero already."""
+    """Subtract one velocity from all molecules, in place, so that conserved components of the total
+    momentum are zero. Returns the kinetic energy that this removes, u Å²/ps²; 0 if the momentum was
+    zero already."""
     mass = model.mass[model.species]
     each = mass[:, None] * velocity
     momentum = np.where(model.keeps_momentum, each.sum(axis=0), 0.0)
@@ -71,8 +76,8 @@ def remove_momentum(model: Model, velocity: np.ndarray) -> float:
 
 
 def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.Generator) -> None:
-    """Draw Maxwell-Boltzmann momenta, in place, and scale them to exactly `temperature` (K), T_trans and T_rot. The
-    conserved components of the total momentum are zero."""
+    """Draw Maxwell-Boltzmann momenta, in place, and scale them to exactly `temperature` (K),
+    T_trans and T_rot. The conserved components of the total momentum are zero."""
     thermal = BOLTZMANN * temperature
     mass = model.mass[model.species]
     freedom = count_degrees_of_freedom(model)
@@ -85,6 +90,8 @@ def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.
     if len(state.angular_momentum_body):
         spread = np.sqrt(thermal * model.inertia[model.species])
         state.angular_momentum_body[:] = rng.standard_normal(spread.shape) * spread
-        kinetic = 0.5 * (state.angular_momentum_body**2 * model.inverse_inertia[model.species]).sum()
+        kinetic = (
+            0.5 * (state.angular_momentum_body**2 * model.inverse_inertia[model.species]).sum()
+        )
         if kinetic > 0:
             state.angular_momentum_body[:] *= np.sqrt(0.5 * freedom.rotation * thermal / kinetic)

@@ -1,4 +1,5 @@
-"""Sums over the molecules of a state, and its largest values: one pass over each array, for observations of a run."""
+"""Sums over the molecules of a state, and its largest values: one pass over each array, for
+observations of a run."""
 
 from typing import NamedTuple
 
@@ -26,7 +27,8 @@ SUM_COUNT = 17
 
 
 class LargestValues(NamedTuple):
-    """The largest absolute value in each array of a state and a load; NaN if one is NaN, 0 for an empty array."""
+    """The largest absolute value in each array of a state and a load; NaN if one is NaN, 0 for an
+    empty array."""
 
     position: float
     velocity: float
@@ -36,7 +38,8 @@ class LargestValues(NamedTuple):
     torque: float
 
 
-#: All bits of a float64 but its sign. Read as integers they are in the order of absolute values, NaN after infinity.
+#: All bits of a float64 but its sign. Read as integers they are in the order of absolute values,
+#: NaN after infinity.
 SIZE = np.int64(2**63 - 1)
 
 
@@ -57,7 +60,8 @@ def find_largest(position, velocity, rotation, angular, force, torque, found):
 
 @kernel
 def _largest(values):
-    """The bits of the largest absolute value. Comparisons of integers are vectorised, of floats with NaN not."""
+    """The bits of the largest absolute value. Comparisons of integers are vectorised, of floats
+    with NaN not."""
     bits = values.view(np.int64)
     most = np.int64(0)
     for k in range(len(bits)):
@@ -69,9 +73,17 @@ def sums_of_state(model: Model, state: State, load: Load = EXAMPLE[1]) -> StateS
     """Sums over a state and the load on it; without a load `force` and `torque` are 0."""
     found = np.zeros(SUM_COUNT)
     fill_sums(
-        model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
-        state.angular_momentum_body, load.force, load.torque_body, found
-    )  # fmt: skip
+        model.species,
+        model.mass,
+        model.inverse_mass,
+        model.inverse_inertia,
+        state.velocity,
+        state.rotation,
+        state.angular_momentum_body,
+        load.force,
+        load.torque_body,
+        found,
+    )
     return unpack_sums(found)
 
 
@@ -79,12 +91,23 @@ def unpack_sums(found: np.ndarray) -> StateSums:
     """The sums from the numbers of `fill_sums`."""
     translation, rotation, force, torque, orthogonality_error = found[:5].tolist()
     vectors = found[5:].copy()
-    return StateSums(translation, rotation, force, torque, vectors[:3], vectors[3:].reshape(3, 3), orthogonality_error)
+    return StateSums(
+        translation,
+        rotation,
+        force,
+        torque,
+        vectors[:3],
+        vectors[3:].reshape(3, 3),
+        orthogonality_error,
+    )
 
 
 @kernel(from_python=True)
-def fill_sums(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found):
-    """Write the numbers (SUM_COUNT,) of `StateSums`; orthogonality is the fifth, then come momentum and flow."""
+def fill_sums(
+    species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found
+):
+    """Write the numbers (SUM_COUNT,) of `StateSums`; orthogonality is the fifth, then come momentum
+    and flow."""
     px = py = pz = xx = yy = zz = xy = xz = yz = turning = pushed = twisted = worst = 0.0
     for m in range(len(velocity)):
         m_i = mass[species[m]]
@@ -99,7 +122,9 @@ def fill_sums(species, mass, inverse_mass, inverse_inertia, velocity, rotation, 
         xz += m_i * x * z
         yz += m_i * y * z
     for m in range(len(force)):
-        pushed += inverse_mass[species[m]] * (force[m, 0] ** 2 + force[m, 1] ** 2 + force[m, 2] ** 2)
+        pushed += inverse_mass[species[m]] * (
+            force[m, 0] ** 2 + force[m, 1] ** 2 + force[m, 2] ** 2
+        )
     for m in range(len(angular)):
         for k in range(3):
             turning += inverse_inertia[species[m], k] * angular[m, k] ** 2

@@ -6,10 +6,12 @@ import numpy as np
 
 from rigidmd.core.state import TALLY_SIZE
 
-#: Indices of `Registers.progress`: flows done in this step; whether the load belongs to the present positions (1), with
-#: the gradient added (2); whether a move of the box has been made and is not yet accepted or rejected.
+#: Indices of `Registers.progress`: flows done in this step; whether the load belongs to the present
+#: positions (1), with the gradient added (2); whether a move of the box has been made and is not
+#: yet accepted or rejected.
 DONE, LOADED, TRIAL = range(3)
-#: What passes may follow, besides the kinds of flows in `core.integrators`: a move of the box; forces that failed.
+#: What passes may follow, besides the kinds of flows in `core.integrators`: a move of the box;
+#: forces that failed.
 AFTER_BAROSTAT, FAILED = -1, -2
 
 

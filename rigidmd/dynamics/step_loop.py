@@ -1,9 +1,10 @@
-"""The compiled loop over steps of molecules, for any sequence of flows, any forces, any thermostat and any barostat.
+"""The compiled loop over steps of molecules, for any sequence of flows, any forces, any thermostat
+and any barostat.
 
-The loop is compiled once: forces, thermostat, barostat and trajectories are passes, which it calls by address.
+The loop is compiled once: forces, thermostat, barostat and trajectories are passes, which it calls
+by address.
 """
 
-# isort: skip_file
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,15 @@ from rigidmd.compile import (
     run_row,
     task,
 )
-from rigidmd.core.integrators import BAROSTAT, DRIFT, KICK, REMOVE_MOMENTUM, SCALE_BOX, THERMOSTAT, Scheme
+from rigidmd.core.integrators import (
+    BAROSTAT,
+    DRIFT,
+    KICK,
+    REMOVE_MOMENTUM,
+    SCALE_BOX,
+    THERMOSTAT,
+    Scheme,
+)
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, REMOVED, WORK, Load, State
 from rigidmd.dynamics.barostats import (
     BarostatWorkspace,
@@ -42,7 +51,14 @@ from rigidmd.dynamics.observables import (
     find_largest,
     unpack_sums,
 )
-from rigidmd.dynamics.registers import AFTER_BAROSTAT, DONE, FAILED, LOADED, Registers, new_registers
+from rigidmd.dynamics.registers import (
+    AFTER_BAROSTAT,
+    DONE,
+    FAILED,
+    LOADED,
+    Registers,
+    new_registers,
+)
 from rigidmd.dynamics.thermostats import thermostat_code, thermostat_pass
 from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
 from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES, TermTable, total_energy_rate
@@ -53,11 +69,12 @@ from rigidmd.mechanics.free_rotor import restore_orthogonality, rotate_by_vector
 DRAWS = 1 << 20
 #: The times of two pending kicks by the present load; 0 stands for no kick.
 NO_PENDING_KICKS = (0.0, 0.0)
-#: Steps between two corrections of the rounding errors of QᵀQ. They would grow, and with them the error of the total
-#: torque: a step of two waters had one of 5e-14 of the forces after 1e3 steps and 1e-12 after 5e5 steps, and their
-#: angular momentum drifted faster than a random walk.
+#: Steps between two corrections of the rounding errors of QᵀQ. They would grow, and with them the
+#: error of the total torque: a step of two waters had one of 5e-14 of the forces after 1e3 steps
+#: and 1e-12 after 5e5 steps, and their angular momentum drifted faster than a random walk.
 ORTHOGONALITY_INTERVAL = 256
-#: Number of molecules that are kicked, moved and rotated together: few enough to stay in a core's cache.
+#: Number of molecules that are kicked, moved and rotated together: few enough to stay in a core's
+#: cache.
 CACHE_GROUP = 32 * LANES
 
 
@@ -100,7 +117,9 @@ def flow_arrays(scheme: Scheme, rows: dict[int, int] | None = None) -> FlowArray
         every=np.array([flow.every for flow in scheme.flows]),
         phase=np.array([flow.phase for flow in scheme.flows]),
         row=np.array([rows.get(flow.kind, -1) for flow in scheme.flows]),
-        gradient=np.array([flow.gradient for flow in scheme.flows]) if scheme.has_gradient else None,
+        gradient=np.array([flow.gradient for flow in scheme.flows])
+        if scheme.has_gradient
+        else None,
         last=last,
         trajectory=scheme.trajectory_steps,
         tallies=needed_tallies(scheme.barostat),
@@ -118,9 +137,15 @@ class CouplingWorkspaces(NamedTuple):
 
 
 def coupling_passes(
-    scheme: Scheme, model: Model, terms: TermTable, state: State, load: Load, workspaces: CouplingWorkspaces,
-    registers: Registers, status: np.ndarray,
-) -> dict[int, Pass]:  # fmt: skip
+    scheme: Scheme,
+    model: Model,
+    terms: TermTable,
+    state: State,
+    load: Load,
+    workspaces: CouplingWorkspaces,
+    registers: Registers,
+    status: np.ndarray,
+) -> dict[int, Pass]:
     """Kind of a flow of a scheme -> its pass, for all flows besides kicks and drifts."""
     heat, box, trajectory = workspaces
     kinds = {flow.kind for flow in scheme.flows}
@@ -134,23 +159,39 @@ def coupling_passes(
         found[SCALE_BOX] = piston_pass(barostat, state, registers)
     if trajectory is not None:
         kinds |= {FAILED} | ({AFTER_BAROSTAT} if box is not None else set())
-        found |= trajectory_passes(thermostat, model, code, terms, state, load, heat, trajectory, registers, status)
+        found |= trajectory_passes(
+            thermostat, model, code, terms, state, load, heat, trajectory, registers, status
+        )
     return {kind: one for kind, one in found.items() if kind in kinds}
 
 
 @kernel
-def advance(model, code, state, load, terms, couplings, flows, registers, gradient_workspace, dt, until, observed):
+def advance(
+    model,
+    code,
+    state,
+    load,
+    terms,
+    couplings,
+    flows,
+    registers,
+    gradient_workspace,
+    dt,
+    until,
+    observed,
+):
     """Take steps of dt of molecules until state.step is `until`. Returns a status code.
 
     code : see `move_code`
-    terms : `TermTable`; couplings : `Rows` of thermostat, barostat and trajectories; flows : see `FlowArrays`
+    terms : `TermTable`; couplings : `Rows` of thermostat, barostat and trajectories; flows : see
+        `FlowArrays`
     gradient_workspace : None compiles no kicks with gradients
     observed : whether energies and virials are computed with the last forces, if a kick needs these
 
-    Forces are evaluated before a kick if positions have changed since, so the last evaluation of a step serves the next
-    step. Kicks are pending until the next drift: the last kick of a step and the first of the next are done in one pass
-    with the drift. If the status is not OK, state and registers are such that another call continues exactly where this
-    one stopped.
+    Forces are evaluated before a kick if positions have changed since, so the last evaluation of a
+    step serves the next step. Kicks are pending until the next drift: the last kick of a step and
+    the first of the next are done in one pass with the drift. If the status is not OK, state and
+    registers are such that another call continues exactly where this one stopped.
     """
     pending, progress = NO_PENDING_KICKS, registers.progress
     while state.step[NOW] < until:
@@ -162,7 +203,9 @@ def advance(model, code, state, load, terms, couplings, flows, registers, gradie
                 if gradient_workspace is None:
                     while progress[LOADED] == 0:
                         now = state.step[NOW] + 1
-                        needed = (observed and now == until) or is_tested(flows, now - state.step[ORIGIN])
+                        needed = (observed and now == until) or is_tested(
+                            flows, now - state.step[ORIGIN]
+                        )
                         which = WITH_ENERGIES if needed and k > flows.last else FORCES_ONLY
                         status = compute_step_load(terms, state, load, registers, flows, which)
                         progress[LOADED] = 1 if status == OK else 0
@@ -185,7 +228,10 @@ def advance(model, code, state, load, terms, couplings, flows, registers, gradie
             elif flows.kind[k] == DRIFT:
                 _move_all(model, code, state, load, pending, moved, True)
                 pending = NO_PENDING_KICKS
-                state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
+                state.time[NOW] = (
+                    state.time[ORIGIN]
+                    + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
+                )
                 progress[LOADED] = 0
                 if k == flows.last and (state.step[NOW] + 1) % ORTHOGONALITY_INTERVAL == 0:
                     restore_orthogonality(state.rotation, state.angular_momentum_body)
@@ -206,7 +252,8 @@ def advance(model, code, state, load, terms, couplings, flows, registers, gradie
 
 @kernel
 def after_forces(couplings, flows, registers, status):
-    """The status code after an evaluation of forces: what failed in a trajectory may be no failure of the run."""
+    """The status code after an evaluation of forces: what failed in a trajectory may be no failure
+    of the run."""
     if status == OK or flows.failed < 0:
         return status
     registers.failure[0] = status
@@ -216,21 +263,28 @@ def after_forces(couplings, flows, registers, status):
 
 @kernel(inline=True)
 def is_tested(flows, step):
-    """Whether a trajectory of hybrid Monte Carlo ends with a step of the segment, counted from 1."""
+    """Whether a trajectory of hybrid Monte Carlo ends with a step of the segment, counted from
+    1."""
     return flows.trajectory > 0 and step % flows.trajectory == 0
 
 
 class Advance:
-    """`advance` of molecules, for Python: bound to all that it works on. At the end it also sums over the state and its
-    load, while these are in the caches of the cores.
+    """`advance` of molecules, for Python: bound to all that it works on. At the end it also sums
+    over the state and its load, while these are in the caches of the cores.
 
     terms : the `TermTable`, bound to the state and the load
     """
 
     def __init__(
-        self, scheme: Scheme, model: Model, state: State, load: Load, terms: TermTable,
-        workspaces: CouplingWorkspaces, gradient: GradientWorkspace | None,
-    ):  # fmt: skip
+        self,
+        scheme: Scheme,
+        model: Model,
+        state: State,
+        load: Load,
+        terms: TermTable,
+        workspaces: CouplingWorkspaces,
+        gradient: GradientWorkspace | None,
+    ):
         self.gradient = gradient
         self._registers = registers = registers_of(workspaces)
         status = np.zeros(1, np.int64)
@@ -238,10 +292,22 @@ class Advance:
         self._couplings = Program(list(passes.values()), ALWAYS, status)
         self._couplings.bind(list(passes.values()))
         flows = flow_arrays(scheme, {kind: row for row, kind in enumerate(passes)})
-        bound = (model, move_code(model), state, load, terms, self._couplings.rows, flows, registers, gradient)
+        bound = (
+            model,
+            move_code(model),
+            state,
+            load,
+            terms,
+            self._couplings.rows,
+            flows,
+            registers,
+            gradient,
+        )
         self._dt, self._integers = np.zeros(1), np.zeros(3, np.int64)
         self._extent, self._sums = np.zeros(len(LargestValues._fields)), np.zeros(SUM_COUNT)
-        self._call = BoundTask(_advance, (bound, self._dt, self._integers, self._extent, self._sums))
+        self._call = BoundTask(
+            _advance, (bound, self._dt, self._integers, self._extent, self._sums)
+        )
 
     def begin(self, dt: float, until: int, observed: bool, loaded: bool) -> None:
         """Set what the next calls do. loaded : whether the load belongs to the present positions"""
@@ -291,20 +357,33 @@ def _advance(arguments, block):
     integers[STATUS] = advance(*bound, dt[0], integers[UNTIL], integers[OBSERVED] != 0)
     if integers[STATUS] == OK:
         find_largest(
-            state.position.ravel(), state.velocity.ravel(), state.rotation.ravel(),
-            state.angular_momentum_body.ravel(), load.force.ravel(), load.torque_body.ravel(), extent
-        )  # fmt: skip
+            state.position.ravel(),
+            state.velocity.ravel(),
+            state.rotation.ravel(),
+            state.angular_momentum_body.ravel(),
+            load.force.ravel(),
+            load.torque_body.ravel(),
+            extent,
+        )
         if integers[OBSERVED] != 0:
             fill_sums(
-                model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
-                state.angular_momentum_body, load.force, load.torque_body, sums
-            )  # fmt: skip
+                model.species,
+                model.mass,
+                model.inverse_mass,
+                model.inverse_inertia,
+                state.velocity,
+                state.rotation,
+                state.angular_momentum_body,
+                load.force,
+                load.torque_body,
+                sums,
+            )
 
 
 @task()
 def _remove_momentum(arguments, block):
-    """Remove the conserved components of the total momentum, in place: the same velocity from all molecules. The energy
-    that this removes is entered in the energy ledger."""
+    """Remove the conserved components of the total momentum, in place: the same velocity from all
+    molecules. The energy that this removes is entered in the energy ledger."""
     model, state = load_arguments(arguments)
     mass, px, py, pz = 0.0, 0.0, 0.0, 0.0
     for m in range(len(state.velocity)):
@@ -324,7 +403,8 @@ def _remove_momentum(arguments, block):
 
 @kernel
 def kick(model, code, state, load, pending, h):
-    """Exact flow of the potential: V += h F/m, L += h n_body, added to the pending kicks. Returns these."""
+    """Exact flow of the potential: V += h F/m, L += h n_body, added to the pending kicks. Returns
+    these."""
     if pending[0] == 0.0:
         return h, 0.0
     if pending[1] == 0.0:
@@ -349,7 +429,12 @@ def _displace_molecules(model, state, load, tau):
             state.position[m, k] += tau_per_mass * load.force[m, k]
     for m in range(len(state.rotation)):
         inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
-        rotate_by_vector(state.rotation[m], tau * inverse[0] * n[0], tau * inverse[1] * n[1], tau * inverse[2] * n[2])
+        rotate_by_vector(
+            state.rotation[m],
+            tau * inverse[0] * n[0],
+            tau * inverse[1] * n[1],
+            tau * inverse[2] * n[2],
+        )
 
 
 @implements(add_gyration, Model)
@@ -371,7 +456,9 @@ def _move_all(model, code, state, load, pending, h, drifts):
 @task()
 def _move(arguments, block):
     """The pending kicks; then, if there is a drift, free flight and free rotation."""
-    rotor, species, inverse_mass, inverse_inertia, state, load, pending, h, drifts = load_arguments(arguments)
+    rotor, species, inverse_mass, inverse_inertia, state, load, pending, h, drifts = load_arguments(
+        arguments
+    )
     first, end = molecules_of_block(len(state.position), block, LANES)
     for start in range(first, end, CACHE_GROUP):
         stop = min(end, start + CACHE_GROUP)
@@ -382,4 +469,6 @@ def _move(arguments, block):
             for m in range(start, stop):
                 for k in range(3):
                     state.position[m, k] += h * state.velocity[m, k]
-            rotate_group(rotor, species, state.rotation, state.angular_momentum_body, start, stop, h)
+            rotate_group(
+                rotor, species, state.rotation, state.angular_momentum_body, start, stop, h
+            )

@@ -1,11 +1,10 @@
 """Thermostats: flows on the momenta that keep a temperature, each a pass of the step; NVE has none.
 
-`apply_thermostat` acts where a scheme has the flow THERMOSTAT. The heat that a thermostat adds is summed in
-`state.energy_ledger[HEAT]`, its own variables are in `state.extra_variables`. Its random numbers are counted by the
-step, from `draw` on (see `noise`).
+`apply_thermostat` acts where a scheme has the flow THERMOSTAT. The heat that a thermostat adds is
+summed in `state.energy_ledger[HEAT]`, its own variables are in `state.extra_variables`. Its random
+numbers are counted by the step, from `draw` on (see `noise`).
 """
 
-# isort: skip_file
 from math import exp, expm1, inf, sqrt
 from typing import NamedTuple
 
@@ -46,12 +45,15 @@ def constant_ramp(value: float) -> Ramp:
 @kernel(inline=True)
 def ramp_value(ramp, state):
     """The value of a ramp in the present step."""
-    return ramp.first + (ramp.last - ramp.first) * ((state.step[NOW] - state.step[ORIGIN] + 1) / ramp.steps)
+    return ramp.first + (ramp.last - ramp.first) * (
+        (state.step[NOW] - state.step[ORIGIN] + 1) / ramp.steps
+    )
 
 
 class VelocityRescaling(NamedTuple):
-    """Stochastic velocity rescaling (Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101) of all momenta,
-    translational and rotational, by one factor: see the theory chapter `sampling`."""
+    """Stochastic velocity rescaling (Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101)
+    of all momenta, translational and rotational, by one factor: see the theory chapter
+    `sampling`."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     time_constant: float  # ps; infinite: no effect
@@ -62,8 +64,9 @@ class VelocityRescaling(NamedTuple):
 
 
 class Langevin(NamedTuple):
-    """Friction and noise on every momentum, along axes that have inertia: the Ornstein-Uhlenbeck process, solved
-    exactly (Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114). See the theory chapter `sampling`."""
+    """Friction and noise on every momentum, along axes that have inertia: the Ornstein-Uhlenbeck
+    process, solved exactly (Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114).
+    See the theory chapter `sampling`."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     friction_translation: float  # 1/ps
@@ -72,8 +75,9 @@ class Langevin(NamedTuple):
 
 
 class HybridMonteCarlo(NamedTuple):
-    """New momenta, in whole or in part, before each trajectory of `dynamics.hybrid_monte_carlo`: the flow of Langevin's
-    thermostat over one step, whose frictions are infinite for wholly new momenta."""
+    """New momenta, in whole or in part, before each trajectory of `dynamics.hybrid_monte_carlo`:
+    the flow of Langevin's thermostat over one step, whose frictions are infinite for wholly new
+    momenta."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     friction_translation: float  # 1/ps
@@ -82,7 +86,8 @@ class HybridMonteCarlo(NamedTuple):
 
 
 class Andersen(NamedTuple):
-    """Random collisions, on average after `time_constant`, that redraw the momenta of one molecule (Andersen 1980)."""
+    """Random collisions, on average after `time_constant`, that redraw the momenta of one molecule
+    (Andersen 1980)."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     time_constant: float  # ps
@@ -90,9 +95,9 @@ class Andersen(NamedTuple):
 
 
 class NoseHoover(NamedTuple):
-    """Two Nose-Hoover chains, one of translation and one of rotation, on two halves of `state.extra_variables`. Each
-    half is eta (links,), then d eta/dt (links,). See the theory chapter `sampling` (Martyna, Tuckerman, Tobias & Klein
-    1996)."""
+    """Two Nose-Hoover chains, one of translation and one of rotation, on two halves of
+    `state.extra_variables`. Each half is eta (links,), then d eta/dt (links,). See the theory
+    chapter `sampling` (Martyna, Tuckerman, Tobias & Klein 1996)."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     period: float  # ps
@@ -106,15 +111,19 @@ class NoseHoover(NamedTuple):
         return 4 * self.links
 
 
-#: Name of a thermostat in `scene.couplings` -> the function that makes it for a stage, from kB T, the degrees of
-#: freedom and the key of its random numbers.
+#: Name of a thermostat in `scene.couplings` -> the function that makes it for a stage, from kB T,
+#: the degrees of freedom and the key of its random numbers.
 THERMOSTATS = {
     "velocity_rescaling": lambda stage, thermal, freedom, key: VelocityRescaling(
         thermal, stage.thermostat_time, freedom.total, key
     ),
     "langevin": lambda stage, thermal, freedom, key: Langevin(thermal, *stage.frictions, key),
     "nose_hoover": lambda stage, thermal, freedom, key: NoseHoover(
-        thermal, stage.thermostat_time, stage.nose_hoover_links, freedom.translation, freedom.rotation
+        thermal,
+        stage.thermostat_time,
+        stage.nose_hoover_links,
+        freedom.translation,
+        freedom.rotation,
     ),
     "andersen": lambda stage, thermal, freedom, key: Andersen(thermal, stage.thermostat_time, key),
     "hybrid_monte_carlo": lambda stage, thermal, freedom, key: HybridMonteCarlo(
@@ -144,8 +153,8 @@ def thermostat_code(thermostat: NamedTuple, model: NamedTuple) -> Code:
 
 @chosen_by_type
 def apply_thermostat(thermostat, model, code, state, workspace, h, draw):
-    """The flow of a thermostat over a time h (ps), in place. draw : its first random draw in this step. workspace : see
-    `thermostat_workspace`"""
+    """The flow of a thermostat over a time h (ps), in place. draw : its first random draw in this
+    step. workspace : see `thermostat_workspace`"""
     return None
 
 
@@ -156,10 +165,17 @@ def _apply_thermostat(arguments, block):
 
 
 def thermostat_pass(
-    thermostat: NamedTuple, model: NamedTuple, code: Code, state: State, workspace: np.ndarray, registers: Registers
+    thermostat: NamedTuple,
+    model: NamedTuple,
+    code: Code,
+    state: State,
+    workspace: np.ndarray,
+    registers: Registers,
 ) -> Pass:
     """`apply_thermostat` over the time in the registers. code : with `thermostat_code`"""
-    return Pass("thermostat", _apply_thermostat, (thermostat, model, code, state, workspace, registers))
+    return Pass(
+        "thermostat", _apply_thermostat, (thermostat, model, code, state, workspace, registers)
+    )
 
 
 @implements(apply_thermostat, VelocityRescaling)
@@ -184,14 +200,17 @@ def _apply_rescaling(thermostat, model, code, state, workspace, h, draw):
 @implements(apply_thermostat, (Langevin, Andersen, HybridMonteCarlo))
 def _apply_by_molecule(thermostat, model, code, state, workspace, h, draw):
     blocks = blocks_of(len(state.velocity))
-    call_blocks(code, "molecules", pack_arguments((thermostat, model, state, workspace, h, draw)), blocks)
+    call_blocks(
+        code, "molecules", pack_arguments((thermostat, model, state, workspace, h, draw)), blocks
+    )
     for block in range(blocks):
         state.energy_ledger[HEAT] += workspace[block, 0]
 
 
 @task()
 def _apply_langevin(arguments, block):
-    """Langevin friction and noise for the molecules of a block; the heat is written to workspace[block, 0]."""
+    """Langevin friction and noise for the molecules of a block; the heat is written to
+    workspace[block, 0]."""
     thermostat, model, state, workspace, h, draw = load_arguments(arguments)
     align_stack()
     first, end = molecules_of_block(len(state.velocity), block, LANES)
@@ -203,13 +222,16 @@ def _apply_langevin(arguments, block):
     heat = 0.0
     for start in range(first, end, BATCH):
         fill_normals(numbers, words, thermostat.key, draw, start, state.step[NOW])
-        heat += apply_langevin_group(model, state, keep, keep_turning, new, numbers, start, min(end, start + BATCH))
+        heat += apply_langevin_group(
+            model, state, keep, keep_turning, new, numbers, start, min(end, start + BATCH)
+        )
     workspace[block, 0] = heat
 
 
 @task()
 def _apply_andersen(arguments, block):
-    """Andersen collisions with the molecules of a block; the heat is written to workspace[block, 0]."""
+    """Andersen collisions with the molecules of a block; the heat is written to workspace[block,
+    0]."""
     thermostat, model, state, workspace, h, draw = load_arguments(arguments)
     velocity, momentum = state.velocity, state.angular_momentum_body
     first, end = molecules_of_block(len(velocity), block, LANES)
@@ -236,7 +258,8 @@ def _apply_andersen(arguments, block):
 
 @kernel
 def thermal_momenta(model, translation, rotation):
-    """Thermal momenta (species, 4): sqrt(I kT) for the three axes of a body, sqrt(kT/m) for a velocity component.
+    """Thermal momenta (species, 4): sqrt(I kT) for the three axes of a body, sqrt(kT/m) for a
+    velocity component.
     translation, rotation : their thermal energies"""
     sizes = np.empty((len(model.mass), 4))
     for kind in range(len(model.mass)):
@@ -255,7 +278,9 @@ def _apply_nose_hoover(thermostat, model, code, state, workspace, h, draw):
     thermal = ramp_value(thermostat.thermal_energy, state)
     moving, turning = kinetic_energies_of(model, code, state, workspace)
     variables, links = state.extra_variables, 2 * thermostat.links
-    scale, heat = move_chain(thermostat, variables[:links], thermal, moving, thermostat.freedom_translation, h)
+    scale, heat = move_chain(
+        thermostat, variables[:links], thermal, moving, thermostat.freedom_translation, h
+    )
     scale_turning, heat_turning = move_chain(
         thermostat, variables[links:], thermal, turning, thermostat.freedom_rotation, h
     )
@@ -265,7 +290,8 @@ def _apply_nose_hoover(thermostat, model, code, state, workspace, h, draw):
 
 @kernel
 def move_chain(thermostat, chain, thermal, kinetic, freedom, h):
-    """Propagate a chain over h, in place. Returns the factor of the momenta and the energy lost (u Å²/ps²)."""
+    """Propagate a chain over h, in place. Returns the factor of the momenta and the energy lost (u
+    Å²/ps²)."""
     if freedom == 0:
         return 1.0, 0.0
     links = thermostat.links
@@ -274,7 +300,9 @@ def move_chain(thermostat, chain, thermal, kinetic, freedom, h):
     scale = 1.0
     for factor in YOSHIDA:
         d = factor * h
-        _kick_links(thermostat, rate, thermal, 2 * scale * scale * kinetic, freedom, d, links - 1, -1, -1)
+        _kick_links(
+            thermostat, rate, thermal, 2 * scale * scale * kinetic, freedom, d, links - 1, -1, -1
+        )
         scale *= exp(-d * rate[0])
         for j in range(links):
             eta[j] += d * rate[j]
@@ -309,7 +337,8 @@ def chain_energy(thermostat, chain, thermal, freedom):
     return total
 
 
-# Sums over all molecules on one thread: for barostats, and for user thermostats, which have no tasks.
+# Sums over all molecules on one thread: for barostats, and for user thermostats, which have no
+# tasks.
 
 
 @kernel
@@ -334,12 +363,15 @@ def kinetic_energy(model, state):
 @kernel
 def _energies(model, state, first, end):
     velocity, momentum = state.velocity, state.angular_momentum_body
-    return kinetic_energies(model.species, model.mass, model.inverse_inertia, velocity, momentum, first, end)
+    return kinetic_energies(
+        model.species, model.mass, model.inverse_inertia, velocity, momentum, first, end
+    )
 
 
 @kernel
 def kinetic_energies_of(model, code, state, workspace):
-    """Translational and rotational kinetic energy of all molecules (u Å²/ps²), summed in the order of blocks."""
+    """Translational and rotational kinetic energy of all molecules (u Å²/ps²), summed in the order
+    of blocks."""
     blocks = blocks_of(len(state.velocity))
     call_blocks(code, "kinetic_energies", pack_arguments((model, state, workspace)), blocks)
     moving = turning = 0.0
@@ -352,7 +384,9 @@ def kinetic_energies_of(model, code, state, workspace):
 @kernel
 def scale_momenta(code, state, scale, scale_turning):
     """Multiply velocities by `scale` and angular momenta by `scale_turning`, in place."""
-    call_blocks(code, "scale", pack_arguments((state, scale, scale_turning)), blocks_of(len(state.velocity)))
+    call_blocks(
+        code, "scale", pack_arguments((state, scale, scale_turning)), blocks_of(len(state.velocity))
+    )
 
 
 @task()

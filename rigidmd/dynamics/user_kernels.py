@@ -17,7 +17,8 @@ THERMOSTATS: dict[type, Callable[..., Any]] = {}
 
 @cache
 def with_checked_indices(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A registered function by itself, compiled such that an index beyond an array raises IndexError."""
+    """A registered function by itself, compiled such that an index beyond an array raises
+    IndexError."""
     return compile_user_function(function, checks_indices=True)
 
 
@@ -38,13 +39,15 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
                 if tally is not None:
                     tally[0] += 0.5 * term.stiffness * state.position[m, k] ** 2
 
-    The function adds forces (lab frame, u Å/ps²) and torques (body frame, u Å²/ps²) to `load` and, unless `tally` is
-    None, its energy (u Å²/ps², 100 of them are 1 kJ/mol) and molecular virial, sum of F (x) R in rows, to `tally`.
+    The function adds forces (lab frame, u Å/ps²) and torques (body frame, u Å²/ps²) to `load` and,
+    unless `tally` is None, its energy (u Å²/ps², 100 of them are 1 kJ/mol) and molecular virial,
+    sum of F (x) R in rows, to `tally`.
 
-    The class may have the attribute `changes_momentum`, three booleans: whether the force may change each component of
-    the total momentum (the default), so False for forces between molecules. `tied_to_places = True` means that the
-    energy depends on positions in the lab, which excludes a barostat. The class may hold numbers, arrays and tuples of
-    them. If its numbers come from the system, give `Simulation` an object with a method `term(system)` that makes it.
+    The class may have the attribute `changes_momentum`, three booleans: whether the force may
+    change each component of the total momentum (the default), so False for forces between
+    molecules. `tied_to_places = True` means that the energy depends on positions in the lab, which
+    excludes a barostat. The class may hold numbers, arrays and tuples of them. If its numbers come
+    from the system, give `Simulation` an object with a method `term(system)` that makes it.
     """
     _check_class(kind)
 
@@ -52,7 +55,9 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
         _check_arguments(function, ("term", "state", "load", "tally"))
         compiled = compile_user_function(function)
         FORCES[kind] = function
-        implements(add_forces, kind)(lambda term, state, load, tally: compiled(term, state, load, tally))
+        implements(add_forces, kind)(
+            lambda term, state, load, tally: compiled(term, state, load, tally)
+        )
         return function
 
     return register
@@ -64,15 +69,17 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     @rigidmd.compiled_thermostat(Berendsen)
     def rescale(thermostat, model, state, h, draw): ...
 
-    The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and adds the change of
-    the kinetic energy to `state.energy_ledger[0]`, so that energy less heat is conserved. It acts half before and half
-    after each step (`halved = False` in the class: all of it after the step); with integrator = "baoab" in its middle.
+    The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and
+    adds the change of the kinetic energy to `state.energy_ledger[0]`, so that energy less heat is
+    conserved. It acts half before and half after each step (`halved = False` in the class: all of
+    it after the step); with integrator = "baoab" in its middle.
 
-    model : `rigidmd.dynamics.model.Model`; masses and moments are by species, `model.mass[model.species[m]]`
+    model : `rigidmd.dynamics.model.Model`; masses and moments are by species,
+        `model.mass[model.species[m]]`
     state : `rigidmd.core.state.State`
     draw : an integer, the first of the random numbers of this call. `rigidmd.dynamics.noise` has
-        `normals(thermostat.key, draw, m, state.step[0])`, two normal numbers for molecule m; draw + 1, ... gives more.
-        The key is a field of the class, from `key_of(seed, THERMOSTAT, stage)`
+        `normals(thermostat.key, draw, m, state.step[0])`, two normal numbers for molecule m; draw +
+        1, ... gives more. The key is a field of the class, from `key_of(seed, THERMOSTAT, stage)`
 
     `changes_momentum = True` in the class means that it changes the total momentum.
     """
@@ -95,7 +102,9 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
 def _check_arguments(function: Callable, wanted: tuple[str, ...]) -> None:
     given = list(inspect.signature(function).parameters)
     if len(given) != len(wanted):
-        raise TypeError(f"the function has the arguments ({', '.join(given)}), must have ({', '.join(wanted)})")
+        raise TypeError(
+            f"the function has the arguments ({', '.join(given)}), must have ({', '.join(wanted)})"
+        )
 
 
 def _check_class(kind: Any) -> None:

@@ -1,1 +1,2 @@
-"""Engines, which move systems: the protocol, the compiled CPU engine, the ODE solver of SciPy, and other programs."""
+"""Engines, which move systems: the protocol, the compiled CPU engine, the ODE solver of SciPy, and
+other programs."""

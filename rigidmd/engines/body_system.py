@@ -26,7 +26,8 @@ Component = TypeVar("Component", bound=NamedTuple)
 
 
 class Pose(NamedTuple):
-    """Position, attitude and velocities of a body relative to the frame. Functions in `applied` are called with it."""
+    """Position, attitude and velocities of a body relative to the frame. Functions in `applied` are
+    called with it."""
 
     time: float  # s
     position: np.ndarray  # (3,) centre of mass, m
@@ -37,10 +38,12 @@ class Pose(NamedTuple):
 
 @dataclass
 class BodySystem:
-    """The system of a single body, in its principal axes. `axes` (3, 3) has them as columns, in the scene's body axes.
+    """The system of a single body, in its principal axes. `axes` (3, 3) has them as columns, in the
+    scene's body axes.
 
-    inertia (3,): principal moments at the start, kg m², about the pivot or the centre of mass, with the added inertia
-    of a fluid. centre (3,): centre of mass from there; points (k, 3): points of the trajectory; both in the body axes.
+    inertia (3,): principal moments at the start, kg m², about the pivot or the centre of mass, with
+    the added inertia of a fluid. centre (3,): centre of mass from there; points (k, 3): points of
+    the trajectory; both in the body axes.
     """
 
     scene: BodyScene
@@ -66,10 +69,16 @@ class BodySystem:
         run, dt, found = self.scene.run, self.scene.run.timestep_s, []
         interval = not_none(self.scene.output.interval_s)
         given = interval != run.duration_s / SAMPLES
-        for key, wanted in (("run.duration_s", run.duration_s), ("output.interval_s", given and interval)):
+        for key, wanted in (
+            ("run.duration_s", run.duration_s),
+            ("output.interval_s", given and interval),
+        ):
             used = wanted and max(1, round(wanted / dt)) * dt
             if not run.is_auto and wanted and abs(used - wanted) > 1e-9 * wanted:
-                found.append(f"{key} = {wanted:g} is not a whole number of steps of {dt:g} s: {used:g} s is used")
+                found.append(
+                    f"{key} = {wanted:g} is not a whole number of steps of {dt:g} s: {used:g} s is"
+                    " used"
+                )
         return found
 
     @property
@@ -123,12 +132,17 @@ class BodySystem:
         kind = CpuEngine
         if self.scene.run.integrator in SOLVERS:
             from rigidmd.engines.ode.engine import OdeEngine as kind  # SciPy is slow to import
-        python_forces = {name: self._load_function(function) for name, function in self.applied.items()}
+        python_forces = {
+            name: self._load_function(function) for name, function in self.applied.items()
+        }
         return kind(*self.terms_at(0.0), python_forces=python_forces)
 
     def breaks(self) -> list[float]:
         """Times within the run at which a prescribed function of time has a jump or a kink."""
-        end, parts = self.scene.run.steps * self.scene.run.timestep_s, (*self.body, *self.terms.values())
+        end, parts = (
+            self.scene.run.steps * self.scene.run.timestep_s,
+            (*self.body, *self.terms.values()),
+        )
         functions = [value for part in parts for value in part if isinstance(value, TimeFunction)]
         return sorted({float(t) for function in functions for t in function.times if 0 < t < end})
 
@@ -138,14 +152,20 @@ class BodySystem:
         return Body._make(_piece(part, time) for part in self.body), terms
 
     def velocity_dependent_functions(self) -> list[str]:
-        """Names of the functions in `applied` that give another force or torque at the start with other velocities, but
-        the same one with the same."""
+        """Names of the functions in `applied` that give another force or torque at the start with
+        other velocities, but the same one with the same."""
         start = self.pose(0.0, self.state)
         reach = float(np.linalg.norm(self.points, axis=1).max()) or 1.0
         rate = 1.0 / self.scene.run.duration_s
         along = np.array([1.0, -0.7, 0.4])
-        velocity = 1.3 * start.velocity + rate * reach * along if self.translates else start.velocity
-        spin = 1.3 * start.angular_velocity_body + rate * along[::-1] if self.rotates else start.angular_velocity_body
+        velocity = (
+            1.3 * start.velocity + rate * reach * along if self.translates else start.velocity
+        )
+        spin = (
+            1.3 * start.angular_velocity_body + rate * along[::-1]
+            if self.rotates
+            else start.angular_velocity_body
+        )
         other = start._replace(velocity=velocity, angular_velocity_body=spin)
         found = []
         for name, function in self.applied.items():
@@ -161,7 +181,8 @@ class BodySystem:
         return found
 
     def _load_function(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
-        """A user's function of a pose as a function of time and state that returns force and torque, checked."""
+        """A user's function of a pose as a function of time and state that returns force and
+        torque, checked."""
 
         def load(time: float, state: State) -> tuple:
             given = function(self.pose(time, state))
@@ -169,23 +190,31 @@ class BodySystem:
                 force, torque = (np.asarray(part, dtype=float).reshape(3) for part in given)
             except (TypeError, ValueError):
                 raise SimulationError(
-                    f"t = {time:g} s: an applied function gave {given!r}, must give force and torque of 3 numbers each"
+                    f"t = {time:g} s: an applied function gave {given!r}, must give force and"
+                    " torque of 3 numbers each"
                 ) from None
-            if not self.translates:  # the force acts at the centre of mass, the torque is about the pivot
+            if (
+                not self.translates
+            ):  # the force acts at the centre of mass, the torque is about the pivot
                 torque = torque + np.cross(self.centre, self.pose(time, state).rotation.T @ force)
             if not (np.isfinite(force).all() and np.isfinite(torque).all()):
-                raise SimulationError(f"t = {time:g} s: an applied function gave infinite or NaN values: {given!r}")
+                raise SimulationError(
+                    f"t = {time:g} s: an applied function gave infinite or NaN values: {given!r}"
+                )
             return force, self.axes.T @ torque
 
         return load
 
     def pose(self, time: float, state: State) -> Pose:
         """The pose of a state in the scene's body axes, relative to the frame."""
-        motion = self.motion(np.array([time]), State(*(np.array(array) for array in zip(state, strict=True))))
+        motion = self.motion(
+            np.array([time]), State(*(np.array(array) for array in zip(state, strict=True)))
+        )
         return Pose(time, *(part[0] for part in motion))
 
     def motion(self, times: np.ndarray, states: State):
-        """position, velocity, rotation, angular_velocity_body at times (t,), of states stacked along axis 0."""
+        """position, velocity, rotation, angular_velocity_body at times (t,), of states stacked
+        along axis 0."""
         n = len(times)
         frame = self.frame_rates(times)
         if self.rotates:
@@ -193,7 +222,11 @@ class BodySystem:
             rotation = engine_rotation @ self.axes.T
             inertia, carried = self.moments(times)
             with np.errstate(divide="ignore", invalid="ignore"):
-                principal = np.where(inertia > 0, (states.angular_momentum_body.reshape(n, 3) - carried) / inertia, 0.0)
+                principal = np.where(
+                    inertia > 0,
+                    (states.angular_momentum_body.reshape(n, 3) - carried) / inertia,
+                    0.0,
+                )
             omega = principal @ self.axes.T - np.einsum("tji,tj->ti", rotation, frame)
         else:
             engine_rotation = rotation = np.broadcast_to(np.eye(3), (n, 3, 3))
@@ -202,7 +235,9 @@ class BodySystem:
             position, velocity = states.position.reshape(n, 3), states.velocity.reshape(n, 3)
             if isinstance(self.body.translation, FluidTranslation):
                 ratio = self.mass / self.body.translation.inertial_mass
-                velocity = np.einsum("tij,j,tkj,tk->ti", engine_rotation, ratio, engine_rotation, velocity)
+                velocity = np.einsum(
+                    "tij,j,tkj,tk->ti", engine_rotation, ratio, engine_rotation, velocity
+                )
             velocity = velocity - np.cross(frame, position)
         else:
             position = rotation @ self.centre
@@ -216,7 +251,8 @@ class BodySystem:
         return values_at(self.body.frame.angular_velocity, times)
 
     def moments(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Principal moments (t, 3) and angular momentum of the rotors (t, 3), in the principal axes."""
+        """Principal moments (t, 3) and angular momentum of the rotors (t, 3), in the principal
+        axes."""
         rotor = self.body.rotor
         if isinstance(rotor, DrivenRotor):
             return values_at(rotor.inertia, times), values_at(rotor.momentum, times)
@@ -233,7 +269,13 @@ class BodySystem:
     def sites(self) -> Sites:
         n = len(self.points)
         names = np.array(self.point_names, dtype=object)
-        return Sites(np.zeros(n, int), self.points, names, np.full(n, "X", dtype=object), np.full(n, self.mass / n))
+        return Sites(
+            np.zeros(n, int),
+            self.points,
+            names,
+            np.full(n, "X", dtype=object),
+            np.full(n, self.mass / n),
+        )
 
     @property
     def residue_names(self) -> np.ndarray:
@@ -249,10 +291,16 @@ class BodySystem:
         """Velocities (k, 3) of the points, Å/ps of the trajectory."""
         pose = self.pose(float(state.time[0]), state)
         origin = pose.velocity if self.translates else np.zeros(3)
-        return self.scale * (origin + np.cross(pose.angular_velocity_body, self.points) @ pose.rotation.T)
+        return self.scale * (
+            origin + np.cross(pose.angular_velocity_body, self.points) @ pose.rotation.T
+        )
 
 
 def _piece(part: Component, time: float) -> Component:
     """A component of a body, with its prescribed functions of time continued from `time`."""
-    courses = {key: piece_at(value, time) for key, value in part._asdict().items() if isinstance(value, TimeFunction)}
+    courses = {
+        key: piece_at(value, time)
+        for key, value in part._asdict().items()
+        if isinstance(value, TimeFunction)
+    }
     return part._replace(**courses)

@@ -1,7 +1,9 @@
-"""External engines: LAMMPS and OpenMM behind the protocol of engines, chosen by `engine.name` of a scene.
+"""External engines: LAMMPS and OpenMM behind the protocol of engines, chosen by `engine.name` of a
+scene.
 
-What an engine can translate is a table. All that is not in the table is refused with one kind of message. Thermostats,
-potentials and fields do not know about other engines: a new one is refused until a table has it.
+What an engine can translate is a table. All that is not in the table is refused with one kind of
+message. Thermostats, potentials and fields do not know about other engines: a new one is refused
+until a table has it.
 """
 
 from abc import ABC, abstractmethod
@@ -12,7 +14,12 @@ import numpy as np
 
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, State
-from rigidmd.engines.force_field import ForceFieldView, force_field_of, tail_of_formulas, unknown_terms
+from rigidmd.engines.force_field import (
+    ForceFieldView,
+    force_field_of,
+    tail_of_formulas,
+    unknown_terms,
+)
 from rigidmd.engines.observables import kinetic_energies, observe
 from rigidmd.engines.protocol import Engine, keep_time
 from rigidmd.engines.registry import Program
@@ -39,7 +46,9 @@ class Key(NamedTuple):
         how = self.values.get(value, Missing(self.reason))
         if not isinstance(how, Missing):
             return None
-        known = " and ".join(str(name) for name, how in self.values.items() if name and not isinstance(how, Missing))
+        known = " and ".join(
+            str(name) for name, how in self.values.items() if name and not isinstance(how, Missing)
+        )
         return f"{self.name} = {value!r}: {how or f'{title} has {known}'}"
 
 
@@ -51,7 +60,8 @@ class Limit(NamedTuple):
 
 
 class Translations(NamedTuple):
-    """The table of an engine. rigidmd itself performs minimisations, in which nothing is refused."""
+    """The table of an engine. rigidmd itself performs minimisations, in which nothing is
+    refused."""
 
     title: str
     scene: tuple[Key, ...]
@@ -68,21 +78,28 @@ class Translations(NamedTuple):
         yield from unknown_terms(view.system, self.title)
         for key in self.scene:
             table, name = key.name.split(".")
-            if key.matters(view) and (message := key.refusal(self.title, getattr(getattr(view.scene, table), name))):
+            if key.matters(view) and (
+                message := key.refusal(self.title, getattr(getattr(view.scene, table), name))
+            ):
                 yield message
         yield from _limits(self.limits, view)
         for k, stage in enumerate(view.scene.stages):
             messages = [key.refusal(self.title, getattr(stage, key.name)) for key in self.stage]
             if not stage.is_minimisation:
-                yield from (f"stages.{k}.{m}" for m in (*messages, *_limits(self.stage_limits, stage)) if m)
+                yield from (
+                    f"stages.{k}.{m}" for m in (*messages, *_limits(self.stage_limits, stage)) if m
+                )
 
 
 def _limits(limits: tuple[Limit, ...], subject: Any) -> Iterator[str]:
     return (limit.message.format(found) for limit in limits if (found := limit.applies(subject)))
 
 
-def checked_view(system: System, program: Program, where: str, more: Iterable[str] = ()) -> ForceFieldView:
-    """The view of a system for an external engine. Raises SceneError with all it lacks, and `more`, after `where`."""
+def checked_view(
+    system: System, program: Program, where: str, more: Iterable[str] = ()
+) -> ForceFieldView:
+    """The view of a system for an external engine. Raises SceneError with all it lacks, and `more`,
+    after `where`."""
     view = force_field_of(system)
     if found := [*program.load(program.translations).refusals(view), *more]:
         raise SceneError(system.scene.source, [f"{where}: {message}" for message in found])
@@ -94,7 +111,10 @@ def moves(title: str, bodies: str) -> tuple[Key, Limit, Limit]:
     by = f"{title} moves {bodies} by velocity_verlet"
     return (
         Key("integrator", {"velocity_verlet": "", "baoab": ""}, by),
-        Limit(f"integrator = 'baoab': {by}", lambda stage: stage.integrator == "baoab" and not is_langevin(stage)),
+        Limit(
+            f"integrator = 'baoab': {by}",
+            lambda stage: stage.integrator == "baoab" and not is_langevin(stage),
+        ),
         Limit(
             f"friction_rotation_per_ps: {title} has one friction for translation and rotation",
             lambda stage: is_langevin(stage) and len(set(stage.frictions)) > 1,
@@ -111,19 +131,33 @@ SPLIT = {None: "", "split": ""}
 
 
 class ExternalEngine(Engine, ABC):
-    """Base of engines that run another program for one stage. The first tally of `evaluate` has the whole virial."""
+    """Base of engines that run another program for one stage. The first tally of `evaluate` has the
+    whole virial."""
 
     def __init__(self, system: System, stage: int):
-        self._system, self._view, self._stage = system, force_field_of(system), system.scene.stages[stage]
+        self._system, self._view, self._stage = (
+            system,
+            force_field_of(system),
+            system.scene.stages[stage],
+        )
         self.conserves_energy = not (self._stage.has_thermostat or self._stage.has_barostat)
         self._known_state: State | None = None  # the present state of the program
-        self._heat_offset = 0.0  # heat in the ledger of a state that was sent, less the heat of the program by then
+        self._heat_offset = (
+            0.0  # heat in the ledger of a state that was sent, less the heat of the program by then
+        )
 
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """None: the program itself keeps the variables of its thermostat and barostat."""
         return np.zeros(0)
 
-    def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
+    def advance(
+        self,
+        state: State,
+        integrator: Scheme | Solver,
+        dt: float,
+        until: int,
+        observed: bool = False,
+    ) -> None:
         keep_time(state, dt)
         self._send(state)
         steps = until - int(state.step[NOW])
@@ -153,11 +187,14 @@ class ExternalEngine(Engine, ABC):
 
 def same_state(one: State | None, other: State) -> bool:
     """Whether two states are equal to the bit, except for time and the energy ledger."""
-    return one is not None and all(np.array_equal(a, b) for a, b in zip(one[:5], other[:5], strict=True))
+    return one is not None and all(
+        np.array_equal(a, b) for a, b in zip(one[:5], other[:5], strict=True)
+    )
 
 
 def external_engine(system: System, stage: int = 0) -> ExternalEngine:
-    """The external engine for a stage. Raises SceneError with all that it lacks; EngineError if not installed."""
+    """The external engine for a stage. Raises SceneError with all that it lacks; EngineError if not
+    installed."""
     program = _supporting_program(system)
     return program.load(program.engine)(system, stage, **system.scene.engine.options)
 
@@ -170,7 +207,8 @@ def _supporting_program(system: System) -> Program:
 
 
 def check_engine(system: System) -> str:
-    """What is installed of the external engine of a scene. Raises SceneError with all features that it lacks."""
+    """What is installed of the external engine of a scene. Raises SceneError with all features that
+    it lacks."""
     program = _supporting_program(system)
     try:
         return program.load(program.installed)() if program.installed else ""
@@ -178,18 +216,22 @@ def check_engine(system: System) -> str:
         return str(error)
 
 
-# Comparison with rigidmd at one state, term by term, for `rigidmd verify` and before runs on external engines.
+# Comparison with rigidmd at one state, term by term, for `rigidmd verify` and before runs on
+# external engines.
 
-#: Tolerance of pair sums, relative to their size: engines have slightly different constants, such as 332.06371.
-#: Energies of OpenMM in single precision differ by up to 3e-7.
+#: Tolerance of pair sums, relative to their size: engines have slightly different constants, such
+#: as 332.06371. Energies of OpenMM in single precision differ by up to 3e-7.
 PLAIN = 1e-6
-#: Component of an observation that engines take from the system, so that it is compared with another value.
+#: Component of an observation that engines take from the system, so that it is compared with
+#: another value.
 TAIL = "lennard_jones_tail"
-#: Ratio of virial and energy of a 1/r¹² term. The energy may be smaller, where attraction cancels repulsion.
+#: Ratio of virial and energy of a 1/r¹² term. The energy may be smaller, where attraction cancels
+#: repulsion.
 STEEPEST = 12
 #: Tolerance of forces with an Ewald sum, in estimated errors. Each engine has such an error.
 ERRORS = 5.0
-#: Tolerance of the energy of an Ewald sum per site, in (force error)/alpha. Measured: 0.003 (512 SPC/E, 1e-5).
+#: Tolerance of the energy of an Ewald sum per site, in (force error)/alpha. Measured: 0.003 (512
+#: SPC/E, 1e-5).
 PER_SITE = 0.02
 
 
@@ -207,22 +249,33 @@ class Comparison(NamedTuple):
 
 
 def compare_at(system: System, state: State, here: Engine, there: Engine) -> list[Comparison]:
-    """Compare energies by term, forces and torques on bodies, and the virial of two engines at a state. The tail
-    correction is compared with `tail_of_formulas`."""
+    """Compare energies by term, forces and torques on bodies, and the virial of two engines at a
+    state. The tail correction is compared with `tail_of_formulas`."""
     ours, theirs = (observe(system, engine, state, energy_unit=1.0) for engine in (here, there))
     independent = {}  # instead of what both observations take from the system
     if TAIL in theirs.components:
         independent[TAIL] = tail_of_formulas(force_field_of(system), state.volume)
-    potential = theirs.potential + sum(value - theirs.components[name] for name, value in independent.items())
+    potential = theirs.potential + sum(
+        value - theirs.components[name] for name, value in independent.items()
+    )
     their_components = theirs.components | independent
     virial = sum(abs(float(tally.virial.trace())) for tally in here.evaluate(state)[1].values())
 
     kinetic = sum(kinetic_energies(system, state))
-    size = sum(abs(ours.components[name]) for name in system.terms if name in ours.components) + kinetic
+    size = (
+        sum(abs(ours.components[name]) for name in system.terms if name in ours.components)
+        + kinetic
+    )
     size = max(size, virial / STEEPEST)
     plain = PLAIN + there.force_tolerance
-    force_error, sites, alpha = system.force_error or 0.0, system.site_count, system.scene.forces.ewald_alpha_per_A
-    ewald = force_error * (1 / alpha if alpha else 0.0) * (PER_SITE * sites + ERRORS * np.sqrt(sites))
+    force_error, sites, alpha = (
+        system.force_error or 0.0,
+        system.site_count,
+        system.scene.forces.ewald_alpha_per_A,
+    )
+    ewald = (
+        force_error * (1 / alpha if alpha else 0.0) * (PER_SITE * sites + ERRORS * np.sqrt(sites))
+    )
     lines = []
     for name in {**ours.components, **their_components}:
         a, b = (components.get(name, 0.0) for components in (ours.components, their_components))
@@ -231,21 +284,37 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
     lines.append(_energy("potential energy", ours.potential, potential, PLAIN * size + ewald))
     each = np.sqrt(sites / len(system.model.species)) * ERRORS * force_error
     radius = max(m.radius for m in system.species)
-    for name, unit, k, tolerance in (("force", "kJ/(mol Å)", 0, each), ("torque", "kJ/mol", 1, each * radius)):
+    for name, unit, k, tolerance in (
+        ("force", "kJ/(mol Å)", 0, each),
+        ("torque", "kJ/mol", 1, each * radius),
+    ):
         if len(a := ours.load[k]):
-            rms = [float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (a, theirs.load[k], theirs.load[k] - a)]
-            # the tolerance is relative to the rms, or to the energy of a body where it nearly vanishes
-            scale = max(rms[0], size / len(system.model.species) / (system.smallest_diameter if k == 0 else 1.0))
+            rms = [
+                float(np.sqrt(np.mean(np.sum(x**2, axis=1))))
+                for x in (a, theirs.load[k], theirs.load[k] - a)
+            ]
+            # the tolerance is relative to the rms, or to the energy of a body where it nearly
+            # vanishes
+            scale = max(
+                rms[0],
+                size / len(system.model.species) / (system.smallest_diameter if k == 0 else 1.0),
+            )
             values = (x / KJ_PER_MOL for x in (*rms, plain * scale + tolerance))
             lines.append(Comparison(f"rms {name} on a molecule", unit, *values))
     if np.isfinite(ours.pressure_bar) and np.isfinite(theirs.pressure_bar):
         a, b = (float(seen.virial.trace()) for seen in (ours, theirs))
-        lines.append(_energy("virial", a, b, (plain + there.virial_tolerance) * max(size, virial) + 3 * ewald))
+        lines.append(
+            _energy(
+                "virial", a, b, (plain + there.virial_tolerance) * max(size, virial) + 3 * ewald
+            )
+        )
     return lines
 
 
 def _energy(name: str, here: float, there: float, tolerance: float) -> Comparison:
-    return Comparison(name, "kJ/mol", *(x / KJ_PER_MOL for x in (here, there, abs(there - here), tolerance)))
+    return Comparison(
+        name, "kJ/mol", *(x / KJ_PER_MOL for x in (here, there, abs(there - here), tolerance))
+    )
 
 
 def describe_comparison(lines: list[Comparison], there: str) -> str:
@@ -253,6 +322,11 @@ def describe_comparison(lines: list[Comparison], there: str) -> str:
     wide = max(len(line.name) for line in lines)
     rows = [f"  {'':<{wide}}  {'rigidmd':>20}  {there:>20}  {'difference':>10}  {'tolerance':>9}"]
     for line in lines:
-        values = f"{line.here:>20.10g}  {line.there:>20.10g}  {line.difference:>10.2g}  {line.tolerance:>9.2g}"
-        rows.append(f"  {line.name:<{wide}}  {values}  {line.unit}{'' if line.agrees else '   <- differs'}")
+        values = (
+            f"{line.here:>20.10g}  {line.there:>20.10g}  {line.difference:>10.2g} "
+            f" {line.tolerance:>9.2g}"
+        )
+        rows.append(
+            f"  {line.name:<{wide}}  {values}  {line.unit}{'' if line.agrees else '   <- differs'}"
+        )
     return "\n".join(rows)

@@ -1,8 +1,9 @@
-"""The force field of a system as another program would see it: kinds of sites, and pair potentials between kinds.
+"""The force field of a system as another program would see it: kinds of sites, and pair potentials
+between kinds.
 
-The engines LAMMPS and OpenMM and the exports to LAMMPS, OpenMM and GROMACS are made from this view. It is read from the
-terms that rigidmd itself runs, so that mixing rules, special pairs and truncation are decided once.
-`unknown_terms` lists what no other program can express.
+The engines LAMMPS and OpenMM and the exports to LAMMPS, OpenMM and GROMACS are made from this view.
+It is read from the terms that rigidmd itself runs, so that mixing rules, special pairs and
+truncation are decided once. `unknown_terms` lists what no other program can express.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,12 +22,26 @@ from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.forces.potentials.truncation import ForceShifted, SmoothlySwitched, Switched, Truncation, Unmodified
+from rigidmd.forces.potentials.truncation import (
+    ForceShifted,
+    SmoothlySwitched,
+    Switched,
+    Truncation,
+    Unmodified,
+)
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.validation import not_none
 
 #: Classes of the pair potentials and terms that the view describes.
-DESCRIBED = (LennardJones, ReactionField, DampedShiftedForce, ScreenedCoulomb, EwaldSum, Pme, Background)
+DESCRIBED = (
+    LennardJones,
+    ReactionField,
+    DampedShiftedForce,
+    ScreenedCoulomb,
+    EwaldSum,
+    Pme,
+    Background,
+)
 #: The switching function S of t = (r - start)/(cutoff - start), see `forces.potentials.truncation`.
 SWITCHES: dict[type, str] = {
     Switched: "1-10*t^3+15*t^4-6*t^5",
@@ -46,7 +61,8 @@ class SiteKind(NamedTuple):
 
 
 class ForceFieldView(NamedTuple):
-    """The sites of a system (s, in its order) and their pair potentials, independent of any engine."""
+    """The sites of a system (s, in its order) and their pair potentials, independent of any
+    engine."""
 
     system: System
     kinds: list[SiteKind]
@@ -94,15 +110,22 @@ class ForceFieldView(NamedTuple):
 
     @property
     def is_body(self) -> np.ndarray:
-        """Whether each molecule (n,) is a rigid body that rotates. All others are points or frozen."""
-        return np.array([m.inertia.any() for m in self.system.species])[self.system.model.species] & ~self.frozen
+        """Whether each molecule (n,) is a rigid body that rotates. All others are points or
+        frozen."""
+        return (
+            np.array([m.inertia.any() for m in self.system.species])[self.system.model.species]
+            & ~self.frozen
+        )
 
 
 def force_field_of(system: System) -> ForceFieldView:
     """The force field of a system. It leaves out the terms that `unknown_terms` lists."""
     index = system.model.species
     per_species = zip(system.species, _lennard_jones_kinds(system), strict=True)
-    parameters = [list(zip(m.elements, m.masses.tolist(), m.charges.tolist(), k, strict=True)) for m, k in per_species]
+    parameters = [
+        list(zip(m.elements, m.masses.tolist(), m.charges.tolist(), k, strict=True))
+        for m, k in per_species
+    ]
     first: dict[tuple, str] = {}  # parameters of a kind -> name of its first site
     for m, of_sites in zip(system.species, parameters, strict=True):
         for site, of_site in zip(m.site_names, of_sites, strict=True):
@@ -116,11 +139,19 @@ def force_field_of(system: System) -> ForceFieldView:
         if lennard_jones and one >= 0 and other >= 0 and lennard_jones.c6[one, other] != 0:
             c12, c6 = lennard_jones.c12[one, other], lennard_jones.c6[one, other]
             sigma[i, j], epsilon[i, j] = (c12 / c6) ** (1 / 6), c6**2 / (4 * c12)
-    coulomb = _potential(system, "coulomb", ReactionField) or _potential(system, "coulomb", DampedShiftedForce)
+    coulomb = _potential(system, "coulomb", ReactionField) or _potential(
+        system, "coulomb", DampedShiftedForce
+    )
     return ForceFieldView(
-        system, kinds, gather_per_molecule(of_species, index), (system.model.inverse_mass == 0)[index], sigma, epsilon,
-        lennard_jones, coulomb or _potential(system, "coulomb_real", ScreenedCoulomb),
-    )  # fmt: skip
+        system,
+        kinds,
+        gather_per_molecule(of_species, index),
+        (system.model.inverse_mass == 0)[index],
+        sigma,
+        epsilon,
+        lennard_jones,
+        coulomb or _potential(system, "coulomb_real", ScreenedCoulomb),
+    )
 
 
 def unknown_terms(system: System, title: str) -> Iterator[str]:
@@ -131,7 +162,11 @@ def unknown_terms(system: System, title: str) -> Iterator[str]:
         if name not in system.user_terms:
             what = "a field" if hasattr(term, "changes_momentum") else f"the term {kind.__name__}"
             what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
-            what = "forces.ewald_slab or ewald_surface_permittivity" if isinstance(term, SurfaceDipole) else what
+            what = (
+                "forces.ewald_slab or ewald_surface_permittivity"
+                if isinstance(term, SurfaceDipole)
+                else what
+            )
         if name in system.user_terms or kind not in DESCRIBED:
             yield f"{name.replace('_', ' ')}: {what} has no translation for {title}"
     if system.thermostat is not None:
@@ -144,31 +179,43 @@ Potential = TypeVar("Potential")
 def _potential(system: System, name: str, kind: type[Potential]) -> Potential | None:
     """The pair potential of a term if it is of a class, else None."""
     term = system.terms.get(name)
-    return term.potential if isinstance(term, PairForces) and isinstance(term.potential, kind) else None
+    return (
+        term.potential
+        if isinstance(term, PairForces) and isinstance(term.potential, kind)
+        else None
+    )
 
 
 def _lennard_jones_kinds(system: System) -> list[list[int]]:
-    """The Lennard-Jones kind of each site of each species; -1 for sites without Lennard-Jones forces."""
+    """The Lennard-Jones kind of each site of each species; -1 for sites without Lennard-Jones
+    forces."""
     found = [[-1] * len(m.masses) for m in system.species]
     term, law = system.terms.get("lennard_jones"), _potential(system, "lennard_jones", LennardJones)
     if law is None or not isinstance(term, PairForces):
         return found
     sites = term.sites
     for k, member in zip(*np.unique(system.model.species, return_index=True), strict=True):
-        of_member, positions = slice(sites.first[member], sites.first[member + 1]), system.species[k].positions_body
+        of_member, positions = (
+            slice(sites.first[member], sites.first[member + 1]),
+            system.species[k].positions_body,
+        )
         for kind, offset in zip(law.kind[of_member], sites.offsets()[of_member], strict=True):
             found[k][int(np.linalg.norm(positions - offset, axis=1).argmin())] = int(kind)
     return found
 
 
-# Pair potentials as formulas and tables of r, for engines that lack the potential with its truncation. Formulas are in
-# the syntax of Lepton, OpenMM's parser: x^2, max, erfc, and definitions after semicolons.
+# Pair potentials as formulas and tables of r, for engines that lack the potential with its
+# truncation. Formulas are in the syntax of Lepton, OpenMM's parser: x^2, max, erfc, and definitions
+# after semicolons.
 
 
 def lennard_jones_formula(potential: LennardJones, c12: float, c6: float, unit: float) -> str:
     """Energy of two sites with c12/r¹² - c6/r⁶, r in Å, in units of `unit` u Å²/ps²."""
     twelve, six = float(c12 / unit), float(c6 / unit)
-    end = tuple(twelve * of12 - six * of6 for of12, of6 in zip(potential.terms12, potential.terms6, strict=True))
+    end = tuple(
+        twelve * of12 - six * of6
+        for of12, of6 in zip(potential.terms12, potential.terms6, strict=True)
+    )
     return _truncated(f"{twelve!r}/r^12-{six!r}/r^6", potential.truncation, end)
 
 
@@ -176,9 +223,12 @@ def coulomb_formula(potential: ReactionField | DampedShiftedForce, strength: flo
     """Energy of two charges that is strength/r without truncation, r in Å."""
     strength = float(strength)
     if isinstance(potential, DampedShiftedForce):
-        return f"{strength!r}*(erfc({potential.alpha!r}*r)/r+{float(potential.slope)!r}*r+({float(potential.shift)!r}))"
+        slope, shift = float(potential.slope), float(potential.shift)
+        return f"{strength!r}*(erfc({potential.alpha!r}*r)/r+{slope!r}*r+({shift!r}))"
     end = tuple(strength * part for part in potential.terms)
-    return _truncated(f"{strength!r}/r+({strength * potential.field!r})*r^2", potential.truncation, end)
+    return _truncated(
+        f"{strength!r}/r+({strength * potential.field!r})*r^2", potential.truncation, end
+    )
 
 
 def _truncated(formula: str, truncation: Truncation, end: tuple[float, ...]) -> str:
@@ -190,21 +240,29 @@ def _truncated(formula: str, truncation: Truncation, end: tuple[float, ...]) -> 
         return f"{whole}-({added}); x=max(0,r-{float(truncation.start)!r})"
     if isinstance(truncation, Switched | SmoothlySwitched):
         width = float(truncation.cutoff - truncation.start)
-        return f"({whole})*({SWITCHES[type(truncation)]}); t=max(0,(r-{float(truncation.start)!r})/{width!r})"
+        return (
+            f"({whole})*({SWITCHES[type(truncation)]});"
+            f" t=max(0,(r-{float(truncation.start)!r})/{width!r})"
+        )
     return whole
 
 
 def table(formula: str, first: float, last: float, entries: int) -> str:
-    """A table for LAMMPS' pair style `table`, even in r² from `first` to `last` Å: number, r, energy, force."""
+    """A table for LAMMPS' pair style `table`, even in r² from `first` to `last` Å: number, r,
+    energy, force."""
     import sympy  # slow to import
 
     r, energy = _symbolic(formula)
     x = np.sqrt(np.linspace(first**2, last**2, entries))
     with np.errstate(all="ignore"):
-        columns = [sympy.lambdify(r, y, ["numpy", "scipy"])(x) for y in (energy, -sympy.diff(energy, r))]
+        columns = [
+            sympy.lambdify(r, y, ["numpy", "scipy"])(x) for y in (energy, -sympy.diff(energy, r))
+        ]
     rows = zip(x, *(np.broadcast_to(column, x.shape) for column in columns), strict=True)
     head = f"N {entries} RSQ {first:.17g} {last:.17g}\n\n"
-    return head + "".join(f"{k} {x:.15g} {u:.15g} {f:.15g}\n" for k, (x, u, f) in enumerate(rows, 1))
+    return head + "".join(
+        f"{k} {x:.15g} {u:.15g} {f:.15g}\n" for k, (x, u, f) in enumerate(rows, 1)
+    )
 
 
 def _symbolic(formula: str) -> tuple[Any, Any]:
@@ -221,16 +279,19 @@ def _symbolic(formula: str) -> tuple[Any, Any]:
 
 
 def tail_of_formulas(view: ForceFieldView, volume: float) -> float:
-    """The energy of the tail correction, u Å²/ps², by quadrature of the formulas that other programs evaluate.
+    """The energy of the tail correction, u Å²/ps², by quadrature of the formulas that other
+    programs evaluate.
 
-    It has no code in common with `lennard_jones.tail`, with which it is compared: programs have no correction for most
-    cutoff schemes, or one that counts sites of one molecule differently.
+    It has no code in common with `lennard_jones.tail`, with which it is compared: programs have no
+    correction for most cutoff schemes, or one that counts sites of one molecule differently.
     """
     count, total = np.bincount(view.kind, minlength=len(view.kinds)), 0.0
     for i, j in combinations_with_replacement(range(len(view.kinds)), 2):
         if view.epsilon[i, j] == 0:
             continue
-        integral, removed = _removed_by_truncation(view, float(view.sigma[i, j]), float(view.epsilon[i, j]))
+        integral, removed = _removed_by_truncation(
+            view, float(view.sigma[i, j]), float(view.epsilon[i, j])
+        )
         orders = 1 if i == j else 2
         total += orders * 2 * np.pi / volume * float(count[i] * count[j]) * integral
         # sites of one molecule are not neighbours of each other
@@ -251,7 +312,9 @@ def _removed_by_truncation(
     unmodified = law._replace(truncation=Unmodified(inf), terms12=nothing, terms6=nothing)
     r, whole = _symbolic(lennard_jones_formula(unmodified, *powers, 1.0))
     # expanded, so that 1/r¹² cancels where it is not truncated
-    inside = sympy.lambdify(r, sympy.expand(whole - _symbolic(lennard_jones_formula(law, *powers, 1.0))[1]))
+    inside = sympy.lambdify(
+        r, sympy.expand(whole - _symbolic(lennard_jones_formula(law, *powers, 1.0))[1])
+    )
     beyond = sympy.lambdify(r, whole)
 
     def removed(distance: float) -> float:
@@ -264,10 +327,13 @@ def _removed_by_truncation(
 
 
 def _distances_in_molecules(view: ForceFieldView, i: int, j: int) -> Iterator[tuple[float, int]]:
-    """Distances (Å) of sites of the kinds i and j in one molecule, a site from itself included, and their numbers."""
+    """Distances (Å) of sites of the kinds i and j in one molecule, a site from itself included, and
+    their numbers."""
     species, sites = view.system.model.species, view.system.sites_per_molecule
     first = np.cumsum(sites) - sites
-    for k, member, molecules in zip(*np.unique(species, return_index=True, return_counts=True), strict=True):
+    for k, member, molecules in zip(
+        *np.unique(species, return_index=True, return_counts=True), strict=True
+    ):
         kind = view.kind[first[member] : first[member] + sites[member]]
         position = view.system.species[k].positions_body
         for a, b in product(position[kind == i], position[kind == j]):

@@ -1,4 +1,5 @@
-"""Observables of molecules at one state: energies, temperatures, pressure, momentum and the orthogonality of Q."""
+"""Observables of molecules at one state: energies, temperatures, pressure, momentum and the
+orthogonality of Q."""
 
 from math import hypot, inf, nan
 from typing import Any, NamedTuple, cast
@@ -22,15 +23,18 @@ UNIT = np.eye(3)
 class Observation(NamedTuple):
     """The observables of molecules at one state: a line of the log, and what the log does not have.
 
-    The columns of the line are attributes too, such as `potential`, all but the size of the momentum. Energies are in
-    the unit that `observe` was given, kJ/mol in a run. Quantities that do not exist are NaN.
+    The columns of the line are attributes too, such as `potential`, all but the size of the
+    momentum. Energies are in the unit that `observe` was given, kJ/mol in a run. Quantities that do
+    not exist are NaN.
     """
 
     sample: Sample
     components: dict[str, float]  # potential energy by term and constant
     kinetic_translation: float
     kinetic_rotation: float
-    pressure_tensor_bar: np.ndarray  # (3, 3) molecular, tail correction included, symmetric; NaN without a box
+    pressure_tensor_bar: (
+        np.ndarray
+    )  # (3, 3) molecular, tail correction included, symmetric; NaN without a box
     virial: np.ndarray  # (3, 3) molecular, without the tail correction; an energy
     momentum: np.ndarray  # (3,) u Å/ps
     load: Load  # u Å/ps² and u Å²/ps²
@@ -58,29 +62,44 @@ class Observation(NamedTuple):
 
 
 def observe(
-    system: System, engine: Engine, state: State, stage: int | None = None, *, time: float | None = None,
-    origin: float | None = None, verlet_step: float = nan, moved: bool = False, energy_unit: float = KJ_PER_MOL,
+    system: System,
+    engine: Engine,
+    state: State,
+    stage: int | None = None,
+    *,
+    time: float | None = None,
+    origin: float | None = None,
+    verlet_step: float = nan,
+    moved: bool = False,
+    energy_unit: float = KJ_PER_MOL,
     trajectories: tuple[float, ...] = (),
-) -> Observation:  # fmt: skip
-    """All observables, from one evaluation of forces and energies. This function fills the columns of the log.
+) -> Observation:
+    """All observables, from one evaluation of forces and energies. This function fills the columns
+    of the log.
 
-    stage : index of the stage, which may remove momentum from the degrees of freedom of the temperatures
+    stage : index of the stage, which may remove momentum from the degrees of freedom of the
+        temperatures
     time : ps, by default of the state
-    origin : conserved energy at the start of the stage, from which its drift is counted; by default the present one
+    origin : conserved energy at the start of the stage, from which its drift is counted; by default
+        the present one
     verlet_step : time step (ps) if the state comes from velocity Verlet, for unbiased temperatures
     (docs/theory/errors.md)
-    moved : whether the engine has just moved this state, so that it may have its forces and energies already
+    moved : whether the engine has just moved this state, so that it may have its forces and
+        energies already
     energy_unit : unit of all energies, u Å²/ps²
     trajectories : the columns `OF_TRAJECTORIES`, if the scene has them
 
-    The pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen & Tildesley 2017, 2.7.2). Its
-    tensor is the symmetric part. The rest is the rate at which orientations gain angular momentum, 0 on average.
+    The pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen &
+    Tildesley 2017, 2.7.2). Its tensor is the symmetric part. The rest is the rate at which
+    orientations gain angular momentum, 0 on average.
     """
     load, tallies = engine.evaluate_current(state) if moved else engine.evaluate(state)
     components = {name: tally.energy for name, tally in tallies.items()} | system.constants
     volume, tail_pressure = state.volume, 0.0
     if system.tail is not None:
-        components["tail" if system.user_terms else "lennard_jones_tail"] = system.tail.energy(volume)
+        components["tail" if system.user_terms else "lennard_jones_tail"] = system.tail.energy(
+            volume
+        )
         tail_pressure = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
     sums = engine.sums(state, load) or sums_of_state(system.model, state, load)
@@ -89,7 +108,9 @@ def observe(
     correction = verlet_step**2 / 12
     freedom = system.freedom if stage is None else system.freedom_in(stage)
     if boxed := volume < inf:
-        pressure = (sums.flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + tail_pressure) * UNIT
+        pressure = (sums.flow + (virial + virial.T) / 2) / volume + (
+            system.constant_pressure + tail_pressure
+        ) * UNIT
         a, b, c, alpha, beta, gamma = edges_and_angles(state.cell)
     else:
         pressure, (a, b, c, alpha, beta, gamma) = np.full((3, 3), nan), [nan] * 6
@@ -98,29 +119,60 @@ def observe(
     energy, ledger = (potential + kinetic) / energy_unit, state.energy_ledger / energy_unit
     conserved = energy - float(ledger.sum())
     sample = Sample(
-        step=int(state.step[NOW]), time=float(state.time[NOW]) if time is None else time,
-        potential=potential / energy_unit, kinetic=kinetic / energy_unit, energy=energy,
-        temperature=_temperature(kinetic, freedom.total), volume=volume * 1e-3 if boxed else nan,
+        step=int(state.step[NOW]),
+        time=float(state.time[NOW]) if time is None else time,
+        potential=potential / energy_unit,
+        kinetic=kinetic / energy_unit,
+        energy=energy,
+        temperature=_temperature(kinetic, freedom.total),
+        volume=volume * 1e-3 if boxed else nan,
         density=system.mass / volume / GRAM_PER_CM3 if boxed else nan,
         stage_name=system.scene.stages[stage or 0].label,
         temperature_translation=_temperature(translation, freedom.translation),
         temperature_rotation=_temperature(rotation, freedom.rotation),
-        temperature_translation_unbiased=_temperature(translation + correction * sums.force, freedom.translation),
-        temperature_rotation_unbiased=_temperature(rotation + correction * sums.torque, freedom.rotation),
-        pressure_bar=float(pressure.trace()) / (3 * BAR), drift=conserved - (conserved if origin is None else origin),
-        momentum=hypot(*sums.momentum.tolist()), orthogonality_error=sums.orthogonality_error, a=a, b=b, c=c,
-        alpha=alpha, beta=beta, gamma=gamma, heat=float(ledger[HEAT]), work=float(ledger[WORK]), pressure_xx=xx,
-        pressure_yy=yy, pressure_zz=zz, pressure_xy=xy, pressure_xz=xz, pressure_yz=yz, conserved=conserved,
+        temperature_translation_unbiased=_temperature(
+            translation + correction * sums.force, freedom.translation
+        ),
+        temperature_rotation_unbiased=_temperature(
+            rotation + correction * sums.torque, freedom.rotation
+        ),
+        pressure_bar=float(pressure.trace()) / (3 * BAR),
+        drift=conserved - (conserved if origin is None else origin),
+        momentum=hypot(*sums.momentum.tolist()),
+        orthogonality_error=sums.orthogonality_error,
+        a=a,
+        b=b,
+        c=c,
+        alpha=alpha,
+        beta=beta,
+        gamma=gamma,
+        heat=float(ledger[HEAT]),
+        work=float(ledger[WORK]),
+        pressure_xx=xx,
+        pressure_yy=yy,
+        pressure_zz=zz,
+        pressure_xy=xy,
+        pressure_xz=xz,
+        pressure_yz=yz,
+        conserved=conserved,
         stage=stage or 0,
         user_energies=(
             *(components[name] / energy_unit for name in system.user_terms),
-            *(term.distance_in(state) for term in system.distances.values()), *trajectories,
+            *(term.distance_in(state) for term in system.distances.values()),
+            *trajectories,
         ),
-    )  # fmt: skip
+    )
     return Observation(
-        sample, {name: energy / energy_unit for name, energy in components.items()}, translation / energy_unit,
-        rotation / energy_unit, tensor_bar, virial / energy_unit, sums.momentum, load, energy_unit,
-    )  # fmt: skip
+        sample,
+        {name: energy / energy_unit for name, energy in components.items()},
+        translation / energy_unit,
+        rotation / energy_unit,
+        tensor_bar,
+        virial / energy_unit,
+        sums.momentum,
+        load,
+        energy_unit,
+    )
 
 
 def kinetic_energies(system: System, state: State) -> tuple[float, float]:
@@ -134,18 +186,23 @@ def _temperature(kinetic: float, freedom: int) -> float:
 
 
 def describe_quantities(system: System) -> dict[str, str]:
-    """Explanations for `rigidmd energy`: name of an energy of charges, `virial` or `pressure` -> text."""
+    """Explanations for `rigidmd energy`: name of an energy of charges, `virial` or `pressure` ->
+    text."""
     method, found = system.scene.forces.electrostatics, {}
     if method == "reaction_field" and system.cutoff < inf and "coulomb" in system.terms:
         found = _describe_reaction_field(system)
     elif method in ("ewald", "pme"):
         found = _describe_ewald(system)
-    found = {name: text for name, text in found.items() if name in {*system.terms, *system.constants}}
+    found = {
+        name: text for name, text in found.items() if name in {*system.terms, *system.constants}
+    }
     if system.space.volume == inf:
         return found
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
     if system.external:
-        virial += ", of the forces between molecules; fields, walls and restraints do not contribute"
+        virial += (
+            ", of the forces between molecules; fields, walls and restraints do not contribute"
+        )
     if system.tail is not None:
         virial += ", without the tail correction"
         pressure += f", and {system.tail.pressure(system.state.volume) / BAR:.10g} bar of the tail"
@@ -160,9 +217,11 @@ def _describe_reaction_field(system: System) -> dict[str, str]:
     shape = cast(ReactionField, cast(PairForces, system.terms["coulomb"]).potential).truncation
     start = 0.0 if isinstance(shape, Unmodified) else shape.start
     ends = {
-        "plain": "", "shift": ", less its value at the cutoff", "force_shift": ", less its value and slope there",
+        "plain": "",
+        "shift": ", less its value at the cutoff",
+        "force_shift": ", less its value and slope there",
         "force_switch": f", its force switched off from {start:g} Å on",
-    }  # fmt: skip
+    }
     how = ends.get(name, f", less its value at the cutoff, times {name} from {start:g} Å on")
     return {
         "coulomb": f"q q (1/r + k r²) up to the cutoff{how}",
@@ -177,5 +236,11 @@ def _describe_ewald(system: System) -> dict[str, str]:
         return {"coulomb_real": f"{real}, plain at the cutoff", "coulomb_self": self_energy}
     more = "; shifted energies add nothing to it, as every molecule is neutral"
     if any(abs(m.charge) > NEUTRAL * np.abs(m.charges).sum() for m in system.species):
-        more = ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted; R is the cutoff"
-    return {"coulomb_real": f"{real}, less its value at the cutoff", "coulomb_self": self_energy + more}
+        more = (
+            ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted; R is"
+            " the cutoff"
+        )
+    return {
+        "coulomb_real": f"{real}, less its value at the cutoff",
+        "coulomb_self": self_energy + more,
+    }

@@ -1,7 +1,8 @@
-"""The protocol of engines. An engine moves the state of a system by steps of an integrator and evaluates its forces.
+"""The protocol of engines. An engine moves the state of a system by steps of an integrator and
+evaluates its forces.
 
-`cpu` runs compiled code. `ode` moves a single body by a general ODE solver. `external` lets another program (LAMMPS or
-OpenMM) compute.
+`cpu` runs compiled code. `ode` moves a single body by a general ODE solver. `external` lets another
+program (LAMMPS or OpenMM) compute.
 """
 
 from abc import abstractmethod
@@ -24,17 +25,17 @@ class Tally(NamedTuple):
 
 
 class Engine(Protocol):
-    """All that a run asks of an engine. An implementation needs the abstract methods. The defaults of all others mean
-    that the engine does not know or cannot do it, which a run accepts."""
+    """All that a run asks of an engine. An implementation needs the abstract methods. The defaults
+    of all others mean that the engine does not know or cannot do it, which a run accepts."""
 
     version: str = "rigidmd"
     """Name and version of the program"""
     conserves_energy: bool = True
-    """Whether the energy less the ledger's heat and work is conserved, so that its drift is an error. Otherwise heat is
-    defined as the change of the energy"""
+    """Whether the energy less the ledger's heat and work is conserved, so that its drift is an
+    error. Otherwise heat is defined as the change of the energy"""
     is_repeatable: bool = False
-    """Whether steps from an earlier state are repeated to the same bits, and evaluations at other states leave no trace
-    in the motion and are cheap"""
+    """Whether steps from an earlier state are repeated to the same bits, and evaluations at other
+    states leave no trace in the motion and are cheap"""
     force_tolerance: float = 0.0
     """Relative error of energies and of rms forces by the arithmetic of the engine"""
     virial_tolerance: float = 0.0
@@ -46,35 +47,47 @@ class Engine(Protocol):
     is_stiff: bool | None = None
     """Whether stability, not accuracy, has limited these steps for long"""
     stop_requested: Callable[[], bool] = staticmethod(lambda: False)
-    """Set by a run. An engine that chooses its steps calls it at each of them, and raises Halted if it is true"""
+    """Set by a run. An engine that chooses its steps calls it at each of them, and raises Halted if
+    it is true"""
 
     @abstractmethod
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
-        """The extra variables of an integrator (`state.extra_variables`) at the begin of a segment."""
+        """The extra variables of an integrator (`state.extra_variables`) at the begin of a
+        segment."""
 
     def begin(self, state: State, integrator: Scheme | Solver) -> State:
         """A copy of a state with the variables of an integrator."""
         return state.copy()._replace(extra_variables=self.variables(state, integrator))
 
     @abstractmethod
-    def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
-        """Move the state in place, in steps of dt, until its step counter is `until`. Raises SimulationError.
-        `observed`: whether `evaluate_current` follows; affects speed only."""
+    def advance(
+        self,
+        state: State,
+        integrator: Scheme | Solver,
+        dt: float,
+        until: int,
+        observed: bool = False,
+    ) -> None:
+        """Move the state in place, in steps of dt, until its step counter is `until`. Raises
+        SimulationError. `observed`: whether `evaluate_current` follows; affects speed only."""
 
     @abstractmethod
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """Forces and torques at a state (new arrays), and energy and virial of each term. Raises SimulationError."""
+        """Forces and torques at a state (new arrays), and energy and virial of each term. Raises
+        SimulationError."""
 
     def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """`evaluate` at the state that was just moved, with what its last step has already computed."""
+        """`evaluate` at the state that was just moved, with what its last step has already
+        computed."""
         return self.evaluate(state)
 
     def sums(self, state: State, load: Load) -> StateSums | None:
-        """Sums over the state that was just moved and its load from `evaluate_current`, if its last step has added them
-        up."""
+        """Sums over the state that was just moved and its load from `evaluate_current`, if its last
+        step has added them up."""
 
     def extent(self, state: State) -> LargestValues | None:
-        """Largest values in the state that was just moved and its load, if its last step has found them."""
+        """Largest values in the state that was just moved and its load, if its last step has found
+        them."""
 
     @property
     def moves(self) -> tuple[int, int] | None:
@@ -82,7 +95,8 @@ class Engine(Protocol):
 
     @property
     def trajectories(self) -> np.ndarray | None:
-        """Sums (5,) over the trajectories of hybrid Monte Carlo so far, see `dynamics.hybrid_monte_carlo`."""
+        """Sums (5,) over the trajectories of hybrid Monte Carlo so far, see
+        `dynamics.hybrid_monte_carlo`."""
 
     @property
     def chosen_steps(self) -> tuple[int, int] | None:
@@ -90,26 +104,33 @@ class Engine(Protocol):
 
     @abstractmethod
     def memory(self) -> dict[str, np.ndarray] | None:
-        """The arrays besides the state on which the next steps depend; None if arrays cannot hold all of it."""
+        """The arrays besides the state on which the next steps depend; None if arrays cannot hold
+        all of it."""
 
     @abstractmethod
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
-        """Resume from a state with the arrays of `memory`, to the same bits. Raises ValueError if they do not fit."""
+        """Resume from a state with the arrays of `memory`, to the same bits. Raises ValueError if
+        they do not fit."""
 
-    def check(self, state: State, integrator: Scheme | Solver, dt: float, start: State | None) -> None:
-        """Raise ValueError unless a recalled state agrees with its extra variables. `start`: the start of the run, if
-        forces have not changed since."""
+    def check(
+        self, state: State, integrator: Scheme | Solver, dt: float, start: State | None
+    ) -> None:
+        """Raise ValueError unless a recalled state agrees with its extra variables. `start`: the
+        start of the run, if forces have not changed since."""
 
     @abstractmethod
     def forget(self) -> None:
-        """Discard what depends on positions, because they were changed from outside since the last step."""
+        """Discard what depends on positions, because they were changed from outside since the last
+        step."""
 
     def change(self, model: Any, terms: dict[str, NamedTuple]) -> None:
-        """Continue with a model and terms of the same types, as at a kink of prescribed functions of time."""
+        """Continue with a model and terms of the same types, as at a kink of prescribed functions
+        of time."""
         raise TypeError(f"{self.version} cannot change its forces")
 
     def rotor(self, model: Any) -> "NamedTuple | None":
-        """The rotor by which rigidmd rotates bodies exactly as this engine does, if there is one."""
+        """The rotor by which rigidmd rotates bodies exactly as this engine does, if there is
+        one."""
 
     def close(self) -> None:
         """End what the engine has started outside this process."""
@@ -129,7 +150,9 @@ class NotFiniteError(SimulationError):
         if np.isfinite(size).all():
             self.molecule = int(rows[0].argmax())
             distance = rows[0][self.molecule]
-            self.reason = f"it is {distance:.3g} Å from the origin, too far to find its image of the box"
+            self.reason = (
+                f"it is {distance:.3g} Å from the origin, too far to find its image of the box"
+            )
         else:
             self.molecule = int(size.argmax())
             self.reason = "its position or momentum is not finite"
@@ -137,7 +160,8 @@ class NotFiniteError(SimulationError):
 
 
 def keep_time(state: State, dt: float) -> None:
-    """Begin a new segment of equal steps, in place, if the step has changed or time was set from outside."""
+    """Begin a new segment of equal steps, in place, if the step has changed or time was set from
+    outside."""
     time, step = state.time.tolist(), state.step.tolist()
     if time[NOW] != time[ORIGIN] + (step[NOW] - step[ORIGIN]) * dt:
         state.begin_segment()

@@ -1,6 +1,7 @@
 """The external engines: what scenes, commands and reports know of them without loading them.
 
-`engines/NAME/options.py` has a record PROGRAM for each. To add an engine, add its folder and its name in NAMES.
+`engines/NAME/options.py` has a record PROGRAM for each. To add an engine, add its folder and its
+name in NAMES.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,11 +31,17 @@ class Program(NamedTuple):
     installed: str = ""  # a function that describes what is installed here
     options: Mapping[str, Option] = {}
     describe: Callable[..., str] = lambda **options: ""  # name and options for reports
-    option_errors: Callable[..., str] = lambda **options: ""  # a message on options that contradict each other
-    precise: Mapping[str, Any] = {}  # the options with which `rigidmd verify` compares, unless others are given
+    option_errors: Callable[..., str] = lambda **options: (
+        ""
+    )  # a message on options that contradict each other
+    precise: Mapping[
+        str, Any
+    ] = {}  # the options with which `rigidmd verify` compares, unless others are given
     thermostat: str | None = None  # its default thermostat in place of rigidmd's
     barostat: str | None = None  # likewise of npt; None if its barostat has no name in a scene
-    writer: str = ""  # its function (folder, view, state) -> names of files; empty without an export
+    writer: str = (
+        ""  # its function (folder, view, state) -> names of files; empty without an export
+    )
     command: str = ""  # that runs an exported folder
     name: str = ""  # its folder, set by `programs`
 
@@ -47,7 +54,10 @@ class Program(NamedTuple):
 @cache
 def programs() -> dict[str, Program]:
     """Name of an external engine -> its record."""
-    return {name: import_module(f"rigidmd.engines.{name}.options").PROGRAM._replace(name=name) for name in NAMES}
+    return {
+        name: import_module(f"rigidmd.engines.{name}.options").PROGRAM._replace(name=name)
+        for name in NAMES
+    }
 
 
 def runnable() -> dict[str, Program]:
@@ -57,4 +67,6 @@ def runnable() -> dict[str, Program]:
 
 def engine_options() -> dict[str, Option]:
     """The keys of [engine] besides its name."""
-    return {key: option for program in runnable().values() for key, option in program.options.items()}
+    return {
+        key: option for program in runnable().values() for key, option in program.options.items()
+    }

@@ -1,8 +1,10 @@
-"""Rigid bodies for external engines, which give positions, velocities and forces of sites or mass points.
+"""Rigid bodies for external engines, which give positions, velocities and forces of sites or mass
+points.
 
-For engines without rigid bodies, molecules are mass points at constrained distances, and virtual sites. Rigid bodies
-with the same mass, centre of mass and inertia move alike (textbook: equimomental systems). So 1, 2, 3 or 4 mass points
-represent a molecule for OpenMM and GROMACS, and every other site is a virtual site.
+For engines without rigid bodies, molecules are mass points at constrained distances, and virtual
+sites. Rigid bodies with the same mass, centre of mass and inertia move alike (textbook:
+equimomental systems). So 1, 2, 3 or 4 mass points represent a molecule for OpenMM and GROMACS, and
+every other site is a virtual site.
 """
 
 from math import sqrt
@@ -25,7 +27,8 @@ class Points(NamedTuple):
 
 
 class RigidBodies:
-    """Converts states and loads between bodies and their sites, or other points with the same mass and centre."""
+    """Converts states and loads between bodies and their sites, or other points with the same mass
+    and centre."""
 
     def __init__(self, system: System, points: Points | None = None):
         model, sites = system.model, system.sites if points is None else points
@@ -42,10 +45,12 @@ class RigidBodies:
         self._linear = (self._inertia == 0).any(axis=1) & (extent > 0)
         self._has_no_rotation = self._frozen | (extent == 0)
 
-    def state(self, before: State, position: np.ndarray, velocity: np.ndarray, cell: np.ndarray) -> State:
-        """The state with sites (s, 3) at these positions, molecules whole and not wrapped; all else as in `before`.
-        Frozen molecules do not move. The spin of a linear body about its axis has no meaning, so its rotation is the
-        one nearest to `before`."""
+    def state(
+        self, before: State, position: np.ndarray, velocity: np.ndarray, cell: np.ndarray
+    ) -> State:
+        """The state with sites (s, 3) at these positions, molecules whole and not wrapped; all else
+        as in `before`. Frozen molecules do not move. The spin of a linear body about its axis has
+        no meaning, so its rotation is the one nearest to `before`."""
         centre, drift = self._mean(position), self._mean(velocity)
         arm = position - centre[self._molecule]
         rotation, spin = before.rotation.copy(), before.angular_momentum_body.copy()
@@ -57,9 +62,12 @@ class RigidBodies:
             spin[self._inertia == 0] = 0.0
         held = self._frozen[:, None]
         return before._replace(
-            position=np.where(held, before.position, centre), velocity=np.where(held, before.velocity, drift),
-            rotation=np.ascontiguousarray(rotation), angular_momentum_body=spin, cell=np.ascontiguousarray(cell),
-        )  # fmt: skip
+            position=np.where(held, before.position, centre),
+            velocity=np.where(held, before.velocity, drift),
+            rotation=np.ascontiguousarray(rotation),
+            angular_momentum_body=spin,
+            cell=np.ascontiguousarray(cell),
+        )
 
     def points(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (s, 3) of the sites, lab frame."""
@@ -75,46 +83,59 @@ class RigidBodies:
         arm = position - self._mean(position)[self._molecule]
         if not len(state.rotation):
             return Load(self._sum(force), np.zeros((0, 3)))
-        return Load(self._sum(force), np.einsum("nij,ni->nj", state.rotation, self._sum(np.cross(arm, force))))
+        return Load(
+            self._sum(force),
+            np.einsum("nij,ni->nj", state.rotation, self._sum(np.cross(arm, force))),
+        )
 
     def intramolecular_virial(self, position: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """Sum (3, 3) of F (x) d, d from the centre of mass. The atomic virial less this is the molecular one."""
+        """Sum (3, 3) of F (x) d, d from the centre of mass. The atomic virial less this is the
+        molecular one."""
         return force.T @ (position - self._mean(position)[self._molecule])
 
     def _sum(self, of_sites: np.ndarray) -> np.ndarray:
-        return np.stack([np.bincount(self._molecule, part, self._count) for part in of_sites.T], axis=1)
+        return np.stack(
+            [np.bincount(self._molecule, part, self._count) for part in of_sites.T], axis=1
+        )
 
     def _mean(self, of_sites: np.ndarray) -> np.ndarray:
         return self._sum(of_sites * self._weight[:, None]) / self._mass[:, None]
 
     def _rotations(self, before: np.ndarray, arm: np.ndarray) -> np.ndarray:
-        """Rotations (n, 3, 3) that bring the body-frame offsets nearest to the offsets (s, 3) in the lab."""
+        """Rotations (n, 3, 3) that bring the body-frame offsets nearest to the offsets (s, 3) in
+        the lab."""
         products = np.einsum("si,sj->sij", arm, self._body).reshape(-1, 9)
         found = nearest_rotation(self._sum(products).reshape(-1, 3, 3))
         if (line := self._linear).any():
             axis_body = (self._inertia[line] == 0).astype(float)
-            found[line] = _tilted(before[line], *(np.einsum("nij,nj->ni", q[line], axis_body) for q in (before, found)))
+            found[line] = _tilted(
+                before[line],
+                *(np.einsum("nij,nj->ni", q[line], axis_body) for q in (before, found)),
+            )
         return found
 
 
 def _tilted(rotation: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
     """Rotations followed by the shortest ones that bring unit vectors old (n, 3) to new (n, 3).
 
-    Source: Rodrigues' formula, about the cross product. For more than a right angle it follows a rotation by 180° about
-    a perpendicular axis, so that opposite vectors are no exception. The result is made orthogonal, or rounding would
-    grow from call to call.
+    Source: Rodrigues' formula, about the cross product. For more than a right angle it follows a
+    rotation by 180° about a perpendicular axis, so that opposite vectors are no exception. The
+    result is made orthogonal, or rounding would grow from call to call.
     """
     across = np.cross(old, np.eye(3)[np.abs(old).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1)[:, None]
     back = (np.einsum("ni,ni->n", old, new) < 0)[:, None]
-    by_180 = np.where(back[:, None], 2 * np.einsum("ni,nj->nij", across, across) - np.eye(3), np.eye(3))
+    by_180 = np.where(
+        back[:, None], 2 * np.einsum("ni,nj->nij", across, across) - np.eye(3), np.eye(3)
+    )
     old = np.where(back, -old, old)
     cross, cosine = hat(np.cross(old, new)), np.einsum("ni,ni->n", old, new)
     step = np.eye(3) + cross + cross @ cross / (1 + cosine)[:, None, None]
     return nearest_rotation(step @ by_180 @ rotation)
 
 
-#: A molecule is planar if its second moment across a plane is below this fraction of the largest one.
+#: A molecule is planar if its second moment across a plane is below this fraction of the largest
+#: one.
 FLAT = 1e-13
 #: A site is off the line or plane of the mass points beyond this fraction of the molecule's radius.
 OFF = 1e-9
@@ -147,7 +168,8 @@ class MassPoints(NamedTuple):
         return int((self.site < 0).sum())
 
     def particles(self, sites: int) -> tuple[np.ndarray, np.ndarray]:
-        """The particle of each point (p,), and the masses of all particles: `sites` sites, then the other points."""
+        """The particle of each point (p,), and the masses of all particles: `sites` sites, then the
+        other points."""
         at = np.where(self.site < 0, sites + np.cumsum(self.site < 0) - 1, self.site)
         mass = np.zeros(sites + self.extra)
         mass[at] = self.mass
@@ -160,22 +182,31 @@ class MassPoints(NamedTuple):
         for i in range(len(self.mass)):
             for j in range(i):
                 d = float(np.linalg.norm(self.position_body[i] - self.position_body[j]))
-                found.append((j, i, next((other for *_, other in found if abs(d - other) <= SAME * d), d)))
+                found.append(
+                    (j, i, next((other for *_, other in found if abs(d - other) <= SAME * d), d))
+                )
         return found
 
 
 def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:
-    """The mass points of a molecule; all sites of a frozen one. `sites`: they may be sites, if enough have mass."""
+    """The mass points of a molecule; all sites of a frozen one. `sites`: they may be sites, if
+    enough have mass."""
     if frozen:
-        return MassPoints(molecule.masses, molecule.positions_body, np.arange(len(molecule.masses)), {})
+        return MassPoints(
+            molecule.masses, molecule.positions_body, np.arange(len(molecule.masses)), {}
+        )
     mass, position, site = _points(molecule, sites)
-    limit, others = OFF * molecule.radius, np.setdiff1d(np.arange(len(molecule.masses)), site).tolist()
+    limit, others = (
+        OFF * molecule.radius,
+        np.setdiff1d(np.arange(len(molecule.masses)), site).tolist(),
+    )
     virtual = {k: _virtual_site(position, molecule.positions_body[k], limit) for k in others}
     return MassPoints(mass, position, site, virtual)
 
 
 def _points(molecule: Molecule, sites: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Masses, positions and sites of the points: the sites if just enough of them have mass, else a simplex."""
+    """Masses, positions and sites of the points: the sites if just enough of them have mass, else a
+    simplex."""
     heavy, total, inertia = np.flatnonzero(molecule.masses > 0), molecule.mass, molecule.inertia
     if not inertia.any():
         return np.array([total]), np.zeros((1, 3)), heavy[:1]
@@ -195,14 +226,18 @@ def _points(molecule: Molecule, sites: bool) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _can_be_points(molecule: Molecule, heavy: np.ndarray) -> bool:
-    """Whether the sites with mass can be the points. The sites of HDO cannot: SETTLE, by which OpenMM and GROMACS
-    constrain isosceles triangles, assumes equal masses at the base, and OpenMM's then gives NaN."""
+    """Whether the sites with mass can be the points. The sites of HDO cannot: SETTLE, by which
+    OpenMM and GROMACS constrain isosceles triangles, assumes equal masses at the base, and OpenMM's
+    then gives NaN."""
     if molecule.kind == "linear" or len(heavy) != 3:
         return molecule.kind == "linear" and len(heavy) == 2
     mass, where = molecule.masses[heavy], molecule.positions_body[heavy]
-    side = [float(np.linalg.norm(where[k - 1] - where[k - 2])) for k in range(3)]  # opposite to point k
+    side = [
+        float(np.linalg.norm(where[k - 1] - where[k - 2])) for k in range(3)
+    ]  # opposite to point k
     return all(
-        abs(side[k - 1] - side[k - 2]) > ISOSCELES * side[k - 1] or abs(mass[k - 1] - mass[k - 2]) <= SAME * mass[k - 1]
+        abs(side[k - 1] - side[k - 2]) > ISOSCELES * side[k - 1]
+        or abs(mass[k - 1] - mass[k - 2]) <= SAME * mass[k - 1]
         for k in range(3)
     )
 
@@ -210,7 +245,10 @@ def _can_be_points(molecule: Molecule, heavy: np.ndarray) -> bool:
 def _virtual_site(points: np.ndarray, where: np.ndarray, limit: float) -> VirtualSite:
     if len(points) == 1:
         return VirtualSite(np.ones(1), 0.0)
-    weight, cross = np.linalg.lstsq((points[1:] - points[0]).T, where - points[0], rcond=None)[0], 0.0
+    weight, cross = (
+        np.linalg.lstsq((points[1:] - points[0]).T, where - points[0], rcond=None)[0],
+        0.0,
+    )
     if len(points) == 3:
         normal = np.cross(points[1] - points[0], points[2] - points[0])
         length = float(np.linalg.norm(normal))

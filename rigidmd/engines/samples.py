@@ -1,6 +1,8 @@
-"""The columns of log.csv (molecules) and motion.csv (a body), and the samples of a run of molecules.
+"""The columns of log.csv (molecules) and motion.csv (a body), and the samples of a run of
+molecules.
 
-One table serves files, displays and documentation. For molecules it is the record `Sample`: each field has a `Column`.
+One table serves files, displays and documentation. For molecules it is the record `Sample`: each
+field has a `Column`.
 """
 
 import re
@@ -29,52 +31,96 @@ UNBIASED = "without the error of the step (velocity Verlet only)"
 
 
 class Sample(NamedTuple):
-    """One line of the log, in its units. NaN for what does not exist: pressure without a box, T_rot of points."""
+    """One line of the log, in its units. NaN for what does not exist: pressure without a box, T_rot
+    of points."""
 
     step: Annotated[int, Column("Step", "1", "steps since the start")]
     time: Annotated[float, Column("Time (ps)", "ps", "time since the start")]
-    potential: Annotated[float, Column("Potential Energy (kJ/mole)", "kJ/mol", "potential energy of the whole system")]
-    kinetic: Annotated[float, Column("Kinetic Energy (kJ/mole)", "kJ/mol", "kinetic energy, translation and rotation")]
-    energy: Annotated[float, Column("Total Energy (kJ/mole)", "kJ/mol", "potential and kinetic energy")]
+    potential: Annotated[
+        float,
+        Column("Potential Energy (kJ/mole)", "kJ/mol", "potential energy of the whole system"),
+    ]
+    kinetic: Annotated[
+        float,
+        Column("Kinetic Energy (kJ/mole)", "kJ/mol", "kinetic energy, translation and rotation"),
+    ]
+    energy: Annotated[
+        float, Column("Total Energy (kJ/mole)", "kJ/mol", "potential and kinetic energy")
+    ]
     temperature: Annotated[float, Column("Temperature (K)", "K", "temperature of all motion")]
     volume: Annotated[float, Column("Box Volume (nm^3)", "nm³", "volume of the box")]
     density: Annotated[float, Column("Density (g/mL)", "g/cm³", "mass density")]
     stage_name: Annotated[str, Column("Stage", "", "name of the stage")]
-    temperature_translation: Annotated[float, Column("T_trans (K)", "K", "temperature of translation")]
+    temperature_translation: Annotated[
+        float, Column("T_trans (K)", "K", "temperature of translation")
+    ]
     temperature_rotation: Annotated[float, Column("T_rot (K)", "K", "temperature of rotation")]
-    temperature_translation_unbiased: Annotated[float, Column("T_trans unbiased (K)", "K", f"T_trans {UNBIASED}")]
-    temperature_rotation_unbiased: Annotated[float, Column("T_rot unbiased (K)", "K", f"T_rot {UNBIASED}")]
-    pressure_bar: Annotated[float, Column("Pressure (bar)", "bar", "molecular pressure, tail correction included")]
-    drift: Annotated[float, Column("Drift (kJ/mole)", "kJ/mol", "change of `conserved` since the stage began")]
+    temperature_translation_unbiased: Annotated[
+        float, Column("T_trans unbiased (K)", "K", f"T_trans {UNBIASED}")
+    ]
+    temperature_rotation_unbiased: Annotated[
+        float, Column("T_rot unbiased (K)", "K", f"T_rot {UNBIASED}")
+    ]
+    pressure_bar: Annotated[
+        float, Column("Pressure (bar)", "bar", "molecular pressure, tail correction included")
+    ]
+    drift: Annotated[
+        float, Column("Drift (kJ/mole)", "kJ/mol", "change of `conserved` since the stage began")
+    ]
     momentum: Annotated[float, Column("Momentum (u A/ps)", "u Å/ps", "size of the total momentum")]
-    orthogonality_error: Annotated[float, Column("Orthogonality error", "1", "largest entry of abs(QᵀQ - 1)")]
+    orthogonality_error: Annotated[
+        float, Column("Orthogonality error", "1", "largest entry of abs(QᵀQ - 1)")
+    ]
     a: Annotated[float, Column("a (A)", "Å", "length of the box's edge a")]
     b: Annotated[float, Column("b (A)", "Å", "length of the box's edge b")]
     c: Annotated[float, Column("c (A)", "Å", "length of the box's edge c")]
     alpha: Annotated[float, Column("alpha (deg)", "°", "angle between b and c")]
     beta: Annotated[float, Column("beta (deg)", "°", "angle between c and a")]
     gamma: Annotated[float, Column("gamma (deg)", "°", "angle between a and b")]
-    heat: Annotated[float, Column("Heat (kJ/mole)", "kJ/mol", "heat that thermostats have added since the start")]
-    work: Annotated[float, Column("Work (kJ/mole)", "kJ/mol", "work of barostats, drives and minimisations so far")]
-    pressure_xx: Annotated[float, Column("Pressure xx (bar)", "bar", "molecular pressure tensor, symmetric part")]
+    heat: Annotated[
+        float,
+        Column("Heat (kJ/mole)", "kJ/mol", "heat that thermostats have added since the start"),
+    ]
+    work: Annotated[
+        float,
+        Column("Work (kJ/mole)", "kJ/mol", "work of barostats, drives and minimisations so far"),
+    ]
+    pressure_xx: Annotated[
+        float, Column("Pressure xx (bar)", "bar", "molecular pressure tensor, symmetric part")
+    ]
     pressure_yy: Annotated[float, Column("Pressure yy (bar)", "bar", "the same, yy")]
     pressure_zz: Annotated[float, Column("Pressure zz (bar)", "bar", "the same, zz")]
     pressure_xy: Annotated[float, Column("Pressure xy (bar)", "bar", "the same, xy")]
     pressure_xz: Annotated[float, Column("Pressure xz (bar)", "bar", "the same, xz")]
     pressure_yz: Annotated[float, Column("Pressure yz (bar)", "bar", "the same, yz")]
-    conserved: Annotated[float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")]
+    conserved: Annotated[
+        float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")
+    ]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
-    user_energies: tuple[float, ...] = ()  # of user-defined forces, kJ/mol; then distances, Å, and OF_TRAJECTORIES
+    user_energies: tuple[
+        float, ...
+    ] = ()  # of user-defined forces, kJ/mol; then distances, Å, and OF_TRAJECTORIES
 
 
 _HINTS = get_type_hints(Sample, include_extras=True)
-COLUMNS: dict[str, Column] = {name: get_args(_HINTS[name])[1] for name in Sample._fields if name != "user_energies"}
+COLUMNS: dict[str, Column] = {
+    name: get_args(_HINTS[name])[1] for name in Sample._fields if name != "user_energies"
+}
 
 
 #: Columns whose means have no meaning.
 NOT_AVERAGED = {
-    "step", "time", "stage_name", "stage", "drift", "momentum", "orthogonality_error", "heat", "work", "conserved",
-}  # fmt: skip
+    "step",
+    "time",
+    "stage_name",
+    "stage",
+    "drift",
+    "momentum",
+    "orthogonality_error",
+    "heat",
+    "work",
+    "conserved",
+}
 
 
 _ENDED = "the trajectories of hybrid Monte Carlo since the line before"
@@ -97,9 +143,15 @@ def distance_column(k: int) -> tuple[str, Column]:
 
 
 def more_columns(names: Sequence[str]) -> dict[str, Column]:
-    """The columns of user-defined forces, of restrained distances and of the trajectories of hybrid Monte Carlo."""
-    energy = lambda name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")  # noqa: E731
-    distances = dict(distance_column(int(found[1])) for name in names if (found := DISTANCE.fullmatch(name)))
+    """The columns of user-defined forces, of restrained distances and of the trajectories of hybrid
+    Monte Carlo."""
+
+    def energy(name):
+        return Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")
+
+    distances = dict(
+        distance_column(int(found[1])) for name in names if (found := DISTANCE.fullmatch(name))
+    )
     return {name: (OF_TRAJECTORIES | distances).get(name) or energy(name) for name in names}
 
 
@@ -116,21 +168,45 @@ BODY = {
     "time": Family(("time",), "s", "time"),
     "position": Family(("x", "y", "z"), "m", "centre of mass"),
     "velocity": Family(("vx", "vy", "vz"), "m/s", "its velocity"),
-    "rotation": Family(tuple(f"q{i}{j}" for i in "123" for j in "123"), "1", "rotation matrix Q by rows: lab = Q body"),
-    "quaternion": Family(("qw", "qx", "qy", "qz"), "1", "Q as a quaternion whose sign does not jump"),
+    "rotation": Family(
+        tuple(f"q{i}{j}" for i in "123" for j in "123"),
+        "1",
+        "rotation matrix Q by rows: lab = Q body",
+    ),
+    "quaternion": Family(
+        ("qw", "qx", "qy", "qz"), "1", "Q as a quaternion whose sign does not jump"
+    ),
     "euler_angles": Family(("phi", "theta", "psi"), "rad", "Q as Euler angles, 3-1-3"),
-    "h_body": Family(tuple(f"h_body_{k}" for k in (1, 2, 3)), "kg m²/s", "angular momentum of wheels, body axes"),
-    "omega_body": Family(tuple(f"omega_body_{k}" for k in (1, 2, 3)), "rad/s", "angular velocity, body axes"),
-    "omega_lab": Family(tuple(f"omega_lab_{k}" for k in "xyz"), "rad/s", "angular velocity, lab axes"),
-    "L_body": Family(tuple(f"L_body_{k}" for k in (1, 2, 3)), "kg m²/s", "angular momentum with wheels, body axes"),
-    "L_lab": Family(tuple(f"L_lab_{k}" for k in "xyz"), "kg m²/s", "angular momentum with wheels, lab axes"),
-    "kinetic": Family(("kinetic",), "J", "kinetic energy of I omega; less Omega · J in a rotating frame"),
+    "h_body": Family(
+        tuple(f"h_body_{k}" for k in (1, 2, 3)), "kg m²/s", "angular momentum of wheels, body axes"
+    ),
+    "omega_body": Family(
+        tuple(f"omega_body_{k}" for k in (1, 2, 3)), "rad/s", "angular velocity, body axes"
+    ),
+    "omega_lab": Family(
+        tuple(f"omega_lab_{k}" for k in "xyz"), "rad/s", "angular velocity, lab axes"
+    ),
+    "L_body": Family(
+        tuple(f"L_body_{k}" for k in (1, 2, 3)),
+        "kg m²/s",
+        "angular momentum with wheels, body axes",
+    ),
+    "L_lab": Family(
+        tuple(f"L_lab_{k}" for k in "xyz"), "kg m²/s", "angular momentum with wheels, lab axes"
+    ),
+    "kinetic": Family(
+        ("kinetic",), "J", "kinetic energy of I omega; less Omega · J in a rotating frame"
+    ),
     "potential": Family(("potential",), "J", "potential energy"),
     "energy": Family(("energy",), "J", "kinetic and potential energy"),
     "work": Family(("work",), "J", "work of drives and resistance: energy - work is conserved"),
-    "energy_error": Family(("energy_error",), "1", "change of energy - work, relative to the largest kinetic energy"),
+    "energy_error": Family(
+        ("energy_error",), "1", "change of energy - work, relative to the largest kinetic energy"
+    ),
     "L_error": Family(
-        tuple(f"L_{k}_error" for k in ("lab", "size", *"xyz123")), "1", "change of L, relative to the largest abs(L)"
+        tuple(f"L_{k}_error" for k in ("lab", "size", *"xyz123")),
+        "1",
+        "change of L, relative to the largest abs(L)",
     ),
     "orthogonality_error": Family(("orthogonality_error",), "1", "largest entry of abs(QᵀQ - 1)"),
 }
@@ -139,13 +215,20 @@ MATRIX = "Q"
 
 
 def _with_unit(name: str, unit: str) -> str:
-    """The header of a column of motion.csv, such as "phi (rad)"; in ASCII, as the headers of log.csv."""
+    """The header of a column of motion.csv, such as "phi (rad)"; in ASCII, as the headers of
+    log.csv."""
     return name if unit == "1" else f"{name} ({unit.replace('²', '^2')})"
 
 
-BODY_COLUMNS = {n: Column(_with_unit(n, f.unit), f.unit, f.about) for f in BODY.values() for n in f.names}
+BODY_COLUMNS = {
+    n: Column(_with_unit(n, f.unit), f.unit, f.about) for f in BODY.values() for n in f.names
+}
 #: Header of a column of motion.csv -> its name, also without units, as earlier versions wrote them.
-BODY_HEADERS = {name: name for name in BODY_COLUMNS} | {"t": "time"} | {c.header: n for n, c in BODY_COLUMNS.items()}
+BODY_HEADERS = (
+    {name: name for name in BODY_COLUMNS}
+    | {"t": "time"}
+    | {c.header: n for n, c in BODY_COLUMNS.items()}
+)
 
 
 class SampleTable(ABC):
@@ -160,7 +243,8 @@ class SampleTable(ABC):
         return f"<{type(self).__name__}: {len(self)} samples of {', '.join(self.described)}>"
 
     def __getitem__(self, column: str) -> np.ndarray:
-        """A column as an array, one value for each sample, in its unit in the file. Raises KeyError with all names."""
+        """A column as an array, one value for each sample, in its unit in the file. Raises KeyError
+        with all names."""
         if column not in self.described:
             raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
         return self._array(column)
@@ -171,7 +255,9 @@ class SampleTable(ABC):
     @property
     def written(self) -> dict[str, np.ndarray]:
         """The columns by their headers in the file."""
-        return {column.header: self[name] for name, column in self.described.items() if column.header}
+        return {
+            column.header: self[name] for name, column in self.described.items() if column.header
+        }
 
 
 class Samples(SampleTable):
@@ -182,7 +268,12 @@ class Samples(SampleTable):
     table : the result of an earlier `table()`. Raises ValueError if it is invalid.
     """
 
-    def __init__(self, stages: Sequence[str], user_terms: tuple[str, ...] = (), table: np.ndarray | None = None):
+    def __init__(
+        self,
+        stages: Sequence[str],
+        user_terms: tuple[str, ...] = (),
+        table: np.ndarray | None = None,
+    ):
         self.stages, self.user_terms = tuple(stages), user_terms
         self.described = COLUMNS | more_columns(user_terms)
         self._numbers = [*NUMBERS, *user_terms]
@@ -219,16 +310,23 @@ class Samples(SampleTable):
     def row(self, k: int) -> Sample:
         """Sample k; -1 for the last one."""
         first, width = range(len(self))[k] * len(self._numbers), len(NUMBERS)
-        values: dict[str, Any] = dict(zip(NUMBERS, self._values[first : first + width], strict=True))
+        values: dict[str, Any] = dict(
+            zip(NUMBERS, self._values[first : first + width], strict=True)
+        )
         values |= {name: int(values[name]) for name in ("step", "stage")}
         energies = self._values[first + width : first + len(self._numbers)]
-        return Sample(**values, stage_name=self.stages[values["stage"]], user_energies=tuple(energies))
+        return Sample(
+            **values, stage_name=self.stages[values["stage"]], user_energies=tuple(energies)
+        )
 
     def latest(self, time: float, since: int) -> int:
         """Index of the last sample not later than a time (ps), at least `since`."""
         width, at = len(self._numbers), self._numbers.index("time")
         rows = range(len(self))
-        return max(since, bisect_right(rows, time, lo=since, key=lambda k: self._values[k * width + at]) - 1)
+        return max(
+            since,
+            bisect_right(rows, time, lo=since, key=lambda k: self._values[k * width + at]) - 1,
+        )
 
     def of_stage(self, k: int) -> "Samples":
         """The samples of stage k, which are contiguous."""
@@ -238,7 +336,8 @@ class Samples(SampleTable):
         return found
 
     def table(self) -> np.ndarray:
-        """A copy of all numbers (rows, columns) as float64, which represents each of them exactly."""
+        """A copy of all numbers (rows, columns) as float64, which represents each of them
+        exactly."""
         return np.array(self._values, float).reshape(-1, len(self._numbers))
 
     def _column(self, name: str) -> np.ndarray:
@@ -250,7 +349,8 @@ _VALUES = attrgetter(*NUMBERS)
 
 
 def moving(stages: Sequence[Stage], of: np.ndarray) -> np.ndarray:
-    """Whether each sample (n,) is of motion and not of a minimisation; `of` has the index of its stage."""
+    """Whether each sample (n,) is of motion and not of a minimisation; `of` has the index of its
+    stage."""
     return ~np.isin(of, [k for k, stage in enumerate(stages) if stage.is_minimisation])
 
 
@@ -259,12 +359,15 @@ LEAST_SAMPLES = 40
 
 
 def equilibrated_from(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage) -> int:
-    """Index from which on the samples of a stage are of its equilibrium: where the potential energy and, if the box
-    moves, the density are steady (`steady_from`). 0 with few samples, and if the temperature or pressure changes."""
+    """Index from which on the samples of a stage are of its equilibrium: where the potential energy
+    and, if the box moves, the density are steady (`steady_from`). 0 with few samples, and if the
+    temperature or pressure changes."""
     return max(map(steady_from, _slow_series(of_stage, stage)), default=0)
 
 
-def _slow_series(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage) -> list[np.ndarray]:
+def _slow_series(
+    of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage
+) -> list[np.ndarray]:
     """The series of a stage that show its equilibration; none where it cannot be detected."""
     if len(of_stage["time"]) < LEAST_SAMPLES or stage.ramps:
         return []
@@ -273,11 +376,16 @@ def _slow_series(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage)
 
 def equilibrated(of_stage: Samples, stage: Stage) -> Samples:
     """The samples of the equilibrated part of a stage."""
-    return Samples(of_stage.stages, of_stage.user_terms, of_stage.table()[equilibrated_from(of_stage, stage) :])
+    return Samples(
+        of_stage.stages, of_stage.user_terms, of_stage.table()[equilibrated_from(of_stage, stage) :]
+    )
 
 
-def describe_equilibrated(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage, begin: float) -> str:
-    """The equilibrated part of a stage that began at a time (ps), such as "the last 14.2 of 20 ps"."""
+def describe_equilibrated(
+    of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage, begin: float
+) -> str:
+    """The equilibrated part of a stage that began at a time (ps), such as "the last 14.2 of 20
+    ps"."""
     time, start = of_stage["time"], equilibrated_from(of_stage, stage)
     whole = f"all {time[-1] - begin:.4g} ps"
     if stage.ramps:
@@ -285,5 +393,7 @@ def describe_equilibrated(of_stage: Mapping[str, np.ndarray] | SampleTable, stag
     if len(time) < LEAST_SAMPLES:
         return f"{whole}, too short to detect equilibration"
     part = f"the last {time[-1] - time[start]:.4g} of {time[-1] - begin:.4g} ps" if start else whole
-    drifts = any(least_error_from(values) == len(time) // 2 for values in _slow_series(of_stage, stage))
+    drifts = any(
+        least_error_from(values) == len(time) // 2 for values in _slow_series(of_stage, stage)
+    )
     return f"{part}, not yet steady" if drifts else part

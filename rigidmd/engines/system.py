@@ -39,7 +39,8 @@ class Sites(NamedTuple):
 class System:
     """The molecules that a scene describes and the forces on them, which are constant during a run.
 
-    `state` is the start, of which every run takes a copy. It is not for changes, although engines need
+    `state` is the start, of which every run takes a copy. It is not for changes, although engines
+    need
     it writable: `Simulation.start_from` checks another one.
     """
 
@@ -53,16 +54,24 @@ class System:
     constants: dict[str, float]  # constant energies, u Å²/ps²
     constant_pressure: float  # a constant part of the pressure, u/(Å ps²)
     tail: Tail | None  # the tail correction, where the scene requests it
-    residue_number: np.ndarray  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
+    residue_number: (
+        np.ndarray
+    )  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
     from_lattice: bool
     left_out: list[str]
     precision_reason: str = ""  # where the scene has precision = "auto"
-    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
+    force_error: float | None = (
+        None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
+    )
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)  # of what is allowed and probably not meant
-    python_forces: dict[str, Callable] = field(default_factory=dict)  # name of a term that Python computes -> function
+    python_forces: dict[str, Callable] = field(
+        default_factory=dict
+    )  # name of a term that Python computes -> function
     thermostat: Any = None  # user-defined, in place of the thermostat of every stage
-    user_terms: dict[str, str] = field(default_factory=dict)  # name of a user-defined term -> description
+    user_terms: dict[str, str] = field(
+        default_factory=dict
+    )  # name of a user-defined term -> description
 
     def __repr__(self) -> str:
         return f"<System of {self.scene.in_short}>"
@@ -72,10 +81,12 @@ class System:
         """All sites. Made at the first use, because a run needs them only to write a trajectory."""
         owner = np.repeat(np.arange(len(self.model.species)), self.sites_per_molecule)
         return Sites(
-            owner, self.of_sites(lambda m: m.positions_body),
+            owner,
+            self.of_sites(lambda m: m.positions_body),
             self.of_sites(lambda m: np.array(m.site_names, dtype=object)),
-            self.of_sites(lambda m: np.array(m.elements, dtype=object)), self.of_sites(lambda m: m.masses),
-        )  # fmt: skip
+            self.of_sites(lambda m: np.array(m.elements, dtype=object)),
+            self.of_sites(lambda m: m.masses),
+        )
 
     @property
     def site_count(self) -> int:
@@ -108,14 +119,16 @@ class System:
 
     @property
     def position_dependent(self) -> list[str]:
-        """Names of the terms whose energy depends on positions in the lab, which exclude a barostat. A field is among
-        them only if a molecule has a net charge."""
+        """Names of the terms whose energy depends on positions in the lab, which exclude a
+        barostat. A field is among them only if a molecule has a net charge."""
         return [name for name, term in self.terms.items() if getattr(term, "tied_to_places", False)]
 
     @property
     def distances(self) -> dict[str, DistanceRestraint]:
         """The terms that restrain distances, by name."""
-        return {name: term for name, term in self.terms.items() if isinstance(term, DistanceRestraint)}
+        return {
+            name: term for name, term in self.terms.items() if isinstance(term, DistanceRestraint)
+        }
 
     @property
     def more_columns(self) -> tuple[str, ...]:
@@ -129,10 +142,13 @@ class System:
 
     @property
     def removes_momentum_every(self) -> float | None:
-        """Time between removals of the total momentum, ps; None for never, also where every thermostat changes it."""
+        """Time between removals of the total momentum, ps; None for never, also where every
+        thermostat changes it."""
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
         return (
-            (self.scene.run.remove_momentum_interval_ps or None) if any(map(self.keeps_momentum_in, moving)) else None
+            (self.scene.run.remove_momentum_interval_ps or None)
+            if any(map(self.keeps_momentum_in, moving))
+            else None
         )
 
     def keeps_momentum_in(self, k: int) -> bool:
@@ -155,21 +171,27 @@ class System:
 
     @property
     def smallest_diameter(self) -> float:
-        """Smallest Lennard-Jones diameter, or smallest molecular radius without Lennard-Jones sites, Å."""
+        """Smallest Lennard-Jones diameter, or smallest molecular radius without Lennard-Jones
+        sites, Å."""
         sigma = [s for m in self.species for s, e in zip(m.sigma, m.epsilon, strict=True) if e > 0]
         return min(sigma or [m.radius for m in self.species if m.radius > 0] or [1.0])
 
     def saved(self, state: State) -> SavedState:
-        """A state as its file holds it, with names and numbers. Frozen and free molecules are one species there."""
+        """A state as its file holds it, with names and numbers. Frozen and free molecules are one
+        species there."""
         names = list(dict.fromkeys(m.name for m in self.species))
         index = np.array([names.index(m.name) for m in self.species])
         first = [next(m for m in self.species if m.name == name).fingerprint for name in names]
-        return SavedState(state, names, index[self.model.species], self.residue_number, np.array(first))
+        return SavedState(
+            state, names, index[self.model.species], self.residue_number, np.array(first)
+        )
 
     @property
     def residue_names(self) -> np.ndarray:
         """Residue name of each molecule (n,) in topology files."""
-        return np.array([m.residue_names[0] for m in self.species], dtype=object)[self.model.species]
+        return np.array([m.residue_names[0] for m in self.species], dtype=object)[
+            self.model.species
+        ]
 
     @property
     def precision(self) -> Precision:
@@ -177,7 +199,8 @@ class System:
         return cast(Precision, self.scene.precision)
 
     def state_errors(self, state: State) -> list[str]:
-        """Messages on positions, momenta and cell of a state from outside which this system cannot have."""
+        """Messages on positions, momenta and cell of a state from outside which this system cannot
+        have."""
         names = State._fields[:5]
         arrays = {name: np.asarray(getattr(state, name)) for name in names}
         shapes = {name: getattr(self.state, name).shape for name in names}
@@ -188,7 +211,9 @@ class System:
         if np.isfinite(cell).all() != np.isfinite(self.state.cell).all():
             return ["one of scene and state has a periodic box, and the other has none"]
         half = min(space_of(cell).edges) / 2
-        reach = [term.potential.cutoff for term in self.terms.values() if isinstance(term, PairForces)]  # type: ignore[attr-defined]
+        reach = [
+            term.potential.cutoff for term in self.terms.values() if isinstance(term, PairForces)
+        ]  # type: ignore[attr-defined]
         return [
             f"half the shortest edge of its box, {half:.4g} Å, is below the cutoff of {r:g} Å"
             for r in reach
@@ -202,19 +227,31 @@ class System:
         """A new engine for this system with the given terms."""
         scene = self.scene
         virials = any(stage.ensemble == "nph" for stage in scene.stages)
-        return CpuEngine(self.model, terms, precision, scene.forces.skin_A, self.python_forces, scene.threads, virials)
+        return CpuEngine(
+            self.model,
+            terms,
+            precision,
+            scene.forces.skin_A,
+            self.python_forces,
+            scene.threads,
+            virials,
+        )
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values of all sites (s,); `of` returns the values of one molecule."""
         return gather_per_molecule([of(m) for m in self.species], self.model.species)
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
-        """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
+        """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of
+        mass inside the box."""
         whole = state._replace(position=self.centres(state, wrapped))
         return self.positions_of(whole, self.sites.molecule, self.sites.offset_body)
 
-    def positions_of(self, state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
-        """Positions (k, 3) of points fixed in molecules (k,) at offsets (k, 3), lab frame, Å, not wrapped."""
+    def positions_of(
+        self, state: State, molecule: np.ndarray, offset_body: np.ndarray
+    ) -> np.ndarray:
+        """Positions (k, 3) of points fixed in molecules (k,) at offsets (k, 3), lab frame, Å, not
+        wrapped."""
         return state.position.take(molecule, axis=0) + _lab_offsets(state, molecule, offset_body)
 
     def centres(self, state: State, wrapped: bool = False) -> np.ndarray:
@@ -229,11 +266,14 @@ class System:
             return velocity
         omega = state.angular_momentum_body * self.model.inverse_inertia[self.model.species]
         lab = np.einsum("nij,nj->ni", state.rotation, omega)
-        return velocity + np.cross(lab.take(owner, axis=0), _lab_offsets(state, owner, self.sites.offset_body))
+        return velocity + np.cross(
+            lab.take(owner, axis=0), _lab_offsets(state, owner, self.sites.offset_body)
+        )
 
 
 def _lab_offsets(state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
-    """Offsets (k, 3) of points from the centres of molecules (k,): from the body frame to the lab frame, Å."""
+    """Offsets (k, 3) of points from the centres of molecules (k,): from the body frame to the lab
+    frame, Å."""
     if len(state.rotation) == 0:
         return np.zeros_like(offset_body)
     # `take` is 4 times faster than indexing

@@ -1,1 +1,2 @@
-"""Figures by Matplotlib of what a run has measured: shared styles, energies over time, the motion of a single body."""
+"""Figures by Matplotlib of what a run has measured: shared styles, energies over time, the motion
+of a single body."""

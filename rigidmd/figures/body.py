@@ -1,6 +1,6 @@
-"""Figures of a single body: path of its axis, Euler angles, ellipsoids, path in space, errors of the invariants."""
+"""Figures of a single body: path of its axis, Euler angles, ellipsoids, path in space, errors of
+the invariants."""
 
-# isort: skip_file
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,8 +8,19 @@ import numpy as np
 from rigidmd.engines.body_motion import Motion, drawn_axis
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.figures.style import (
-    COLORS, COOL, FAINT, INK, UP, WARM, camera, circle, draw_front_and_back, globe, new_figure, thin_series,
-)  # fmt: skip
+    COLORS,
+    COOL,
+    FAINT,
+    INK,
+    UP,
+    WARM,
+    camera,
+    circle,
+    draw_front_and_back,
+    globe,
+    new_figure,
+    thin_series,
+)
 from rigidmd.mechanics.free_rotor import SplitRotor
 from rigidmd.mechanics.translation import InertialFrame
 
@@ -26,7 +37,8 @@ MOST_POINTS, FLOOR = 10_000, 1e-17
 
 
 def body_figures(system: BodySystem, samples: Motion) -> dict[str, "Picture"]:
-    """The figures of FIGURES that the columns allow, under a title with the name of the run; none for two samples."""
+    """The figures of FIGURES that the columns allow, under a title with the name of the run; none
+    for two samples."""
     if len(samples) <= 2:
         return {}
     columns, gravity, figures = dict(samples.columns), system.scene.gravity, {}
@@ -41,8 +53,11 @@ def body_figures(system: BodySystem, samples: Motion) -> dict[str, "Picture"]:
     if "phi" in columns:
         figures["angles"] = _angles_figure(columns)
     if "omega_body_1" in columns:
-        # omega stays on ellipsoids if the inertia is constant, the frame does not rotate, and no torque acts
-        steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, InertialFrame)
+        # omega stays on ellipsoids if the inertia is constant, the frame does not rotate, and no
+        # torque acts
+        steady = isinstance(system.body.rotor, SplitRotor) and isinstance(
+            system.body.frame, InertialFrame
+        )
         if steady and "L_size" in samples.invariants and np.min(system.inertia) > 0:
             figures["ellipsoids"] = _ellipsoids_figure(columns, np.asarray(system.inertia, float))
         else:
@@ -56,13 +71,22 @@ def body_figures(system: BodySystem, samples: Motion) -> dict[str, "Picture"]:
     figures["invariants"] = _invariants_figure(columns, samples.invariants)
     figures = {stem: figure for stem, figure in figures.items() if figure is not None}
     for figure in figures.values():
-        figure.suptitle(f"{system.scene.name}: {figure.get_suptitle()}", color=INK, x=0.01, ha="left", fontsize=11)
+        figure.suptitle(
+            f"{system.scene.name}: {figure.get_suptitle()}",
+            color=INK,
+            x=0.01,
+            ha="left",
+            fontsize=11,
+        )
     return figures
 
 
 def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np.ndarray | None):
-    """The body axis on the unit sphere and seen along z, enlarged if it stays in a small part of the disc."""
-    path = np.stack([sum(columns[f"q{i}{j}"] * axis_body[j - 1] for j in (1, 2, 3)) for i in (1, 2, 3)], axis=-1)
+    """The body axis on the unit sphere and seen along z, enlarged if it stays in a small part of
+    the disc."""
+    path = np.stack(
+        [sum(columns[f"q{i}{j}"] * axis_body[j - 1] for j in (1, 2, 3)) for i in (1, 2, 3)], axis=-1
+    )
     polar = np.degrees(np.arctan2(np.hypot(path[:, 0], path[:, 1]), path[:, 2]))
     side, word = (1.0, "above") if path[:, 2].mean() > -1e-9 else (-1.0, "below")
     azimuth, lift = np.arctan2(path[0, 1], path[0, 0]) - np.radians(25), side * np.radians(25)
@@ -73,7 +97,9 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
     for ring in globe():
         draw_front_and_back(sphere, ring, view, ring @ eye, (0.45, 0.12), color=FAINT, lw=0.4)
     for ring in (extremes := [circle(UP, polar.min()), circle(UP, polar.max())]):
-        draw_front_and_back(sphere, ring, view, ring @ eye, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED)
+        draw_front_and_back(
+            sphere, ring, view, ring @ eye, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED
+        )
     _draw_path(sphere, path, view, path @ eye, half, np.zeros(2), COOL)
     _triad(sphere, view, "xyz", down)
     sphere.set_title(f"from 25° {word} the horizon", y=1.0, **NOTE)
@@ -98,29 +124,44 @@ def _label_start(figure) -> None:
     from matplotlib.lines import Line2D
 
     dot = Line2D([], [], color=WARM, marker="o", ms=5, ls="none", label="start")
-    figure.legend(handles=[dot], loc="outside upper right", frameon=False, fontsize=9, labelcolor=FAINT)
+    figure.legend(
+        handles=[dot], loc="outside upper right", frameon=False, fontsize=9, labelcolor=FAINT
+    )
 
 
 def _angles_figure(columns: dict[str, np.ndarray]):
-    """The Euler angles against time: φ and ψ continuous over full rotations, θ with at least a minimum span."""
+    """The Euler angles against time: φ and ψ continuous over full rotations, θ with at least a
+    minimum span."""
     time, theta = columns["time"], np.degrees(columns["theta"])
     phi, psi = columns["phi"].copy(), columns["psi"].copy()
-    # at θ = 0 or 180° only the sum or the difference of φ and ψ is defined: φ has its value in the next sample
+    # at θ = 0 or 180° only the sum or the difference of φ and ψ is defined: φ has its value in the
+    # next sample
     for k in np.flatnonzero(np.sin(columns["theta"][:-1]) < 1e-12)[::-1]:
         psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(columns["theta"][k]))
         phi[k] = phi[k + 1]
     angles = [np.degrees(np.unwrap(phi)), theta, np.degrees(np.unwrap(psi))]
     figure = new_figure(8, 6.4, title="Euler angles (3-1-3)")
     beyond_turn = [np.ptp(angle) > 360 for angle in angles]
-    drawn = [angle / 360 if many else angle for angle, many in zip(angles, beyond_turn, strict=True)]
-    labels = [f"{name} ({'turns' if many else '°'})" for name, many in zip("φθψ", beyond_turn, strict=True)]
-    panels = _draw_series(figure, figure.add_gridspec(3, 1), time, drawn, labels, 1e-5, 1.0, (COOL, WARM, COOL))
+    drawn = [
+        angle / 360 if many else angle for angle, many in zip(angles, beyond_turn, strict=True)
+    ]
+    labels = [
+        f"{name} ({'turns' if many else '°'})"
+        for name, many in zip("φθψ", beyond_turn, strict=True)
+    ]
+    panels = _draw_series(
+        figure, figure.add_gridspec(3, 1), time, drawn, labels, 1e-5, 1.0, (COOL, WARM, COOL)
+    )
     panels[1].set_title(_range(theta), **NOTE)
     for panel, angle in zip(panels[::2], angles[::2], strict=True):
         first, last = np.round(angle[[0, -1]], 6) + 0.0
         text = f"from {first:.6g}° to {last:.6g}°: {(last - first) / 360:+.4g} turns"
         panel.set_title(text if np.ptp(angle) > 1e-5 else _range(angle), **NOTE)
-    speed = np.sqrt(sum(columns[f"omega_body_{i}"] ** 2 for i in "123")) if "omega_body_1" in columns else 0 * time
+    speed = (
+        np.sqrt(sum(columns[f"omega_body_{i}"] ** 2 for i in "123"))
+        if "omega_body_1" in columns
+        else 0 * time
+    )
     note = ""
     if (speed[1:] * np.diff(time)).max() > np.pi:
         note = "the body rotates by more than 180° between samples: not all rotations are counted"
@@ -138,7 +179,10 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
     if fastest == 0:
         return None
     at = 0 if energies[0] > 1e-3 * energies.max() else int(energies.argmax())
-    energy, momentum = np.sqrt(energies[at] / inertia), np.linalg.norm(inertia * omega[at]) / inertia
+    energy, momentum = (
+        np.sqrt(energies[at] / inertia),
+        np.linalg.norm(inertia * omega[at]) / inertia,
+    )
     order, mean = np.argsort(inertia, kind="stable"), omega.mean(0) / fastest
     eye = np.array([0.5, 0.75, 0.45])[np.argsort(order)]
     view = camera(eye * np.where(mean < -1e-6, -1.0, 1.0) + 0.6 * mean, np.eye(3)[order[2]])
@@ -148,9 +192,17 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
     half = 1.06 * np.minimum(np.maximum(whole, np.abs(flat).max(0)), 2.5 * fastest)
     half = np.maximum(half, 0.8 * half[::-1])
     near, middle = 0.75 * np.ptp(flat, axis=0).max(), (flat.max(0) + flat.min(0)) / 2
-    boxes = [(half, np.zeros(2), f"from the side of ω; energy (blue), momentum (red), t = {time[at]:g} s")]
+    boxes = [
+        (
+            half,
+            np.zeros(2),
+            f"from the side of ω; energy (blue), momentum (red), t = {time[at]:g} s",
+        )
+    ]
     if 1e-6 * half.max() < near < 0.2 * half.max():
-        boxes.append((np.full(2, near), middle, f"the path, enlarged {_enlargement(half.max() / near)}"))
+        boxes.append(
+            (np.full(2, near), middle, f"the path, enlarged {_enlargement(half.max() / near)}")
+        )
     figure = new_figure(6.2 + 4 * len(boxes), 5, title="ω in the body frame")
     cells = figure.add_gridspec(3, len(boxes) + 1, width_ratios=[1.25, 1, 1][-len(boxes) - 1 :])
     for column, (half, centre, title) in enumerate(boxes):
@@ -159,13 +211,16 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
         _draw_path(axis, omega, view, depth, half, centre, INK)
         _triad(axis, view, ("ω₁", "ω₂", "ω₃"))
         axis.set_title(title, **NOTE)
-    _draw_series(figure, cells[:, -1].subgridspec(3, 1), time, omega.T, OMEGA, 1e-9 * fastest, 2 * fastest)
+    _draw_series(
+        figure, cells[:, -1].subgridspec(3, 1), time, omega.T, OMEGA, 1e-9 * fastest, 2 * fastest
+    )
     _label_start(figure)
     return figure
 
 
 def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
-    """Coordinates of the centre of mass against time, its path in a vertical plane and from above."""
+    """Coordinates of the centre of mass against time, its path in a vertical plane and from
+    above."""
     position = np.stack([columns[key] for key in "xyz"], axis=-1)
     span = np.ptp(position, axis=0).max()
     least = 1e-11 * span + 1e-13 * np.abs(position).max()
@@ -176,7 +231,11 @@ def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
     level -= np.outer(level @ up, up)
     along = np.linalg.eigh(level.T @ level - (level**2).sum() * np.outer(up, up))[1][:, -1]
     still = np.ptp(level @ along) < least
-    plain = [unit for unit in np.eye(3) if abs(unit @ up) < 1e-9 and (still or abs(unit @ along) > 0.9998)]
+    plain = [
+        unit
+        for unit in np.eye(3)
+        if abs(unit @ up) < 1e-9 and (still or abs(unit @ along) > 0.9998)
+    ]
     along = plain[0] if plain else along * np.sign(along[np.abs(along).argmax()])
     planes = [("in the vertical plane", along, up)]
     if np.ptp(level @ np.cross(up, along)) > least:
@@ -192,8 +251,11 @@ def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
     return figure
 
 
-def _draw_plane(axis, title: str, position: np.ndarray, right: np.ndarray, up: np.ndarray, least: float) -> None:
-    """The path in one plane, with equal scales if possible; otherwise the title states the distortion."""
+def _draw_plane(
+    axis, title: str, position: np.ndarray, right: np.ndarray, up: np.ndarray, least: float
+) -> None:
+    """The path in one plane, with equal scales if possible; otherwise the title states the
+    distortion."""
     flat = np.stack([position @ right, position @ up], axis=-1)
     span, centre = np.ptp(flat, axis=0), (flat.max(0) + flat.min(0)) / 2
     half = 0.55 * span
@@ -201,13 +263,22 @@ def _draw_plane(axis, title: str, position: np.ndarray, right: np.ndarray, up: n
         half = np.full(2, max(half))
         axis.set_aspect("equal")
     else:
-        title += f"; drawn {_enlargement(max(span) / min(span))} too {'wide' if span[1] > span[0] else 'tall'}"
+        title += (
+            f"; drawn {_enlargement(max(span) / min(span))} too"
+            f" {'wide' if span[1] > span[0] else 'tall'}"
+        )
     shown, style = _path_style(flat, half)
     axis.plot(*flat[shown].T, color=COOL, **style)
     axis.plot(*flat[0], "o", color=WARM, ms=5)
     for which, side in (("x", right), ("y", up)):
         vector = ", ".join(f"{part:.3g}" for part in side + 0.0)
-        axis.set(**{f"{which}label": f"{'xyz'[side.argmax()] if side.max() > 1 - 1e-9 else f'along ({vector})'} (m)"})
+        axis.set(
+            **{
+                f"{which}label": (
+                    f"{'xyz'[side.argmax()] if side.max() > 1 - 1e-9 else f'along ({vector})'} (m)"
+                )
+            }
+        )
     axis.axis(np.stack([centre - half, centre + half], axis=1).ravel())
     axis.set_title(title, **NOTE)
     axis.locator_params(axis="x", nbins=4)
@@ -221,7 +292,9 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
     for name in [*invariants, "orthogonality"]:
         error = np.abs(columns.get(f"{name}_error", np.nan))
         if np.isfinite(error).any():
-            errors[LABELS.get(name, name.replace("_", " "))] = np.where(np.isfinite(error), error, np.nan)
+            errors[LABELS.get(name, name.replace("_", " "))] = np.where(
+                np.isfinite(error), error, np.nan
+            )
     if not errors:
         return None
     axis = (figure := new_figure(8, 4.6, title="errors of the invariants")).subplots()
@@ -229,21 +302,36 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
     for color, (label, error) in zip(COLORS, errors.items(), strict=False):
         largest = np.fmax.reduceat(error, np.arange(0, len(error), size))
         most = f"at most {np.nanmax(error):.1e}" if np.nanmax(error) > 0 else "exactly 0"
-        axis.plot(columns["time"][::size], np.maximum(largest, FLOOR), color=color, lw=1.0, label=f"{label}: {most}")
+        axis.plot(
+            columns["time"][::size],
+            np.maximum(largest, FLOOR),
+            color=color,
+            lw=1.0,
+            label=f"{label}: {most}",
+        )
     axis.axhline(np.finfo(float).eps, color=FAINT, lw=0.8, ls=":")
     axis.set_yscale("log")
-    axis.yaxis.set_major_formatter("{x:.0e}")  # as in the legend; powers of ten as formulas are slow to draw
+    axis.yaxis.set_major_formatter(
+        "{x:.0e}"
+    )  # as in the legend; powers of ten as formulas are slow to draw
     axis.set_ylim(FLOOR / 2, max(1e-13, 5 * max(np.nanmax(error) for error in errors.values())))
     note = f"largest of each {size} samples; " if size > 1 else ""
-    axis.set_title(f"{note}dotted: rounding, 2.2e-16; an error of exactly 0 is drawn at {FLOOR:.0e}", y=1.0, **NOTE)
+    axis.set_title(
+        f"{note}dotted: rounding, 2.2e-16; an error of exactly 0 is drawn at {FLOOR:.0e}",
+        y=1.0,
+        **NOTE,
+    )
     axis.set(xlabel="time (s)", ylabel="relative error", xmargin=0)
     axis.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     axis.spines[["top", "right"]].set_visible(False)
     return figure
 
 
-def _draw_series(figure, cells, time, series, labels, least: float, shown: float, colors=(COOL,) * 3) -> list:
-    """Panels above one another against time; a curve that varies by less than `least` gets a span of `shown`."""
+def _draw_series(
+    figure, cells, time, series, labels, least: float, shown: float, colors=(COOL,) * 3
+) -> list:
+    """Panels above one another against time; a curve that varies by less than `least` gets a span
+    of `shown`."""
     panels = []
     for row, (values, label, color) in enumerate(zip(series, labels, colors, strict=True)):
         panel = figure.add_subplot(cells[row])
@@ -261,11 +349,20 @@ def _draw_series(figure, cells, time, series, labels, least: float, shown: float
     return panels
 
 
-def _shade(axis, solids: list[tuple[np.ndarray, str]], view: np.ndarray, half: np.ndarray, centre: np.ndarray) -> None:
+def _shade(
+    axis,
+    solids: list[tuple[np.ndarray, str]],
+    view: np.ndarray,
+    half: np.ndarray,
+    centre: np.ndarray,
+) -> None:
     """An image of ellipsoids (semi-axes, colour) about the origin, lit from the upper left."""
     from matplotlib.colors import to_rgb
 
-    x, y = (np.linspace(c - h, c + h, int(500 * h / half.max())) for c, h in zip(centre, half, strict=True))
+    x, y = (
+        np.linspace(c - h, c + h, int(500 * h / half.max()))
+        for c, h in zip(centre, half, strict=True)
+    )
     base = x[None, :, None] * view[0] + y[:, None, None] * view[1]
     light = 0.55 * view[2] + 0.65 * view[1] - 0.5 * view[0]
     nearest = np.full(base.shape[:2], -np.inf)
@@ -281,10 +378,14 @@ def _shade(axis, solids: list[tuple[np.ndarray, str]], view: np.ndarray, half: n
         image[seen, :3], image[seen, 3] = (1 - tint * (1 - np.array(to_rgb(color))))[seen], 1.0
         nearest[seen] = depth[seen]
         axis.plot(*view[:2] @ (semi * circle(view[2] / semi)).T, color=color, lw=0.8, alpha=0.6)
-    axis.imshow(image, origin="lower", extent=(x[0], x[-1], y[0], y[-1]), interpolation="bilinear", zorder=0)
+    axis.imshow(
+        image, origin="lower", extent=(x[0], x[-1], y[0], y[-1]), interpolation="bilinear", zorder=0
+    )
 
 
-def _draw_path(axis, points: np.ndarray, view: np.ndarray, depth: np.ndarray, half, centre, color: str) -> None:
+def _draw_path(
+    axis, points: np.ndarray, view: np.ndarray, depth: np.ndarray, half, centre, color: str
+) -> None:
     """Draw a path in space with a dot at its start; longer paths are thinner."""
     flat = points @ view[:2].T
     shown, style = _path_style(flat, half.max())
@@ -296,11 +397,17 @@ def _draw_path(axis, points: np.ndarray, view: np.ndarray, depth: np.ndarray, ha
 
 
 def _triad(axis, view: np.ndarray, names, down: np.ndarray | None = None) -> None:
-    """The axes of the picture as small arrows in its lower left corner, and the direction of gravity."""
+    """The axes of the picture as small arrows in its lower left corner, and the direction of
+    gravity."""
     vectors = [(vector, name, INK) for vector, name in zip(np.eye(3), names, strict=False)]
     for vector, name, color in vectors if down is None else [*vectors, (0.8 * down, "g", WARM)]:
         tip = 30 * (view[:2] @ vector)
-        style = {"xycoords": "axes fraction", "textcoords": "offset points", "color": color, "fontsize": 9}
+        style = {
+            "xycoords": "axes fraction",
+            "textcoords": "offset points",
+            "color": color,
+            "fontsize": 9,
+        }
         if np.linalg.norm(tip) > 2:
             arrow = {"arrowstyle": "<-", "color": color, "lw": 0.8}
             axis.annotate("", (0.1, 0.1), xytext=tip, arrowprops=arrow, **style)
@@ -308,17 +415,23 @@ def _triad(axis, view: np.ndarray, names, down: np.ndarray | None = None) -> Non
 
 
 def _path_style(flat: np.ndarray, half) -> tuple[np.ndarray, dict]:
-    """Points of a path to draw, about one per pixel, and the line style, thinner for longer paths."""
+    """Points of a path to draw, about one per pixel, and the line style, thinner for longer
+    paths."""
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(flat, axis=0) / half, axis=1).cumsum()])
     shown = np.flatnonzero(np.diff(np.floor(800 * way), prepend=-1.0) > 0)
-    return shown, {"lw": max(0.25, 1.7 / (1 + way[-1] / 60)), "rasterized": len(shown) > MOST_POINTS}
+    return shown, {
+        "lw": max(0.25, 1.7 / (1 + way[-1] / 60)),
+        "rasterized": len(shown) > MOST_POINTS,
+    }
 
 
 def _range(degrees: np.ndarray) -> str:
     """A range of degrees as text, with enough digits to distinguish its ends."""
     low, high = degrees.min(), degrees.max()
     if high - low < 1e-5:
-        return f"{round(low, 6) + 0.0:.8g}°, constant{f' to {high - low:.0e}°' if high > low else ''}"
+        return (
+            f"{round(low, 6) + 0.0:.8g}°, constant{f' to {high - low:.0e}°' if high > low else ''}"
+        )
     digits = int(np.clip(2 - np.floor(np.log10(high - low)), 1, 8))
     return f"from {low:.{digits}f}° to {high:.{digits}f}°"
 

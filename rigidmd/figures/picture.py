@@ -1,4 +1,5 @@
-"""Matplotlib figures that a notebook displays without pyplot. Apart from `style`, as Matplotlib is slow to import."""
+"""Matplotlib figures that a notebook displays without pyplot. Apart from `style`, as Matplotlib is
+slow to import."""
 
 import io
 from collections.abc import Iterator
@@ -15,15 +16,17 @@ DPI = 80
 
 
 class Picture(Figure):
-    """A figure of Matplotlib that is not known to pyplot, so that a notebook shows it once, as the value of its cell.
-    Texts are not parsed as formulas, as names of users may contain dollar signs; numbers at ticks are."""
+    """A figure of Matplotlib that is not known to pyplot, so that a notebook shows it once, as the
+    value of its cell. Texts are not parsed as formulas, as names of users may contain dollar signs;
+    numbers at ticks are."""
 
     def draw(self, renderer) -> None:
         self._take_texts_as_written()
         super().draw(renderer)
 
     def lay_out(self, dpi: float) -> None:
-        """Arrange the axes once, for files of this resolution: a layout engine lets `savefig` draw everything twice."""
+        """Arrange the axes once, for files of this resolution: a layout engine lets `savefig` draw
+        everything twice."""
         self._take_texts_as_written()
         self.dpi = dpi
         if engine := self.get_layout_engine():

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from rigidmd.figures.picture import Picture
 
 
-def run_figures(system: System | BodySystem, samples: Any, summary: dict[str, Any]) -> "dict[str, Picture]":
+def run_figures(
+    system: System | BodySystem, samples: Any, summary: dict[str, Any]
+) -> "dict[str, Picture]":
     """The figures of a run by the names of their files, if there are enough samples."""
     if isinstance(system, BodySystem):
         return body_figures(system, samples)
@@ -25,19 +27,23 @@ def run_figures(system: System | BodySystem, samples: Any, summary: dict[str, An
     return {"energy": energy_figure(system, samples, summary)} if is_enough else {}
 
 
-#: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of names at most.
+#: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of
+#: names at most.
 LETTER_WIDTH, MOST_ROWS = 0.012, 5
 #: Columns of the samples in energy.png.
 DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
 
 
 def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
-    """The drift of the conserved energy in each stage, on the scale of the last; energies and temperatures."""
+    """The drift of the conserved energy in each stage, on the scale of the last; energies and
+    temperatures."""
     stages, n = system.scene.stages, len(system.model.species)
     shown = moving(stages, samples["stage"])
     column = {name: samples[name][shown] for name in DRAWN}
     time, stage = column["time"], samples["stage"][shown]
-    known = bool(np.isfinite(column["drift"][stage == stage[-1]]).any())  # an external engine may not report it
+    known = bool(
+        np.isfinite(column["drift"][stage == stage[-1]]).any()
+    )  # an external engine may not report it
     figure = new_figure(8, 7, title=f"{system.scene.name}: {n} molecules")
     axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :], sharex=True)
     *_, parts, temperature = axes
@@ -66,7 +72,9 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
     return figure
 
 
-def _draw(axis: "Axes", time: np.ndarray, values: np.ndarray, stage: np.ndarray, color: str, label: str) -> None:
+def _draw(
+    axis: "Axes", time: np.ndarray, values: np.ndarray, stage: np.ndarray, color: str, label: str
+) -> None:
     """Draw a curve, and widen the limits of the axis to its `shown_range`."""
     before = axis.get_ylim() if axis.lines else None
     axis.plot(*thin_series(time, values), color=color, lw=0.9, label=label)
@@ -74,20 +82,29 @@ def _draw(axis: "Axes", time: np.ndarray, values: np.ndarray, stage: np.ndarray,
         axis.set_ylim(min(limits[0], *(before or limits)), max(limits[1], *(before or limits)))
 
 
-def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.ndarray, summary: dict | None) -> None:
-    """Draw the conserved energy since each stage began, kJ/mol per molecule, and the line of the last drift, if there
-    is a summary of its stage."""
+def _draw_drift(
+    axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.ndarray, summary: dict | None
+) -> None:
+    """Draw the conserved energy since each stage began, kJ/mol per molecule, and the line of the
+    last drift, if there is a summary of its stage."""
     last = stage == stage[-1]
     for k in np.unique(stage):
         of_stage = stage == k
-        axis.plot(*thin_series(time[of_stage], drift[of_stage]), color=COOL if of_stage[-1] else FAINT, lw=0.9)
+        axis.plot(
+            *thin_series(time[of_stage], drift[of_stage]),
+            color=COOL if of_stage[-1] else FAINT,
+            lw=0.9,
+        )
     low, high = np.nanmin(drift[last]), np.nanmax(drift[last])
     if high > low:
         axis.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
     axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
     if summary is None or last.sum() <= 2:
         return
-    gradient, error = summary["drift_kJ_mol_ns_per_molecule"], summary["drift_error_kJ_mol_ns_per_molecule"]
+    gradient, error = (
+        summary["drift_kJ_mol_ns_per_molecule"],
+        summary["drift_error_kJ_mol_ns_per_molecule"],
+    )
     if gradient is not None:
         line = drift[last].mean() + gradient / 1000 * (time[last] - time[last].mean())
         axis.plot(time[last], line, color=WARM, lw=1.4)
@@ -110,8 +127,15 @@ def _label_stages(axis: "Axes", starts: list[float], labels: list[str]) -> None:
             continue
         rows[row : row + 1] = [end]
         axis.annotate(
-            label, (start, 1), xycoords=("data", "axes fraction"), xytext=(-4 if at_end else 4, -2 - 11 * row),
-            textcoords="offset points", fontsize=9, color=FAINT, va="top", ha="right" if at_end else "left",
-        )  # fmt: skip
+            label,
+            (start, 1),
+            xycoords=("data", "axes fraction"),
+            xytext=(-4 if at_end else 4, -2 - 11 * row),
+            textcoords="offset points",
+            fontsize=9,
+            color=FAINT,
+            va="top",
+            ha="right" if at_end else "left",
+        )
     low, high = axis.get_ylim()
     axis.set_ylim(low, high + 0.09 * len(rows) * (high - low))

@@ -1,4 +1,5 @@
-"""Functions for all figures: writing, settings, styles of curves, thinning of long series, views of 3D objects."""
+"""Functions for all figures: writing, settings, styles of curves, thinning of long series, views of
+3D objects."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -16,10 +17,22 @@ from rigidmd.errors import RigidMDError, RigidMDWarning
 if TYPE_CHECKING:
     from rigidmd.figures.picture import Picture
 
-#: Most points of a curve that are drawn at once. The renderer fails on 200,000 points across a figure.
+#: Most points of a curve that are drawn at once. The renderer fails on 200,000 points across a
+#: figure.
 AT_ONCE = 5000
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
-COLORS = ("#2b6f9e", "#c8553d", "#4f8a5b", "#7a5ca3", "#b8862d", "#1f2430", "#3fa7a0", "#c2569a", "#8a8f99", "#7f9a1c")
+COLORS = (
+    "#2b6f9e",
+    "#c8553d",
+    "#4f8a5b",
+    "#7a5ca3",
+    "#b8862d",
+    "#1f2430",
+    "#3fa7a0",
+    "#c2569a",
+    "#8a8f99",
+    "#7f9a1c",
+)
 MARKERS = "os^Dv*PX<>"
 UP = np.array([0.0, 0.0, 1.0])
 DASHES = ((), (5, 1.5), (1.5, 1.2), (6, 1.5, 1.5, 1.5))
@@ -34,12 +47,15 @@ def curve_style(k: int) -> dict:
 
 
 class InPieces:
-    """A path effect of Matplotlib that draws a path in pieces, each from the end of the previous one. The pieces of
-    Matplotlib, `agg.path.chunksize`, omit the last point of each, and thus two sides of the path."""
+    """A path effect of Matplotlib that draws a path in pieces, each from the end of the previous
+    one. The pieces of Matplotlib, `agg.path.chunksize`, omit the last point of each, and thus two
+    sides of the path."""
 
     def draw_path(self, renderer, gc, path, affine, rgbFace=None):
         sides = len(path.vertices) - 1
-        pieces = -(-sides // (AT_ONCE - 1))  # of equal length: a short level one would be snapped to whole pixels
+        pieces = -(
+            -sides // (AT_ONCE - 1)
+        )  # of equal length: a short level one would be snapped to whole pixels
         for first, last in pairwise(sides * k // pieces for k in range(pieces + 1)):
             piece = type(path)(path.vertices[first : last + 1])
             piece.simplify_threshold = path.simplify_threshold
@@ -57,8 +73,8 @@ def settings(changed: dict) -> Iterator[None]:
 
 @contextmanager
 def drawing(path: Path) -> Iterator[None]:
-    """Context in which an error of drawing becomes a warning, as results do not depend on pictures. The errors of this
-    package are raised."""
+    """Context in which an error of drawing becomes a warning, as results do not depend on pictures.
+    The errors of this package are raised."""
     try:
         yield
     except RigidMDError:
@@ -91,17 +107,22 @@ def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
 
 
 def save_files(figure: "Picture", stem: Path, suffixes: Sequence[str]) -> list[Path]:
-    """Write a figure as files of these types, with the same bytes for the same figure. Raises OutputError."""
+    """Write a figure as files of these types, with the same bytes for the same figure. Raises
+    OutputError."""
     figure.lay_out(150)
     paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in suffixes]
     for path in paths:
-        options = {"dpi": 100, "metadata": {"Date": None}} if path.suffix == ".svg" else {"dpi": 150}
+        options = (
+            {"dpi": 100, "metadata": {"Date": None}} if path.suffix == ".svg" else {"dpi": 150}
+        )
         with settings({"svg.hashsalt": "rigidmd"}), atomic_file(path) as temporary:
             save_figure(figure, temporary, **options)
     return paths
 
 
-def new_figure(width: float, height: float, layout: Any = "constrained", title: str = "", **options) -> "Picture":
+def new_figure(
+    width: float, height: float, layout: Any = "constrained", title: str = "", **options
+) -> "Picture":
     """An empty figure of this size, inches, under a title."""
     from rigidmd.figures.picture import Picture  # Matplotlib is slow to import
 
@@ -111,8 +132,11 @@ def new_figure(width: float, height: float, layout: Any = "constrained", title: 
     return figure
 
 
-def panel_grid(count: int, across: int, width: float, height: float, margin: float) -> "tuple[Picture, list[Any]]":
-    """A figure of panels in rows of at most `across`, and the axes of the panels. Inches: of a panel, and below all."""
+def panel_grid(
+    count: int, across: int, width: float, height: float, margin: float
+) -> "tuple[Picture, list[Any]]":
+    """A figure of panels in rows of at most `across`, and the axes of the panels. Inches: of a
+    panel, and below all."""
     across = min(across, max(1, count))
     down = max(1, -(-count // across))
     figure = new_figure(width * across, height * down + margin)
@@ -129,21 +153,28 @@ def open_axis(axis, **ticks) -> None:
     axis.tick_params(colors=INK, **ticks)
 
 
-def thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tuple[np.ndarray, np.ndarray]:
-    """A long series reduced to the lowest and highest value of each of its parts, whose curve is the same."""
+def thin_series(
+    time: np.ndarray, values: np.ndarray, bins: int = 1500
+) -> tuple[np.ndarray, np.ndarray]:
+    """A long series reduced to the lowest and highest value of each of its parts, whose curve is
+    the same."""
     size = len(time) // bins
     if size < 4:
         return time, values
     starts = np.arange(0, len(time) // size * size, size)
     parts = values[: len(starts) * size].reshape(-1, size)
-    kept = np.unique(np.concatenate([starts + parts.argmin(1), starts + parts.argmax(1), [0, len(time) - 1]]))
+    kept = np.unique(
+        np.concatenate([starts + parts.argmin(1), starts + parts.argmax(1), [0, len(time) - 1]])
+    )
     return time[kept], values[kept]
 
 
 def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | None:
-    """Limits of the axis of a curve (n,): the range of the second halves of the stages, and as much above and below, as
-    the starts of stages would flatten the rest. None if the range is 0."""
-    late = np.concatenate([part[len(part) // 2 :] for part in (values[stage == k] for k in np.unique(stage))])
+    """Limits of the axis of a curve (n,): the range of the second halves of the stages, and as much
+    above and below, as the starts of stages would flatten the rest. None if the range is 0."""
+    late = np.concatenate(
+        [part[len(part) // 2 :] for part in (values[stage == k] for k in np.unique(stage))]
+    )
     late, values = late[np.isfinite(late)], values[np.isfinite(values)]
     if len(late) == 0 or not (span := float(np.ptp(late))) > 0:
         return None
@@ -152,7 +183,8 @@ def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | 
 
 
 def thin_path(path: np.ndarray, most: int) -> np.ndarray:
-    """Indices of at most about `most` points of a path (n, d), evenly along its length, with its ends."""
+    """Indices of at most about `most` points of a path (n, d), evenly along its length, with its
+    ends."""
     if len(path) <= most:
         return np.arange(len(path))
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
@@ -163,7 +195,8 @@ def thin_path(path: np.ndarray, most: int) -> np.ndarray:
 
 
 def camera(eye: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """An orthographic view from the direction `eye`: rows are to the right, upwards and towards the eye."""
+    """An orthographic view from the direction `eye`: rows are to the right, upwards and towards the
+    eye."""
     toward, right = eye / np.linalg.norm(eye), np.cross(up, eye)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(toward, right), toward])
@@ -178,11 +211,15 @@ def circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
 
 def globe() -> list[np.ndarray]:
     """Circles of longitude and latitude on the unit sphere, every 30 degrees."""
-    around = [circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in np.radians(np.arange(0, 180, 30))]
+    around = [
+        circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in np.radians(np.arange(0, 180, 30))
+    ]
     return [*around, *(circle(UP, polar) for polar in range(30, 180, 30))]
 
 
-def draw_front_and_back(axis, points, view: np.ndarray, depth, alphas: tuple[float, float], **style) -> None:
+def draw_front_and_back(
+    axis, points, view: np.ndarray, depth, alphas: tuple[float, float], **style
+) -> None:
     """Draw a line that is strong on the side of the eye (depth >= 0) and faint on the other."""
     flat, front = points @ view[:2].T, depth >= 0
     joined = front.copy()
@@ -192,15 +229,20 @@ def draw_front_and_back(axis, points, view: np.ndarray, depth, alphas: tuple[flo
         axis.plot(*np.where(part[:, None], flat, np.nan).T, alpha=alpha, zorder=order, **style)
 
 
-def draw_scale(axis, right: float, foot: float, length: float, label: str, fontsize: float = 10) -> None:
+def draw_scale(
+    axis, right: float, foot: float, length: float, label: str, fontsize: float = 10
+) -> None:
     """Draw a bar of this length with its label above it, from its right end at (right, foot)."""
-    axis.plot([right - length, right], [foot, foot], color=INK, lw=2, solid_capstyle="butt", zorder=4)
+    axis.plot(
+        [right - length, right], [foot, foot], color=INK, lw=2, solid_capstyle="butt", zorder=4
+    )
     style = {"ha": "right", "va": "bottom", "zorder": 4, "textcoords": "offset points"}
     axis.annotate(label, (right, foot), (0, 3), color=INK, fontsize=fontsize, **style)
 
 
 def label_minor_ticks(line) -> None:
-    """Label a logarithmic axis (`axis.xaxis` or `.yaxis`) between powers of ten if it has fewer than two of them."""
+    """Label a logarithmic axis (`axis.xaxis` or `.yaxis`) between powers of ten if it has fewer
+    than two of them."""
     from matplotlib.ticker import LogFormatterSciNotation
 
     line.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(1.0, 0.5)))

@@ -1,1 +1,2 @@
-"""Forces: the dispatch over force terms, pair potentials, neighbour lists, Ewald sums, fields, forces on a body."""
+"""Forces: the dispatch over force terms, pair potentials, neighbour lists, Ewald sums, fields,
+forces on a body."""

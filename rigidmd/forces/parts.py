@@ -1,8 +1,9 @@
-"""What force terms are made of: the parts of a system, and the interactions that are made from them.
+"""What force terms are made of: the parts of a system, and the interactions that are made from
+them.
 
-A factory of this package makes the terms of one key of a scene: `interactions` of a pair potential or of a method of
-electrostatics, `term` of a field. The scene and its molecules are values of `scene`, a package above this one, so that
-their types are given in words.
+A factory of this package makes the terms of one key of a scene: `interactions` of a pair potential
+or of a method of electrostatics, `term` of a field. The scene and its molecules are values of
+`scene`, a package above this one, so that their types are given in words.
 """
 
 from collections.abc import Callable, Iterator
@@ -29,7 +30,9 @@ class SystemParts(NamedTuple):
     space: Space
     state: State  # the start
     number: np.ndarray  # (n,) residue numbers, by which a scene selects molecules
-    basis: np.ndarray  # (3, 3) integers: the edges of the box in terms of the edges of the given cell
+    basis: (
+        np.ndarray
+    )  # (3, 3) integers: the edges of the box in terms of the edges of the given cell
     grid: Grid | None  # of PME, along the edges of the box
 
     @property
@@ -44,7 +47,9 @@ class SystemParts(NamedTuple):
 
     def pair_forces(self, potential: NamedTuple, sites: BodySites | CentralSites) -> PairForces:
         """The term of a pair potential between sites of different molecules, not both frozen."""
-        return PairForces(potential, sites, exclusion_groups(sites, ~self.moves[self.model.species]))
+        return PairForces(
+            potential, sites, exclusion_groups(sites, ~self.moves[self.model.species])
+        )
 
     @property
     def counts(self) -> np.ndarray:
@@ -58,12 +63,14 @@ class SystemParts(NamedTuple):
 
     def charged(self) -> tuple[BodySites | CentralSites, np.ndarray]:
         """The charged sites, and their charges (s,) in e."""
-        charges = gather_per_molecule([m.charges[m.charges != 0] for m in self.species], self.model.species)
+        charges = gather_per_molecule(
+            [m.charges[m.charges != 0] for m in self.species], self.model.species
+        )
         return self.sites([np.flatnonzero(m.charges != 0) for m in self.species]), charges
 
     def sum_over_molecules(self, energy: Callable[[np.ndarray, np.ndarray], float]) -> float:
-        """Sum of energy(charges (s,) in energy units, positions (s, 3)) over the molecules that are not frozen, of
-        their charged sites."""
+        """Sum of energy(charges (s,) in energy units, positions (s, 3)) over the molecules that are
+        not frozen, of their charged sites."""
         total = 0.0
         for m, moves, count in zip(self.species, self.moves, self.counts, strict=True):
             if moves and count:
@@ -73,7 +80,8 @@ class SystemParts(NamedTuple):
 
 
 class InnerPairs(NamedTuple):
-    """Pairs of sites of one molecule: each pair in both orders, and each site with itself. Equal pairs are one row."""
+    """Pairs of sites of one molecule: each pair in both orders, and each site with itself. Equal
+    pairs are one row."""
 
     one: np.ndarray  # (p,) kind of a site
     other: np.ndarray  # (p,) kind of the other
@@ -86,9 +94,11 @@ class InnerPairs(NamedTuple):
         return InnerPairs(*(column[rows] for column in self))
 
 
-def inner_pairs(kinds: list[np.ndarray], positions: list[np.ndarray], counts: np.ndarray) -> InnerPairs:
-    """The pairs inside molecules, from the kinds (s_k,) and the positions (s_k, 3) of the sites of each species k, and
-    the number of its molecules."""
+def inner_pairs(
+    kinds: list[np.ndarray], positions: list[np.ndarray], counts: np.ndarray
+) -> InnerPairs:
+    """The pairs inside molecules, from the kinds (s_k,) and the positions (s_k, 3) of the sites of
+    each species k, and the number of its molecules."""
     rows, count = [np.zeros((0, 3))], [np.zeros(0)]
     for of_sites, position, molecules in zip(kinds, positions, counts, strict=True):
         distance = np.linalg.norm(position[:, None] - position, axis=2).round(FINE)
@@ -104,7 +114,9 @@ def inner_pairs(kinds: list[np.ndarray], positions: list[np.ndarray], counts: np
 class Tail(NamedTuple):
     """Tail correction: the energy and pressure that truncation takes away, at any volume."""
 
-    energy_volume: float  # the part of the energy that is inverse to the volume, times the volume, u Å⁵/ps²
+    energy_volume: (
+        float  # the part of the energy that is inverse to the volume, times the volume, u Å⁵/ps²
+    )
     pressure_square: float  # pressure times the volume squared, u Å⁵/ps²
     constant: float = 0.0  # the part of the energy that does not depend on the volume, u Å²/ps²
 
@@ -129,7 +141,9 @@ class Interactions(NamedTuple):
     constants: dict[str, float]  # constant energies, u Å²/ps²
     pressure: float = 0.0  # a constant part of the pressure, u/(Å ps²)
     tail: Tail | None = None  # if the scene has forces.tail_correction
-    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
+    force_error: float | None = (
+        None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
+    )
     notes: tuple[str, ...] = ()
 
 
@@ -164,19 +178,25 @@ class Settings(NamedTuple):
 def select_by_number(
     ranges: list[tuple[int, int]], name: str, of_species: np.ndarray, number: np.ndarray
 ) -> Iterator[tuple[str, np.ndarray, str]]:
-    """For each range of molecule numbers of a species: its text, its mask (n,), and a message on missing numbers."""
+    """For each range of molecule numbers of a species: its text, its mask (n,), and a message on
+    missing numbers."""
     for first, last in ranges:
         text = f"{first}" if first == last else f"{first}-{last}"
         mask = of_species & (first <= number) & (number <= last)
         fault, present = "", number[of_species]
         if not mask.any() or last > present.max():
-            there = f"they have {present.min()} to {present.max()}" if len(present) else "there are none"
+            there = (
+                f"they have {present.min()} to {present.max()}"
+                if len(present)
+                else "there are none"
+            )
             fault = f"no {name} has the number {text}; {there}"
         yield text, mask, fault
 
 
 def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
-    """values[k], an array (s_k, ...) of each species k, repeated for each molecule in order; species (n,)."""
+    """values[k], an array (s_k, ...) of each species k, repeated for each molecule in order;
+    species (n,)."""
     sizes = np.array([len(array) for array in values])
     begin, count = np.cumsum(sizes) - sizes, sizes[species]
     rows = np.repeat(begin[species] - np.cumsum(count) + count, count)
@@ -185,11 +205,13 @@ def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.nda
 
 
 def sites_named(species: list[Any], name: str) -> list[np.ndarray]:
-    """Masks of the sites of each species with this name, or else this element; SPECIES.NAME for one species."""
+    """Masks of the sites of each species with this name, or else this element; SPECIES.NAME for one
+    species."""
     owner, _, site = name.rpartition(".")
     for attribute in ("site_names", "elements"):
         found = [
-            np.array([owner in ("", m.name) and other == site for other in getattr(m, attribute)]) for m in species
+            np.array([owner in ("", m.name) and other == site for other in getattr(m, attribute)])
+            for m in species
         ]
         if any(mask.any() for mask in found):
             break

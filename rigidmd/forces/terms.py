@@ -1,13 +1,13 @@
 """Force terms and their workspaces, and the dispatch over them.
 
-A term is a frozen NamedTuple of numbers that describes a force. A workspace is made from a term by one engine: the
-numbers of the term and, if needed, lists, grids, sums and machine code. A term that needs no workspace is used as its
-workspace. `add_forces(workspace, state, load, tally)` is chosen by the type of the workspace at compile time, so only
-what a scene has is compiled. A new force is one file with a NamedTuple and an `@implements(add_forces)`, a new pair
-potential one with an `@implements(pair_loop.pair)`.
+A term is a frozen NamedTuple of numbers that describes a force. A workspace is made from a term by
+one engine: the numbers of the term and, if needed, lists, grids, sums and machine code. A term that
+needs no workspace is used as its workspace. `add_forces(workspace, state, load, tally)` is chosen
+by the type of the workspace at compile time, so only what a scene has is compiled. A new force is
+one file with a NamedTuple and an `@implements(add_forces)`, a new pair potential one with an
+`@implements(pair_loop.pair)`.
 """
 
-# isort: skip_file
 from typing import NamedTuple
 
 import numpy as np
@@ -48,12 +48,14 @@ def with_code(workspace: NamedTuple) -> NamedTuple:
 
 
 def with_capacity(workspace: NamedTuple, cell: np.ndarray) -> NamedTuple:
-    """The workspace with the capacity that it needed, for a cell (3, 3). May raise SimulationError."""
+    """The workspace with the capacity that it needed, for a cell (3, 3). May raise
+    SimulationError."""
     return workspace.with_capacity(cell) if hasattr(workspace, "with_capacity") else workspace
 
 
 def with_common_scratch(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple, ...]:
-    """The workspaces with one common scratch array, the largest of theirs, for use while forces are computed."""
+    """The workspaces with one common scratch array, the largest of theirs, for use while forces are
+    computed."""
     arrays = [workspace.scratch for workspace in workspaces if hasattr(workspace, "scratch")]
     if not arrays:
         return workspaces
@@ -62,21 +64,29 @@ def with_common_scratch(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple,
 
 
 def checkpoint_arrays(workspace: NamedTuple) -> dict[str, np.ndarray]:
-    """Arrays on which the next forces depend besides the state, for `restored`; most workspaces have none."""
+    """Arrays on which the next forces depend besides the state, for `restored`; most workspaces
+    have none."""
     return workspace.checkpoint_arrays() if hasattr(workspace, "checkpoint_arrays") else {}
 
 
-def restored(workspace: NamedTuple, arrays: dict[str, np.ndarray], skin: float, now: float) -> NamedTuple:
-    """The workspace, which has machine code, with its `checkpoint_arrays`. Raises ValueError if these do not fit. skin
-    : of neighbour lists, as requested, Å. now : the present time, ps"""
+def restored(
+    workspace: NamedTuple, arrays: dict[str, np.ndarray], skin: float, now: float
+) -> NamedTuple:
+    """The workspace, which has machine code, with its `checkpoint_arrays`. Raises ValueError if
+    these do not fit. skin : of neighbour lists, as requested, Å. now : the present time, ps"""
     if bool(arrays) != hasattr(workspace, "checkpoint_arrays"):
-        raise ValueError(f"{type(workspace).__name__} {'lacks' if not arrays else 'has no'} checkpoint arrays")
+        raise ValueError(
+            f"{type(workspace).__name__} {'lacks' if not arrays else 'has no'} checkpoint arrays"
+        )
     return workspace.restore(arrays, skin, now) if arrays else workspace
 
 
 def add_forces(term, state, load, tally):
-    """Add the forces and torques of a term to `load`, its energy and virial to `tally` unless None; a status code."""
-    raise TypeError(f"{type(term).__name__} is not a term, or this was called outside compiled code")
+    """Add the forces and torques of a term to `load`, its energy and virial to `tally` unless None;
+    a status code."""
+    raise TypeError(
+        f"{type(term).__name__} is not a term, or this was called outside compiled code"
+    )
 
 
 @kernel(inline=True)
@@ -87,15 +97,16 @@ def worse_status(status, other):
 
 @chosen_by_type
 def power(term, state, velocity, omega):
-    """Power of a term whose class has `time_dependent = True`; 0 for any other, since its energy includes its work.
-    velocity (lab axes) and omega (body axes) : tuples, relative to the frame"""
+    """Power of a term whose class has `time_dependent = True`; 0 for any other, since its energy
+    includes its work. velocity (lab axes) and omega (body axes) : tuples, relative to the frame"""
     if not getattr(term.instance_class, "time_dependent", False):
         return lambda term, state, velocity, omega: 0.0
 
 
 @chosen_by_type
 def energy_rate(term, state):
-    """dU/dt at fixed positions of a term of molecules whose class has `time_dependent = True`; 0 for any other."""
+    """dU/dt at fixed positions of a term of molecules whose class has `time_dependent = True`; 0
+    for any other."""
     if not getattr(term.instance_class, "time_dependent", False):
         return lambda term, state: 0.0
 
@@ -111,8 +122,8 @@ def _add_no_force(term, state, load, tally):
     return OK
 
 
-#: What `compute_load` computes, and when passes of terms act: forces; forces, energies and virials; forces and virials,
-#: and energies only where these take no extra time.
+#: What `compute_load` computes, and when passes of terms act: forces; forces, energies and virials;
+#: forces and virials, and energies only where these take no extra time.
 FORCES_ONLY, WITH_ENERGIES, WITH_VIRIALS = 1, 2, 4
 TALLIED = WITH_ENERGIES | WITH_VIRIALS
 #: For `compute_load`: forces into the other load.
@@ -135,7 +146,12 @@ def passes_of(workspace: NamedTuple, into: Evaluation) -> list[Pass]:
     state, load, tally, status = into
     return [
         Pass("add forces", _add_plain, (workspace, state, load, status), when=FORCES_ONLY),
-        Pass("add forces and energies", _add_tallied, (workspace, state, load, tally, status), when=TALLIED),
+        Pass(
+            "add forces and energies",
+            _add_tallied,
+            (workspace, state, load, tally, status),
+            when=TALLIED,
+        ),
     ]
 
 
@@ -180,7 +196,9 @@ class TermDispatcher:
         self._status, valid = np.zeros((2, 1), np.int64)
         self._with_rates = with_rates
         self._program = Program(self._passes(workspaces, *EXAMPLE), uses, self._status)
-        self._rates = Program(self._rate_passes(workspaces, EXAMPLE[0]), ALWAYS, np.zeros(1, np.int64))
+        self._rates = Program(
+            self._rate_passes(workspaces, EXAMPLE[0]), ALWAYS, np.zeros(1, np.int64)
+        )
         rows = self._program.rows
         elsewhere = np.zeros_like(rows.arguments)
         self.table = TermTable(rows, elsewhere, self._rates.rows, self._tallies, valid, self._power)
@@ -188,7 +206,8 @@ class TermDispatcher:
         self._load: Load | None = None
 
     def load_for(self, state: State) -> Load:
-        """An array for the forces on the bodies of a state, which the next call may return again."""
+        """An array for the forces on the bodies of a state, which the next call may return
+        again."""
         if self._load is None or len(self._load.force) != len(state.velocity):
             self._load = no_load(state)
         return self._load
@@ -201,13 +220,22 @@ class TermDispatcher:
 
     def _rate_passes(self, workspaces: tuple[NamedTuple, ...], state: State) -> list[Pass]:
         dependent = [w for w in workspaces if getattr(type(w), "time_dependent", False)]
-        return [Pass("rate of the energy", _add_rate, (w, state, self._power)) for w in dependent if self._with_rates]
+        return [
+            Pass("rate of the energy", _add_rate, (w, state, self._power))
+            for w in dependent
+            if self._with_rates
+        ]
 
     def bind(
-        self, workspaces: tuple[NamedTuple, ...], state: State, load: Load, other: Load | None = None
+        self,
+        workspaces: tuple[NamedTuple, ...],
+        state: State,
+        load: Load,
+        other: Load | None = None,
     ) -> TermTable:
-        """The table, bound to workspaces (of the same types as the first), a state and its loads. Numba takes
-        milliseconds to determine the types of the arrays, so nothing is done if these are unchanged."""
+        """The table, bound to workspaces (of the same types as the first), a state and its loads.
+        Numba takes milliseconds to determine the types of the arrays, so nothing is done if these
+        are unchanged."""
         bound_to = (*workspaces, *state, *load, *(other or ()))
         if list(map(id, bound_to)) != list(map(id, self._bound_to)):
             self._program.bind(self._passes(workspaces, state, load))
@@ -220,16 +248,17 @@ class TermDispatcher:
 
 @kernel(from_python=True)
 def compute_load_with_energies(table, force, torque_body):
-    """Write forces and torques of all terms, and energies and virials into the table; a status code. force, torque_body
-    : the arrays of the load to which the table is bound"""
+    """Write forces and torques of all terms, and energies and virials into the table; a status
+    code. force, torque_body : the arrays of the load to which the table is bound"""
     return compute_load(table, None, Load(force, torque_body), WITH_ENERGIES)
 
 
 @chosen_by_type
 def compute_load(terms, state, load, which):
-    """Write the forces and torques of all terms at the present positions; the worst status code. terms : a tuple of
-    terms, which gives forces only, or a `TermTable`, which gets energies and virials. which : FORCES_ONLY,
-    WITH_ENERGIES, INTO_OTHER_LOAD or WITH_VIRIALS; `load` must be the load that it means."""
+    """Write the forces and torques of all terms at the present positions; the worst status code.
+    terms : a tuple of terms, which gives forces only, or a `TermTable`, which gets energies and
+    virials. which : FORCES_ONLY, WITH_ENERGIES, INTO_OTHER_LOAD or WITH_VIRIALS; `load` must be the
+    load that it means."""
     if not is_a(terms, TermTable):
         return lambda terms, state, load, which: compute_body_load(terms, state, load)
 
@@ -265,7 +294,8 @@ def copy(source, target):
 
 @kernel(inline=True)
 def compute_body_load(terms, state, load):
-    """Write the forces and torques of all terms (a tuple) at the present positions; the worst status code."""
+    """Write the forces and torques of all terms (a tuple) at the present positions; the worst
+    status code."""
     load.force[:] = 0.0
     load.torque_body[:] = 0.0
     status = OK

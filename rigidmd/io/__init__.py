@@ -1,1 +1,2 @@
-"""Files that runs read and write: formats of structures and trajectories, the folder of a run, log, checkpoint."""
+"""Files that runs read and write: formats of structures and trajectories, the folder of a run, log,
+checkpoint."""

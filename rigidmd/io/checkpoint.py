@@ -13,9 +13,11 @@ from rigidmd.core.files import atomic_file, sync_file, unreadable_reason
 from rigidmd.errors import CheckpointError, option
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 
-#: Version of the format. Version 1 (rigidmd 0.1) named observers by their number; 2 had no record of the run.
+#: Version of the format. Version 1 (rigidmd 0.1) named observers by their number; 2 had no record
+#: of the run.
 SCHEMA = 3
-#: Members besides the arrays of the run: all other values as JSON, and names, lengths and CRC-32 of all other members.
+#: Members besides the arrays of the run: all other values as JSON, and names, lengths and CRC-32 of
+#: all other members.
 JSON, CONTENTS = "told", "contents"
 
 
@@ -26,12 +28,17 @@ class Checkpoint(NamedTuple):
     def of(self, owner: str) -> "Checkpoint":
         """The part of one owner, whose arrays have names of the form owner/name."""
         start = f"{owner}/"
-        found = {name.removeprefix(start): array for name, array in self.arrays.items() if name.startswith(start)}
+        found = {
+            name.removeprefix(start): array
+            for name, array in self.arrays.items()
+            if name.startswith(start)
+        }
         return Checkpoint(dict(self.values["of"].get(owner, {})), found)
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint to the disk, then replace the last one, which is kept as PREVIOUS. Raises OutputError."""
+    """Write a checkpoint to the disk, then replace the last one, which is kept as PREVIOUS. Raises
+    OutputError."""
     path = folder / CHECKPOINT
     with atomic_file(path) as temporary:
         values = json.dumps(checkpoint.values | {"schema": SCHEMA}).encode()
@@ -49,7 +56,11 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 def _contents(archive: zipfile.ZipFile) -> str:
     """Names, lengths and checksums of the members of an archive, except of this list."""
-    return "\n".join(f"{m.filename} {m.file_size} {m.CRC:08x}" for m in archive.infolist() if m.filename != CONTENTS)
+    return "\n".join(
+        f"{m.filename} {m.file_size} {m.CRC:08x}"
+        for m in archive.infolist()
+        if m.filename != CONTENTS
+    )
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -64,19 +75,26 @@ def read_checkpoint(path: Path) -> Checkpoint:
             arrays = {name: data[name] for name in data.files if name != CONTENTS}
         values = json.loads(arrays.pop(JSON).tobytes())
         schema = int(values.pop("schema"))
-    except Exception as error:  # zipfile, zlib, numpy and json refusals all mean the same to the user
+    except (
+        Exception
+    ) as error:  # zipfile, zlib, numpy and json refusals all mean the same to the user
         raise CheckpointError(f"{path}: is damaged, or not a checkpoint: {error}") from None
     if schema != SCHEMA:
         age = "a later" if schema > SCHEMA else "an earlier"
-        problem = f"was written by {age} rigidmd (version {schema} of the format; this one reads version {SCHEMA})"
+        problem = (
+            f"was written by {age} rigidmd (version {schema} of the format; this one reads version"
+            f" {SCHEMA})"
+        )
         raise CheckpointError(
-            f"{path}: {problem}: finish the run with that one, or begin it again with {option('force')}"
+            f"{path}: {problem}: finish the run with that one, or begin it again with"
+            f" {option('force')}"
         )
     return Checkpoint(values, arrays)
 
 
 def latest(folder: Path) -> tuple[Checkpoint, list[str]]:
-    """The last readable checkpoint of a folder, and the error of a later one. Raises CheckpointError without one."""
+    """The last readable checkpoint of a folder, and the error of a later one. Raises
+    CheckpointError without one."""
     errors = []
     for name in (CHECKPOINT, PREVIOUS):
         path = folder / name
@@ -85,8 +103,14 @@ def latest(folder: Path) -> tuple[Checkpoint, list[str]]:
                 return read_checkpoint(path), errors
             except CheckpointError as error:
                 errors.append(str(error))
-    there = sorted(path.name for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
+    there = (
+        sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+        if folder.is_dir()
+        else []
+    )
     if errors:
         raise CheckpointError("; ".join(errors) + f". The run cannot be resumed from {folder}")
     listed = f"it holds {', '.join(there)}" if there else "it is empty"
-    raise CheckpointError(f"{folder} holds no checkpoint ({listed}); {option('force')} begins the run again")
+    raise CheckpointError(
+        f"{folder} holds no checkpoint ({listed}); {option('force')} begins the run again"
+    )

@@ -39,7 +39,8 @@ class DisplayArea:
 
 
 def announce(sentence: str, spot: DisplayArea) -> None:
-    """Announce an operation that takes a moment: in a notebook in this area, else as a line on standard error."""
+    """Announce an operation that takes a moment: in a notebook in this area, else as a line on
+    standard error."""
     if in_notebook():
         faint = f'<small style="opacity:.7">{html.escape(sentence)} ...</small>'
         spot.show({"text/html": faint, "text/plain": f"{sentence} ..."})
@@ -47,24 +48,33 @@ def announce(sentence: str, spot: DisplayArea) -> None:
         print(f"  {sentence} ...", file=sys.stderr, flush=True)
 
 
-def progress_of(total: float, unit: str, shown: bool | None, spot: DisplayArea | None = None) -> "Bar":
-    """A bar for a `with` statement. Its `update` is called with each advance, in `unit` of time. `shown`: None shows it
-    only in a notebook. `spot`: the area in which a notebook shows it, also at the end."""
+def progress_of(
+    total: float, unit: str, shown: bool | None, spot: DisplayArea | None = None
+) -> "Bar":
+    """A bar for a `with` statement. Its `update` is called with each advance, in `unit` of time.
+    `shown`: None shows it only in a notebook. `spot`: the area in which a notebook shows it, also
+    at the end."""
     if not is_shown(shown):
         return Bar(disable=True)
     if in_notebook():
         return _NotebookBar(spot or DisplayArea(), total=total, unit=unit)
     if not sys.stderr.isatty():
         return _Lines(total=total, unit=unit)
-    return Bar(total=total, bar_format="{l_bar}{bar}| {n:.1f}/{total:.1f} " + unit + " [{elapsed}<{remaining}]")
+    return Bar(
+        total=total,
+        bar_format="{l_bar}{bar}| {n:.1f}/{total:.1f} " + unit + " [{elapsed}<{remaining}]",
+    )
 
 
 class Bar(tqdm):
     """A bar on a terminal. Its rate is without pauses."""
 
     def __init__(self, **options: Any):
-        # with miniters no thread of tqdm shows the bar; the output of a thread would have no cell in a notebook
-        super().__init__(**{"leave": False, "mininterval": 0.2, "miniters": 0, "smoothing": 0.0} | options)
+        # with miniters no thread of tqdm shows the bar; the output of a thread would have no cell
+        # in a notebook
+        super().__init__(
+            **{"leave": False, "mininterval": 0.2, "miniters": 0, "smoothing": 0.0} | options
+        )
         self._time, self.initial = clock.monotonic, 0.0
         self.start_t = self.last_print_t = self._marked = clock.monotonic()
 
@@ -92,7 +102,11 @@ class Bar(tqdm):
     @property
     def left(self) -> str:
         """The remaining time as text; empty before the first advance."""
-        return f", {tqdm.format_interval(round((self.total - self.n) / self.rate))} left" if self.rate > 0 else ""
+        return (
+            f", {tqdm.format_interval(round((self.total - self.n) / self.rate))} left"
+            if self.rate > 0
+            else ""
+        )
 
 
 class _NotebookBar(Bar):
@@ -115,10 +129,13 @@ class _NotebookBar(Bar):
             fraction, text = 1.0, f"{total:.4g} {status['unit']} in {elapsed:.3g} s"
         else:
             fraction = done / total
-            text += f", {tqdm.format_interval(elapsed)}{'' if self._ended or elapsed == 0 else self.left}"
+            left = "" if self._ended or elapsed == 0 else self.left
+            text += f", {tqdm.format_interval(elapsed)}{left}"
         style = "width:18em;max-width:50%;vertical-align:middle"
         bar = f'<progress value="{fraction:.4f}" max="1" style="{style}"></progress>'
-        content = f'<div style="font-variant-numeric:tabular-nums">{bar} <small>{text}</small></div>'
+        content = (
+            f'<div style="font-variant-numeric:tabular-nums">{bar} <small>{text}</small></div>'
+        )
         self._spot.show({"text/html": content, "text/plain": f"{100 * fraction:.0f} %: {text}"})
 
 
@@ -131,5 +148,8 @@ class _Lines(Bar):
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
         """Print a line, except for the empty message at the end."""
         if msg is None:
-            done = f"  {self.n:.4g} of {self.total:.4g} {self.unit}, {self.rate:.3g} {self.unit}/s{self.left}"
+            done = (
+                f"  {self.n:.4g} of {self.total:.4g} {self.unit}, {self.rate:.3g}"
+                f" {self.unit}/s{self.left}"
+            )
             print(done, file=sys.stderr, flush=True)

@@ -1,7 +1,9 @@
-"""The JSON and CSV files of runs: writers of log.csv and pressure_tensor.csv, and readers of all of them.
+"""The JSON and CSV files of runs: writers of log.csv and pressure_tensor.csv, and readers of all of
+them.
 
-Files are untrusted input, so sizes are limited and data validated. Written lines are soon on the disk, so that a
-killed run keeps its samples. The first columns of log.csv are the same as in OpenMM's StateDataReporter.
+Files are untrusted input, so sizes are limited and data validated. Written lines are soon on the
+disk, so that a killed run keeps its samples. The first columns of log.csv are the same as in
+OpenMM's StateDataReporter.
 """
 
 import csv
@@ -25,7 +27,8 @@ from rigidmd.errors import OutputError
 from rigidmd.io.folder import check_inside
 from rigidmd.scene.validation import Flag, Number, validation_messages
 
-#: Limits: bytes of a JSON file and of a CSV file, characters of a line of CSV, absolute value of a number.
+#: Limits: bytes of a JSON file and of a CSV file, characters of a line of CSV, absolute value of a
+#: number.
 LARGEST_JSON, LARGEST_TABLE, LONGEST_LINE, LARGEST_NUMBER = 5e7, 4e9, 100_000, 1e100
 
 T = TypeVar("T")
@@ -89,7 +92,8 @@ class Summary(BaseModel):
 
 
 def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
-    """The validated JSON file, or None. Raises OutputError with file and field, and `remedy` for a damaged file."""
+    """The validated JSON file, or None. Raises OutputError with file and field, and `remedy` for a
+    damaged file."""
     if not _is_there(path, LARGEST_JSON):
         return None
     try:
@@ -106,14 +110,16 @@ def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
 
 
 def _is_there(path: Path, largest: float) -> bool:
-    """Whether a file exists. Raises OutputError for a link out of its folder, for a folder or device, and for a file
-    larger than `largest`."""
+    """Whether a file exists. Raises OutputError for a link out of its folder, for a folder or
+    device, and for a file larger than `largest`."""
     if not path.exists() and not path.is_symlink():
         return False
     check_inside(path)
     if reason := unreadable_reason(path, largest):
         is_clause = reason.startswith(("is", "has"))
-        raise OutputError(f"{path} cannot be read: it {reason}" if is_clause else f"{path}: {reason}")
+        raise OutputError(
+            f"{path} cannot be read: it {reason}" if is_clause else f"{path}: {reason}"
+        )
     return True
 
 
@@ -124,14 +130,19 @@ class Columns(NamedTuple):
     cells: dict[str, list[str]]
 
     def numbers(self, header: str, finite: bool = False) -> np.ndarray:
-        """A column as numbers. An empty cell is NaN, or an error if all must be `finite`. Raises OutputError."""
+        """A column as numbers. An empty cell is NaN, or an error if all must be `finite`. Raises
+        OutputError."""
         try:
             found = np.array([float(cell or "nan") for cell in self.cells[header]])
         except ValueError:
-            raise OutputError(f"{self.path}: column {header!r} has a cell that is not a number") from None
+            raise OutputError(
+                f"{self.path}: column {header!r} has a cell that is not a number"
+            ) from None
         empty = np.array([not cell for cell in self.cells[header]], bool)
         if not ((np.abs(found) <= LARGEST_NUMBER) | (empty & (not finite))).all():
-            raise OutputError(f"{self.path}: column {header!r} has a cell that is not a finite number below 1e100")
+            raise OutputError(
+                f"{self.path}: column {header!r} has a cell that is not a finite number below 1e100"
+            )
         return found
 
 
@@ -150,9 +161,12 @@ def read_columns(path: Path) -> Columns | None:
 
 
 def read_motion(path: Path) -> Columns | None:
-    """motion.csv as `read_columns`, its columns by their names in Python, as far as they are known; of any version."""
+    """motion.csv as `read_columns`, its columns by their names in Python, as far as they are known;
+    of any version."""
     found = read_columns(path)
-    return found and Columns(path, {samples.BODY_HEADERS.get(header, header): c for header, c in found.cells.items()})
+    return found and Columns(
+        path, {samples.BODY_HEADERS.get(header, header): c for header, c in found.cells.items()}
+    )
 
 
 def _lines(file: Any) -> Iterator[str]:
@@ -164,27 +178,45 @@ def _lines(file: Any) -> Iterator[str]:
             raise csv.Error(f"a line has more than {LONGEST_LINE} characters")
 
 
-#: Seconds that a line waits for others, which together take a tenth of the time. Lines at longer intervals do not wait.
+#: Seconds that a line waits for others, which together take a tenth of the time. Lines at longer
+#: intervals do not wait.
 DELAY, SELDOM = 0.5, 0.05
 #: Columns of log.csv that are written on request.
-TENSOR = tuple(name for name in samples.COLUMNS if name.startswith("pressure_") and len(name) == len("pressure_xx"))
+TENSOR = tuple(
+    name
+    for name in samples.COLUMNS
+    if name.startswith("pressure_") and len(name) == len("pressure_xx")
+)
 
 
 def columns(tensor: bool = True, user_terms: Sequence[str] = ()) -> dict[str, str]:
-    """Name of each column -> its header, with or without the pressure tensor. user_terms : see `Samples`"""
+    """Name of each column -> its header, with or without the pressure tensor. user_terms : see
+    `Samples`"""
     described = samples.COLUMNS | samples.more_columns(user_terms)
     written = {name: column.header for name, column in described.items() if column.header}
-    return written if tensor else {name: header for name, header in written.items() if name not in TENSOR}
+    return (
+        written
+        if tensor
+        else {name: header for name, header in written.items() if name not in TENSOR}
+    )
 
 
 class Log(AppendedFile):
-    """Writes samples to log.csv, numbers with all significant digits, missing values empty. Raises OutputError.
+    """Writes samples to log.csv, numbers with all significant digits, missing values empty. Raises
+    OutputError.
 
-    kept : earlier value of the property `kept`, from which the file is continued; None begins a new file
+    kept : earlier value of the property `kept`, from which the file is continued; None begins a new
+        file
     tensor, user_terms : see `columns`
     """
 
-    def __init__(self, path: Path, tensor: bool, kept: Sequence[int] | None = None, user_terms: Sequence[str] = ()):
+    def __init__(
+        self,
+        path: Path,
+        tensor: bool,
+        kept: Sequence[int] | None = None,
+        user_terms: Sequence[str] = (),
+    ):
         self._columns = columns(tensor, user_terms)
         shared = [name for name in self._columns if name not in user_terms]
         self._values = attrgetter(*shared)
@@ -214,7 +246,8 @@ class Log(AppendedFile):
             self._written = now
 
     def flush(self) -> None:
-        """Write the waiting lines. Lines that cannot be written are lost, because the error stops the run."""
+        """Write the waiting lines. Lines that cannot be written are lost, because the error stops
+        the run."""
         rows, self._rows = self._rows, []
         if not rows:
             return
@@ -256,5 +289,7 @@ def read_tensor(path: Path) -> np.ndarray | None:
     if (found := read_columns(path)) is None:
         return None
     if list(found.cells) != HEADER:
-        raise OutputError(f"{path} is not a pressure tensor of rigidmd: its columns must be {', '.join(HEADER)}")
+        raise OutputError(
+            f"{path} is not a pressure tensor of rigidmd: its columns must be {', '.join(HEADER)}"
+        )
     return np.array([found.numbers(header, finite=True) for header in HEADER]).T

@@ -1,4 +1,5 @@
-"""Writers of TOML: the scene of a run with all defaults and copies of its input files, and a molecular model."""
+"""Writers of TOML: the scene of a run with all defaults and copies of its input files, and a
+molecular model."""
 
 import json
 import re
@@ -18,17 +19,26 @@ from rigidmd.scene.models import MoleculeFile
 
 
 def input_names(scene: Scene) -> dict[str, str]:
-    """Names of the copies of a scene's input files: dotted key -> unique name. Copies of copies keep their names."""
-    names = {key: path.name for key, path in scene.inputs.items()} | dict.fromkeys(scene.embedded_files, STRUCTURE)
-    starts = {key: f"input_{re.sub(r'[.](file|module|table)$|^molecules[.]', '', key)}_" for key in names}
+    """Names of the copies of a scene's input files: dotted key -> unique name. Copies of copies
+    keep their names."""
+    names = {key: path.name for key, path in scene.inputs.items()} | dict.fromkeys(
+        scene.embedded_files, STRUCTURE
+    )
+    starts = {
+        key: f"input_{re.sub(r'[.](file|module|table)$|^molecules[.]', '', key)}_" for key in names
+    }
     return {key: starts[key] + name.removeprefix(starts[key]) for key, name in names.items()}
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
-    """Write the scene into the folder of a run, so that it can be run again. Keys that do nothing are left out."""
+    """Write the scene into the folder of a run, so that it can be run again. Keys that do nothing
+    are left out."""
     data = plain_values(scene.model_dump(exclude_none=True))
     if isinstance(scene, MolecularScene):
-        for section, table in [(scene.forces, data["forces"]), *zip(scene.stages, data["stages"], strict=True)]:
+        for section, table in [
+            (scene.forces, data["forces"]),
+            *zip(scene.stages, data["stages"], strict=True),
+        ]:
             for key in section.idle_keys:
                 table.pop(key, None)
     for key, copied in input_names(scene).items():
@@ -52,7 +62,10 @@ TO_FILL_IN = """# Sites have masses only and do not interact. Add the parameters
 
 def write_model(path: Path, model: MoleculeFile) -> None:
     """Write a model, which is read back to the same bits. Raises OutputError."""
-    idle = all(site.charge_e is None and site.sigma_A is None and not site.parameters for site in model.sites)
+    idle = all(
+        site.charge_e is None and site.sigma_A is None and not site.parameters
+        for site in model.sites
+    )
     data = model.model_dump(exclude_defaults=True)
     sites = data.pop("sites")
     tables = [_lines(data), *(f"\n[[sites]]\n{_lines(site)}" for site in sites)]
@@ -64,7 +77,9 @@ def _lines(table: dict[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    """A text, a number, a list or a table in one line, which TOML writes as JSON except for tables."""
+    """A text, a number, a list or a table in one line, which TOML writes as JSON except for
+    tables."""
     if isinstance(value, dict):
-        return f"{{ {', '.join(f'{_value(name)} = {_value(inner)}' for name, inner in value.items())} }}"
+        pairs = [f"{_value(name)} = {_value(inner)}" for name, inner in value.items()]
+        return f"{{ {', '.join(pairs)} }}"
     return json.dumps(value, ensure_ascii=False)

@@ -1,4 +1,5 @@
-"""The atoms of a structure file of any format, read through ASE or by the readers in `io.formats`."""
+"""The atoms of a structure file of any format, read through ASE or by the readers in
+`io.formats`."""
 
 import bz2
 import codecs
@@ -31,14 +32,18 @@ PIECE = 1 << 24  # bytes that are unpacked at a time
 
 
 def read_atoms(
-    path: Path, frame: int | None = None, atom_types: dict[str, str] | None = None, topology: Path | None = None,
+    path: Path,
+    frame: int | None = None,
+    atom_types: dict[str, str] | None = None,
+    topology: Path | None = None,
     content: bytes | None = None,
-) -> Atoms:  # fmt: skip
+) -> Atoms:
     """The atoms of a file, or of one of several structures in it. Raises StructureError.
 
-    frame: 1 for the first, -1 for the last; None for the only structure of a file, or the last of a trajectory.
-    atom_types: names of types, for formats with types. topology: a file with the names that a trajectory lacks.
-    content: the content of the file, if it is not read from `path`, which is then only its name.
+    frame: 1 for the first, -1 for the last; None for the only structure of a file, or the last of a
+    trajectory. atom_types: names of types, for formats with types. topology: a file with the names
+    that a trajectory lacks. content: the content of the file, if it is not read from `path`, which
+    is then only its name.
     """
     if content is None and (reason := unreadable_reason(path)):
         raise structure_error(path, reason)
@@ -53,7 +58,11 @@ def read_atoms(
             atoms = _choose(path, _frames(path, atom_types, content), frame)()
     if len(atoms.position) == 0:
         raise structure_error(path, "holds no atoms")
-    for what, values in (("position", atoms.position), ("velocity", atoms.velocity), ("cell", atoms.cell)):
+    for what, values in (
+        ("position", atoms.position),
+        ("velocity", atoms.velocity),
+        ("cell", atoms.cell),
+    ):
         if what == "velocity" and not (form and form.is_trajectory):
             continue  # some atoms may have none
         if values is not None and not np.isfinite(values).all():
@@ -61,17 +70,22 @@ def read_atoms(
             owner = "its box has an edge" if what == "cell" else f"atom {bad + 1} has a {what}"
             raise structure_error(path, f"{owner} that is not a finite number")
     if (far := np.abs(atoms.position).max()) > FARTHEST:
-        raise structure_error(path, f"an atom is at {far:.3g} Å, farther than {FARTHEST:g} Å: is this the unit?")
+        raise structure_error(
+            path, f"an atom is at {far:.3g} Å, farther than {FARTHEST:g} Å: is this the unit?"
+        )
     if atoms.masses is not None and not ((atoms.masses >= 0) & (atoms.masses < HEAVIEST)).all():
         raise structure_error(path, "an atom has a mass that is negative, too large or no number")
     for k, texts in enumerate(zip(atoms.names, atoms.elements, atoms.residue, strict=True), 1):
         if any(UNPRINTABLE.search(str(text)) for text in (*texts[:2], *texts[2])):
-            raise structure_error(path, f"atom {k} has a name with control characters: {texts[0]!r}")
+            raise structure_error(
+                path, f"atom {k} has a name with control characters: {texts[0]!r}"
+            )
     return _without_placeholder(atoms)
 
 
 def _without_placeholder(atoms: Atoms) -> Atoms:
-    """The atoms without a cell that stands for none: a cell of no volume, or the cube of 1 Å of PDB."""
+    """The atoms without a cell that stands for none: a cell of no volume, or the cube of 1 Å of
+    PDB."""
     if atoms.cell is None:
         return atoms
     longest = np.linalg.norm(atoms.cell, axis=1).max()
@@ -79,11 +93,15 @@ def _without_placeholder(atoms: Atoms) -> Atoms:
         note = ["its cell has no volume and is not used"] if longest else []
         return atoms._replace(cell=None, notes=[*atoms.notes, *note])
     if np.allclose(atoms.cell, np.eye(3), rtol=0, atol=1e-6):
-        return atoms._replace(cell=None, notes=[*atoms.notes, "its cell, a cube of 1 Å, stands for none"])
+        return atoms._replace(
+            cell=None, notes=[*atoms.notes, "its cell, a cube of 1 Å, stands for none"]
+        )
     return atoms
 
 
-def _read_trajectory(path: Path, form: Format, frame: int, atom_types, topology: Path | None) -> Atoms:
+def _read_trajectory(
+    path: Path, form: Format, frame: int, atom_types, topology: Path | None
+) -> Atoms:
     """The atoms of a frame, with the names in the topology file if the format has none."""
     if form.read_arrays is None:
         if atom_types is not None and not form.has_types:
@@ -91,10 +109,14 @@ def _read_trajectory(path: Path, form: Format, frame: int, atom_types, topology:
         return not_none(form.read_frame)(path, frame, *([atom_types] if form.has_types else []))
     if topology is None:
         missing = f"there is no {' or '.join(TOPOLOGIES)} next to it"
-        raise structure_error(path, f"holds no names of atoms, and {missing}: name a file by structure.topology")
+        raise structure_error(
+            path, f"holds no names of atoms, and {missing}: name a file by structure.topology"
+        )
     atoms = read_atoms(topology, None, atom_types)
     found = read_in_process(form.read_arrays, path, frame, len(atoms.names))
-    return atoms._replace(position=found["position"], velocity=found.get("velocity"), cell=found.get("cell"))
+    return atoms._replace(
+        position=found["position"], velocity=found.get("velocity"), cell=found.get("cell")
+    )
 
 
 def _no_types() -> str:
@@ -104,26 +126,38 @@ def _no_types() -> str:
 
 
 def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndarray]:
-    """Names, elements, masses (s,) and positions (s, 3) of the atoms of a file with one molecule."""
+    """Names, elements, masses (s,) and positions (s, 3) of the atoms of a file with one
+    molecule."""
     from ase.data import atomic_masses, atomic_numbers
 
     if (form := format_of(path)) is not None and form.is_trajectory:
-        raise structure_error(path, "is a trajectory: name a structure file, or write a frame of it as one")
+        raise structure_error(
+            path, "is a trajectory: name a structure file, or write a frame of it as one"
+        )
     atoms = read_atoms(path)
-    elements = [e or element_of(name) or "X" for e, name in zip(atoms.elements, atoms.names, strict=True)]
+    elements = [
+        e or element_of(name) or "X" for e, name in zip(atoms.elements, atoms.names, strict=True)
+    ]
     masses = atoms.masses
     if masses is None:
         known = {"X": 0.0} | HEAVY_HYDROGEN
-        masses = np.array([known[e] if e in known else atomic_masses[atomic_numbers[e]] for e in elements])
+        masses = np.array(
+            [known[e] if e in known else atomic_masses[atomic_numbers[e]] for e in elements]
+        )
     return atoms.names, elements, masses, atoms.position
 
 
-def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) -> Callable[[], Atoms]:
+def _choose(
+    path: Path, frames: list[Callable[[], Atoms]], frame: int | None
+) -> Callable[[], Atoms]:
     if frame is None:
         form = format_of(path)
         frame = -1 if form is not None and form.read is None else 1
         if frame == 1 and len(frames) > 1:
-            hint = f"keep one, or for a start select one by structure.frame (1 to {len(frames)}, -1 for the last)"
+            hint = (
+                f"keep one, or for a start select one by structure.frame (1 to {len(frames)}, -1"
+                " for the last)"
+            )
             raise structure_error(path, f"holds {len(frames)} structures: {hint}")
     if not frames:
         raise structure_error(path, "holds no atoms")
@@ -133,16 +167,21 @@ def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) ->
         raise structure_error(path, str(error)) from None
 
 
-def _frames(path: Path, atom_types: dict[str, str] | None, content: bytes | None) -> list[Callable[[], Atoms]]:
+def _frames(
+    path: Path, atom_types: dict[str, str] | None, content: bytes | None
+) -> list[Callable[[], Atoms]]:
     """For each structure of a file, a function that reads it."""
     content = _content(path) if content is None else content
     name = Path(path.stem if path.suffix.lower() in PACKED else path.name)
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    # Titles may have any encoding, data are ASCII. Windows begins files with a mark of the encoding.
+    # Titles may have any encoding, data are ASCII. Windows begins files with a mark of the
+    # encoding.
     text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
     if not text.strip():
         raise structure_error(path, "holds no atoms: it is empty")
-    recognised = (form for form in BY_CONTENT if form.content and form.content.search(text[:BEGINNING]))
+    recognised = (
+        form for form in BY_CONTENT if form.content and form.content.search(text[:BEGINNING])
+    )
     form = format_of(name) or next(recognised, None)
     if atom_types is not None and not (form and form.has_types):
         raise structure_error(path, _no_types())

@@ -29,7 +29,12 @@ from rigidmd.io.formats import BY_EXTENSION, written
 from rigidmd.io.formats.atoms import Frame
 from rigidmd.io.formats.bonds import charges, connections
 from rigidmd.io.formats.frame_file import FrameFile
-from rigidmd.io.formats.through_mdanalysis import dimensions, read_in_process, set_frame, universe_of
+from rigidmd.io.formats.through_mdanalysis import (
+    dimensions,
+    read_in_process,
+    set_frame,
+    universe_of,
+)
 from rigidmd.scene.validation import not_none
 
 #: Frames are evenly spaced if intervals differ by less than this fraction of the longest.
@@ -43,7 +48,8 @@ UNLIMITED = written(lambda form: form.encoder and form.limits == (-inf, inf) and
 
 
 def universe(system: System | BodySystem, state: State, wrapped: bool = True) -> mda.Universe:
-    """An MDAnalysis Universe of all sites, one residue per molecule, with one frame of this state."""
+    """An MDAnalysis Universe of all sites, one residue per molecule, with one frame of this
+    state."""
     u = universe_of(system)
     _connect(u, system, massless=False)  # viewers would draw these bonds
     set_frame(u.trajectory.ts, Frame(0.0, system.site_positions(state, wrapped), state.cell))
@@ -62,16 +68,29 @@ def in_memory(system: System | BodySystem, frames: Sequence[Frame]) -> mda.Unive
     """A Universe of frames in memory, each with its time and box."""
     u = universe(system, system.state)
     _connect(u, system)
-    times, positions = _checked([frame.time for frame in frames]), np.array([frame.positions for frame in frames])
+    times, positions = (
+        _checked([frame.time for frame in frames]),
+        np.array([frame.positions for frame in frames]),
+    )
     boxes = None if u.dimensions is None else np.array([dimensions(frame.cell) for frame in frames])
     velocities = np.array([frame.velocities for frame in frames])
-    u.trajectory = timed(MemoryReader)(positions, times=times, order="fac", dimensions=boxes, velocities=velocities)
+    u.trajectory = timed(MemoryReader)(
+        positions, times=times, order="fac", dimensions=boxes, velocities=velocities
+    )
     return u
 
 
-def from_files(system: System | BodySystem, topology: Path, trajectory: Path, times: list[float]) -> mda.Universe:
-    """The Universe of a finished run's files, with these times (ps) of its frames, and elements, masses and bonds."""
-    u = mda.Universe(str(topology), str(trajectory), format=timed(reader_of(trajectory.suffix)), times=_checked(times))
+def from_files(
+    system: System | BodySystem, topology: Path, trajectory: Path, times: list[float]
+) -> mda.Universe:
+    """The Universe of a finished run's files, with these times (ps) of its frames, and elements,
+    masses and bonds."""
+    u = mda.Universe(
+        str(topology),
+        str(trajectory),
+        format=timed(reader_of(trajectory.suffix)),
+        times=_checked(times),
+    )
     u.add_TopologyAttr("elements", system.sites.element)
     u.add_TopologyAttr("masses", system.sites.mass)
     _connect(u, system)
@@ -83,7 +102,10 @@ def _checked(times: list[float]) -> list[float]:
     gaps = np.diff(times)
     if len(gaps) and np.ptp(gaps) > EVEN * gaps.max():
         spacing = f"frames are not evenly spaced ({gaps.min():g} to {gaps.max():g} ps)"
-        warnings.warn(f"{spacing}: dt is the first of these; use the time of each frame (ts.time)", stacklevel=4)
+        warnings.warn(
+            f"{spacing}: dt is the first of these; use the time of each frame (ts.time)",
+            stacklevel=4,
+        )
     return times
 
 
@@ -98,19 +120,23 @@ class Frames(NamedTuple):
 
 
 def read_frames(path: Path, sites: int, most: int) -> Frames:
-    """At most `most` evenly spaced frames of a trajectory. An incomplete last frame is left out. Raises OutputError if
-    the file cannot be read, or has another number of sites."""
+    """At most `most` evenly spaced frames of a trajectory. An incomplete last frame is left out.
+    Raises OutputError if the file cannot be read, or has another number of sites."""
     return _read(_frames, path, sites, most)
 
 
 def read_times(path: Path, sites: int) -> np.ndarray:
-    """Times (f,) of the frames of a trajectory, ps, without the rounding of files; for errors see `read_frames`."""
+    """Times (f,) of the frames of a trajectory, ps, without the rounding of files; for errors see
+    `read_frames`."""
     return without_rounding(np.array(_read(_times, path, sites)))
 
 
 def without_rounding(time: np.ndarray) -> np.ndarray:
-    """Times (f,) of frames without the rounding of files to single precision, if nothing else makes them uneven."""
-    even = np.linspace(_as_decimal(time[0]), _as_decimal(time[-1]), len(time)) if len(time) else time
+    """Times (f,) of frames without the rounding of files to single precision, if nothing else makes
+    them uneven."""
+    even = (
+        np.linspace(_as_decimal(time[0]), _as_decimal(time[-1]), len(time)) if len(time) else time
+    )
     rounding = np.spacing(np.abs(time).max(initial=0.0).astype(np.float32))
     return even if np.all(np.abs(even - time) <= 2 * rounding) else time
 
@@ -179,12 +205,15 @@ def _opened(path: Path, sites: int) -> Any:
     reader = reader_of(path.suffix)(str(path))
     if reader.n_atoms != sites:
         reader.close()
-        raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
+        raise OutputError(
+            f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}"
+        )
     return reader
 
 
 def _whole_frames(reader: Any, path: Path, selected: range) -> Iterator[Any]:
-    """The selected frames of a reader, without an incomplete last one. Raises OutputError for any other."""
+    """The selected frames of a reader, without an incomplete last one. Raises OutputError for any
+    other."""
     for k in selected:
         try:
             frame = reader[k]
@@ -197,13 +226,16 @@ def _whole_frames(reader: Any, path: Path, selected: range) -> Iterator[Any]:
 
 
 def _times_and_cells_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
-    """Times (ps) and cells (3, 3) in lines between the frames of a text, which MDAnalysis ignores."""
+    """Times (ps) and cells (3, 3) in lines between the frames of a text, which MDAnalysis
+    ignores."""
     times, cells, pattern = [], [], BY_EXTENSION[path.suffix].times
     if pattern is None:
         return times, cells
     with path.open("rb") as file:
         for line in file:
-            if (b"Time=" in line or line.startswith(b"REMARK")) and (found := re.search(pattern, line)):
+            if (b"Time=" in line or line.startswith(b"REMARK")) and (
+                found := re.search(pattern, line)
+            ):
                 times.append(float(found[2]))
                 if found[1]:
                     cells.append(np.array(found[1].split(), float).reshape(3, 3))
@@ -211,7 +243,8 @@ def _times_and_cells_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]
 
 
 def read_exactly(path: Path) -> list[Frame]:
-    """All frames as the reader of their format in rigidmd has them. Raises OutputError if they cannot be read."""
+    """All frames as the reader of their format in rigidmd has them. Raises OutputError if they
+    cannot be read."""
     try:
         with contextlib.closing(not_none(BY_EXTENSION[path.suffix].reader)(path)) as reader:
             return [reader.frame(k) for k in range(reader.count)]
@@ -219,9 +252,11 @@ def read_exactly(path: Path) -> list[Frame]:
         raise OutputError(f"{path} cannot be read: {error}") from None
 
 
-def near_pairs(at: np.ndarray, cell: np.ndarray | None, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (p, 2) of points (k, 3) closer than `distance`, in a cell (3, 3) or without a box, and the vectors (p, 3)
-    from the first to the second; Å, single precision."""
+def near_pairs(
+    at: np.ndarray, cell: np.ndarray | None, distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (p, 2) of points (k, 3) closer than `distance`, in a cell (3, 3) or without a box, and
+    the vectors (p, 3) from the first to the second; Å, single precision."""
     box = None if cell is None else np.array(dimensions(cell), np.float32)
     pairs = self_capped_distance(at.astype(np.float32), distance, box=box, return_distances=False)
     vectors = (at[pairs[:, 1]] - at[pairs[:, 0]]).astype(np.float32)
@@ -268,12 +303,15 @@ class SiteReader(ReaderBase):
 
 
 class _WithTimes(ProtoReader):
-    """Mixin for a reader that returns the times of the run (ps), evenly spaced or not, instead of those in the file."""
+    """Mixin for a reader that returns the times of the run (ps), evenly spaced or not, instead of
+    those in the file."""
 
     def __init__(self, *source, times: list[float], **options):
         self._times = times
         self._dt = float(times[1] - times[0]) if len(times) > 1 else 0.0
-        super().__init__(*source, **options | {"times": times})  # a reader passes its options to its copies
+        super().__init__(
+            *source, **options | {"times": times}
+        )  # a reader passes its options to its copies
         self._set_time(self.ts)
 
     @property
@@ -294,8 +332,8 @@ class _WithTimes(ProtoReader):
 
 
 class _WithoutOffsetsFile:
-    """Mixin for the readers of XTC and TRR. Offsets of frames stay in memory: no file is made next to a trajectory, and
-    none there is believed."""
+    """Mixin for the readers of XTC and TRR. Offsets of frames stay in memory: no file is made next
+    to a trajectory, and none there is believed."""
 
     def _load_offsets(self):
         self._read_offsets()
@@ -307,7 +345,11 @@ class _WithoutOffsetsFile:
 def reader_of(extension: str) -> Any:
     """MDAnalysis' class of readers of a format."""
     form = BY_EXTENSION[extension]
-    reader = SiteReader if form.reader else get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
+    reader = (
+        SiteReader
+        if form.reader
+        else get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
+    )
     return _subclass(_WithoutOffsetsFile, reader) if issubclass(reader, XDRBaseReader) else reader
 
 
@@ -325,9 +367,13 @@ def _subclass(mixin: type, reader: Any) -> Any:
 
 
 def open_trajectory(
-    path: Path, system: System | BodySystem, interval: float, velocities: bool, wrapped: bool,
-    kept: Sequence[int] | None = None
-) -> "TrajectoryFile | FrameFile":  # fmt: skip
+    path: Path,
+    system: System | BodySystem,
+    interval: float,
+    velocities: bool,
+    wrapped: bool,
+    kept: Sequence[int] | None = None,
+) -> "TrajectoryFile | FrameFile":
     """The trajectory file for the extension of a path. For the arguments see `TrajectoryFile`."""
     if (writer := BY_EXTENSION[path.suffix].writer) is not None:
         return writer(path, system, velocities, wrapped, kept)
@@ -335,38 +381,51 @@ def open_trajectory(
 
 
 def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
-    """Write names, molecules and first positions for viewers. Raises SimulationError if the format cannot hold one."""
+    """Write names, molecules and first positions for viewers. Raises SimulationError if the format
+    cannot hold one."""
     positions = system.site_positions(state, wrapped)
     others = written(lambda form: form.write_topology and form.exceeded(positions) is None)
     _check_fits(path, positions, "output.topology", others)
-    with atomic_file(path) as temporary, ignore_warnings():  # of missing attributes (occupancies, ...)
+    with (
+        atomic_file(path) as temporary,
+        ignore_warnings(),
+    ):  # of missing attributes (occupancies, ...)
         write = not_none(BY_EXTENSION[path.suffix].write_topology)
         write(temporary, universe(system, state, wrapped).select_atoms("all"))
 
 
 def _check_fits(path: Path, positions: np.ndarray, key: str, others: Sequence[str]) -> None:
-    """Raise SimulationError if the format of a file cannot hold positions (s, 3); `others` are formats that can."""
+    """Raise SimulationError if the format of a file cannot hold positions (s, 3); `others` are
+    formats that can."""
     if (bound := BY_EXTENSION[path.suffix].exceeded(positions)) is not None:
         hint = "output.positions = 'wrapped', or for a body a smaller output.trajectory_A_per_m"
         hint = f"use {' or '.join(others)}, {hint}" if others else f"set {hint}"
-        raise SimulationError(f"a position is beyond the {bound:g} Å that {path.suffix} ({key}) can hold: {hint}")
+        raise SimulationError(
+            f"a position is beyond the {bound:g} Å that {path.suffix} ({key}) can hold: {hint}"
+        )
 
 
 class TrajectoryFile(AppendedFile):
     """Writes frames to a trajectory, in the format of the file's extension.
 
-    The bytes of each frame are appended to the file. So every write is checked, a killed run leaves whole frames, and
-    a resumed run can continue the file.
+    The bytes of each frame are appended to the file. So every write is checked, a killed run leaves
+    whole frames, and a resumed run can continue the file.
 
     interval : time between frames (ps), for formats that store it once for all frames
-    kept : earlier value of the property `kept`, from which `cut` continues the file; None begins a new file
+    kept : earlier value of the property `kept`, from which `cut` continues the file; None begins a
+        new file
     Raises OutputError, here and in every method.
     """
 
     def __init__(
-        self, path: Path, system: System | BodySystem, interval: float, velocities: bool, wrapped: bool,
-        kept: Sequence[int] | None = None
-    ):  # fmt: skip
+        self,
+        path: Path,
+        system: System | BodySystem,
+        interval: float,
+        velocities: bool,
+        wrapped: bool,
+        kept: Sequence[int] | None = None,
+    ):
         self._system, self._velocities, self._wrapped = system, velocities, wrapped
         form = BY_EXTENSION[path.suffix]
         self._encode: Any = not_none(form.encoder)(system, interval, velocities)

@@ -1,4 +1,5 @@
-"""Files that are written as a whole: CSV, JSON, arrays, tables of reports. The target is checked before the work."""
+"""Files that are written as a whole: CSV, JSON, arrays, tables of reports. The target is checked
+before the work."""
 
 import csv
 import io
@@ -14,10 +15,14 @@ from rigidmd.errors import OutputError, option
 
 
 def check_target(
-    path: Path, extensions: tuple[str, ...], force: bool, what: str = "file", inputs: Iterable[Path] = ()
+    path: Path,
+    extensions: tuple[str, ...],
+    force: bool,
+    what: str = "file",
+    inputs: Iterable[Path] = (),
 ) -> None:
-    """Raise OutputError if a file cannot be written to a path or would replace another one. Changes nothing. `inputs`:
-    files from which it is made, which are never replaced."""
+    """Raise OutputError if a file cannot be written to a path or would replace another one. Changes
+    nothing. `inputs`: files from which it is made, which are never replaced."""
     if path.suffix not in extensions:
         raise OutputError(f"{path}: the name of this {what} ends in {' or '.join(extensions)}")
     if path.is_dir():
@@ -27,7 +32,9 @@ def check_target(
     if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
         raise OutputError(f"{path} is an input of this {what}; {option('file')} names another file")
     if path.exists() and not force:
-        raise OutputError(f"{path} exists; {option('force')} replaces it, {option('file')} names another file")
+        raise OutputError(
+            f"{path} exists; {option('force')} replaces it, {option('file')} names another file"
+        )
 
 
 def write_json(path: Path, data: Any, **options: Any) -> None:
@@ -45,7 +52,15 @@ def write_columns(path: Path, columns: dict[str, np.ndarray]) -> None:
     """Write columns as CSV, one line per sample, numbers with 17 digits, which keep every bit."""
     with atomic_file(path) as temporary:
         rows = np.column_stack(list(columns.values()))
-        np.savetxt(temporary, rows, fmt="%.17g", delimiter=",", header=",".join(columns), comments="", encoding="utf-8")
+        np.savetxt(
+            temporary,
+            rows,
+            fmt="%.17g",
+            delimiter=",",
+            header=",".join(columns),
+            comments="",
+            encoding="utf-8",
+        )
 
 
 def write_npz(path: Path, columns: dict[str, np.ndarray]) -> None:
@@ -59,10 +74,13 @@ def nine_digits(value: float | None) -> float | None:
 
 
 def columns_text(lines: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:
-    """Lines of cells as a table. The columns with indices `left` are aligned left, all others right."""
+    """Lines of cells as a table. The columns with indices `left` are aligned left, all others
+    right."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     align = [str.ljust if k in left else str.rjust for k in range(len(widths))]
-    padded = [[a(cell, w) for a, cell, w in zip(align, line, widths, strict=True)] for line in lines]
+    padded = [
+        [a(cell, w) for a, cell, w in zip(align, line, widths, strict=True)] for line in lines
+    ]
     return "\n".join("  ".join(line).rstrip() for line in padded)
 
 
@@ -79,10 +97,18 @@ class Column(NamedTuple):
     short: str = ""  # header for a terminal, if it is another one
 
 
-def with_error(header: str, measured: Callable[[Any], Sequence[Any] | None], error_header: str = "±") -> list[Column]:
+def with_error(
+    header: str, measured: Callable[[Any], Sequence[Any] | None], error_header: str = "±"
+) -> list[Column]:
     """Columns of a value and its error. measured(row) : both, or None"""
-    pair = lambda row: measured(row) or (None, None)  # noqa: E731
-    return [Column(header, lambda row: pair(row)[0]), Column(error_header, lambda row: pair(row)[1])]
+
+    def pair(row):
+        return measured(row) or (None, None)
+
+    return [
+        Column(header, lambda row: pair(row)[0]),
+        Column(error_header, lambda row: pair(row)[1]),
+    ]
 
 
 class Table(NamedTuple):
@@ -94,15 +120,26 @@ class Table(NamedTuple):
 
     def shown(self) -> tuple[list[str], list[list[str]]]:
         """Headers and cells as text, for readers."""
-        return [c.header for c in self.columns], [list(map(format_cell, self.values(row))) for row in self.rows]
+        return [c.header for c in self.columns], [
+            list(map(format_cell, self.values(row))) for row in self.rows
+        ]
 
     def text(self, left: Sequence[int] = (0,)) -> str:
-        """The table for a terminal, without columns that have no values. left : indices of columns aligned left"""
+        """The table for a terminal, without columns that have no values. left : indices of columns
+        aligned left"""
         _, cells = self.shown()
-        kept = [k for k in range(len(self.columns)) if any(line[k] not in ("", "-") for line in cells)]
+        kept = [
+            k for k in range(len(self.columns)) if any(line[k] not in ("", "-") for line in cells)
+        ]
         lines = [[column.short or column.header for column in self.columns], *cells]
-        return columns_text([[line[k] for k in kept] for line in lines], [kept.index(k) for k in left if k in kept])
+        return columns_text(
+            [[line[k] for k in kept] for line in lines], [kept.index(k) for k in left if k in kept]
+        )
 
     def write(self, path: Path, quoting: Any = csv.QUOTE_MINIMAL) -> None:
         """Write the table as CSV. Raises OutputError."""
-        write_csv(path, [[column.header for column in self.columns], *map(self.values, self.rows)], quoting)
+        write_csv(
+            path,
+            [[column.header for column in self.columns], *map(self.values, self.rows)],
+            quoting,
+        )

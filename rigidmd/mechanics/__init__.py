@@ -1,1 +1,2 @@
-"""The rigid body: orientation, inertia and the flows that rotate it. Nothing here depends on molecules."""
+"""The rigid body: orientation, inertia and the flows that rotate it. Nothing here depends on
+molecules."""

@@ -1,24 +1,43 @@
-"""Kinetic energies, kicks, friction with noise and rotations of several bodies at a time, in SIMD vectors.
+"""Kinetic energies, kicks, friction with noise and rotations of several bodies at a time, in SIMD
+vectors.
 
-In rotations each lane has a body: for a single body, each factor of a rotation would wait for the one before it.
+In rotations each lane has a body: for a single body, each factor of a rotation would wait for the
+one before it.
 """
 
 import numpy as np
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
-from rigidmd.compile.simd import align_stack, broadcast, lane_count, load, mask_bits, select, store, sum_lanes
+from rigidmd.compile.simd import (
+    align_stack,
+    broadcast,
+    lane_count,
+    load,
+    mask_bits,
+    select,
+    store,
+    sum_lanes,
+)
 from rigidmd.compile.simd_memory import load_matrices, load_vectors, store_matrices, store_vectors
-from rigidmd.mechanics.free_rotor import SHORT_ANGLE2, SplitRotor, rotate, rotate_vector, rotation_coefficient_series
+from rigidmd.mechanics.free_rotor import (
+    SHORT_ANGLE2,
+    SplitRotor,
+    rotate,
+    rotate_vector,
+    rotation_coefficient_series,
+)
 
 LANES = lane_count(np.float64)  # bodies that are rotated together
-#: Rows of the constants of the species in each lane: axes a and b (as numbers), h g, h (1/I - g) about a, b and c, the
-#: square of the largest of these, and 1 if the axes a, b, c are left-handed, -1 if right-handed.
+#: Rows of the constants of the species in each lane: axes a and b (as numbers), h g, h (1/I - g)
+#: about a, b and c, the square of the largest of these, and 1 if the axes a, b, c are left-handed,
+#: -1 if right-handed.
 AXIS_A, AXIS_B, COMMON, RATE, LARGEST_RATE2, HANDEDNESS, ROWS = 0, 1, 2, 3, 6, 7, 8
 
 
 @kernel
 def kick_group(species, inverse_mass, inverse_inertia, state, body_load, first, end, h):
-    """V += h F/m, L += h n_body of molecules first ... end - 1; axes without inertia keep their momentum."""
+    """V += h F/m, L += h n_body of molecules first ... end - 1; axes without inertia keep their
+    momentum."""
     velocity, momentum = state.velocity, state.angular_momentum_body
     force, torque = body_load.force, body_load.torque_body
     kinds = np.full(LANES, -1)
@@ -35,7 +54,9 @@ def kick_group(species, inverse_mass, inverse_inertia, state, body_load, first, 
             store(velocity, at, load(velocity, at) + load(velocity_factors, n) * load(force, at))
             if rotates:
                 before, factor = load(momentum, at), load(torque_factors, n)
-                store(momentum, at, select(factor == 0.0, before, before + factor * load(torque, at)))
+                store(
+                    momentum, at, select(factor == 0.0, before, before + factor * load(torque, at))
+                )
         first += LANES
     for m in range(first, end):
         kind = species[m]
@@ -74,10 +95,15 @@ def kinetic_energies(species, mass, inverse_inertia, velocity, momentum, first, 
 
 @kernel(inline=True)
 def _with_squares(sums, weights, values, at):
-    """Three vectors of sums, with the weighted squares of the values (n, 3) of one molecule per lane added."""
+    """Three vectors of sums, with the weighted squares of the values (n, 3) of one molecule per
+    lane added."""
     x, y, z = load(values, at), load(values, at + LANES), load(values, at + 2 * LANES)
     a, b, c = sums
-    return a + load(weights, 0) * x * x, b + load(weights, LANES) * y * y, c + load(weights, 2 * LANES) * z * z
+    return (
+        a + load(weights, 0) * x * x,
+        b + load(weights, LANES) * y * y,
+        c + load(weights, 2 * LANES) * z * z,
+    )
 
 
 @kernel
@@ -93,11 +119,12 @@ def scale_group(values, first, end, scale):
 
 @kernel
 def apply_langevin_group(model, state, keep, keep_momentum, noise, numbers, first, end):
-    """Friction and noise: v <- keep v + size xi, and likewise angular momenta, of molecules first ... end - 1.
+    """Friction and noise: v <- keep v + size xi, and likewise angular momenta, of molecules first
+    ... end - 1.
 
-    noise (species, 4) : sizes along each axis of a body, and that of a velocity. numbers (6 k,) : number j of molecule
-    first + m is numbers[k j + m]; three for its velocity, then three for its angular momentum. Returns the kinetic
-    energy gained.
+    noise (species, 4) : sizes along each axis of a body, and that of a velocity. numbers (6 k,) :
+    number j of molecule first + m is numbers[k j + m]; three for its velocity, then three for its
+    angular momentum. Returns the kinetic energy gained.
     """
     species, velocity, momentum = model.species, state.velocity, state.angular_momentum_body
     kinds, constants = np.full(LANES, -1), np.empty(8 * LANES)
@@ -110,7 +137,10 @@ def apply_langevin_group(model, state, keep, keep_momentum, noise, numbers, firs
                 for k in range(3):
                     constants[k * LANES + n] = noise[kind, k]
                     constants[(4 + k) * LANES + n] = model.inverse_inertia[kind, k]
-                constants[3 * LANES + n], constants[7 * LANES + n] = noise[kind, 3], model.mass[kind]
+                constants[3 * LANES + n], constants[7 * LANES + n] = (
+                    noise[kind, 3],
+                    model.mass[kind],
+                )
         size = load(constants, 3 * LANES)
         before = load_vectors(velocity, first)
         after = _friction_and_noise(before, keep, (size, size, size), numbers, at, stride)
@@ -120,10 +150,16 @@ def apply_langevin_group(model, state, keep, keep_momentum, noise, numbers, firs
         if rotates:
             sizes = load(constants, 0), load(constants, LANES), load(constants, 2 * LANES)
             before = load_vectors(momentum, first)
-            after = _friction_and_noise(before, keep_momentum, sizes, numbers, 3 * stride + at, stride)
+            after = _friction_and_noise(
+                before, keep_momentum, sizes, numbers, 3 * stride + at, stride
+            )
             store_vectors(momentum, first, after)
             x, y, z = _square_gain(before, after)
-            gained += load(constants, 4 * LANES) * x + load(constants, 5 * LANES) * y + load(constants, 6 * LANES) * z
+            gained += (
+                load(constants, 4 * LANES) * x
+                + load(constants, 5 * LANES) * y
+                + load(constants, 6 * LANES) * z
+            )
         first, at = first + LANES, at + LANES
     heat = sum_lanes(gained)
     for m in range(first, end):
@@ -134,7 +170,9 @@ def apply_langevin_group(model, state, keep, keep_momentum, noise, numbers, firs
             heat += model.mass[kind] * (velocity[m, k] ** 2 - old * old)
             if rotates:
                 old = momentum[m, k]
-                momentum[m, k] = keep_momentum * old + noise[kind, k] * numbers[stride * (3 + k) + at]
+                momentum[m, k] = (
+                    keep_momentum * old + noise[kind, k] * numbers[stride * (3 + k) + at]
+                )
                 heat += model.inverse_inertia[kind, k] * (momentum[m, k] ** 2 - old * old)
         at += 1
     return 0.5 * heat
@@ -174,8 +212,15 @@ def rotate_group(rotor, species, rotation, angular_momentum_body, first, end, h)
                 about = _set_constants(constants, kinds, rotor, h)
             momentum = load_vectors(angular_momentum_body, first)
             x, y, z = momentum
-            if mask_bits(load(constants, LARGEST_RATE2 * LANES) * (x * x + y * y + z * z) < SHORT_ANGLE2) != whole:
-                _rotate_one_by_one(rotor, species, rotation, angular_momentum_body, first, first + LANES, h)
+            if (
+                mask_bits(
+                    load(constants, LARGEST_RATE2 * LANES) * (x * x + y * y + z * z) < SHORT_ANGLE2
+                )
+                != whole
+            ):
+                _rotate_one_by_one(
+                    rotor, species, rotation, angular_momentum_body, first, first + LANES, h
+                )
             elif about[0] | about[1] | about[2]:
                 _rotate_lanes(constants, about, rotation, angular_momentum_body, first, momentum)
             else:
@@ -209,7 +254,8 @@ def _species_changed(kinds, species, first):
 
 @kernel
 def _set_constants(constants, kinds, rotor, h):
-    """Fill the rows of constants; returns whether any body rotates about each of the axes a, b, c."""
+    """Fill the rows of constants; returns whether any body rotates about each of the axes a, b,
+    c."""
     about_a = about_b = about_c = False
     for n in range(LANES):
         kind = kinds[n]
@@ -231,35 +277,62 @@ def _set_constants(constants, kinds, rotor, h):
 
 @kernel(inline=True)
 def _rotate_lanes(constants, about, rotation, angular_momentum_body, first, momentum):
-    """`free_rotor.rotate_by_splitting` for one body per lane, in the frame of the rotor's axes a, b, c."""
-    a, b, sign = load(constants, AXIS_A * LANES), load(constants, AXIS_B * LANES), load(constants, HANDEDNESS * LANES)
+    """`free_rotor.rotate_by_splitting` for one body per lane, in the frame of the rotor's axes a,
+    b, c."""
+    a, b, sign = (
+        load(constants, AXIS_A * LANES),
+        load(constants, AXIS_B * LANES),
+        load(constants, HANDEDNESS * LANES),
+    )
     axes = (a == 0.0, b == 0.0, a == 1.0, b == 1.0)
     q = load_matrices(rotation, first)
     L = _to_rotor_axes(momentum, axes)
     common = load(constants, COMMON * LANES)
     along = (common * L[0], common * L[1], common * L[2])
-    ordered = _to_rotor_axes(q[:3], axes) + _to_rotor_axes(q[3:6], axes) + _to_rotor_axes(q[6:], axes)
+    ordered = (
+        _to_rotor_axes(q[:3], axes) + _to_rotor_axes(q[3:6], axes) + _to_rotor_axes(q[6:], axes)
+    )
     q0, q1, q2, q3, q4, q5, q6, q7, q8 = _rotate_about_momenta(ordered, along, sign)
     L0, L1, L2 = L
     if about[0]:
         angle = 0.5 * load(constants, RATE * LANES) * L0
-        L1, L2, q1, q2, q4, q5, q7, q8 = _rotate_about_axis(angle, sign, L1, L2, q1, q2, q4, q5, q7, q8)
+        L1, L2, q1, q2, q4, q5, q7, q8 = _rotate_about_axis(
+            angle, sign, L1, L2, q1, q2, q4, q5, q7, q8
+        )
     if about[1]:
         angle = 0.5 * load(constants, (RATE + 1) * LANES) * L1
-        L2, L0, q2, q0, q5, q3, q8, q6 = _rotate_about_axis(angle, sign, L2, L0, q2, q0, q5, q3, q8, q6)
+        L2, L0, q2, q0, q5, q3, q8, q6 = _rotate_about_axis(
+            angle, sign, L2, L0, q2, q0, q5, q3, q8, q6
+        )
     if about[2]:
         angle = load(constants, (RATE + 2) * LANES) * L2
-        L0, L1, q0, q1, q3, q4, q6, q7 = _rotate_about_axis(angle, sign, L0, L1, q0, q1, q3, q4, q6, q7)
+        L0, L1, q0, q1, q3, q4, q6, q7 = _rotate_about_axis(
+            angle, sign, L0, L1, q0, q1, q3, q4, q6, q7
+        )
     if about[1]:
         angle = 0.5 * load(constants, (RATE + 1) * LANES) * L1
-        L2, L0, q2, q0, q5, q3, q8, q6 = _rotate_about_axis(angle, sign, L2, L0, q2, q0, q5, q3, q8, q6)
+        L2, L0, q2, q0, q5, q3, q8, q6 = _rotate_about_axis(
+            angle, sign, L2, L0, q2, q0, q5, q3, q8, q6
+        )
     if about[0]:
         angle = 0.5 * load(constants, RATE * LANES) * L0
-        L1, L2, q1, q2, q4, q5, q7, q8 = _rotate_about_axis(angle, sign, L1, L2, q1, q2, q4, q5, q7, q8)
+        L1, L2, q1, q2, q4, q5, q7, q8 = _rotate_about_axis(
+            angle, sign, L1, L2, q1, q2, q4, q5, q7, q8
+        )
     x, y, z = _from_rotor_axes((L0, L1, L2), axes)
-    unchanged = load(constants, RATE * LANES) == 0.0  # its momentum is kept, with the signs of zeros
-    unchanged = unchanged & (load(constants, (RATE + 1) * LANES) == 0.0) & (load(constants, (RATE + 2) * LANES) == 0.0)
-    kept = select(unchanged, momentum[0], x), select(unchanged, momentum[1], y), select(unchanged, momentum[2], z)
+    unchanged = (
+        load(constants, RATE * LANES) == 0.0
+    )  # its momentum is kept, with the signs of zeros
+    unchanged = (
+        unchanged
+        & (load(constants, (RATE + 1) * LANES) == 0.0)
+        & (load(constants, (RATE + 2) * LANES) == 0.0)
+    )
+    kept = (
+        select(unchanged, momentum[0], x),
+        select(unchanged, momentum[1], y),
+        select(unchanged, momentum[2], z),
+    )
     store_vectors(angular_momentum_body, first, kept)
     back = (
         _from_rotor_axes((q0, q1, q2), axes)
@@ -295,7 +368,8 @@ def _from_rotor_axes(vector, axes):
 
 @kernel(inline=True)
 def _rotate_about_momenta(q, along, sign):
-    """Rows of rotations (nine numbers) after a rotation along a vector: `free_rotor.rotate_by_vector`."""
+    """Rows of rotations (nine numbers) after a rotation along a vector:
+    `free_rotor.rotate_by_vector`."""
     x, y, z = along
     odd, even = rotation_coefficient_series(x * x + y * y + z * z)
     odd = sign * odd
@@ -308,7 +382,8 @@ def _rotate_about_momenta(q, along, sign):
 
 @kernel(inline=True)
 def _rotate_about_axis(angle, sign, La, Lb, a0, b0, a1, b1, a2, b2):
-    """`free_rotor.rotate_about_axis`: the other two components of the momenta, and of each row of the rotations."""
+    """`free_rotor.rotate_about_axis`: the other two components of the momenta, and of each row of
+    the rotations."""
     odd, even = rotation_coefficient_series(angle * angle)
     s = sign * (angle * odd)
     versine = angle * angle * even

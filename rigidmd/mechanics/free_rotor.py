@@ -1,5 +1,5 @@
-"""Free-rotor flows: the rotation of a body without torque. The kernel `rotate(rotor, ...)` is chosen by the type at
-compile time, so a scene of points compiles no rotation."""
+"""Free-rotor flows: the rotation of a body without torque. The kernel `rotate(rotor, ...)` is
+chosen by the type at compile time, so a scene of points compiles no rotation."""
 
 from math import cos, inf, nan, sin, sqrt
 from typing import NamedTuple
@@ -12,24 +12,29 @@ from rigidmd.mechanics.time_functions import TimeFunction, rate, value
 
 
 class SplitRotor(NamedTuple):
-    """Composition of exact rotations: about L, and about the principal axes (Dullweber, Leimkuhler & McLachlan 1997).
+    """Composition of exact rotations: about L, and about the principal axes (Dullweber, Leimkuhler
+    & McLachlan 1997).
 
-    H = g |L|²/2 + sum (1/I_k - g) L_k²/2. The first part rotates about L and commutes with the rest, which is Ra(h/2)
-    Rb(h/2) Rc(h) Rb(h/2) Ra(h/2). a is the axis of the middle 1/I, b the axis whose 1/I is farther from it, c the
-    third; g = (2/I_a + 1/I_c)/3. See the theory chapter `dynamics` for the energy that it conserves. Bodies with two
-    equal moments move exactly; for linear and spherical bodies only g remains.
+    H = g |L|²/2 + sum (1/I_k - g) L_k²/2. The first part rotates about L and commutes with the
+    rest, which is Ra(h/2) Rb(h/2) Rc(h) Rb(h/2) Ra(h/2). a is the axis of the middle 1/I, b the
+    axis whose 1/I is farther from it, c the third; g = (2/I_a + 1/I_c)/3. See the theory chapter
+    `dynamics` for the energy that it conserves. Bodies with two equal moments move exactly; for
+    linear and spherical bodies only g remains.
     """
 
     inverse_inertia: np.ndarray  # (species, 3), 1/(u Å²); 0 where the moment is 0
     symmetry: np.ndarray  # (species,) SPHERICAL, or the axis of symmetry 0, 1, 2, or NO_SYMMETRY
     common: np.ndarray  # (species,) g
-    excess: np.ndarray  # (species, 3) 1/I - g; 0 for linear bodies, which have no momentum along their axis
+    excess: (
+        np.ndarray
+    )  # (species, 3) 1/I - g; 0 for linear bodies, which have no momentum along their axis
     order: np.ndarray  # (species, 3) axes a, b, c
 
 
 class ExactRotor(NamedTuple):
-    """The exact free motion, to rounding, for any body and any time step, by a closed form or by Taylor series: see the
-    theory chapter `dynamics`. A rotation by 0.03 to 0.3 rad takes 0.23 to 0.46 µs; longer ones are divided into parts.
+    """The exact free motion, to rounding, for any body and any time step, by a closed form or by
+    Taylor series: see the theory chapter `dynamics`. A rotation by 0.03 to 0.3 rad takes 0.23 to
+    0.46 µs; longer ones are divided into parts.
     """
 
     inverse_inertia: np.ndarray  # all five as in SplitRotor
@@ -41,8 +46,8 @@ class ExactRotor(NamedTuple):
 
 NO_SYMMETRY, SPHERICAL = -1, 3  # of SplitRotor.symmetry
 MOST_TERMS = 30
-#: Largest rotation in one drift, rad. Beyond it the momentum is set to NaN, which stops the run; a body whose energy
-#: diverges would otherwise be rotated in parts for hours.
+#: Largest rotation in one drift, rad. Beyond it the momentum is set to NaN, which stops the run; a
+#: body whose energy diverges would otherwise be rotated in parts for hours.
 LARGEST_ANGLE = 1e4
 SHORT_ANGLE2 = 0.0625  # rad², below which series are used
 LONGEST_PART = 0.5  # rad; 0.3 rad takes 14 terms, 1 rad 26
@@ -59,9 +64,14 @@ def split_rotor(inertia: np.ndarray) -> SplitRotor:
 
 
 def _parts(inverse: np.ndarray) -> tuple[float, tuple[int, int, int]]:
-    """g and the axes a, b, c of SplitRotor; a symmetric body rotates once about its axis of symmetry, c."""
+    """g and the axes a, b, c of SplitRotor; a symmetric body rotates once about its axis of
+    symmetry, c."""
     low, middle, high = np.argsort(inverse)
-    far, near = (high, low) if inverse[middle] - inverse[low] < inverse[high] - inverse[middle] else (low, high)
+    far, near = (
+        (high, low)
+        if inverse[middle] - inverse[low] < inverse[high] - inverse[middle]
+        else (low, high)
+    )
     beyond = inverse[middle] - inverse[near]
     return inverse[near] + 2 / 3 * beyond, (middle, far, near) if beyond else (middle, near, far)
 
@@ -73,9 +83,9 @@ def _symmetry(moments: np.ndarray) -> int:
 
 
 class DrivenRotor(NamedTuple):
-    """A single body with wheels or a changing inertia, with L = I(t) omega + h(t): see the theory chapter `bodies`. I
-    and h are evaluated at the middle of each time interval. The changes of H with them are computed exactly, as work
-    done on the body."""
+    """A single body with wheels or a changing inertia, with L = I(t) omega + h(t): see the theory
+    chapter `bodies`. I and h are evaluated at the middle of each time interval. The changes of H
+    with them are computed exactly, as work done on the body."""
 
     inertia: TimeFunction
     momentum: TimeFunction
@@ -89,7 +99,8 @@ class NoRotor(NamedTuple):
 
 @chosen_by_type(inline=True)
 def rotate(rotor, species, rotation, angular_momentum_body, m, h):
-    """Rotate molecule m of the given species freely for a time h: Q' = Q hat(I^-1 L), L' = L x I^-1 L, in place."""
+    """Rotate molecule m of the given species freely for a time h: Q' = Q hat(I^-1 L), L' = L x I^-1
+    L, in place."""
     if is_a(rotor, NoRotor):
         return lambda rotor, species, rotation, angular_momentum_body, m, h: None
     if is_a(rotor, SplitRotor):
@@ -98,7 +109,9 @@ def rotate(rotor, species, rotation, angular_momentum_body, m, h):
 
         def rotate_exact(rotor, species, rotation, angular_momentum_body, m, h):
             if rotor.symmetry[species] == NO_SYMMETRY:
-                rotate_by_series(rotation, angular_momentum_body, m, rotor.inverse_inertia[species], h)
+                rotate_by_series(
+                    rotation, angular_momentum_body, m, rotor.inverse_inertia[species], h
+                )
             else:
                 rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h)
 
@@ -107,7 +120,8 @@ def rotate(rotor, species, rotation, angular_momentum_body, m, h):
 
 @kernel(inline=True)
 def rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h):
-    """Rotate about L, which is constant, by the angle h g |L|, then about the axes; the two flows commute."""
+    """Rotate about L, which is constant, by the angle h g |L|, then about the axes; the two flows
+    commute."""
     L, rate = angular_momentum_body[m], h * rotor.common[species]
     rotate_by_vector(rotation[m], rate * L[0], rate * L[1], rate * L[2])
     a, b, c = rotor.order[species, 0], rotor.order[species, 1], rotor.order[species, 2]
@@ -118,7 +132,8 @@ def rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h):
 
 @kernel
 def rotate_by_series(rotation, angular_momentum_body, m, inverse, h):
-    """Free motion of an asymmetric body by the Taylor series of omega and of the quaternion of the rotation."""
+    """Free motion of an asymmetric body by the Taylor series of omega and of the quaternion of the
+    rotation."""
     L = angular_momentum_body[m]
     fastest = abs(L[0] * inverse[0]) + abs(L[1] * inverse[1]) + abs(L[2] * inverse[2])
     if not 0.0 < fastest * abs(h) < inf:
@@ -175,7 +190,8 @@ def rotate_by_series(rotation, angular_momentum_body, m, inverse, h):
 
 @kernel(inline=True)
 def apply_quaternion(rotation, angular_momentum_body, m, w, x, y, z):
-    """Q <- Q R, L <- R^T L with R the rotation of the quaternion (1 + w, x, y, z), of any length."""
+    """Q <- Q R, L <- R^T L with R the rotation of the quaternion (1 + w, x, y, z), of any
+    length."""
     scale = 2 / ((1 + w) * (1 + w) + x * x + y * y + z * z)
     c = scale * (1 + w)
     L = angular_momentum_body[m]
@@ -185,7 +201,8 @@ def apply_quaternion(rotation, angular_momentum_body, m, w, x, y, z):
 
 @kernel(inline=True)
 def rotate_vector(a, b, d, x, y, z, first, second):
-    """v + first u x v + second u x (u x v) for v = (a, b, d), u = (x, y, z): a rotation, written as a change."""
+    """v + first u x v + second u x (u x v) for v = (a, b, d), u = (x, y, z): a rotation, written as
+    a change."""
     p = y * d - z * b
     q = z * a - x * d
     r = x * b - y * a
@@ -207,7 +224,8 @@ def rotate_rows(rotation, x, y, z, first, second):
 
 @kernel(inline=True)
 def rotate_about_axes(rotation, angular_momentum_body, m, order, rate, offset, h):
-    """Five exact rotations about the axes `order`, by angles h rate (L_k - offset); offset: momentum of wheels."""
+    """Five exact rotations about the axes `order`, by angles h rate (L_k - offset); offset:
+    momentum of wheels."""
     L = angular_momentum_body
     a, b, c = order
     rotate_about_axis(rotation, L, m, a, 0.5 * h * rate[0] * (L[m, a] - offset[0]))
@@ -237,8 +255,8 @@ def rotate_about_axis(rotation, angular_momentum_body, m, k, angle):
 
 @kernel(inline=True)
 def sine_and_versine(angle):
-    """sin and 1 - cos of an angle, for rotations that are written as a change: see "Rounding of Q" in the theory
-    chapter `dynamics`."""
+    """sin and 1 - cos of an angle, for rotations that are written as a change: see "Rounding of Q"
+    in the theory chapter `dynamics`."""
     odd, even = rotation_coefficients(angle * angle)
     return angle * odd, angle * angle * even
 
@@ -256,7 +274,8 @@ def rotation_coefficients(x):
 
 @kernel(inline=True)
 def rotation_coefficient_series(x):
-    """`rotation_coefficients` by Taylor series, accurate to rounding below SHORT_ANGLE2 and faster than sin and cos."""
+    """`rotation_coefficients` by Taylor series, accurate to rounding below SHORT_ANGLE2 and faster
+    than sin and cos."""
     x2 = x * x
     odd = (1 - 1 / 6 * x) + x2 * (
         (1 / 120 - 1 / 5040 * x) + x2 * ((1 / 362880 - 1 / 39916800 * x) + 1 / 6227020800 * x2)
@@ -269,15 +288,17 @@ def rotation_coefficient_series(x):
 
 @kernel(inline=True)
 def rotate_by_vector(rotation, x, y, z):
-    """Q <- Q R with the rotation vector (x, y, z) of R, body frame; its length is not needed, which saves a third."""
+    """Q <- Q R with the rotation vector (x, y, z) of R, body frame; its length is not needed, which
+    saves a third."""
     odd, even = rotation_coefficients(x * x + y * y + z * z)
     rotate_rows(rotation, x, y, z, -odd, even)
 
 
 @kernel
 def restore_orthogonality(rotation, momentum):
-    """Q <- Q (3 - QᵀQ) / 2 of rotations (n, 3, 3), in place: a Newton step to the nearest rotation, which leaves the
-    square of the error (Higham 2008, Functions of Matrices, eq. 8.20). Bodies without angular momentum (n, 3) stay."""
+    """Q <- Q (3 - QᵀQ) / 2 of rotations (n, 3, 3), in place: a Newton step to the nearest rotation,
+    which leaves the square of the error (Higham 2008, Functions of Matrices, eq. 8.20). Bodies
+    without angular momentum (n, 3) stay."""
     for m in range(len(rotation)):
         if momentum[m, 0] == 0.0 and momentum[m, 1] == 0.0 and momentum[m, 2] == 0.0:
             continue
@@ -298,17 +319,25 @@ def restore_orthogonality(rotation, momentum):
 def rotate_body(rotor, state, time, h):
     """Rotate a single body freely from `time` to time + h, in place."""
     if not is_a(rotor, DrivenRotor):
-        return lambda rotor, state, time, h: rotate(rotor, 0, state.rotation, state.angular_momentum_body, 0, h)
+        return lambda rotor, state, time, h: rotate(
+            rotor, 0, state.rotation, state.angular_momentum_body, 0, h
+        )
 
     def rotate_driven(rotor, state, time, h):
         L, inertia, carried = state.angular_momentum_body, rotor.inertia, rotor.momentum
         before = driven_energy(rotor, L, time)
         middle = time + 0.5 * h
-        inverse = 1 / value(inertia, middle, 0), 1 / value(inertia, middle, 1), 1 / value(inertia, middle, 2)
+        inverse = (
+            1 / value(inertia, middle, 0),
+            1 / value(inertia, middle, 1),
+            1 / value(inertia, middle, 2),
+        )
         offset = value(carried, middle, 0), value(carried, middle, 1), value(carried, middle, 2)
         state.energy_ledger[WORK] += driven_energy(rotor, L, middle) - before
         rotate_about_axes(state.rotation, L, 0, (0, 1, 2), inverse, offset, h)
-        state.energy_ledger[WORK] += driven_energy(rotor, L, time + h) - driven_energy(rotor, L, middle)
+        state.energy_ledger[WORK] += driven_energy(rotor, L, time + h) - driven_energy(
+            rotor, L, middle
+        )
 
     return rotate_driven
 
@@ -327,7 +356,10 @@ def driven_energy(rotor, angular_momentum_body, time):
 def moments(rotor, time, k):
     """(1/I_k, h_k) of a single body's rotor at a time; 1/I_k is 0 for an axis without inertia."""
     if is_a(rotor, DrivenRotor):
-        return lambda rotor, time, k: (1 / value(rotor.inertia, time, k), value(rotor.momentum, time, k))
+        return lambda rotor, time, k: (
+            1 / value(rotor.inertia, time, k),
+            value(rotor.momentum, time, k),
+        )
     if is_a(rotor, NoRotor):
         return lambda rotor, time, k: (0.0, 0.0)
     return lambda rotor, time, k: (rotor.inverse_inertia[0, k], 0.0)
@@ -340,7 +372,12 @@ def moment_rates(rotor, time, k):
 
         def driven(rotor, time, k):
             inertia, carried = rotor.inertia, rotor.momentum
-            return value(inertia, time, k), rate(inertia, time, k), value(carried, time, k), rate(carried, time, k)
+            return (
+                value(inertia, time, k),
+                rate(inertia, time, k),
+                value(carried, time, k),
+                rate(carried, time, k),
+            )
 
         return driven
 

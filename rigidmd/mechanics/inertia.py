@@ -1,5 +1,5 @@
-"""Inertia of point masses: tensor, principal frame, kind of body. Homogeneous solids by name, and the added mass of an
-ellipsoid in a fluid, in any consistent units."""
+"""Inertia of point masses: tensor, principal frame, kind of body. Homogeneous solids by name, and
+the added mass of an ellipsoid in a fluid, in any consistent units."""
 
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -10,15 +10,16 @@ from numpy.typing import ArrayLike
 
 BodyKind = Literal["point", "linear", "spherical", "symmetric", "asymmetric"]
 
-#: Two principal moments that differ by less than this fraction of the largest count as equal, and a smaller moment as
-#: zero: 1e-8 in inertia is 1e-4 in length, a rounded coordinate.
+#: Two principal moments that differ by less than this fraction of the largest count as equal, and a
+#: smaller moment as zero: 1e-8 in inertia is 1e-4 in length, a rounded coordinate.
 SAME_MOMENT = 1e-8
 
 
 class PrincipalFrame(NamedTuple):
     """The principal frame of a body, in which its inertia is diagonal.
 
-    mass (u), centre (3,), axes (3, 3) with the principal axes as columns (right-handed), inertia (3,) ascending
+    mass (u), centre (3,), axes (3, 3) with the principal axes as columns (right-handed), inertia
+    (3,) ascending
     (u Å²), kind. A moment that counts as zero (point, linear) is exactly 0.
     """
 
@@ -36,7 +37,8 @@ def inertia_tensor(masses: np.ndarray, positions: np.ndarray) -> np.ndarray:
 
 
 def shifted_inertia(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.ndarray:
-    """Inertia tensor (3, 3) about a point at `offset` (3,) from the centre of mass, by the parallel axis theorem.
+    """Inertia tensor (3, 3) about a point at `offset` (3,) from the centre of mass, by the parallel
+    axis theorem.
 
     tensor (3, 3) : about the centre of mass. A negative mass gives the inverse
     """
@@ -44,22 +46,28 @@ def shifted_inertia(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.n
 
 
 def inertia_error(tensor: np.ndarray, scale: float = 0.0) -> str:
-    """Why no mass distribution has this inertia tensor (3, 3); empty if one exists. The tolerance for rounding is 1e-12
-    of the largest moment, or of `scale` if the tensor is a difference of larger ones."""
+    """Why no mass distribution has this inertia tensor (3, 3); empty if one exists. The tolerance
+    for rounding is 1e-12 of the largest moment, or of `scale` if the tensor is a difference of
+    larger ones."""
     low, middle, high = np.linalg.eigvalsh(tensor)
     slack = 1e-12 * max(abs(low), abs(high), scale)
     if low < -slack:
         return f"a principal moment is {low:.6g}, must not be negative"
     if low + middle < high - slack:
-        return f"principal moments {low:.6g} and {middle:.6g} together are less than {high:.6g} (triangle inequality)"
+        return (
+            f"principal moments {low:.6g} and {middle:.6g} together are less than {high:.6g}"
+            " (triangle inequality)"
+        )
     return ""
 
 
-def principal_frame(masses: np.ndarray, positions: np.ndarray, size: float | None = None) -> PrincipalFrame:
+def principal_frame(
+    masses: np.ndarray, positions: np.ndarray, size: float | None = None
+) -> PrincipalFrame:
     """Principal frame of masses (s,) at positions (s, 3).
 
-    `size` is the length scale for the decision that all masses are at one point; by default, the largest distance of a
-    position from the centre of mass.
+    `size` is the length scale for the decision that all masses are at one point; by default, the
+    largest distance of a position from the centre of mass.
     """
     masses = np.asarray(masses, dtype=float)
     positions = np.asarray(positions, dtype=float)
@@ -71,7 +79,8 @@ def principal_frame(masses: np.ndarray, positions: np.ndarray, size: float | Non
     moments, axes = np.linalg.eigh(inertia_tensor(masses, relative))
     if moments[2] <= SAME_MOMENT * mass * size**2:
         return PrincipalFrame(mass, centre, np.eye(3), np.zeros(3), "point")
-    # eigh leaves signs undefined: make the largest component of each axis positive, then the frame right-handed.
+    # eigh leaves signs undefined: make the largest component of each axis positive, then the frame
+    # right-handed.
     axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), [0, 1, 2]])
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     kind = kind_of_body(moments)
@@ -105,19 +114,20 @@ def rotational_freedom(kind: BodyKind) -> int:
 
 
 class Solid(NamedTuple):
-    """A homogeneous solid: principal moments `inertia` (3,) and points `outline` (k, 3) to draw, body frame."""
+    """A homogeneous solid: principal moments `inertia` (3,) and points `outline` (k, 3) to draw,
+    body frame."""
 
     inertia: np.ndarray
     outline: np.ndarray
 
 
 class Shape(NamedTuple):
-    """A kind of solid with all dimensions equal to 1, which are scaled along the axes 1, 2, 3 of its principal frame.
-    Axis 3 is the axis of symmetry, and the origin is the centre of mass.
+    """A kind of solid with all dimensions equal to 1, which are scaled along the axes 1, 2, 3 of
+    its principal frame. Axis 3 is the axis of symmetry, and the origin is the centre of mass.
 
-    dimensions: the axes (0, 1, 2) that each dimension scales, by the name of the dimension in a scene; the solid is
-    thin along an axis without a dimension. mean_squares (3,): <x²>, <y²>, <z²> over its mass. outline (k, 3): points on
-    its surface. volume: 0 for a thin solid.
+    dimensions: the axes (0, 1, 2) that each dimension scales, by the name of the dimension in a
+    scene; the solid is thin along an axis without a dimension. mean_squares (3,): <x²>, <y²>, <z²>
+    over its mass. outline (k, 3): points on its surface. volume: 0 for a thin solid.
     """
 
     dimensions: dict[str, list[int]]
@@ -134,20 +144,30 @@ class Shape(NamedTuple):
 
 
 #: Number of components of each dimension.
-COMPONENTS_PER_DIMENSION = {"radius_m": 1, "height_m": 1, "length_m": 1, "lengths_m": 3, "semi_axes_m": 3}
+COMPONENTS_PER_DIMENSION = {
+    "radius_m": 1,
+    "height_m": 1,
+    "length_m": 1,
+    "lengths_m": 3,
+    "semi_axes_m": 3,
+}
 
 
 def _outline(*rings: tuple[int, float, float]) -> np.ndarray:
-    """Points (k, 3) of all rings (count, radius, z), evenly spaced on circles about axis 3 at height z; a ring of one
-    point with radius 0 is a tip or a centre."""
+    """Points (k, 3) of all rings (count, radius, z), evenly spaced on circles about axis 3 at
+    height z; a ring of one point with radius 0 is a tip or a centre."""
     points = []
     for count, radius, z in rings:
         angle = 2 * np.pi * np.arange(count) / count
-        points.append(np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)], axis=-1))
+        points.append(
+            np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)], axis=-1)
+        )
     return np.concatenate(points)
 
 
-_BALL = _outline((1, 0, -1), (8, 0.5**0.5, -(0.5**0.5)), (8, 1, 0), (8, 0.5**0.5, 0.5**0.5), (1, 0, 1))
+_BALL = _outline(
+    (1, 0, -1), (8, 0.5**0.5, -(0.5**0.5)), (8, 1, 0), (8, 0.5**0.5, 0.5**0.5), (1, 0, 1)
+)
 #: Shapes by name. A cone points down, with its tip at z = -3/4 height, so that a top stands on it.
 SOLIDS = {
     "cylinder": Shape(
@@ -170,9 +190,16 @@ SOLIDS = {
         1.0,
     ),
     "ellipsoid": Shape({"semi_axes_m": [0, 1, 2]}, (1 / 5, 1 / 5, 1 / 5), _BALL, 4 / 3 * np.pi),
-    "disk": Shape({"radius_m": [0, 1]}, (1 / 4, 1 / 4, 0), _outline((1, 0, 0), (8, 0.5, 0), (16, 1, 0)), 0.0),
+    "disk": Shape(
+        {"radius_m": [0, 1]}, (1 / 4, 1 / 4, 0), _outline((1, 0, 0), (8, 0.5, 0), (16, 1, 0)), 0.0
+    ),
     "ring": Shape({"radius_m": [0, 1]}, (1 / 2, 1 / 2, 0), _outline((24, 1, 0)), 0.0),
-    "rod": Shape({"length_m": [2]}, (0, 0, 1 / 12), _outline(*((1, 0, z) for z in np.linspace(-0.5, 0.5, 13))), 0.0),
+    "rod": Shape(
+        {"length_m": [2]},
+        (0, 0, 1 / 12),
+        _outline(*((1, 0, z) for z in np.linspace(-0.5, 0.5, 13))),
+        0.0,
+    ),
 }
 
 
@@ -211,7 +238,10 @@ class Assembly(NamedTuple):
 def assemble_solids(parts: Sequence[Part]) -> Assembly:
     """The rigid body of solids, whose masses and inertia add up, by the parallel axis theorem.
     Where solids overlap, both masses are there."""
-    masses, positions = np.array([part.mass for part in parts]), np.array([part.position for part in parts])
+    masses, positions = (
+        np.array([part.mass for part in parts]),
+        np.array([part.position for part in parts]),
+    )
     mass = float(masses.sum())
     centre = masses @ positions / mass
     tensor, outlines = np.zeros((3, 3)), []
@@ -223,11 +253,12 @@ def assemble_solids(parts: Sequence[Part]) -> Assembly:
 
 
 def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.ndarray, np.ndarray]:
-    """Added mass (3,) and added inertia (3,) along and about the axes of an ellipsoid in an ideal fluid at rest.
+    """Added mass (3,) and added inertia (3,) along and about the axes of an ellipsoid in an ideal
+    fluid at rest.
 
-    semi_axes (3,), all positive; density of the fluid. See the theory chapter `bodies` (Lamb, art. 114-115). Lamb's
-    differences are written as integrals of one sign, (b² - c²)² near/(alpha + 2 far), which has no cancellation for
-    nearly equal axes.
+    semi_axes (3,), all positive; density of the fluid. See the theory chapter `bodies` (Lamb, art.
+    114-115). Lamb's differences are written as integrals of one sign, (b² - c²)² near/(alpha + 2
+    far), which has no cancellation for nearly equal axes.
     """
     from scipy.special import elliprd  # slow to import, and other solids do not need it
 
@@ -235,8 +266,9 @@ def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.nd
     following, last = axes[[1, 2, 0]], axes[[2, 0, 1]]
     a, b, c = axes**2, following**2, last**2
     alpha = 2 / 3 * axes.prod() * elliprd(b, c, a)
-    # The trapezoidal rule in log l is exact to rounding: the integrands are analytic in a strip of ± pi about the real
-    # axis of log l, and decay as powers of l at both ends, to below 1e-16 at these limits.
+    # The trapezoidal rule in log l is exact to rounding: the integrands are analytic in a strip of
+    # ± pi about the real axis of log l, and decay as powers of l at both ends, to below 1e-16 at
+    # these limits.
     step = 0.4
     l = np.exp(np.arange(np.log(a.min()) - 40, np.log(a.max()) + 30, step))[:, None]  # noqa: E741
     weight = step * l * axes.prod() / (np.sqrt(a + l) * ((b + l) * (c + l)) ** 1.5)

@@ -1,7 +1,8 @@
-"""The attitude as variables of a first-order system of ODEs: rotation matrix, quaternion or Euler angles.
+"""The attitude as variables of a first-order system of ODEs: rotation matrix, quaternion or Euler
+angles.
 
-The attitude variables come first in y. Their rates follow from the angular velocity relative to the frame of reference,
-along the body's axes. Kernels are chosen by the type of the form.
+The attitude variables come first in y. Their rates follow from the angular velocity relative to the
+frame of reference, along the body's axes. Kernels are chosen by the type of the form.
 """
 
 from math import cos, sin
@@ -14,13 +15,15 @@ from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
 
 
 class Matrix(NamedTuple):
-    """Nine direction cosines, Q' = Q hat(omega). Q^T Q = 1 is not enforced; its error measures the accuracy."""
+    """Nine direction cosines, Q' = Q hat(omega). Q^T Q = 1 is not enforced; its error measures the
+    accuracy."""
 
     variables: int = 9
 
 
 class Quaternion(NamedTuple):
-    """w, x, y, z with q' = q (0, omega) / 2. |q| = 1 is not enforced; its error measures the accuracy."""
+    """w, x, y, z with q' = q (0, omega) / 2. |q| = 1 is not enforced; its error measures the
+    accuracy."""
 
     variables: int = 4
 
@@ -44,12 +47,15 @@ def attitude_variables(form: AttitudeForm, rotation: np.ndarray) -> np.ndarray:
     """The attitude variables of a rotation matrix (1, 3, 3)."""
     if isinstance(form, NoAttitude):
         return np.zeros(0)
-    return {Matrix: np.ravel, Quaternion: to_quaternion, EulerAngles: to_euler_angles}[type(form)](rotation[0])
+    return {Matrix: np.ravel, Quaternion: to_quaternion, EulerAngles: to_euler_angles}[type(form)](
+        rotation[0]
+    )
 
 
 @chosen_by_type(inline=True)
 def write_rotation(form, y, rotation):
-    """Write Q (1, 3, 3) from the variables, without normalisation: Q of a quaternion is |q|² times a rotation."""
+    """Write Q (1, 3, 3) from the variables, without normalisation: Q of a quaternion is |q|² times
+    a rotation."""
     if is_a(form, NoAttitude):
         return lambda form, y, rotation: None
     if is_a(form, Matrix):

@@ -1,4 +1,5 @@
-"""Vectors as given functions of time, such as the torque of a motor, a changing inertia or a frame that spins up."""
+"""Vectors as given functions of time, such as the torque of a motor, a changing inertia or a frame
+that spins up."""
 
 from math import inf
 from typing import NamedTuple
@@ -11,9 +12,10 @@ from rigidmd.compile import kernel
 class TimeFunction(NamedTuple):
     """A vector that is piecewise constant, linear or quadratic in time.
 
-    Piece i, from times[i] to times[i + 1], is constant[i] + d slope[i] + d² curvature[i] with d = t - times[i]. The
-    first piece begins at time 0, like every run; the last has no end. Compiled code gets one piece at a time
-    (`piece_at`), and a run stops at every break, so that no step contains a jump or a kink.
+    Piece i, from times[i] to times[i + 1], is constant[i] + d slope[i] + d² curvature[i] with d = t
+    - times[i]. The first piece begins at time 0, like every run; the last has no end. Compiled code
+    gets one piece at a time (`piece_at`), and a run stops at every break, so that no step contains
+    a jump or a kink.
     """
 
     times: np.ndarray  # (k,) increasing, the first 0
@@ -24,11 +26,14 @@ class TimeFunction(NamedTuple):
 
 def constant_function(vector) -> TimeFunction:
     """A constant vector (3,)."""
-    return TimeFunction(np.zeros(1), np.array([vector], dtype=float), np.zeros((1, 3)), np.zeros((1, 3)))
+    return TimeFunction(
+        np.zeros(1), np.array([vector], dtype=float), np.zeros((1, 3)), np.zeros((1, 3))
+    )
 
 
 def interpolated_function(times, values) -> TimeFunction:
-    """Linear interpolation of values (k, 3) at increasing times (k,) >= 0; constant before and after these times."""
+    """Linear interpolation of values (k, 3) at increasing times (k,) >= 0; constant before and
+    after these times."""
     times, values = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
     if times[0] > 0:
         times, values = np.insert(times, 0, 0.0), np.insert(values, 0, values[0], axis=0)
@@ -50,12 +55,16 @@ def integrate_function(function: TimeFunction, start) -> TimeFunction:
     constant = np.empty_like(function.constant)
     constant[0] = start
     for i, length in enumerate(np.diff(function.times)):
-        constant[i + 1] = constant[i] + length * (function.constant[i] + 0.5 * length * function.slope[i])
+        constant[i + 1] = constant[i] + length * (
+            function.constant[i] + 0.5 * length * function.slope[i]
+        )
     return TimeFunction(function.times, constant, function.constant, 0.5 * function.slope)
 
 
 def is_constant_function(function: TimeFunction) -> bool:
-    return not (function.slope.any() or function.curvature.any() or np.ptp(function.constant, axis=0).any())
+    return not (
+        function.slope.any() or function.curvature.any() or np.ptp(function.constant, axis=0).any()
+    )
 
 
 def has_constant_direction(function: TimeFunction) -> bool:

@@ -1,6 +1,6 @@
-"""The translation of a single body: free, none, or through an ideal fluid with added mass; frames of reference.
-`translate(translation, ...)` is chosen by the type at compile time, so a pinned body compiles no translation. See the
-theory chapter `bodies`."""
+"""The translation of a single body: free, none, or through an ideal fluid with added mass; frames
+of reference. `translate(translation, ...)` is chosen by the type at compile time, so a pinned body
+compiles no translation. See the theory chapter `bodies`."""
 
 from math import sqrt
 from typing import NamedTuple
@@ -25,8 +25,9 @@ class NoTranslation(NamedTuple):
 
 
 class FluidTranslation(NamedTuple):
-    """A body in an ideal fluid: Kirchhoff's equations, see the theory chapter `bodies`. `state.velocity` is the impulse
-    of body and fluid over the body's mass, lab frame. The moments of inertia of the rotor include the added ones."""
+    """A body in an ideal fluid: Kirchhoff's equations, see the theory chapter `bodies`.
+    `state.velocity` is the impulse of body and fluid over the body's mass, lab frame. The moments
+    of inertia of the rotor include the added ones."""
 
     mass: float
     inertial_mass: np.ndarray  # (3,) mass and added mass along the body's axes
@@ -74,7 +75,11 @@ def translate_in_fluid(translation, state, h):
 @kernel(inline=True)
 def body_component(rotation, vector_lab, k):
     """Component of a lab vector (3,) along body axis k."""
-    return rotation[0, k] * vector_lab[0] + rotation[1, k] * vector_lab[1] + rotation[2, k] * vector_lab[2]
+    return (
+        rotation[0, k] * vector_lab[0]
+        + rotation[1, k] * vector_lab[1]
+        + rotation[2, k] * vector_lab[2]
+    )
 
 
 @kernel(inline=True)
@@ -104,7 +109,11 @@ def inertial_mass(translation, k):
 
 def inertial_masses(translation: FreeTranslation | NoTranslation | FluidTranslation) -> np.ndarray:
     """Mass, with added mass, along the body's axes (3,), for Python."""
-    return translation.inertial_mass if isinstance(translation, FluidTranslation) else np.full(3, translation.mass)
+    return (
+        translation.inertial_mass
+        if isinstance(translation, FluidTranslation)
+        else np.full(3, translation.mass)
+    )
 
 
 class InertialFrame(NamedTuple):
@@ -119,7 +128,8 @@ class RotatingFrame(NamedTuple):
 
 @chosen_by_type(inline=True)
 def rotate_with_frame(frame, state, time, h):
-    """Rotate the state of a single body from the frame's axes at `time` to those at time + h, in place."""
+    """Rotate the state of a single body from the frame's axes at `time` to those at time + h, in
+    place."""
     if is_a(frame, InertialFrame):
         return lambda frame, state, time, h: None
 

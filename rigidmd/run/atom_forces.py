@@ -1,9 +1,11 @@
-"""Runs of molecules as `ase.Atoms`; forces on atoms, in two forms with the same totals on each molecule.
+"""Runs of molecules as `ase.Atoms`; forces on atoms, in two forms with the same totals on each
+molecule.
 
-`gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's force and torque, minus
-the gradient of the energy as a function of atoms to which rigid molecules are fitted; the guide `ase` has the formula.
-`site_forces`: each atom has the forces on its site. Forces on massless sites are distributed over the atoms. Forces
-inside molecules are included; constraints have to balance them.
+`gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's
+force and torque, minus the gradient of the energy as a function of atoms to which rigid molecules
+are fitted; the guide `ase` has the formula. `site_forces`: each atom has the forces on its site.
+Forces on massless sites are distributed over the atoms. Forces inside molecules are included;
+constraints have to balance them.
 """
 
 import contextlib
@@ -36,16 +38,20 @@ if TYPE_CHECKING:
 
 #: Times of a run that differ by less than this fraction are equal.
 SAME_TIME = 1e-9
-#: Distance of a massless site from a linear combination of the atoms that is rounding, as a fraction of the radius.
+#: Distance of a massless site from a linear combination of the atoms that is rounding, as a
+#: fraction of the radius.
 COMBINATION_TOLERANCE = 1e-9
-#: Smaller moments of inertia, as fractions of the largest, are 0, as one moment of linear molecules is.
+#: Smaller moments of inertia, as fractions of the largest, are 0, as one moment of linear molecules
+#: is.
 MIN_MOMENT = 1e-9
 
 #: `gradient_forces` or `site_forces`.
 Form = Literal["gradient", "sites"]
 
 
-def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "ase.Atoms | list[ase.Atoms]":
+def atoms_of_results(
+    results: "Results", frame: int | slice | str | None
+) -> "ase.Atoms | list[ase.Atoms]":
     """See `Results.atoms`."""
     from ase.calculators.singlepoint import SinglePointCalculator
 
@@ -56,7 +62,9 @@ def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "as
     def with_logged_energy(atoms: "ase.Atoms", time: float) -> "ase.Atoms":
         """Atoms with the energy of the log, if it has a line at their time."""
         if len(same := np.flatnonzero(_same(results["time"], time))):
-            energy = results["potential"][same[-1]] * KJ_PER_MOL / EV  # after a minimisation that begins then
+            energy = (
+                results["potential"][same[-1]] * KJ_PER_MOL / EV
+            )  # after a minimisation that begins then
             atoms.calc = SinglePointCalculator(atoms, energy=float(energy))
         return atoms
 
@@ -73,7 +81,9 @@ def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "as
     if frame is None:
         return final()
     if not frames:
-        raise ValueError("this run has no frames (output.trajectory = false); atoms() is the final state")
+        raise ValueError(
+            "this run has no frames (output.trajectory = false); atoms() is the final state"
+        )
     indices, sites = _frame_indices(frame, len(frames)), _sites_of_frames(results)
     found, last = [], results._state
     for k in indices:
@@ -86,7 +96,8 @@ def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "as
 
 
 def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
-    """Indices of frames: a range for several, a list of one for an index. Raises IndexError, ValueError."""
+    """Indices of frames: a range for several, a list of one for an index. Raises IndexError,
+    ValueError."""
     from ase.utils import string2index
 
     wanted: Any = frame
@@ -96,17 +107,23 @@ def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
     if isinstance(wanted, slice) and wanted.step != 0:
         return range(count)[wanted]
     if not isinstance(wanted, int | np.integer):
-        raise ValueError(f"frame is {frame!r}, must be a number, a slice or a text like '-1' or '::10'")
+        raise ValueError(
+            f"frame is {frame!r}, must be a number, a slice or a text like '-1' or '::10'"
+        )
     if not -count <= wanted < count:
         raise IndexError(f"frame {wanted} is out of range: this run has {count}")
     return [int(wanted) % count]
 
 
 def _sites_of_frames(results: "Results") -> Callable[[int], tuple[Any, Any, Any]]:
-    """A function of k that gives positions, velocities and cell of frame k, from the files if there are any."""
+    """A function of k that gives positions, velocities and cell of frame k, from the files if there
+    are any."""
     from rigidmd.io.trajectory import read_exactly  # MDAnalysis is slow to import
 
-    exact = next((path for path in results.files if (form := format_of(path)) is not None and form.double), None)
+    exact = next(
+        (path for path in results.files if (form := format_of(path)) is not None and form.double),
+        None,
+    )
     if exact is not None or not results.files:
         frames = results._frames if exact is None else read_exactly(exact)
         return lambda k: frames[k].sites
@@ -126,19 +143,29 @@ def _same(time: Any, other: float) -> Any:
 
 
 def ase_results(
-    system: System, engine: CpuEngine, state: State, form: Form = "gradient", atoms: np.ndarray | None = None
+    system: System,
+    engine: CpuEngine,
+    state: State,
+    form: Form = "gradient",
+    atoms: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """Energy (eV), forces (a, 3) on the sites with mass (eV/Å) and, in a box, stress (6,) (eV/Å³) as ASE has them.
+    """Energy (eV), forces (a, 3) on the sites with mass (eV/Å) and, in a box, stress (6,) (eV/Å³)
+    as ASE has them.
 
-    The stress is from the molecular virial, without the ideal part: the derivative of the energy for a strain that
-    moves centres of mass and rotates nothing, over the volume.
+    The stress is from the molecular virial, without the ideal part: the derivative of the energy
+    for a strain that moves centres of mass and rotates nothing, over the volume.
 
     atoms : positions (a, 3) where they are not those of rigid molecules, Å
     """
     from ase.stress import full_3x3_to_voigt_6_stress
 
     velocity, momentum = np.zeros_like(state.velocity), np.zeros_like(state.angular_momentum_body)
-    seen = observe(system, engine, state._replace(velocity=velocity, angular_momentum_body=momentum), energy_unit=EV)
+    seen = observe(
+        system,
+        engine,
+        state._replace(velocity=velocity, angular_momentum_body=momentum),
+        energy_unit=EV,
+    )
     load, torque = seen.load, np.zeros_like(seen.load.force)
     if len(state.rotation):
         torque = np.einsum("nij,nj->ni", state.rotation, load.torque_body)
@@ -155,28 +182,41 @@ def ase_results(
 def gradient_forces(
     system: System, state: State, force: np.ndarray, torque: np.ndarray, atoms: np.ndarray | None
 ) -> np.ndarray:
-    """Forces (a, 3) on the sites with mass, u Å/ps²: the first form of this file. force, torque (n, 3) : of the
-    molecules, lab frame; atoms : as in `ase_results`"""
+    """Forces (a, 3) on the sites with mass, u Å/ps²: the first form of this file. force, torque (n,
+    3) : of the molecules, lab frame; atoms : as in `ase_results`"""
     atom = system.sites.mass > 0
     of_atom, mass = system.sites.molecule[atom], system.sites.mass[atom, None]
     found = mass * (force / system.model.mass[system.model.species][:, None])[of_atom]
     if len(state.rotation):
         arm, r = _arms(system, state, atoms)
         y = arm[atom]
-        moments = _sum_per_molecule(of_atom, mass[..., None] * y[:, :, None] * r[:, None, :], len(force))
-        moments = 0.5 * (moments + moments.swapaxes(1, 2))  # it is symmetric where the fit is the best
+        moments = _sum_per_molecule(
+            of_atom, mass[..., None] * y[:, :, None] * r[:, None, :], len(force)
+        )
+        moments = 0.5 * (
+            moments + moments.swapaxes(1, 2)
+        )  # it is symmetric where the fit is the best
         tensor = moments.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments
-        turn = np.einsum("nij,nj->ni", np.linalg.pinv(tensor, rcond=MIN_MOMENT, hermitian=True), torque)
+        turn = np.einsum(
+            "nij,nj->ni", np.linalg.pinv(tensor, rcond=MIN_MOMENT, hermitian=True), torque
+        )
         found += mass * np.cross(turn[of_atom], y)
     return found
 
 
 def site_forces(
-    system: System, engine: CpuEngine, state: State, force: np.ndarray, torque: np.ndarray, atoms: np.ndarray | None
+    system: System,
+    engine: CpuEngine,
+    state: State,
+    force: np.ndarray,
+    torque: np.ndarray,
+    atoms: np.ndarray | None,
 ) -> np.ndarray:
-    """Forces (a, 3) on the sites with mass, u Å/ps²: the second form, with total force and torque (n, 3), lab frame.
+    """Forces (a, 3) on the sites with mass, u Å/ps²: the second form, with total force and torque
+    (n, 3), lab frame.
 
-    engine : has just evaluated them at the state. Forces on whole molecules, such as gravity, are in the first form.
+    engine : has just evaluated them at the state. Forces on whole molecules, such as gravity, are
+        in the first form.
     """
     on_sites = np.zeros((system.site_count, 3))
     arm, from_centre = _arms(system, state, atoms)
@@ -187,7 +227,10 @@ def site_forces(
         of_term = np.array(cast(Any, workspace).site_force)
         at = _site_indices(system, sites)
         if name.endswith("reciprocal"):
-            term, position = cast(EwaldSum, system.terms[name]), (state.position[system.sites.molecule] + arm)[at]
+            term, position = (
+                cast(EwaldSum, system.terms[name]),
+                (state.position[system.sites.molecule] + arm)[at],
+            )
             of_term = of_term + forces_inside(term.charge, position, sites.first, term.smooth)
         np.add.at(on_sites, at, of_term)
     atom = system.sites.mass > 0
@@ -200,7 +243,10 @@ def site_forces(
 
 def _arms(system: System, state: State, atoms: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Positions from the centres of mass, lab frame: (s, 3) of the sites, (a, 3) of the atoms."""
-    arm, atom = system.site_positions(state) - state.position[system.sites.molecule], system.sites.mass > 0
+    arm, atom = (
+        system.site_positions(state) - state.position[system.sites.molecule],
+        system.sites.mass > 0,
+    )
     return arm, arm[atom] if atoms is None else atoms - state.position[system.sites.molecule[atom]]
 
 
@@ -218,7 +264,9 @@ def _site_indices(system: System, sites: BodySites | CentralSites) -> np.ndarray
         first = sites.first[kind.index[has_sites]]
         if len(first):
             count = int(sites.first[kind.index[has_sites][0] + 1] - first[0])
-            nearest = cdist(offset[first[0] : first[0] + count], kind.molecule.positions_body).argmin(axis=1)
+            nearest = cdist(
+                offset[first[0] : first[0] + count], kind.molecule.positions_body
+            ).argmin(axis=1)
             found[first[:, None] + np.arange(count)] = kind.sites[has_sites][:, nearest]
     return found
 
@@ -231,20 +279,29 @@ def _massless_forces_on_atoms(system: System, state: State, force: np.ndarray) -
         bare, heavy = np.flatnonzero(m.masses == 0), np.flatnonzero(m.masses > 0)
         if len(bare) == 0:
             continue
-        Q = state.rotation[kind.index] if len(state.rotation) else np.tile(np.eye(3), (len(kind.index), 1, 1))
-        matrices = np.array([_transfer_matrices(m, int(site)) for site in bare])  # (bare, heavy, 3, 3)
+        Q = (
+            state.rotation[kind.index]
+            if len(state.rotation)
+            else np.tile(np.eye(3), (len(kind.index), 1, 1))
+        )
+        matrices = np.array(
+            [_transfer_matrices(m, int(site)) for site in bare]
+        )  # (bare, heavy, 3, 3)
         body = np.einsum("nij,nbi->nbj", Q, force[kind.sites[:, bare]])
         found[kind.sites[:, heavy]] = np.einsum("nij,bhjk,nbk->nhi", Q, matrices, body)
     return found
 
 
 def _transfer_matrices(molecule: Molecule, site: int) -> np.ndarray:
-    """Matrices (heavy, 3, 3), body frame, from the force on a massless site to forces on the atoms with the same total
-    force and torque: by the coefficients of a site that is a linear combination of the atoms, or else the smallest."""
+    """Matrices (heavy, 3, 3), body frame, from the force on a massless site to forces on the atoms
+    with the same total force and torque: by the coefficients of a site that is a linear combination
+    of the atoms, or else the smallest."""
     position, heavy = molecule.positions_body[site], molecule.positions_body[molecule.masses > 0]
     rows = np.vstack([heavy.T, np.ones(len(heavy))])
     weight = np.linalg.lstsq(rows, np.append(position, 1.0), rcond=COMBINATION_TOLERANCE)[0]
-    if np.abs(rows @ weight - np.append(position, 1.0)).max() <= COMBINATION_TOLERANCE * max(molecule.radius, 1.0):
+    if np.abs(rows @ weight - np.append(position, 1.0)).max() <= COMBINATION_TOLERANCE * max(
+        molecule.radius, 1.0
+    ):
         return weight[:, None, None] * np.eye(3)
     totals = np.hstack([np.vstack([np.eye(3), hat(x)]) for x in heavy])
     of_site = np.vstack([np.eye(3), hat(position)])

@@ -58,22 +58,33 @@ class Sampler(Observer):
     @property
     def stacked(self) -> dict[str, np.ndarray]:
         """The arrays of all snapshots, by name."""
-        found = {name: np.array([seen.state[k] for seen in self.snapshots]) for k, name in enumerate(STORED_NAMES)}
+        found = {
+            name: np.array([seen.state[k] for seen in self.snapshots])
+            for k, name in enumerate(STORED_NAMES)
+        }
         return found | {"t": np.array([seen.time for seen in self.snapshots])}
 
     @stacked.setter
     def stacked(self, stacked: dict[str, np.ndarray]) -> None:
         times = stacked.pop("t")
         states = [State(*(stacked[name][k] for name in STORED_NAMES)) for k in range(len(times))]
-        self.snapshots = [Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)]
+        self.snapshots = [
+            Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)
+        ]
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         super().resume(run, kept)
         times = np.array([seen.time for seen in self.snapshots])
-        if not ((np.diff(times) >= 0).all() and (times >= 0).all() and (times <= run.part.state.time[NOW]).all()):
+        if not (
+            (np.diff(times) >= 0).all()
+            and (times >= 0).all()
+            and (times <= run.part.state.time[NOW]).all()
+        ):
             raise ValueError("the times of its samples cannot be of a run")
         for seen in self.snapshots:
-            state_from(dict(zip(STORED_NAMES, seen.state, strict=True)), run.part.state, exact=False)
+            state_from(
+                dict(zip(STORED_NAMES, seen.state, strict=True)), run.part.state, exact=False
+            )
 
     def see(self, moment: Moment) -> None:
         self.snapshots.append(Snapshot(moment.time, moment.state))
@@ -96,13 +107,20 @@ class BodyWatch(Observer):
 
     def __init__(self, run: "Simulation"):
         self._run, self._system, self._limits = run, run.system, run.scene.watch
-        system, every = run.system, max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
-        most = EVALUATIONS_PER_CHECK // getattr(system.method, "force_evaluations", 1)  # half a second of computing
+        system, every = (
+            run.system,
+            max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s)),
+        )
+        most = EVALUATIONS_PER_CHECK // getattr(
+            system.method, "force_evaluations", 1
+        )  # half a second of computing
         self.steps = min(most, SAMPLES_PER_CHECK * every)
         self._start = energies_of(system, system.state)
         weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
         swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
-        self.exchanged = abs(self._start["kinetic"]) + (0.0 if system.translates else 2 * float(swing))
+        self.exchanged = abs(self._start["kinetic"]) + (
+            0.0 if system.translates else 2 * float(swing)
+        )
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         least = self.exchanged
@@ -121,25 +139,33 @@ class BodyWatch(Observer):
         system, limits = self._system, self._limits
         largest = not_none(limits.orthogonality)
         if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
-            message = f"Q is not a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
+            message = (
+                f"Q is not a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
+            )
             return FailedCheck(message, rotation_not_orthogonal=True)
         if system.rotates and limits.turn_rad:
             omega = system.pose(float(state.time[0]), state).angular_velocity_body
             angle = dt * float(np.linalg.norm(omega))
             if angle > limits.turn_rad:
-                message = f"the body rotates by {angle:.3g} rad in a step (watch.turn_rad = {limits.turn_rad:g})"
+                message = (
+                    f"the body rotates by {angle:.3g} rad in a step (watch.turn_rad ="
+                    f" {limits.turn_rad:g})"
+                )
                 return FailedCheck(message, factor=angle / limits.turn_rad)
         if not limits.energy or not is_balanced(system):
             return None
         start, now = self._start, energies_of(system, state)
-        self.exchanged = max(self.exchanged, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
+        self.exchanged = max(
+            self.exchanged, sum(abs(now[key] - start[key]) for key in ("potential", "work"))
+        )
         error = abs(now["energy"] - now["work"] - start["energy"] + start["work"])
         scale = self.exchanged + ROUNDING * abs(now["energy"])
         if error <= limits.energy * scale:
             return None
         return FailedCheck(
-            f"the energy less the work done changed by {error:.3g} J, {error / scale if scale else inf:.3g} of all "
-            f"energy exchanged (watch.energy = {limits.energy:g})"
+            f"the energy less the work done changed by {error:.3g} J,"
+            f" {error / scale if scale else inf:.3g} of all energy exchanged (watch.energy ="
+            f" {limits.energy:g})"
         )
 
     def explain(self, error: SimulationError, stable: float | None) -> str:
@@ -165,10 +191,14 @@ class BodyWatch(Observer):
             if isinstance(system.method, Solver):
                 likely = f"only accuracy keeps Q a rotation under {system.method.name}"
             advice = f"integrator = 'srkn_6', which keeps Q, or {shorter}"
-        elif system.rotates and (least := inertia[inertia > 0].min()) < MIN_INERTIA_FRACTION * inertia.max():
+        elif (
+            system.rotates
+            and (least := inertia[inertia > 0].min()) < MIN_INERTIA_FRACTION * inertia.max()
+        ):
             likely = (
-                f"bad inertia: the smallest moment, {least:.2g} kg m², is {least / inertia.max():.1g} of the largest, "
-                "and the body spins about that axis faster than the step can follow"
+                f"bad inertia: the smallest moment, {least:.2g} kg m², is"
+                f" {least / inertia.max():.1g} of the largest, and the body spins about that axis"
+                " faster than the step can follow"
             )
             advice = f"{shorter}, or a moment of 0"
         else:
@@ -189,7 +219,10 @@ class MotionFiles(Observer):
         write_columns(run.path(MOTION), samples.written)
         results.files.append(run.path(MOTION))
         if self._npz:
-            write_npz(run.path(MOTION_NPZ), {name: samples[name] for name in samples.described if name != MATRIX})
+            write_npz(
+                run.path(MOTION_NPZ),
+                {name: samples[name] for name in samples.described if name != MATRIX},
+            )
             results.files.append(run.path(MOTION_NPZ))
 
     def failed(self, run: "Simulation") -> str:
@@ -218,7 +251,10 @@ class BodyRun(RunPart):
     record: BodyRecord
 
     def __init__(
-        self, simulation: "Simulation", scene: BodyScene, applied: Mapping[str, Callable[[Pose], tuple]] | None
+        self,
+        simulation: "Simulation",
+        scene: BodyScene,
+        applied: Mapping[str, Callable[[Pose], tuple]] | None,
     ):
         super().__init__(simulation)
         self._choice = None
@@ -240,15 +276,19 @@ class BodyRun(RunPart):
 
     def prepare(self) -> None:
         system, run, compiled = self.system, self.scene.run, self.system.engine()
-        compiled.advance(compiled.begin(system.state, system.method), system.method, run.timestep_s, 0)
+        compiled.advance(
+            compiled.begin(system.state, system.method), system.method, run.timestep_s, 0
+        )
         if run.has_scheme and (names := system.velocity_dependent_functions()):
             self.simulation.note(
-                f"{' and '.join(names)}: depends on velocities, so that {run.integrator} is of order 1. For "
-                "friction and resistance use [friction] and [fluid], which keep order 2; otherwise integrator = "
-                "'dop853'"
+                f"{' and '.join(names)}: depends on velocities, so that {run.integrator} is of"
+                " order 1. For friction and resistance use [friction] and [fluid], which keep"
+                " order 2; otherwise integrator = 'dop853'"
             )
         rate, angle = fastest_body_rate(system), stable_angle(system.method)
-        if not self.scene.watch.stable_step or rate == 0 or angle == inf:  # some solvers choose their own steps
+        if (
+            not self.scene.watch.stable_step or rate == 0 or angle == inf
+        ):  # some solvers choose their own steps
             return
         self.record.stable = angle / rate
         for sentence in body_step_warnings(system):
@@ -264,19 +304,26 @@ class BodyRun(RunPart):
         return self._segments[k]
 
     def restore(self, kept: Checkpoint) -> None:
-        arrays, method, k = kept.of("state").arrays, self.system.method, self.record.position.segment
+        arrays, method, k = (
+            kept.of("state").arrays,
+            self.system.method,
+            self.record.position.segment,
+        )
         check_same_scene(self.scene, self.record.scene, {}, int(arrays["step"][NOW]))
         self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
         if k > 0:
             self.engine.change(*self.system.terms_at(float(self.state.time[ORIGIN])))
         self.engine.recall(self.state, kept.of("engine").arrays)
-        self.engine.check(self.state, method, self._segments[k].dt, self.system.state if k == 0 else None)
+        self.engine.check(
+            self.state, method, self._segments[k].dt, self.system.state if k == 0 else None
+        )
 
     def reenter_segment(self, k: int) -> Segment:
         return self._segments[k]
 
     def _equal_step_segments(self) -> list[Segment]:
-        """Segments between the breaks of functions of time, in equal steps no longer than the timestep of the scene."""
+        """Segments between the breaks of functions of time, in equal steps no longer than the
+        timestep of the scene."""
         run = self.scene.run
         segments, steps = [], 0
         for begin, end in pairwise((0.0, *self.system.breaks(), run.steps * run.timestep_s)):
@@ -325,10 +372,14 @@ class BodyRun(RunPart):
         found["stable_timestep_s"] = self.record.stable
         if self.engine.is_stiff:
             self.simulation.note(
-                "the motion is stiff: stability, not accuracy, limits the steps of dop853; integrator = 'radau' takes "
-                "much longer ones"
+                "the motion is stiff: stability, not accuracy, limits the steps of dop853;"
+                " integrator = 'radau' takes much longer ones"
             )
-        found["notes"] = [*([self._choice] if self._choice else []), *found["notes"], *self.record.notes]
+        found["notes"] = [
+            *([self._choice] if self._choice else []),
+            *found["notes"],
+            *self.record.notes,
+        ]
         return found
 
     def explain(self, error: SimulationError) -> str:
@@ -339,12 +390,14 @@ class BodyRun(RunPart):
         system, run = self.system, self.scene.run
         pinned = "" if system.translates else ", pinned"
         return (
-            f"{self.scene.name}: one body ({system.kind}{pinned}), {system.degrees_of_freedom} degrees of freedom; "
-            f"{run.steps} steps of {run.timestep_s:g} s, {run.integrator.replace('_', ' ')}"
+            f"{self.scene.name}: one body ({system.kind}{pinned}), {system.degrees_of_freedom}"
+            f" degrees of freedom; {run.steps} steps of {run.timestep_s:g} s,"
+            f" {run.integrator.replace('_', ' ')}"
         )
 
     def start_energy(self) -> dict:
-        """Energies at the start in J, force in N along the lab's axes, torque in N m along the body's."""
+        """Energies at the start in J, force in N along the lab's axes, torque in N m along the
+        body's."""
         self.reset()
         with interruptible():
             self.prepare()

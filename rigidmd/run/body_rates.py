@@ -16,11 +16,13 @@ from rigidmd.scene.body import EQUAL_MOMENTS
 
 #: Least samples of a motion, and of each period in it.
 LEAST_SAMPLES, SAMPLES_PER_PERIOD = 16, 8
-#: Angle (rad) within which an axis that stays there is along another, and an angle that stays there is constant.
+#: Angle (rad) within which an axis that stays there is along another, and an angle that stays there
+#: is constant.
 SMALL_ANGLE = 1e-6
 #: Change of an angle (rad) between two samples from which on it is not known how far the axis went.
 LARGEST_CHANGE = np.pi / 2
-#: The middle axis of a free body comes as near to the angular momentum as this cosine if the body flips.
+#: The middle axis of a free body comes as near to the angular momentum as this cosine if the body
+#: flips.
 FLIP_COSINE = np.cos(np.radians(30))
 
 
@@ -43,12 +45,22 @@ def body_rates(system: BodySystem, motion: Motion) -> dict[str, Rate]:
     omega_period_s : period of the angular velocity in a free body with three different moments
     flip_interval_s : time between two flips of such a body, half of this period
     """
-    if not system.rotates or len(motion) < LEAST_SAMPLES or not isinstance(system.body.frame, InertialFrame):
+    if (
+        not system.rotates
+        or len(motion) < LEAST_SAMPLES
+        or not isinstance(system.body.frame, InertialFrame)
+    ):
         return {}
-    forces = [term for term in system.terms.values() if isinstance(term, SteadyForce) and term.force.any()]
-    # the direction of all forces, and the sum of force times point of action along it: U = -down . Q moment
+    forces = [
+        term for term in system.terms.values() if isinstance(term, SteadyForce) and term.force.any()
+    ]
+    # the direction of all forces, and the sum of force times point of action along it: U = -down .
+    # Q moment
     down = forces[0].force / np.linalg.norm(forces[0].force) if forces else np.zeros(3)
-    if any(np.linalg.norm(np.cross(term.force, down)) > EQUAL_MOMENTS * np.linalg.norm(term.force) for term in forces):
+    if any(
+        np.linalg.norm(np.cross(term.force, down)) > EQUAL_MOMENTS * np.linalg.norm(term.force)
+        for term in forces
+    ):
         return {}
     moment = sum((term.force @ down * term.point for term in forces), np.zeros(3))
     if moment.any():
@@ -74,14 +86,19 @@ def _has_theory(system: BodySystem) -> bool:
     )
 
 
-def _of_heavy_body(system: BodySystem, motion: Motion, down: np.ndarray, moment: np.ndarray) -> dict[str, Rate]:
+def _of_heavy_body(
+    system: BodySystem, motion: Motion, down: np.ndarray, moment: np.ndarray
+) -> dict[str, Rate]:
     """Rates of a body on which a constant force acts. down (3,) : its direction. moment (3,) :
     force times point of action, principal axes, N m"""
     axis, size = moment / np.linalg.norm(moment), float(np.linalg.norm(moment))
     path = _path_of_axis(motion, system.axes @ axis)
     polar, azimuth = _angles(path, -down)
     rates = {}
-    along, across = axis**2 @ system.inertia, float(np.delete(system.inertia, np.abs(axis).argmax())[0])
+    along, across = (
+        axis**2 @ system.inertia,
+        float(np.delete(system.inertia, np.abs(axis).argmax())[0]),
+    )
     even = across * np.eye(3) + (along - across) * np.outer(axis, axis)
     symmetric = np.abs(even - np.diag(system.inertia)).max() <= EQUAL_MOMENTS * system.inertia.max()
     nutation = precession = None
@@ -91,15 +108,24 @@ def _of_heavy_body(system: BodySystem, motion: Motion, down: np.ndarray, moment:
         across_axis = momentum - spin * axis
         up_body = -down @ motion["Q"][0] @ system.axes
         precession, nutation = heavy_top_motion(
-            across, size, spin, float(up_body @ axis), float(across_axis @ across_axis), float(across_axis @ up_body)
+            across,
+            size,
+            spin,
+            float(up_body @ axis),
+            float(across_axis @ across_axis),
+            float(across_axis @ up_body),
         )
-        rates["spin_rad_s"] = Rate(float((_vectors(motion, "omega_body") @ system.axes @ axis).mean()), None)
+        rates["spin_rad_s"] = Rate(
+            float((_vectors(motion, "omega_body") @ system.axes @ axis).mean()), None
+        )
     if azimuth is None:
         return rates
     rates["precession_rad_s"] = Rate(_slope(motion["time"], azimuth), precession)
     if np.ptp(polar) > SMALL_ANGLE:
         cosine = np.cos(polar)
-        period, rate = _periods(motion["time"], cosine, 0.5 * (cosine.max() + cosine.min()), azimuth)
+        period, rate = _periods(
+            motion["time"], cosine, 0.5 * (cosine.max() + cosine.min()), azimuth
+        )
         rates["nutation_period_s"] = Rate(period, nutation)
         if precession is not None:
             rates["precession_rad_s"] = Rate(rate, precession)
@@ -122,19 +148,26 @@ def _of_free_body(system: BodySystem, motion: Motion) -> dict[str, Rate]:
             rates["precession_about_L_rad_s"] = Rate(measured, size / float(inertia[k - 1]))
         return rates
     omega = _vectors(motion, "omega_body") @ system.axes
-    if system.kind != "asymmetric" or np.ptp(omega, axis=0).max() <= SMALL_ANGLE * np.abs(omega).max():
+    if (
+        system.kind != "asymmetric"
+        or np.ptp(omega, axis=0).max() <= SMALL_ANGLE * np.abs(omega).max()
+    ):
         return {}
     middle = int(np.argsort(inertia)[1])
     time, swings, period = motion["time"], omega[:, middle], free_body_period(inertia, omega[0])
     rates = {"omega_period_s": Rate(_periods(time, swings, 0.0, swings)[0], period)}
     if np.abs(swings).max() * inertia[middle] > FLIP_COSINE * size:
-        rates["flip_interval_s"] = Rate(_periods(time, swings, 0.0, swings, both_ways=True)[0], period / 2)
+        rates["flip_interval_s"] = Rate(
+            _periods(time, swings, 0.0, swings, both_ways=True)[0], period / 2
+        )
     return rates
 
 
 def _vectors(motion: Motion, family: str) -> np.ndarray:
     """A family of three columns as vectors (t, 3)."""
-    return np.stack([motion[f"{family}_{k}"] for k in ("xyz" if family.endswith("lab") else "123")], axis=-1)
+    return np.stack(
+        [motion[f"{family}_{k}"] for k in ("xyz" if family.endswith("lab") else "123")], axis=-1
+    )
 
 
 def _path_of_axis(motion: Motion, axis_body: np.ndarray) -> np.ndarray:
@@ -171,11 +204,15 @@ def _periods(
     counted = passes if both_ways else passes[above[passes + 1]]
     if len(counted) < 2:
         return None, None
-    (begin, before), (end, after) = (_interpolated(int(k), time, values, other[rows]) for k in counted[[0, -1]])
+    (begin, before), (end, after) = (
+        _interpolated(int(k), time, values, other[rows]) for k in counted[[0, -1]]
+    )
     return (end - begin) / (len(counted) - 1), (after - before) / (end - begin)
 
 
-def _interpolated(k: int, time: np.ndarray, values: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+def _interpolated(
+    k: int, time: np.ndarray, values: np.ndarray, other: np.ndarray
+) -> tuple[float, float]:
     """Time between samples k and k + 1 at which values are 0, and the value of the other series
     there, by cubic polynomials through the four samples around."""
     near = slice(first := min(max(k - 1, 0), len(time) - 4), first + 4)

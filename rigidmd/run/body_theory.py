@@ -38,10 +38,21 @@ def heavy_top_motion(
     """
     from scipy.special import ellipk, elliprf, elliprj  # slow to import
 
-    alpha, kappa, w, c = 2 * moment / across, transverse / across**2, vertical / across, momentum / across
+    alpha, kappa, w, c = (
+        2 * moment / across,
+        transverse / across**2,
+        vertical / across,
+        momentum / across,
+    )
     sine = 1 - cosine * cosine
-    cubic = np.array([alpha, 2 * alpha * cosine - kappa - c * c, 2 * (w * c - kappa * cosine) - alpha * sine,
-                      kappa * sine - w * w])  # fmt: skip
+    cubic = np.array(
+        [
+            alpha,
+            2 * alpha * cosine - kappa - c * c,
+            2 * (w * c - kappa * cosine) - alpha * sine,
+            kappa * sine - w * w,
+        ]
+    )
     if not (alpha > 0 and np.isfinite(cubic / alpha).all()):
         return TopMotion(np.nan, np.nan)
     top = np.roots(cubic).real.max()
@@ -74,7 +85,9 @@ def free_body_period(inertia: np.ndarray, omega: np.ndarray) -> float:
     order = np.argsort(inertia)
     (a, b, c), squares = inertia[order], omega[order] ** 2
     # L² - 2 E I_k without cancellation
-    from_low, from_middle, from_high = ((inertia[order] * squares) @ (inertia[order] - moment) for moment in (a, b, c))
+    from_low, from_middle, from_high = (
+        (inertia[order] * squares) @ (inertia[order] - moment) for moment in (a, b, c)
+    )
     if from_middle >= 0:
         rate, complement = (c - b) * from_low, (c - a) * from_middle
     else:

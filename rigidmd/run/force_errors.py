@@ -1,7 +1,6 @@
-"""Errors of the forces of a scene: of Ewald sums, estimated and measured; of single precision between pairs; of
-user-defined forces, which are compared with their energies."""
+"""Errors of the forces of a scene: of Ewald sums, estimated and measured; of single precision
+between pairs; of user-defined forces, which are compared with their energies."""
 
-# isort: skip_file
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import inf
@@ -17,8 +16,13 @@ from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.ewald.errors import (
-    charges_in, filled_fraction, k_cutoff_of_count, k_space_error, pme_error, real_error,
-)  # fmt: skip
+    charges_in,
+    filled_fraction,
+    k_cutoff_of_count,
+    k_space_error,
+    pme_error,
+    real_error,
+)
 from rigidmd.forces.ewald.smooth import InverseR, Smooth
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import compute_site_positions
@@ -38,15 +42,25 @@ MIN_REFERENCE_ERROR = 1e-12  # e²/Å²; float64 has no more digits
 
 
 def coulomb_errors(system: System, state: State, size: float = 1.0) -> dict[str, Any]:
-    """Errors of a system's Ewald sums at a state, of forces on sites and of the energy, compared with a more accurate
-    sum: the entry `accuracy` of `rigidmd energy`, with energies in a unit of `size` u Å²/ps². Raises SceneError if it
-    has no Ewald sums."""
+    """Errors of a system's Ewald sums at a state, of forces on sites and of the energy, compared
+    with a more accurate sum: the entry `accuracy` of `rigidmd energy`, with energies in a unit of
+    `size` u Å²/ps². Raises SceneError if it has no Ewald sums."""
     scene, method = system.scene, system.scene.forces.electrostatics
     if system.force_error is None:
-        problem = f"--accuracy needs Ewald sums; forces.electrostatics is {method!r}, or no site has a charge"
+        problem = (
+            f"--accuracy needs Ewald sums; forces.electrostatics is {method!r}, or no site has a"
+            " charge"
+        )
         raise SceneError(scene.source, [problem])
     accuracy = max(REFERENCE_ERROR * system.force_error / COULOMB, MIN_REFERENCE_ERROR)
-    settings = ("ewald_alpha_per_A", "ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A", "pme_order", "pme_grid")
+    settings = (
+        "ewald_alpha_per_A",
+        "ewald_k_max",
+        "ewald_k2_max",
+        "ewald_k_radius_per_A",
+        "pme_order",
+        "pme_grid",
+    )
     changes = dict.fromkeys(settings) | {"electrostatics": "ewald", "ewald_accuracy": accuracy}
     forces = scene.forces.model_copy(update=changes)
     reference = build(scene.model_copy(update={"forces": forces, "precision": "double"}))
@@ -54,22 +68,35 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> dict[str,
     found, energy = _coulomb(system, state)
     exact, exact_energy = _coulomb(reference, state)
     error = np.linalg.norm((found - exact)[moves], axis=1)
-    measured, force = float(np.sqrt((error**2).mean())), float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean()))
+    measured, force = (
+        float(np.sqrt((error**2).mean())),
+        float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean())),
+    )
     return {
         "reference": next(note for note in reference.notes if note.startswith("ewald")),
-        "rms_force_per_A": force / size, "rms_error_per_A": measured / size, "relative": measured / force,
-        "in_e2_per_A2": measured / COULOMB, "estimated_per_A": system.force_error / size,
-        "largest_error_per_A": float(error.max()) / size, "energy_error": (energy - exact_energy) / size,
-    }  # fmt: skip
+        "rms_force_per_A": force / size,
+        "rms_error_per_A": measured / size,
+        "relative": measured / force,
+        "in_e2_per_A2": measured / COULOMB,
+        "estimated_per_A": system.force_error / size,
+        "largest_error_per_A": float(error.max()) / size,
+        "energy_error": (energy - exact_energy) / size,
+    }
 
 
 def estimated_error(system: System, cell: np.ndarray) -> float:
-    """Estimated rms error of Coulomb forces in another cell (3, 3), u Å/ps², with the Ewald sums of a system."""
+    """Estimated rms error of Coulomb forces in another cell (3, 3), u Å/ps², with the Ewald sums of
+    a system."""
     term, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
     counts = np.bincount(system.model.species, minlength=len(system.species))
-    charges, cutoff = charges_in(system.species, counts), not_none(system.scene.forces.ewald_cutoff_A)
+    charges, cutoff = (
+        charges_in(system.species, counts),
+        not_none(system.scene.forces.ewald_cutoff_A),
+    )
     if isinstance(term, EwaldSum):
-        reciprocal = k_space_error(charges, term.smooth.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume)
+        reciprocal = k_space_error(
+            charges, term.smooth.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume
+        )
     else:
         term = cast("Pme", term)
         reciprocal = pme_error(charges, term.smooth.alpha, cell, term.grid, term.order)
@@ -80,18 +107,23 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
 
 
 def single_precision_errors(system: System, state: State) -> tuple[float, float] | None:
-    """Relative rms errors of forces and torques with `precision = "mixed"`; None for a scene with "double"."""
+    """Relative rms errors of forces and torques with `precision = "mixed"`; None for a scene with
+    "double"."""
     if system.precision == "double" and not system.precision_reason:
         return None
     exact = system.engine_of(system.terms, "double").evaluate(state)[0]
     found = system.engine_of(system.terms, "mixed").evaluate(state)[0]
-    sizes = [(float(np.linalg.norm(a - b)), float(np.linalg.norm(b))) for a, b in zip(found, exact, strict=True)]
+    sizes = [
+        (float(np.linalg.norm(a - b)), float(np.linalg.norm(b)))
+        for a, b in zip(found, exact, strict=True)
+    ]
     force, torque = (error / size if size > 0 else 0.0 for error, size in sizes)
     return force, torque
 
 
 def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
-    """Coulomb forces on charged sites (s, 3) without pairs inside molecules, and the Coulomb energy."""
+    """Coulomb forces on charged sites (s, 3) without pairs inside molecules, and the Coulomb
+    energy."""
     charged = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
     engine = system.engine_of(charged, system.precision)
     _, tallies = engine.evaluate(state)
@@ -102,16 +134,22 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     compute_site_positions(real.sites, state, position)
     law = cast(ScreenedCoulomb, real.potential)
     force = force + forces_inside(law.charge, position, real.sites.first, InverseR(law.alpha))
-    constants = sum(energy for name, energy in system.constants.items() if name.startswith("coulomb"))
+    constants = sum(
+        energy for name, energy in system.constants.items() if name.startswith("coulomb")
+    )
     return force, sum(tally.energy for tally in tallies.values()) + constants
 
 
-def forces_inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, smooth: Smooth) -> np.ndarray:
+def forces_inside(
+    charge: np.ndarray, position: np.ndarray, first: np.ndarray, smooth: Smooth
+) -> np.ndarray:
     """Forces (s, 3) that cancel the forces of the reciprocal part between sites of one molecule."""
     force = np.zeros_like(position)
     count = np.diff(first)
     for gap in range(1, count.max(initial=1)):
-        i = np.concatenate([np.arange(a, a + n - gap) for a, n in zip(first[:-1], count, strict=True) if n > gap])
+        i = np.concatenate(
+            [np.arange(a, a + n - gap) for a, n in zip(first[:-1], count, strict=True) if n > gap]
+        )
         d = position[i] - position[i + gap]
         slope = smooth.force_over_r(np.linalg.norm(d, axis=1))
         pull = (charge[i] * charge[i + gap] * slope)[:, None] * d
@@ -120,8 +158,9 @@ def forces_inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, s
     return force
 
 
-#: Displacements of molecules, in smallest diameters or radians, and strains of the box. A force is right if it agrees
-#: for one of them, as a pair that crosses a cutoff at which the energy jumps spoils a difference.
+#: Displacements of molecules, in smallest diameters or radians, and strains of the box. A force is
+#: right if it agrees for one of them, as a pair that crosses a cutoff at which the energy jumps
+#: spoils a difference.
 STEP_FRACTIONS, STRAINS = (1e-4, 1e-5), (1e-5, 1e-6, 1e-7)
 #: If energies have random errors, the first of these times this factor is used.
 NOISY = 10.0
@@ -131,20 +170,23 @@ TOLERANCE = 1e-4
 ROUNDING = 1e-13
 
 
-#: The fall of the energy along a move, if it is not the given one: by a function of the step, steps, given value, size.
+#: The fall of the energy along a move, if it is not the given one: by a function of the step,
+#: steps, given value, size.
 _Difference = Callable[[Callable[[float], State], Sequence[float], float, float], float | None]
 
 
 def check_forces(system: System, state: State) -> None:
-    """Compare user-defined forces with differences of their energies, for a few molecules and the box. Raises
-    SceneError with the numbers where they differ."""
-    if errors := [error for name in system.user_terms if (error := _error_of_force(system, state, name))]:
+    """Compare user-defined forces with differences of their energies, for a few molecules and the
+    box. Raises SceneError with the numbers where they differ."""
+    if errors := [
+        error for name in system.user_terms if (error := _error_of_force(system, state, name))
+    ]:
         raise SceneError(system.scene.source, errors)
 
 
 def velocity_notes(system: System, state: State) -> list[str]:
-    """A note on each user-defined force that depends on the velocities: with other ones at the same positions it
-    differs, by more than where nothing changes."""
+    """A note on each user-defined force that depends on the velocities: with other ones at the same
+    positions it differs, by more than where nothing changes."""
     rng, other = np.random.default_rng(0), state.copy()
     speed = np.abs(state.velocity).max(initial=0.0) or 1.0
     spin = np.abs(state.angular_momentum_body).max(initial=0.0) or 1.0
@@ -158,12 +200,16 @@ def velocity_notes(system: System, state: State) -> list[str]:
         (load, _), (again, _), (moved, _) = (engine.evaluate(at) for at in (state, state, other))
         noise = [np.abs(a - b).max(initial=0.0) for a, b in zip(again, load, strict=True)]
         change = [np.abs(a - b).max(initial=0.0) for a, b in zip(moved, load, strict=True)]
-        size = [np.abs(a).max(initial=0.0) + np.abs(b).max(initial=0.0) for a, b in zip(moved, load, strict=True)]
+        size = [
+            np.abs(a).max(initial=0.0) + np.abs(b).max(initial=0.0)
+            for a, b in zip(moved, load, strict=True)
+        ]
         if any(c > NOISY * n + ROUNDING * s for c, n, s in zip(change, noise, size, strict=True)):
             found.append(
-                f"{name}: its forces depend on velocities. Integrators take them as forces of positions, with an error "
-                "of order 1 in the step, and such forces have no energy that is conserved. For friction use thermostat "
-                "= 'langevin'; otherwise test with shorter steps"
+                f"{name}: its forces depend on velocities. Integrators take them as forces of"
+                " positions, with an error of order 1 in the step, and such forces have no energy"
+                " that is conserved. For friction use thermostat = 'langevin'; otherwise test with"
+                " shorter steps"
             )
     return found
 
@@ -175,33 +221,51 @@ def _error_of_force(system: System, state: State, name: str) -> str:
     if not np.isfinite(tally.energy):
         return f"{name}: its energy at the start is {tally.energy}"
     noise = ROUNDING * max(abs(tally.energy), np.abs(load.force).sum() * system.smallest_diameter)
-    random = KJ_PER_MOL * getattr(getattr(system.python_forces.get(name), "force", None), "energy_noise", 0.0)
+    random = KJ_PER_MOL * getattr(
+        getattr(system.python_forces.get(name), "force", None), "energy_noise", 0.0
+    )
 
-    def difference(moved: Callable[[float], State], steps: Sequence[float], given: float, size: float) -> float | None:
+    def difference(
+        moved: Callable[[float], State], steps: Sequence[float], given: float, size: float
+    ) -> float | None:
         found = []
         for step in [NOISY * steps[0]] if random else steps:
             ahead, behind = (engine.evaluate(moved(way))[1][name].energy for way in (step, -step))
             found.append((behind - ahead) / (2 * step))
-            if abs(found[-1] - given) <= TOLERANCE * max(size, abs(found[-1])) + (noise + random) / step:
+            if (
+                abs(found[-1] - given)
+                <= TOLERANCE * max(size, abs(found[-1])) + (noise + random) / step
+            ):
                 return None
         return found[0]
 
     wrong = _check_molecules(system, state, load, difference)
     if not wrong and state.volume < inf and name not in system.position_dependent:
-        wrong = _check_virial(state, tally.virial, max(float(np.abs(tally.virial).sum()), noise), difference)
+        wrong = _check_virial(
+            state, tally.virial, max(float(np.abs(tally.virial).sum()), noise), difference
+        )
     if wrong and name in system.python_forces and not random:
-        wrong += ". If its energies have random errors, as in single precision, give their size: energy_noise"
+        wrong += (
+            ". If its energies have random errors, as in single precision, give their size:"
+            " energy_noise"
+        )
     return f"{name}: {wrong}" if wrong else ""
 
 
 def _check_molecules(system: System, state: State, load: Load, difference: _Difference) -> str:
-    """The error of a force or torque, on the molecules with the two largest and a median one; empty without one."""
+    """The error of a force or torque, on the molecules with the two largest and a median one; empty
+    without one."""
     rng = np.random.default_rng(0)
     species = [system.species[k] for k in system.model.species]
-    for kind, acting, unit in (("force", load.force, "kJ/mol/Å"), ("torque", load.torque_body, "kJ/mol")):
+    for kind, acting, unit in (
+        ("force", load.force, "kJ/mol/Å"),
+        ("torque", load.torque_body, "kJ/mol"),
+    ):
         size = np.linalg.norm(acting, axis=1)
         ranked = np.argsort(size, kind="stable")
-        for m in dict.fromkeys(ranked[[-1, -min(2, len(ranked)), len(ranked) // 2]].tolist() if len(ranked) else ()):
+        for m in dict.fromkeys(
+            ranked[[-1, -min(2, len(ranked)), len(ranked) // 2]].tolist() if len(ranked) else ()
+        ):
             if kind == "torque" and not species[m].radius:
                 continue
             along = rng.standard_normal(3) + (acting[m] / size[m] if size[m] else 0.0)
@@ -211,14 +275,18 @@ def _check_molecules(system: System, state: State, load: Load, difference: _Diff
                 continue
             along /= np.linalg.norm(along)
             given = float(acting[m] @ along)
-            steps = [fraction * (system.smallest_diameter if kind == "force" else 1.0) for fraction in STEP_FRACTIONS]
+            steps = [
+                fraction * (system.smallest_diameter if kind == "force" else 1.0)
+                for fraction in STEP_FRACTIONS
+            ]
             found = difference(partial(_moved, state, kind, m, along), steps, given, size.max())
             if found is not None:
                 where = "the lab's axes" if kind == "force" else "the axes of its body"
                 return (
-                    f"the {kind} on molecule {m + 1} ({species[m].name}) is not the derivative of the energy: along "
-                    f"({', '.join(f'{x:.3f}' for x in along)}) in {where} it is {given / KJ_PER_MOL:.8g} {unit}, and "
-                    f"the energy falls by {found / KJ_PER_MOL:.8g} {unit}"
+                    f"the {kind} on molecule {m + 1} ({species[m].name}) is not the derivative of"
+                    f" the energy: along ({', '.join(f'{x:.3f}' for x in along)}) in {where} it is"
+                    f" {given / KJ_PER_MOL:.8g} {unit}, and the energy falls by"
+                    f" {found / KJ_PER_MOL:.8g} {unit}"
                 )
     return ""
 
@@ -248,9 +316,10 @@ def _check_virial(state: State, virial: np.ndarray, size: float, difference: _Di
         found = difference(strained, STRAINS, given, size)
         if found is not None:
             return (
-                f"the component {'xyz'[j]}{'xyz'[i]} of its molecular virial is {given / KJ_PER_MOL:.8g} kJ/mol, and "
-                f"when box and centres of mass are strained the energy falls by {found / KJ_PER_MOL:.8g} kJ/mol: "
-                f"{'correct it' if virial.any() else 'add it'}, or, if the energy depends on positions in the lab, set "
-                "tied_to_places = True in its class"
+                f"the component {'xyz'[j]}{'xyz'[i]} of its molecular virial is"
+                f" {given / KJ_PER_MOL:.8g} kJ/mol, and when box and centres of mass are strained"
+                f" the energy falls by {found / KJ_PER_MOL:.8g} kJ/mol:"
+                f" {'correct it' if virial.any() else 'add it'}, or, if the energy depends on"
+                " positions in the lab, set tied_to_places = True in its class"
             )
     return ""

@@ -1,6 +1,6 @@
-"""The loop of a run: it begins or resumes, jumps from one observation to the next, and ends with all files."""
+"""The loop of a run: it begins or resumes, jumps from one observation to the next, and ends with
+all files."""
 
-# isort: skip_file
 import contextlib
 import os
 import signal
@@ -30,8 +30,13 @@ from rigidmd.run import resume
 from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import (
-    SEGMENT_SECONDS, CheckpointSchedule, ObservationSchedule, interruptible, signal_handler, stop_signals,
-)  # fmt: skip
+    SEGMENT_SECONDS,
+    CheckpointSchedule,
+    ObservationSchedule,
+    interruptible,
+    signal_handler,
+    stop_signals,
+)
 
 if TYPE_CHECKING:
     from rigidmd.run.simulation import Simulation
@@ -40,8 +45,11 @@ if TYPE_CHECKING:
 USER, RECORD = "user-", "run"
 
 
-def _observers_by_name(default: Sequence[Observer], user: Sequence[Observer]) -> dict[str, Observer]:
-    """Observers by the names under which a checkpoint has their data: class, and number in its class."""
+def _observers_by_name(
+    default: Sequence[Observer], user: Sequence[Observer]
+) -> dict[str, Observer]:
+    """Observers by the names under which a checkpoint has their data: class, and number in its
+    class."""
     found: dict[str, Observer] = {}
     for start, observers in (("", default), (USER, user)):
         count: Counter[str] = Counter()
@@ -60,10 +68,14 @@ class RunLoop:
     results : of the run, after its end
     """
 
-    def __init__(self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None):
+    def __init__(
+        self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None
+    ):
         self._simulation, self._folder, self._part = simulation, simulation.folder, simulation.part
         self._force, self._resumes = force, resumes
-        self.checkpoints = CheckpointSchedule(simulation.folder, simulation.scene.output.checkpoint_minutes, deadline)
+        self.checkpoints = CheckpointSchedule(
+            simulation.folder, simulation.scene.output.checkpoint_minutes, deadline
+        )
         self.process = os.getpid()
         self.interrupted, self.out_of_time, self.advanced = False, False, 0
         self.signal: int | None = None
@@ -73,7 +85,10 @@ class RunLoop:
         self._failed_before: list[Observer] = []
         self._bar, self._progress = progress_of(0.0, "", False), False
         self._until = 0.0  # the step at which the run pauses
-        self._wall, self._since = 0.0, clock.perf_counter()  # seconds before, and the time since which it runs
+        self._wall, self._since = (
+            0.0,
+            clock.perf_counter(),
+        )  # seconds before, and the time since which it runs
         self._observers: dict[str, Observer] = {}
         self._course = self._run()
 
@@ -98,14 +113,18 @@ class RunLoop:
         self._progress = progress
         with contextlib.ExitStack() as stack:
             if hasattr(signal, "SIGUSR1"):
-                stack.enter_context(signal_handler(self._simulation.ask_for_checkpoint, signal.SIGUSR1))
+                stack.enter_context(
+                    signal_handler(self._simulation.ask_for_checkpoint, signal.SIGUSR1)
+                )
             if getgeneratorstate(self._course) == GEN_CREATED:
                 next(self._course)
             part, whole = self._part, sum(self._part.durations())
             before = int(part.state.step[NOW])
             self._until = before + steps
             stack.enter_context(signal_handler(self._stop_by_signal, *stop_signals()))
-            self._bar = progress_of(whole, part.time_unit, progress if whole > 0 else False, self._simulation.spot)
+            self._bar = progress_of(
+                whole, part.time_unit, progress if whole > 0 else False, self._simulation.spot
+            )
             stack.enter_context(self._bar).skip(float(part.state.time[NOW]))
             self._since = clock.perf_counter()
             next(self._course, None)
@@ -131,7 +150,9 @@ class RunLoop:
             if kept is not None:
                 with resume.as_checkpoint_errors(self._folder):
                     kind = part.record_type
-                    part.record = kind(**resume.restored(kept.of(RECORD), kind.types(), part.scene.rows))
+                    part.record = kind(
+                        **resume.restored(kept.of(RECORD), kind.types(), part.scene.rows)
+                    )
                     part.restore(kept)
                     part.check_position()
                     changed = resume.describe_changes(kept.values["with"])
@@ -144,7 +165,10 @@ class RunLoop:
                 run_folder.check_names(self._folder, names)
             elif self._folder is not None:
                 source = simulation.scene.path(Path(simulation.scene.source).name)
-                inputs = [*simulation.scene.inputs.values(), *([source] if source.is_file() else [])]
+                inputs = [
+                    *simulation.scene.inputs.values(),
+                    *([source] if source.is_file() else []),
+                ]
                 run_folder.check_folder(self._folder, self._force, inputs, names)
             if kept is None:
                 for warning in part.system.warnings:
@@ -186,7 +210,9 @@ class RunLoop:
             except (SimulationError, OutputError) as error:
                 self._check_process()
                 raise self._failed(error) from None
-            except Exception as error:  # of a user force, or of an observer, after which all files are complete
+            except (
+                Exception
+            ) as error:  # of a user force, or of an observer, after which all files are complete
                 if error is not self._error and os.getpid() == self.process:
                     for observer in observers:
                         with contextlib.suppress(Exception):  # the first error is the one to report
@@ -197,26 +223,39 @@ class RunLoop:
         self._simulation.announce(f"compiling ({describe_cache()})")
 
     def _if_not_forked(self, function: Callable[[], object]) -> None:
-        """Call a function unless this is a forked process: files and locks belong to the process that was forked."""
+        """Call a function unless this is a forked process: files and locks belong to the process
+        that was forked."""
         if os.getpid() == self.process:
             function()
 
-    def _close(self, observer: Observer, kind: Any, error: BaseException | None, trace: Any) -> None:
+    def _close(
+        self, observer: Observer, kind: Any, error: BaseException | None, trace: Any
+    ) -> None:
         """Close the files of an observer; of two errors the earlier one is reported."""
         with contextlib.suppress(*([] if error is None else [OutputError])):
             self._if_not_forked(observer.close)
 
     def _check_process(self) -> None:
         if os.getpid() != self.process:
-            raise OutputError("a forked process cannot continue the run: the files belong to the process that began it")
+            raise OutputError(
+                "a forked process cannot continue the run: the files belong to the process that"
+                " began it"
+            )
 
     def _finish(self, preparing: float, wall: float) -> None:
-        """Make the results, with all files written; times as in `RunPart.summary`. Raises OutputError."""
+        """Make the results, with all files written; times as in `RunPart.summary`. Raises
+        OutputError."""
         simulation, part, notes = self._simulation, self._part, self._part.record.notes
         self._note_lost_files()
         results = Results(part.system, part.state, part.samples())
-        results.interrupted, results.signal, results.out_of_time = self.interrupted, self.signal, self.out_of_time
-        made_by = resume.provenance(simulation.scene, part.threads, part.record.inputs, part.engine_version)
+        results.interrupted, results.signal, results.out_of_time = (
+            self.interrupted,
+            self.signal,
+            self.out_of_time,
+        )
+        made_by = resume.provenance(
+            simulation.scene, part.threads, part.record.inputs, part.engine_version
+        )
         results.summary = made_by | part.summary(results.samples, preparing, wall)
         for draws in (False, True):  # results first, pictures after
             noted = len(notes)
@@ -228,13 +267,16 @@ class RunLoop:
             results.summary["notes"] += notes[noted:]
             if self._folder is not None:
                 results.summary["files"] = [str(path) for path in files]
-                write_json(files[-1], results.summary, indent=2, ensure_ascii=False, allow_nan=False)
+                write_json(
+                    files[-1], results.summary, indent=2, ensure_ascii=False, allow_nan=False
+                )
         results.files, self.results = files, results
         if self._error is not None:
             raise self._error
 
     def _note_lost_files(self) -> None:
-        """Note which files another program removed, replaced or changed; the run has no more to write to them."""
+        """Note which files another program removed, replaced or changed; the run has no more to
+        write to them."""
         for observer in self._observers.values():
             if isinstance(observer, GrowingFile):
                 try:
@@ -244,7 +286,8 @@ class RunLoop:
 
     @np.errstate(over="ignore", invalid="ignore")
     def _failed(self, error: SimulationError | OutputError) -> RigidMDError:
-        """The error with its step, time and explanation, and how to resume a run that could not write."""
+        """The error with its step, time and explanation, and how to resume a run that could not
+        write."""
         part = self._part
         time, origin = part.state.time
         step = int(part.state.step[ORIGIN]) + round((time - origin) / part.segment.dt)
@@ -252,9 +295,13 @@ class RunLoop:
         if isinstance(error, OutputError):
             if isinstance(error, LostFileError):
                 with contextlib.suppress(OutputError):
-                    return OutputError(f"{where}{error}; the run cannot continue it{self._last_words()}")
+                    return OutputError(
+                        f"{where}{error}; the run cannot continue it{self._last_words()}"
+                    )
             advice = ""
-            if self._folder is not None and any((self._folder / name).is_file() for name in (CHECKPOINT, PREVIOUS)):
+            if self._folder is not None and any(
+                (self._folder / name).is_file() for name in (CHECKPOINT, PREVIOUS)
+            ):
                 resume = resume_command(self._folder)
                 advice = f". Free disk space, then {resume} continues from the last checkpoint"
             return OutputError(f"{where}{error}{advice}")
@@ -265,7 +312,8 @@ class RunLoop:
         return "".join(observer.failed(self._simulation) for observer in self._observers.values())
 
     def _read_checkpoint(self, folder: Path) -> tuple[Checkpoint | None, bool]:
-        """The checkpoint to resume from, None if the run has to begin, and whether the files of the folder stay."""
+        """The checkpoint to resume from, None if the run has to begin, and whether the files of the
+        folder stay."""
         if run_folder.is_empty(folder) or run_folder.never_began(folder):
             self._simulation.announce(f"{folder} holds no run yet: beginning it")
             return None, not run_folder.is_empty(folder)
@@ -277,9 +325,14 @@ class RunLoop:
         return kept, True
 
     def _checkpoint(self) -> None:
-        """Write a checkpoint, if the run has checkpoints and its engine can give its memory as arrays."""
+        """Write a checkpoint, if the run has checkpoints and its engine can give its memory as
+        arrays."""
         part, record = self._part, self._part.record
-        if not self.checkpoints.writes or self._error is not None or (memory := part.engine.memory()) is None:
+        if (
+            not self.checkpoints.writes
+            or self._error is not None
+            or (memory := part.engine.memory()) is None
+        ):
             return  # after an error a run that resumes calls the observer again
         try:
             parts = {name: observer.memory() for name, observer in self._observers.items()}
@@ -288,23 +341,36 @@ class RunLoop:
                 return  # the run ends with its other files, and notes this
             raise
         parts |= {
-            RECORD: resume.stored(record, record.types()), "engine": Checkpoint({}, memory),
+            RECORD: resume.stored(record, record.types()),
+            "engine": Checkpoint({}, memory),
             "state": Checkpoint({}, dict(zip(STORED_NAMES, part.state, strict=True))),
-        }  # fmt: skip
-        arrays = {f"{owner}/{name}": array for owner, kept in parts.items() for name, array in kept.arrays.items()}
-        data = {"with": resume.computed_with(), "of": {owner: kept.values for owner, kept in parts.items()}}
+        }
+        arrays = {
+            f"{owner}/{name}": array
+            for owner, kept in parts.items()
+            for name, array in kept.arrays.items()
+        }
+        data = {
+            "with": resume.computed_with(),
+            "of": {owner: kept.values for owner, kept in parts.items()},
+        }
         position = record.position.segment, int(part.state.step[NOW]), record.position.seconds > 0
         self.checkpoints.write_once(Checkpoint(data, arrays), position)
 
     def _run_segments(self, resumed: bool) -> Generator[None]:
-        """Advance through all segments, or from the position of a checkpoint on; pause at step `_until`."""
+        """Advance through all segments, or from the position of a checkpoint on; pause at step
+        `_until`."""
         part, position, observers = self._part, self._part.record.position, self._observers.values()
         for k in range(position.segment, len(part.durations())):
             if resumed:
                 part.segment = segment = part.reenter_segment(k)
             else:
                 part.segment = segment = part.enter_segment(k)
-                position.segment, position.first, position.seconds = k, int(part.state.step[NOW]), 0.0
+                position.segment, position.first, position.seconds = (
+                    k,
+                    int(part.state.step[NOW]),
+                    0.0,
+                )
                 if k == 0:
                     self._notify(0, [observer.interval is not None for observer in observers])
                     self._checkpoint()
@@ -319,15 +385,22 @@ class RunLoop:
             shown, pace = None, inf
             self._bar.unpause()
             while done < segment.steps and not self.interrupted:
-                to, together = min(schedule.next_observation(done), self._until - position.first), segment.together
+                to, together = (
+                    min(schedule.next_observation(done), self._until - position.first),
+                    segment.together,
+                )
                 if pace > 0:  # the first step alone, as it may be slow
                     to = min(to, done + max(1, int(SEGMENT_SECONDS / pace)))
                 to = done + -int((done - to) // together) * together
                 before, shown = shown, schedule.due(to)
-                with_energies = any(each.reads_energies for each, now in zip(observers, shown, strict=True) if now)
+                with_energies = any(
+                    each.reads_energies for each, now in zip(observers, shown, strict=True) if now
+                )
                 began = clock.perf_counter()
                 try:
-                    part.engine.advance(part.state, segment.method, segment.dt, position.first + to, with_energies)
+                    part.engine.advance(
+                        part.state, segment.method, segment.dt, position.first + to, with_energies
+                    )
                 except Halted:
                     shown = before
                     break
@@ -345,8 +418,13 @@ class RunLoop:
                     yield
             if not (segment.action is not None and self.interrupted):
                 self._checkpoint()
-            if done < segment.steps and shown is not None:  # only a run that stops here calls these observers
-                due = [observer.ends and not seen for observer, seen in zip(observers, shown, strict=True)]
+            if (
+                done < segment.steps and shown is not None
+            ):  # only a run that stops here calls these observers
+                due = [
+                    observer.ends and not seen
+                    for observer, seen in zip(observers, shown, strict=True)
+                ]
                 self._notify(done, due)
             position.time += done * segment.dt
             position.computing.append(position.seconds)
@@ -363,9 +441,12 @@ class RunLoop:
                 self._call_observer(observer, observer.see, moment)
         self._check_process()
 
-    def _call_observer(self, observer: Observer, method: Callable[..., None], *arguments: Any) -> None:
-        """Call a method of an observer, unless the observer has failed before. Its error ends the run, which raises it
-        when all files are complete; an error of a figure becomes a note. `see` may raise the errors of this package."""
+    def _call_observer(
+        self, observer: Observer, method: Callable[..., None], *arguments: Any
+    ) -> None:
+        """Call a method of an observer, unless the observer has failed before. Its error ends the
+        run, which raises it when all files are complete; an error of a figure becomes a note. `see`
+        may raise the errors of this package."""
         if observer in self._failed_before:
             return
         try:
@@ -374,12 +455,19 @@ class RunLoop:
             if isinstance(error, RigidMDError) and method == observer.see:
                 raise
             self._failed_before.append(observer)
-            reason, name = f"{type(error).__name__}: {' '.join(str(error).split())}", type(observer).__name__
+            reason, name = (
+                f"{type(error).__name__}: {' '.join(str(error).split())}",
+                type(observer).__name__,
+            )
             if observer.draws:
-                self._simulation.note(f"{', '.join(observer.files()) or name} cannot be drawn: {reason}")
+                self._simulation.note(
+                    f"{', '.join(observer.files()) or name} cannot be drawn: {reason}"
+                )
                 return
             part = self._part
-            self._simulation.note(f"{name} failed at {part.state.time[NOW]:g} {part.time_unit}: {reason}")
+            self._simulation.note(
+                f"{name} failed at {part.state.time[NOW]:g} {part.time_unit}: {reason}"
+            )
             self.interrupted, self._error = True, self._error or error
 
     def must_end(self) -> bool:

@@ -11,16 +11,19 @@ from rigidmd.scene.validation import not_none
 
 
 def scale_to_mean_box(system: System, state: State, samples: Samples, k: int) -> None:
-    """Scale a state before stage k, in place, if this stage continues in the mean box of the stage before.
+    """Scale a state before stage k, in place, if this stage continues in the mean box of the stage
+    before.
 
-    The box has the ratios of the mean edges and the mean angles of the equilibrated part of that stage, and its mean
-    volume. Centres of mass are scaled with it. Molecules do not rotate, and momenta do not change. The change of the
-    energy is added to the energy ledger as work.
+    The box has the ratios of the mean edges and the mean angles of the equilibrated part of that
+    stage, and its mean volume. Centres of mass are scaled with it. Molecules do not rotate, and
+    momenta do not change. The change of the energy is added to the energy ledger as work.
     """
     if not k or not system.scene.stages[k].volume:
         return
     steady = equilibrated(samples.of_stage(k - 1), system.scene.stages[k - 1])
-    mean = not_none(cell_of([float(steady[name].mean()) for name in ("a", "b", "c", "alpha", "beta", "gamma")]))
+    mean = not_none(
+        cell_of([float(steady[name].mean()) for name in ("a", "b", "c", "alpha", "beta", "gamma")])
+    )
     cell = np.where(state.cell == 0, 0.0, mean)  # right angles stay exact
     cell *= np.cbrt(1000 * steady["volume"].mean() / np.prod(np.diag(cell)))
     engine = system.engine()

@@ -31,7 +31,13 @@ from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
 from rigidmd.run.force_errors import check_forces, coulomb_errors, velocity_notes
 from rigidmd.run.mean_box import scale_to_mean_box
-from rigidmd.run.minimise import Enthalpy, OverlapRemoval, minimise, precision_of_minimisation, remove_overlaps
+from rigidmd.run.minimise import (
+    Enthalpy,
+    OverlapRemoval,
+    minimise,
+    precision_of_minimisation,
+    remove_overlaps,
+)
 from rigidmd.run.molecular_observers import FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
@@ -56,9 +62,13 @@ class MolecularRecord(RunRecord):
 
     stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
     removal: OverlapRemoval | None = None
-    choices: dict[Count, str] = field(default_factory=dict)  # of integrator and step, with the reasons
+    choices: dict[Count, str] = field(
+        default_factory=dict
+    )  # of integrator and step, with the reasons
     stable: dict[Count, PositiveFloat] = field(default_factory=dict)  # the longest stable step, ps
-    moves: dict[Count, tuple[Count, Count]] = field(default_factory=dict)  # of the box, tried and accepted
+    moves: dict[Count, tuple[Count, Count]] = field(
+        default_factory=dict
+    )  # of the box, tried and accepted
     minima: dict[Count, Minimum] = field(default_factory=dict)
 
 
@@ -77,9 +87,13 @@ class MolecularRun(RunPart):
     engine: Engine
     record: MolecularRecord
 
-    def __init__(self, simulation: "Simulation", scene: MolecularScene, forces: Any, thermostat: Any):
+    def __init__(
+        self, simulation: "Simulation", scene: MolecularScene, forces: Any, thermostat: Any
+    ):
         super().__init__(simulation)
-        given = forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
+        given = (
+            forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
+        )
         self._start = build(scene.with_user_code(() if forces is None else given, thermostat))
         self.reset()
 
@@ -89,28 +103,34 @@ class MolecularRun(RunPart):
 
     def start_from(self, state: State) -> None:
         if not isinstance(state, State):
-            raise TypeError(f"start_from needs a State, such as results.state, not {type(state).__name__}")
+            raise TypeError(
+                f"start_from needs a State, such as results.state, not {type(state).__name__}"
+            )
         if faults := self._start.state_errors(state):
             raise StructureError("start_from", faults)
         self._start = replace(self._start, state=state_of(*state[:5]), from_lattice=False)
         self.reset()
 
     def take_threads(self, count: int) -> None:
-        self._start = replace(self._start, scene=self._start.scene.model_copy(update={"threads": count}))
+        self._start = replace(
+            self._start, scene=self._start.scene.model_copy(update={"threads": count})
+        )
         self.reset()
 
     def atoms(self) -> "ase.Atoms":
         return atoms_of_system(self.system, self.state, self.scene.output.positions == "wrapped")
 
     def start(self) -> OverlapRemoval | None:
-        """Go to the state before the first step, from which a run starts. Returns the removal of overlaps."""
+        """Go to the state before the first step, from which a run starts. Returns the removal of
+        overlaps."""
         self.reset()
         with interruptible():
             self._remove_overlaps()
         return self.record.removal
 
     def settle(self) -> State:
-        """Go to the state after removal of overlaps and the minimisations that come first, from which time passes."""
+        """Go to the state after removal of overlaps and the minimisations that come first, from
+        which time passes."""
         self.start()
         for k, stage in enumerate(self.scene.stages):
             if not stage.is_minimisation:
@@ -129,7 +149,9 @@ class MolecularRun(RunPart):
     def _set_stages(self, stages: Iterable[Stage]) -> None:
         """Set the stages of the run, some of which may have been chosen by pilot runs."""
         self.record.stages = tuple(stages)
-        self.system = replace(self._start, scene=self._start.scene.model_copy(update={"stages": self.record.stages}))
+        self.system = replace(
+            self._start, scene=self._start.scene.model_copy(update={"stages": self.record.stages})
+        )
         # the integrator of a stage with its thermostat and barostat, made once
         self._integrator = cache(partial(integrator_of_stage, self.system))
 
@@ -138,16 +160,25 @@ class MolecularRun(RunPart):
         if self.scene.engine.is_external:
             from rigidmd.engines.external import compare_at, describe_comparison, external_engine
 
-            other = external_engine(self.system)  # first: the error of a missing program comes before compilation
+            other = external_engine(
+                self.system
+            )  # first: the error of a missing program comes before compilation
             try:
                 self._remove_overlaps()
-                lines = compare_at(self.system, self.state, self.system.engine_of(self.system.terms, "double"), other)
+                lines = compare_at(
+                    self.system,
+                    self.state,
+                    self.system.engine_of(self.system.terms, "double"),
+                    other,
+                )
             finally:
                 other.close()
             if not all(line.agrees for line in lines):
                 title = self.scene.engine.name
                 table = describe_comparison(lines, title)
-                raise EngineError(f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{table}")
+                raise EngineError(
+                    f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{table}"
+                )
         else:
             self._remove_overlaps()
             with user_errors_explained(self.system):
@@ -170,13 +201,18 @@ class MolecularRun(RunPart):
         with user_errors_explained(system):
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
-            raise SceneError(scene.source, ["the start has no finite energy: sites of different molecules coincide"])
+            raise SceneError(
+                scene.source,
+                ["the start has no finite energy: sites of different molecules coincide"],
+            )
         # At 0 K the scale is the deepest well between two sites.
         deepest = max((m.epsilon.max() for m in system.species), default=0.0)
         thermal = BOLTZMANN * (scene.start.temperature_K or 0.0) or deepest
         if system.from_lattice and not first.is_minimisation and thermal > 0:
             dt = first.timestep_fs * FEMTOSECOND
-            removal = self.record.removal = remove_overlaps(system, self.engine, self.state, thermal, dt)
+            removal = self.record.removal = remove_overlaps(
+                system, self.engine, self.state, thermal, dt
+            )
             if removal.excess > 1:
                 raise SceneError(scene.source, [self._why_too_strong(removal, thermal, dt)])
         check_forces(system, self.state)
@@ -190,14 +226,15 @@ class MolecularRun(RunPart):
             load, _ = system.engine_of(fields, "double").evaluate(self.state)
             if (excess := float(checks.kicks(system.model, load, thermal, dt).max())) > 1:
                 return (
-                    f"timestep_fs of the first stage is too long for {' and '.join(fields)}: the first time step would "
-                    f"change a momentum by {excess:.2g} times its thermal size. Shorten it, or weaken the field"
+                    f"timestep_fs of the first stage is too long for {' and '.join(fields)}: the"
+                    f" first time step would change a momentum by {excess:.2g} times its thermal"
+                    " size. Shorten it, or weaken the field"
                 )
         return (
-            f"the molecules cannot be packed at {system.density:.3g} g/cm³ without overlap: after "
-            f"{removal.steps} steps of overlap removal the first time step would change a momentum by "
-            f"{removal.excess:.2g} times its thermal size. Lower the density, enlarge the box or shorten "
-            "timestep_fs of the first stage"
+            f"the molecules cannot be packed at {system.density:.3g} g/cm³ without overlap: after"
+            f" {removal.steps} steps of overlap removal the first time step would change a momentum"
+            f" by {removal.excess:.2g} times its thermal size. Lower the density, enlarge the box"
+            " or shorten timestep_fs of the first stage"
         )
 
     def _compile_stage(self, k: int) -> None:
@@ -235,20 +272,28 @@ class MolecularRun(RunPart):
             for now, then, chosen in zip(self.scene.stages, before, record.stages, strict=False)
         ]
         step = int(kept.arrays["state/step"][NOW])
-        check_same_scene(self.scene, record.scene | {"stages": decided or before}, record.inputs, step)
+        check_same_scene(
+            self.scene, record.scene | {"stages": decided or before}, record.inputs, step
+        )
         for stage, (chosen, then) in enumerate(zip(record.stages, before, strict=True)):
             if stage not in record.choices and plain(chosen) != then:
                 raise ValueError(f"its stages.{stage} differs from its scene")
-        if any(stage > k for stage in (*record.choices, *record.stable, *record.moves, *record.minima)):
+        if any(
+            stage > k for stage in (*record.choices, *record.stable, *record.moves, *record.minima)
+        ):
             raise ValueError(f"it has data of later stages than {k}")
-        last = record.stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})
+        last = record.stages[-1].model_copy(
+            update={"duration_ps": self.scene.stages[-1].duration_ps}
+        )
         self._set_stages((*record.stages[:-1], last))
         method = self.reenter_segment(k).method
         self.engine = self._engine_of(k)
         start = self.system.state
         like = start._replace(extra_variables=self.engine.variables(start, method))
         self.state = state_from(kept.of("state").arrays, like)
-        moves = any(before.has_barostat or before.is_minimisation for before in record.stages[: k + 1])
+        moves = any(
+            before.has_barostat or before.is_minimisation for before in record.stages[: k + 1]
+        )
         if not moves and not np.array_equal(self.state.cell, start.cell):
             raise ValueError("its box differs from the box of the scene")
         self.engine.recall(self.state, kept.of("engine").arrays)
@@ -259,7 +304,9 @@ class MolecularRun(RunPart):
         for force in self.system.python_forces.values():
             force.may_diverge = stage.is_hybrid
         if stage.is_minimisation:
-            return Segment(stage.scheme, step, 0, action=None if k in self.record.minima else self._minimise)
+            return Segment(
+                stage.scheme, step, 0, action=None if k in self.record.minima else self._minimise
+            )
         return Segment(self._integrator(k), step, stage.steps, together=stage.steps_together)
 
     def durations(self) -> list[float]:
@@ -277,8 +324,9 @@ class MolecularRun(RunPart):
             self._compile_stage(k)
         if moves:
             self._estimate(k)
-        # Pilot runs change the neighbour lists. With new lists at every stage the resolved scene repeats the run to the
-        # bit. The lists of the start, if nothing has moved since, are what new ones would be.
+        # Pilot runs change the neighbour lists. With new lists at every stage the resolved scene
+        # repeats the run to the bit. The lists of the start, if nothing has moved since, are what
+        # new ones would be.
         as_at_start = k == 0 and moves and not was_auto and not self.scene.engine.is_external
         if not as_at_start or (record.removal and record.removal.steps):
             self.engine = self._engine_of(k)
@@ -288,14 +336,18 @@ class MolecularRun(RunPart):
         before = [other for other in range(k) if not self.scene.stages[other].is_minimisation]
         keeps = self.system.keeps_momentum_in
         if moves and before and keeps(k) and not keeps(before[-1]):
-            self.state.energy_ledger[REMOVED] -= remove_momentum(self.system.model, self.state.velocity)
+            self.state.energy_ledger[REMOVED] -= remove_momentum(
+                self.system.model, self.state.velocity
+            )
         return segment
 
     def _minimise(self, progress: bool | None) -> None:
         """Run the present stage, a minimisation, with a warning if it does not converge."""
         k = self.record.position.segment
         stage = self.scene.stages[k]
-        with progress_of(stage.most_iterations, "iterations", progress, self.simulation.spot) as bar:
+        with progress_of(
+            stage.most_iterations, "iterations", progress, self.simulation.spot
+        ) as bar:
 
             def advance(count: float) -> None:
                 if bar.n:
@@ -311,26 +363,31 @@ class MolecularRun(RunPart):
             self.simulation.note(f"stages.{k}: {describe_minimum(found, stage)}")
 
     def _estimate(self, k: int) -> None:
-        """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is longer."""
+        """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is
+        longer."""
         stage = self.scene.stages[k]
         evaluations = stage.steps * stage.scheme.force_evaluations
         is_cheap = len(self.system.model.species) <= SMALL_SYSTEM or evaluations >= 100 * DIRECTIONS
         if not self.scene.watch.stable_step or not is_cheap:
             return
-        found = stiffest_mode(self.system, self.state, self.engine if self.engine.is_repeatable else None)
+        found = stiffest_mode(
+            self.system, self.state, self.engine if self.engine.is_repeatable else None
+        )
         if found is None:
             return
         stable = self.record.stable[k] = stable_angle(stage.scheme) / found.rate
         if stage.timestep_fs * FEMTOSECOND > stable:
             self.simulation.note(
-                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable: the stiffest motion "
-                f"at its start, of {checks.molecule_label(self.system, found.molecule)}, has a period of "
-                f"{2 * np.pi / found.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows up to "
-                f"{stable / FEMTOSECOND:.3g} fs"
+                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable:"
+                " the stiffest motion at its start, of"
+                f" {checks.molecule_label(self.system, found.molecule)}, has a period of"
+                f" {2 * np.pi / found.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows"
+                f" up to {stable / FEMTOSECOND:.3g} fs"
             )
 
     def _choose(self, k: int) -> None:
-        """Choose integrator and step of a stage by pilot runs from the present state, and set them in the scene."""
+        """Choose integrator and step of a stage by pilot runs from the present state, and set them
+        in the scene."""
         from rigidmd.run.pilot.sampling import choose_for_averages, choose_for_sampling
         from rigidmd.run.pilot.trial_systems import choose_for_molecules
 
@@ -339,7 +396,9 @@ class MolecularRun(RunPart):
         choose = choose_for_averages if stage.bias_kT else choose_for_molecules
         choose = choose_for_sampling if stage.is_hybrid else choose
         decided, reason = choose(self.system, self.state, k)
-        self.record.choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
+        self.record.choices[k] = (
+            f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
+        )
         stages = self.record.stages
         self._set_stages((*stages[:k], decided, *stages[k + 1 :]))
         for sentence in self.scene.rounded_times([k]):
@@ -352,38 +411,59 @@ class MolecularRun(RunPart):
         if stages[k].is_minimisation and k not in self.record.minima:
             return True  # the start
         ended = moment.step == sum(stage.steps for stage in stages[: k + 1])
-        # an interrupted minimisation is repeated by a run that resumes, which also has another frame for it
+        # an interrupted minimisation is repeated by a run that resumes, which also has another
+        # frame for it
         ends_here = stages[k].is_minimisation and self.simulation.is_interrupted
         return ended and not ends_here and k + 1 < len(stages) and stages[k + 1].is_minimisation
 
     def is_finite(self) -> bool:
         state, extent = self.state, self.engine.extent(self.state) or largest_values(self.state)
-        return all(map(isfinite, [*extent[:4], *state.energy_ledger.tolist(), *state.extra_variables.tolist()]))
+        return all(
+            map(
+                isfinite,
+                [*extent[:4], *state.energy_ledger.tolist(), *state.extra_variables.tolist()],
+            )
+        )
 
     def observe(self, moment: Moment) -> Observation:
-        """The observation at a moment. The drift of its stage is counted from the last sample before the stage."""
+        """The observation at a moment. The drift of its stage is counted from the last sample
+        before the stage."""
         stage = self.scene.stages[moment.stage]
-        is_verlet = stage.integrator == "velocity_verlet" and not (stage.is_minimisation or stage.is_hybrid)
+        is_verlet = stage.integrator == "velocity_verlet" and not (
+            stage.is_minimisation or stage.is_hybrid
+        )
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
         trajectories = tuple(nan for name in self.system.more_columns if name in OF_TRAJECTORIES)
         if (sums := self.engine.trajectories) is not None:
             samples = self._sampler.samples
             of_stage = len(samples) > 0 and samples.row(-1).stage == moment.stage
-            ended, accepted, sizes, _, weights = (sums - of_stage * self._sampler.trajectories).tolist()
-            trajectories = (accepted / ended, sizes / ended, weights / ended) if ended else trajectories
+            ended, accepted, sizes, _, weights = (
+                sums - of_stage * self._sampler.trajectories
+            ).tolist()
+            trajectories = (
+                (accepted / ended, sizes / ended, weights / ended) if ended else trajectories
+            )
         return observe(
-            self.system, self.engine, self.state, moment.stage, time=moment.time, moved=True, trajectories=trajectories,
+            self.system,
+            self.engine,
+            self.state,
+            moment.stage,
+            time=moment.time,
+            moved=True,
+            trajectories=trajectories,
             origin=self._sampler.origin(moment.stage) if conserves else nan,
             verlet_step=stage.timestep_fs * FEMTOSECOND if is_verlet else nan,
-        )  # fmt: skip
+        )
 
     def observe_now(self) -> Observation:
         with interruptible(), user_errors_explained(self.system):
             if not self._is_sampled:
                 return observe(self.system, self.engine, self.state)
             now, position = self.state, self.record.position
-            moment = Moment(self.simulation, int(now.step[NOW]), float(now.time[NOW]), position.segment)
+            moment = Moment(
+                self.simulation, int(now.step[NOW]), float(now.time[NOW]), position.segment
+            )
             return self.observe(moment)
 
     def energy_now(self) -> float:
@@ -401,12 +481,25 @@ class MolecularRun(RunPart):
         files: list[Observer] = []
         if output.trajectory:
             velocities, wrapped = bool(output.velocities), output.positions == "wrapped"
-            files = [Frames(output.trajectory_interval_ps, output.topology, output.trajectory, velocities, wrapped)]
+            files = [
+                Frames(
+                    output.trajectory_interval_ps,
+                    output.topology,
+                    output.trajectory,
+                    velocities,
+                    wrapped,
+                )
+            ]
         if output.pressure_tensor_interval_ps:
             files.append(PressureTensor(output.pressure_tensor_interval_ps))
         if self.simulation.folder is not None:
             names = input_names(self.scene)
-            files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]
+            files = [
+                SceneFile(names.values()),
+                *files,
+                LogFile(interval, output.pressure_tensor),
+                FinalState(),
+            ]
             files += [Figures(["energy"], ["png"])] if output.figures else []
         return [*files, self._sampler, *watch]
 
@@ -415,15 +508,24 @@ class MolecularRun(RunPart):
 
     def summary(self, samples: Samples, preparing: float, wall: float) -> dict[str, Any]:
         self.record.moves[self.record.position.segment] = self.engine.moves or (0, 0)
-        return summarise(self.system, self.record, samples, self.state, preparing, wall, self.simulation.is_interrupted)
+        return summarise(
+            self.system,
+            self.record,
+            samples,
+            self.state,
+            preparing,
+            wall,
+            self.simulation.is_interrupted,
+        )
 
     def explain(self, error: SimulationError) -> str:
         stable = self.record.stable.get(self.record.position.segment)
         return checks.explain(self.system, error, self._states_to_search(), self.segment.dt, stable)
 
     def _states_to_search(self) -> Iterator[tuple[str, State]]:
-        """States of a run that failed, with words for their times: now; the last good one; states in between, which are
-        computed again if this is cheap, because a collapse has moved everything by now."""
+        """States of a run that failed, with words for their times: now; the last good one; states
+        in between, which are computed again if this is cheap, because a collapse has moved
+        everything by now."""
         yield "", self.state
         if (good := self._sampler.last_good) is None:
             return
@@ -431,7 +533,11 @@ class MolecularRun(RunPart):
         yield f"at step {first}, ", good
         steps = int(self.state.step[NOW]) - first
         short = 0 < steps * len(system.model.species) <= REPLAYED * checks.MOVES_PER_CHECK
-        if short and self.engine.is_repeatable and not (self.segment.action or system.python_forces):
+        if (
+            short
+            and self.engine.is_repeatable
+            and not (self.segment.action or system.python_forces)
+        ):
             state = good.copy()
             if state.step[ORIGIN] != self.state.step[ORIGIN]:  # it is the end of the stage before
                 scale_to_mean_box(system, state, self.samples(), self.record.position.segment)
@@ -448,7 +554,11 @@ class MolecularRun(RunPart):
     @property
     def headline(self) -> str:
         system, asked = self.system, self.scene.threads or 0
-        more = f" (the scene requests {asked}; this machine has no more)" if asked > self.threads else ""
+        more = (
+            f" (the scene requests {asked}; this machine has no more)"
+            if asked > self.threads
+            else ""
+        )
         return (
             f"{self.scene.name}: {len(system.model.species)} molecules, {system.site_count} sites, "
             f"{system.last_freedom.total} degrees of freedom; {self.threads} threads{more}"
@@ -456,10 +566,15 @@ class MolecularRun(RunPart):
 
     @property
     def _is_crystal(self) -> bool:
-        """Whether the start is a crystal that only interactions of its molecules hold: from a CIF or a repeated cell,
-        without fields and user-defined forces."""
+        """Whether the start is a crystal that only interactions of its molecules hold: from a CIF
+        or a repeated cell, without fields and user-defined forces."""
         scene, structure = self.scene, self.scene.structure
-        if structure is None or not scene.box.periodic or scene.fields.entries or self.system.user_terms:
+        if (
+            structure is None
+            or not scene.box.periodic
+            or scene.fields.entries
+            or self.system.user_terms
+        ):
             return False
         if any(entry.frozen for entry in scene.molecules):  # which do not interact with each other
             return False
@@ -467,34 +582,46 @@ class MolecularRun(RunPart):
         return (form is not None and form.crystals) or structure.repeat != (1, 1, 1)
 
     def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
-        """Energies, virial, pressure and largest force at the start; energies in a unit of `size` u Å²/ps².
+        """Energies, virial, pressure and largest force at the start; energies in a unit of `size` u
+        Å²/ps².
 
         measure_accuracy : also the errors of Coulomb forces against a more accurate Ewald sum
         """
         if self._start.precision_reason:  # precision = "auto" is for runs
-            self._start = replace(self._start, scene=self._start.scene.model_copy(update={"precision": "double"}))
+            self._start = replace(
+                self._start, scene=self._start.scene.model_copy(update={"precision": "double"})
+            )
         removal = self.start()
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
-        seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state, energy_unit=1.0)
+        seen = observe(
+            self.system, self._engine_of(moving[0] if moving else 0), self.state, energy_unit=1.0
+        )
         forces = np.linalg.norm(seen.load.force, axis=1)
         n, meaning = len(self.system.model.species), describe_quantities(self.system)
         lattice_energy = seen.potential / size / n if self._is_crystal else None
         if lattice_energy is not None:
             meaning["lattice_energy"] = (
-                "the potential energy per molecule at the positions of the structure file, relative to the same rigid "
-                "molecules far from each other; static: without zero-point and thermal energy"
+                "the potential energy per molecule at the positions of the structure file, relative"
+                " to the same rigid molecules far from each other; static: without zero-point and"
+                " thermal energy"
             )
         found = {
-            "unit": unit, "molecules": n, "relief_steps": removal.steps if removal else 0,
+            "unit": unit,
+            "molecules": n,
+            "relief_steps": removal.steps if removal else 0,
             "notes": [*self.system.notes, *self.system.warnings],
             "components": {name: energy / size for name, energy in seen.components.items()},
-            "potential": seen.potential / size, "potential_per_molecule": seen.potential / size / n,
-            "lattice_energy_per_molecule": lattice_energy, "kinetic": seen.kinetic / size,
-            "virial": float(seen.virial.trace()) / size, "virial_tensor": (seen.virial / size).tolist(),
+            "potential": seen.potential / size,
+            "potential_per_molecule": seen.potential / size / n,
+            "lattice_energy_per_molecule": lattice_energy,
+            "kinetic": seen.kinetic / size,
+            "virial": float(seen.virial.trace()) / size,
+            "virial_tensor": (seen.virial / size).tolist(),
             "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
-            "largest_force_per_A": float(forces.max()) / size, "largest_force_molecule": int(forces.argmax()) + 1,
+            "largest_force_per_A": float(forces.max()) / size,
+            "largest_force_molecule": int(forces.argmax()) + 1,
             "meaning": meaning,
-        }  # fmt: skip
+        }
         if measure_accuracy:
             found["accuracy"] = coulomb_errors(self.system, self.state, size)
         return found

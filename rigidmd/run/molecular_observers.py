@@ -1,4 +1,5 @@
-"""Observers of molecules: samples and their checks, log.csv, pressure_tensor.csv, the final state."""
+"""Observers of molecules: samples and their checks, log.csv, pressure_tensor.csv, the final
+state."""
 
 from math import inf
 from typing import TYPE_CHECKING, Any
@@ -72,12 +73,15 @@ def _check_next_step(run: "Simulation", check: checks.StepCheck, load: Load, sta
     """Raise the failed check of the next step of a stage, if the stage has steps."""
     if not stage.is_minimisation:
         dt = stage.timestep_fs * FEMTOSECOND
-        if problem := check.failed_check(run.part.state, load, stage.scheme, dt, run.engine.extent(run.part.state)):
+        if problem := check.failed_check(
+            run.part.state, load, stage.scheme, dt, run.engine.extent(run.part.state)
+        ):
             raise problem
 
 
 class Sampler(Observer):
-    """Keeps samples, checks each against the limits of the scene, and keeps the last state that passed."""
+    """Keeps samples, checks each against the limits of the scene, and keeps the last state that
+    passed."""
 
     remembers: dict[str, Any] = {"table": np.ndarray}  # noqa: RUF012
     ends = reads_energies = True
@@ -91,11 +95,16 @@ class Sampler(Observer):
         self.trajectories = np.zeros(5)  # see `Engine.trajectories`, at the last sample
         if any(stage.is_hybrid for stage in run.scene.stages):
             self.remembers = self.remembers | {"trajectories": np.ndarray}
-        self._begins: dict[int, int] = {}  # stage -> row of the last sample before it, or of the first
+        self._begins: dict[
+            int, int
+        ] = {}  # stage -> row of the last sample before it, or of the first
 
     def origin(self, stage: int) -> float | None:
-        """Conserved energy (kJ/mol) at the start of a stage: of the last sample before it, or else of its first."""
-        return self.samples.row(self._begins.get(stage, -1)).conserved if len(self.samples) else None
+        """Conserved energy (kJ/mol) at the start of a stage: of the last sample before it, or else
+        of its first."""
+        return (
+            self.samples.row(self._begins.get(stage, -1)).conserved if len(self.samples) else None
+        )
 
     def see(self, moment: Moment) -> None:
         run, now, samples = self._run, moment.sample, self.samples
@@ -132,12 +141,16 @@ class Sampler(Observer):
         steps, times, stages, conserved, drift = map(samples.__getitem__, names)
         step, time = int(run.part.state.step[NOW]), float(run.part.state.time[NOW])
         series = ((steps, step), (times, time), (stages, len(samples.stages)))
-        if not all(((of >= 0) & (of <= most)).all() and (np.diff(of) >= 0).all() for of, most in series):
+        if not all(
+            ((of >= 0) & (of <= most)).all() and (np.diff(of) >= 0).all() for of, most in series
+        ):
             raise ValueError(f"its samples are not those of a run of {step} steps ({time:g} ps)")
         first = {k: int(np.argmax(stages == k)) for k in np.unique(stages).tolist()}
         self._begins = {k: max(0, row - 1) for k, row in first.items()}
         origin = conserved[[self._begins[k] for k in stages.tolist()]]
-        if not (np.isfinite(conserved).all() and ((drift == conserved - origin) | np.isnan(drift)).all()):
+        if not (
+            np.isfinite(conserved).all() and ((drift == conserved - origin) | np.isnan(drift)).all()
+        ):
             raise ValueError("the drifts of its samples are not those of their energies")
         if len(samples):
             self._check.rescale(samples.row(-1).kinetic * KJ_PER_MOL)
@@ -148,7 +161,10 @@ class Sampler(Observer):
             return ""
         path = run.path(LAST_GOOD)
         write_state(path, run.system.saved(self.last_good))
-        return f". Last good state, of step {self.last_good.step[NOW]} ({self.last_good.time[NOW]:g} ps): {path}"
+        return (
+            f". Last good state, of step {self.last_good.step[NOW]} ({self.last_good.time[NOW]:g}"
+            f" ps): {path}"
+        )
 
 
 class StepWatch(Observer):
@@ -160,9 +176,14 @@ class StepWatch(Observer):
         self._run, self._check = run, check
         interval, stages = run.scene.output.log_interval_ps, run.scene.stages
         moving = [stage for stage in stages if not stage.is_minimisation]
-        of_samples = [inf if stage.is_auto else interval / (stage.timestep_fs * FEMTOSECOND) for stage in moving]
+        of_samples = [
+            inf if stage.is_auto else interval / (stage.timestep_fs * FEMTOSECOND)
+            for stage in moving
+        ]
         every = checks.check_interval(run.system)
-        self.steps = every if max(of_samples, default=0.0) > every else None  # samples come at least as often
+        self.steps = (
+            every if max(of_samples, default=0.0) > every else None
+        )  # samples come at least as often
 
     def see(self, moment: Moment) -> None:
         if (load := self._run.engine.load) is not None:  # forces have been evaluated

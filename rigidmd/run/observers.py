@@ -1,10 +1,10 @@
 """Observers are called between the steps of a run. They read its state and never change it.
 
-An observer is any object with an `interval` and a method `see`; `Observer` has all other methods, which do nothing.
-`see` is called every `interval` of time, counted in steps of each segment, or every `steps` steps, independent of the
-interval of results, and with `ends` also at the last moment of every segment. A time at which a minimisation begins has
-two states: with `once` only the second is observed. No observer depends on another: data that several need belong to
-the moment or run.
+An observer is any object with an `interval` and a method `see`; `Observer` has all other methods,
+which do nothing. `see` is called every `interval` of time, counted in steps of each segment, or
+every `steps` steps, independent of the interval of results, and with `ends` also at the last moment
+of every segment. A time at which a minimisation begins has two states: with `once` only the second
+is observed. No observer depends on another: data that several need belong to the moment or run.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -30,10 +30,12 @@ if TYPE_CHECKING:
 
 
 class Moment:
-    """The argument of observers: position in the run, state and observation. Its values do not change later.
+    """The argument of observers: position in the run, state and observation. Its values do not
+    change later.
 
     step : steps since the start; time : ps, or s for a single body; stage : index of the stage
-    state : for molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in SI units
+    state : for molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body
+        in SI units
     """
 
     def __init__(self, run: "Simulation", step: int, time: float, stage: int):
@@ -50,8 +52,8 @@ class Moment:
 
     @cached_property
     def observation(self) -> Any:
-        """Evaluated at its first use, for all observers: an `Observation` of molecules, in the units of the log, or the
-        `Pose` of a body, in SI units."""
+        """Evaluated at its first use, for all observers: an `Observation` of molecules, in the
+        units of the log, or the `Pose` of a body, in SI units."""
         return self._run.part.observe(self)
 
     @property
@@ -75,8 +77,9 @@ def above_zero(interval: float, name: str) -> float:
 class Observer:
     """Base class; its methods do nothing.
 
-    remembers : name -> type of each attribute that a checkpoint has and a resumed run gets back: an array
-        (`np.ndarray`), arrays by name (`dict[str, np.ndarray]`), or what JSON can hold, which is checked
+    remembers : name -> type of each attribute that a checkpoint has and a resumed run gets back: an
+        array (`np.ndarray`), arrays by name (`dict[str, np.ndarray]`), or what JSON can hold, which
+        is checked
     """
 
     remembers: ClassVar[dict[str, Any]] = {}
@@ -84,8 +87,11 @@ class Observer:
     steps: int | None = None
     ends = False
     once = False  # whether it is called once for each time: not before a minimisation
-    draws = False  # whether it only draws: its `end` is called after the others, and its errors are notes
-    reads_energies = False  # whether it reads forces or energies, which the last step then computes too
+    # whether it only draws: its `end` is called after the others, and its errors are notes
+    draws = False
+    reads_energies = (
+        False  # whether it reads forces or energies, which the last step then computes too
+    )
     _names: Sequence[str] = ()
 
     def files(self) -> list[str]:
@@ -99,11 +105,13 @@ class Observer:
         """Observe a moment. Raises SimulationError to stop the run."""
 
     def memory(self) -> Checkpoint:
-        """The data that `resume` needs, for a checkpoint. Its files must be on the disk when it returns."""
+        """The data that `resume` needs, for a checkpoint. Its files must be on the disk when it
+        returns."""
         return stored(self, self.remembers)
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
-        """Called instead of `begin` when a run is resumed: restore the data of `memory`, and check files unchanged.
+        """Called instead of `begin` when a run is resumed: restore the data of `memory`, and check
+        files unchanged.
 
         The run is refused if this raises KeyError, TypeError, ValueError or OutputError.
         """
@@ -121,13 +129,15 @@ class Observer:
         """Called in any case: close files."""
 
     def failed(self, run: "Simulation") -> str:
-        """Called if the run stops with an error: save results. Returns a sentence that names the file, or ""."""
+        """Called if the run stops with an error: save results. Returns a sentence that names the
+        file, or ""."""
         return ""
 
 
 def as_observer(value: Any) -> Observer:
-    """An observer, or one that calls an object with `see` and `interval` (or `steps`, `ends`), which may also have any
-    of the other methods and attributes of `Observer` but `remembers`. Raises TypeError."""
+    """An observer, or one that calls an object with `see` and `interval` (or `steps`, `ends`),
+    which may also have any of the other methods and attributes of `Observer` but `remembers`.
+    Raises TypeError."""
     if isinstance(value, Observer):
         return value
     is_timed = any(hasattr(value, name) for name in ("interval", "steps", "ends"))
@@ -136,8 +146,14 @@ def as_observer(value: Any) -> Observer:
             f"{value!r:.60} is not an observer: it needs an interval and a method see(moment); "
             "rigidmd.Every(interval, function) makes one of a function"
         )
-    observer = type(type(value).__name__, (Observer,), {})()  # its name is in messages and checkpoints
-    given = {name: getattr(value, name) for name in dir(Observer) if name[0] != "_" and hasattr(value, name)}
+    observer = type(
+        type(value).__name__, (Observer,), {}
+    )()  # its name is in messages and checkpoints
+    given = {
+        name: getattr(value, name)
+        for name in dir(Observer)
+        if name[0] != "_" and hasattr(value, name)
+    }
     vars(observer).update(given)
     return observer
 
@@ -159,7 +175,9 @@ class GrowingFile(Observer):
     """An observer whose file grows during the run; None without a folder."""
 
     remembers: ClassVar[dict[str, Any]] = {"kept": list[Annotated[int, Field(ge=0, strict=True)]]}
-    kept: list[int] | None = None  # sizes and checksum of the file of the run that is resumed, which `begin` opens
+    kept: list[int] | None = (
+        None  # sizes and checksum of the file of the run that is resumed, which `begin` opens
+    )
     _file: Any = None
 
     def memory(self) -> Checkpoint:
@@ -209,7 +227,10 @@ class Figures(Observer):
     draws = True
 
     def __init__(self, stems: Sequence[str], suffixes: Sequence[str]):
-        self._suffixes, self._names = suffixes, [f"{stem}.{suffix}" for stem in stems for suffix in suffixes]
+        self._suffixes, self._names = (
+            suffixes,
+            [f"{stem}.{suffix}" for stem in stems for suffix in suffixes],
+        )
 
     def end(self, run: "Simulation", results: "Results") -> None:
         failed = None
@@ -229,7 +250,12 @@ class Frames(GrowingFile):
     once = True
 
     def __init__(
-        self, interval: float, topology: str, trajectory: str, velocities: bool = False, wrapped: bool = False
+        self,
+        interval: float,
+        topology: str,
+        trajectory: str,
+        velocities: bool = False,
+        wrapped: bool = False,
     ):
         self.interval: float = interval
         self._names = [topology, trajectory]
@@ -250,14 +276,19 @@ class Frames(GrowingFile):
         self._run = run
         if run.folder is None:
             return
-        from rigidmd.io.trajectory import open_trajectory, write_topology  # MDAnalysis is slow to import
+        from rigidmd.io.trajectory import (  # MDAnalysis is slow to import
+            open_trajectory,
+            write_topology,
+        )
 
         if self.kept is None:
             write_topology(run.path(self._names[0]), run.system, run.part.state, self._wrapped)
         elif self.kept[-1:] != [len(self._frames)] or (self.times > run.part.state.time[NOW]).any():
             raise ValueError("the times of its frames are not those of a run")
         path = run.path(self._names[1])
-        self._file = open_trajectory(path, run.system, self.interval, self._velocities, self._wrapped, self.kept)
+        self._file = open_trajectory(
+            path, run.system, self.interval, self._velocities, self._wrapped, self.kept
+        )
 
     def see(self, moment: Moment) -> None:
         system, state = self._run.system, self._run.part.state
@@ -267,7 +298,9 @@ class Frames(GrowingFile):
         else:
             positions = system.site_positions(state, self._wrapped).astype(np.float32)
             velocities = system.site_velocities(state).astype(np.float32)
-            self._frames.append(Frame(moment.time, positions, state.cell.copy(), velocities, state.rotation.copy()))
+            self._frames.append(
+                Frame(moment.time, positions, state.cell.copy(), velocities, state.rotation.copy())
+            )
 
     def end(self, run: "Simulation", results: "Results") -> None:
         results._frames = self._frames

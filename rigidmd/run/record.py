@@ -1,4 +1,5 @@
-"""Reading of the folder of a run: its scene, its summary, and the columns of log.csv or motion.csv."""
+"""Reading of the folder of a run: its scene, its summary, and the columns of log.csv or
+motion.csv."""
 
 import shlex
 from collections.abc import Sequence
@@ -55,8 +56,12 @@ class Record:
     def log(self) -> samples.Samples:
         """The samples of a run of molecules; NaN in columns that log.csv does not have."""
         names, unknown = self.system.more_columns, np.full(len(self.time), np.nan)
-        table = np.column_stack([self.columns.get(name, unknown) for name in (*samples.NUMBERS, *names)])
-        return samples.Samples([stage.label for stage in self.system.scene.stages], names, table.astype(float))
+        table = np.column_stack(
+            [self.columns.get(name, unknown) for name in (*samples.NUMBERS, *names)]
+        )
+        return samples.Samples(
+            [stage.label for stage in self.system.scene.stages], names, table.astype(float)
+        )
 
     @property
     def moving(self) -> np.ndarray:
@@ -70,7 +75,9 @@ class Record:
         """Path of the trajectory. Raises OutputError if there is none."""
         name = self.scene.output.trajectory
         if not name:
-            raise OutputError(f"{self.folder}: this run wrote no trajectory (output.trajectory = false)")
+            raise OutputError(
+                f"{self.folder}: this run wrote no trajectory (output.trajectory = false)"
+            )
         if not (self.folder / name).is_file():
             raise OutputError(f"{self.folder}: its trajectory {name} is missing")
         return self.folder / name
@@ -81,7 +88,8 @@ class Record:
 
 
 def read_record(folder: Path) -> Record:
-    """Read the folder of a run, ended or not. Raises OutputError if it is no such folder, or has no samples."""
+    """Read the folder of a run, ended or not. Raises OutputError if it is no such folder, or has no
+    samples."""
     check_is_run(folder)
     scene = Scene.read(folder / SCENE)
     summary, missing = read_json(folder / SUMMARY, Summary), []
@@ -99,7 +107,9 @@ def read_record(folder: Path) -> Record:
         columns = _log(folder, scene)
     if not columns or len(next(iter(columns.values()))) == 0:
         raise OutputError(f"{folder}: the run has not written samples yet; {resume}")
-    return Record(folder, scene, system, summary and summary.model_dump(exclude_unset=True), columns, missing)
+    return Record(
+        folder, scene, system, summary and summary.model_dump(exclude_unset=True), columns, missing
+    )
 
 
 def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
@@ -114,18 +124,23 @@ def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
         header = samples.COLUMNS[lacking[0]].header
         raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {header!r}")
     found = {
-        name: np.array(read.cells[header]) if name == "stage_name" else read.numbers(header, finite=name == "time")
+        name: np.array(read.cells[header])
+        if name == "stage_name"
+        else read.numbers(header, finite=name == "time")
         for name, header in headers.items()
     }
     return found | {"stage": _stage_of(found["stage_name"], found["time"], scene.stages)}
 
 
 def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:
-    """Index of the stage of each row. Stages with the same name are distinguished by their times."""
+    """Index of the stage of each row. Stages with the same name are distinguished by their
+    times."""
     found, first, end = np.full(len(names), len(stages) - 1), 0, 0.0
     for k, stage in enumerate(stages[:-1]):
         end += stage.duration
-        of_stage = (names[first:] == stage.label) & (time[first:] <= end + 0.5e-3 * stage.timestep_fs)
+        of_stage = (names[first:] == stage.label) & (
+            time[first:] <= end + 0.5e-3 * stage.timestep_fs
+        )
         count = len(of_stage) if of_stage.all() else int(of_stage.argmin())
         found[first : first + count] = k
         first += count
@@ -135,12 +150,28 @@ def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> n
 def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
     """Columns of motion.csv, or, of a run that has not written it, of its last checkpoint."""
     if (found := read_motion(folder / MOTION)) is not None:
-        families = ["time", "position", "kinetic", "potential", "energy", "work"]  # that every motion has
+        families = [
+            "time",
+            "position",
+            "kinetic",
+            "potential",
+            "energy",
+            "work",
+        ]  # that every motion has
         if system.rotates:
-            families += ["rotation", "quaternion", "euler_angles", "omega_body", "omega_lab", "L_lab"]
+            families += [
+                "rotation",
+                "quaternion",
+                "euler_angles",
+                "omega_body",
+                "omega_lab",
+                "L_lab",
+            ]
         needed = [name for family in families for name in BODY[family].names]
         if lacking := [BODY_COLUMNS[name].header for name in needed if name not in found.cells]:
-            raise OutputError(f"{found.path} is not the motion of this run: it has no column {lacking[0]!r}")
+            raise OutputError(
+                f"{found.path} is not the motion of this run: it has no column {lacking[0]!r}"
+            )
         return {name: found.numbers(name, finite=name in needed) for name in found.cells}
     try:
         kept, _ = latest(folder)
@@ -152,6 +183,8 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
             states = zip(*(part[f"stacked/{name}"] for name in STORED_NAMES), strict=True)
             times = part["stacked/t"].tolist()
             snapshots = [Snapshot(t, State(*state)) for t, state in zip(times, states, strict=True)]
-            missing.append(f"{MOTION} is written at the end; the motion shown ends at the last checkpoint.")
+            missing.append(
+                f"{MOTION} is written at the end; the motion shown ends at the last checkpoint."
+            )
             return motion(system, snapshots).columns
     return {}

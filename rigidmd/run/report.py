@@ -16,19 +16,30 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
     species = ", ".join(f"{count} {name}" for name, count in summary["species"].items())
     freedom = summary["degrees_of_freedom"]
     lines = [
-        f"{summary['scene']}: {species}; {summary['molecules']} bodies, {summary['sites']} sites, {freedom} degrees of "
-        f"freedom ({summary['degrees_of_freedom_translation']} translation, "
-        f"{summary['degrees_of_freedom_rotation']} rotation)"
+        f"{summary['scene']}: {species}; {summary['molecules']} bodies, {summary['sites']} sites,"
+        f" {freedom} degrees of freedom ({summary['degrees_of_freedom_translation']} translation,"
+        f" {summary['degrees_of_freedom_rotation']} rotation)"
     ]
     for stage in summary["stages"]:
         lines += ["", stage_title(stage), *_as_lines(stage_rows(stage))]
-    momentum = f"|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, {summary['momentum_relative']:.1e} of the sum of |m v|"
+    momentum = (
+        f"|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, {summary['momentum_relative']:.1e} of the"
+        " sum of |m v|"
+    )
     rows = [("precision", summary["precision_reason"])] if summary["precision_reason"] else []
     rows += [_orthogonality(summary), ("momentum", momentum)]
     for name, (calls, seconds) in summary.get("forces_by_python", {}).items():
         rows.append(("forces", f"{name}: {calls} calls, {seconds:.3g} s"))
     if removed := summary["momentum_removed"]:
-        rows.append(("", f"removed every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e} kJ/mol in all"))
+        rows.append(
+            (
+                "",
+                (
+                    f"removed every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e}"
+                    " kJ/mol in all"
+                ),
+            )
+        )
     if summary["positions"]:
         rows.append(("positions", f"{summary['positions']}: {POSITIONS[summary['positions']]}"))
     return "\n".join([*lines, "", *_as_lines(rows), *_last_lines(summary, known)])
@@ -36,7 +47,9 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
 
 def body_summary_text(summary: dict, known: Container[str] = ()) -> str:
     """The summary of a run of a single body as text, without the notes in `known`."""
-    return "\n".join([f"\n{body_title(summary)}", *_as_lines(body_rows(summary)), *_last_lines(summary, known)])
+    return "\n".join(
+        [f"\n{body_title(summary)}", *_as_lines(body_rows(summary)), *_last_lines(summary, known)]
+    )
 
 
 def _as_lines(rows: list[tuple[str, str]]) -> list[str]:
@@ -45,7 +58,10 @@ def _as_lines(rows: list[tuple[str, str]]) -> list[str]:
 
 def _last_lines(summary: dict, known: Container[str]) -> list[str]:
     notes = [f"\n  note: {note}" for note in summary["notes"] if note not in known]
-    return [*notes, *(["", "  interrupted: these are the results so far"] if summary["interrupted"] else [])]
+    return [
+        *notes,
+        *(["", "  interrupted: these are the results so far"] if summary["interrupted"] else []),
+    ]
 
 
 def _orthogonality(summary: dict) -> tuple[str, str]:
@@ -55,7 +71,10 @@ def _orthogonality(summary: dict) -> tuple[str, str]:
 def body_title(summary: dict) -> str:
     """Steps and speed of a run of a single body."""
     speed = f"; {summary['steps_per_s']:,.0f} steps/s" if summary["steps_per_s"] else ""
-    return f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g} s{speed}"
+    return (
+        f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g}"
+        f" s{speed}"
+    )
 
 
 #: Name of a rate of a body -> its name in reports, and how it is written with a number.
@@ -74,13 +93,26 @@ def _rate(rate: dict, pattern: str) -> str:
     measured, theory = rate.get("measured"), rate.get("theory")
     if measured is None:
         theory = math.nan if theory is None else theory
-        return f"{pattern.format(f'{theory:.7g}')} in theory; fewer than two periods in the samples, or too few samples"
-    return pattern.format(f"{measured:.7g}") + ("" if theory is None else f"; in theory {theory:.7g}")
+        return (
+            f"{pattern.format(f'{theory:.7g}')} in theory; fewer than two periods in the samples,"
+            " or too few samples"
+        )
+    return pattern.format(f"{measured:.7g}") + (
+        "" if theory is None else f"; in theory {theory:.7g}"
+    )
 
 
 def body_rows(summary: dict) -> list[tuple[str, str]]:
     """Names and values of the summary of a run of a single body."""
-    rows = [("energy", f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J at the end")]
+    rows = [
+        (
+            "energy",
+            (
+                f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J"
+                " at the end"
+            ),
+        )
+    ]
     if summary["work_J"]:
         rows.append(("work", f"{summary['work_J']:.12g} J done on the body"))
     if summary["theta_range_deg"]:
@@ -103,16 +135,27 @@ def stage_title(stage: dict) -> str:
     """Steps and speed of a stage, or how its minimisation ended."""
     if found := stage["minimum"]:
         ended = "converged" if found["converged"] else f"not converged ({found['ended_by']}),"
-        removal = f" and {found['relief_steps']} of overlap removal" if found["relief_steps"] else ""
-        return f"{stage['name']}: {ended} after {found['iterations']} iterations{removal}; {stage['computing_s']:.1f} s"
-    title = f"{stage['name']}: {stage['steps']} steps of {stage['timestep_fs']:g} fs, {stage['duration_ps']:g} ps"
+        removal = (
+            f" and {found['relief_steps']} of overlap removal" if found["relief_steps"] else ""
+        )
+        return (
+            f"{stage['name']}: {ended} after {found['iterations']} iterations{removal};"
+            f" {stage['computing_s']:.1f} s"
+        )
+    title = (
+        f"{stage['name']}: {stage['steps']} steps of {stage['timestep_fs']:g} fs,"
+        f" {stage['duration_ps']:g} ps"
+    )
     if stage["steps_per_s"]:
         title += f"; {stage['steps_per_s']:,.0f} steps/s, {stage['ns_per_day']:.3g} ns/day"
     return title
 
 
 def _minimum_rows(stage: dict, found: dict) -> list[tuple[str, str]]:
-    before, after = found["energy_before_kJ_mol_per_molecule"], found["energy_after_kJ_mol_per_molecule"]
+    before, after = (
+        found["energy_before_kJ_mol_per_molecule"],
+        found["energy_after_kJ_mol_per_molecule"],
+    )
     force, torque = found["largest_force_kJ_mol_A"], found["largest_torque_kJ_mol"]
     rows = [
         ("potential", f"{before:.6g} before, {after:.6f} kJ/mol per molecule after"),
@@ -136,8 +179,16 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
     rows.append(("means", f"over {stage['means_over']}"))
     if stage.get("volume_nm3") is not None:
-        mean, end = format_with_error(stage["volume_nm3"], stage["volume_error_nm3"]), stage["volume_before_nm3"]
-        rows.append(("volume", f"{mean} nm³, the mean of the stage before, at whose end it was {end:.4g} nm³"))
+        mean, end = (
+            format_with_error(stage["volume_nm3"], stage["volume_error_nm3"]),
+            stage["volume_before_nm3"],
+        )
+        rows.append(
+            (
+                "volume",
+                f"{mean} nm³, the mean of the stage before, at whose end it was {end:.4g} nm³",
+            )
+        )
     if stage["temperature_K"] is not None:
         value = _with_error(stage["temperature_K"], stage["temperature_error_K"], 2, "K")
         rows.append(("temperature", value + _set_point(stage["set_temperature_K"], "K")))
@@ -146,18 +197,36 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         if parts := _temperatures(stage, "_unbiased"):
             rows.append(("", f"{parts} corrected for the time step"))
         if (scatter := stage.get("temperature_scatter_K")) is not None:
-            off, before = stage["temperature_K"] - stage["temperature_before_K"], stage["temperature_before_K"]
+            off, before = (
+                stage["temperature_K"] - stage["temperature_before_K"],
+                stage["temperature_before_K"],
+            )
             moment = "this stage keeps the energy of one moment; such temperatures scatter by"
             more = "" if abs(off) < 3 * scatter else ", less than this: equilibrate longer"
-            rows.append(("", f"{off:+.2g} K from the {before:g} K before: {moment} {scatter:.2g} K{more}"))
+            rows.append(
+                ("", f"{off:+.2g} K from the {before:g} K before: {moment} {scatter:.2g} K{more}")
+            )
     error = stage["potential_error_kJ_mol_per_molecule"]
-    rows.append(("potential", _with_error(stage["potential_kJ_mol_per_molecule"], error, 3, "kJ/mol per molecule")))
+    rows.append(
+        (
+            "potential",
+            _with_error(stage["potential_kJ_mol_per_molecule"], error, 3, "kJ/mol per molecule"),
+        )
+    )
     if stage["pressure_bar"] is not None:
         value = _with_error(stage["pressure_bar"], stage["pressure_error_bar"], 0, "bar")
         rows.append(("pressure", value + _set_point(stage["set_pressure_bar"], "bar")))
     if stage.get("density_g_cm3") is not None:
-        rows.append(("density", _with_error(stage["density_g_cm3"], stage["density_error_g_cm3"], 4, "g/cm³")))
-        edges = (f"{edge} {_with_error(stage[f'{edge}_A'], stage[f'{edge}_error_A'], 3)}" for edge in "abc")
+        rows.append(
+            (
+                "density",
+                _with_error(stage["density_g_cm3"], stage["density_error_g_cm3"], 4, "g/cm³"),
+            )
+        )
+        edges = (
+            f"{edge} {_with_error(stage[f'{edge}_A'], stage[f'{edge}_error_A'], 3)}"
+            for edge in "abc"
+        )
         rows.append(("box", f"{', '.join(edges)} Å"))
     if stage["moves_tried"]:
         accepted = stage["moves_accepted"] / stage["moves_tried"]
@@ -166,21 +235,36 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         accepted, size = 100 * stage["acceptance_mean"], stage["abs_dH_kT_mean"]
         rows.append(("trajectories", f"{stage['trajectories']}, {accepted:.0f} % accepted"))
         balance = _with_error(stage["exp_minus_dH_mean"], stage["exp_minus_dH_error_mean"], 3)
-        rows.append(("", f"mean abs(dH) {size:.2g} kT; mean exp(-dH/kT) {balance}, 1 in equilibrium"))
+        rows.append(
+            ("", f"mean abs(dH) {size:.2g} kT; mean exp(-dH/kT) {balance}, 1 in equilibrium")
+        )
     elif stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
-        value, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]
+        value, error = (
+            stage["drift_kJ_mol_ns_per_molecule"],
+            stage["drift_error_kJ_mol_ns_per_molecule"],
+        )
         verdict = f": {stage['drift_verdict']}" if stage["drift_verdict"] else ""
-        rows.append(("drift", f"{format_signed(value, error)} kJ/mol/ns per molecule ({what}){verdict}"))
+        rows.append(
+            ("drift", f"{format_signed(value, error)} kJ/mol/ns per molecule ({what}){verdict}")
+        )
         if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
-            value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
+            value, error = (
+                stage["drift_kT_ns_per_degree_of_freedom"],
+                stage["drift_error_kT_ns_per_degree_of_freedom"],
+            )
             rows.append(("", f"{format_signed(value, error)} kT/ns per degree of freedom"))
             total = f"in total {value * stage['duration_ps'] / 1000:+.2g} kT per degree of freedom"
             if stage["drift_over_kinetic_std"] is not None:
-                total += f", {stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy"
+                total += (
+                    f", {stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic"
+                    " energy"
+                )
             rows.append(("", total))
         noise = stage["energy_rms_kJ_mol_per_molecule"]
-        rows.append(("energy noise", f"{noise:.2g} kJ/mol per molecule, rms deviation from the linear fit"))
+        rows.append(
+            ("energy noise", f"{noise:.2g} kJ/mol per molecule, rms deviation from the linear fit")
+        )
     return rows
 
 
@@ -194,12 +278,17 @@ def _set_point(given: float | Sequence[float] | None, unit: str) -> str:
     if given is None:
         return ""
     values = given if isinstance(given, Sequence) else [given]
-    return f", set point {(' to ' if len(values) == 2 else ', ').join(f'{value:g}' for value in values)} {unit}"
+    return (
+        ", set point"
+        f" {(' to ' if len(values) == 2 else ', ').join(f'{value:g}' for value in values)} {unit}"
+    )
 
 
 def _temperatures(stage: dict, kind: str) -> str:
     found = []
     for name, motion in (("T_trans", "translation"), ("T_rot", "rotation")):
         if (value := stage[f"temperature_{motion}{kind}_K"]) is not None:
-            found.append(f"{name} {_with_error(value, stage[f'temperature_{motion}{kind}_error_K'], 2)}")
+            found.append(
+                f"{name} {_with_error(value, stage[f'temperature_{motion}{kind}_error_K'], 2)}"
+            )
     return f"{', '.join(found)} K" if found else ""

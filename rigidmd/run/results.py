@@ -1,4 +1,5 @@
-"""Results of a run: samples, summary, final state, frames; the value that `Simulation.run` returns."""
+"""Results of a run: samples, summary, final state, frames; the value that `Simulation.run`
+returns."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -28,8 +29,9 @@ if TYPE_CHECKING:
 class Results(Displayed):
     """Results of a run: samples as arrays, summary, final state, files.
 
-    results["energy"] is a column of the samples as an array, in the unit of log.csv (kJ/mol of the whole system, K,
-    bar, Å, ps) or, for a body, in SI units. `units` lists all columns with their units.
+    results["energy"] is a column of the samples as an array, in the unit of log.csv (kJ/mol of the
+    whole system, K, bar, Å, ps) or, for a body, in SI units. `units` lists all columns with their
+    units.
 
     summary : values with units in their keys, as in summary.json
     files : paths of the files written
@@ -47,13 +49,18 @@ class Results(Displayed):
     out_of_time: bool = False
     _frames: "Sequence[Frame]" = field(default_factory=list)
     _tensor: np.ndarray | None = None  # (n, 7) rows of the pressure tensor of a run without files
-    _analysis_frames: dict[float | None, Any] = field(default_factory=dict)  # kept by rigidmd.analysis, by their start
+    _analysis_frames: dict[float | None, Any] = field(
+        default_factory=dict
+    )  # kept by rigidmd.analysis, by their start
     _is_stored: bool = False  # read from a folder, without user-defined forces
     _no_state: str = ""  # why a stored run has no final state
 
     def __repr__(self) -> str:
         name = self.system.scene.name
-        return f"<Results of {name}: {self._summary_line}; results[column], .units, .summary, .universe()>"
+        return (
+            f"<Results of {name}: {self._summary_line}; results[column], .units, .summary,"
+            " .universe()>"
+        )
 
     @property
     def _summary_line(self) -> str:
@@ -62,8 +69,8 @@ class Results(Displayed):
 
     @property
     def state(self) -> State:
-        """The final state, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units. Raises OutputError if a run
-        that was read from a folder has none."""
+        """The final state, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units. Raises
+        OutputError if a run that was read from a folder has none."""
         if self._state is None:
             raise OutputError(self._no_state)
         return self._state
@@ -78,7 +85,8 @@ class Results(Displayed):
     def __getitem__(self, column: str) -> np.ndarray:
         """A column of the samples as an array (n,), in its unit of `units`: results["energy"].
 
-        For a body that rotates, results["Q"] holds its rotation matrices (n, 3, 3). Raises KeyError with all names.
+        For a body that rotates, results["Q"] holds its rotation matrices (n, 3, 3). Raises KeyError
+        with all names.
         """
         return self.samples[column]
 
@@ -88,7 +96,8 @@ class Results(Displayed):
         return {name: column.unit for name, column in self.samples.described.items()}
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """The samples under the headers of log.csv (motion.csv of a body). Raises ImportError without pandas."""
+        """The samples under the headers of log.csv (motion.csv of a body). Raises ImportError
+        without pandas."""
         try:
             import pandas
         except ImportError:
@@ -96,13 +105,17 @@ class Results(Displayed):
         from rigidmd.io.run_files import TENSOR
 
         left_out = () if getattr(self.system.scene.output, "pressure_tensor", True) else TENSOR
-        return pandas.DataFrame(self.samples.written).drop(columns=[self.samples.described[n].header for n in left_out])
+        return pandas.DataFrame(self.samples.written).drop(
+            columns=[self.samples.described[n].header for n in left_out]
+        )
 
     def universe(self) -> "MDAnalysis.Universe":
-        """The trajectory as an MDAnalysis Universe, from the files if there are any, or else from memory.
+        """The trajectory as an MDAnalysis Universe, from the files if there are any, or else from
+        memory.
 
-        Lengths in Å, times in ps; for a body a second becomes a picosecond. Every frame has its time in the run, also
-        where the file format has none. Warns if frames are not evenly spaced. Raises ValueError without a trajectory.
+        Lengths in Å, times in ps; for a body a second becomes a picosecond. Every frame has its
+        time in the run, also where the file format has none. Warns if frames are not evenly spaced.
+        Raises ValueError without a trajectory.
         """
         from rigidmd.io import trajectory
 
@@ -111,7 +124,9 @@ class Results(Displayed):
             raise ValueError("this run wrote no trajectory (output.trajectory = false)")
         if self.files:
             times = [frame.time for frame in self._frames]
-            return trajectory.from_files(self.system, self._file(output.topology), self._file(output.trajectory), times)
+            return trajectory.from_files(
+                self.system, self._file(output.topology), self._file(output.trajectory), times
+            )
         return trajectory.in_memory(self.system, self._frames)
 
     def _file(self, name: str | None) -> Path:
@@ -128,14 +143,15 @@ class Results(Displayed):
     @overload
     def atoms(self, frame: str) -> "ase.Atoms | list[ase.Atoms]": ...
     def atoms(self, frame: int | slice | str | None = None) -> "ase.Atoms | list[ase.Atoms]":
-        """The final state of molecules as an `ase.Atoms`, or frames of the trajectory: one for an index, a list for a
-        slice or a text like ":" or "::10", as in `ase.io.read`.
+        """The final state of molecules as an `ase.Atoms`, or frames of the trajectory: one for an
+        index, a list for a slice or a text like ":" or "::10", as in `ase.io.read`.
 
-        Atoms are the sites with mass, with the masses of the models, cell, periodicity, `info["time_ps"]` and, where
-        frames have velocities, momenta. The final state, and a last frame at its time, is exact, with energy, forces
-        and stress; other frames have the digits of the trajectory (single precision but for .traj), and the energy
-        where the log has a line at their time. So has the final state of a run that was read from a folder, without
-        forces. Raises ValueError for a body or without frames, IndexError.
+        Atoms are the sites with mass, with the masses of the models, cell, periodicity,
+        `info["time_ps"]` and, where frames have velocities, momenta. The final state, and a last
+        frame at its time, is exact, with energy, forces and stress; other frames have the digits of
+        the trajectory (single precision but for .traj), and the energy where the log has a line at
+        their time. So has the final state of a run that was read from a folder, without forces.
+        Raises ValueError for a body or without frames, IndexError.
         """
         from rigidmd.run.atom_forces import atoms_of_results
 
@@ -145,9 +161,10 @@ class Results(Displayed):
     def rotation(self) -> np.ndarray:
         """The rotation matrices Q, body to lab, at the frames of `universe()` (frames, n, 3, 3).
 
-        For molecules Q rotates the principal axes of `rigidmd models NAME`, for a body the body's axes, at all samples.
-        A trajectory.gsd stores Q. With other files it is fitted to the positions of sites, as exact as these, with an
-        arbitrary rotation of linear molecules about their axes. Raises ValueError if nothing rotates.
+        For molecules Q rotates the principal axes of `rigidmd models NAME`, for a body the body's
+        axes, at all samples. A trajectory.gsd stores Q. With other files it is fitted to the
+        positions of sites, as exact as these, with an arbitrary rotation of linear molecules about
+        their axes. Raises ValueError if nothing rotates.
         """
         if "Q" in self.samples.described:
             return self["Q"][:, None]
@@ -161,7 +178,9 @@ class Results(Displayed):
                 from rigidmd.run.rigid_fit import RigidFit
 
                 fit = RigidFit(cast("System", self.system))
-                return np.array([fit.bodies(frame.positions, None).Q for frame in self.universe().trajectory])
+                return np.array(
+                    [fit.bodies(frame.positions, None).Q for frame in self.universe().trajectory]
+                )
             from rigidmd.io.trajectory import read_exactly
 
             return np.array([frame.rotation for frame in read_exactly(path)])

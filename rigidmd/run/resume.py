@@ -1,4 +1,5 @@
-"""What a checkpoint has of a run: its record, the memories of observers; checks that both belong to the scene."""
+"""What a checkpoint has of a run: its record, the memories of observers; checks that both belong to
+the scene."""
 
 import contextlib
 import hashlib
@@ -27,35 +28,59 @@ from rigidmd.scene import MolecularScene, Scene
 PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy")
 #: Keys of a summary on programs and machine.
 MADE_WITH = (
-    *(f"{package}_version" for package in PACKAGES), "python_version", "machine", "processor", "vector_bits",
-    "numba_settings", "threads",
-)  # fmt: skip
+    *(f"{package}_version" for package in PACKAGES),
+    "python_version",
+    "machine",
+    "processor",
+    "vector_bits",
+    "numba_settings",
+    "threads",
+)
 #: Keys that change no bit of a run, or, as input files, are compared by contents.
-NOT_COMPARED = ("name", "threads", "output.checkpoint_minutes", "output.figures", "output.drawn_as", "watch")
+NOT_COMPARED = (
+    "name",
+    "threads",
+    "output.checkpoint_minutes",
+    "output.figures",
+    "output.drawn_as",
+    "watch",
+)
 
 
 def computed_with() -> dict[str, Any]:
     """Everything besides the scene that may change the bits of a result, as JSON values."""
-    settings = " ".join(f"{name}={os.environ[name]}" for name in CODE_SETTINGS if name in os.environ)
+    settings = " ".join(
+        f"{name}={os.environ[name]}" for name in CODE_SETTINGS if name in os.environ
+    )
     return {
-        **{f"{package}_version": version(package) for package in PACKAGES}, "python_version": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}", "processor": PROCESSOR,
-        "processor_features": list(PROCESSOR_FEATURES), "vector_bits": SIMD_BITS,
+        **{f"{package}_version": version(package) for package in PACKAGES},
+        "python_version": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "processor": PROCESSOR,
+        "processor_features": list(PROCESSOR_FEATURES),
+        "vector_bits": SIMD_BITS,
         **({"numba_settings": settings} if settings else {}),
-    }  # fmt: skip
+    }
 
 
-def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: str) -> dict[str, Any]:
+def provenance(
+    scene: Scene, threads: int, inputs: Mapping[str, str], engine: str
+) -> dict[str, Any]:
     """The first part of summary.json: `computed_with`, and the input.
 
     inputs : `input_digests` at the start; engine : the program that computed the motion
     """
     molecular = isinstance(scene, MolecularScene)
     return {
-        "scene": scene.name, **computed_with(), "engine": engine, "threads": threads,
-        "seed": scene.seed if molecular else None, "precision": scene.precision if molecular else "double",
-        "scene_sha256": scene_digest(scene), "input_sha256": dict(inputs),
-    }  # fmt: skip
+        "scene": scene.name,
+        **computed_with(),
+        "engine": engine,
+        "threads": threads,
+        "seed": scene.seed if molecular else None,
+        "precision": scene.precision if molecular else "double",
+        "scene_sha256": scene_digest(scene),
+        "input_sha256": dict(inputs),
+    }
 
 
 def scene_digest(scene: Scene) -> str:
@@ -69,12 +94,17 @@ def file_digest(path: Path) -> str:
 
 
 def input_digests(scene: Scene, file_digest: Callable[[Path], str] = file_digest) -> dict[str, str]:
-    """SHA-256 of each input of a scene, a file or its contents, by its dotted key. Raises SceneError."""
+    """SHA-256 of each input of a scene, a file or its contents, by its dotted key. Raises
+    SceneError."""
     try:
         read = {key: file_digest(path) for key, path in scene.inputs.items()}
     except OSError as error:
-        raise SceneError(scene.source, [f"{error.filename} cannot be read: {error.strerror}"]) from None
-    return read | {key: hashlib.sha256(content).hexdigest() for key, content in scene.embedded_files.items()}
+        raise SceneError(
+            scene.source, [f"{error.filename} cannot be read: {error.strerror}"]
+        ) from None
+    return read | {
+        key: hashlib.sha256(content).hexdigest() for key, content in scene.embedded_files.items()
+    }
 
 
 def plain(scene: BaseModel) -> dict[str, Any]:
@@ -88,9 +118,13 @@ def keys_of(scene: Mapping[str, Any], excluded: Iterable[str]) -> dict[str, Any]
     return {key: value for key, value in _flat(scene).items() if not f"{key}.".startswith(left_out)}
 
 
-def differences(first: Mapping[str, Any], second: Mapping[str, Any], left_out: Any = "left out") -> dict[str, tuple]:
+def differences(
+    first: Mapping[str, Any], second: Mapping[str, Any], left_out: Any = "left out"
+) -> dict[str, tuple]:
     """Key -> both values, where two dictionaries differ."""
-    pairs = {key: (first.get(key, left_out), second.get(key, left_out)) for key in {**first, **second}}
+    pairs = {
+        key: (first.get(key, left_out), second.get(key, left_out)) for key in {**first, **second}
+    }
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
@@ -101,7 +135,11 @@ def _flat(data: Any, name: str = "") -> dict[str, Any]:
     if not isinstance(data, Mapping):
         return {} if data is None else {name: data}
     start = f"{name}." if name else ""
-    return {key: value for part, inner in data.items() for key, value in _flat(inner, f"{start}{part}").items()}
+    return {
+        key: value
+        for part, inner in data.items()
+        for key, value in _flat(inner, f"{start}{part}").items()
+    }
 
 
 Count = Annotated[int, Field(ge=0)]
@@ -110,14 +148,19 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Arrays = dict[str, np.ndarray]
 
 
-def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[str, str], steps: int) -> None:
-    """Raise CheckpointError unless a resolved scene can continue a run of the scene `before` after some steps. The last
-    stage of molecules may be longer or shorter than before, but not shorter than it has run."""
+def check_same_scene(
+    scene: Scene, before: Mapping[str, Any], inputs: Mapping[str, str], steps: int
+) -> None:
+    """Raise CheckpointError unless a resolved scene can continue a run of the scene `before` after
+    some steps. The last stage of molecules may be longer or shorter than before, but not shorter
+    than it has run."""
     excluded = [*scene.inputs, *scene.embedded_files, *NOT_COMPARED]
     if isinstance(scene, MolecularScene) and not scene.stages[-1].ramps:
         excluded.append(f"stages.{len(scene.stages) - 1}.duration_ps")
         if sum(stage.steps for stage in scene.stages) < steps:
-            raise CheckpointError(f"{scene.source}: the run in the folder is already longer, {steps} steps")
+            raise CheckpointError(
+                f"{scene.source}: the run in the folder is already longer, {steps} steps"
+            )
     unlike = differences(keys_of(plain(scene), excluded), keys_of(before, excluded))
     changes = [f"{key} is {now}, there {then}" for key, (now, then) in unlike.items()]
     found = input_digests(scene)
@@ -130,7 +173,8 @@ def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[st
 
 
 def describe_changes(before: Mapping[str, Any]) -> str | None:
-    """A sentence if the run so far was computed with other versions or on another processor; None otherwise."""
+    """A sentence if the run so far was computed with other versions or on another processor; None
+    otherwise."""
     changed = [
         f"{key.replace('_', ' ').removesuffix(' version')} {then} there, {here} here"
         for key, (then, here) in differences(before, computed_with(), None).items()
@@ -139,31 +183,40 @@ def describe_changes(before: Mapping[str, Any]) -> str | None:
     if not changed:
         return None
     return (
-        f"the run so far was computed with {'; '.join(changed)}: from here on bits may differ from a run without a stop"
+        f"the run so far was computed with {'; '.join(changed)}: from here on bits may differ from"
+        " a run without a stop"
     )
 
 
 def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True) -> State:
-    """The state in a checkpoint of a run whose states have arrays like `like`. Raises ValueError, KeyError.
+    """The state in a checkpoint of a run whose states have arrays like `like`. Raises ValueError,
+    KeyError.
 
     exact : whether the method of the run keeps rotation matrices orthogonal to rounding
     """
     found = State(*(np.array(arrays[name], order="C") for name in STORED_NAMES))
     shapes = {name: expected.shape for name, expected in zip(STORED_NAMES, like, strict=True)}
-    for name, problem in array_errors(dict(zip(STORED_NAMES, found, strict=True)), shapes, exact).items():
+    for name, problem in array_errors(
+        dict(zip(STORED_NAMES, found, strict=True)), shapes, exact
+    ).items():
         raise ValueError(f"{name} of its state {problem}")
     for name, array, expected in zip(STORED_NAMES, found, like, strict=True):
         if array.dtype != expected.dtype:
-            raise ValueError(f"{name} of its state is of the type {array.dtype}, not {expected.dtype}")
+            raise ValueError(
+                f"{name} of its state is of the type {array.dtype}, not {expected.dtype}"
+            )
     if (np.isfinite(found.cell) != np.isfinite(like.cell)).any():
         raise ValueError("its state has another kind of box")
-    if not (0 <= found.step[ORIGIN] <= found.step[NOW] and 0 <= found.time[ORIGIN] <= found.time[NOW]):
+    if not (
+        0 <= found.step[ORIGIN] <= found.step[NOW] and 0 <= found.time[ORIGIN] <= found.time[NOW]
+    ):
         raise ValueError("its step or time is before the start")
     return found
 
 
 def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
-    """Attributes of an object for a checkpoint, by their names and types: arrays as arrays, all others as JSON."""
+    """Attributes of an object for a checkpoint, by their names and types: arrays as arrays, all
+    others as JSON."""
     arrays, plain_types = {}, {}
     for name, kind in types.items():
         if kind is np.ndarray:
@@ -173,16 +226,27 @@ def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
         else:
             plain_types[name] = kind
     values = {name: getattr(owner, name) for name in plain_types}
-    found = _model_of(plain_types).model_construct(**values).model_dump(mode="json", exclude_none=True)
+    found = (
+        _model_of(plain_types).model_construct(**values).model_dump(mode="json", exclude_none=True)
+    )
     return Checkpoint({name: found.get(name) for name in plain_types}, arrays)
 
 
-def restored(kept: Checkpoint, types: Mapping[str, Any], rows: Mapping[str, Scheme] | None = None) -> dict[str, Any]:
-    """The attributes of `stored`, validated. rows : see `Scene.rows`. Raises ValueError or KeyError."""
-    arrays: dict[str, Any] = {name: kept.arrays[name] for name, kind in types.items() if kind is np.ndarray}
+def restored(
+    kept: Checkpoint, types: Mapping[str, Any], rows: Mapping[str, Scheme] | None = None
+) -> dict[str, Any]:
+    """The attributes of `stored`, validated. rows : see `Scene.rows`. Raises ValueError or
+    KeyError."""
+    arrays: dict[str, Any] = {
+        name: kept.arrays[name] for name, kind in types.items() if kind is np.ndarray
+    }
     for name in (name for name, kind in types.items() if kind == Arrays):
         start = f"{name}/"
-        arrays[name] = {key.removeprefix(start): kept.arrays[key] for key in kept.arrays if key.startswith(start)}
+        arrays[name] = {
+            key.removeprefix(start): kept.arrays[key]
+            for key in kept.arrays
+            if key.startswith(start)
+        }
     try:
         model = _model_of({name: types[name] for name in types if name not in arrays})
         found = model.model_validate(kept.values, context=rows)
@@ -193,7 +257,9 @@ def restored(kept: Checkpoint, types: Mapping[str, Any], rows: Mapping[str, Sche
 
 
 def _model_of(types: Mapping[str, Any]) -> type[BaseModel]:
-    config = ConfigDict(extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants", protected_namespaces=())
+    config = ConfigDict(
+        extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants", protected_namespaces=()
+    )
     fields: Any = {name: (kind, ...) for name, kind in types.items()}
     return create_model("Stored", __config__=config, **fields)
 
@@ -211,9 +277,11 @@ class RunPosition:
 
 @dataclass
 class RunRecord:
-    """The input of a run and all that evolves in it, besides its state, its engine and its observers.
+    """The input of a run and all that evolves in it, besides its state, its engine and its
+    observers.
 
-    Every field of this class and its subclasses is in the checkpoints: `stored` and `restored` follow the annotations.
+    Every field of this class and its subclasses is in the checkpoints: `stored` and `restored`
+    follow the annotations.
     """
 
     scene: dict[str, Any] = field(default_factory=dict)  # as JSON values
@@ -234,5 +302,6 @@ def as_checkpoint_errors(folder: Path | None) -> Iterator[None]:
         yield
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError) as error:
         raise CheckpointError(
-            f"the checkpoint in {folder} does not fit this run: {error}. {option('force')} begins a new run"
+            f"the checkpoint in {folder} does not fit this run: {error}. {option('force')} begins a"
+            " new run"
         ) from None

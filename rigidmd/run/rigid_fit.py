@@ -1,4 +1,5 @@
-"""Fits of rigid molecules to the positions and velocities of sites, such as those in a trajectory."""
+"""Fits of rigid molecules to the positions and velocities of sites, such as those in a
+trajectory."""
 
 from typing import NamedTuple
 
@@ -20,31 +21,40 @@ class Bodies(NamedTuple):
 
 
 class RigidFit:
-    """Fits the molecules of a system, with the axes of `rigidmd models NAME`, to frames of sites."""
+    """Fits the molecules of a system, with the axes of `rigidmd models NAME`, to frames of
+    sites."""
 
     def __init__(self, system: System):
         self._kinds, self._n = kinds_of(system), len(system.model.species)
         self._rotates = len(system.state.rotation) > 0
 
     def bodies(self, sites: np.ndarray, velocities: np.ndarray | None) -> Bodies:
-        """Bodies of a frame from sites (s, 3), Å, and their velocities. Raises OutputError if a molecule is not whole,
-        or a number not finite. Q of a linear molecule has an arbitrary rotation about its axis."""
+        """Bodies of a frame from sites (s, 3), Å, and their velocities. Raises OutputError if a
+        molecule is not whole, or a number not finite. Q of a linear molecule has an arbitrary
+        rotation about its axis."""
         if not (np.isfinite(sites).all() and (velocities is None or np.isfinite(velocities).all())):
             raise OutputError("positions or velocities are not finite numbers")
         centre = np.empty((self._n, 3))
         Q = np.tile(np.eye(3), (self._n if self._rotates else 0, 1, 1))
         velocity, L = np.empty((self._n, 3)), np.zeros((len(Q), 3))
         for kind in self._kinds:
-            at, index, body = sites[kind.sites].astype(float), kind.index, kind.molecule.positions_body
+            at, index, body = (
+                sites[kind.sites].astype(float),
+                kind.index,
+                kind.molecule.positions_body,
+            )
             middle, middle_body = at.mean(axis=1), body.mean(axis=0)
             rotation = align(body - middle_body, at - middle[:, None], np.ones(len(body)))
             centre[index] = middle - rotation @ middle_body
             arms = np.einsum("nij,sj->nsi", rotation, body)
             off = np.abs(at - centre[index][:, None] - arms).max(axis=(1, 2), initial=0.0)
-            if (worst := float(off.max(initial=0.0))) > MAX_DEVIATION + MAX_RELATIVE_DEVIATION * kind.molecule.radius:
+            if (
+                worst := float(off.max(initial=0.0))
+            ) > MAX_DEVIATION + MAX_RELATIVE_DEVIATION * kind.molecule.radius:
                 raise OutputError(
-                    f"a site of molecule {index[off.argmax()] + 1} is {worst:.2g} Å away from its position in the "
-                    f"rigid {kind.name}: the molecules of a trajectory must be whole, and be the molecules of this run"
+                    f"a site of molecule {index[off.argmax()] + 1} is {worst:.2g} Å away from its"
+                    f" position in the rigid {kind.name}: the molecules of a trajectory must be"
+                    " whole, and be the molecules of this run"
                 )
             if self._rotates:
                 Q[index] = rotation
@@ -55,10 +65,13 @@ class RigidFit:
                 if self._rotates:
                     lab = np.einsum("s,nsi->ni", mass, np.cross(arms, v - mean[:, None]))
                     L[index] = np.einsum("nij,ni->nj", rotation, lab)
-        return Bodies(centre, Q, None, None) if velocities is None else Bodies(centre, Q, velocity, L)
+        return (
+            Bodies(centre, Q, None, None) if velocities is None else Bodies(centre, Q, velocity, L)
+        )
 
 
-#: Largest deviation of a site from the rigid molecule, Å, and fraction of the radius: files are rounded to 0.01 Å.
+#: Largest deviation of a site from the rigid molecule, Å, and fraction of the radius: files are
+#: rounded to 0.01 Å.
 MAX_DEVIATION, MAX_RELATIVE_DEVIATION = 0.03, 0.03
 
 

@@ -1,7 +1,8 @@
-"""Segments of a run, when observers are called in them, when checkpoints are written, and when a run has to end.
+"""Segments of a run, when observers are called in them, when checkpoints are written, and when a
+run has to end.
 
-Wall time and signals decide on checkpoints and the end, and change no bit of the results. Python handles signals in its
-main thread only; in other threads the functions for signals do nothing.
+Wall time and signals decide on checkpoints and the end, and change no bit of the results. Python
+handles signals in its main thread only; in other threads the functions for signals do nothing.
 """
 
 import _thread
@@ -21,14 +22,17 @@ from rigidmd.run.observers import Observer, above_zero
 
 
 class Segment(NamedTuple):
-    """Equal steps (a stage, or the time between two breaks of a body), or an action in which no time passes."""
+    """Equal steps (a stage, or the time between two breaks of a body), or an action in which no
+    time passes."""
 
     method: Scheme | Solver
     dt: float  # ps, or s for a single body
     steps: int
     steps_before: int = 0  # in the same count of the intervals of observers
     together: int = 1  # steps between which nothing is observed
-    action: Callable[[bool | None], None] | None = None  # called before the steps, with whether to show progress
+    action: Callable[[bool | None], None] | None = (
+        None  # called before the steps, with whether to show progress
+    )
 
 
 class ObservationSchedule:
@@ -36,18 +40,31 @@ class ObservationSchedule:
 
     def __init__(self, observers: Collection[Observer], segment: Segment):
         self._observers, self._last, together = observers, segment.steps, segment.together
-        self._regular: list[tuple[int, int]] = []  # steps between two calls of each, or 0; steps before the segment
+        self._regular: list[
+            tuple[int, int]
+        ] = []  # steps between two calls of each, or 0; steps before the segment
         for observer in observers:
             if observer.interval is None:
                 self._regular.append((-(-(observer.steps or 0) // together) * together, 0))
             else:  # may continue from the segment before
-                interval = above_zero(observer.interval, f"the interval of {type(observer).__name__}")
+                interval = above_zero(
+                    observer.interval, f"the interval of {type(observer).__name__}"
+                )
                 every = max(1, round(interval / (segment.dt * together))) * together
                 self._regular.append((every, segment.steps_before))
 
     def next_observation(self, done: int) -> int:
         """Number of steps at which the next observer is called, after `done` steps."""
-        return min([self._last, *(done + every - (before + done) % every for every, before in self._regular if every)])
+        return min(
+            [
+                self._last,
+                *(
+                    done + every - (before + done) % every
+                    for every, before in self._regular
+                    if every
+                ),
+            ]
+        )
 
     def due(self, done: int) -> list[bool]:
         """Which observers are called after `done` steps."""
@@ -59,14 +76,17 @@ class ObservationSchedule:
 
 #: Seconds of computing after which the clock and signals are checked.
 SEGMENT_SECONDS = 1.0
-#: Time reserved for the last checkpoint and the final files: durations of the longest checkpoint, and seconds.
+#: Time reserved for the last checkpoint and the final files: durations of the longest checkpoint,
+#: and seconds.
 RESERVED_CHECKPOINTS, RESERVED_SECONDS = 3.0, 2.0
 
 
 def checked_walltime(seconds: float) -> float:
     """Seconds until a run has to end; ValueError unless they are finite and not negative."""
     if not 0 <= seconds < inf:
-        raise ValueError(f"walltime is {seconds!r}, must be a finite number of seconds, not negative")
+        raise ValueError(
+            f"walltime is {seconds!r}, must be a finite number of seconds, not negative"
+        )
     return seconds
 
 
@@ -96,8 +116,8 @@ class CheckpointSchedule:
         return self._deadline is not None and clock.monotonic() + needed > self._deadline
 
     def write_once(self, checkpoint: Checkpoint, position: tuple[int, int, bool]) -> None:
-        """Write a checkpoint, unless the last one has the same position: segment, step, whether steps were computed.
-        Raises OutputError."""
+        """Write a checkpoint, unless the last one has the same position: segment, step, whether
+        steps were computed. Raises OutputError."""
         self.requested = False
         if self._folder is None or position == self._written:
             return
@@ -113,7 +133,9 @@ def signal_handler(handler: Callable[[int], None], *numbers: int) -> Iterator[No
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, lambda number, frame: handler(number)) for number in numbers}
+    before = {
+        number: signal.signal(number, lambda number, frame: handler(number)) for number in numbers
+    }
     try:
         yield
     finally:
@@ -123,7 +145,10 @@ def signal_handler(handler: Callable[[int], None], *numbers: int) -> Iterator[No
 
 def stop_signals() -> list[int]:
     """The signals that end runs: Ctrl-C, and SIGTERM unless the program has its own handler."""
-    return [signal.SIGINT, *([signal.SIGTERM] if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL else [])]
+    return [
+        signal.SIGINT,
+        *([signal.SIGTERM] if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL else []),
+    ]
 
 
 #: Seconds until a Ctrl-C is repeated that came where Python ignores exceptions.
@@ -132,8 +157,8 @@ RETRY_DELAY = 0.05
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Context in which Ctrl-C is not lost in a compiler, which ignores it while LLVM calls Python, or raises another
-    error. Raises KeyboardInterrupt, at the latest at its end."""
+    """Context in which Ctrl-C is not lost in a compiler, which ignores it while LLVM calls Python,
+    or raises another error. Raises KeyboardInterrupt, at the latest at its end."""
     has_handler = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
     if has_handler or threading.current_thread() is not threading.main_thread():
         yield

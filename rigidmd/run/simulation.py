@@ -1,4 +1,5 @@
-"""The simulation of a scene, of molecules or of a single body; several of them at once in one process."""
+"""The simulation of a scene, of molecules or of a single body; several of them at once in one
+process."""
 
 import atexit
 import contextlib
@@ -55,68 +56,101 @@ def _as_warning(sentence: str) -> None:
 
 
 class Simulation(Displayed):
-    """A scene, ready to run: `run()` runs it to its end, `step(n)` advances it by n steps; both can be mixed.
+    """A scene, ready to run: `run()` runs it to its end, `step(n)` advances it by n steps; both can
+    be mixed.
 
     scene : the scene
     folder : folder for the files; None writes nothing and keeps the frames in memory
     force : replace an earlier run in that folder
-    observers : user-defined, called between steps: `Every`, `LivePlot`, any object with `interval` and `see(moment)`
-    `say` : called with a sentence before something slow (compiling, pilot runs). Default: printed with the progress
-    warn : called with each warning; the summary repeats them. Default: a `RigidMDWarning` of Python's `warnings`
-    resume : continue from the last checkpoint in the folder, to the same bits; begin if the folder is empty or absent
-    walltime : seconds from now until the run has to have ended; it stops shortly before, with a checkpoint
-    forces : for molecules, user-defined forces, besides the forces of the scene: `rigidmd.Force`, `rigidmd.pair_law`,
-        terms of classes with `rigidmd.compiled_force`, or objects whose method term(system) makes such a term. At the
-        start forces and torques are compared with differences of the energy, and the virial with the effect of a
-        strain of the box
-    thermostat : for molecules, a user-defined thermostat for every stage: a NamedTuple of a class with
-        `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
-    applied : for a single body, name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at the
-        centre of mass, and a torque (3,) in N m along the body's axes. It is called once for each position of the
-        body. Forces that depend on the velocity are constant within a step, which reduces its order to 1
+    observers : user-defined, called between steps: `Every`, `LivePlot`, any object with `interval`
+        and `see(moment)`
+    `say` : called with a sentence before something slow (compiling, pilot runs). Default: printed
+        with the progress
+    warn : called with each warning; the summary repeats them. Default: a `RigidMDWarning` of
+        Python's `warnings`
+    resume : continue from the last checkpoint in the folder, to the same bits; begin if the folder
+        is empty or absent
+    walltime : seconds from now until the run has to have ended; it stops shortly before, with a
+        checkpoint
+    forces : for molecules, user-defined forces, besides the forces of the scene: `rigidmd.Force`,
+        `rigidmd.pair_law`, terms of classes with `rigidmd.compiled_force`, or objects whose method
+        term(system) makes such a term. At the start forces and torques are compared with
+        differences of the energy, and the virial with the effect of a strain of the box
+    thermostat : for molecules, a user-defined thermostat for every stage: a NamedTuple of a class
+        with `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
+    applied : for a single body, name -> function of a `Pose` that gives a force (3,) in N along the
+        lab's axes, at the centre of mass, and a torque (3,) in N m along the body's axes. It is
+        called once for each position of the body. Forces that depend on the velocity are constant
+        within a step, which reduces its order to 1
     """
 
     def __init__(
-        self, scene: Scene, folder: str | Path | None = None, force: bool = False, *,
-        observers: Any = (), say: Callable[[str], object] | None = None,
-        warn: Callable[[str], object] = _as_warning, resume: bool = False, walltime: float | None = None,
+        self,
+        scene: Scene,
+        folder: str | Path | None = None,
+        force: bool = False,
+        *,
+        observers: Any = (),
+        say: Callable[[str], object] | None = None,
+        warn: Callable[[str], object] = _as_warning,
+        resume: bool = False,
+        walltime: float | None = None,
         forces: "UserForce | Sequence[UserForce] | None" = None,
         thermostat: "NamedTuple | HasStage | None" = None,
         applied: "Mapping[str, Callable[[Pose], tuple]] | None" = None,
-    ):  # fmt: skip
-        self.folder = None if folder is None else Path(folder).absolute()  # a callback may change the directory
+    ):
+        self.folder = (
+            None if folder is None else Path(folder).absolute()
+        )  # a callback may change the directory
         if resume and folder is None:
             raise ValueError("a run without a folder has no checkpoint to resume from")
         self._force, self._resume, self._user_say, self.warn = force, resume, say, warn
-        self._deadline = None if walltime is None else clock.monotonic() + checked_walltime(walltime)
-        self.observers = [as_observer(each) for each in (observers if isinstance(observers, Sequence) else [observers])]
+        self._deadline = (
+            None if walltime is None else clock.monotonic() + checked_walltime(walltime)
+        )
+        self.observers = [
+            as_observer(each)
+            for each in (observers if isinstance(observers, Sequence) else [observers])
+        ]
         self.spot = DisplayArea()
         self._progress: bool | None = None
         self._issued: list[str] = []  # warnings by this process
         self._loop: RunLoop | None = None  # the run, after it has begun and before it has ended
-        self._earlier: run_folder.RunMark | None = None  # of the last run by this object in the folder
+        self._earlier: run_folder.RunMark | None = (
+            None  # of the last run by this object in the folder
+        )
         of_molecules = {"forces": forces, "thermostat": thermostat}
         self.part: Any  # a `RunPart`
         if isinstance(scene, BodyScene):
             from rigidmd.run.body import BodyRun
 
             if given := [key for key, value in of_molecules.items() if value is not None]:
-                problem = f"{' and '.join(given)}: for molecules; a single body takes applied={{name: function}}"
+                problem = (
+                    f"{' and '.join(given)}: for molecules; a single body takes applied={{name:"
+                    " function}"
+                )
                 raise SceneError(scene.source, [problem])
             self.part = BodyRun(self, scene, applied)
         else:
             from rigidmd.run.molecular import MolecularRun
 
             if applied is not None:
-                raise SceneError(scene.source, ["applied: for a single body; molecules take forces=[...]"])
+                raise SceneError(
+                    scene.source, ["applied: for a single body; molecules take forces=[...]"]
+                )
             self.part = MolecularRun(self, cast(Any, scene), forces, thermostat)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._summary_line}>"
 
     def __reduce__(self) -> Any:
-        what = "a Simulation has compiled code and open files, and can be neither copied nor pickled"
-        raise TypeError(f"{what}: use simulation.scene and simulation.state.copy(), from which start_from begins")
+        what = (
+            "a Simulation has compiled code and open files, and can be neither copied nor pickled"
+        )
+        raise TypeError(
+            f"{what}: use simulation.scene and simulation.state.copy(), from which start_from"
+            " begins"
+        )
 
     def __enter__(self) -> "Simulation":
         return self
@@ -124,39 +158,45 @@ class Simulation(Displayed):
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    scene = property(attrgetter("part.scene"), doc="The scene as it runs, with defaults and choices.")
+    scene = property(
+        attrgetter("part.scene"), doc="The scene as it runs, with defaults and choices."
+    )
     system = property(attrgetter("part.system"), doc="The `System` or `BodySystem`.")
     engine = property(attrgetter("part.engine"), doc="The present engine.")
-    segment = property(attrgetter("part.segment"), doc="The present segment: its method, step and number of steps.")
+    segment = property(
+        attrgetter("part.segment"), doc="The present segment: its method, step and number of steps."
+    )
     threads = property(attrgetter("part.threads"), doc="Number of threads.")
 
     @property
     def state(self) -> State:
         """The present state, read-only: the next step changes it, a copy stays as it is.
 
-        For molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in SI units. Runs begin
-        from another state by `start_from`.
+        For molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in
+        SI units. Runs begin from another state by `start_from`.
         """
         return self.part.state.read_only
 
     @property
     def observation(self) -> Any:
-        """Observables of the present state, before, within and after a run; each use evaluates the forces.
+        """Observables of the present state, before, within and after a run; each use evaluates the
+        forces.
 
-        An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log; the `Pose` of a body, in SI units.
-        Raises SimulationError if the forces cannot be evaluated.
+        An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log; the `Pose` of a body,
+        in SI units. Raises SimulationError if the forces cannot be evaluated.
         """
         return self.part.observe_now()
 
     @property
     def energy(self) -> float:
-        """Potential plus kinetic energy of the present state, kJ/mol, for a body J; `observation` has both."""
+        """Potential plus kinetic energy of the present state, kJ/mol, for a body J; `observation`
+        has both."""
         return self.part.energy_now()
 
     @property
     def forces(self) -> np.ndarray:
-        """Forces (n, 3) on the centres of mass at the present state, lab frame, kJ/mol/Å; on a body (1, 3) in N, empty
-        if it is pinned."""
+        """Forces (n, 3) on the centres of mass at the present state, lab frame, kJ/mol/Å; on a body
+        (1, 3) in N, empty if it is pinned."""
         return self.part.forces_now()
 
     @property
@@ -180,7 +220,8 @@ class Simulation(Displayed):
         return "\n".join([self.part.headline, *(f"  {note}" for note in self.system.notes)])
 
     def conclusion(self, results: Results) -> str:
-        """The summary as text, without the notes of the introduction and the warnings that were issued."""
+        """The summary as text, without the notes of the introduction and the warnings that were
+        issued."""
         return self.part.summary_text(results.summary, [*self.system.notes, *self._issued])
 
     def write_scene(self, folder: Path) -> None:
@@ -196,36 +237,43 @@ class Simulation(Displayed):
         return self.part
 
     def _molecules(self, begun: bool = False) -> "MolecularRun":
-        """The part of molecules. Raises TypeError for a body, RuntimeError within a run unless it may have `begun`."""
+        """The part of molecules. Raises TypeError for a body, RuntimeError within a run unless it
+        may have `begun`."""
         part = self.part if begun else self._before_run()
         if isinstance(self.scene, BodyScene):
             raise TypeError(f"{self.scene.name} is a single body; this method is for molecules")
         return part
 
     def start_from(self, state: State) -> None:
-        """Let runs of molecules begin at the given positions and momenta, without removal of overlaps.
+        """Let runs of molecules begin at the given positions and momenta, without removal of
+        overlaps.
 
-        state : of as many molecules in the same order, in the units of `state`, such as `results.state`. Time and step
-            begin at 0. Raises StructureError for a state that this scene cannot have, TypeError for anything else.
+        state : of as many molecules in the same order, in the units of `state`, such as
+            `results.state`. Time and step begin at 0. Raises StructureError for a state that this
+            scene cannot have, TypeError for anything else.
         """
         self._molecules().start_from(state)
         if self._earlier is not None:
             self._earlier.is_complete = True  # the next run does not continue it
 
     def start(self) -> "OverlapRemoval | None":
-        """Go to the state before the first step, from which `run` starts. Returns the removal of overlaps."""
+        """Go to the state before the first step, from which `run` starts. Returns the removal of
+        overlaps."""
         return self._molecules().start()
 
     def settle(self) -> State:
-        """Go to the state of molecules after removal of overlaps and the minimisations that come first."""
+        """Go to the state of molecules after removal of overlaps and the minimisations that come
+        first."""
         return self._molecules().settle()
 
     def atoms(self) -> "ase.Atoms":
-        """The present state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers may call it."""
+        """The present state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers
+        may call it."""
         return self._molecules(begun=True).atoms()
 
     def compile(self) -> None:
-        """Compile what a run needs, or read it from the cache, without running: before a course, or on a login node.
+        """Compile what a run needs, or read it from the cache, without running: before a course, or
+        on a login node.
 
         A stage with integrator = "auto" compiles more when pilot runs have chosen.
         """
@@ -237,7 +285,8 @@ class Simulation(Displayed):
         self._before_run().take_threads(count)
 
     def start_energy(self, *unit: Any, **options: Any) -> dict[str, Any]:
-        """Energies and forces at the start; for the arguments see `MolecularRun.start_energy`, a body has none."""
+        """Energies and forces at the start; for the arguments see `MolecularRun.start_energy`, a
+        body has none."""
         return self._before_run().start_energy(*unit, **options)
 
     # The run.
@@ -245,36 +294,44 @@ class Simulation(Displayed):
     def run(self, progress: bool | None = None) -> Results:
         """Run the scene, or what remains of it after `step`, and complete all files.
 
-        After the end of a run, a call repeats it; in a folder it replaces the files of that run. A run in a folder that
-        was interrupted is continued from its last checkpoint. Without a folder there is none, and it begins anew.
+        After the end of a run, a call repeats it; in a folder it replaces the files of that run. A
+        run in a folder that was interrupted is continued from its last checkpoint. Without a folder
+        there is none, and it begins anew.
 
         Raises OutputError (before computing), SimulationError if it fails, CheckpointError.
 
-        progress : whether to show progress, by a bar or, if not on a terminal, lines every 30 s; default: in notebooks
+        progress : whether to show progress, by a bar or, if not on a terminal, lines every 30 s;
+            default: in notebooks
         """
         return cast(Results, self._drive(inf, progress).results)
 
     def step(self, count: int = 1) -> int:
-        """Advance by a number of steps, as `run` does. Returns the number done: fewer at the end of the scene, then 0.
+        """Advance by a number of steps, as `run` does. Returns the number done: fewer at the end of
+        the scene, then 0.
 
-        The first call begins the run: it compiles and writes the first files. A minimisation is done with the next step
-        after it. `run` or `close` completes the run. A signal such as Ctrl-C ends the run with all files, and is raised
-        then. Raises ValueError, and as `run`.
+        The first call begins the run: it compiles and writes the first files. A minimisation is
+        done with the next step after it. `run` or `close` completes the run. A signal such as
+        Ctrl-C ends the run with all files, and is raised then. Raises ValueError, and as `run`.
         """
         if count < 1:
             raise ValueError(f"step({count}): at least one step")
         return self._drive(count, False).advanced
 
     def close(self) -> None:
-        """End a run that `step` has begun, with all files, as `stop` ends it: it can be resumed. The end of a `with`
-        block does this, and so does the end of Python."""
-        if self._loop is not None and not self._loop.is_running and os.getpid() == self._loop.process:
+        """End a run that `step` has begun, with all files, as `stop` ends it: it can be resumed.
+        The end of a `with` block does this, and so does the end of Python."""
+        if (
+            self._loop is not None
+            and not self._loop.is_running
+            and os.getpid() == self._loop.process
+        ):
             if not self._loop.is_complete:
                 self.stop()
             self.run(progress=False)
 
     def stop(self, number: int | None = None) -> None:
-        """End the run at its next observation, with all files. Observers and other threads may call it.
+        """End the run at its next observation, with all files. Observers and other threads may call
+        it.
 
         number : of the signal that requests it
         """
@@ -309,7 +366,8 @@ class Simulation(Displayed):
         return self._loop is not None and self._loop.interrupted
 
     def _drive(self, steps: float, progress: bool | None) -> RunLoop:
-        """Let the run advance by at most this number of steps, or to its end. A new one begins after its end."""
+        """Let the run advance by at most this number of steps, or to its end. A new one begins
+        after its end."""
         if self._loop is None:
             self._issued = []
             force, resume = self._force, self._resume
@@ -320,7 +378,9 @@ class Simulation(Displayed):
             _BEGUN.add(self)
         loop = self._loop
         if loop.is_running:
-            raise RuntimeError("this simulation is running already; its observers cannot run it again")
+            raise RuntimeError(
+                "this simulation is running already; its observers cannot run it again"
+            )
         self._progress, self.spot = progress, DisplayArea()
         try:
             loop.drive(steps, progress)
@@ -344,17 +404,21 @@ def _close_all() -> None:
 POLL_INTERVAL = 0.2
 
 
-def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> list[Results | None]:
-    """Run simulations at once, each on one thread; their results in the same order, with the bits of `run`.
+def run_together(
+    simulations: Sequence[Simulation], jobs: int | None = None
+) -> list[Results | None]:
+    """Run simulations at once, each on one thread; their results in the same order, with the bits
+    of `run`.
 
-    For many small systems this is faster than one run after another on all cores: no thread waits for another, and the
-    steps of one run continue while the observers of another are called.
+    For many small systems this is faster than one run after another on all cores: no thread waits
+    for another, and the steps of one run continue while the observers of another are called.
 
     jobs : runs at a time; default: the number of cores
 
-    Ctrl-C and SIGTERM stop all runs at their next observations; a run that had not begun is None in the list. A second
-    Ctrl-C then raises KeyboardInterrupt. If a run fails, the others continue, and the first error is raised at the end,
-    with a note on the runs that failed. Summaries and scenes of the simulations have one thread.
+    Ctrl-C and SIGTERM stop all runs at their next observations; a run that had not begun is None in
+    the list. A second Ctrl-C then raises KeyboardInterrupt. If a run fails, the others continue,
+    and the first error is raised at the end, with a note on the runs that failed. Summaries and
+    scenes of the simulations have one thread.
     """
     simulations = list(simulations)
     if wrong := [value for value in simulations if not isinstance(value, Simulation)]:
@@ -400,9 +464,13 @@ def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> 
             _, running = wait(running, POLL_INTERVAL)
             if received:
                 stop_all()  # repeatedly: a run that was just beginning may have missed it
-    failed = {k: error for k, future in enumerate(futures, 1) if (error := future.exception()) is not None}
+    failed = {
+        k: error for k, future in enumerate(futures, 1) if (error := future.exception()) is not None
+    }
     if failed:
         error, which = next(iter(failed.values())), ", ".join(map(str, failed))
-        error.add_note(f"of {len(futures)} runs at once these failed: {which}; this is the error of the first")
+        error.add_note(
+            f"of {len(futures)} runs at once these failed: {which}; this is the error of the first"
+        )
         raise error
     return [future.result() for future in futures]

@@ -1,4 +1,5 @@
-"""The summary of a run, of molecules or of a single body: one dictionary with units in its keys, and its notes."""
+"""The summary of a run, of molecules or of a single body: one dictionary with units in its keys,
+and its notes."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -11,7 +12,14 @@ from rigidmd.core.state import REMOVED, State
 from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean_and_error, slope
 from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.samples import COLUMNS, LEAST_SAMPLES, Sample, Samples, describe_equilibrated, equilibrated
+from rigidmd.engines.samples import (
+    COLUMNS,
+    LEAST_SAMPLES,
+    Sample,
+    Samples,
+    describe_equilibrated,
+    equilibrated,
+)
 from rigidmd.engines.system import System
 from rigidmd.run.body_rates import body_rates
 from rigidmd.scene.stage import Stage
@@ -24,8 +32,9 @@ if TYPE_CHECKING:
 TEMPERATURES = {name: "K" for name in COLUMNS if name.startswith("temperature")}
 BOX = {"density": "g_cm3", "a": "A", "b": "A", "c": "A"}
 HYBRID = {"acceptance": "mean", "abs_dH_kT": "mean", "exp_minus_dH": "mean"}
-#: The second half of a stage has notes if it has enough samples, on effects larger than some standard errors. A drift
-#: is significant from there on: in random walks of the energy its errors are up to 1.5 times too small (`slope`).
+#: The second half of a stage has notes if it has enough samples, on effects larger than some
+#: standard errors. A drift is significant from there on: in random walks of the energy its errors
+#: are up to 1.5 times too small (`slope`).
 MIN_SAMPLES, STANDARD_ERRORS = 20, 4.0
 #: Drift of the conserved energy per degree of freedom, kT/ns, and its sum over the time, kT.
 DRIFT_LIMIT, DRIFT_SUM_LIMIT = 0.1, 1e-3
@@ -33,8 +42,8 @@ DRIFT_LIMIT, DRIFT_SUM_LIMIT = 0.1, 1e-3
 LEAST_ACCEPTANCE = 0.2
 #: Error of the temperature by the step, and difference of T_trans and T_rot, as fractions.
 HEATING_LIMIT, DIFFERENCE_LIMIT = 0.01, 0.01
-#: Largest fraction of T_trans in a common drift of all molecules without a note. Where the total momentum is thermal:
-#: its largest kinetic energy in kT, which one run in two million exceeds.
+#: Largest fraction of T_trans in a common drift of all molecules without a note. Where the total
+#: momentum is thermal: its largest kinetic energy in kT, which one run in two million exceeds.
 COMMON_DRIFT_LIMIT, THERMAL_LIMIT = 1e-4, 16.0
 MOTIONS = ("translation", "rotation")
 #: Growth of the estimated error of Coulomb forces that has a note.
@@ -54,18 +63,35 @@ class Minimum(NamedTuple):
     energy_after: float  # at the end
     force: float  # largest force on a molecule that is not frozen
     torque: float  # largest torque about a principal axis
-    pressure: tuple[float, ...] | None  # six, by `barostats.COMPONENTS`, without the kinetic part; None without a box
-    deviation: float | None  # largest deviation from the requested pressure; None if the cell does not relax
+    pressure: (
+        tuple[float, ...] | None
+    )  # six, by `barostats.COMPONENTS`, without the kinetic part; None without a box
+    deviation: (
+        float | None
+    )  # largest deviation from the requested pressure; None if the cell does not relax
     precision: str = "double"  # of the last forces
 
 
 def summarise(
-    system: System, record: "MolecularRecord", samples: Samples, state: State, preparing: float, wall: float,
+    system: System,
+    record: "MolecularRecord",
+    samples: Samples,
+    state: State,
+    preparing: float,
+    wall: float,
     interrupted: bool,
-) -> dict:  # fmt: skip
-    """The summary of a run of molecules, without its `provenance`; seconds as in `RunPart.summary`."""
-    scene, minima, computing, last = system.scene, record.minima, record.position.computing, samples.row(-1)
-    size = float(system.model.mass[system.model.species] @ np.linalg.norm(state.velocity, axis=1))  # sum of |m v|
+) -> dict:
+    """The summary of a run of molecules, without its `provenance`; seconds as in
+    `RunPart.summary`."""
+    scene, minima, computing, last = (
+        system.scene,
+        record.minima,
+        record.position.computing,
+        samples.row(-1),
+    )
+    size = float(
+        system.model.mass[system.model.species] @ np.linalg.norm(state.velocity, axis=1)
+    )  # sum of |m v|
     moving = [k for k in range(len(computing)) if k not in minima]
     stages = []
     for k in np.unique(samples["stage"]).tolist():
@@ -78,35 +104,62 @@ def summarise(
         stages.append(values | {"choice": choice, "stable_timestep_fs": stable})
     removed, interval = None, system.removes_momentum_every
     if interval is not None:
-        removed = {"interval_ps": interval, "energy_kJ_mol": -float(state.energy_ledger[REMOVED]) / KJ_PER_MOL}
+        removed = {
+            "interval_ps": interval,
+            "energy_kJ_mol": -float(state.energy_ledger[REMOVED]) / KJ_PER_MOL,
+        }
     return {
-        "interrupted": interrupted, "molecules": len(system.model.species),
-        "species": {m.name: 0 for m in system.species} | Counter(system.species[k].name for k in system.model.species),
-        "sites": system.site_count, "degrees_of_freedom": system.last_freedom.total,
+        "interrupted": interrupted,
+        "molecules": len(system.model.species),
+        "species": (
+            {m.name: 0 for m in system.species}
+            | Counter(system.species[k].name for k in system.model.species)
+        ),
+        "sites": system.site_count,
+        "degrees_of_freedom": system.last_freedom.total,
         "degrees_of_freedom_translation": system.last_freedom.translation,
         "degrees_of_freedom_rotation": system.last_freedom.rotation,
-        "box_A": list(system.space) if system.density else None, "density_g_cm3": system.density or None,
+        "box_A": list(system.space) if system.density else None,
+        "density_g_cm3": system.density or None,
         "cutoff_A": system.cutoff if np.isfinite(system.cutoff) else None,
         "positions": scene.output.positions if scene.output.trajectory and system.density else None,
-        "precision_reason": f"{system.precision}: {system.precision_reason}" if system.precision_reason else None,
+        "precision_reason": (
+            f"{system.precision}: {system.precision_reason}" if system.precision_reason else None
+        ),
         "relief_steps": record.removal.steps if record.removal else 0,
-        "preparing_s": preparing, "wall_s": wall,
-        "largest_orthogonality_error": float(samples["orthogonality_error"].max()), "momentum_u_A_ps": last.momentum,
+        "preparing_s": preparing,
+        "wall_s": wall,
+        "largest_orthogonality_error": float(samples["orthogonality_error"].max()),
+        "momentum_u_A_ps": last.momentum,
         "momentum_relative": last.momentum / size if size else 0.0,
-        "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
-        "own_forces": dict(system.user_terms),
-        "forces_by_python": {name: [f.calls, f.seconds] for name, f in system.python_forces.items()},
-        "momentum_removed": removed, "stages": stages,
-        "notes": [
-            *system.notes, *_common_drift_notes(system, state, last), *ewald_error_notes(system, state),
-            *(note for k in moving for note in _notes_on_averages(system, samples, k)), *record.notes,
+        "momentum_conserved": [
+            axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept
         ],
-    }  # fmt: skip
+        "own_forces": dict(system.user_terms),
+        "forces_by_python": {
+            name: [f.calls, f.seconds] for name, f in system.python_forces.items()
+        },
+        "momentum_removed": removed,
+        "stages": stages,
+        "notes": [
+            *system.notes,
+            *_common_drift_notes(system, state, last),
+            *ewald_error_notes(system, state),
+            *(note for k in moving for note in _notes_on_averages(system, samples, k)),
+            *record.notes,
+        ],
+    }
 
 
 def _choice(system: System, samples: Samples, k: int, text: str | None) -> str | None:
-    """The text of the choice for a stage; where it was for an error of the energy, also the error that was reached."""
-    thermal = BOLTZMANN / KJ_PER_MOL * (mean_and_error(samples["temperature"])[0] or 0.0) * system.freedom_in(k).total
+    """The text of the choice for a stage; where it was for an error of the energy, also the error
+    that was reached."""
+    thermal = (
+        BOLTZMANN
+        / KJ_PER_MOL
+        * (mean_and_error(samples["temperature"])[0] or 0.0)
+        * system.freedom_in(k).total
+    )
     if text is None or ENERGY_ERROR not in text or len(samples) < 2 or thermal == 0:
         return text
     rms, time = float(np.sqrt(np.mean(samples["drift"] ** 2))) / thermal, samples["time"]
@@ -114,8 +167,8 @@ def _choice(system: System, samples: Samples, k: int, text: str | None) -> str |
 
 
 def _common_drift_notes(system: System, state: State, last: Sample) -> list[str]:
-    """A note if the molecules drift together: if a conserved momentum, whose degrees of freedom are not counted, adds
-    to the temperatures, or if one that is not conserved exceeds a thermal one."""
+    """A note if the molecules drift together: if a conserved momentum, whose degrees of freedom are
+    not counted, adds to the temperatures, or if one that is not conserved exceeds a thermal one."""
     if not system.freedom.translation or not last.temperature_translation > 0:
         return []
     mass = system.model.mass[system.model.species]
@@ -126,7 +179,10 @@ def _common_drift_notes(system: System, state: State, last: Sample) -> list[str]
         if energy <= THERMAL_LIMIT * last.temperature_translation:
             return []
         usual = sqrt(3 * float(mass.sum()) * BOLTZMANN * last.temperature_translation)
-        return [f"{together}, where thermal motion has {usual:.3g}: the thermostat has not stopped it yet; run longer"]
+        return [
+            f"{together}, where thermal motion has {usual:.3g}: the thermostat has not stopped it"
+            " yet; run longer"
+        ]
     gain = 2 * energy / system.freedom.translation
     if gain <= COMMON_DRIFT_LIMIT * last.temperature_translation:
         return []
@@ -135,7 +191,8 @@ def _common_drift_notes(system: System, state: State, last: Sample) -> list[str]
 
 
 def ewald_error_notes(system: System, state: State) -> list[str]:
-    """A note if the box has grown or shrunk until the k-vectors or grid of the start miss the accuracy of the scene."""
+    """A note if the box has grown or shrunk until the k-vectors or grid of the start miss the
+    accuracy of the scene."""
     if system.force_error is None or not any(stage.changes_box for stage in system.scene.stages):
         return []
     from rigidmd.run.force_errors import estimated_error  # SciPy is for such runs only
@@ -145,16 +202,19 @@ def ewald_error_notes(system: System, state: State) -> list[str]:
         return []
     before, after = (f"{error / COULOMB:.2g}" for error in (system.force_error, now))
     return [
-        f"the box has changed, and with it the estimated error of Coulomb forces, from {before} to {after} e²/Å²: "
-        "alpha, k-vectors and grid are still from the start. A run with structure.file = 'final.npz' chooses new ones"
+        f"the box has changed, and with it the estimated error of Coulomb forces, from {before} to"
+        f" {after} e²/Å²: alpha, k-vectors and grid are still from the start. A run with"
+        " structure.file = 'final.npz' chooses new ones"
     ]
 
 
 def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
-    """Notes if the averages of stage k may be wrong: if energy drifts, or temperatures change by the step or differ.
+    """Notes if the averages of stage k may be wrong: if energy drifts, or temperatures change by
+    the step or differ.
 
-    A thermostat hides the energy that a long step adds: it removes this energy, faster from some motions than from
-    others, and by the temperatures at the steps, which are not the temperatures of the ensemble.
+    A thermostat hides the energy that a long step adds: it removes this energy, faster from some
+    motions than from others, and by the temperatures at the steps, which are not the temperatures
+    of the ensemble.
     """
     of_stage = samples.of_stage(k)
     if system.scene.stages[k].is_hybrid:  # its averages have no error of the step
@@ -163,50 +223,89 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     if len(of_stage) - half < MIN_SAMPLES:
         return []
     time, drift, whole = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
-    found, stage, freedom, level = [], system.scene.stages[k], system.freedom_in(k), float(whole.mean())
+    found, stage, freedom, level = (
+        [],
+        system.scene.stages[k],
+        system.freedom_in(k),
+        float(whole.mean()),
+    )
     line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
-    if thermal > 0 and abs(line.value) > _drift_limit(time[-1] - time[0]) * thermal + STANDARD_ERRORS * line.error:
+    if (
+        thermal > 0
+        and abs(line.value)
+        > _drift_limit(time[-1] - time[0]) * thermal + STANDARD_ERRORS * line.error
+    ):
         rate, error = (value * 1000 / thermal for value in (line.value, line.error))
-        smooth = "" if system.scene.forces.truncation == "smooth_switch" else " or truncation = 'smooth_switch'"
-        hides = "; the thermostat hides this and leaves temperatures wrong" if stage.has_thermostat else ""
+        smooth = (
+            ""
+            if system.scene.forces.truncation == "smooth_switch"
+            else " or truncation = 'smooth_switch'"
+        )
+        hides = (
+            "; the thermostat hides this and leaves temperatures wrong"
+            if stage.has_thermostat
+            else ""
+        )
         found.append(
-            f"stages.{k}: in its second half the conserved energy drifts by {rate:+.2g} ± {error:.1g} kT/ns per "
-            f"degree of freedom, as from a step that is too long or forces that jump at the cutoff{hides}. Try a "
-            f"shorter timestep_fs than {stage.timestep_fs:g}{smooth}"
+            f"stages.{k}: in its second half the conserved energy drifts by {rate:+.2g} ±"
+            f" {error:.1g} kT/ns per degree of freedom, as from a step that is too long or forces"
+            f" that jump at the cutoff{hides}. Try a shorter timestep_fs than"
+            f" {stage.timestep_fs:g}{smooth}"
         )
     if not stage.has_thermostat:
         return found
     moving, rotating = pair = [of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS]
-    unbiased, corrected = [of_stage[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS], ""
+    unbiased, corrected = (
+        [of_stage[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS],
+        "",
+    )
     if any(np.isfinite(values).all() for values in unbiased):
         (moving, rotating), corrected = unbiased, " without the error of the step"
         both = zip(unbiased, (freedom.translation, freedom.rotation), strict=True)
-        right = sum((values * count for values, count in both if count), np.zeros(len(whole))) / freedom.total
+        right = (
+            sum((values * count for values, count in both if count), np.zeros(len(whole)))
+            / freedom.total
+        )
         heat, error = mean_and_error(right - whole)
-        if heat is not None and error is not None and abs(heat) > max(HEATING_LIMIT * level, STANDARD_ERRORS * error):
-            parts = [f"{name} {v.mean():.4g}" for name, v in zip(("T_trans", "T_rot"), pair, strict=True) if v[0] > 0]
+        if (
+            heat is not None
+            and error is not None
+            and abs(heat) > max(HEATING_LIMIT * level, STANDARD_ERRORS * error)
+        ):
+            parts = [
+                f"{name} {v.mean():.4g}"
+                for name, v in zip(("T_trans", "T_rot"), pair, strict=True)
+                if v[0] > 0
+            ]
             shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heat))
             found.append(
-                f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules {abs(heat):.2g} K too "
-                f"{'hot' if heat > 0 else 'cold'}: their temperature{corrected} is "
-                f"{format_with_error(float(right.mean()), mean_and_error(right)[1])} K; at the steps it is "
-                f"{level:.4g} K, {', '.join(parts)}, which the thermostat controls. Try timestep_fs = {shorter:.1g}, "
-                "or integrator = 'baoab' with thermostat = 'langevin', whose positions have hardly such an error"
+                f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules"
+                f" {abs(heat):.2g} K too {'hot' if heat > 0 else 'cold'}: their"
+                f" temperature{corrected} is"
+                f" {format_with_error(float(right.mean()), mean_and_error(right)[1])} K; at the"
+                f" steps it is {level:.4g} K, {', '.join(parts)}, which the thermostat controls."
+                f" Try timestep_fs = {shorter:.1g}, or integrator = 'baoab' with thermostat ="
+                " 'langevin', whose positions have hardly such an error"
             )
     gap, error = mean_and_error(moving - rotating)
-    if gap is not None and error is not None and abs(gap) > max(DIFFERENCE_LIMIT * level, STANDARD_ERRORS * error):
+    if (
+        gap is not None
+        and error is not None
+        and abs(gap) > max(DIFFERENCE_LIMIT * level, STANDARD_ERRORS * error)
+    ):
         found.append(
-            f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {rotating.mean():.4g} K"
-            f"{corrected}, a difference of {abs(gap):.2g} ± {error:.1g} K that sampling does not explain: timestep_fs "
-            "is too long, or translation and rotation exchange energy too slowly in this stage. Try a shorter step, or "
-            "run longer before means are taken"
+            f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot"
+            f" {rotating.mean():.4g} K{corrected}, a difference of {abs(gap):.2g} ± {error:.1g} K"
+            " that sampling does not explain: timestep_fs is too long, or translation and rotation"
+            " exchange energy too slowly in this stage. Try a shorter step, or run longer before"
+            " means are taken"
         )
     return found
 
 
 def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list[str]:
-    """A note if few trajectories of hybrid Monte Carlo were accepted, in the second half of enough samples, or if none
-    was. acceptance (t,) : between samples, NaN where no trajectory ended"""
+    """A note if few trajectories of hybrid Monte Carlo were accepted, in the second half of enough
+    samples, or if none was. acceptance (t,) : between samples, NaN where no trajectory ended"""
     known = acceptance[np.isfinite(acceptance)]
     enough = len(acceptance) - len(acceptance) // 2 >= MIN_SAMPLES
     judged, where = (known[len(known) // 2 :], "in its second half ") if enough else (known, "")
@@ -214,9 +313,10 @@ def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list
     if accepted > (LEAST_ACCEPTANCE if enough else 0.0):
         return []
     return [
-        f"stages.{k}: {where}{accepted:.1%} of the trajectories were accepted: positions hardly change and "
-        f"the errors of the means are too small. Try a shorter timestep_fs than {stage.timestep_fs:g}, an "
-        "integrator of higher order such as 'srkn_4', or integrator = 'auto'"
+        f"stages.{k}: {where}{accepted:.1%} of the trajectories were accepted: positions hardly"
+        " change and the errors of the means are too small. Try a shorter timestep_fs than"
+        f" {stage.timestep_fs:g}, an integrator of higher order such as 'srkn_4', or integrator ="
+        " 'auto'"
     ]
 
 
@@ -226,17 +326,24 @@ def _drift_limit(time: float) -> float:
 
 
 def _drift_verdict(drift: float, error: float, limit: float) -> str | None:
-    """Whether a drift is significant, against its standard error and the largest small drift; None without an error."""
+    """Whether a drift is significant, against its standard error and the largest small drift; None
+    without an error."""
     if not error > 0:
         return None
     count = abs(drift) / error
     if count < STANDARD_ERRORS:
         return f"not significant, {count:.1f} standard errors"
-    return f"significant, {count:.1f} standard errors, {'but small' if abs(drift) <= limit else 'and large'}"
+    return (
+        f"significant, {count:.1f} standard errors,"
+        f" {'but small' if abs(drift) <= limit else 'and large'}"
+    )
 
 
-def stage_summary(system: System, samples: Samples, k: int, computing: float, moves: tuple[int, int]) -> dict:
-    """Values of one stage: means over its equilibrated part, and its drift since the last sample before it."""
+def stage_summary(
+    system: System, samples: Samples, k: int, computing: float, moves: tuple[int, int]
+) -> dict:
+    """Values of one stage: means over its equilibrated part, and its drift since the last sample
+    before it."""
     of_stage, before = samples.of_stage(k), samples.of_stage(k - 1)
     first = before.row(-1) if len(before) else of_stage.row(0)
     stage = system.scene.stages[k]
@@ -245,42 +352,73 @@ def stage_summary(system: System, samples: Samples, k: int, computing: float, mo
     n, steps = len(system.model.species), of_stage.row(-1).step - first.step
     speed = steps / computing if computing > 0 else None
     time, drift = of_stage["time"], of_stage["drift"]
-    line = slope(np.append(first.time, time), np.append(0.0, drift)) if len(before) else slope(time, drift)
+    line = (
+        slope(np.append(first.time, time), np.append(0.0, drift))
+        if len(before)
+        else slope(time, drift)
+    )
     temperatures = _means(steady, TEMPERATURES)
-    potential, pressure = mean_and_error(steady["potential"] / n), mean_and_error(steady["pressure_bar"])
+    potential, pressure = (
+        mean_and_error(steady["potential"] / n),
+        mean_and_error(steady["pressure_bar"]),
+    )
     spread, duration = float(of_stage["kinetic"].std()), steps * stage.timestep_fs * FEMTOSECOND
-    thermal = BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total
+    thermal = (
+        BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total
+    )
     per_kt = [_finite_or_none(rate * 1000 / thermal) if thermal > 0 else None for rate in line[:2]]
     values = {
-        "name": stage.label, "ensemble": stage.ensemble, "integrator": stage.integrator,
-        "timestep_fs": stage.timestep_fs, "steps": steps, "duration_ps": duration, "computing_s": computing,
-        "steps_per_s": speed, "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
+        "name": stage.label,
+        "ensemble": stage.ensemble,
+        "integrator": stage.integrator,
+        "timestep_fs": stage.timestep_fs,
+        "steps": steps,
+        "duration_ps": duration,
+        "computing_s": computing,
+        "steps_per_s": speed,
+        "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
         "means_over": describe_equilibrated(of_stage, stage, first.time),
         "equilibrated_from_ps": begin if len(time) >= LEAST_SAMPLES else None,
-        "set_temperature_K": stage.temperature_K, "set_pressure_bar": stage.pressure_bar,
-        **temperatures, "potential_kJ_mol_per_molecule": potential[0],
+        "set_temperature_K": stage.temperature_K,
+        "set_pressure_bar": stage.pressure_bar,
+        **temperatures,
+        "potential_kJ_mol_per_molecule": potential[0],
         "potential_error_kJ_mol_per_molecule": potential[1],
-        "pressure_bar": pressure[0], "pressure_error_bar": pressure[1],
-        **(_means(steady, BOX) if stage.has_barostat else {}), "moves_tried": moves[0], "moves_accepted": moves[1],
-        "drift_verdict": _drift_verdict(line.value, line.error, _drift_limit(duration) * thermal) if duration else None,
+        "pressure_bar": pressure[0],
+        "pressure_error_bar": pressure[1],
+        **(_means(steady, BOX) if stage.has_barostat else {}),
+        "moves_tried": moves[0],
+        "moves_accepted": moves[1],
+        "drift_verdict": (
+            _drift_verdict(line.value, line.error, _drift_limit(duration) * thermal)
+            if duration
+            else None
+        ),
         "drift_kJ_mol_ns_per_molecule": _finite_or_none(line.value * 1000 / n),
         "drift_error_kJ_mol_ns_per_molecule": _finite_or_none(line.error * 1000 / n),
-        "drift_kT_ns_per_degree_of_freedom": per_kt[0], "drift_error_kT_ns_per_degree_of_freedom": per_kt[1],
-        "drift_over_kinetic_std": _finite_or_none(line.value * duration / spread) if spread else None,
-        "energy_rms_kJ_mol_per_molecule": _finite_or_none(line.rms / n), "minimum": None,
-    }  # fmt: skip
+        "drift_kT_ns_per_degree_of_freedom": per_kt[0],
+        "drift_error_kT_ns_per_degree_of_freedom": per_kt[1],
+        "drift_over_kinetic_std": (
+            _finite_or_none(line.value * duration / spread) if spread else None
+        ),
+        "energy_rms_kJ_mol_per_molecule": _finite_or_none(line.rms / n),
+        "minimum": None,
+    }
     earlier = system.scene.stages[k - 1] if k else stage
     if stage.ensemble == "nve" and earlier.has_thermostat and len(steady) >= MIN_SAMPLES:
         values["temperature_before_K"] = earlier.temperatures[1]
-        # standard deviation of the mean temperatures of such stages that start from states of a canonical ensemble, see
-        # "Temperatures after a thermostat" in the theory chapter `errors`; None if sampling hides it
+        # standard deviation of the mean temperatures of such stages that start from states of a
+        # canonical ensemble, see "Temperatures after a thermostat" in the theory chapter `errors`;
+        # None if sampling hides it
         level, freedom = steady["temperature"], system.freedom_in(k).total
         square = 2 * level.mean() ** 2 / freedom - level.var() if freedom else 0.0
         values["temperature_scatter_K"] = sqrt(square) if square > 0 else None
     if stage.is_hybrid:
         values |= {"trajectories": steps // stage.steps_together} | _means(steady, HYBRID)
     if stage.volume:
-        values |= _means(equilibrated(before, earlier), {"volume": "nm3"}) | {"volume_before_nm3": first.volume}
+        values |= _means(equilibrated(before, earlier), {"volume": "nm3"}) | {
+            "volume_before_nm3": first.volume
+        }
     return values
 
 
@@ -289,11 +427,18 @@ def _minimised(system: System, samples: Samples, k: int, computing: float, found
     stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
     end = Samples(samples.stages, samples.user_terms, samples.of_stage(k).table()[-1:])
     return dict.fromkeys(stage_summary(system, samples, k, computing, (0, 0))) | {
-        "name": stage.label, "ensemble": stage.ensemble, "steps": 0, "duration_ps": 0.0, "computing_s": computing,
+        "name": stage.label,
+        "ensemble": stage.ensemble,
+        "steps": 0,
+        "duration_ps": 0.0,
+        "computing_s": computing,
         "potential_kJ_mol_per_molecule": figures["energy_after_kJ_mol_per_molecule"],
-        "pressure_bar": figures["pressure_bar"], **(_means(end, BOX) if stage.changes_box else {}), "moves_tried": 0,
-        "moves_accepted": 0, "minimum": figures,
-    }  # fmt: skip
+        "pressure_bar": figures["pressure_bar"],
+        **(_means(end, BOX) if stage.changes_box else {}),
+        "moves_tried": 0,
+        "moves_accepted": 0,
+        "minimum": figures,
+    }
 
 
 def _means(samples: Samples, columns: Mapping[str, str]) -> dict[str, float | None]:
@@ -301,7 +446,9 @@ def _means(samples: Samples, columns: Mapping[str, str]) -> dict[str, float | No
     found = {}
     for name, unit in columns.items():
         values = samples[name]  # no trajectory has ended at the first sample
-        found[f"{name}_{unit}"], found[f"{name}_error_{unit}"] = mean_and_error(values[np.isfinite(values)])
+        found[f"{name}_{unit}"], found[f"{name}_error_{unit}"] = mean_and_error(
+            values[np.isfinite(values)]
+        )
     return found
 
 
@@ -310,70 +457,110 @@ def _finite_or_none(value: float) -> float | None:
 
 
 def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
-    """The values of a minimum with units in their keys. Pressures are without the kinetic part; None without a box."""
+    """The values of a minimum with units in their keys. Pressures are without the kinetic part;
+    None without a box."""
     pressure = None if found.pressure is None else np.array(found.pressure) / BAR
     return {
-        "converged": found.converged, "ended_by": found.ended_by or None, "iterations": found.iterations,
+        "converged": found.converged,
+        "ended_by": found.ended_by or None,
+        "iterations": found.iterations,
         "precision": found.precision,
         "relief_steps": found.overlap_steps,
         "energy_before_kJ_mol_per_molecule": found.energy_before / KJ_PER_MOL / molecules,
         "energy_after_kJ_mol_per_molecule": found.energy_after / KJ_PER_MOL / molecules,
-        "largest_force_kJ_mol_A": found.force / KJ_PER_MOL, "largest_torque_kJ_mol": found.torque / KJ_PER_MOL,
+        "largest_force_kJ_mol_A": found.force / KJ_PER_MOL,
+        "largest_torque_kJ_mol": found.torque / KJ_PER_MOL,
         "pressure_bar": float(pressure[:3].mean()) if pressure is not None else None,
         "pressure_tensor_bar": pressure.tolist() if pressure is not None else None,
-        "largest_pressure_deviation_bar": None if found.deviation is None else found.deviation / BAR,
-    }  # fmt: skip
+        "largest_pressure_deviation_bar": (
+            None if found.deviation is None else found.deviation / BAR
+        ),
+    }
 
 
 def describe_minimum(found: Minimum, stage: Stage) -> str:
-    """A warning for a minimisation that has not converged, with the largest force, torque and deviation."""
+    """A warning for a minimisation that has not converged, with the largest force, torque and
+    deviation."""
     parts = [
         ("force", found.force / KJ_PER_MOL, stage.force_limit_kJ_mol_A, "kJ/(mol Å)"),
         ("torque", found.torque / KJ_PER_MOL, stage.torque_limit_kJ_mol, "kJ/mol"),
     ]
     if found.deviation is not None:
-        parts.append(("deviation of the pressure", found.deviation / BAR, stage.pressure_limit_bar, "bar"))
-    reached = ", ".join(f"{what} {value:.3g} (limit {limit:g}) {unit}" for what, value, limit, unit in parts)
+        parts.append(
+            ("deviation of the pressure", found.deviation / BAR, stage.pressure_limit_bar, "bar")
+        )
+    reached = ", ".join(
+        f"{what} {value:.3g} (limit {limit:g}) {unit}" for what, value, limit, unit in parts
+    )
     how = f"after {found.iterations} iterations ({found.ended_by})"
     return f"the minimisation has not converged {how}: largest {reached}"
 
 
 def summarise_body(
-    system: BodySystem, motion: Motion, planned: int, preparing: float, wall: float, computing: float, interrupted: bool
+    system: BodySystem,
+    motion: Motion,
+    planned: int,
+    preparing: float,
+    wall: float,
+    computing: float,
+    interrupted: bool,
 ) -> dict:
-    """The summary of a run of a single body, without its `provenance`. planned : steps of a run that ends in time"""
+    """The summary of a run of a single body, without its `provenance`. planned : steps of a run
+    that ends in time"""
     run, end = system.scene.run, float(motion["time"][-1])
     steps = round(end / run.timestep_s) if interrupted else planned
     notes = system.notes
-    if "energy" in motion.invariants and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR:
+    if (
+        "energy" in motion.invariants
+        and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR
+    ):
         wrong = f"the energy is wrong by {error:.1e} of the largest kinetic energy"
         notes.append(f"{wrong}: timestep_s is too long for this motion")
     if system.rotates:
         speed = np.sqrt(sum(motion[f"omega_body_{k}"] ** 2 for k in (1, 2, 3)))
         if (speed[1:] * np.diff(motion["time"])).max(initial=0.0) > np.pi:
             notes.append(
-                "the body rotates by more than 180° between samples; shorten output.interval_s to follow its angles"
+                "the body rotates by more than 180° between samples; shorten output.interval_s to"
+                " follow its angles"
             )
     return {
-        "interrupted": interrupted, "kind": system.kind, "pinned": not system.translates,
-        "degrees_of_freedom": system.degrees_of_freedom, "mass_kg": system.mass,
-        "inertia_kg_m2": system.inertia.tolist(), "integrator": run.integrator,
-        "formulation": getattr(system.method, "formulation", None), "timestep_s": run.timestep_s, "steps": steps,
-        "duration_s": end, "samples": len(motion), "preparing_s": preparing, "wall_s": wall,
-        "computing_s": computing, "steps_per_s": steps / computing if computing > 0 else None,
+        "interrupted": interrupted,
+        "kind": system.kind,
+        "pinned": not system.translates,
+        "degrees_of_freedom": system.degrees_of_freedom,
+        "mass_kg": system.mass,
+        "inertia_kg_m2": system.inertia.tolist(),
+        "integrator": run.integrator,
+        "formulation": getattr(system.method, "formulation", None),
+        "timestep_s": run.timestep_s,
+        "steps": steps,
+        "duration_s": end,
+        "samples": len(motion),
+        "preparing_s": preparing,
+        "wall_s": wall,
+        "computing_s": computing,
+        "steps_per_s": steps / computing if computing > 0 else None,
         **motion_figures(motion.columns, motion.invariants),
         "rates": {name: rate._asdict() for name, rate in body_rates(system, motion).items()},
-        "trajectory_A_per_m": system.scale, "notes": notes,
-    }  # fmt: skip
+        "trajectory_A_per_m": system.scale,
+        "notes": notes,
+    }
 
 
 def motion_figures(columns: Mapping[str, np.ndarray], invariants: Iterable[str]) -> dict:
     """The part of the summary of a body that follows from the columns of its motion."""
     theta, orthogonality = columns.get("theta"), columns.get("orthogonality_error")
     return {
-        "energy_start_J": float(columns["energy"][0]), "energy_end_J": float(columns["energy"][-1]),
+        "energy_start_J": float(columns["energy"][0]),
+        "energy_end_J": float(columns["energy"][-1]),
         "work_J": float(columns["work"][-1]),
-        "largest_relative_error": {name: float(np.abs(columns[f"{name}_error"]).max()) for name in invariants},
-        "largest_orthogonality_error": None if orthogonality is None else float(orthogonality.max()),
-        "theta_range_deg": None if theta is None else np.degrees([theta.min(), theta.max()]).tolist(),
-    }  # fmt: skip
+        "largest_relative_error": {
+            name: float(np.abs(columns[f"{name}_error"]).max()) for name in invariants
+        },
+        "largest_orthogonality_error": (
+            None if orthogonality is None else float(orthogonality.max())
+        ),
+        "theta_range_deg": (
+            None if theta is None else np.degrees([theta.min(), theta.max()]).tolist()
+        ),
+    }

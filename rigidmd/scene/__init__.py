@@ -3,7 +3,12 @@
 from typing import Any
 
 from pydantic import BaseModel
-from pydantic.json_schema import GenerateJsonSchema, JsonSchemaMode, JsonSchemaValue, models_json_schema
+from pydantic.json_schema import (
+    GenerateJsonSchema,
+    JsonSchemaMode,
+    JsonSchemaValue,
+    models_json_schema,
+)
 
 from rigidmd.scene.base import Scene, parse_override
 from rigidmd.scene.body import BodyScene
@@ -14,15 +19,25 @@ __all__ = ["BodyScene", "MolecularScene", "Scene", "parse_override", "schema"]
 
 
 def schema() -> dict[str, Any]:
-    """The JSON schema of scene files: `BodyScene` for a file with a table [body], else `MolecularScene`."""
-    kinds: list[tuple[type[BaseModel], JsonSchemaMode]] = [(BodyScene, "validation"), (MolecularScene, "validation")]
+    """The JSON schema of scene files: `BodyScene` for a file with a table [body], else
+    `MolecularScene`."""
+    kinds: list[tuple[type[BaseModel], JsonSchemaMode]] = [
+        (BodyScene, "validation"),
+        (MolecularScene, "validation"),
+    ]
     _, found = models_json_schema(kinds, schema_generator=_TomlSchema)
     found["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
-    for kind, section in (("MolecularScene", "Stage"), ("BodyScene", "Run")):  # other names need [[integrators]]
+    for kind, section in (
+        ("MolecularScene", "Stage"),
+        ("BodyScene", "Run"),
+    ):  # other names need [[integrators]]
         enum = found["$defs"][section]["properties"]["integrator"].pop("enum")
         known = {"properties": {"integrator": {"enum": enum}}}
         sections = {"run": known} if section == "Run" else {"stages": {"items": known}}
-        found["$defs"][kind] |= {"if": {"required": ["integrators"]}, "else": {"properties": sections}}
+        found["$defs"][kind] |= {
+            "if": {"required": ["integrators"]},
+            "else": {"properties": sections},
+        }
     return {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "A scene of rigidmd",
@@ -36,7 +51,8 @@ def schema() -> dict[str, Any]:
 
 
 class _TomlSchema(GenerateJsonSchema):
-    """JSON schema for TOML, which has no null. Only keys have defaults, and only those that JSON can hold."""
+    """JSON schema for TOML, which has no null. Only keys have defaults, and only those that JSON
+    can hold."""
 
     def nullable_schema(self, schema) -> JsonSchemaValue:
         return self.generate_inner(schema["schema"])

@@ -1,6 +1,6 @@
-"""The base class of scenes: reading one from a TOML file or a dictionary, and setting single keys of it."""
+"""The base class of scenes: reading one from a TOML file or a dictionary, and setting single keys
+of it."""
 
-# isort: skip_file
 import os
 import re
 import shlex
@@ -8,7 +8,14 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, overload
 
-from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from rigidmd.core.display import Displayed
 from rigidmd.core.files import unreadable_reason
@@ -16,25 +23,42 @@ from rigidmd.core.integrators import SCHEMES, Scheme
 from rigidmd.core.plain_text import did_you_mean, similar_names, suggestion
 from rigidmd.core.shipped import examples
 from rigidmd.core.toml import (
-    DEEPEST, TOMLDecodeError, impossible_values, parse_toml, parse_whole_number, plain_values, read_toml, shorten_repr,
+    DEEPEST,
+    TOMLDecodeError,
+    impossible_values,
+    parse_toml,
+    parse_whole_number,
+    plain_values,
+    read_toml,
+    shorten_repr,
     values_in,
-)  # fmt: skip
+)
 from rigidmd.errors import SceneError, option
 from rigidmd.io.formats import Format, format_of, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
-    MOST_TABLES, Section, exact_names, is_within, location_of, numbers_out_of_range, setting, validation_messages,
-)  # fmt: skip
+    MOST_TABLES,
+    Section,
+    exact_names,
+    is_within,
+    location_of,
+    numbers_out_of_range,
+    setting,
+    validation_messages,
+)
 
 if TYPE_CHECKING:
     from rigidmd.scene.body import BodyScene
     from rigidmd.scene.molecules import MolecularScene
 
 LONGEST_NAME = 100
-#: Largest number of characters of the name of a file. File systems allow 255, which temporary files need too.
+#: Largest number of characters of the name of a file. File systems allow 255, which temporary files
+#: need too.
 LONGEST_FILE_NAME = 200
 #: Keys that name a file.
-FILE_KEYS = re.compile(r"(structure|(molecules|forces\.custom)\.[^.]+)\.(file|topology|parameters|module|table)")
+FILE_KEYS = re.compile(
+    r"(structure|(molecules|forces\.custom)\.[^.]+)\.(file|topology|parameters|module|table)"
+)
 #: Programs whose input files have these names.
 FOREIGN_INPUTS = {
     "GROMACS": re.compile(r".*\.(mdp|top|itp|tpr|ndx)"),
@@ -48,7 +72,8 @@ AnyScene = TypeVar("AnyScene", "MolecularScene", "BodyScene")
 
 
 class Scene(Section, Displayed):
-    """The description of a run, read by `Scene.read(path)`: a `BodyScene` if it has [body], else a `MolecularScene`."""
+    """The description of a run, read by `Scene.read(path)`: a `BodyScene` if it has [body], else a
+    `MolecularScene`."""
 
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
     """Name of the run; default: the name of the file"""
@@ -57,11 +82,14 @@ class Scene(Section, Displayed):
     """Integrators of users, for stages, [run] of a body and `rigidmd accuracy`"""
 
     SIZES: ClassVar[tuple[float, float]] = (1e-100, 1e100)
-    """Smallest and largest absolute value of numbers other than 0, so that squares and products stay finite"""
+    """Smallest and largest absolute value of numbers other than 0, so that squares and products
+    stay finite"""
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
-    _read_in: Path = PrivateAttr(default_factory=lambda: _working_directory())  # from which `_folder` begins
+    _read_in: Path = PrivateAttr(
+        default_factory=lambda: _working_directory()
+    )  # from which `_folder` begins
     _embedded_files: dict[str, bytes] = PrivateAttr(default_factory=dict)
 
     @field_validator("integrators")
@@ -100,11 +128,16 @@ class Scene(Section, Displayed):
         return self._source
 
     def with_end(self, time: float) -> "Scene":
-        """The same scene with its end at a time of the run, ps. Raises SceneError if the end cannot be set."""
-        raise SceneError(self.source, [f"{option('until')} is for molecules; set run.duration_s of a single body"])
+        """The same scene with its end at a time of the run, ps. Raises SceneError if the end cannot
+        be set."""
+        raise SceneError(
+            self.source,
+            [f"{option('until')} is for molecules; set run.duration_s of a single body"],
+        )
 
     def path(self, file: str) -> Path:
-        """Path of a file that the scene names relative to its folder, absolute if the working directory has changed."""
+        """Path of a file that the scene names relative to its folder, absolute if the working
+        directory has changed."""
         is_same = _working_directory() == self._read_in
         return (self._folder if is_same else self._read_in / self._folder) / file
 
@@ -115,26 +148,36 @@ class Scene(Section, Displayed):
 
     @property
     def embedded_files(self) -> dict[str, bytes]:
-        """Inputs that are not on disk: dotted key of the file's name -> content. A run writes them to its folder."""
+        """Inputs that are not on disk: dotted key of the file's name -> content. A run writes them
+        to its folder."""
         return self._embedded_files
 
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
-        """Messages on tables that contradict each other, found even if single tables are invalid."""
+        """Messages on tables that contradict each other, found even if single tables are
+        invalid."""
         return []
 
     @overload
     @classmethod
-    def read(cls: type[AnyScene], path: PathName, overrides: dict[str, Any] | None = None) -> AnyScene: ...
+    def read(
+        cls: type[AnyScene], path: PathName, overrides: dict[str, Any] | None = None
+    ) -> AnyScene: ...
     @overload
     @classmethod
-    def read(cls, path: PathName, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene": ...
+    def read(
+        cls, path: PathName, overrides: dict[str, Any] | None = None
+    ) -> "MolecularScene | BodyScene": ...
     @classmethod
-    def read(cls, path: PathName, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene":
-        """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}. Raises SceneError.
+    def read(
+        cls, path: PathName, overrides: dict[str, Any] | None = None
+    ) -> "MolecularScene | BodyScene":
+        """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}.
+        Raises SceneError.
 
-        An override of None removes the key. Files named in the scene must lie in its folder or below; files named in
-        `overrides` may be anywhere, and are taken relative to the working directory.
+        An override of None removes the key. Files named in the scene must lie in its folder or
+        below; files named in `overrides` may be anywhere, and are taken relative to the working
+        directory.
         """
         path = Path(path)
         data, text = read_tables(path)
@@ -144,32 +187,54 @@ class Scene(Section, Displayed):
     @overload
     @classmethod
     def from_dict(
-        cls: type[AnyScene], data: dict[str, Any], folder: PathName = ".", overrides: dict[str, Any] | None = None,
-        source: str = "scene", text: str = "", embedded_files: dict[str, bytes] | None = None,
-    ) -> AnyScene: ...  # fmt: skip
+        cls: type[AnyScene],
+        data: dict[str, Any],
+        folder: PathName = ".",
+        overrides: dict[str, Any] | None = None,
+        source: str = "scene",
+        text: str = "",
+        embedded_files: dict[str, bytes] | None = None,
+    ) -> AnyScene: ...
     @overload
     @classmethod
     def from_dict(
-        cls, data: dict[str, Any], folder: PathName = ".", overrides: dict[str, Any] | None = None,
-        source: str = "scene", text: str = "", embedded_files: dict[str, bytes] | None = None,
-    ) -> "MolecularScene | BodyScene": ...  # fmt: skip
+        cls,
+        data: dict[str, Any],
+        folder: PathName = ".",
+        overrides: dict[str, Any] | None = None,
+        source: str = "scene",
+        text: str = "",
+        embedded_files: dict[str, bytes] | None = None,
+    ) -> "MolecularScene | BodyScene": ...
     @classmethod
     def from_dict(
-        cls, data: dict[str, Any], folder: PathName = ".", overrides: dict[str, Any] | None = None,
-        source: str = "scene", text: str = "", embedded_files: dict[str, bytes] | None = None,
-    ) -> "MolecularScene | BodyScene":  # fmt: skip
-        """The scene in a nested dictionary like the one of a TOML file. Raises SceneError with all errors.
+        cls,
+        data: dict[str, Any],
+        folder: PathName = ".",
+        overrides: dict[str, Any] | None = None,
+        source: str = "scene",
+        text: str = "",
+        embedded_files: dict[str, bytes] | None = None,
+    ) -> "MolecularScene | BodyScene":
+        """The scene in a nested dictionary like the one of a TOML file. Raises SceneError with all
+        errors.
 
-        Numbers and arrays of NumPy and paths are accepted as numbers, lists and texts. The dictionary is not changed.
+        Numbers and arrays of NumPy and paths are accepted as numbers, lists and texts. The
+        dictionary is not changed.
 
-        source, text : path of the TOML file, for messages, and its text, for the numbers of lines in them
+        source, text : path of the TOML file, for messages, and its text, for the numbers of lines
+            in them
         embedded_files : see `embedded_files`; with them, files may be outside `folder`
         """
         folder, data = Path(folder), plain_values(data)
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
         from rigidmd.scene import BodyScene, MolecularScene
 
-        kind = cls if issubclass(cls, (BodyScene, MolecularScene)) else _kind_of_scene(data, BodyScene, MolecularScene)
+        kind = (
+            cls
+            if issubclass(cls, (BodyScene, MolecularScene))
+            else _kind_of_scene(data, BodyScene, MolecularScene)
+        )
         if kind is None:
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults, overridden = [], []
@@ -182,18 +247,24 @@ class Scene(Section, Displayed):
             else:
                 overridden.append(key)
         if wrong := impossible_values(data):
-            raise SceneError(source, [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong])
+            raise SceneError(
+                source, [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]
+            )
         wrong = numbers_out_of_range(data, *kind.SIZES)
         faults += [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]
         faults += kind.contradictions(data, text)
         for keys, name in values_in(data):
             key = ".".join(map(str, keys))
-            if not (isinstance(name, str) and FILE_KEYS.fullmatch(key)) or key in (embedded_files or {}):
+            if not (isinstance(name, str) and FILE_KEYS.fullmatch(key)) or key in (
+                embedded_files or {}
+            ):
                 continue
             where, path = location_of(keys, text, overridden), folder / name
             if not (embedded_files or is_within(key, overridden) or is_inside(path, folder)):
                 advice = f"move it there, or set it by {setting(key, 'PATH')}"
-                faults.append(f"{where}: {shorten_repr(name)} is outside the scene's folder; {advice}")
+                faults.append(
+                    f"{where}: {shorten_repr(name)} is outside the scene's folder; {advice}"
+                )
             elif fault := unreadable_reason(path):
                 faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
         whole, rows = with_registered_rows(exact_names(data, kind))
@@ -203,17 +274,24 @@ class Scene(Section, Displayed):
         except ValidationError as error:
             faults += validation_messages(error, kind, text, overridden)
         if scene is None or faults:
-            raise SceneError(source, [fault + _removal_hint(fault, data, overridden) for fault in faults])
+            raise SceneError(
+                source, [fault + _removal_hint(fault, data, overridden) for fault in faults]
+            )
         scene._source, scene._folder, scene._embedded_files = source, folder, embedded_files or {}
         return scene
 
 
 def read_tables(path: Path) -> tuple[dict[str, Any], str]:
-    """The tables of a scene file, and its text. Raises SceneError, which suggests shipped scenes of similar names."""
+    """The tables of a scene file, and its text. Raises SceneError, which suggests shipped scenes of
+    similar names."""
     fault = unreadable_reason(path)
     if fault.startswith("there is no such file"):
         shipped = similar_names(path.stem, [example.name for example in examples()])
-        new = f"; `rigidmd new {shipped[0]}` copies a shipped scene" if shipped else "; `rigidmd examples` lists scenes"
+        new = (
+            f"; `rigidmd new {shipped[0]}` copies a shipped scene"
+            if shipped
+            else "; `rigidmd examples` lists scenes"
+        )
         raise SceneError(str(path), [fault + (_similar_files(path, ".toml") or new)])
     if path.is_dir():
         raise SceneError(str(path), [fault + _scenes_in(path)])
@@ -224,19 +302,25 @@ def read_tables(path: Path) -> tuple[dict[str, Any], str]:
             raise SceneError(str(path), [other]) from None
         if path.suffix in (".toml", ""):
             raise error
-        advice = "a scene is a TOML file; one that starts from a structure names it by [structure] file"
+        advice = (
+            "a scene is a TOML file; one that starts from a structure names it by [structure] file"
+        )
         raise SceneError(str(path), [f"{fault}; {advice}" for fault in error.errors]) from None
 
 
 def _scenes_in(folder: Path) -> str:
-    """Which scenes a folder has, and how a run in it is continued, for the message on a folder as a scene."""
+    """Which scenes a folder has, and how a run in it is continued, for the message on a folder as a
+    scene."""
     try:
         names = sorted(file.name for file in folder.iterdir() if file.suffix == ".toml")
     except OSError:
         return ""
     if "scene.toml" in names:
         run = shlex.quote(str(folder))
-        return f"; `rigidmd resume {run}` continues the run in it, and {folder / 'scene.toml'} is its scene"
+        return (
+            f"; `rigidmd resume {run}` continues the run in it, and {folder / 'scene.toml'} is its"
+            " scene"
+        )
     if names:
         return f"; a scene is a file, such as {folder / names[0]}"
     return "; a scene is a TOML file"
@@ -248,13 +332,17 @@ def _other_kind_of_file(path: Path) -> str:
     for program, pattern in FOREIGN_INPUTS.items():
         if pattern.fullmatch(name):
             return (
-                f"is an input file of {program}, not a scene: `rigidmd help coming_from` lists the keys of a scene "
-                "for the settings of other programs, and `rigidmd new` copies a shipped scene"
+                f"is an input file of {program}, not a scene: `rigidmd help coming_from` lists the"
+                " keys of a scene for the settings of other programs, and `rigidmd new` copies a"
+                " shipped scene"
             )
     if form := format_of(path):
         kind = "structure" if form.read is not None else "trajectory"
         key = f'[structure] file = "{path.name}"'
-        return f"is a {kind} file, not a scene: a scene names it by {key}; see `rigidmd help structures`"
+        return (
+            f"is a {kind} file, not a scene: a scene names it by {key}; see `rigidmd help"
+            " structures`"
+        )
     return ""
 
 
@@ -288,15 +376,21 @@ def default_name(path: Path) -> str:
 
 
 def is_inside(path: Path, folder: Path) -> bool:
-    """Whether a path is inside a folder. True for a path that cannot be resolved, which is missing."""
+    """Whether a path is inside a folder. True for a path that cannot be resolved, which is
+    missing."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # a name that is too long, a loop of links, a zero byte
+    except (
+        OSError,
+        RuntimeError,
+        ValueError,
+    ):  # a name that is too long, a loop of links, a zero byte
         return True
 
 
 def _similar_files(path: Path, suffix: str = "") -> str:
-    """'; did you mean ...?' for files of similar names in the folder of a path; empty if there are none."""
+    """'; did you mean ...?' for files of similar names in the folder of a path; empty if there are
+    none."""
     try:
         there = [other for other in sorted(path.parent.iterdir()) if other.name.endswith(suffix)]
     except (OSError, ValueError):
@@ -306,7 +400,8 @@ def _similar_files(path: Path, suffix: str = "") -> str:
 
 
 def file_name(wanted: Callable[[Format], Any]) -> AfterValidator:
-    """Annotation of a plain file name with an extension that is written of the formats for which `wanted` is true."""
+    """Annotation of a plain file name with an extension that is written of the formats for which
+    `wanted` is true."""
 
     def check(name):
         if name is None or name is False:
@@ -314,9 +409,13 @@ def file_name(wanted: Callable[[Format], Any]) -> AfterValidator:
         if not re.fullmatch(r"[\w\-][\w.\-]*", name):
             raise ValueError(f"is {shorten_repr(name)}, must be a plain file name without a folder")
         if len(name) > LONGEST_FILE_NAME:
-            raise ValueError(f"is {shorten_repr(name)}, must have at most {LONGEST_FILE_NAME} characters")
+            raise ValueError(
+                f"is {shorten_repr(name)}, must have at most {LONGEST_FILE_NAME} characters"
+            )
         if name.startswith("input_"):
-            raise ValueError(f"is {name!r}; names beginning with input_ are reserved for copies of input files")
+            raise ValueError(
+                f"is {name!r}; names beginning with input_ are reserved for copies of input files"
+            )
         if not name.endswith(extensions := written(wanted)):
             raise ValueError(f"is {name!r}, must end in one of {' '.join(extensions)}")
         return name
@@ -328,17 +427,25 @@ def _kind_of_scene(data: dict, body: "type[BodyScene]", molecules: "type[Molecul
     """The class of scenes with these tables; None if no table belongs to either class."""
     if "body" in data or "molecules" in data:
         return body if "body" in data else molecules
-    count = {kind: len(set(data) & set(kind.model_fields) - set(Scene.model_fields)) for kind in (body, molecules)}
+    count = {
+        kind: len(set(data) & set(kind.model_fields) - set(Scene.model_fields))
+        for kind in (body, molecules)
+    }
     best = max(count, key=lambda kind: count[kind])
     return best if count[best] > 0 else None
 
 
 def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
-    """How to remove the keys that contradict overridden ones on the command line; empty for any other error."""
+    """How to remove the keys that contradict overridden ones on the command line; empty for any
+    other error."""
     if not re.search("not both|omit one|contradict", fault):
         return ""
     names = re.findall(r"[a-z]\w*(?:\.\w+)*", fault)
-    tables = dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)]) if overridden else ()
+    tables = (
+        dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)])
+        if overridden
+        else ()
+    )
     keys = [table + name for table in tables for name in names]
     there = [key for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)]
     return "".join(f"; {setting(key)} removes it" for key in there)
@@ -354,12 +461,14 @@ def _has_key(data: Any, key: str) -> bool:
 
 
 def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
-    """Set one dotted key in nested tables and lists in place; None removes it. Returns the key, with numbers for names
-    of entries of lists, and error messages."""
+    """Set one dotted key in nested tables and lists in place; None removes it. Returns the key,
+    with numbers for names of entries of lists, and error messages."""
     *parents, last = key.split(".", DEEPEST + 1)
     where = f"{option('overrides')} {key}"
     if len(parents) > DEEPEST:
-        return key, [f"{option('overrides')} {shorten_repr(key)}: is a key of more than {DEEPEST} parts"]
+        return key, [
+            f"{option('overrides')} {shorten_repr(key)}: is a key of more than {DEEPEST} parts"
+        ]
     target: Any = data
     indices: list[Any] = []
     for depth, part in enumerate([*parents, last]):
@@ -368,13 +477,22 @@ def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
         number = parse_whole_number(part)
         if listed:
             # of a stage its name or ensemble, of molecules their name or model
-            named = [[e[k] for k in ("name", "ensemble", "model") if isinstance(e, dict) and k in e] for e in target]
+            named = [
+                [e[k] for k in ("name", "ensemble", "model") if isinstance(e, dict) and k in e]
+                for e in target
+            ]
             names = [found[0] if found else "" for found in named]
             if number is None and names.count(part) == 1:
                 number = names.index(part)
             if number is None or number >= len(target):
-                called = f" ({', '.join(map(shorten_repr, names))})" if number is None and any(names) else ""
-                return key, [f"{where}: {here} has entries 0 to {len(target) - 1}{called}, not {part!r}"]
+                called = (
+                    f" ({', '.join(map(shorten_repr, names))})"
+                    if number is None and any(names)
+                    else ""
+                )
+                return key, [
+                    f"{where}: {here} has entries 0 to {len(target) - 1}{called}, not {part!r}"
+                ]
         elif not table:
             return key, [f"{where}: {here} is not a table"]
         elif value is None and part not in target:
@@ -394,10 +512,13 @@ def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """KEY=VALUE of the command line. The value is read as TOML, else as text; None if empty. Raises SceneError."""
+    """KEY=VALUE of the command line. The value is read as TOML, else as text; None if empty. Raises
+    SceneError."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
-        raise SceneError("--set", [f"{text!r} is not KEY=VALUE, for example stages.1.timestep_fs=4"])
+        raise SceneError(
+            "--set", [f"{text!r} is not KEY=VALUE, for example stages.1.timestep_fs=4"]
+        )
     if not value.strip():
         return key.strip(), None
     try:

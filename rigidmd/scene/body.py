@@ -1,31 +1,68 @@
-"""The scene of a single body: a top, a gyroscope, a satellite, a falling stone. SI units throughout.
+"""The scene of a single body: a top, a gyroscope, a satellite, a falling stone. SI units
+throughout.
 
 The equations contain no physical constants, so any other consistent units work as well.
 """
 
-# isort: skip_file
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, Strict, field_validator
 
-from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, WITH_THERMOSTAT, Rotor, auto_errors
+from rigidmd.core.integrators import (
+    AUTO,
+    FORMULATIONS,
+    SCHEMES,
+    SOLVERS,
+    WITH_THERMOSTAT,
+    Rotor,
+    auto_errors,
+)
 from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY
-from rigidmd.mechanics.inertia import COMPONENTS_PER_DIMENSION, SOLIDS, inertia_error, shifted_inertia
+from rigidmd.mechanics.inertia import (
+    COMPONENTS_PER_DIMENSION,
+    SOLIDS,
+    inertia_error,
+    shifted_inertia,
+)
 from rigidmd.mechanics.rotation import (
-    angular_velocity_of_euler_rates, from_attitude_matrix, from_axis, from_euler_angles, from_quaternion,
-    from_yaw_pitch_roll, nearest_rotation, orthogonality_error, unit_vector,
-)  # fmt: skip
+    angular_velocity_of_euler_rates,
+    from_attitude_matrix,
+    from_axis,
+    from_euler_angles,
+    from_quaternion,
+    from_yaw_pitch_roll,
+    nearest_rotation,
+    orthogonality_error,
+    unit_vector,
+)
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.body_forces import (
-    Applied, ChangingInertia, Fluid, Frame, Friction, Gravity, NonNegativeVector, PositiveVector, Wheel,
-)  # fmt: skip
+    Applied,
+    ChangingInertia,
+    Fluid,
+    Frame,
+    Friction,
+    Gravity,
+    NonNegativeVector,
+    PositiveVector,
+    Wheel,
+)
 from rigidmd.scene.integrators import MovedByScheme
 from rigidmd.scene.validation import (
-    MOST_TABLES, Flag, Limit, LimitOfEnergy, LimitOfRounding, NameIn, Number, Positive, Section, Vector, location_of,
+    MOST_TABLES,
+    Flag,
+    Limit,
+    LimitOfEnergy,
+    LimitOfRounding,
+    NameIn,
+    Number,
+    Positive,
+    Section,
+    Vector,
+    location_of,
     not_none,
-)  # fmt: skip
-
+)
 
 Matrix = tuple[Vector, Vector, Vector]
 Quaternion = tuple[Number, Number, Number, Number]
@@ -38,15 +75,18 @@ MOST_STEPS = 1e12
 WAYS_OF_INERTIA = ("solid", "solids", "points", "inertia_kg_m2", "inertia_tensor_kg_m2")
 #: Those of them that are tables of parts with masses and positions.
 PARTS = ("solids", "points")
-#: Solids that are not symmetric about axis 3 for all dimensions, so that a direction does not fix their orientation.
+#: Solids that are not symmetric about axis 3 for all dimensions, so that a direction does not fix
+#: their orientation.
 WITHOUT_AXIS = ("cuboid", "ellipsoid")
 
-#: Moments of inertia are equal, for a picture, if they differ by less than this fraction of the largest.
+#: Moments of inertia are equal, for a picture, if they differ by less than this fraction of the
+#: largest.
 EQUAL_MOMENTS = 1e-6
 
 
 def axis_of_symmetry(moments: np.ndarray) -> int | None:
-    """The axis about which a body with these principal moments is symmetric: 2 (axis 3) if all are equal; or None."""
+    """The axis about which a body with these principal moments is symmetric: 2 (axis 3) if all are
+    equal; or None."""
     near = EQUAL_MOMENTS * moments.max()
     return next((k for k in (2, 0, 1) if abs(moments[k - 1] - moments[k - 2]) <= near), None)
 
@@ -70,12 +110,19 @@ class Solid(Section):
     @property
     def dimensions(self) -> dict[str, Any]:
         """The dimensions given."""
-        return {key: value for key in COMPONENTS_PER_DIMENSION if (value := getattr(self, key)) is not None}
+        return {
+            key: value
+            for key in COMPONENTS_PER_DIMENSION
+            if (value := getattr(self, key)) is not None
+        }
 
     def _errors(self):
         wanted, given = set(SOLIDS[self.shape].dimensions), set(self.dimensions)
         if wanted != given:
-            yield f"a {self.shape} has {' and '.join(sorted(wanted))}, not {' and '.join(sorted(given)) or 'none'}"
+            yield (
+                f"a {self.shape} has {' and '.join(sorted(wanted))}, not"
+                f" {' and '.join(sorted(given)) or 'none'}"
+            )
 
 
 class SolidPart(Solid):
@@ -87,12 +134,14 @@ class SolidPart(Solid):
     density_kg_m3: Positive | None = None
     """Density of this solid, instead of its mass"""
     position_m: Vector = (0.0, 0.0, 0.0)
-    """Position of its centre of mass, along the body axes, from any origin; from the pivot if the body is pinned"""
+    """Position of its centre of mass, along the body axes, from any origin; from the pivot if the
+    body is pinned"""
     axis: Vector | None = None
-    """Direction of its axis 3, along the body axes, of any length; of a cone from its tip to its base; default: axis 3
-    of the body"""
+    """Direction of its axis 3, along the body axes, of any length; of a cone from its tip to its
+    base; default: axis 3 of the body"""
     euler_angles_deg: Vector | None = None
-    """Its orientation in the body axes: phi, theta, psi (3-1-3), x_body = Rz(phi) Rx(theta) Rz(psi) x_solid"""
+    """Its orientation in the body axes: phi, theta, psi (3-1-3), x_body = Rz(phi) Rx(theta) Rz(psi)
+    x_solid"""
 
     def _errors(self):
         faults = [*super()._errors()]
@@ -102,11 +151,17 @@ class SolidPart(Solid):
         elif ways == ["density_kg_m3"] and SOLIDS[self.shape].volume == 0:
             faults.append(f"a {self.shape} has no volume: give mass_kg instead of density_kg_m3")
         elif not faults and not Scene.SIZES[0] <= self.mass <= Scene.SIZES[1]:
-            faults.append(f"its mass is {self.mass:g} kg, must be between {Scene.SIZES[0]:g} and {Scene.SIZES[1]:g}")
+            faults.append(
+                f"its mass is {self.mass:g} kg, must be between {Scene.SIZES[0]:g} and"
+                f" {Scene.SIZES[1]:g}"
+            )
         if self.axis is not None and self.euler_angles_deg is not None:
             faults.append("give axis or euler_angles_deg, not both")
         elif self.axis is not None and self.shape in WITHOUT_AXIS:
-            rotation = f"{'an' if self.shape == 'ellipsoid' else 'a'} {self.shape} may be rotated about its axis"
+            rotation = (
+                f"{'an' if self.shape == 'ellipsoid' else 'a'} {self.shape} may be rotated about"
+                " its axis"
+            )
             faults.append(f"axis is not enough, as {rotation}: give euler_angles_deg")
         elif self.axis is not None and not any(self.axis):
             faults.append("axis is zero, which is not a direction")
@@ -118,7 +173,9 @@ class SolidPart(Solid):
         if self.mass_kg is not None:
             return self.mass_kg
         shape = SOLIDS[self.shape]
-        return not_none(self.density_kg_m3) * shape.volume * float(shape.scale(self.dimensions).prod())
+        return (
+            not_none(self.density_kg_m3) * shape.volume * float(shape.scale(self.dimensions).prod())
+        )
 
     @property
     def rotation(self) -> np.ndarray:
@@ -171,7 +228,9 @@ class BodyTable(Section):
             "centre_of_mass_m is for a pinned body, from its pivot; this one is not pinned": (
                 has_centre and not self.pinned
             ),
-            f"centre_of_mass_m would do nothing: it follows from the {parts}": has_centre and has_parts,
+            f"centre_of_mass_m would do nothing: it follows from the {parts}": (
+                has_centre and has_parts
+            ),
             "inertia_about = 'pivot', but no inertia is given": about_pivot and not ways,
             "inertia_about = 'pivot', but the body is not pinned": about_pivot and not self.pinned,
             f"inertia_about would do nothing with {''.join(ways[:1])}": (
@@ -186,9 +245,14 @@ class BodyTable(Section):
         if why := inertia_error(tensor):
             return [f"no body has this inertia: {why}"]
         if self.inertia_about == "pivot":
-            at_centre = shifted_inertia(tensor, -self.mass_kg, np.array(self.centre_of_mass_m or (0, 0, 0)))
+            at_centre = shifted_inertia(
+                tensor, -self.mass_kg, np.array(self.centre_of_mass_m or (0, 0, 0))
+            )
             if why := inertia_error(at_centre, np.abs(tensor).max()):
-                return [f"no body of this mass has this inertia about its pivot: about its centre of mass {why}"]
+                return [
+                    "no body of this mass has this inertia about its pivot: about its centre of"
+                    f" mass {why}"
+                ]
         return []
 
     @property
@@ -236,7 +300,10 @@ class BodyStart(Section):
     """Velocity of the centre of mass of a body that is not pinned"""
 
     def _errors(self):
-        for keys in (ATTITUDES, ("euler_rates_rad_s", "angular_velocity_body_rad_s", "angular_velocity_lab_rad_s")):
+        for keys in (
+            ATTITUDES,
+            ("euler_rates_rad_s", "angular_velocity_body_rad_s", "angular_velocity_lab_rad_s"),
+        ):
             given = [key for key in keys if getattr(self, key) is not None]
             if len(given) > 1:
                 yield f"give one of {', '.join(given)}"
@@ -247,11 +314,21 @@ class BodyStart(Section):
             error = orthogonality_error(np.array([matrix]))
             sense = np.linalg.det(matrix)
             if self.project and (sense <= 0 or error > FURTHEST_FROM_ROTATION):
-                what = f"determinant {sense:.3g}, |Q^T Q - 1| is {error:.2g}, must be below {FURTHEST_FROM_ROTATION:g}"
+                what = (
+                    f"determinant {sense:.3g}, |Q^T Q - 1| is {error:.2g}, must be below"
+                    f" {FURTHEST_FROM_ROTATION:g}"
+                )
                 yield f"the matrix is not a rotation with rounded digits: {what}"
             elif not self.project and (error > LARGEST_ORTHOGONALITY_ERROR or sense < 0):
-                what = "a reflection" if error <= LARGEST_ORTHOGONALITY_ERROR else f"|Q^T Q - 1| is {error:.2g}"
-                limit = f"must be below {LARGEST_ORTHOGONALITY_ERROR:g}; project = true uses the nearest rotation"
+                what = (
+                    "a reflection"
+                    if error <= LARGEST_ORTHOGONALITY_ERROR
+                    else f"|Q^T Q - 1| is {error:.2g}"
+                )
+                limit = (
+                    f"must be below {LARGEST_ORTHOGONALITY_ERROR:g}; project = true uses the"
+                    " nearest rotation"
+                )
                 yield f"the matrix is not a rotation: {what}, {limit}"
         if self.quaternion_wxyz is not None and not any(self.quaternion_wxyz):
             yield "quaternion_wxyz is zero, which is not a rotation"
@@ -259,20 +336,28 @@ class BodyStart(Section):
             if self.euler_angles_deg is None:
                 yield "euler_rates_rad_s needs euler_angles_deg"
             elif self.euler_angles_deg[1] % 180 == 0:
-                why = "phi' and psi' rotate about the same axis there; give angular_velocity_body_rad_s"
+                why = (
+                    "phi' and psi' rotate about the same axis there; give"
+                    " angular_velocity_body_rad_s"
+                )
                 yield f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: {why}"
 
     @property
     def attitude(self) -> np.ndarray:
         """Q (3, 3), a rotation to rounding."""
         given = [(to_rotation, getattr(self, key)) for key, to_rotation in ATTITUDES.items()]
-        return next((to_rotation(np.array(value)) for to_rotation, value in given if value is not None), np.eye(3))
+        return next(
+            (to_rotation(np.array(value)) for to_rotation, value in given if value is not None),
+            np.eye(3),
+        )
 
     @property
     def angular_velocity(self) -> np.ndarray:
         """Angular velocity (3,) along the body axes, rad/s."""
         if self.euler_rates_rad_s is not None and self.euler_angles_deg is not None:
-            return angular_velocity_of_euler_rates(np.radians(self.euler_angles_deg), np.array(self.euler_rates_rad_s))
+            return angular_velocity_of_euler_rates(
+                np.radians(self.euler_angles_deg), np.array(self.euler_rates_rad_s)
+            )
         if self.angular_velocity_lab_rad_s is not None:
             return self.attitude.T @ self.angular_velocity_lab_rad_s
         return np.array(self.angular_velocity_body_rad_s or (0.0, 0.0, 0.0))
@@ -284,13 +369,16 @@ class Run(MovedByScheme):
     duration_s: Positive
     """Duration"""
     timestep_s: Positive
-    """Time step; with dop853 and radau, whose steps are adaptive, the interval between observations; with auto the
-    longest step"""
-    integrator: Annotated[str, NameIn((*SCHEMES, AUTO, *SOLVERS), in_scene=True)] = "velocity_verlet"
-    """A scheme of flows; auto: the scheme and step that keep the requested error with the fewest force evaluations; or
-    a general ODE solver for the textbook equations: rk4, dop853, radau"""
+    """Time step; with dop853 and radau, whose steps are adaptive, the interval between
+    observations; with auto the longest step"""
+    integrator: Annotated[str, NameIn((*SCHEMES, AUTO, *SOLVERS), in_scene=True)] = (
+        "velocity_verlet"
+    )
+    """A scheme of flows; auto: the scheme and step that keep the requested error with the fewest
+    force evaluations; or a general ODE solver for the textbook equations: rk4, dop853, radau"""
     energy_error: Positive | None = None
-    """With auto: rms error of the energy over the run, as a fraction of the largest kinetic energy"""
+    """With auto: rms error of the energy over the run, as a fraction of the largest kinetic
+    energy"""
     trajectory_error: Positive | None = None
     """With auto: largest error of Q at the end; for a point the error of X in m"""
     rotor: Rotor | None = None
@@ -300,14 +388,17 @@ class Run(MovedByScheme):
     relative_tolerance: Annotated[float, Strict(), Field(ge=1e-13, lt=1)] | None = None
     """Relative tolerance of dop853 and radau; default: 1e-10"""
     absolute_tolerance: Positive | None = None
-    """Absolute tolerance of dop853 and radau, as a fraction of the size of each variable in the run; default: 1e-10"""
+    """Absolute tolerance of dop853 and radau, as a fraction of the size of each variable in the
+    run; default: 1e-10"""
 
     @field_validator("integrator", mode="before")
     @classmethod
     def _moves_bodies(cls, name: Any):
         if name in WITH_THERMOSTAT:
             known = ", ".join((*SCHEMES, AUTO, *SOLVERS))
-            raise ValueError(f"is {name!r}, which has a thermostat, for molecules. The integrators are {known}")
+            raise ValueError(
+                f"is {name!r}, which has a thermostat, for molecules. The integrators are {known}"
+            )
         return name
 
     def _errors(self):
@@ -315,8 +406,15 @@ class Run(MovedByScheme):
             yield f"rotor would do nothing with {self.integrator}"
         yield from self._rotor_errors()
         if self.formulation is not None and self.integrator not in SOLVERS:
-            yield f"formulation would do nothing with {self.integrator}: it is for {', '.join(SOLVERS)}"
-        tolerances = [key for key in ("relative_tolerance", "absolute_tolerance") if getattr(self, key) is not None]
+            yield (
+                f"formulation would do nothing with {self.integrator}: it is for"
+                f" {', '.join(SOLVERS)}"
+            )
+        tolerances = [
+            key
+            for key in ("relative_tolerance", "absolute_tolerance")
+            if getattr(self, key) is not None
+        ]
         if tolerances and self.integrator not in ("dop853", "radau"):
             yield f"{', '.join(tolerances)} would do nothing with {self.integrator}"
         asked = {"energy_error": self.energy_error, "trajectory_error": self.trajectory_error}
@@ -335,28 +433,36 @@ class BodyOutput(Section):
     """Files in the folder of the run."""
 
     interval_s: Positive | None = None
-    """Time between samples in motion.csv and the trajectory; default: the duration divided by 2000"""
+    """Time between samples in motion.csv and the trajectory; default: the duration divided by
+    2000"""
     npz: Flag = False
     """Also write motion.npz, the same columns as arrays"""
-    trajectory: Annotated[str | Literal[False], file_name(lambda form: form.encoder and not form.even)] = TRAJECTORY
-    """Trajectory of points of the body for viewers; the extension sets the format; false for none"""
+    trajectory: Annotated[
+        str | Literal[False], file_name(lambda form: form.encoder and not form.even)
+    ] = TRAJECTORY
+    """Trajectory of points of the body for viewers; the extension sets the format; false for
+    none"""
     topology: Annotated[str | None, file_name(lambda form: form.write_topology)] = None
-    """Topology file that viewers need for the trajectory (.gro, or .pdb, in which bonds are the edges of the body);
-    default: topology.pdb, or topology.gro for a body that starts more than 900 Å of the trajectory away"""
+    """Topology file that viewers need for the trajectory (.gro, or .pdb, in which bonds are the
+    edges of the body); default: topology.pdb, or topology.gro for a body that starts more than 900
+    Å of the trajectory away"""
     trajectory_A_per_m: Positive | None = None
-    """Ångström in the trajectory per metre; default: the body has a radius of 10 Å. A second becomes a ps"""
+    """Ångström in the trajectory per metre; default: the body has a radius of 10 Å. A second
+    becomes a ps"""
     figures: Flag = True
     """Draw the motion"""
     checkpoint_minutes: Annotated[float, Strict(), Field(gt=0, le=1e9)] | Literal[False] = 5.0
-    """Wall time between checkpoints, from which `rigidmd resume` continues a run; false for none. Runs with radau have
-    none"""
+    """Wall time between checkpoints, from which `rigidmd resume` continues a run; false for none.
+    Runs with radau have none"""
     axis: Vector | None = None
-    """Body axis whose path is drawn; default: towards the centre of mass, else the axis of symmetry, else axis 3"""
+    """Body axis whose path is drawn; default: towards the centre of mass, else the axis of
+    symmetry, else axis 3"""
     drawn_as: Literal["top", "ellipsoid", "cuboid"] | Solid | None = None
-    """Shape in animations and pages; no effect on the motion. "top", "ellipsoid" or "cuboid" with the mass and inertia
-    of the body, or a solid with its dimensions, such as { shape = "cone", radius_m = 0.03, height_m = 0.06 }. Default:
-    the solids or the points of the body; else a cylinder or ball of its inertia if two moments are equal, on a stem if
-    it is pinned outside; else a cuboid"""
+    """Shape in animations and pages; no effect on the motion. "top", "ellipsoid" or "cuboid" with
+    the mass and inertia of the body, or a solid with its dimensions, such as { shape = "cone",
+    radius_m = 0.03, height_m = 0.06 }. Default: the solids or the points of the body; else a
+    cylinder or ball of its inertia if two moments are equal, on a stem if it is pinned outside;
+    else a cuboid"""
 
     def _errors(self):
         if self.trajectory and self.trajectory == (self.topology or BODY_TOPOLOGY):
@@ -369,14 +475,16 @@ class BodyWatch(Section):
     """Limits beyond which a run of a single body stops; false switches a check off."""
 
     energy: LimitOfEnergy = 1.0
-    """Largest change of the energy less the work done, in units of the largest energy exchanged so far: the kinetic
-    energy at the start and changes of potential energy and work"""
+    """Largest change of the energy less the work done, in units of the largest energy exchanged so
+    far: the kinetic energy at the start and changes of potential energy and work"""
     orthogonality: LimitOfRounding | None = None
-    """Largest entry of abs(QᵀQ - 1); default: 1e-9, or 0.1 with rk4, dop853 and radau, which do not preserve it"""
+    """Largest entry of abs(QᵀQ - 1); default: 1e-9, or 0.1 with rk4, dop853 and radau, which do not
+    preserve it"""
     turn_rad: Limit = False
     """Largest rotation of the body in a step"""
     stable_step: Flag = True
-    """Estimate the longest stable step from the body's spin and swing, and warn if timestep_s is longer"""
+    """Estimate the longest stable step from the body's spin and swing, and warn if timestep_s is
+    longer"""
 
 
 class BodyScene(Scene):
@@ -409,29 +517,55 @@ class BodyScene(Scene):
         body, start, fluid = (tables.get(key, {}) for key in ("body", "start", "fluid"))
         if body.get("pinned") is True:
             moved = "the body is pinned at a point and cannot be moved: omit it"
-            found += [(["start", key], moved) for key in ("position_m", "velocity_m_s") if key in start]
+            found += [
+                (["start", key], moved) for key in ("position_m", "velocity_m_s") if key in start
+            ]
             forces = ("linear_resistance_kg_s", "quadratic_resistance_kg_m", "added_mass_kg")
-            given = [key for key in forces if isinstance(fluid.get(key), list | tuple) and any(fluid[key])]
-            found += [(["fluid", key], "the body is pinned at a point: no such force acts on it") for key in given]
+            given = [
+                key
+                for key in forces
+                if isinstance(fluid.get(key), list | tuple) and any(fluid[key])
+            ]
+            found += [
+                (["fluid", key], "the body is pinned at a point: no such force acts on it")
+                for key in given
+            ]
         given = [key for key in WAYS_OF_INERTIA if key in body]
         if "changing_inertia" in data and given:
-            found.append((["body", given[0]], "changing_inertia defines the inertia: omit one of them"))
+            found.append(
+                (["body", given[0]], "changing_inertia defines the inertia: omit one of them")
+            )
         if "fluid" in data and "frame" in data:
-            found.append((["frame"], "a fluid at rest and an accelerated frame together are not supported"))
+            found.append(
+                (["frame"], "a fluid at rest and an accelerated frame together are not supported")
+            )
         return [f"{location_of(keys, text)}: {fault}" for keys, fault in found]
 
     def _errors(self):
         fluid, body = self.fluid, self.body
         if fluid is not None:
             if fluid.density_kg_m3 is not None:
-                if body.solid is None or body.solid.shape not in ("sphere", "ellipsoid") or body.pinned:
-                    yield "fluid.density_kg_m3 needs a body.solid that is a sphere or an ellipsoid, not pinned"
+                if (
+                    body.solid is None
+                    or body.solid.shape not in ("sphere", "ellipsoid")
+                    or body.pinned
+                ):
+                    yield (
+                        "fluid.density_kg_m3 needs a body.solid that is a sphere or an ellipsoid,"
+                        " not pinned"
+                    )
                 follow = ("displaced_mass_kg", "added_mass_kg", "added_inertia_kg_m2")
                 given = [key for key in follow if getattr(fluid, key) is not None]
-                yield from [f"fluid.{key} contradicts fluid.density_kg_m3, from which it follows" for key in given]
+                yield from [
+                    f"fluid.{key} contradicts fluid.density_kg_m3, from which it follows"
+                    for key in given
+                ]
             buoyant = fluid.displaced_mass_kg is not None or fluid.density_kg_m3 is not None
             if fluid.centre_of_buoyancy_m is not None and not buoyant:
-                yield "fluid.centre_of_buoyancy_m would do nothing without displaced_mass_kg or density_kg_m3"
+                yield (
+                    "fluid.centre_of_buoyancy_m would do nothing without displaced_mass_kg or"
+                    " density_kg_m3"
+                )
             if (fluid.displaced_mass_kg or fluid.density_kg_m3) and self.gravity is None:
                 yield "fluid: buoyancy needs [gravity]"
         if self.output.interval_s is not None and self.output.interval_s > self.run.duration_s:

@@ -1,4 +1,5 @@
-"""Tables of a scene that act on a single body: fields, forces, friction, fluids, frames, wheels. SI units."""
+"""Tables of a scene that act on a single body: fields, forces, friction, fluids, frames, wheels. SI
+units."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -24,7 +25,8 @@ class Gravity(Section):
 
 
 class Timed(Section):
-    """Quantities that are constant, limited to a window of time, or interpolated linearly in a table."""
+    """Quantities that are constant, limited to a window of time, or interpolated linearly in a
+    table."""
 
     times_s: Times | None = None
     """Increasing times; each quantity is then a list of as many values"""
@@ -42,14 +44,17 @@ class Timed(Section):
         return times
 
     def timing_errors(self, values: dict[str, Any], entry: type) -> Iterator[str]:
-        """Messages on quantities that do not match the times; a single value has the type `entry`."""
+        """Messages on quantities that do not match the times; a single value has the type
+        `entry`."""
         times = self.times_s
         if times is not None and (self.from_s is not None or self.to_s is not None):
             yield "from_s and to_s would do nothing next to times_s"
         if not (self.to_s is None or self.to_s > (self.from_s or 0)):
             yield f"to_s = {self.to_s:g} is not after from_s = {self.from_s or 0:g}"
         for key, value in values.items():
-            many = isinstance(value, tuple) and (entry is float or isinstance(next(iter(value), None), tuple))
+            many = isinstance(value, tuple) and (
+                entry is float or isinstance(next(iter(value), None), tuple)
+            )
             if value == ():
                 yield f"{key} is an empty list"
             elif times is None and many:
@@ -74,11 +79,13 @@ class Applied(Timed):
     torque_N_m: Vector | tuple[Vector, ...] | None = None
     """Torque in addition to the torque of the force"""
     at_m: Vector | None = None
-    """Point of action, along the body axes, from the centre of mass, or from the pivot of a pinned body; default: that
-    point itself"""
+    """Point of action, along the body axes, from the centre of mass, or from the pivot of a pinned
+    body; default: that point itself"""
 
     def _errors(self):
-        yield from self.timing_errors({"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple)
+        yield from self.timing_errors(
+            {"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple
+        )
         if self.force_N is None and self.torque_N_m is None:
             yield "needs force_N or torque_N_m"
         if self.at_m is not None and self.force_N is None:
@@ -110,8 +117,8 @@ class Fluid(Section):
     displaced_mass_kg: NonNegative | None = None
     """Mass of the fluid displaced: buoyancy is its weight"""
     centre_of_buoyancy_m: Vector | None = None
-    """Point where buoyancy acts, along the body axes, from the centre of mass, or from the pivot of a pinned body;
-    default: the centre of mass"""
+    """Point where buoyancy acts, along the body axes, from the centre of mass, or from the pivot of
+    a pinned body; default: the centre of mass"""
     added_mass_kg: NonNegativeVector | None = None
     """Mass of fluid carried along each axis"""
     added_inertia_kg_m2: NonNegativeVector | None = None
@@ -126,21 +133,32 @@ class Frame(Timed):
     angular_acceleration_rad_s2: Vector | None = None
     """Angular acceleration of the frame, along its own axes, constant from the start"""
     origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
-    """Acceleration of the frame's origin, along the frame's axes; the body has the opposite acceleration"""
+    """Acceleration of the frame's origin, along the frame's axes; the body has the opposite
+    acceleration"""
 
     def _errors(self):
-        timed = {key: getattr(self, key) for key in ("angular_velocity_rad_s", "origin_acceleration_m_s2")}
+        timed = {
+            key: getattr(self, key)
+            for key in ("angular_velocity_rad_s", "origin_acceleration_m_s2")
+        }
         yield from self.timing_errors(timed, tuple)
         if self.from_s is not None or self.to_s is not None:
             yield "from_s and to_s are not supported here; use times_s"
         if self.angular_acceleration_rad_s2 is not None and self.times_s is not None:
             yield "angular_acceleration_rad_s2 and times_s contradict each other"
-        if all(value is None for value in timed.values()) and self.angular_acceleration_rad_s2 is None:
-            yield "needs angular_velocity_rad_s, angular_acceleration_rad_s2 or origin_acceleration_m_s2"
+        if (
+            all(value is None for value in timed.values())
+            and self.angular_acceleration_rad_s2 is None
+        ):
+            yield (
+                "needs angular_velocity_rad_s, angular_acceleration_rad_s2 or"
+                " origin_acceleration_m_s2"
+            )
 
 
 class Wheel(Timed):
-    """A rotor on an axis fixed in the body. The inertia of the body includes the wheel, except about this axis."""
+    """A rotor on an axis fixed in the body. The inertia of the body includes the wheel, except
+    about this axis."""
 
     axis: Vector
     """Direction of the axis, along the body axes, of any length"""
@@ -159,15 +177,17 @@ class Wheel(Timed):
 
 
 class ChangingInertia(Timed):
-    """Principal moments about the centre of mass as given functions of time, along fixed body axes; mass and centre of
-    mass do not change. The pivot of a pinned body must be its centre of mass."""
+    """Principal moments about the centre of mass as given functions of time, along fixed body axes;
+    mass and centre of mass do not change. The pivot of a pinned body must be its centre of mass."""
 
     inertia_kg_m2: tuple[PositiveVector, ...]
     """Principal moments at each time"""
 
     def _errors(self):
         timed = {"inertia_kg_m2": self.inertia_kg_m2}
-        yield from ["times_s is missing"] if self.times_s is None else self.timing_errors(timed, tuple)
+        yield from (
+            ["times_s is missing"] if self.times_s is None else self.timing_errors(timed, tuple)
+        )
         if self.from_s is not None or self.to_s is not None:
             yield "from_s and to_s are not supported here; use times_s"
         for k, moments in enumerate(self.inertia_kg_m2):

@@ -26,33 +26,41 @@ class Coupling(NamedTuple):
 
     summary: str  # for the description of the key `thermostat` or `barostat`
     source: str
-    keys: dict[str, float | Callable[[Any], float]]  # its keys -> their defaults, or functions of the stage
+    keys: dict[
+        str, float | Callable[[Any], float]
+    ]  # its keys -> their defaults, or functions of the stage
     ensembles: tuple[str, ...] = ("nvt", "npt")
-    #: For a thermostat: whether it acts on each molecule by itself, so that the total momentum is not conserved and
-    #: diffusion and spectra change; its time constant (ps) and its description by the values of its keys.
+    #: For a thermostat: whether it acts on each molecule by itself, so that the total momentum is
+    #: not conserved and diffusion and spectra change; its time constant (ps) and its description by
+    #: the values of its keys.
     on_molecules: bool = False
     in_trajectories: bool = False  # whether steps are accepted or rejected together
     time: Callable[[Values], float] = lambda values: values["thermostat_time_ps"]
     description: Callable[[Values], str] = lambda values: f"{values['thermostat_time_ps']:g} ps"
-    #: Whether its time constant is the period of an oscillation, which steps have to resolve, or the relaxation time of
-    #: moves, which has to be longer than the time between two of them.
+    #: Whether its time constant is the period of an oscillation, which steps have to resolve, or
+    #: the relaxation time of moves, which has to be longer than the time between two of them.
     oscillates: bool = False
     relaxes_in_moves: bool = False
-    #: For a barostat: how the box may change; whether its flows are parts of velocity Verlet steps, of which the
-    #: integrator then has to consist; its name in reports, if it is another one.
+    #: For a barostat: how the box may change; whether its flows are parts of velocity Verlet steps,
+    #: of which the integrator then has to consist; its name in reports, if it is another one.
     shapes: tuple[str, ...] = get_args(Shapes)
     in_verlet_steps: bool = False
     title: str = ""
 
     def values(self, stage: Any) -> Values:
         """The values of its keys in a stage."""
-        defaults = {key: default(stage) if callable(default) else default for key, default in self.keys.items()}
+        defaults = {
+            key: default(stage) if callable(default) else default
+            for key, default in self.keys.items()
+        }
         return {key: getattr(stage, key) or default for key, default in defaults.items()}
 
 
 def _describe_frictions(values: Values) -> str:
     translation, rotation = values.values()
-    return f"friction {translation:g}/ps" + (f" ({rotation:g}/ps of rotation)" if rotation != translation else "")
+    return f"friction {translation:g}/ps" + (
+        f" ({rotation:g}/ps of rotation)" if rotation != translation else ""
+    )
 
 
 #: Length of a trajectory of hybrid Monte Carlo, ps.
@@ -72,48 +80,76 @@ def _interval(stage: Any) -> float:
 DEFAULT_THERMOSTAT = "velocity_rescaling"
 THERMOSTATS = {
     "velocity_rescaling": Coupling(
-        "stochastic, by Bussi et al.", "Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101",
+        "stochastic, by Bussi et al.",
+        "Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101",
         {"thermostat_time_ps": 0.1},
     ),
     "langevin": Coupling(
-        "friction and noise", "Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114",
-        {"friction_translation_per_ps": 1.0,
-         "friction_rotation_per_ps": lambda stage: stage.friction_translation_per_ps or 1.0},
-        on_molecules=True, time=lambda values: 1 / min(values.values()), description=_describe_frictions,
+        "friction and noise",
+        "Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114",
+        {
+            "friction_translation_per_ps": 1.0,
+            "friction_rotation_per_ps": lambda stage: stage.friction_translation_per_ps or 1.0,
+        },
+        on_molecules=True,
+        time=lambda values: 1 / min(values.values()),
+        description=_describe_frictions,
     ),
     "nose_hoover": Coupling(
         "one chain for translation and one for rotation",
         "Martyna, Tuckerman, Tobias & Klein 1996, Mol. Phys. 87, 1117",
-        {"thermostat_time_ps": 0.5, "nose_hoover_links": 3}, oscillates=True,
+        {"thermostat_time_ps": 0.5, "nose_hoover_links": 3},
+        oscillates=True,
     ),
     "andersen": Coupling(
-        "collisions", "Andersen 1980, J. Chem. Phys. 72, 2384", {"thermostat_time_ps": 1.0}, on_molecules=True,
+        "collisions",
+        "Andersen 1980, J. Chem. Phys. 72, 2384",
+        {"thermostat_time_ps": 1.0},
+        on_molecules=True,
     ),
     "hybrid_monte_carlo": Coupling(
-        "trajectories from new momenta, accepted or rejected: averages without an error of the step",
+        "trajectories from new momenta, accepted or rejected: averages without an error of the"
+        " step",
         "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216",
-        {"trajectory_steps": lambda stage: max(1, round(TRAJECTORY_PS * 1000 / stage.timestep_fs)),
-         "momentum_refreshment": 1.0},
-        on_molecules=True, in_trajectories=True, time=lambda values: 0.0, description=_describe_trajectories,
+        {
+            "trajectory_steps": lambda stage: max(
+                1, round(TRAJECTORY_PS * 1000 / stage.timestep_fs)
+            ),
+            "momentum_refreshment": 1.0,
+        },
+        on_molecules=True,
+        in_trajectories=True,
+        time=lambda values: 0.0,
+        description=_describe_trajectories,
     ),
-}  # fmt: skip
+}
 #: The first one of an ensemble is its default.
 BAROSTATS = {
     "cell_rescaling": Coupling(
         "stochastic cell rescaling, made exact by a Metropolis test",
         "Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107",
-        {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": _interval}, ("npt",), relaxes_in_moves=True,
+        {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": _interval},
+        ("npt",),
+        relaxes_in_moves=True,
     ),
     "monte_carlo": Coupling(
-        "random changes of the volume", "Åqvist et al. 2004, Chem. Phys. Lett. 384, 288",
-        {"barostat_interval_ps": _interval}, ("npt",), shapes=("isotropic",),
+        "random changes of the volume",
+        "Åqvist et al. 2004, Chem. Phys. Lett. 384, 288",
+        {"barostat_interval_ps": _interval},
+        ("npt",),
+        shapes=("isotropic",),
     ),
     "piston": Coupling(
-        "a volume with inertia and without friction", "Andersen 1980, J. Chem. Phys. 72, 2384",
-        {"barostat_time_ps": BAROSTAT_TIME}, ("nph",), shapes=("isotropic",), in_verlet_steps=True, title="a piston",
+        "a volume with inertia and without friction",
+        "Andersen 1980, J. Chem. Phys. 72, 2384",
+        {"barostat_time_ps": BAROSTAT_TIME},
+        ("nph",),
+        shapes=("isotropic",),
+        in_verlet_steps=True,
+        title="a piston",
         oscillates=True,
     ),
-}  # fmt: skip
+}
 
 
 class ThermostatKeys(Section):
@@ -125,8 +161,8 @@ class ThermostatKeys(Section):
         + f". Default: langevin with baoab, else {DEFAULT_THERMOSTAT}",
     )
     thermostat_time_ps: Positive | None = None
-    """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or mean time between two
-    collisions of a molecule with andersen (1 ps)"""
+    """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or
+    mean time between two collisions of a molecule with andersen (1 ps)"""
     friction_translation_per_ps: Positive | None = None
     """Friction of langevin on translation; default: 1"""
     friction_rotation_per_ps: Positive | None = None
@@ -134,23 +170,29 @@ class ThermostatKeys(Section):
     nose_hoover_links: Annotated[int, Strict(), Field(ge=1, le=100)] = 3
     """Links of each Nose-Hoover chain"""
     trajectory_steps: Annotated[int, Strict(), Field(ge=1, le=100_000)] | None = None
-    """Steps of a trajectory of hybrid_monte_carlo, after which it is accepted or rejected; default: those of 0.1 ps"""
+    """Steps of a trajectory of hybrid_monte_carlo, after which it is accepted or rejected; default:
+    those of 0.1 ps"""
     momentum_refreshment: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Fraction of the variance of each momentum that hybrid_monte_carlo draws anew before a trajectory; 1: all of it"""
+    """Fraction of the variance of each momentum that hybrid_monte_carlo draws anew before a
+    trajectory; 1: all of it"""
 
 
 class BarostatKeys(Section):
     """The keys of barostats in a stage."""
 
     pressure_bar: Number | tuple[Number, Number] | tuple[Number, Number, Number] | Six | None = None
-    """Pressure of the barostat, or of the minimisation of the enthalpy; two for a linear change over the stage,
-    [1, 1000]; three for one along each axis; six for the tensor xx, yy, zz, xy, xz, yz"""
+    """Pressure of the barostat, or of the minimisation of the enthalpy; two for a linear change
+    over the stage, [1, 1000]; three for one along each axis; six for the tensor xx, yy, zz, xy, xz,
+    yz"""
     pressure_coupling: Shapes = "isotropic"
-    """How the box changes: isotropic keeps its shape; semi_isotropic: x and y together, z separately; anisotropic:
-    three edges; flexible: edges and angles; normal: z alone, at constant area; lateral: x and y together, z is kept"""
+    """How the box changes: isotropic keeps its shape; semi_isotropic: x and y together, z
+    separately; anisotropic: three edges; flexible: edges and angles; normal: z alone, at constant
+    area; lateral: x and y together, z is kept"""
     barostat: Annotated[str, NameIn(BAROSTATS)] | None = Field(
         default=None,
-        description="; ".join(f"{name}, of {kind.ensembles[0]}: {kind.summary}" for name, kind in BAROSTATS.items())
+        description="; ".join(
+            f"{name}, of {kind.ensembles[0]}: {kind.summary}" for name, kind in BAROSTATS.items()
+        )
         + ". Default: the first one of the ensemble",
     )
     barostat_time_ps: Positive | None = None

@@ -13,17 +13,23 @@ _TITLES = " or ".join(program.title for program in _PROGRAMS.values())
 
 
 class _Engine(Section):
-    """The engine that moves the molecules. Start, log, trajectory and analysis are the same for all engines."""
+    """The engine that moves the molecules. Start, log, trajectory and analysis are the same for all
+    engines."""
 
     name: Literal[(RIGIDMD, *_PROGRAMS)] = Field(  # type: ignore[valid-type]
-        default=RIGIDMD, description=f"rigidmd itself, or {_TITLES} if installed (pip install {' or '.join(_PROGRAMS)})"
+        default=RIGIDMD,
+        description=(
+            f"rigidmd itself, or {_TITLES} if installed (pip install {' or '.join(_PROGRAMS)})"
+        ),
     )
 
     def _errors(self):
         for name, program in _PROGRAMS.items():
             for key in program.options.keys() - self.options.keys():
                 if getattr(self, key) is not None:
-                    yield f"{key} would do nothing with engine.name = {self.name!r}; it is for {name}"
+                    yield (
+                        f"{key} would do nothing with engine.name = {self.name!r}; it is for {name}"
+                    )
         if self.program and (fault := self.program.option_errors(**self.options)):
             yield fault
 
@@ -42,7 +48,9 @@ class _Engine(Section):
         """The options of this engine, with defaults."""
         options = self.program.options if self.program else {}
         given = {key: getattr(self, key) for key in options}
-        return {key: options[key].default if value is None else value for key, value in given.items()}
+        return {
+            key: options[key].default if value is None else value for key, value in given.items()
+        }
 
     @property
     def title(self) -> str:

@@ -30,8 +30,8 @@ class Walls(Section):
     axis: Literal["x", "y", "z"]
     """Axis of the lab to which the walls are perpendicular"""
     kind: Literal["lj93", "harmonic"]
-    """lj93: (2/15) (sigma/d)^9 - (sigma/d)^3, times epsilon, at a distance d; harmonic: stiffness/2 d² at a depth d
-    behind the wall, 0 in front of it"""
+    """lj93: (2/15) (sigma/d)^9 - (sigma/d)^3, times epsilon, at a distance d; harmonic: stiffness/2
+    d² at a depth d behind the wall, 0 in front of it"""
     positions_A: tuple[Edge, Edge]
     """Positions along the axis, the lower one first; without a box -inf or inf for no wall"""
     acts_on: Literal["sites", "centres"] = "sites"
@@ -72,16 +72,18 @@ Group = Annotated[int, Strict(), Field(ge=1)] | Numbers
 
 
 class Restraint(Section):
-    """Springs between centres of mass and their positions at the start or one given position; or, with `between`, a
-    spring on the distance of two molecules or groups."""
+    """Springs between centres of mass and their positions at the start or one given position; or,
+    with `between`, a spring on the distance of two molecules or groups."""
 
     species: str | None = None
     """Species that is restrained; required if there are several"""
     molecules: Numbers | None = None
-    """Numbers of the restrained molecules, [1, 2, 5] or "1-10, 15", as for `frozen`; default: all"""
+    """Numbers of the restrained molecules, [1, 2, 5] or "1-10, 15", as for `frozen`; default:
+    all"""
     between: tuple[Group, Group] | None = None
-    """Two molecules, or groups of them, whose distance is restrained: [1, 2], [[1, 2], "3-5"]. The numbers count all
-    molecules of the scene from 1 on. The distance is between the centres of mass, to the nearest periodic image"""
+    """Two molecules, or groups of them, whose distance is restrained: [1, 2], [[1, 2], "3-5"]. The
+    numbers count all molecules of the scene from 1 on. The distance is between the centres of mass,
+    to the nearest periodic image"""
     distance_A: Positive | None = None
     """With between: the distance at which the spring has no energy"""
     stiffness_kJ_mol_A2: NonNegative | tuple[NonNegative, NonNegative, NonNegative]
@@ -105,7 +107,9 @@ class Restraint(Section):
             yield "between needs distance_A, at which the spring has no energy"
         if isinstance(self.stiffness_kJ_mol_A2, tuple):
             yield "stiffness_kJ_mol_A2 has one number for a distance"
-        if given := [key for key in ("species", "molecules", "position_A") if getattr(self, key) is not None]:
+        if given := [
+            key for key in ("species", "molecules", "position_A") if getattr(self, key) is not None
+        ]:
             yield f"{', '.join(given)} would do nothing with between, which names the molecules"
 
     @property
@@ -135,8 +139,8 @@ class Fields(Section):
     electric_V_per_nm: Vector | None = None
     """Uniform electric field, which acts on all charges, whatever `electrostatics` is"""
     electric_frequency_per_ps: Positive | None = None
-    """Frequency f of a field that oscillates as cos(2 pi f t + phase), with t from the start of the run; default: a
-    constant field"""
+    """Frequency f of a field that oscillates as cos(2 pi f t + phase), with t from the start of the
+    run; default: a constant field"""
     electric_phase_deg: Number = 0.0
     """Phase of the oscillating field"""
     gravity_m_s2: Vector | None = None
@@ -154,20 +158,32 @@ class Fields(Section):
 
     @property
     def entries(self) -> dict[str, tuple["FieldKind", Section, str]]:
-        """Name of each term -> its kind, the table with its keys, and the path of that table or key in the scene."""
+        """Name of each term -> its kind, the table with its keys, and the path of that table or key
+        in the scene."""
         found: dict[str, tuple[FieldKind, Section, str]] = {}
         for name, kind in FIELDS.items():
             value = getattr(self, kind.key)
             if isinstance(value, tuple) and all(isinstance(entry, Section) for entry in value):
-                found |= {f"{name}_{k}": (kind, entry, f"fields.{kind.key}.{k}") for k, entry in enumerate(value)}
+                found |= {
+                    f"{name}_{k}": (kind, entry, f"fields.{kind.key}.{k}")
+                    for k, entry in enumerate(value)
+                }
             elif value is not None:
-                found[name] = (kind, value if isinstance(value, Section) else self, f"fields.{kind.key}")
+                found[name] = (
+                    kind,
+                    value if isinstance(value, Section) else self,
+                    f"fields.{kind.key}",
+                )
         return found
 
     def bounds(self, axis: int) -> tuple[float, float] | None:
         """Range of positions between the walls perpendicular to an axis, Å; None without walls."""
         ranges = [walls.positions_A for walls in self.walls if walls.direction == axis]
-        return (max(lower for lower, _ in ranges), min(upper for _, upper in ranges)) if ranges else None
+        return (
+            (max(lower for lower, _ in ranges), min(upper for _, upper in ranges))
+            if ranges
+            else None
+        )
 
 
 class FieldKind(NamedTuple):
@@ -176,20 +192,28 @@ class FieldKind(NamedTuple):
     module: str  # in `forces.fields`, with the function `term`
     key: str  # of `Fields`: a value, a table or a list of tables, each of which is one term
     title: str  # in the list of unused interactions of a scene
-    sentence: Callable[[Any, Any], str]  # of the table with its keys and of its term, for `rigidmd check`
+    sentence: Callable[
+        [Any, Any], str
+    ]  # of the table with its keys and of its term, for `rigidmd check`
 
 
 def _electric_sentence(fields: Fields, term: Any) -> str:
     if fields.electric_frequency_per_ps is None:
         return f"{_vector(fields.electric_V_per_nm)} V/nm"
     frequency = f"f = {fields.electric_frequency_per_ps:g}/ps; its work is in the energy ledger"
-    return f"{_vector(fields.electric_V_per_nm)} V/nm cos(2 pi f t + {fields.electric_phase_deg:g}°), {frequency}"
+    return (
+        f"{_vector(fields.electric_V_per_nm)} V/nm cos(2 pi f t + {fields.electric_phase_deg:g}°),"
+        f" {frequency}"
+    )
 
 
 def _walls_sentence(walls: Walls, term: Any) -> str:
     kind = f"harmonic, {walls.stiffness_kJ_mol_A2 or 0:g} kJ/mol/Å²"
     if walls.kind == "lj93":
-        kind = f"Lennard-Jones 9-3, sigma {walls.sigma_A:g} Å, epsilon {walls.epsilon_kJ_mol:g} kJ/mol, "
+        kind = (
+            f"Lennard-Jones 9-3, sigma {walls.sigma_A:g} Å, epsilon {walls.epsilon_kJ_mol:g}"
+            " kJ/mol, "
+        )
         kind += f"cutoff {walls.cutoff_A:g} Å" if walls.cutoff_A else "no cutoff"
     what = "centres of mass" if walls.acts_on == "centres" else f"{len(term.sites.molecule)} sites"
     positions = [f"{walls.axis} = {x:g} Å" for x in walls.positions_A if abs(x) < inf]
@@ -202,13 +226,21 @@ def _restraint_sentence(entry: Restraint, term: Any) -> str:
         spring = f"restrained to {entry.distance_A:g} Å, {entry.stiffness[0]:g} kJ/mol/Å²"
         return f"distance of {one} and {other} {spring}"
     size = f"{entry.stiffness[0]:g}" if len(set(entry.stiffness)) == 1 else _vector(entry.stiffness)
-    where = "to their starting positions" if entry.position_A is None else f"to {_vector(entry.position_A)} Å"
+    where = (
+        "to their starting positions"
+        if entry.position_A is None
+        else f"to {_vector(entry.position_A)} Å"
+    )
     return f"{len(term.molecule)} molecules restrained {where}, {size} kJ/mol/Å²"
 
 
 def _numbers(group: list[int]) -> str:
     """A group of molecules, for messages."""
-    return f"molecule {group[0]}" if len(group) == 1 else f"the centre of {len(group)} molecules ({group[0]}, ...)"
+    return (
+        f"molecule {group[0]}"
+        if len(group) == 1
+        else f"the centre of {len(group)} molecules ({group[0]}, ...)"
+    )
 
 
 def _vector(values: Any) -> str:
@@ -217,9 +249,14 @@ def _vector(values: Any) -> str:
 
 #: Name of a term, to which a number is added if `key` is a list -> its kind.
 FIELDS = {
-    "electric_field": FieldKind("electric", "electric_V_per_nm", "electric field", _electric_sentence),
+    "electric_field": FieldKind(
+        "electric", "electric_V_per_nm", "electric field", _electric_sentence
+    ),
     "gravity": FieldKind(
-        "gravity", "gravity_m_s2", "gravity", lambda fields, _: f"{_vector(fields.gravity_m_s2)} m/s²"
+        "gravity",
+        "gravity_m_s2",
+        "gravity",
+        lambda fields, _: f"{_vector(fields.gravity_m_s2)} m/s²",
     ),
     "walls": FieldKind("walls", "walls", "walls", _walls_sentence),
     "restraints": FieldKind("restraints", "restraints", "restraints", _restraint_sentence),
@@ -230,7 +267,10 @@ def field_notes(scene: "MolecularScene") -> list[str]:
     method = scene.forces.electrostatics
     if not (scene.fields.walls and method and ELECTROSTATICS[method].sums_images):
         return []
-    effect = "act on the layer between the walls across the empty part of the box; a longer box reduces this effect"
+    effect = (
+        "act on the layer between the walls across the empty part of the box; a longer box reduces"
+        " this effect"
+    )
     return [f"fields.walls: {method} includes the periodic images beyond the walls, which {effect}"]
 
 
@@ -250,13 +290,21 @@ def field_errors(scene: "MolecularScene") -> Iterator[str]:
             yield f"fields.walls: the walls across {name} leave no space between them"
         along = fields.gravity_m_s2 is not None and fields.gravity_m_s2[axis]
         if along and boxed and bounds is None and not held:
-            why = f"nothing stops the fall along {name}, which is periodic: all molecules would be accelerated together"
+            why = (
+                f"nothing stops the fall along {name}, which is periodic: all molecules would be"
+                " accelerated together"
+            )
             advice = f"Add walls across {name}, freeze or restrain some molecules, or use no box"
             yield f"fields.gravity_m_s2: {why}. {advice}"
     if fields.walls and scene.forces.tail_correction:
         yield "forces.tail_correction assumes a uniform liquid: omit it between walls"
-    period = inf if fields.electric_frequency_per_ps is None else 1000 / fields.electric_frequency_per_ps
+    period = (
+        inf if fields.electric_frequency_per_ps is None else 1000 / fields.electric_frequency_per_ps
+    )
     for k, stage in enumerate(scene.stages):
         if not (stage.is_auto or stage.is_minimisation) and period < 2 * stage.timestep_fs:
-            what = f"less than two steps of stages.{k} ({stage.timestep_fs:g} fs), which cannot follow it"
+            what = (
+                f"less than two steps of stages.{k} ({stage.timestep_fs:g} fs), which cannot"
+                " follow it"
+            )
             yield f"fields.electric_frequency_per_ps: a period of {period:.3g} fs is {what}"

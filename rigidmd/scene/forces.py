@@ -8,7 +8,16 @@ from pydantic import Field, Strict
 
 from rigidmd.core.toml import shorten_repr
 from rigidmd.scene.models import Mixing
-from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Line, NonNegative, Number, Positive, Section
+from rigidmd.scene.validation import (
+    MOST_TABLES,
+    Count,
+    Flag,
+    Line,
+    NonNegative,
+    Number,
+    Positive,
+    Section,
+)
 
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 KIndex = Annotated[int, Strict(), Field(ge=0, le=1000)]
@@ -19,30 +28,40 @@ GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 class Method(NamedTuple):
     """A method of electrostatics."""
 
-    module: str = ""  # in `forces`: its function `interactions`, and `setting_errors` and `settings` if it needs them
+    # in `forces`: its function `interactions`, and `setting_errors` and `settings` if it needs them
+    module: str = ""
     keys: tuple[str, ...] = ()  # of `Forces`, which do nothing with other methods
     sums_images: bool = False  # whether charges act on all periodic images
     conserves_momentum: bool = True
 
 
 _EWALD = (
-    "ewald_accuracy", "ewald_cutoff_A", "ewald_alpha_per_A", "ewald_surface_permittivity", "ewald_slab",
+    "ewald_accuracy",
+    "ewald_cutoff_A",
+    "ewald_alpha_per_A",
+    "ewald_surface_permittivity",
+    "ewald_slab",
     "ewald_truncation",
-)  # fmt: skip
+)
 _K_VECTORS = ("ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A")
 #: Value of `electrostatics` -> the method.
 ELECTROSTATICS = {
-    "reaction_field": Method("potentials.coulomb", ("reaction_field_permittivity", "reaction_field_truncation")),
+    "reaction_field": Method(
+        "potentials.coulomb", ("reaction_field_permittivity", "reaction_field_truncation")
+    ),
     "ewald": Method("ewald.interactions", (*_EWALD, *_K_VECTORS), sums_images=True),
-    "pme": Method("ewald.interactions", (*_EWALD, "pme_order", "pme_grid"), True, conserves_momentum=False),
+    "pme": Method(
+        "ewald.interactions", (*_EWALD, "pme_order", "pme_grid"), True, conserves_momentum=False
+    ),
     "damped_shifted_force": Method("potentials.screened_coulomb", ("damping_per_A",)),
     "coulomb": Method("potentials.coulomb"),
     "none": Method(),
 }
 #: Defaults of `electrostatics` where sites have charges, in a periodic box and in an open one.
 PERIODIC, OPEN = "pme", "coulomb"
-#: Pair potentials that are not of charges: key of `Forces`, which also names the term and the module in
-#: `forces.potentials` with the function `interactions` -> its name among the unused interactions, and why.
+#: Pair potentials that are not of charges: key of `Forces`, which also names the term and the
+#: module in `forces.potentials` with the function `interactions` -> its name among the unused
+#: interactions, and why.
 POTENTIALS = {"lennard_jones": ("Lennard-Jones", "lennard_jones is false")}
 
 
@@ -71,30 +90,34 @@ FORCE_FILES = ("module", "table")
 
 
 class CustomForce(Section):
-    """A custom force: a formula of the distance between sites, a table, or an object in a Python file."""
+    """A custom force: a formula of the distance between sites, a table, or an object in a Python
+    file."""
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)]
     """Name in the log; with `module` also the name of the object in it"""
     module: Line | None = None
     """Python file in the folder of the scene. Its code runs only with --trust FILE"""
     energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
-    """Without a module: energy of a pair of sites (kJ/mol) as a function of their distance r (Å) and named parameters,
-    such as A*exp(-B*r) - C/r**6; with exp, log, sqrt, sin, cos"""
+    """Without a module: energy of a pair of sites (kJ/mol) as a function of their distance r (Å)
+    and named parameters, such as A*exp(-B*r) - C/r**6; with exp, log, sqrt, sin, cos"""
     table: Line | None = None
-    """Instead of an energy: a file in the folder of the scene with the columns r_A, energy_kJ_mol and perhaps
-    force_kJ_mol_A (-dE/dr), in lines of ascending r up to the cutoff. All keys of an energy are also those of a table;
-    its one parameter is scale, a factor of the energy; default: 1"""
+    """Instead of an energy: a file in the folder of the scene with the columns r_A, energy_kJ_mol
+    and perhaps force_kJ_mol_A (-dE/dr), in lines of ascending r up to the cutoff. All keys of an
+    energy are also those of a table; its one parameter is scale, a factor of the energy; default:
+    1"""
     parameters: dict[str, Any] = Field(default={}, max_length=MOST_TABLES)
-    """With a module: arguments with which its object is called. With an energy: numbers, the same for all sites, or a
-    table of numbers for each kind of sites, by site, SPECIES.SITE or element; default: `parameters` in the models'
-    files"""
+    """With a module: arguments with which its object is called. With an energy: numbers, the same
+    for all sites, or a table of numbers for each kind of sites, by site, SPECIES.SITE or element;
+    default: `parameters` in the models' files"""
     sites: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
     """With an energy: the sites that it acts on; default: all with parameters"""
     pairs: tuple[PairParameters, ...] = Field(default=(), max_length=MOST_TABLES)
     """With an energy: parameters of particular pairs, in place of mixed parameters"""
-    mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(default={}, max_length=MOST_TABLES)
-    """With an energy: the mean of each parameter for unlike sites; default: arithmetic for names that begin with sig,
-    else geometric"""
+    mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(
+        default={}, max_length=MOST_TABLES
+    )
+    """With an energy: the mean of each parameter for unlike sites; default: arithmetic for names
+    that begin with sig, else geometric"""
     truncation: Truncation | None = None
     """With an energy: its cutoff scheme; default: forces.truncation"""
     cutoff_A: Positive | None = None
@@ -104,13 +127,18 @@ class CustomForce(Section):
 
     def _errors(self):
         if sum(given is not None for given in (self.module, self.energy, self.table)) != 1:
-            kinds = "a module, a Python file with the force, an energy, a formula of r, or a table, a file of energies"
+            kinds = (
+                "a module, a Python file with the force, an energy, a formula of r, or a table, a"
+                " file of energies"
+            )
             yield f"give {kinds}"
         if self.module is not None:
             of_energy = ("sites", "pairs", "mixing", "truncation", "cutoff_A", "switch_start_A")
             idle = [key for key in of_energy if getattr(self, key) not in (None, (), {})]
             if idle:
-                yield f"{', '.join(idle)} would do nothing with a module: its object has `parameters`"
+                yield (
+                    f"{', '.join(idle)} would do nothing with a module: its object has `parameters`"
+                )
             if not self.module.endswith(".py"):
                 yield f"module = {shorten_repr(self.module)} must be a Python file (.py)"
 
@@ -121,11 +149,12 @@ class Forces(Section):
     cutoff_A: Positive | None = None
     """Cutoff between sites; default: 9 Å in a periodic box, none without a box"""
     truncation: Truncation = "shift"
-    """Cutoff scheme of Lennard-Jones forces; smooth_switch suits integrators of order 4 and more, which forces that
-    jump at the cutoff bring down. Charges follow reaction_field_truncation and ewald_truncation"""
+    """Cutoff scheme of Lennard-Jones forces; smooth_switch suits integrators of order 4 and more,
+    which forces that jump at the cutoff bring down. Charges follow reaction_field_truncation and
+    ewald_truncation"""
     switch_start_A: Positive | None = None
-    """Where force_switch and switch begin; default: 1 Å before the cutoff, or at 0.9 of it if that is larger. Where
-    smooth_switch begins; default: at 0.6 of the cutoff"""
+    """Where force_switch and switch begin; default: 1 Å before the cutoff, or at 0.9 of it if that
+    is larger. Where smooth_switch begins; default: at 0.6 of the cutoff"""
     lennard_jones: Flag = True
     """Whether Lennard-Jones sites interact; false where `custom` replaces Lennard-Jones forces"""
     mixing: Mixing = "lorentz-berthelot"
@@ -135,15 +164,16 @@ class Forces(Section):
     custom: tuple[CustomForce, ...] = Field(default=(), max_length=MOST_TABLES)
     """Custom forces"""
     tail_correction: Flag | None = None
-    """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it, `virial` does not.
-    Default: true in a periodic box that the molecules fill evenly; false with walls, frozen molecules, custom forces or
-    empty space"""
+    """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it,
+    `virial` does not. Default: true in a periodic box that the molecules fill evenly; false with
+    walls, frozen molecules, custom forces or empty space"""
     dispersion: Literal["cutoff", "ewald", "pme"] = "cutoff"
-    """Attraction -C6/r⁶ of Lennard-Jones sites: within the cutoff, or also of all periodic images beyond it, by a sum
-    over k-vectors (ewald) or on a grid (pme), with the geometric mixing rule for C6 there"""
+    """Attraction -C6/r⁶ of Lennard-Jones sites: within the cutoff, or also of all periodic images
+    beyond it, by a sum over k-vectors (ewald) or on a grid (pme), with the geometric mixing rule
+    for C6 there"""
     dispersion_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
-    """With a sum of dispersion: rms error of its force on a site, relative to the largest 24 epsilon/sigma of a site,
-    the attraction at sigma; sets the keys below; default: 5e-5"""
+    """With a sum of dispersion: rms error of its force on a site, relative to the largest 24
+    epsilon/sigma of a site, the attraction at sigma; sets the keys below; default: 5e-5"""
     dispersion_beta_per_A: Positive | None = None
     """With a sum of dispersion: splitting parameter"""
     dispersion_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
@@ -151,56 +181,74 @@ class Forces(Section):
     dispersion_grid: tuple[GridSize, GridSize, GridSize] | None = None
     """With dispersion = pme: grid points, as for pme_grid"""
     electrostatics: Literal[tuple(ELECTROSTATICS)] | None = None  # type: ignore[valid-type]
-    """Coulomb forces: ewald and pme act on all periodic images, reaction_field and damped_shifted_force within the
-    cutoff, coulomb on all pairs without a periodic box; none ignores charges. Default: pme in a periodic box, coulomb
-    in an open one"""
+    """Coulomb forces: ewald and pme act on all periodic images, reaction_field and
+    damped_shifted_force within the cutoff, coulomb on all pairs without a periodic box; none
+    ignores charges. Default: pme in a periodic box, coulomb in an open one"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cutoff; inf for a conductor"""
     reaction_field_truncation: Truncation | None = None
-    """Cutoff scheme of charges with a reaction field. A conductor's field leaves no force at the cutoff, so that a
-    shifted energy suffices. switch and smooth_switch multiply the shifted energy; they make the random walk of the
-    energy smaller and steps slower. Default: plain or smooth_switch if `truncation` is, else shift"""
+    """Cutoff scheme of charges with a reaction field. A conductor's field leaves no force at the
+    cutoff, so that a shifted energy suffices. switch and smooth_switch multiply the shifted energy;
+    they make the random walk of the energy smaller and steps slower. Default: plain or
+    smooth_switch if `truncation` is, else shift"""
     damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
     """Damping of damped_shifted_force; 0 for none"""
     ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
-    """With ewald and pme: rms error of the force on a site, relative to the force between two charges e at 1 Å; sets
-    the keys below; default: 5e-5, somewhat better than the defaults of GROMACS and OpenMM"""
+    """With ewald and pme: rms error of the force on a site, relative to the force between two
+    charges e at 1 Å; sets the keys below; default: 5e-5, somewhat better than the defaults of
+    GROMACS and OpenMM"""
     ewald_cutoff_A: Positive | None = None
-    """With ewald and pme: cutoff of the real-space part. Default: with pme the one that makes a step fastest, by a
-    model of its cost, else cutoff_A"""
+    """With ewald and pme: cutoff of the real-space part. Default: with pme the one that makes a
+    step fastest, by a model of its cost, else cutoff_A"""
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
     ewald_k_max: KIndex | tuple[KIndex, KIndex, KIndex] | None = None
-    """With ewald: largest |n| of k = 2 pi n/L, one for all axes or one each, for the cell of box or file"""
+    """With ewald: largest |n| of k = 2 pi n/L, one for all axes or one each, for the cell of box or
+    file"""
     ewald_k2_max: Count | None = None
     """With ewald: also largest n_x² + n_y² + n_z²"""
     ewald_k_radius_per_A: Positive | None = None
     """With ewald: largest length of k"""
     ewald_truncation: Literal["plain", "shift"] | None = None
-    """With ewald and pme: whether the real-space energy erfc(alpha r)/r is shifted to 0 at the cutoff, forces are the
-    same. Default: plain if `truncation` is plain, else shift. With shift, coulomb_self also includes
-    -erfc(alpha R)/(2 R) times the square of each molecule's charge with the cutoff R, which is 0 for neutral ones"""
+    """With ewald and pme: whether the real-space energy erfc(alpha r)/r is shifted to 0 at the
+    cutoff, forces are the same. Default: plain if `truncation` is plain, else shift. With shift,
+    coulomb_self also includes
+    -erfc(alpha R)/(2 R) times the square of each molecule's charge with the cutoff R, which is 0
+    for neutral ones"""
     ewald_surface_permittivity: Permittivity = inf
     """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
     ewald_slab: Literal["x", "y", "z"] | None = None
-    """With ewald and pme: the normal of a slab between empty parts of the box; images along it then do not act"""
+    """With ewald and pme: the normal of a slab between empty parts of the box; images along it then
+    do not act"""
     pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
     """With pme: order of the B-splines; 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
-    """With pme: grid points along each edge of the cell of box or file; three equal numbers if its tilt is more than
-    half an edge, because an equivalent cell then replaces it"""
+    """With pme: grid points along each edge of the cell of box or file; three equal numbers if its
+    tilt is more than half an edge, because an equivalent cell then replaces it"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.9
     """Extra radius of the neighbour list; affects only the speed"""
 
     def _errors(self):
-        if self.switch_start_A is not None and "switch" not in f"{self.truncation} {self.reaction_field_truncation}":
-            yield f"switch_start_A would do nothing with truncation = {self.truncation!r}: add truncation = 'switch'"
+        if (
+            self.switch_start_A is not None
+            and "switch" not in f"{self.truncation} {self.reaction_field_truncation}"
+        ):
+            yield (
+                f"switch_start_A would do nothing with truncation = {self.truncation!r}: add"
+                " truncation = 'switch'"
+            )
         if self.dispersion == "cutoff":
             names = (f"dispersion_{key}" for key in ("accuracy", "beta_per_A", "order", "grid"))
             idle = [key for key in names if getattr(self, key) is not None]
-            yield from (f"{key} would do nothing with dispersion = 'cutoff' (the default)" for key in idle)
+            yield from (
+                f"{key} would do nothing with dispersion = 'cutoff' (the default)" for key in idle
+            )
         else:
-            yield from (f"dispersion = {self.dispersion!r}: {why}" for why, wrong in self._not_summable if wrong)
+            yield from (
+                f"dispersion = {self.dispersion!r}: {why}"
+                for why, wrong in self._not_summable
+                if wrong
+            )
         yield from self.idle_key_errors(self.electrostatics or PERIODIC)
         if self.ewald_k2_max is not None and self.ewald_k_max is None:
             yield "ewald_k2_max needs ewald_k_max too"
@@ -208,7 +256,9 @@ class Forces(Section):
             yield "give ewald_k2_max or ewald_k_radius_per_A, not both"
         if self.ewald_slab is not None and self.ewald_surface_permittivity < inf:
             yield "give ewald_slab or ewald_surface_permittivity, not both"
-        determined = self.sets_k_vectors or (self.pme_grid is not None and self.pme_order is not None)
+        determined = self.sets_k_vectors or (
+            self.pme_grid is not None and self.pme_order is not None
+        )
         if determined and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
             yield "ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given"
 
@@ -217,13 +267,30 @@ class Forces(Section):
         """Messages on keys that exclude a sum of dispersion, and whether they are set."""
         grid = self.dispersion_order or self.dispersion_grid
         return (
-            ("only Lennard-Jones forces have such a sum; lennard_jones is false", not self.lennard_jones),
-            ("custom forces have no such sum, so that a part of the dispersion would end at the cutoff", self.custom),
-            ("tail_correction would count what lies beyond the cutoff twice; leave it out", self.tail_correction),
-            (f"truncation = {self.truncation!r} would change the sum; take 'shift' or 'plain'",
-                self.truncation not in ("shift", "plain")),
-            ("dispersion_order and dispersion_grid belong to 'pme'", self.dispersion == "ewald" and grid),
-        )  # fmt: skip
+            (
+                "only Lennard-Jones forces have such a sum; lennard_jones is false",
+                not self.lennard_jones,
+            ),
+            (
+                (
+                    "custom forces have no such sum, so that a part of the dispersion would end at"
+                    " the cutoff"
+                ),
+                self.custom,
+            ),
+            (
+                "tail_correction would count what lies beyond the cutoff twice; leave it out",
+                self.tail_correction,
+            ),
+            (
+                f"truncation = {self.truncation!r} would change the sum; take 'shift' or 'plain'",
+                self.truncation not in ("shift", "plain"),
+            ),
+            (
+                "dispersion_order and dispersion_grid belong to 'pme'",
+                self.dispersion == "ewald" and grid,
+            ),
+        )
 
     @property
     def idle_keys(self) -> list[str]:

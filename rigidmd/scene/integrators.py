@@ -1,14 +1,22 @@
-"""Integrators of users as rows of coefficients, in the tables [[integrators]] of a scene or by `integrator`."""
+"""Integrators of users as rows of coefficients, in the tables [[integrators]] of a scene or by
+`integrator`."""
 
-# isort: skip_file
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, Strict, ValidationError
 
 from rigidmd.core.integrators import (
-    AUTO, SCHEMES, SOLVERS, WITH_THERMOSTAT, Rotor, Scheme, composed, measured_order, split,
-)  # fmt: skip
+    AUTO,
+    SCHEMES,
+    SOLVERS,
+    WITH_THERMOSTAT,
+    Rotor,
+    Scheme,
+    composed,
+    measured_order,
+    split,
+)
 from rigidmd.core.toml import plain_values
 from rigidmd.errors import SceneError
 from rigidmd.scene.validation import Line, Section, exact_names, validation_messages
@@ -16,7 +24,8 @@ from rigidmd.scene.validation import Line, Section, exact_names, validation_mess
 RESERVED = (*SCHEMES, *WITH_THERMOSTAT, AUTO, *SOLVERS)
 Coefficient = Annotated[float, Strict(), Field(ge=-10, le=10)]
 Coefficients = Annotated[tuple[Coefficient, ...], Field(min_length=1, max_length=1000)]
-#: Largest difference of the order that is measured for an oscillator from the order that a row states.
+#: Largest difference of the order that is measured for an oscillator from the order that a row
+#: states.
 ORDER_TOLERANCE = 0.5
 
 
@@ -26,13 +35,16 @@ class IntegratorRow(Section):
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$", max_length=60)]
     """Name for stages, [run] of a body and --integrators"""
     steps: Coefficients | None = None
-    """Lengths of successive velocity Verlet steps, as fractions of the time step; such a row works with any rotor"""
+    """Lengths of successive velocity Verlet steps, as fractions of the time step; such a row works
+    with any rotor"""
     kicks: Coefficients | None = None
-    """Instead of steps: fractions of the kicks, of which the first and the last may be 0; needs the exact rotor"""
+    """Instead of steps: fractions of the kicks, of which the first and the last may be 0; needs the
+    exact rotor"""
     drifts: Coefficients | None = None
     """Fractions of the drifts between the kicks, one fewer than kicks"""
     gradients: Coefficients | None = None
-    """Coefficients of the force gradient of each kick, in squares of the time step; default: none"""
+    """Coefficients of the force gradient of each kick, in squares of the time step; default:
+    none"""
     order: Annotated[int, Strict(), Field(ge=2, le=20)]
     """Order of convergence; it is compared with the order for an anharmonic oscillator"""
     source: Line = ""
@@ -45,8 +57,13 @@ class IntegratorRow(Section):
             yield "needs steps, or kicks and drifts"
         elif self.steps is not None and (self.kicks or self.drifts or self.gradients):
             yield "steps and kicks, drifts or gradients contradict each other: omit one"
-        elif any(g and not kick for g, kick in zip(self.gradients or (), self.kicks or (), strict=False)):
-            yield "gradients: a kick of fraction 0 has no gradient: its coefficient is multiplied by the fraction"
+        elif any(
+            g and not kick for g, kick in zip(self.gradients or (), self.kicks or (), strict=False)
+        ):
+            yield (
+                "gradients: a kick of fraction 0 has no gradient: its coefficient is multiplied by"
+                " the fraction"
+            )
         else:
             try:
                 order = measured_order(self.scheme)
@@ -54,14 +71,19 @@ class IntegratorRow(Section):
                 yield str(error).partition("; odd")[0]
             else:
                 if order < self.order - ORDER_TOLERANCE:
-                    yield f"order = {self.order}, but the error of an oscillator has order {order:.1f}"
+                    yield (
+                        f"order = {self.order}, but the error of an oscillator has order"
+                        f" {order:.1f}"
+                    )
 
     @property
     def scheme(self) -> Scheme:
         """Raises ValueError if kicks or drifts do not sum to 1, or the row is not a palindrome."""
         if self.steps is not None:
             return composed(self.name, self.steps, self.order, self.source)
-        return split(self.name, self.kicks or (), self.drifts or (), self.order, self.source, self.gradients)
+        return split(
+            self.name, self.kicks or (), self.drifts or (), self.order, self.source, self.gradients
+        )
 
 
 #: Rows that Python has registered in this process.
@@ -69,37 +91,72 @@ _REGISTERED: dict[str, IntegratorRow] = {}
 
 
 def integrator(
-    name: str, *, order: int, steps: Sequence[float] | None = None, kicks: Sequence[float] | None = None,
-    drifts: Sequence[float] | None = None, gradients: Sequence[float] | None = None, source: str = "",
-) -> str:  # fmt: skip
+    name: str,
+    *,
+    order: int,
+    steps: Sequence[float] | None = None,
+    kicks: Sequence[float] | None = None,
+    drifts: Sequence[float] | None = None,
+    gradients: Sequence[float] | None = None,
+    source: str = "",
+) -> str:
     """Make a row of coefficients an integrator, and return its name, which scenes then accept.
 
-    rigidmd.integrator("ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth 1990")
+    rigidmd.integrator("ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth
+    1990")
 
     steps : lengths of successive velocity Verlet steps, as fractions of the time step; or
-    kicks, drifts : fractions of kick, drift, ..., drift, kick; gradients : of each kick, see `core.integrators.Flow`
+    kicks, drifts : fractions of kick, drift, ..., drift, kick; gradients : of each kick, see
+        `core.integrators.Flow`
 
-    Fractions sum to 1 and read the same from both ends. A scene that names the row keeps its coefficients in its table
-    [[integrators]], so that its file and the folder of its run are complete. Raises SceneError.
+    Fractions sum to 1 and read the same from both ends. A scene that names the row keeps its
+    coefficients in its table [[integrators]], so that its file and the folder of its run are
+    complete. Raises SceneError.
     """
-    given = {"name": name, "order": order, "steps": steps, "kicks": kicks, "drifts": drifts, "gradients": gradients}
-    table = {key: value for key, value in plain_values(given | {"source": source}).items() if value is not None}
+    given = {
+        "name": name,
+        "order": order,
+        "steps": steps,
+        "kicks": kicks,
+        "drifts": drifts,
+        "gradients": gradients,
+    }
+    table = {
+        key: value
+        for key, value in plain_values(given | {"source": source}).items()
+        if value is not None
+    }
     try:
         _REGISTERED[name] = IntegratorRow.model_validate(table)
     except ValidationError as error:
-        faults = [fault.removeprefix("scene: ") for fault in validation_messages(error, IntegratorRow)]
+        faults = [
+            fault.removeprefix("scene: ") for fault in validation_messages(error, IntegratorRow)
+        ]
         raise SceneError(f"integrator {name!r:.60}", faults) from None
     return name
 
 
 def with_registered_rows(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Scheme]]:
-    """Tables of a scene with those registered rows that it names and does not have; and its names of rows, each with a
-    scheme that stands for an invalid row, so that only the row is an error."""
-    there, stages = ([*given] if isinstance(given := data.get(key), list) else [] for key in ("integrators", "stages"))
-    names = [table.get("integrator") for table in (*stages, data.get("run")) if isinstance(table, dict)]
-    taken = [name for table in there if isinstance(table, dict) and isinstance(name := table.get("name"), str)]
+    """Tables of a scene with those registered rows that it names and does not have; and its names
+    of rows, each with a scheme that stands for an invalid row, so that only the row is an error."""
+    there, stages = (
+        [*given] if isinstance(given := data.get(key), list) else []
+        for key in ("integrators", "stages")
+    )
+    names = [
+        table.get("integrator") for table in (*stages, data.get("run")) if isinstance(table, dict)
+    ]
+    taken = [
+        name
+        for table in there
+        if isinstance(table, dict) and isinstance(name := table.get("name"), str)
+    ]
     rows = [row for name, row in _REGISTERED.items() if name in names and name not in taken]
-    changed = {"integrators": [*there, *(row.model_dump(exclude_none=True) for row in rows)]} if rows else {}
+    changed = (
+        {"integrators": [*there, *(row.model_dump(exclude_none=True) for row in rows)]}
+        if rows
+        else {}
+    )
     return data | changed, dict.fromkeys(taken, SCHEMES["velocity_verlet"])
 
 
@@ -137,4 +194,7 @@ class MovedByScheme(Section):
 
     def _rotor_errors(self):
         if self.rotor == "split" and self.has_scheme and self.row.exact_rotor:
-            yield f"{self.integrator} needs rotor = 'exact': with the split rotor it would be of order 2"
+            yield (
+                f"{self.integrator} needs rotor = 'exact': with the split rotor it would be of"
+                " order 2"
+            )

@@ -1,6 +1,6 @@
-"""Molecular models: rigid bodies in their principal frames from lists of sites. `models/` has published ones."""
+"""Molecular models: rigid bodies in their principal frames from lists of sites. `models/` has
+published ones."""
 
-# isort: skip_file
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,26 +13,43 @@ from rigidmd.core.toml import impossible_values, read_toml, shorten_repr
 from rigidmd.errors import MoleculeError
 from rigidmd.mechanics.inertia import BodyKind, principal_frame, rotational_freedom
 from rigidmd.scene.validation import (
-    Line, NonNegative, Number, Positive, Section, ShortName, Vector, did_you_mean, location_of, numbers_out_of_range,
+    Line,
+    NonNegative,
+    Number,
+    Positive,
+    Section,
+    ShortName,
+    Vector,
+    did_you_mean,
+    location_of,
+    numbers_out_of_range,
     validation_messages,
-)  # fmt: skip
+)
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
 
 MODELS = Path(__file__).parent.parent / "models"
-#: Smallest and largest absolute value of numbers of molecules other than 0: products of a few are finite.
+#: Smallest and largest absolute value of numbers of molecules other than 0: products of a few are
+#: finite.
 SIZES = (1e-30, 1e30)
 #: Largest number of sites of a molecule.
 MOST_SITES = 5000
 #: Two sites closer than this fraction of the molecule's size count as coinciding.
 COINCIDENT = 1e-6
-#: A site further than this fraction of the size from a linear body's axis exerts a torque without any inertia.
+#: A site further than this fraction of the size from a linear body's axis exerts a torque without
+#: any inertia.
 OFF_AXIS = 1e-4
 MOST_PARAMETERS = 100  # of a site
-#: Keys of the well depth, of which a Lennard-Jones site has one, and their units; it also has sigma_A.
-DEPTHS = {"epsilon_kJ_mol": KJ_PER_MOL, "epsilon_kcal_mol": ENERGY_UNITS["kcal/mol"], "epsilon_K": BOLTZMANN}
+#: Keys of the well depth, of which a Lennard-Jones site has one, and their units; it also has
+#: sigma_A.
+DEPTHS = {
+    "epsilon_kJ_mol": KJ_PER_MOL,
+    "epsilon_kcal_mol": ENERGY_UNITS["kcal/mol"],
+    "epsilon_K": BOLTZMANN,
+}
 LENNARD_JONES = ("sigma_A", *DEPTHS)
 
-#: Names of sites and residues that every structure format can hold: one to five visible ASCII characters.
+#: Names of sites and residues that every structure format can hold: one to five visible ASCII
+#: characters.
 SiteName = Annotated[str, Field(pattern=r"^[!-~]{1,5}$")]
 
 
@@ -42,14 +59,17 @@ Rb Sr Y Zr Nb Mo Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu G
 Yb Lu Hf Ta W Re Os Ir Pt Au Hg Tl Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm Bk Cf Es Fm Md No
 Lr Rf Db Sg Bh Hs Mt Ds Rg Cn Nh Fl Mc Lv Ts Og
 """
-#: Values of `element`: chemical symbols, deuterium and tritium, and X for a site without an element.
+#: Values of `element`: chemical symbols, deuterium and tritium, and X for a site without an
+#: element.
 ELEMENTS = frozenset((*SYMBOLS.split(), "D", "T", "X"))
 
 
 def _checked_element(symbol: str) -> str:
     if symbol not in ELEMENTS:
         advice = "names of other kinds of sites belong to name"
-        raise ValueError(f"is {shorten_repr(symbol)}, must be a chemical symbol such as O, or X; {advice}")
+        raise ValueError(
+            f"is {shorten_repr(symbol)}, must be a chemical symbol such as O, or X; {advice}"
+        )
     return symbol
 
 
@@ -126,8 +146,8 @@ class ParameterFile(Section):
 class Molecule:
     """A rigid molecule in its principal frame, centre of mass at the origin.
 
-    masses (s,) u, positions_body (s, 3) Å, charges (s,) e, sigma (s,) Å, epsilon (s,) u Å²/ps²; inertia (3,) u Å²,
-    ascending, 0 about an axis on which the whole mass lies.
+    masses (s,) u, positions_body (s, 3) Å, charges (s,) e, sigma (s,) Å, epsilon (s,) u Å²/ps²;
+    inertia (3,) u Å², ascending, 0 about an axis on which the whole mass lies.
     """
 
     name: str
@@ -154,12 +174,14 @@ class Molecule:
 
     @property
     def fingerprint(self) -> tuple[float, ...]:
-        """Mass, u, moments of inertia, u Å², and number of sites (5,), by which a saved state is checked."""
+        """Mass, u, moments of inertia, u Å², and number of sites (5,), by which a saved state is
+        checked."""
         return (self.mass, *map(float, self.inertia), float(len(self.masses)))
 
     @property
     def dispersion(self) -> np.ndarray:
-        """c (s,) of each site, 2 sigma³ sqrt(epsilon): c_i c_j is the geometric mean of the coefficients of 1/r⁶."""
+        """c (s,) of each site, 2 sigma³ sqrt(epsilon): c_i c_j is the geometric mean of the
+        coefficients of 1/r⁶."""
         return 2 * self.sigma**3 * np.sqrt(self.epsilon)
 
     @property
@@ -180,18 +202,25 @@ class Molecule:
     @property
     def has_dipole(self) -> bool:
         """Whether the dipole moment about the centre of mass is more than a rounding error."""
-        return bool(self.dipole_debye * DEBYE > COINCIDENT * self.radius * np.abs(self.charges).sum())
+        return bool(
+            self.dipole_debye * DEBYE > COINCIDENT * self.radius * np.abs(self.charges).sum()
+        )
 
     @property
     def quadrupole_debye_A(self) -> np.ndarray:
-        """Traceless quadrupole moment (3, 3) about the centre of mass, body frame, D Å: sum of q (3 x x - r²) / 2."""
+        """Traceless quadrupole moment (3, 3) about the centre of mass, body frame, D Å: sum of q (3
+        x x - r²) / 2."""
         x, q = self.positions_body, self.charges
-        return (1.5 * np.einsum("s,si,sj->ij", q, x, x) - 0.5 * np.sum(q * np.sum(x**2, axis=1)) * np.eye(3)) / DEBYE
+        return (
+            1.5 * np.einsum("s,si,sj->ij", q, x, x)
+            - 0.5 * np.sum(q * np.sum(x**2, axis=1)) * np.eye(3)
+        ) / DEBYE
 
     @property
     def planar(self) -> bool:
         """Whether all sites, massless ones included, lie in one plane but not on one line."""
-        # extents along the principal axes of the shape, descending; fewer than three for one or two sites
+        # extents along the principal axes of the shape, descending; fewer than three for one or two
+        # sites
         extents = [*np.linalg.svd(self.positions_body, compute_uv=False), 0.0, 0.0]
         return bool(extents[2] <= OFF_AXIS * self.radius < extents[1])
 
@@ -199,11 +228,16 @@ class Molecule:
     def description(self) -> str:
         """Kind of body, number of sites, mass, charge and dipole, for reports."""
         shape = f"{self.kind}, planar" if self.planar else self.kind
-        charge, count = f"net charge {self.charge:+g} e" if self.charge else "neutral", len(self.masses)
+        charge, count = (
+            f"net charge {self.charge:+g} e" if self.charge else "neutral",
+            len(self.masses),
+        )
         dipole = ""
         if self.charges.any() and self.radius > 0:
             dipole = f", dipole {self.dipole_debye:.3f} D" if self.has_dipole else ", no dipole"
-        return f"{shape}, {count} site{'' if count == 1 else 's'}, {self.mass:.4f} u, {charge}{dipole}"
+        return (
+            f"{shape}, {count} site{'' if count == 1 else 's'}, {self.mass:.4f} u, {charge}{dipole}"
+        )
 
     @property
     def radius(self) -> float:
@@ -215,21 +249,31 @@ class Molecule:
         entries = []
         for i, name in enumerate(self.site_names):
             entry = {
-                "name": name, "element": self.elements[i], "mass_u": float(self.masses[i]),
-                "position_A": self.positions_body[i].tolist(), "charge_e": float(self.charges[i]),
-            }  # fmt: skip
+                "name": name,
+                "element": self.elements[i],
+                "mass_u": float(self.masses[i]),
+                "position_A": self.positions_body[i].tolist(),
+                "charge_e": float(self.charges[i]),
+            }
             if self.epsilon[i] > 0:
-                entry |= {"sigma_A": float(self.sigma[i]), "epsilon_kJ_mol": float(self.epsilon[i] / KJ_PER_MOL)}
+                entry |= {
+                    "sigma_A": float(self.sigma[i]),
+                    "epsilon_kJ_mol": float(self.epsilon[i] / KJ_PER_MOL),
+                }
             if self.parameters[i]:
                 entry["parameters"] = dict(self.parameters[i])
             entries.append(entry)
         return entries
 
 
-def molecule(name: str, sites: tuple[Site, ...], residue_names: tuple[str, ...] = (), **about: Any) -> Molecule:
-    """The rigid body of these sites, each of which needs a position and a mass; about: more fields of `Molecule`.
-    Raises MoleculeError."""
-    missing = [(s, key) for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None]
+def molecule(
+    name: str, sites: tuple[Site, ...], residue_names: tuple[str, ...] = (), **about: Any
+) -> Molecule:
+    """The rigid body of these sites, each of which needs a position and a mass; about: more fields
+    of `Molecule`. Raises MoleculeError."""
+    missing = [
+        (s, key) for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
+    ]
     faults = [f"site {s.name}: {key} is missing" for s, key in missing]
     if len(sites) > MOST_SITES:
         faults.append(f"has {len(sites)} sites, must not have more than {MOST_SITES}")
@@ -237,36 +281,57 @@ def molecule(name: str, sites: tuple[Site, ...], residue_names: tuple[str, ...] 
         raise MoleculeError(f"molecule {name}", faults)
     masses, positions = np.array([s.mass_u for s in sites]), np.array([s.position_A for s in sites])
     if masses.sum() == 0:
-        raise MoleculeError(f"molecule {name}", ["all sites are massless; a body needs mass to move"])
+        raise MoleculeError(
+            f"molecule {name}", ["all sites are massless; a body needs mass to move"]
+        )
     size = float(np.linalg.norm(positions - masses @ positions / masses.sum(), axis=1).max())
     frame = principal_frame(masses, positions, size)
     body = (positions - frame.centre) @ frame.axes
     from scipy.spatial import KDTree  # slow to import
 
     near = KDTree(body).query_pairs(COINCIDENT * size, output_type="ndarray")
-    faults += [f"sites {sites[j].name} and {sites[i].name} coincide" for i, j in sorted(near[:, ::-1].tolist())]
+    faults += [
+        f"sites {sites[j].name} and {sites[i].name} coincide"
+        for i, j in sorted(near[:, ::-1].tolist())
+    ]
     if frame.kind == "linear" or (frame.kind == "point" and not faults):
-        off, limit = np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1), OFF_AXIS * size
+        off, limit = (
+            np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1),
+            OFF_AXIS * size,
+        )
         where = "from the centre of mass, but all the mass is there: nothing resists its torque"
         if frame.kind == "linear":
             where = "off the axis of a linear body: nothing resists its torque about that axis"
-        faults += [f"site {s.name} is {d:.3g} Å {where}" for s, d in zip(sites, off, strict=True) if d > limit]
+        faults += [
+            f"site {s.name} is {d:.3g} Å {where}"
+            for s, d in zip(sites, off, strict=True)
+            if d > limit
+        ]
     if faults:
         raise MoleculeError(f"molecule {name}", faults)
     if frame.kind == "point":
         body = np.zeros_like(body)  # exactly at the centre of mass, without rounding errors
     return Molecule(
-        name=name, residue_names=tuple(residue_names) or (name.upper()[:5],),
-        site_names=tuple(s.name for s in sites), elements=tuple(s.element for s in sites), masses=masses,
-        positions_body=body, charges=np.array([s.charge_e or 0.0 for s in sites]),
-        sigma=np.array([s.sigma_A or 0.0 for s in sites]), epsilon=np.array([s.epsilon for s in sites]),
-        mass=float(frame.mass), inertia=frame.inertia, kind=frame.kind, parameters=tuple(s.parameters for s in sites),
+        name=name,
+        residue_names=tuple(residue_names) or (name.upper()[:5],),
+        site_names=tuple(s.name for s in sites),
+        elements=tuple(s.element for s in sites),
+        masses=masses,
+        positions_body=body,
+        charges=np.array([s.charge_e or 0.0 for s in sites]),
+        sigma=np.array([s.sigma_A or 0.0 for s in sites]),
+        epsilon=np.array([s.epsilon for s in sites]),
+        mass=float(frame.mass),
+        inertia=frame.inertia,
+        kind=frame.kind,
+        parameters=tuple(s.parameters for s in sites),
         **about,
-    )  # fmt: skip
+    )
 
 
 def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
-    """The same molecule with other masses (u) of isotopes, by site name or else element. Raises MoleculeError."""
+    """The same molecule with other masses (u) of isotopes, by site name or else element. Raises
+    MoleculeError."""
     faults, changed = [], {}
     for key, mass in masses.items():
         sites = [i for i, name in enumerate(found.site_names) if name == key]
@@ -274,12 +339,19 @@ def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
         heavy = [i for i in sites if found.masses[i] > 0]
         if not heavy:
             known = ", ".join(dict.fromkeys([*found.elements, *found.site_names]))
-            why = "is massless, and stays so" if sites else f"is not a site or element of it; there are {known}"
+            why = (
+                "is massless, and stays so"
+                if sites
+                else f"is not a site or element of it; there are {known}"
+            )
             faults.append(f"masses_u.{key} {why}")
         changed |= {i: mass for i in heavy if i not in changed or found.site_names[i] == key}
     if faults:
         raise MoleculeError(f"molecule {found.name}", faults)
-    sites = [Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])}) for i, entry in enumerate(found.sites())]
+    sites = [
+        Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])})
+        for i, entry in enumerate(found.sites())
+    ]
     kept = ("name", "residue_names", "title", "source", "group", "note", "mixing")
     return molecule(sites=tuple(sites), **{key: getattr(found, key) for key in kept})
 
@@ -300,7 +372,9 @@ def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[S
 
 def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
     """The entry of this name, or else of the element."""
-    return next((s for s in sites if s.name == name), None) or next((s for s in sites if s.name == element), None)
+    return next((s for s in sites if s.name == name), None) or next(
+        (s for s in sites if s.name == element), None
+    )
 
 
 @cache
@@ -315,7 +389,10 @@ def model_error(name: str) -> str:
     known = available_models()
     if name in known:
         return ""
-    return f"unknown model {name!r}{did_you_mean(name, known) or ';'} `rigidmd models` lists all {len(known)}"
+    return (
+        f"unknown model {name!r}{did_you_mean(name, known) or ';'} `rigidmd models` lists all"
+        f" {len(known)}"
+    )
 
 
 def load_model(name: str) -> Molecule:
@@ -339,8 +416,14 @@ def read_parameters(path: Path) -> ParameterFile:
     """A table of parameters. Raises MoleculeError."""
     table = _read(path, ParameterFile)
     names = [s.name for s in table.sites]
-    faults = [f"sites: {name} appears twice" for name in sorted(set(names)) if names.count(name) > 1]
-    faults += [f"sites: {s.name}: position_A belongs to a molecule" for s in table.sites if s.position_A is not None]
+    faults = [
+        f"sites: {name} appears twice" for name in sorted(set(names)) if names.count(name) > 1
+    ]
+    faults += [
+        f"sites: {s.name}: position_A belongs to a molecule"
+        for s in table.sites
+        if s.position_A is not None
+    ]
     if faults:
         raise MoleculeError(str(path), faults)
     return table
@@ -352,7 +435,9 @@ Table = TypeVar("Table", bound=Section)
 def _read(path: Path, kind: type[Table]) -> Table:
     data, text = read_toml(path, MoleculeError)
     if wrong := impossible_values(data) or numbers_out_of_range(data, *SIZES):
-        raise MoleculeError(str(path), [f"{location_of(keys, text)}: {fault}" for keys, fault in wrong])
+        raise MoleculeError(
+            str(path), [f"{location_of(keys, text)}: {fault}" for keys, fault in wrong]
+        )
     try:
         return kind.model_validate(data)
     except ValidationError as error:

@@ -47,14 +47,21 @@ def name_of(thing: Any) -> str:
     named = getattr(thing, "name", None)
     if isinstance(named, str) and named:
         return re.sub(r"\W+", "_", named)
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(thing).__qualname__.rpartition(".")[2]).lower().strip("_")
+    return (
+        re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(thing).__qualname__.rpartition(".")[2])
+        .lower()
+        .strip("_")
+    )
 
 
 def missing_user_code(wanted: Sequence[str], given: Sequence[str]) -> str:
     """The error message of a scene without the user code that its `from_python` lists."""
     there = f"; this has {', '.join(given)}" if given else ""
     advice = "Run it from Python with the same: Simulation(scene, forces=[...], thermostat=...)"
-    return f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{there}. {advice}"
+    return (
+        f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{there}."
+        f" {advice}"
+    )
 
 
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
@@ -65,8 +72,9 @@ class RunSettings(Section):
     """Settings for all stages."""
 
     remove_momentum_interval_ps: Interval | Literal[False] | None = None
-    """Time between removals of the total momentum; false for never. Default: 1 ps with pme, whose forces do not add up
-    to zero exactly, else never. The energy removed counts as heat, as with a thermostat"""
+    """Time between removals of the total momentum; false for never. Default: 1 ps with pme, whose
+    forces do not add up to zero exactly, else never. The energy removed counts as heat, as with a
+    thermostat"""
 
 
 class Output(Section):
@@ -77,18 +85,21 @@ class Output(Section):
     pressure_tensor: Flag = False
     """Write the six components of the pressure into log.csv"""
     pressure_tensor_interval_ps: Interval | Literal[False] = False
-    """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for none. Each line needs an
-    evaluation of forces with the virial"""
-    trajectory: Annotated[str | Literal[False], file_name(lambda form: form.encoder or form.writer)] = TRAJECTORY
-    """Trajectory file; the extension sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb); .gsd stores rotations
-    and angular momenta, .traj is ASE's and has double precision; false for none"""
+    """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for
+    none. Each line needs an evaluation of forces with the virial"""
+    trajectory: Annotated[
+        str | Literal[False], file_name(lambda form: form.encoder or form.writer)
+    ] = TRAJECTORY
+    """Trajectory file; the extension sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb);
+    .gsd stores rotations and angular momenta, .traj is ASE's and has double precision; false for
+    none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
     topology: Annotated[str, file_name(lambda form: form.write_topology)] = TOPOLOGY
     """File with names and first positions that viewers need for the trajectory (.gro or .pdb)"""
     positions: Literal["wrapped", "unwrapped"] = "unwrapped"
-    """unwrapped: continuous paths, for displacements; wrapped: centres of mass inside the box. Molecules are whole in
-    both cases"""
+    """unwrapped: continuous paths, for displacements; wrapped: centres of mass inside the box.
+    Molecules are whole in both cases"""
     velocities: Flag | None = None
     """Write velocities; default: true if the format can store them"""
     figures: Flag = True
@@ -99,7 +110,10 @@ class Output(Section):
     def _errors(self):
         if self.velocities and not self.can_store_velocities:
             formats = f"use a {' or '.join(written(lambda form: form.velocities))} file"
-            yield f"velocities = true, but {self.trajectory or 'no trajectory'} cannot store them; {formats}"
+            yield (
+                f"velocities = true, but {self.trajectory or 'no trajectory'} cannot store them;"
+                f" {formats}"
+            )
         if self.topology == self.trajectory:
             yield f"topology and trajectory are both {self.topology}; give them different names"
 
@@ -109,24 +123,26 @@ class Output(Section):
 
 
 class Watch(Section):
-    """Limits beyond which a run stops, relative to scales of the system; false switches a check off."""
+    """Limits beyond which a run stops, relative to scales of the system; false switches a check
+    off."""
 
     move: Limit = 0.25
-    """Largest displacement of a molecule between two evaluations of its forces, in units of the smallest site
-    diameter"""
+    """Largest displacement of a molecule between two evaluations of its forces, in units of the
+    smallest site diameter"""
     turn_rad: Limit = 2.0
     """Largest rotation of a molecule between two evaluations of its forces"""
     kick: Limit = 20.0
     """Largest change of a momentum by one kick, in units of the thermal momentum"""
     energy: LimitOfEnergy = 0.5
-    """Largest change of the conserved energy, in units of the kinetic energy: in an nve stage, and within each
-    thermostat_time_ps of an nvt stage"""
+    """Largest change of the conserved energy, in units of the kinetic energy: in an nve stage, and
+    within each thermostat_time_ps of an nvt stage"""
     volume: LimitOfVolume = 8.0
     """Largest volume of the box under a barostat, in units of the volume at the start"""
     orthogonality: LimitOfRounding = 1e-9
     """Largest entry of abs(QᵀQ - 1)"""
     stable_step: Flag = True
-    """Estimate the longest stable time step at the start of each stage, and warn if timestep_fs is longer"""
+    """Estimate the longest stable time step at the start of each stage, and warn if timestep_fs is
+    longer"""
 
 
 class Settings(TypedDict, total=False):
@@ -157,9 +173,9 @@ class MolecularScene(Scene):
     seed: Annotated[int, Strict(), Field(ge=0)] = 1
     """Seed of all random numbers"""
     precision: Literal["auto", "double", "mixed"] = "auto"
-    """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in double; auto: mixed
-    where the error of the time step hides that of single precision, else double. Minimisations with tight limits, or
-    with a pressure, are in double"""
+    """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in
+    double; auto: mixed where the error of the time step hides that of single precision, else
+    double. Minimisations with tight limits, or with a pressure, are in double"""
     threads: Count | None = None
     """Number of threads; default: all cores. Results do not depend on it"""
     engine: EngineChoice = EngineChoice.model_construct()
@@ -174,8 +190,8 @@ class MolecularScene(Scene):
     output: Output = Output.model_construct()
     watch: Watch = Watch.model_construct()
     from_python: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Names of forces and a thermostat that Python added, set by the run. Such a scene runs only from Python, with the
-    same forces and thermostat"""
+    """Names of forces and a thermostat that Python added, set by the run. Such a scene runs only
+    from Python, with the same forces and thermostat"""
 
     _user_code: UserCode = PrivateAttr(UserCode())
 
@@ -184,8 +200,11 @@ class MolecularScene(Scene):
         """The forces and the thermostat that Python added."""
         return self._user_code
 
-    def with_user_code(self, forces: Sequence[Any] = (), thermostat: Any = None) -> "MolecularScene":
-        """The same scene with forces and a thermostat from Python, see `Simulation`. Raises SceneError."""
+    def with_user_code(
+        self, forces: Sequence[Any] = (), thermostat: Any = None
+    ) -> "MolecularScene":
+        """The same scene with forces and a thermostat from Python, see `Simulation`. Raises
+        SceneError."""
         thermostat = self._user_code.thermostat if thermostat is None else thermostat
         user_code = UserCode((*self._user_code.forces, *forces), thermostat)
         if self.from_python not in ((), user_code.names):
@@ -195,25 +214,42 @@ class MolecularScene(Scene):
         return scene
 
     def with_end(self, time: float) -> "MolecularScene":
-        """The same scene with a last stage that ends at a time of the run, ps. Raises SceneError."""
+        """The same scene with a last stage that ends at a time of the run, ps. Raises
+        SceneError."""
         before = sum(stage.duration for stage in self.stages[:-1])
         last = self.stages[-1]
         if last.is_minimisation or last.ramps:
-            what = "is a minimisation" if last.is_minimisation else "changes temperature or pressure over its duration"
-            raise SceneError(self.source, [f"the last stage {what}: {option('until')} cannot set its end"])
+            what = (
+                "is a minimisation"
+                if last.is_minimisation
+                else "changes temperature or pressure over its duration"
+            )
+            raise SceneError(
+                self.source, [f"the last stage {what}: {option('until')} cannot set its end"]
+            )
         if not time > before:
-            raise SceneError(self.source, [f"{option('until')} {time:g} ps: the last stage begins at {before:g} ps"])
+            raise SceneError(
+                self.source,
+                [f"{option('until')} {time:g} ps: the last stage begins at {before:g} ps"],
+            )
         if not (time - before) * 1000 / last.timestep_fs < MOST_STEPS:
-            raise SceneError(self.source, [f"{option('until')} {time:g} ps is more than {MOST_STEPS:g} steps away"])
+            raise SceneError(
+                self.source,
+                [f"{option('until')} {time:g} ps is more than {MOST_STEPS:g} steps away"],
+            )
         stages = (*self.stages[:-1], last.model_copy(update={"duration_ps": time - before}))
         return self.model_copy(update={"stages": stages})
 
     @property
     def in_short(self) -> str:
         """Species, their origin and stages."""
-        species = ", ".join(f"{entry.count or ''} {entry.label}".strip() for entry in self.molecules)
+        species = ", ".join(
+            f"{entry.count or ''} {entry.label}".strip() for entry in self.molecules
+        )
         origin = "" if self.structure is None else f" of {self.structure.file}"
-        stages = ", ".join(s.label if s.is_minimisation else f"{s.label} {s.duration:g} ps" for s in self.stages)
+        stages = ", ".join(
+            s.label if s.is_minimisation else f"{s.label} {s.duration:g} ps" for s in self.stages
+        )
         return f"{self.name}: {species}{origin}; {stages}"
 
     @property
@@ -238,14 +274,23 @@ class MolecularScene(Scene):
         """Path of the structure file, or "atoms", for messages; empty without a structure."""
         if self.structure is None:
             return ""
-        return "atoms" if "structure.file" in self.embedded_files else str(self.path(self.structure.file))
+        return (
+            "atoms"
+            if "structure.file" in self.embedded_files
+            else str(self.path(self.structure.file))
+        )
 
     @property
     def topology(self) -> str | None:
-        """The topology file of a trajectory as structure: as given, or else as found in the trajectory's folder."""
+        """The topology file of a trajectory as structure: as given, or else as found in the
+        trajectory's folder."""
         if (start := self.structure) is None:
             return None
-        if start.topology is not None or (form := format_of(start.file)) is None or form.read_arrays is None:
+        if (
+            start.topology is not None
+            or (form := format_of(start.file)) is None
+            or form.read_arrays is None
+        ):
             return start.topology
         candidates = [str(Path(start.file).with_name(name)) for name in TOPOLOGIES]
         found = next((name for name in candidates if self.path(name).is_file()), None)
@@ -253,33 +298,77 @@ class MolecularScene(Scene):
             return None
         path = self.path(found)
         if not any(is_inside(path, folder) for folder in (self.path("."), path.parent)):
-            problem = f"{found} next to the trajectory is a link out of the scene's folder; name it by --set"
-            raise SceneError(self.source, [f"structure.topology: {problem} structure.topology=PATH"])
+            problem = (
+                f"{found} next to the trajectory is a link out of the scene's folder; name it by"
+                " --set"
+            )
+            raise SceneError(
+                self.source, [f"structure.topology: {problem} structure.topology=PATH"]
+            )
         return found
 
     def _errors(self):
         if self.structure is None:
             missing = [k for k, species in enumerate(self.molecules) if species.count is None]
-            yield from [f"molecules.{k}.count is missing (required without a structure file)" for k in missing]
+            yield from [
+                f"molecules.{k}.count is missing (required without a structure file)"
+                for k in missing
+            ]
             if self.box.lengths_A is None and self.box.density_g_cm3 is None:
                 yield "box needs lengths_A or density_g_cm3, or there must be a structure file"
         elif self.box.density_g_cm3 is not None:
             yield "box.density_g_cm3 and a structure file contradict each other: omit one"
-        elif self.structure.repeat != (1, 1, 1) and (self.box.lengths_A is not None or not self.box.periodic):
-            yield "structure.repeat repeats the file's cell: omit box.lengths_A and periodic = false"
-        if self.box.vacuum_A and self.box.vacuum_axis in [walls.axis for walls in self.fields.walls]:
-            yield "box.vacuum_A and fields.walls across the same axis contradict each other: omit one"
-        first, from_file = self.first_moving, self.structure is not None and self.structure.velocities
-        if self.start.temperature_K is None and first is not None and first.temperature_K is None and not from_file:
-            which = "the first stage" if first is self.stages[0] else "the first stage that is not a minimisation"
-            yield f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are read"
+        elif self.structure.repeat != (1, 1, 1) and (
+            self.box.lengths_A is not None or not self.box.periodic
+        ):
+            yield (
+                "structure.repeat repeats the file's cell: omit box.lengths_A and periodic = false"
+            )
+        if self.box.vacuum_A and self.box.vacuum_axis in [
+            walls.axis for walls in self.fields.walls
+        ]:
+            yield (
+                "box.vacuum_A and fields.walls across the same axis contradict each other: omit one"
+            )
+        first, from_file = (
+            self.first_moving,
+            self.structure is not None and self.structure.velocities,
+        )
+        if (
+            self.start.temperature_K is None
+            and first is not None
+            and first.temperature_K is None
+            and not from_file
+        ):
+            which = (
+                "the first stage"
+                if first is self.stages[0]
+                else "the first stage that is not a minimisation"
+            )
+            yield (
+                f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are"
+                " read"
+            )
         if self.start.temperature_K is not None and from_file:
-            yield "start.temperature_K would do nothing: the velocities are read from the structure file"
-        if self.start.temperature_K == 0 and first is not None and first.has_thermostat and first.keeps_momentum:
-            yield "start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules at rest"
+            yield (
+                "start.temperature_K would do nothing: the velocities are read from the structure"
+                " file"
+            )
+        if (
+            self.start.temperature_K == 0
+            and first is not None
+            and first.has_thermostat
+            and first.keeps_momentum
+        ):
+            yield (
+                "start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules"
+                " at rest"
+            )
         reasons = {
             "box.periodic is false": not self.box.periodic,
-            "frozen molecules do not move: release them, or keep the volume": any(m.frozen for m in self.molecules),
+            "frozen molecules do not move: release them, or keep the volume": any(
+                m.frozen for m in self.molecules
+            ),
             "fields.walls do not move: keep the volume": self.fields.walls,
             "fields.restraints fix positions: keep the volume": any(
                 entry.between is None for entry in self.fields.restraints
@@ -287,25 +376,52 @@ class MolecularScene(Scene):
         }
         if (slab := self.forces.ewald_slab) is not None:
             rigid = {"lateral"} if slab == "z" else set()
-            why = f"forces.ewald_slab = {slab!r} needs a constant edge along {slab}: keep the volume"
+            why = (
+                f"forces.ewald_slab = {slab!r} needs a constant edge along {slab}: keep the volume"
+            )
             why += ", or set pressure_coupling = 'lateral'" if rigid else ""
-            moving = [k for k, s in enumerate(self.stages) if s.changes_box and s.pressure_coupling not in rigid]
+            moving = [
+                k
+                for k, s in enumerate(self.stages)
+                if s.changes_box and s.pressure_coupling not in rigid
+            ]
             yield from [f"stages.{k}: {why}" for k in moving]
         for k, stage in enumerate(self.stages):
-            what = f"stages.{k}: {stage.ensemble}{' with pressure_bar' * stage.is_minimisation} changes the box"
-            yield from [f"{what}, but {why}" for why, applies in reasons.items() if stage.changes_box and applies]
+            what = (
+                f"stages.{k}: {stage.ensemble}{' with pressure_bar' * stage.is_minimisation}"
+                " changes the box"
+            )
+            yield from [
+                f"{what}, but {why}"
+                for why, applies in reasons.items()
+                if stage.changes_box and applies
+            ]
             before = self.stages[k - 1] if k else None
             if stage.volume and (before is None or not before.has_barostat or before.ramps):
                 changes = ", and its set point changes" if before and before.ramps else ""
-                found = f"stages.{k - 1} is {before.ensemble}{changes}" if before else "it is the first stage"
-                why = "needs an npt or nph stage just before it, at constant temperature and pressure"
+                found = (
+                    f"stages.{k - 1} is {before.ensemble}{changes}"
+                    if before
+                    else "it is the first stage"
+                )
+                why = (
+                    "needs an npt or nph stage just before it, at constant temperature and pressure"
+                )
                 yield f"stages.{k}.volume = 'mean' {why}; {found}. Add one, or leave volume out"
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
             yield "forces.tail_correction assumes a uniform liquid: omit it with frozen molecules"
         if self.forces.dispersion != "cutoff" and any(species.frozen for species in self.molecules):
-            yield "forces.dispersion: sums over images also act between frozen molecules: use cutoff, or freeze none"
-        if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
-            yield "run.remove_momentum_interval_ps: the total momentum is not conserved with frozen molecules; omit it"
+            yield (
+                "forces.dispersion: sums over images also act between frozen molecules: use cutoff,"
+                " or freeze none"
+            )
+        if self.run.remove_momentum_interval_ps and any(
+            species.frozen for species in self.molecules
+        ):
+            yield (
+                "run.remove_momentum_interval_ps: the total momentum is not conserved with frozen"
+                " molecules; omit it"
+            )
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
             yield f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}"
@@ -313,7 +429,8 @@ class MolecularScene(Scene):
         yield from self._uneven_frames()
 
     def rounded_times(self, stages: Sequence[int] | None = None) -> list[str]:
-        """Notes on intervals and durations that are not a whole number of steps, of all stages or these."""
+        """Notes on intervals and durations that are not a whole number of steps, of all stages or
+        these."""
         output, found = self.output, {}
         of_run = [
             ("output.log_interval_ps", output.log_interval_ps),
@@ -324,12 +441,21 @@ class MolecularScene(Scene):
             stage = self.stages[k]
             if stage.is_minimisation or stage.is_auto:
                 continue
-            of_stage = [(f"stages.{k}.{key}", getattr(stage, key)) for key in ("duration_ps", "barostat_interval_ps")]
+            of_stage = [
+                (f"stages.{k}.{key}", getattr(stage, key))
+                for key in ("duration_ps", "barostat_interval_ps")
+            ]
             if stage.keeps_momentum:  # elsewhere nothing is removed
-                of_stage.insert(0, ("run.remove_momentum_interval_ps", self.run.remove_momentum_interval_ps))
+                of_stage.insert(
+                    0, ("run.remove_momentum_interval_ps", self.run.remove_momentum_interval_ps)
+                )
             for key, wanted in [*of_run, *of_stage]:
                 taken = wanted and stage.steps_of(wanted) * stage.timestep_fs / 1000
-                if wanted and taken < MOST_STEPS * stage.timestep_fs / 1000 and abs(taken - wanted) > 1e-9 * wanted:
+                if (
+                    wanted
+                    and taken < MOST_STEPS * stage.timestep_fs / 1000
+                    and abs(taken - wanted) > 1e-9 * wanted
+                ):
                     together = f"trajectories of {stage.steps_together} " if stage.is_hybrid else ""
                     unit = f"a whole number of {together}steps of {stage.timestep_fs:g} fs"
                     found.setdefault((key, wanted, unit, taken), []).append(f"stages.{k}")
@@ -339,7 +465,8 @@ class MolecularScene(Scene):
         ]
 
     def _uneven_frames(self) -> Iterator[str]:
-        """Messages on stages with other intervals between frames, for a file with one interval for all frames."""
+        """Messages on stages with other intervals between frames, for a file with one interval for
+        all frames."""
         kind = Path(self.output.trajectory or "").suffix
         if not kind or not BY_EXTENSION[kind].even:
             return
@@ -350,8 +477,16 @@ class MolecularScene(Scene):
             every = stage.steps_of(wanted)
             uneven = stage.steps % every and k < len(self.stages) - 1
             if stage.is_auto:
-                yield f"output.trajectory: a {kind} file cannot follow the step of stages.{k}; {other}"
+                yield (
+                    f"output.trajectory: a {kind} file cannot follow the step of stages.{k};"
+                    f" {other}"
+                )
             elif abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven:
-                fault = f"a {kind} file stores one time between frames, and stages.{k} cannot keep {wanted:g} ps"
-                advice = f"make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"
+                fault = (
+                    f"a {kind} file stores one time between frames, and stages.{k} cannot keep"
+                    f" {wanted:g} ps"
+                )
+                advice = (
+                    f"make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"
+                )
                 yield f"output.trajectory: {fault}: {advice}"

@@ -1,4 +1,5 @@
-"""Tables of a scene of molecules: [[molecules]], the species and their numbers; [structure], [box] and [start]."""
+"""Tables of a scene of molecules: [[molecules]], the species and their numbers; [structure], [box]
+and [start]."""
 
 import re
 from math import pi, radians
@@ -11,7 +12,16 @@ from pydantic import AfterValidator, Field, Strict, field_validator
 from rigidmd.io.formats import extensions
 from rigidmd.io.formats.cells import cell_of
 from rigidmd.scene.models import Site, SiteName, available_models, model_error
-from rigidmd.scene.validation import Count, Flag, Line, NonNegative, Positive, Section, ShortName, exact_names
+from rigidmd.scene.validation import (
+    Count,
+    Flag,
+    Line,
+    NonNegative,
+    Positive,
+    Section,
+    ShortName,
+    exact_names,
+)
 
 #: Keys of [[molecules]] that name a file.
 SPECIES_FILES = ("file", "parameters")
@@ -23,7 +33,9 @@ def checked_numbers(numbers: tuple[int, ...] | str) -> tuple[int, ...] | str:
         raise ValueError("is empty: list the numbers of molecules, or omit it")
     if isinstance(numbers, str):
         if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", numbers):
-            raise ValueError(f"is {numbers!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")
+            raise ValueError(
+                f"is {numbers!r}, must be numbers of molecules such as '1-10' or '1-10, 15'"
+            )
         if reversed_ := [f"{first}-{last}" for first, last in spans(numbers) if first > last]:
             raise ValueError(f"is {numbers!r}: {', '.join(reversed_)} ends before it begins")
     return numbers
@@ -47,14 +59,16 @@ class Molecules(Section):
     model: str | None = None
     """A shipped model; `rigidmd models` lists them"""
     file: Line | None = None
-    """A .toml file with a molecule, like those models, or a geometry in a format of ASE, with `sites` for its atoms"""
+    """A .toml file with a molecule, like those models, or a geometry in a format of ASE, with
+    `sites` for its atoms"""
     name: ShortName | None = None
     """Name of the species; default: the name of the model or file"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
-    """Sites of a custom molecule; with a geometry `file`, their parameters by atom name or element"""
-    parameters: Line | None = None
-    """A .toml file with entries like `sites` that several molecules may use. It supplies missing keys by atom name or
+    """Sites of a custom molecule; with a geometry `file`, their parameters by atom name or
     element"""
+    parameters: Line | None = None
+    """A .toml file with entries like `sites` that several molecules may use. It supplies missing
+    keys by atom name or element"""
     masses_u: dict[str, Positive] | None = Field(default=None, min_length=1)
     """Masses of sites by name or element, for other isotopes: { H = 2.014 } for heavy water"""
     residue_names: tuple[SiteName, ...] | None = None
@@ -62,9 +76,9 @@ class Molecules(Section):
     count: Count | None = None
     """Number of molecules; required without a structure file"""
     frozen: Flag | Numbers = False
-    """Molecules that do not move. They act on all others but not on each other. True for all, or numbers of some,
-    [1, 2, 5] or "1-10, 15": residue numbers of the structure file; or, without a file or if its residues are not the
-    molecules, 1, 2, ... within this species"""
+    """Molecules that do not move. They act on all others but not on each other. True for all, or
+    numbers of some, [1, 2, 5] or "1-10, 15": residue numbers of the structure file; or, without a
+    file or if its residues are not the molecules, 1, 2, ... within this species"""
 
     @field_validator("model")
     @classmethod
@@ -76,11 +90,15 @@ class Molecules(Section):
 
     def _errors(self):
         """The first error, which may explain the others."""
-        model, file, sites, table = (key is not None for key in (self.model, self.file, self.sites, self.parameters))
+        model, file, sites, table = (
+            key is not None for key in (self.model, self.file, self.sites, self.parameters)
+        )
         whole = file and str(self.file).endswith(".toml")
         faults = {
             "give a model, or a custom file and sites, not both": model and (file or sites),
-            "parameters would do nothing: a model or a .toml file contains parameters": table and (model or whole),
+            "parameters would do nothing: a model or a .toml file contains parameters": (
+                table and (model or whole)
+            ),
             f"parameters = {self.parameters!r} must be a .toml file with [[sites]]": (
                 table and not str(self.parameters).endswith(".toml")
             ),
@@ -106,33 +124,40 @@ class Structure(Section):
     """Positions at the start from a file."""
 
     file: Line
-    """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), a trajectory (.xtc .trr .gsd .traj .dcd .nc),
-    or `final.npz` of an earlier run; in the folder of the scene or below"""
+    """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), a trajectory (.xtc .trr
+    .gsd .traj .dcd .nc), or `final.npz` of an earlier run; in the folder of the scene or below"""
     topology: Line | None = None
-    """Structure file with the names of the atoms, in the same order, for trajectories without names (all but .gsd).
-    Default: topology.gro or topology.pdb in the folder of the trajectory"""
+    """Structure file with the names of the atoms, in the same order, for trajectories without names
+    (all but .gsd). Default: topology.gro or topology.pdb in the folder of the trajectory"""
     frame: Annotated[int, Strict()] | None = None
-    """Number of the structure in a file with several: 1 is the first, -1 the last. Required for such files, except
-    trajectories; default for trajectories: the last"""
+    """Number of the structure in a file with several: 1 is the first, -1 the last. Required for
+    such files, except trajectories; default for trajectories: the last"""
     repeat: tuple[Count, Count, Count] = (1, 1, 1)
     """Repetitions of the file's cell along a, b, c, to make a crystal of its unit cell"""
     velocities: Flag = False
     """Use the velocities in the file instead of drawing them"""
     tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
-    """Largest distance of an atom from its position in the rigid template, as a fraction of the template's radius"""
+    """Largest distance of an atom from its position in the rigid template, as a fraction of the
+    template's radius"""
     atom_types: dict[str, SiteName] | None = Field(default=None, min_length=1)
-    """Site name or element of each atom type in LAMMPS data files, dumps and .xyz files: { 1 = "O", 2 = "H" }; X has no
-    mass. Default: labels or elements in the file, else masses"""
+    """Site name or element of each atom type in LAMMPS data files, dumps and .xyz files: { 1 = "O",
+    2 = "H" }; X has no mass. Default: labels or elements in the file, else masses"""
 
     def _errors(self):
         if self.topology is None:
             return
         nameless = extensions(lambda form: form.read_arrays)
         if not self.file.lower().endswith(nameless):
-            yield f"topology is for trajectories without names ({' '.join(nameless)}), not for {self.file}"
+            yield (
+                f"topology is for trajectories without names ({' '.join(nameless)}), not for"
+                f" {self.file}"
+            )
         if self.topology.lower().endswith((*extensions(lambda form: form.is_trajectory), ".npz")):
             with_names = ", ".join(extensions(lambda form: form.write_topology))
-            yield f"topology = {self.topology!r}: name a structure file with names of atoms ({with_names})"
+            yield (
+                f"topology = {self.topology!r}: name a structure file with names of atoms"
+                f" ({with_names})"
+            )
 
 
 class Box(Section):
@@ -159,7 +184,9 @@ class Box(Section):
         if self.vacuum_A is not None and not self.periodic:
             yield "vacuum_A would do nothing: periodic is false"
         angles = [radians(angle) for angle in self.angles_deg or (90, 90, 90)]
-        if not 2 * max(angles) < sum(angles) < 2 * pi:  # the edges would be in one plane, or could not meet
+        if (
+            not 2 * max(angles) < sum(angles) < 2 * pi
+        ):  # the edges would be in one plane, or could not meet
             yield "angles_deg: three edges cannot form these angles"
 
     @property
@@ -168,11 +195,14 @@ class Box(Section):
         if self.lengths_A is None:
             return None
         lengths = self.lengths_A if isinstance(self.lengths_A, tuple) else (self.lengths_A,) * 3
-        return np.diag(lengths) if self.angles_deg is None else cell_of([*lengths, *self.angles_deg])
+        return (
+            np.diag(lengths) if self.angles_deg is None else cell_of([*lengths, *self.angles_deg])
+        )
 
 
 class Start(Section):
     """Momenta at the start."""
 
     temperature_K: NonNegative | None = None
-    """Temperature at which momenta are drawn; default: the temperature of the first stage that is not a minimisation"""
+    """Temperature at which momenta are drawn; default: the temperature of the first stage that is
+    not a minimisation"""

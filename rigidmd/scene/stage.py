@@ -1,6 +1,6 @@
-"""The tables [[stages]] of a scene of molecules: each has one ensemble and one time step, or is a minimisation."""
+"""The tables [[stages]] of a scene of molecules: each has one ensemble and one time step, or is a
+minimisation."""
 
-# isort: skip_file
 from math import inf, log, pi
 from typing import Annotated, Any, Literal
 
@@ -8,9 +8,16 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from rigidmd.core.integrators import AUTO, SCHEMES, SOLVERS, WITH_THERMOSTAT, Rotor, auto_errors
 from rigidmd.scene.couplings import (
-    BAROSTAT_TIME, BAROSTATS, COMPRESSIBILITY, DEFAULT_THERMOSTAT, THERMOSTATS, BarostatKeys, Six, ThermostatKeys,
+    BAROSTAT_TIME,
+    BAROSTATS,
+    COMPRESSIBILITY,
+    DEFAULT_THERMOSTAT,
+    THERMOSTATS,
+    BarostatKeys,
+    Six,
+    ThermostatKeys,
     Values,
-)  # fmt: skip
+)
 from rigidmd.scene.integrators import MovedByScheme
 from rigidmd.scene.validation import Count, NameIn, Positive, Section, ShortName
 from rigidmd.units import FEMTOSECOND
@@ -26,7 +33,10 @@ CELL = "minimise with a cell"
 #: Key -> the ensembles that use it; keys of thermostats and barostats are in their tables.
 USED = {
     **dict.fromkeys(("duration_ps", "timestep_fs", "integrator", "rotor"), MOVING),
-    **{key: {"minimise"} for key in ("force_limit_kJ_mol_A", "torque_limit_kJ_mol", "most_iterations")},
+    **{
+        key: {"minimise"}
+        for key in ("force_limit_kJ_mol_A", "torque_limit_kJ_mol", "most_iterations")
+    },
     **{key: {"npt", "nph"} for key in ("barostat", "compressibility_per_bar")},
     **{key: {"nvt", "npt"} for key in ("temperature_K", "thermostat")},
     "volume": {"nve", "nvt"},
@@ -40,9 +50,13 @@ ERROR_TARGETS = ("energy_error_kT", "trajectory_error", "bias_kT")
 
 #: Names of methods in other programs -> advice.
 REFUSED = {
-    "berendsen": "'berendsen' samples no ensemble: its fluctuations are too small and heat flows into the slowest "
-    "motions",
-    "parrinello_rahman": "Parrinello-Rahman is not available; cell_rescaling samples the same ensemble",
+    "berendsen": (
+        "'berendsen' samples no ensemble: its fluctuations are too small and heat flows into the"
+        " slowest motions"
+    ),
+    "parrinello_rahman": (
+        "Parrinello-Rahman is not available; cell_rescaling samples the same ensemble"
+    ),
     "mttk": "MTTK is not available; cell_rescaling samples the same ensemble",
     "c_rescale": "C-rescale is called cell_rescaling in rigidmd",
     "v_rescale": "V-rescale is called velocity_rescaling in rigidmd",
@@ -51,7 +65,9 @@ REFUSED = {
 OTHER_INTEGRATORS = {
     **dict.fromkeys(SOLVERS, "general ODE solvers are for single bodies"),
     **dict.fromkeys(("md", "md_vv", "leap_frog", "leapfrog"), "write 'velocity_verlet'"),
-    **dict.fromkeys(("sd", "bd", "langevin"), "write ensemble = 'nvt' with thermostat = 'langevin'"),
+    **dict.fromkeys(
+        ("sd", "bd", "langevin"), "write ensemble = 'nvt' with thermostat = 'langevin'"
+    ),
     **dict.fromkeys(("steep", "cg", "l_bfgs", "lbfgs"), "write ensemble = 'minimise'"),
 }
 
@@ -62,9 +78,10 @@ class Timing(Section):
     name: ShortName | None = None
     """Name of the stage; default: the name of the ensemble"""
     ensemble: Ensemble = "nve"
-    """Constant: nve energy and volume; nvt temperature and volume; npt temperature and pressure; nph enthalpy and
-    pressure. minimise: no time passes; molecules move and rotate to a minimum of the potential energy, or, if
-    pressure_bar is given, molecules and cell to a minimum of the enthalpy"""
+    """Constant: nve energy and volume; nvt temperature and volume; npt temperature and pressure;
+    nph enthalpy and pressure. minimise: no time passes; molecules move and rotate to a minimum of
+    the potential energy, or, if pressure_bar is given, molecules and cell to a minimum of the
+    enthalpy"""
     duration_ps: Positive | None = Field(default=None, validate_default=True)
     """Duration; required except with minimise"""
     timestep_fs: Positive = 2.0
@@ -72,34 +89,41 @@ class Timing(Section):
     temperature_K: Positive | tuple[Positive, Positive] | None = None
     """Temperature of the thermostat; two for a linear change over the stage, [300, 240]"""
     volume: Literal["mean"] | None = None
-    """With nve and nvt, mean: the box is scaled at the start to the mean, over its equilibrated part, of the npt or nph
-    stage just before. Default: the box as it is at the end of that stage"""
+    """With nve and nvt, mean: the box is scaled at the start to the mean, over its equilibrated
+    part, of the npt or nph stage just before. Default: the box as it is at the end of that stage"""
 
 
 class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     """A part of a run with one ensemble and one time step."""
 
-    integrator: Annotated[str, NameIn((*SCHEMES, *WITH_THERMOSTAT, AUTO), in_scene=True)] = "velocity_verlet"
-    """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift, langevin by default; auto: the
-    scheme and step that keep the requested error with the fewest force evaluations"""
+    integrator: Annotated[str, NameIn((*SCHEMES, *WITH_THERMOSTAT, AUTO), in_scene=True)] = (
+        "velocity_verlet"
+    )
+    """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift, langevin
+    by default; auto: the scheme and step that keep the requested error with the fewest force
+    evaluations"""
     energy_error_kT: Positive | None = None
-    """With auto: rms error of the energy over the whole stage, as pilot runs predict it, in kT per degree of freedom"""
+    """With auto: rms error of the energy over the whole stage, as pilot runs predict it, in kT per
+    degree of freedom"""
     trajectory_error: Positive | None = None
-    """With auto: largest error of Q (for points of X in Å) at the end of the pilot run of ten radians of libration"""
+    """With auto: largest error of Q (for points of X in Å) at the end of the pilot run of ten
+    radians of libration"""
     bias_kT: Positive | None = None
-    """With auto in nvt: estimated bias of the average potential energy, in kT per degree of freedom"""
+    """With auto in nvt: estimated bias of the average potential energy, in kT per degree of
+    freedom"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow; default: the flow that the integrator needs"""
     force_limit_kJ_mol_A: Positive = 0.1
-    """With minimise: largest force on a molecule at convergence. Forces in a liquid are of the order of 10 kJ/mol/Å,
-    and force constants between 1 (argon) and 100 kJ/mol/Å² (hydrogen bonds): with 0.1 positions are good to 0.1 and
-    0.001 Å and energies to 0.005 kJ/mol per molecule, 0.002 kT at 300 K"""
+    """With minimise: largest force on a molecule at convergence. Forces in a liquid are of the
+    order of 10 kJ/mol/Å, and force constants between 1 (argon) and 100 kJ/mol/Å² (hydrogen bonds):
+    with 0.1 positions are good to 0.1 and 0.001 Å and energies to 0.005 kJ/mol per molecule, 0.002
+    kT at 300 K"""
     torque_limit_kJ_mol: Positive = 0.1
-    """With minimise: largest torque on a molecule about a principal axis at convergence; for a molecule with a radius
-    of 1 Å as strict as the default limit of forces"""
+    """With minimise: largest torque on a molecule about a principal axis at convergence; for a
+    molecule with a radius of 1 Å as strict as the default limit of forces"""
     pressure_limit_bar: Positive = 1.0
-    """With minimise and pressure_bar: largest deviation of the pressure at convergence. At the compressibility of water
-    1 bar changes the volume by 5e-5"""
+    """With minimise and pressure_bar: largest deviation of the pressure at convergence. At the
+    compressibility of water 1 bar changes the volume by 5e-5"""
     most_iterations: Count = 5000
     """With minimise: largest number of iterations, after which it stops with a warning"""
 
@@ -129,7 +153,9 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
         if plain in OTHER_INTEGRATORS and name not in (info.context or ()):
             known = ", ".join((*SCHEMES, *WITH_THERMOSTAT, AUTO))
-            raise ValueError(f"is {name!r}: {OTHER_INTEGRATORS[plain]}. The integrators are {known}")
+            raise ValueError(
+                f"is {name!r}: {OTHER_INTEGRATORS[plain]}. The integrators are {known}"
+            )
         return name
 
     @field_validator("duration_ps")
@@ -146,10 +172,17 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             yield f"an {self.ensemble} stage needs pressure_bar"
         if idle := [key for key in self.idle_keys if self._is_given(key)]:
             yield f"{', '.join(idle)} would do nothing {self._where([_users(key) for key in idle])}"
-        if self.integrator in WITH_THERMOSTAT and not self.has_thermostat and not self.is_minimisation:
+        if (
+            self.integrator in WITH_THERMOSTAT
+            and not self.has_thermostat
+            and not self.is_minimisation
+        ):
             yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
         if self.integrator in WITH_THERMOSTAT and self.is_hybrid:
-            yield f"{self.integrator} contains a thermostat of its own: name another one for {self.thermostat_kind}"
+            yield (
+                f"{self.integrator} contains a thermostat of its own: name another one for"
+                f" {self.thermostat_kind}"
+            )
         if self.changes_box:
             yield from self._pressure_errors()
         if self.has_barostat:
@@ -161,7 +194,10 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         if self.is_hybrid and self.is_auto:
             if given := [key for key, target in targets.items() if target is not None]:
                 kind = self.thermostat_kind
-                yield f"{', '.join(given)} would do nothing: averages of {kind} have no error of the step"
+                yield (
+                    f"{', '.join(given)} would do nothing: averages of {kind} have no error of the"
+                    " step"
+                )
         else:
             yield from auto_errors(self.integrator, targets, step_keys)
         if self.bias_kT is not None and not self.has_thermostat:
@@ -169,14 +205,21 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
             yield f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps"
         if self.duration * 1000 < 0.5 * self.timestep_fs and not self.is_minimisation:
-            yield f"duration_ps = {self.duration_ps:g} is less than one step of {self.timestep_fs:g} fs"
+            yield (
+                f"duration_ps = {self.duration_ps:g} is less than one step of"
+                f" {self.timestep_fs:g} fs"
+            )
 
     @property
     def idle_keys(self) -> list[str]:
         """The keys that do nothing in this stage."""
         parts = {self.ensemble, self.thermostat_kind, self.barostat_kind}
         parts |= {CELL} if self.is_minimisation and self.changes_box else set()
-        return [key for key in type(self).model_fields if (users := _users(key)) and users.isdisjoint(parts)]
+        return [
+            key
+            for key in type(self).model_fields
+            if (users := _users(key)) and users.isdisjoint(parts)
+        ]
 
     def _is_given(self, key: str) -> bool:
         return getattr(self, key) != type(self).model_fields[key].default
@@ -184,14 +227,21 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def _where(self, users: list[set[str]]) -> str:
         """The settings with which keys that have these users would do nothing, for the message."""
         if self.is_minimisation:
-            return "in a minimise stage" + (" without pressure_bar" if all(CELL in names for names in users) else "")
+            return "in a minimise stage" + (
+                " without pressure_bar" if all(CELL in names for names in users) else ""
+            )
         kinds = THERMOSTATS | BAROSTATS
         for names in users:
-            if not any(self.ensemble in (kinds[name].ensembles if name in kinds else (name,)) for name in names):
+            if not any(
+                self.ensemble in (kinds[name].ensembles if name in kinds else (name,))
+                for name in names
+            ):
                 return f"in an {self.ensemble} stage"
         concerned = set().union(*users)  # a key of the barostat does not depend on the thermostat
         parts = ((self.thermostat_kind, THERMOSTATS), (self.barostat_kind, BAROSTATS))
-        return f"with {' and '.join(kind for kind, among in parts if kind and concerned & set(among))}"
+        return (
+            f"with {' and '.join(kind for kind, among in parts if kind and concerned & set(among))}"
+        )
 
     def _pressure_errors(self):
         given, coupling = self.pressure_bar, self.pressure_coupling
@@ -199,10 +249,21 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         if self.is_minimisation and several == 2:
             yield "pressure_bar: a minimum has one pressure, not one that changes"
         if self.integrator == AUTO:
-            yield "integrator = 'auto' is for constant volume: name an integrator for a stage with a pressure"
-        unequal = coupling == "semi_isotropic" and isinstance(given, tuple) and several == 3 and given[0] != given[1]
+            yield (
+                "integrator = 'auto' is for constant volume: name an integrator for a stage with a"
+                " pressure"
+            )
+        unequal = (
+            coupling == "semi_isotropic"
+            and isinstance(given, tuple)
+            and several == 3
+            and given[0] != given[1]
+        )
         if unequal or (coupling == "isotropic" and several == 3):
-            yield f"pressure_bar: these three need pressure_coupling = 'anisotropic', not {coupling!r}"
+            yield (
+                "pressure_bar: these three need pressure_coupling = 'anisotropic', not"
+                f" {coupling!r}"
+            )
         if several in (3, 6) and coupling in ("normal", "lateral"):
             yield f"pressure_bar: pressure_coupling = {coupling!r} has one pressure"
         elif several == 6 and coupling != "flexible":
@@ -210,9 +271,16 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     def _barostat_errors(self):
         name, kind = self.barostat_kind, BAROSTATS[self.barostat_kind]
-        others = [other for other in BAROSTATS if self.ensemble in BAROSTATS[other].ensembles and other != name]
+        others = [
+            other
+            for other in BAROSTATS
+            if self.ensemble in BAROSTATS[other].ensembles and other != name
+        ]
         if self.ensemble not in kind.ensembles:
-            yield f"barostat = {name!r} is for {' and '.join(kind.ensembles)}; {self.ensemble} has {', '.join(others)}"
+            yield (
+                f"barostat = {name!r} is for {' and '.join(kind.ensembles)}; {self.ensemble} has"
+                f" {', '.join(others)}"
+            )
             return
         several = isinstance(self.pressure_bar, tuple) and len(self.pressure_bar) > 2
         if self.pressure_coupling not in kind.shapes or (several and kind.shapes == ("isotropic",)):
@@ -231,29 +299,42 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             return
         step = self.timestep_fs * FEMTOSECOND
         least = pi * step
-        thermostat, barostat = THERMOSTATS.get(self.thermostat_kind), BAROSTATS.get(self.barostat_kind)
+        thermostat, barostat = (
+            THERMOSTATS.get(self.thermostat_kind),
+            BAROSTATS.get(self.barostat_kind),
+        )
         if thermostat and thermostat.oscillates and self.thermostat_time < least:
-            yield f"thermostat_time_ps = {self.thermostat_time:g} is a period shorter than pi steps, {least:.3g} ps"
+            yield (
+                f"thermostat_time_ps = {self.thermostat_time:g} is a period shorter than pi steps,"
+                f" {least:.3g} ps"
+            )
         if barostat and barostat.oscillates and self.barostat_time < least:
-            yield f"barostat_time_ps = {self.barostat_time:g} is a period shorter than pi steps, {least:.3g} ps"
+            yield (
+                f"barostat_time_ps = {self.barostat_time:g} is a period shorter than pi steps,"
+                f" {least:.3g} ps"
+            )
         moves = self.moves_every * step if barostat and barostat.relaxes_in_moves else 0.0
         if self.barostat_time < moves:
-            yield f"barostat_time_ps = {self.barostat_time:g} is shorter than the {moves:g} ps between moves of the box"
+            yield (
+                f"barostat_time_ps = {self.barostat_time:g} is shorter than the {moves:g} ps"
+                " between moves of the box"
+            )
 
     @property
     def steps(self) -> int:
         return self.steps_of(self.duration) if self.duration else 0
 
     def steps_of(self, interval: float) -> int:
-        """The nearest number of steps to an interval (ps), at least one step or trajectory; at most `MOST_STEPS`, which
-        no stage has."""
+        """The nearest number of steps to an interval (ps), at least one step or trajectory; at most
+        `MOST_STEPS`, which no stage has."""
         together = self.steps_together
         wanted = min(interval * 1000 / self.timestep_fs, MOST_STEPS)
         return max(1, round(wanted / together)) * together
 
     @property
     def steps_together(self) -> int:
-        """Steps of a trajectory of hybrid Monte Carlo, between which nothing is observed; else 1."""
+        """Steps of a trajectory of hybrid Monte Carlo, between which nothing is observed; else
+        1."""
         return int(self.thermostat_values["trajectory_steps"]) if self.is_hybrid else 1
 
     @property
@@ -263,7 +344,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def refreshment_rate(self) -> float:
-        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo anew in one step; infinite for all of it."""
+        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo anew in one step;
+        infinite for all of it."""
         kept = 1 - self.momentum_refreshment
         return -log(kept) / (2 * self.timestep_fs * FEMTOSECOND) if kept else inf
 
@@ -278,8 +360,11 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def thermostat_is_open(self) -> bool:
-        """Whether the thermostat is chosen with the integrator: bias_kT is given, and no key of a thermostat."""
-        return self.bias_kT is not None and self.thermostat is None and self.thermostat_time_ps is None
+        """Whether the thermostat is chosen with the integrator: bias_kT is given, and no key of a
+        thermostat."""
+        return (
+            self.bias_kT is not None and self.thermostat is None and self.thermostat_time_ps is None
+        )
 
     def with_integrator(self, integrator: str, timestep_fs: float) -> "Stage":
         """This stage with the integrator and step that pilot runs have chosen."""
@@ -294,7 +379,9 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             found |= {"thermostat": self.thermostat_kind} | self.thermostat_values
         if self.has_barostat:
             named = {"barostat": self.barostat_kind} if self.ensemble == "npt" else {}
-            found |= named | {"compressibility_per_bar": self.compressibility} | self.barostat_values
+            found |= (
+                named | {"compressibility_per_bar": self.compressibility} | self.barostat_values
+            )
         return self.model_copy(update=found)
 
     @property
@@ -386,7 +473,9 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
 def _users(key: str) -> set[str]:
     """The ensembles, thermostats and barostats that use a key; none for the keys of every stage."""
-    return USED.get(key, set()) | {name for name, kind in (THERMOSTATS | BAROSTATS).items() if key in kind.keys}
+    return USED.get(key, set()) | {
+        name for name, kind in (THERMOSTATS | BAROSTATS).items() if key in kind.keys
+    }
 
 
 def _tensor(given: Any) -> Six:

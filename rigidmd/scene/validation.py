@@ -1,4 +1,5 @@
-"""Validation of input tables: strict value types for pydantic, and its errors as messages with key and line."""
+"""Validation of input tables: strict value types for pydantic, and its errors as messages with key
+and line."""
 
 import ast
 import inspect
@@ -11,7 +12,15 @@ from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, ValidationInfo, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 
 from rigidmd.core.plain_text import did_you_mean, plain_letters
@@ -35,11 +44,16 @@ MOST_TABLES = 1000
 
 
 def _add_docstrings(schema: dict[str, Any], kind: type[BaseModel]) -> None:
-    """Describe keys in a JSON schema by their docstrings. The option `use_attribute_docstrings` of pydantic parses all
-    sources at each import instead, which took a quarter of the time to read a scene."""
+    """Describe keys in a JSON schema by their docstrings. The option `use_attribute_docstrings` of
+    pydantic parses all sources at each import instead, which took a quarter of the time to read a
+    scene."""
     for owner in kind.__mro__[:-2]:
         classes = ast.parse(inspect.getsource(not_none(inspect.getmodule(owner)))).body
-        bodies = [node.body for node in classes if isinstance(node, ast.ClassDef) and node.name == owner.__name__]
+        bodies = [
+            node.body
+            for node in classes
+            if isinstance(node, ast.ClassDef) and node.name == owner.__name__
+        ]
         for key, text in pairwise(bodies[0] if bodies else []):
             if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
                 described = schema["properties"].get(ast.unparse(key.target), {})
@@ -49,7 +63,9 @@ def _add_docstrings(schema: dict[str, Any], kind: type[BaseModel]) -> None:
 class Section(BaseModel):
     """A frozen table of a TOML file; unknown keys are errors."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True, json_schema_extra=_add_docstrings)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", defer_build=True, json_schema_extra=_add_docstrings
+    )
 
     @model_validator(mode="after")
     def _is_sound(self):
@@ -70,7 +86,8 @@ ShortName = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]+$"
 
 
 class NameIn:
-    """Annotation of a text that is a name in a table, which is read anew at each validation. Its JSON schema lists the
+    """Annotation of a text that is a name in a table, which is read anew at each validation. Its
+    JSON schema lists the
     names. in_scene : whether names in the context of the validation are known too"""
 
     def __init__(self, names: Collection[str], in_scene: bool = False):
@@ -79,7 +96,9 @@ class NameIn:
     def _check(self, name: Any, info: ValidationInfo) -> str:
         *first, last = known = [*self.names, *(info.context or () if self.in_scene else ())]
         if name not in known:
-            raise PydanticKnownError("literal_error", {"expected": f"{', '.join(map(repr, first))} or {last!r}"})
+            raise PydanticKnownError(
+                "literal_error", {"expected": f"{', '.join(map(repr, first))} or {last!r}"}
+            )
         return name
 
     def __get_pydantic_core_schema__(self, source, handler):
@@ -98,8 +117,8 @@ def not_none(value: T | None) -> T:
 def validation_messages(
     error: ValidationError, model: type[BaseModel], text: str = "", overridden: Iterable[str] = ()
 ) -> list[str]:
-    """One message for each error of pydantic: line (if the TOML text is given), key, what was expected. Keys in
-    `overridden` are set by the command line and have no line."""
+    """One message for each error of pydantic: line (if the TOML text is given), key, what was
+    expected. Keys in `overridden` are set by the command line and have no line."""
     faults: dict[tuple, list[str]] = {}
     for detail in error.errors(include_url=False):
         unknown = detail["type"] == "extra_forbidden"  # the last key is text of the user
@@ -111,8 +130,8 @@ def validation_messages(
         # Messages beyond the number shown are only counted.
         sentence = _sentence(detail, keys, model) if len(faults) <= MOST_SHOWN else detail["msg"]
         faults.setdefault(tuple(keys), []).append(sentence)
-    # pydantic reports one error for each type that a value may have: join them. An error inside a value is more
-    # specific than an error of the whole value.
+    # pydantic reports one error for each type that a value may have: join them. An error inside a
+    # value is more specific than an error of the whole value.
     around = {keys[:depth] for keys in faults for depth in range(1, len(keys))}
     return [
         f"{location_of(list(keys), text, overridden)}: {_either(list(dict.fromkeys(sentences)))}"
@@ -122,18 +141,22 @@ def validation_messages(
 
 
 def numbers_out_of_range(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
-    """Path of keys and message of numbers in nested tables whose absolute value is outside these limits."""
+    """Path of keys and message of numbers in nested tables whose absolute value is outside these
+    limits."""
     bounds = f"{least:g} and {largest:g}".replace("e+", "e")
     return [
         (keys, f"is {value:g}, must be 0 or between {bounds}")
         for keys, value in values_in(data)
-        if isinstance(value, float) and value != 0 and not least <= abs(value) <= largest and isfinite(value)
+        if isinstance(value, float)
+        and value != 0
+        and not least <= abs(value) <= largest
+        and isfinite(value)
     ]
 
 
 def _either(sentences: list[str]) -> str:
-    """Join messages: "is 1, must be a list" and "is 1, must be a table" become "is 1, must be a list or a table".
-    Advice, after the first colon, comes last."""
+    """Join messages: "is 1, must be a list" and "is 1, must be a table" become "is 1, must be a
+    list or a table". Advice, after the first colon, comes last."""
     parts = [sentence.partition(ADVICE) for sentence in sentences]
     begin, must, _ = parts[0][0].partition(", must be ")
     either = " or ".join([parts[0][0], *(part[0].removeprefix(begin + must) for part in parts[1:])])
@@ -150,7 +173,8 @@ def location_of(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
 
 
 def setting(key: str, value: str = "", argument: str = "overrides") -> str:
-    """How a user sets a key, or removes it without a value: --set KEY=VALUE, in Python overrides={'KEY': VALUE}."""
+    """How a user sets a key, or removes it without a value: --set KEY=VALUE, in Python
+    overrides={'KEY': VALUE}."""
     if in_python():
         return f"{argument}={{{key!r}: {value or None}}}"
     return f"{option(argument)} {key}={value}"
@@ -182,7 +206,9 @@ SENTENCES = {
     "bool_type": "is {shown}, must be true or false",
     "string_type": "is {shown}, must be a text in quotes",
     **dict.fromkeys(("tuple_type", "list_type"), "is {shown}, must be a list"),
-    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "is {shown}, must be a table"),
+    **dict.fromkeys(
+        ("model_type", "model_attributes_type", "dict_type"), "is {shown}, must be a table"
+    ),
     "value_error": "{error}",
 }
 
@@ -198,7 +224,15 @@ OTHER_UNITS = {
     "fs": {"as": 1e-3, "fs": 1.0, "ps": 1e3, "ns": 1e6, "s": 1e15},
     "A": {"pm": 1e-2, "A": 1.0, "Å": 1.0, "bohr": BOHR, "nm": 10.0},
     "K": {"K": 1.0},
-    "bar": {"Pa": 1e-5, "kPa": 1e-2, "MPa": 10.0, "GPa": 1e4, "bar": 1.0, "kbar": 1e3, "atm": 1.01325},
+    "bar": {
+        "Pa": 1e-5,
+        "kPa": 1e-2,
+        "MPa": 10.0,
+        "GPa": 1e4,
+        "bar": 1.0,
+        "kbar": 1e3,
+        "atm": 1.01325,
+    },
     "kJ_mol": {"J/mol": 1e-3, "kJ/mol": 1.0, "kcal/mol": 4.184},
     "deg": {"deg": 1.0, "°": 1.0},
     "s": {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
@@ -210,14 +244,17 @@ KEY_WITH_UNIT = re.compile(rf"(?:.*_)?[a-z]{{4,}}_({'|'.join(OTHER_UNITS)})")
 
 
 def _as_number(text: str, keys: list) -> str:
-    """Advice on a text where a number is expected: the number in the unit of the key; empty for other texts."""
+    """Advice on a text where a number is expected: the number in the unit of the key; empty for
+    other texts."""
     found = WITH_UNIT.fullmatch(text)
     if not found:
         return ""
     number, unit = float(found[1]), found[2]
     if not unit:
         return f"{ADVICE}{found[1]} without quotes"
-    key = KEY_WITH_UNIT.fullmatch(str(next((key for key in reversed(keys) if isinstance(key, str)), "")))
+    key = KEY_WITH_UNIT.fullmatch(
+        str(next((key for key in reversed(keys) if isinstance(key, str)), ""))
+    )
     size = OTHER_UNITS[key[1]].get(unit) if key else None
     if key is None or size is None:
         return f"{ADVICE}it without unit, in the one that the key names"
@@ -226,19 +263,29 @@ def _as_number(text: str, keys: list) -> str:
 
 def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     value = detail["input"]
-    shown = "a table" if isinstance(value, dict) else "a list" if isinstance(value, list) else shorten_repr(value)
+    shown = (
+        "a table"
+        if isinstance(value, dict)
+        else "a list"
+        if isinstance(value, list)
+        else shorten_repr(value)
+    )
     context = detail.get("ctx", {})
     match detail["type"]:
         case "extra_forbidden":
             known, name = _known_keys(model, keys[:-1]), str(keys[-1])
             with_unit = any(re.fullmatch(f"{re.escape(name)}_[a-zA-Z0-9_]+", key) for key in known)
             listed = f"; there are {', '.join(known)}" if known else ""
-            return "unknown key" + ((not with_unit and _foreign(name, model)) or did_you_mean(name, known) or listed)
+            return "unknown key" + (
+                (not with_unit and _foreign(name, model)) or did_you_mean(name, known) or listed
+            )
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
         case "literal_error":
             wanted = context["expected"].replace("False", "false").replace("True", "true")
-            return f"is {shown}, must be {wanted}" + did_you_mean(str(value), re.findall(r"'([^']*)'", wanted))
+            return f"is {shown}, must be {wanted}" + did_you_mean(
+                str(value), re.findall(r"'([^']*)'", wanted)
+            )
         case "tuple_type" | "list_type" if isinstance(value, dict):
             return f"is a table, must be a list of tables: write [[{'.'.join(map(str, keys))}]]"
         case "string_pattern_mismatch" if "!-~" in context["pattern"]:
@@ -253,7 +300,8 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
 
 
 def _foreign(name: str, model: type[BaseModel]) -> str:
-    """What a scene has for a setting of another program, for the message on its unknown key; empty for other names."""
+    """What a scene has for a setting of another program, for the message on its unknown key; empty
+    for other names."""
     for table, entries in tomllib.loads(FOREIGN_KEYS.read_text(encoding="utf-8")).items():
         section, path = model.model_fields.get(table), [] if table == "scene" else [table]
         for key, text in entries.items():
@@ -263,7 +311,13 @@ def _foreign(name: str, model: type[BaseModel]) -> str:
             if table == "none" and "stages" in model.model_fields:
                 return f"; not needed: {note}"
             if (section or not path) and key in _known_keys(model, path):
-                place = f" in [[{table}]]" if "tuple" in str(section) else f" in [{table}]" if path else ""
+                place = (
+                    f" in [[{table}]]"
+                    if "tuple" in str(section)
+                    else f" in [{table}]"
+                    if path
+                    else ""
+                )
                 return f"; in rigidmd this is {key}{place}{note and f' ({note})'}"
     return ""
 
@@ -281,8 +335,8 @@ def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
 
 
 def exact_names(data: Any, annotation: Any) -> Any:
-    """Data of a type in which values with a fixed choice have their exact spelling: "NVT" becomes "nvt". The case of
-    letters, hyphens, underscores and slashes do not matter in scenes."""
+    """Data of a type in which values with a fixed choice have their exact spelling: "NVT" becomes
+    "nvt". The case of letters, hyphens, underscores and slashes do not matter in scenes."""
     if isinstance(data, str):
         near = [name for name in _choices(annotation) if plain_letters(name) == plain_letters(data)]
         return near[0] if len(near) == 1 else data
@@ -290,8 +344,13 @@ def exact_names(data: Any, annotation: Any) -> Any:
         return [exact_names(value, annotation) for value in data]
     if not isinstance(data, dict):
         return data
-    fields = {key: kind for model in _models_in(annotation) for key, kind in _annotations(model).items()}
-    return {key: exact_names(value, fields.get(key) if fields else annotation) for key, value in data.items()}
+    fields = {
+        key: kind for model in _models_in(annotation) for key, kind in _annotations(model).items()
+    }
+    return {
+        key: exact_names(value, fields.get(key) if fields else annotation)
+        for key, value in data.items()
+    }
 
 
 @cache
@@ -304,7 +363,11 @@ def _choices(annotation: Any) -> list[str]:
     if isinstance(annotation, str):
         return [annotation]
     parts = (*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ()))
-    return [*annotation.names] if isinstance(annotation, NameIn) else [n for part in parts for n in _choices(part)]
+    return (
+        [*annotation.names]
+        if isinstance(annotation, NameIn)
+        else [n for part in parts for n in _choices(part)]
+    )
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

@@ -18,7 +18,8 @@ from rigidmd.io.run_files import Columns, Summary, read_columns, read_json, read
 from rigidmd.io.write import columns_text
 from rigidmd.run.resume import MADE_WITH, differences, keys_of
 
-#: Columns by which samples are matched: steps if they have the same times in both files, else times.
+#: Columns by which samples are matched: steps if they have the same times in both files, else
+#: times.
 STEP, TIMES = "Step", ("Time (ps)", "time")
 BITS = 53  # bits of the significand of a float64
 
@@ -28,7 +29,9 @@ class CellDifference:
     column: str
     first: str
     second: str
-    bits: int | None  # last bits of 53 that differ: 1 for neighbours, 53 for unlike numbers; None for text
+    bits: (
+        int | None
+    )  # last bits of 53 that differ: 1 for neighbours, 53 for unlike numbers; None for text
 
 
 @dataclass
@@ -42,7 +45,9 @@ class SampleComparison:
     at: str | None = None  # the clock's value at the first sample that differs
     index: int = 0  # that sample among the common ones, from 0
     first: list[CellDifference] = field(default_factory=list)  # columns that differ there
-    last: list[CellDifference] = field(default_factory=list)  # columns that differ at the last common sample
+    last: list[CellDifference] = field(
+        default_factory=list
+    )  # columns that differ at the last common sample
     only: list[str] = field(default_factory=list)  # columns of one file alone
 
 
@@ -52,18 +57,25 @@ class RunComparison:
 
     folders: tuple[str, str]
     scene: dict[str, tuple] = field(default_factory=dict)  # dotted key -> values that differ
-    made: dict[str, tuple] = field(default_factory=dict)  # key of summary.json -> values that differ
+    made: dict[str, tuple] = field(
+        default_factory=dict
+    )  # key of summary.json -> values that differ
     samples: SampleComparison | None = None
     # array of final.npz -> largest difference, internal units; None for unlike shapes
     state: dict[str, float | None] = field(default_factory=dict)
-    files: dict[str, bool] = field(default_factory=dict)  # other files of both -> whether their bytes are the same
+    files: dict[str, bool] = field(
+        default_factory=dict
+    )  # other files of both -> whether their bytes are the same
     missing: list[str] = field(default_factory=list)  # what could not be compared
 
     @property
     def same(self) -> bool:
-        """Whether all that both runs computed is the same to the last bit, and they have the same length."""
+        """Whether all that both runs computed is the same to the last bit, and they have the same
+        length."""
         samples = self.samples
-        same_samples = samples is None or (samples.at is None and samples.lengths == (samples.common, samples.common))
+        same_samples = samples is None or (
+            samples.at is None and samples.lengths == (samples.common, samples.common)
+        )
         return same_samples and not self.state and all(self.files.values()) and not self.missing
 
     def to_json(self) -> dict[str, Any]:
@@ -80,7 +92,8 @@ def compare(first: Path, second: Path) -> RunComparison:
         return (first / name).exists() or (second / name).exists()
 
     def both(name: str, read: Callable[[Path], Any]) -> list[Any]:
-        """The content of this file in both folders; empty, which `missing` explains, if one of them cannot be read."""
+        """The content of this file in both folders; empty, which `missing` explains, if one of them
+        cannot be read."""
         contents = []
         for path in (first / name, second / name):
             try:
@@ -97,8 +110,13 @@ def compare(first: Path, second: Path) -> RunComparison:
         made = []
         for there in (summary.model_dump(exclude_unset=True) for summary in summaries):
             of_run = {key.replace("_", " "): there[key] for key in MADE_WITH if key in there}
-            of_run |= {f"processor has {feature}": True for feature in there.get("processor_features", ())}
-            made.append(of_run | {f"file of {key}": sha[:12] for key, sha in there.get("input_sha256", {}).items()})
+            of_run |= {
+                f"processor has {feature}": True for feature in there.get("processor_features", ())
+            }
+            made.append(
+                of_run
+                | {f"file of {key}": sha[:12] for key, sha in there.get("input_sha256", {}).items()}
+            )
         found.made = differences(made[0], made[1], "not recorded")
     for name, read in ((LOG, read_columns), (MOTION, read_motion)):
         if either(name) and (tables := both(name, read)):
@@ -111,9 +129,16 @@ def compare(first: Path, second: Path) -> RunComparison:
                 found.state[name] = float(np.abs(a - b).max())
     for key in ("output.topology", "output.trajectory"):
         names = [keys_of(scene, ()).get(key) for scene in scenes]
-        if scenes and isinstance(name := names[0], str) and names[1] == name and Path(name).name == name:
+        if (
+            scenes
+            and isinstance(name := names[0], str)
+            and names[1] == name
+            and Path(name).name == name
+        ):
             paths = first / name, second / name
-            if missing := [f"{path}: {reason}" for path in paths if (reason := unreadable_reason(path))]:
+            if missing := [
+                f"{path}: {reason}" for path in paths if (reason := unreadable_reason(path))
+            ]:
                 found.missing += missing
             else:
                 found.files[name] = filecmp.cmp(*paths, shallow=False)
@@ -131,13 +156,20 @@ def _compare_samples(file: str, one: Columns, other: Columns) -> SampleCompariso
     clock = time
     if STEP in columns:
         times = dict(zip(second[STEP], second[time], strict=True))
-        if all(times.get(step, value) == value for step, value in zip(first[STEP], first[time], strict=True)):
+        if all(
+            times.get(step, value) == value
+            for step, value in zip(first[STEP], first[time], strict=True)
+        ):
             clock = STEP
     for columns_of in (one, other):
         columns_of.numbers(clock)
     lengths = len(first[clock]), len(second[clock])
     rows_of_second = _rows_by_value(second[clock])
-    rows = [(k, rows_of_second[key]) for key, k in _rows_by_value(first[clock]).items() if key in rows_of_second]
+    rows = [
+        (k, rows_of_second[key])
+        for key, k in _rows_by_value(first[clock]).items()
+        if key in rows_of_second
+    ]
     found = SampleComparison(file, lengths, len(rows), clock, only=only)
     compared = [name for name in columns if name != STEP or clock == STEP]
     for index, (i, j) in enumerate(rows):
@@ -150,7 +182,8 @@ def _compare_samples(file: str, one: Columns, other: Columns) -> SampleCompariso
 
 
 def _rows_by_value(values: list[str]) -> dict[tuple[str, int], int]:
-    """(value, number of earlier rows with it) -> row. A step has two samples where a stage begins."""
+    """(value, number of earlier rows with it) -> row. A step has two samples where a stage
+    begins."""
     seen: dict[str, int] = {}
     rows = {}
     for row, value in enumerate(values):
@@ -161,7 +194,8 @@ def _rows_by_value(values: list[str]) -> dict[tuple[str, int], int]:
 
 
 def last_bits(first: str, second: str) -> int | None:
-    """Number of last bits that differ: bits of the count of floats between two numbers, at most 53; None for text."""
+    """Number of last bits that differ: bits of the count of floats between two numbers, at most 53;
+    None for text."""
     try:
         numbers = np.array([float(first), float(second)]).view(np.int64)
     except ValueError:
@@ -178,11 +212,25 @@ def describe_run_comparison(found: RunComparison) -> str:
     ]
     if found.samples is not None:
         rows.append((found.samples.file, _describe_samples(found.samples)))
-    rows += [(name, ["the same bytes" if same else "other bytes"]) for name, same in found.files.items()]
+    rows += [
+        (name, ["the same bytes" if same else "other bytes"]) for name, same in found.files.items()
+    ]
     if found.state:
-        by = {name: "in shape" if value is None else f"by up to {value:.3g}" for name, value in found.state.items()}
-        rows.append((FINAL, [f"differs: {', '.join(f'{name} {how}' for name, how in by.items())} (u, Å, ps)"]))
-    elif found.samples is not None and found.samples.file == LOG and not any(FINAL in text for text in found.missing):
+        by = {
+            name: "in shape" if value is None else f"by up to {value:.3g}"
+            for name, value in found.state.items()
+        }
+        rows.append(
+            (
+                FINAL,
+                [f"differs: {', '.join(f'{name} {how}' for name, how in by.items())} (u, Å, ps)"],
+            )
+        )
+    elif (
+        found.samples is not None
+        and found.samples.file == LOG
+        and not any(FINAL in text for text in found.missing)
+    ):
         rows.append((FINAL, ["the same to the last bit"]))
     rows += [("missing", [text]) for text in found.missing]
     cells = [("", "" if k else name, text) for name, texts in rows for k, text in enumerate(texts)]
@@ -190,7 +238,10 @@ def describe_run_comparison(found: RunComparison) -> str:
     if found.same:
         verdict = "the runs are the same to the last bit"
     elif samples is not None and samples.at is not None:
-        verdict = f"the runs diverge at {samples.clock} {samples.at}, sample {samples.index + 1} of {samples.common}"
+        verdict = (
+            f"the runs diverge at {samples.clock} {samples.at}, sample {samples.index + 1} of"
+            f" {samples.common}"
+        )
     elif samples is not None and samples.lengths != (samples.common, samples.common):
         verdict = "the runs are the same to the last bit as far as both have samples"
     return "\n".join([f"{one} and {other}", columns_text(cells, left=(0, 1, 2)), "", verdict])
@@ -198,7 +249,11 @@ def describe_run_comparison(found: RunComparison) -> str:
 
 def _describe_samples(samples: SampleComparison) -> list[str]:
     n, m = samples.lengths
-    lengths = f"{n} samples in both" if n == m == samples.common else f"{n} and {m} samples, {samples.common} in common"
+    lengths = (
+        f"{n} samples in both"
+        if n == m == samples.common
+        else f"{n} and {m} samples, {samples.common} in common"
+    )
     lines = [f"a column of one run only: {name}" for name in samples.only]
     if samples.at is None:
         return [f"{lengths}, the same to the last bit", *lines]
@@ -211,8 +266,12 @@ def _describe_samples(samples: SampleComparison) -> list[str]:
 
 def _describe_cells(unlike: list[CellDifference]) -> list[str]:
     rows = [
-        ("", cell.column, f"{cell.first or 'nothing'} and {cell.second or 'nothing'}"
-         + (f"  last {cell.bits} of {BITS} bits" if cell.bits else ""))
+        (
+            "",
+            cell.column,
+            f"{cell.first or 'nothing'} and {cell.second or 'nothing'}"
+            + (f"  last {cell.bits} of {BITS} bits" if cell.bits else ""),
+        )
         for cell in unlike
-    ]  # fmt: skip
+    ]
     return columns_text(rows, left=(0, 1, 2)).splitlines()

@@ -1,7 +1,8 @@
 """Averages at a step of zero: mean = limit + slope dt^p, where p is the order of the integrator.
 
-The limit belongs to the ensemble, not to the integrator, so that one weighted fit has the same limit for all methods
-and a slope for each of them. See "Averages at a step of zero" in the theory chapter `errors`.
+The limit belongs to the ensemble, not to the integrator, so that one weighted fit has the same
+limit for all methods and a slope for each of them. See "Averages at a step of zero" in the theory
+chapter `errors`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,8 +13,8 @@ import numpy as np
 
 from rigidmd.core.statistics import format_signed, student_factor
 
-#: Degrees of freedom of the scatter of replicas, over all steps, from which on it gives the size of errors. With fewer
-#: the errors of single runs do.
+#: Degrees of freedom of the scatter of replicas, over all steps, from which on it gives the size of
+#: errors. With fewer the errors of single runs do.
 LEAST_FREEDOM = 8
 
 
@@ -37,7 +38,8 @@ class BiasFit(NamedTuple):
     freedom: int = 0  # degrees of freedom of chi²: points less fitted numbers
 
     def bias(self, point: MeanAtStep) -> tuple[float, float]:
-        """Mean less limit, and its error, which accounts for the weight of the mean in the limit."""
+        """Mean less limit, and its error, which accounts for the weight of the mean in the
+        limit."""
         weight = self.weights.get(point, 0.0)
         others = self.limit_error**2 - (weight * point.error) ** 2
         return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - weight) * point.error) ** 2)
@@ -46,10 +48,14 @@ class BiasFit(NamedTuple):
         return format_signed(self.limit, self.limit_error).lstrip("+")
 
 
-def extrapolate(points: Sequence[MeanAtStep], exact: float | None = None, order: int = 2) -> BiasFit:
-    """The limit of means at a step of zero, from all methods at once and from the short steps that dt^order describes.
+def extrapolate(
+    points: Sequence[MeanAtStep], exact: float | None = None, order: int = 2
+) -> BiasFit:
+    """The limit of means at a step of zero, from all methods at once and from the short steps that
+    dt^order describes.
 
-    Long steps are left out one by one while chi² exceeds its mean by more than two of its standard deviations and
+    Long steps are left out one by one while chi² exceeds its mean by more than two of its standard
+    deviations and
     enough points are left. exact : the limit, where it is known. Raises ValueError without points.
     """
     steps = sorted({point.timestep for point in points}, reverse=True)
@@ -64,11 +70,16 @@ def extrapolate(points: Sequence[MeanAtStep], exact: float | None = None, order:
     return BiasFit(best.mean, best.error, {}, {best: 1.0}, best.timestep, order)
 
 
-def _fit(points: Sequence[MeanAtStep], longest: float, exact: float | None, order: int) -> BiasFit | None:
+def _fit(
+    points: Sequence[MeanAtStep], longest: float, exact: float | None, order: int
+) -> BiasFit | None:
     """Weighted least squares over steps up to the longest. None with too few points."""
     points = [point for point in points if point.timestep <= longest]
     methods = list(dict.fromkeys(point.method for point in points))
-    columns = [[float(point.method == name) * point.timestep**order for point in points] for name in methods]
+    columns = [
+        [float(point.method == name) * point.timestep**order for point in points]
+        for name in methods
+    ]
     if exact is None:
         columns.insert(0, [1.0] * len(points))
     if len(points) < len(columns):
@@ -113,14 +124,15 @@ def means_of_runs(
     runs: Mapping[float, Sequence[tuple[float, float | None]]],
     together: Mapping[float, Together] | None = None,
 ) -> list[MeanAtStep]:
-    """Means over the runs at each step, with errors; none where the runs are too few and too short for an error.
+    """Means over the runs at each step, with errors; none where the runs are too few and too short
+    for an error.
 
     runs : step (fs) -> value and error of each of its runs
     together : step -> value of its runs together, used instead of the mean of their values
 
-    The errors of single runs give the ratios of the errors of the steps. Their common size is from the scatter of the
-    runs about the means of their steps if that has at least `LEAST_FREEDOM` degrees of freedom, else as it is.
-    Values of runs together need no errors of single runs.
+    The errors of single runs give the ratios of the errors of the steps. Their common size is from
+    the scatter of the runs about the means of their steps if that has at least `LEAST_FREEDOM`
+    degrees of freedom, else as it is. Values of runs together need no errors of single runs.
     """
     together = together or {}
     names = [step for step in dict.fromkeys([*runs, *together]) if step in together or runs[step]]
@@ -129,7 +141,9 @@ def means_of_runs(
     variances = [(at.variance if known else None) or 1.0 for at in steps.values()]
     freedom, factor = sum(at.runs - 1 for at in steps.values()), 1.0
     if freedom >= LEAST_FREEDOM or (not known and together.keys() >= steps.keys()):
-        squares = sum(at.squares / variance for at, variance in zip(steps.values(), variances, strict=True))
+        squares = sum(
+            at.squares / variance for at, variance in zip(steps.values(), variances, strict=True)
+        )
         factor = sqrt(squares / freedom) * student_factor(freedom)
     elif not known:
         return []
@@ -144,6 +158,8 @@ def _at_step(runs: Sequence[tuple[float, float | None]], together: Together | No
     within = [error**2 for _, error in runs if error is not None]
     variance = float(np.mean(within)) if any(within) else None
     if together is None:
-        return _AtStep(float(values.mean()), len(values), float(len(values) * values.var()), variance)
+        return _AtStep(
+            float(values.mean()), len(values), float(len(values) * values.var()), variance
+        )
     count = together.runs
     return _AtStep(together.value, count, count * (count - 1) * together.error**2, variance)

@@ -1,8 +1,9 @@
 """Normal modes of rigid molecules: their small vibrations about a minimum of the energy.
 
-The coordinates are q = (sqrt(m) X, sqrt(I_k) theta_k), with X in the lab frame and theta_k about principal axes. The
-Hessian in them has the eigenvalues w² (Goldstein, Classical Mechanics, chapter 6). It is made of central differences of
-the compiled forces and torques, in double precision. The guide `normal_modes` has the equations.
+The coordinates are q = (sqrt(m) X, sqrt(I_k) theta_k), with X in the lab frame and theta_k about
+principal axes. The Hessian in them has the eigenvalues w² (Goldstein, Classical Mechanics, chapter
+6). It is made of central differences of the compiled forces and torques, in double precision. The
+guide `normal_modes` has the equations.
 """
 
 from collections.abc import Callable
@@ -31,22 +32,27 @@ from rigidmd.scene.stage import Stage
 from rigidmd.studies.gamma_point import cells_of, periodic_basis
 from rigidmd.units import AVOGADRO, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
-#: Displacement of a difference, in smallest diameters: its error and that of rounding are 1e-10 of the largest entry.
+#: Displacement of a difference, in smallest diameters: its error and that of rounding are 1e-10 of
+#: the largest entry.
 DISPLACEMENT = 3e-6
-#: Largest force after the minimisation, and largest one that is accepted as a minimum: fractions of the force with
-#: which the stiffest motion opposes a displacement by the smallest diameter. Torques: these forces at a lever of 1 Å.
+#: Largest force after the minimisation, and largest one that is accepted as a minimum: fractions of
+#: the force with which the stiffest motion opposes a displacement by the smallest diameter.
+#: Torques: these forces at a lever of 1 Å.
 TIGHT, ACCEPTED = 1e-13, 1e-6
 #: A mode with a smaller |w²|, as a fraction of the largest, is a zero mode.
 ZERO = 1e-8
-#: Largest error of w² as a fraction of the largest: beyond it forces jump where a pair passes the cutoff.
+#: Largest error of w² as a fraction of the largest: beyond it forces jump where a pair passes the
+#: cutoff.
 LARGEST_ERROR = 1e-4
 SMOOTH = (
-    "where forces jump at the cutoff, forces.truncation = 'smooth_switch', and with PME or Ewald sums also "
-    "forces.ewald_accuracy = 1e-7, make them smooth"
+    "where forces jump at the cutoff, forces.truncation = 'smooth_switch', and with PME or Ewald"
+    " sums also forces.ewald_accuracy = 1e-7, make them smooth"
 )
-#: Most coordinates of a complete spectrum by default: a matrix of them has 0.3 GB. Modes at each end beyond it.
+#: Most coordinates of a complete spectrum by default: a matrix of them has 0.3 GB. Modes at each
+#: end beyond it.
 MOST_DENSE, COUNT = 6000, 20
-#: Residual of Lanczos vectors as a fraction of the largest w², and least dimension of their Krylov space.
+#: Residual of Lanczos vectors as a fraction of the largest w², and least dimension of their Krylov
+#: space.
 RESIDUAL, KRYLOV = 1e-9, 80
 #: Largest displacement in an animation, Å; its periods, and the frames of each.
 AMPLITUDE, PERIODS, FRAMES = 0.3, 2, 48
@@ -59,27 +65,39 @@ INTENSITY = pi * AVOGADRO / 3 * COULOMB * 1e-9 / 299792458**2
 
 
 class Coordinates:
-    """The mass-weighted coordinates q (d,) about a state. Frozen molecules and axes without inertia have none.
+    """The mass-weighted coordinates q (d,) about a state. Frozen molecules and axes without inertia
+    have none.
 
-    The order is: shifts sqrt(m) X along x, y, z of molecule 1, of molecule 2, ...; then rotations sqrt(I_k) theta_k
-    about the principal axes 1, 2, 3 of molecule 1, of molecule 2, ...; those that do not move are left out.
+    The order is: shifts sqrt(m) X along x, y, z of molecule 1, of molecule 2, ...; then rotations
+    sqrt(I_k) theta_k about the principal axes 1, 2, 3 of molecule 1, of molecule 2, ...; those that
+    do not move are left out.
 
     scale : (d,) length of a move of `Enthalpy`, Å, for a unit of q
     index : (d,) of each coordinate among all shifts (3 n) and then all rotations (3 n)
-    translations : (t, d) unit vectors of uniform translations along which the total momentum is conserved
+    translations : (t, d) unit vectors of uniform translations along which the total momentum is
+        conserved
     """
 
     def __init__(self, system: System, state: State):
         self.system = system
         self.enthalpy, self.state = Enthalpy(system, Stage(ensemble="minimise"), state), state
         model, species = system.model, system.model.species
-        rotations = np.sqrt(model.inverse_inertia[species[: len(state.rotation)]]) * self.enthalpy.arm
-        self._all = np.concatenate([np.repeat(np.sqrt(model.inverse_mass[species]), 3), rotations.ravel()])
+        rotations = (
+            np.sqrt(model.inverse_inertia[species[: len(state.rotation)]]) * self.enthalpy.arm
+        )
+        self._all = np.concatenate(
+            [np.repeat(np.sqrt(model.inverse_mass[species]), 3), rotations.ravel()]
+        )
         self.index = np.flatnonzero(self._all)
         self.scale, self._step = self._all[self.index], DISPLACEMENT * system.smallest_diameter
         self.is_shift = self.index < state.position.size
-        uniform = [self.is_shift * (self.index % 3 == k) / self.scale for k in np.flatnonzero(model.keeps_momentum)]
-        self.translations = np.array([q / np.linalg.norm(q) for q in uniform]).reshape(-1, len(self.index))
+        uniform = [
+            self.is_shift * (self.index % 3 == k) / self.scale
+            for k in np.flatnonzero(model.keeps_momentum)
+        ]
+        self.translations = np.array([q / np.linalg.norm(q) for q in uniform]).reshape(
+            -1, len(self.index)
+        )
 
     def at(self, q: np.ndarray) -> State:
         """The state at a displacement q (d,)."""
@@ -97,7 +115,8 @@ class Coordinates:
         return q - (self.translations @ q) @ self.translations
 
     def curvature(self, q: np.ndarray) -> np.ndarray:
-        """The Hessian times q (d,), without the forces on uniform translations that errors of meshes make."""
+        """The Hessian times q (d,), without the forces on uniform translations that errors of
+        meshes make."""
         gradient = self.slope(self.relative(q), lambda state: self.enthalpy.at(state).gradient)
         return self.relative(self.scale * gradient[self.index])
 
@@ -113,21 +132,31 @@ class NormalModes:
     torque: float  # largest at the minimum, kJ/mol
     ended: str  # why the minimisation stopped before the rounding of forces, if it did
     temperature: float  # of the scene, K; 0 if it has none
-    longest_step_fs: float  # 2/w of the last mode; if all were computed, the longest stable step of velocity Verlet
+    # 2/w of the last mode; if all were computed, the longest stable step of velocity Verlet
+    longest_step_fs: float
     number: np.ndarray  # (k,) of each mode among all d, from 1
     rate: np.ndarray  # (k,) w, rad/ps; 0 of zero modes, negative of unstable modes
     wavenumber: np.ndarray  # (k,) w/(2 pi c), cm⁻¹
-    error: np.ndarray  # (k,) cm⁻¹, by the asymmetry of the Hessian or the residual of the vector; NaN of zero modes
-    vector: np.ndarray  # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
-    translation: np.ndarray  # (k,) fraction of the kinetic energy that is of translation, not of libration
+    error: (
+        np.ndarray
+    )  # (k,) cm⁻¹, by the asymmetry of the Hessian or the residual of the vector; NaN of zero modes
+    vector: (
+        np.ndarray
+    )  # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
+    translation: (
+        np.ndarray
+    )  # (k,) fraction of the kinetic energy that is of translation, not of libration
     weight: np.ndarray  # (k, n) fraction of the kinetic energy in each molecule
-    intensity: np.ndarray  # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges
+    intensity: (
+        np.ndarray
+    )  # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges
     total: int  # number of all modes; at the Gamma point those of a unit cell
     cells: int = 0  # number of unit cells, if these are modes at the Gamma point
 
     def free_energy(self, temperature: float, quantum: bool = True) -> float:
-        """Helmholtz energy (kJ/mol) of the vibrations of the rigid molecules, from the energy of the minimum on, at a
-        temperature (K); at 0 the zero-point energy. Raises ValueError if there are only some of the modes."""
+        """Helmholtz energy (kJ/mol) of the vibrations of the rigid molecules, from the energy of
+        the minimum on, at a temperature (K); at 0 the zero-point energy. Raises ValueError if there
+        are only some of the modes."""
         if len(self.rate) < len(self.coordinates.index):
             raise ValueError("a sum over all modes needs all of them: leave out count and gamma")
         quanta, thermal = HBAR * self.rate[self.rate > 0], BOLTZMANN * temperature
@@ -137,7 +166,13 @@ class NormalModes:
         return float(terms.sum() / KJ_PER_MOL)
 
     def kind(self, k: int) -> str:
-        return "zero" if self.rate[k] == 0 else "translation" if self.translation[k] >= 0.5 else "libration"
+        return (
+            "zero"
+            if self.rate[k] == 0
+            else "translation"
+            if self.translation[k] >= 0.5
+            else "libration"
+        )
 
     def is_vibration(self, number: int) -> bool:
         """Whether the mode of this number was computed and has a frequency."""
@@ -149,16 +184,23 @@ class NormalModes:
         def of(values: np.ndarray) -> Callable[[int], float | None]:
             return lambda k: float(values[k]) if self.rate[k] else None
 
-        return Table([
-            Column("mode", lambda k: str(self.number[k])), Column("kind", self.kind),
-            Column("wavenumber (cm^-1)", lambda k: float(self.wavenumber[k]), "cm⁻¹"),
-            Column("error (cm^-1)", of(self.error), "±"),
-            Column("frequency (1/ps)", lambda k: float(self.rate[k] / (2 * pi)), "1/ps"),
-            Column("translation", of(self.translation)),
-            Column("participation", of(1 / (self.weight**2).sum(axis=1)), "molecules"),
-            Column("IR intensity (km/mol)", of(self.intensity), "IR (km/mol)"),
-            Column("largest in", lambda k: molecule_label(self.system, int(self.weight[k].argmax()))),
-        ], range(len(self.rate)))  # fmt: skip
+        return Table(
+            [
+                Column("mode", lambda k: str(self.number[k])),
+                Column("kind", self.kind),
+                Column("wavenumber (cm^-1)", lambda k: float(self.wavenumber[k]), "cm⁻¹"),
+                Column("error (cm^-1)", of(self.error), "±"),
+                Column("frequency (1/ps)", lambda k: float(self.rate[k] / (2 * pi)), "1/ps"),
+                Column("translation", of(self.translation)),
+                Column("participation", of(1 / (self.weight**2).sum(axis=1)), "molecules"),
+                Column("IR intensity (km/mol)", of(self.intensity), "IR (km/mol)"),
+                Column(
+                    "largest in",
+                    lambda k: molecule_label(self.system, int(self.weight[k].argmax())),
+                ),
+            ],
+            range(len(self.rate)),
+        )
 
 
 def normal_modes(
@@ -170,7 +212,8 @@ def normal_modes(
     required: int | None = None,
     progress: Callable[[float], object] = lambda fraction: None,
 ) -> NormalModes:
-    """Normal modes about the minimum next to the start of a scene, or next to the present state of a simulation.
+    """Normal modes about the minimum next to the start of a scene, or next to the present state of
+    a simulation.
 
     modes = rigidmd.normal_modes(rigidmd.Scene.read("water_dimer.toml"))
     print(modes.wavenumber, modes.free_energy(300.0), modes.longest_step_fs)
@@ -178,24 +221,34 @@ def normal_modes(
     A minimisation comes first, to the rounding of forces and torques and at constant cell.
 
     minimise : False requires that the start is a minimum
-    count : of the lowest and of the highest modes, by Lanczos; default: all, or 20 if there are more than 6000
+    count : of the lowest and of the highest modes, by Lanczos; default: all, or 20 if there are
+        more than 6000
     gamma : only modes with the period of the unit cell that `structure.repeat` repeats (k = 0)
     required : number of a mode that has to be computed, which is checked before computing
     progress : called with the fraction done
 
-    Raises SceneError for a single body, for a required mode that does not exist, and at the Gamma point without a unit
-    cell; SimulationError where a minimum is required and not found.
+    Raises SceneError for a single body, for a required mode that does not exist, and at the Gamma
+    point without a unit cell; SimulationError where a minimum is required and not found.
     """
     simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
     if isinstance(simulation.scene, BodyScene):
-        raise SceneError(simulation.scene.source, ["normal modes are of molecules, and this is a single body"])
-    state, system = (simulation.state if simulation is scene else simulation.settle()).copy(), simulation.system
+        raise SceneError(
+            simulation.scene.source, ["normal modes are of molecules, and this is a single body"]
+        )
+    state, system = (
+        (simulation.state if simulation is scene else simulation.settle()).copy(),
+        simulation.system,
+    )
     numbers = _numbers(Coordinates(system, state), count, gamma)
     if required is not None and required not in numbers:
         among = (
-            f"there are {numbers[-1]} modes" if len(numbers) == numbers[-1] else f"count = {count or COUNT} omits it"
+            f"there are {numbers[-1]} modes"
+            if len(numbers) == numbers[-1]
+            else f"count = {count or COUNT} omits it"
         )
-        raise SceneError(simulation.scene.source, [f"mode {required} will not be computed: {among}"])
+        raise SceneError(
+            simulation.scene.source, [f"mode {required} will not be computed: {among}"]
+        )
     sizes = _find_minimum(system, state, minimise)
     c, charges, cells = Coordinates(system, state), system.of_sites(lambda m: m.charges), 0
     if gamma:
@@ -207,18 +260,35 @@ def normal_modes(
         square, vector, error = _outer_modes(c, (len(numbers) - len(c.translations)) // 2)
     if not error.max() <= LARGEST_ERROR * square[-1]:
         raise SimulationError(
-            f"forces are not smooth at the minimum: w² are uncertain by {error.max():.1e}/ps²; {SMOOTH}"
+            f"forces are not smooth at the minimum: w² are uncertain by {error.max():.1e}/ps²;"
+            f" {SMOOTH}"
         )
-    signed = np.where(np.abs(square) > ZERO * square[-1], np.sign(square) * np.sqrt(np.abs(square)), np.nan)
+    signed = np.where(
+        np.abs(square) > ZERO * square[-1], np.sign(square) * np.sqrt(np.abs(square)), np.nan
+    )
     rate, weight = np.nan_to_num(signed), np.zeros((len(state.position), len(square)))
     np.add.at(weight, c.index // 3 % len(weight), vector.T**2)
-    slopes = np.array([c.slope(q, lambda state: charges @ system.site_positions(state)) for q in vector])
+    slopes = np.array(
+        [c.slope(q, lambda state: charges @ system.site_positions(state)) for q in vector]
+    )
     intensity = INTENSITY * (slopes**2).sum(axis=1) / max(cells, 1)
     return NormalModes(
-        system, c, *sizes, _last_temperature(simulation.scene), 2 / rate[-1] / FEMTOSECOND,
-        numbers, rate, PER_CM * rate, PER_CM * error / np.abs(2 * signed),
-        vector, vector**2 @ c.is_shift, weight.T, intensity, int(numbers[-1]), cells,
-    )  # fmt: skip
+        system,
+        c,
+        *sizes,
+        _last_temperature(simulation.scene),
+        2 / rate[-1] / FEMTOSECOND,
+        numbers,
+        rate,
+        PER_CM * rate,
+        PER_CM * error / np.abs(2 * signed),
+        vector,
+        vector**2 @ c.is_shift,
+        weight.T,
+        intensity,
+        int(numbers[-1]),
+        cells,
+    )
 
 
 def _numbers(c: Coordinates, count: int | None, gamma: bool) -> np.ndarray:
@@ -226,7 +296,9 @@ def _numbers(c: Coordinates, count: int | None, gamma: bool) -> np.ndarray:
     d, fixed, scene = len(c.index), len(c.translations), c.system.scene
     if gamma:
         if count is not None:
-            raise SceneError(scene.source, ["count and gamma cannot be combined: a unit cell has few modes"])
+            raise SceneError(
+                scene.source, ["count and gamma cannot be combined: a unit cell has few modes"]
+            )
         return np.arange(1, d // prod(cells_of(c.system)) + 1)
     count = COUNT if count is None and d > MOST_DENSE else count
     if count is None or 2 * count + fixed >= d:
@@ -235,7 +307,8 @@ def _numbers(c: Coordinates, count: int | None, gamma: bool) -> np.ndarray:
 
 
 def _last_temperature(scene: MolecularScene) -> float:
-    """The temperature at the end of the last stage that sets one, K; without one the one of the start, or 0."""
+    """The temperature at the end of the last stage that sets one, K; without one the one of the
+    start, or 0."""
     temperature = scene.start.temperature_K or 0.0
     for stage in scene.stages:
         temperature = stage.temperatures[1] or temperature
@@ -243,10 +316,15 @@ def _last_temperature(scene: MolecularScene) -> float:
 
 
 def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, float, float, str]:
-    """Move a state to a minimum, in place, or check that it is one: energy, largest force and torque (kJ/mol, Å), and
-    why the minimisation stopped before the rounding of forces, if it did."""
+    """Move a state to a minimum, in place, or check that it is one: energy, largest force and
+    torque (kJ/mol, Å), and why the minimisation stopped before the rounding of forces, if it
+    did."""
     loose = Stage(ensemble="minimise")
-    enthalpy, keys, ended = Enthalpy(system, loose, state), ("force_limit_kJ_mol_A", "torque_limit_kJ_mol"), ""
+    enthalpy, keys, ended = (
+        Enthalpy(system, loose, state),
+        ("force_limit_kJ_mol_A", "torque_limit_kJ_mol"),
+        "",
+    )
     if minimise:
         find_minimum(system, state, loose)
     stiff = _stiffness(enthalpy, system, state)
@@ -263,25 +341,31 @@ def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, 
     why = f"the minimisation ended there ({ended}); {SMOOTH}"
     advice = why if minimise else f"leave out --no-minimise, or begin with {stage}"
     raise SimulationError(
-        f"this is not a minimum of the energy: the largest force is {force:.3g} kJ/(mol Å), the largest torque "
-        f"{torque:.3g} kJ/mol; {advice}"
+        f"this is not a minimum of the energy: the largest force is {force:.3g} kJ/(mol Å), the"
+        f" largest torque {torque:.3g} kJ/mol; {advice}"
     )
 
 
 def _stiffness(enthalpy: Enthalpy, system: System, state: State) -> float:
-    """The force, kJ/(mol Å), with which the stiffest motion opposes a displacement by the smallest diameter; at least
-    the deepest well over this diameter, as far from each other molecules hardly attract. Raises SimulationError."""
+    """The force, kJ/(mol Å), with which the stiffest motion opposes a displacement by the smallest
+    diameter; at least the deepest well over this diameter, as far from each other molecules hardly
+    attract. Raises SimulationError."""
     fastest = stiffest_mode(system, state, enthalpy.engine) if enthalpy.free.any() else None
     if fastest is None:
-        raise SimulationError("no force holds these molecules at their positions: they have no normal modes")
+        raise SimulationError(
+            "no force holds these molecules at their positions: they have no normal modes"
+        )
     mass = float(system.model.mass[system.model.species[enthalpy.free]].min())
     deepest = max((float(m.epsilon.max()) for m in system.species), default=0.0)
     diameter = system.smallest_diameter
     return max(fastest.rate**2 * mass * diameter, deepest / diameter) / KJ_PER_MOL
 
 
-def _all_modes(c: Coordinates, progress: Callable[[float], object]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """w² (d,), modes (d, d) and the error of w² (d,): the asymmetry of the Hessian, or its error on a vector."""
+def _all_modes(
+    c: Coordinates, progress: Callable[[float], object]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """w² (d,), modes (d, d) and the error of w² (d,): the asymmetry of the Hessian, or its error on
+    a vector."""
     hessian = np.eye(len(c.index))
     for k, unit in enumerate(hessian):
         hessian[k] = c.curvature(unit)
@@ -295,20 +379,24 @@ def _all_modes(c: Coordinates, progress: Callable[[float], object]) -> tuple[np.
 def _periodic_modes(
     c: Coordinates, basis: np.ndarray, progress: Callable[[float], object]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same in the space of a basis (d, k), which the Hessian must not leave: what does is an error too."""
+    """The same in the space of a basis (d, k), which the Hessian must not leave: what does is an
+    error too."""
     images = []
     for k, unit in enumerate(basis.T):
         images.append(c.curvature(unit))
         progress((k + 1) / basis.shape[1])
     image = np.array(images).T
     hessian = basis.T @ image
-    error = max(np.abs(hessian - hessian.T).max(), np.linalg.norm(image - basis @ hessian, axis=0).max())
+    error = max(
+        np.abs(hessian - hessian.T).max(), np.linalg.norm(image - basis @ hessian, axis=0).max()
+    )
     square, vector = np.linalg.eigh((hessian + hessian.T) / 2)
     return square, (basis @ vector).T, np.full(len(square), error)
 
 
 def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of uniform translations and of the lowest and highest modes, by Lanczos; errors by residuals."""
+    """The same of uniform translations and of the lowest and highest modes, by Lanczos; errors by
+    residuals."""
     shape, size = (len(c.index),) * 2, min(len(c.index), max(2 * count + 1, KRYLOV))
     start = c.relative(np.random.default_rng(0).standard_normal(len(c.index)))
 
@@ -318,41 +406,79 @@ def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np
 
     high = largest(c.curvature)
     top = max(q @ c.curvature(q) for q in high)
-    low = largest(lambda q: c.relative(top * q) - c.curvature(q))  # w² near 0 would converge to a fraction of itself
+    low = largest(
+        lambda q: c.relative(top * q) - c.curvature(q)
+    )  # w² near 0 would converge to a fraction of itself
     vector = np.concatenate([c.translations, low, high])
     image = np.concatenate([0 * c.translations, [c.curvature(q) for q in (*low, *high)]])
     square = (vector * image).sum(axis=1)
     order = square.argsort(kind="stable")
-    return square[order], vector[order], np.linalg.norm(image - square[:, None] * vector, axis=1)[order]
+    return (
+        square[order],
+        vector[order],
+        np.linalg.norm(image - square[:, None] * vector, axis=1)[order],
+    )
 
 
 def animation_files(scene: MolecularScene | BodyScene) -> list[str]:
     """Names of the files of `write_animation`. Raises SceneError without a trajectory."""
     output = scene.output
     if not output.trajectory:
-        raise SceneError(scene.source, ["an animation needs a trajectory, and output.trajectory is false"])
-    return [SCENE, *input_names(scene).values(), str(output.topology), output.trajectory, LOG, SUMMARY]
+        raise SceneError(
+            scene.source, ["an animation needs a trajectory, and output.trajectory is false"]
+        )
+    return [
+        SCENE,
+        *input_names(scene).values(),
+        str(output.topology),
+        output.trajectory,
+        LOG,
+        SUMMARY,
+    ]
 
 
 def write_animation(folder: Path, found: NormalModes, number: int) -> None:
-    """Write the harmonic motion along a mode, at rest in each frame, with its energies, as a run for `view`."""
-    from rigidmd.io.trajectory import open_trajectory, write_topology  # MDAnalysis is slow to import
+    """Write the harmonic motion along a mode, at rest in each frame, with its energies, as a run
+    for `view`."""
+    from rigidmd.io.trajectory import (  # MDAnalysis is slow to import
+        open_trajectory,
+        write_topology,
+    )
 
-    c, system, scene, output = found.coordinates, found.system, found.system.scene, found.system.scene.output
+    c, system, scene, output = (
+        found.coordinates,
+        found.system,
+        found.system.scene,
+        found.system.scene.output,
+    )
     if not found.is_vibration(number):
-        raise SceneError(scene.source, [f"mode {number} is not a vibration that was computed, and has no animation"])
+        raise SceneError(
+            scene.source,
+            [f"mode {number} is not a vibration that was computed, and has no animation"],
+        )
     k = int(np.flatnonzero(found.number == number)[0])
-    period, q = 2 * pi / abs(found.rate[k]), AMPLITUDE / np.abs(c.scale * found.vector[k]).max() * found.vector[k]
+    period, q = (
+        2 * pi / abs(found.rate[k]),
+        AMPLITUDE / np.abs(c.scale * found.vector[k]).max() * found.vector[k],
+    )
     write_scene(folder, scene)
     write_topology(folder / output.topology, system, c.state, False)
     log = Log(folder / LOG, False, None, tuple(system.user_terms))
     frames = open_trajectory(folder / str(output.trajectory), system, period / FRAMES, False, False)
     for step in range(PERIODS * FRAMES + 1):
         state, time = c.at(np.cos(2 * pi * step / FRAMES) * q), period * step / FRAMES
-        state.velocity[:], state.angular_momentum_body[:], state.time[NOW], state.step[NOW] = 0, 0, time, step
+        state.velocity[:], state.angular_momentum_body[:], state.time[NOW], state.step[NOW] = (
+            0,
+            0,
+            time,
+            step,
+        )
         frames.write(state, time, step)
         log.write(observe(system, c.enthalpy.engine, state, len(scene.stages) - 1).sample)
     frames.close()
     log.close()
-    note = f"mode {number}, {found.wavenumber[k]:.4g} cm⁻¹: harmonic motion by up to {AMPLITUDE:g} Å, not a run"
+    note = (
+        f"mode {number}, {found.wavenumber[k]:.4g} cm⁻¹: harmonic motion by up to {AMPLITUDE:g} Å,"
+        " not a run"
+    )
     write_json(folder / SUMMARY, {"notes": [note]})

@@ -1,4 +1,5 @@
-"""Reading of the folder of a run or of a sweep as results. Nothing is written, locked or computed."""
+"""Reading of the folder of a run or of a sweep as results. Nothing is written, locked or
+computed."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -20,17 +21,19 @@ from rigidmd.studies.sweep.table import Table, table_of
 
 
 def read_run(folder: str | Path) -> Results | Table:
-    """Open the folder of a run, ended or not, or of a sweep. Nothing is written, locked or computed.
+    """Open the folder of a run, ended or not, or of a sweep. Nothing is written, locked or
+    computed.
 
     results = rigidmd.read_run("runs/water")
     print(results["temperature"].mean(), results.summary, rigidmd.analysis.rdf(results, "OW", "OW"))
     table = rigidmd.read_run("runs/water-sweep")
     several = [rigidmd.read_run(path) for path in table.runs.values()]
 
-    A run gives the `Results` that `Simulation.run` returned, with three differences. Columns that log.csv does not have
-    are NaN. The last frame of `results.atoms` has no forces, because nothing is computed. A run that has not ended has
-    results so far: its summary has only `interrupted`, `notes` and an empty `stages`, its state is the one of the last
-    checkpoint. A sweep gives the `Table` that `rigidmd.sweep` returned, with the points that have finished.
+    A run gives the `Results` that `Simulation.run` returned, with three differences. Columns that
+    log.csv does not have are NaN. The last frame of `results.atoms` has no forces, because nothing
+    is computed. A run that has not ended has results so far: its summary has only `interrupted`,
+    `notes` and an empty `stages`, its state is the one of the last checkpoint. A sweep gives the
+    `Table` that `rigidmd.sweep` returned, with the points that have finished.
 
     Raises OutputError if the folder has no run, or a damaged one.
     """
@@ -61,20 +64,27 @@ def _results_of(record: Record) -> Results:
         samples = record.log
     results = Results(record.system, state, samples, summary | {"notes": notes})
     results.files = [path for name in names if (path := record.folder / name).is_file()]
-    results.interrupted, results._is_stored, results._no_state = bool(summary["interrupted"]), True, problem
+    results.interrupted, results._is_stored, results._no_state = (
+        bool(summary["interrupted"]),
+        True,
+        problem,
+    )
     if record.scene.output.trajectory:
         results._frames = StoredFrames(record)
     return results
 
 
 def _state_of(record: Record) -> tuple[State | None, str]:
-    """The final state of a run, or the state of its last checkpoint; if there is none, None and why."""
+    """The final state of a run, or the state of its last checkpoint; if there is none, None and
+    why."""
     path, start = record.folder / FINAL, record.system.state
     try:
         if record.summary is not None and path.is_file():
             found = read_state(path).state
             if found.position.shape != start.position.shape:
-                raise ValueError(f"{path} is of {len(found.position)} molecules, not of {len(start.position)}")
+                raise ValueError(
+                    f"{path} is of {len(found.position)} molecules, not of {len(start.position)}"
+                )
             return found, ""
         arrays = latest(record.folder)[0].of("state").arrays
         return state_from(arrays, start._replace(extra_variables=arrays["bath"]), exact=False), ""
@@ -83,7 +93,8 @@ def _state_of(record: Record) -> tuple[State | None, str]:
 
 
 class StoredFrames(Sequence[Frame]):
-    """The frames of a trajectory file, of which only the times are read, when they are first needed."""
+    """The frames of a trajectory file, of which only the times are read, when they are first
+    needed."""
 
     def __init__(self, record: Record):
         self._record = record

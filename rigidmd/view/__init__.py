@@ -1,4 +1,5 @@
-"""Pictures of finished runs: pages, animations, notebook display. `rigidmd.view.plot(results, "energy")`."""
+"""Pictures of finished runs: pages, animations, notebook display. `rigidmd.view.plot(results,
+"energy")`."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING

@@ -1,4 +1,5 @@
-"""Animations of runs as files, which `rigidmd film` writes: .mp4 by ffmpeg, .gif by Pillow, frames by Matplotlib."""
+"""Animations of runs as files, which `rigidmd film` writes: .mp4 by ffmpeg, .gif by Pillow, frames
+by Matplotlib."""
 
 import contextlib
 import importlib
@@ -17,8 +18,8 @@ from rigidmd.view import plots
 from rigidmd.view.run_page import animation_of
 
 EXTENSIONS = (".mp4", ".gif")
-#: Frames per second, length in seconds, and height in pixels of an animation; inches of its picture. A frame of a .gif
-#: lasts a whole number of hundredths of a second.
+#: Frames per second, length in seconds, and height in pixels of an animation; inches of its
+#: picture. A frame of a .gif lasts a whole number of hundredths of a second.
 RATE, SECONDS, HEIGHT = {".mp4": 25, ".gif": 12.5}, 10.0, {".mp4": 640, ".gif": 448}
 INCHES = 6.4
 #: Most panels next to an animation.
@@ -31,7 +32,9 @@ def ffmpeg() -> str | None:
     """The program that writes .mp4, on the path or in the package imageio-ffmpeg, or None."""
     if found := shutil.which("ffmpeg"):
         return found
-    with contextlib.suppress(ImportError, RuntimeError):  # RuntimeError: the package without its program
+    with contextlib.suppress(
+        ImportError, RuntimeError
+    ):  # RuntimeError: the package without its program
         return importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
     return None
 
@@ -42,10 +45,15 @@ def default_name() -> str:
 
 
 def write_film(
-    folder: Path, path: Path, seconds: float = SECONDS, with_plots: bool = False, height: int | None = None,
+    folder: Path,
+    path: Path,
+    seconds: float = SECONDS,
+    with_plots: bool = False,
+    height: int | None = None,
     progress: Callable[[float], object] = lambda fraction: None,
-) -> tuple[Path, list[str]]:  # fmt: skip
-    """Write the animation of the run in a folder. Returns its path, and notes on it. Raises OutputError.
+) -> tuple[Path, list[str]]:
+    """Write the animation of the run in a folder. Returns its path, and notes on it. Raises
+    OutputError.
 
     seconds : its length; height : pixels, made even; progress : called with the fraction done
     """
@@ -72,11 +80,23 @@ def write_film(
     count = max(2, round(seconds * rate))
     digits = int(np.clip(2 - np.floor(np.log10((end - begin) or 1.0)), 0, 6))
     kind = FFMpegWriter if path.suffix == ".mp4" else PillowWriter
-    options = {"codec": "h264", "extra_args": ["-pix_fmt", "yuv420p", "-crf", "20"]} if path.suffix == ".mp4" else {}
+    options = (
+        {"codec": "h264", "extra_args": ["-pix_fmt", "yuv420p", "-crf", "20"]}
+        if path.suffix == ".mp4"
+        else {}
+    )
     writer = kind(fps=rate, **options)
     times = np.linspace(begin, end, count)
-    notes = [*record.missing, *animation.notes, *notes, *animation.film_notes(times[1] - times[0], seconds)]
-    with atomic_file(path) as temporary, rc_context({"animation.ffmpeg_path": ffmpeg() or "ffmpeg"}):
+    notes = [
+        *record.missing,
+        *animation.notes,
+        *notes,
+        *animation.film_notes(times[1] - times[0], seconds),
+    ]
+    with (
+        atomic_file(path) as temporary,
+        rc_context({"animation.ffmpeg_path": ffmpeg() or "ffmpeg"}),
+    ):
         try:
             with writer.saving(figure, str(temporary), figure.dpi):
                 for k, time in enumerate(times):
@@ -91,11 +111,15 @@ def write_film(
                     progress((k + 1) / count)
         except (RuntimeError, ValueError) as error:
             raise OutputError(f"{path} cannot be written: {error}") from None
-    return path, [*notes, f"{seconds:g} s of animation: {(end - begin) / seconds:.3g} {record.time_unit} per second"]
+    return path, [
+        *notes,
+        f"{seconds:g} s of animation: {(end - begin) / seconds:.3g} {record.time_unit} per second",
+    ]
 
 
 def _draw_panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:
-    """Put the first plots of the run next to the picture, as an image. Returns (cursor line, axis) of each."""
+    """Put the first plots of the run next to the picture, as an image. Returns (cursor line, axis)
+    of each."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.lines import Line2D
 
@@ -105,12 +129,16 @@ def _draw_panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:
     found = []
     for k, panel in enumerate(panels):
         height = 0.94 / len(panels)
-        axis = still.add_axes((left + 0.06, 0.98 - height * (k + 1) + 0.07, 0.86 - left, height - 0.11))
+        axis = still.add_axes(
+            (left + 0.06, 0.98 - height * (k + 1) + 0.07, 0.86 - left, height - 0.11)
+        )
         plots.draw_panel(axis, record, panel)
         axis.set_title(panel.title, loc="left", fontsize=9, color=INK, x=-0.06)
         if k == len(panels) - 1:
             axis.set_xlabel(f"time ({record.time_unit})", fontsize=8, color=INK)
-        cursor = Line2D([0, 0], axis.get_position().intervaly, color=WARM, lw=1.2, transform=figure.transFigure)
+        cursor = Line2D(
+            [0, 0], axis.get_position().intervaly, color=WARM, lw=1.2, transform=figure.transFigure
+        )
         found.append((figure.add_artist(cursor), axis))
     canvas.draw()
     figure.figimage(np.asarray(canvas.buffer_rgba()), zorder=-1)

@@ -1,11 +1,23 @@
-"""The animation of a single body: its data in units of the picture, for pages and files, and drawing by Matplotlib."""
+"""The animation of a single body: its data in units of the picture, for pages and files, and
+drawing by Matplotlib."""
 
 import html
 
 import numpy as np
 
 from rigidmd.engines.body_motion import drawn_axis
-from rigidmd.figures.style import COOL, FAINT, INK, UP, WARM, camera, draw_front_and_back, draw_scale, globe, thin_path
+from rigidmd.figures.style import (
+    COOL,
+    FAINT,
+    INK,
+    UP,
+    WARM,
+    camera,
+    draw_front_and_back,
+    draw_scale,
+    globe,
+    thin_path,
+)
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run.record import Record
 from rigidmd.view.mesh import mesh_of
@@ -13,11 +25,13 @@ from rigidmd.view.page import PagePart, read_asset
 
 #: Most samples of an animation, most points of the drawn path.
 MOST_SAMPLES, MOST_POINTS = 20_000, 3000
-#: Radius of the sphere around a body, in its reach; least fraction of the picture that a moving body fills.
+#: Radius of the sphere around a body, in its reach; least fraction of the picture that a moving
+#: body fills.
 SPHERE, MIN_BODY_FRACTION = 1.2, 0.07
 #: A body whose centre moves by less than this fraction of its reach is drawn at rest.
 FIXED_FRACTION = 0.05
-#: Length of the longest L and omega, and of gravity, in radii of the sphere (True) or in the unit of the picture.
+#: Length of the longest L and omega, and of gravity, in radii of the sphere (True) or in the unit
+#: of the picture.
 VECTOR_LENGTH, GRAVITY_LENGTH = {True: 1.0, False: 0.45}, {True: 0.45, False: 0.3}
 #: Height of the eye above the horizon, rad; colours of a body's sides, painted or not.
 LIFT = 0.35
@@ -30,7 +44,8 @@ VECTORS = {
 ARROW = {"arrowstyle": "-|>,head_width=0.25,head_length=0.5", "lw": 2, "shrinkA": 0, "shrinkB": 0}
 #: Rotations between two frames beyond which a body seems to rotate backwards.
 MAX_ROTATION = 0.5
-#: Differences of Q (rad), and of velocities and position, in their largest values, at which a motion has returned.
+#: Differences of Q (rad), and of velocities and position, in their largest values, at which a
+#: motion has returned.
 RETURN_ANGLE, RETURN_FRACTION = 0.03, 0.02
 #: As a fraction of these: a motion that returns to what a picture can show. Others nearly return.
 EXACT_RETURN = 0.02
@@ -39,9 +54,10 @@ EXACT_RETURN = 0.02
 class BodyAnimation:
     """Lengths are in units of the picture's half width, about its centre; (t,) samples.
 
-    position (t, 3) : of the pivot or the centre of mass; centre (3,) : centre of mass in the body's axes
-    quaternion (t, 4) : w, x, y, z, without jumps of sign; angles (t, 3) : phi, theta, psi, degrees; empty for a point
-    path (p, 3) and when (p,) : the body axis on the sphere, or the centre of mass; sphere : its radius, 0 without one
+    position (t, 3) : of the pivot or the centre of mass; centre (3,) : centre of mass in the body's
+    axes quaternion (t, 4) : w, x, y, z, without jumps of sign; angles (t, 3) : phi, theta, psi,
+    degrees; empty for a point path (p, 3) and when (p,) : the body axis on the sphere, or the
+    centre of mass; sphere : its radius, 0 without one
     vectors : name -> (t, 3), and largest : name -> largest size with its unit; gravity (3,) or None
     unit : of the picture, m; azimuth : of the eye, rad; notes : on thinning and enlargement
     """
@@ -52,7 +68,9 @@ class BodyAnimation:
         stride = -(-count // MOST_SAMPLES)
         rows = np.arange(0, count, stride)
         self.time = record.time[rows]
-        self.notes = [f"{len(rows)} of {count} samples are shown: every {stride}th."] if stride > 1 else []
+        self.notes = (
+            [f"{len(rows)} of {count} samples are shown: every {stride}th."] if stride > 1 else []
+        )
         mesh = mesh_of(system)
         self.notes.append(f"The body is drawn as {mesh.about}.")
 
@@ -72,13 +90,20 @@ class BodyAnimation:
             self.unit = 1.05 * extent + mesh.reach * enlarged
             self.position = path = (position - middle) / self.unit
             if turns and enlarged > 1:
-                self.notes.append(f"The body is drawn {enlarged:.3g} times as large as it is relative to its path.")
+                self.notes.append(
+                    f"The body is drawn {enlarged:.3g} times as large as it is relative to its"
+                    " path."
+                )
         else:
             self.unit, self.position = 1.08 * radius, np.zeros_like(position)
-            turned = [sum(seen[f"q{i}{j + 1}"][rows] * self.axis[j] for j in range(3)) for i in (1, 2, 3)]
+            turned = [
+                sum(seen[f"q{i}{j + 1}"][rows] * self.axis[j] for j in range(3)) for i in (1, 2, 3)
+            ]
             path = radius / self.unit * np.stack(turned, axis=-1)
         self.sphere = 0.0 if moves else radius / self.unit
-        self.quaternion = of("qw", "qx", "qy", "qz") if turns else np.tile([1.0, 0, 0, 0], (len(rows), 1))
+        self.quaternion = (
+            of("qw", "qx", "qy", "qz") if turns else np.tile([1.0, 0, 0, 0], (len(rows), 1))
+        )
         shown = thin_path(path, MOST_POINTS)
         self.path, self.when = path[shown], self.time[shown]
         self.vectors, self.largest = {}, {}
@@ -89,15 +114,25 @@ class BodyAnimation:
                 if longest > 0:
                     scale = VECTOR_LENGTH[not moves] * (self.sphere or 1.0) / longest
                     self.vectors[name], self.largest[name] = scale * found, f"{longest:.4g} {size}"
-        gravity = np.array(system.scene.gravity.acceleration_m_s2 if system.scene.gravity else np.zeros(3), float)
-        self.gravity = GRAVITY_LENGTH[not moves] * gravity / np.linalg.norm(gravity) if gravity.any() else None
+        gravity = np.array(
+            system.scene.gravity.acceleration_m_s2 if system.scene.gravity else np.zeros(3), float
+        )
+        self.gravity = (
+            GRAVITY_LENGTH[not moves] * gravity / np.linalg.norm(gravity) if gravity.any() else None
+        )
         self.angles = np.degrees(of("phi", "theta", "psi")) if turns else np.empty(0)
-        self.azimuth = float(np.arctan2(path[0, 1], path[0, 0])) - 0.6 if np.hypot(*path[0, :2]) > 1e-9 else 0.6
+        self.azimuth = (
+            float(np.arctan2(path[0, 1], path[0, 0])) - 0.6
+            if np.hypot(*path[0, :2]) > 1e-9
+            else 0.6
+        )
         self.mesh = mesh._replace(vertices=mesh.vertices * enlarged / self.unit)
         self.centre, self.pinned = system.centre * enlarged / self.unit, not system.translates
         level = np.array([np.cos(self.azimuth), np.sin(self.azimuth), 0.0])
         self._view = camera(np.cos(LIFT) * level + np.sin(LIFT) * UP, UP)
-        self._rings = self.sphere * np.concatenate([np.vstack([ring, np.full(3, np.nan)]) for ring in globe()])
+        self._rings = self.sphere * np.concatenate(
+            [np.vstack([ring, np.full(3, np.nan)]) for ring in globe()]
+        )
 
     def draw(self, axes, time: float) -> None:
         """Draw a time into axes, which are cleared."""
@@ -121,19 +156,40 @@ class BodyAnimation:
             ):
                 draw_front_and_back(axes, curve, view, curve @ view[2], alphas, **style)
             toward = float(view[2] @ tip) >= 0
-            axes.plot(*(view[:2] @ tip), "o", color=WARM, ms=6, alpha=1.0 if toward else 0.4, zorder=5 if toward else 1)
+            axes.plot(
+                *(view[:2] @ tip),
+                "o",
+                color=WARM,
+                ms=6,
+                alpha=1.0 if toward else 0.4,
+                zorder=5 if toward else 1,
+            )
         else:
             axes.plot(*(self.path @ view[:2].T).T, color=COOL, lw=0.9, alpha=0.3, zorder=1)
-            axes.plot(*(np.concatenate([past, origin[None]]) @ view[:2].T).T, color=COOL, lw=1.7, zorder=1)
+            axes.plot(
+                *(np.concatenate([past, origin[None]]) @ view[:2].T).T, color=COOL, lw=1.7, zorder=1
+            )
         self._faces(axes, rotation, origin)
         if self.pinned:
             ends = np.stack([origin, centre]) @ view[:2].T
             if not self.mesh.stem:
-                axes.plot(*ends.T, color=INK, lw=2.2, zorder=2.5 if view[2] @ (centre - origin) < 0 else 1.5)
+                axes.plot(
+                    *ends.T,
+                    color=INK,
+                    lw=2.2,
+                    zorder=2.5 if view[2] @ (centre - origin) < 0 else 1.5,
+                )
             axes.plot(*ends[0], "o", color=INK, ms=5, zorder=2.5)
         for name, values in self.vectors.items():
             vector = np.array([np.interp(time, self.time, values[:, k]) for k in range(3)])
-            self._arrow(axes, origin if self.pinned else centre, vector, VECTORS[name][2], name, VECTORS[name][4])
+            self._arrow(
+                axes,
+                origin if self.pinned else centre,
+                vector,
+                VECTORS[name][2],
+                name,
+                VECTORS[name][4],
+            )
         if self.gravity is not None:
             self._arrow(axes, centre, self.gravity, INK, "g")
         length = 10.0 ** np.floor(np.log10(0.6 * self.unit))
@@ -148,14 +204,18 @@ class BodyAnimation:
         angle = np.arccos(np.clip(a @ b, -1, 1))
         mixed = (1 - fraction) * a + fraction * b
         if angle > 1e-4:
-            mixed = (np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b) / np.sin(angle)
+            mixed = (np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b) / np.sin(
+                angle
+            )
         position = (1 - fraction) * self.position[high - 1] + fraction * self.position[high]
         return from_quaternion(mixed / np.linalg.norm(mixed)), position
 
     def _faces(self, axes, rotation: np.ndarray, origin: np.ndarray) -> None:
         from matplotlib.collections import PolyCollection
 
-        seen = (self.mesh.vertices @ rotation.T + origin) @ self._view.T  # right, up, towards the eye
+        seen = (
+            self.mesh.vertices @ rotation.T + origin
+        ) @ self._view.T  # right, up, towards the eye
         light = np.array([-0.5, 0.65, 0.55])
         shown = []
         for face, painted in zip(self.mesh.faces, self.mesh.painted, strict=True):
@@ -169,7 +229,9 @@ class BodyAnimation:
         style = {"facecolors": colors, "edgecolors": colors, "lw": 0.5, "zorder": 2}
         axes.add_collection(PolyCollection([flat for _, flat, _ in shown], **style))
 
-    def _arrow(self, axes, start: np.ndarray, vector: np.ndarray, color: str, name: str, side: float = 0.0) -> None:
+    def _arrow(
+        self, axes, start: np.ndarray, vector: np.ndarray, color: str, name: str, side: float = 0.0
+    ) -> None:
         tail, tip = (self._view[:2] @ point for point in (start, start + vector))
         size = float(np.linalg.norm(tip - tail))
         if size < 0.02:
@@ -177,11 +239,19 @@ class BodyAnimation:
         axes.annotate("", tip, xytext=tail, arrowprops=ARROW | {"color": color}, zorder=4)
         along = (tip - tail) / size
         label = tip + 0.06 * along + side * np.array([-along[1], along[0]])
-        style = {"fontsize": 13, "style": "italic", "weight": "bold", "ha": "center", "va": "center", "zorder": 4}
+        style = {
+            "fontsize": 13,
+            "style": "italic",
+            "weight": "bold",
+            "ha": "center",
+            "va": "center",
+            "zorder": 4,
+        }
         axes.text(*label, name, color=color, **style)
 
     def loop_end(self) -> tuple[float, list[str]]:
-        """End of an animation, and a note: the last return of the motion to its start, to repeat it without a jump."""
+        """End of an animation, and a note: the last return of the motion to its start, to repeat it
+        without a jump."""
         dots = np.abs(self.quaternion @ self.quaternion[0]).clip(0, 1)
         away = [2 * np.arccos(dots) / RETURN_ANGLE]
         for values in (*self.vectors.values(), self.position):
@@ -193,9 +263,15 @@ class BodyAnimation:
         back = np.flatnonzero((off < 1) & (np.arange(len(off)) > left[0])) if len(left) else left
         if len(back) == 0:
             return float(self.time[-1]), []
-        near = back[np.searchsorted(back, back[-1] - 0.1 * len(off)) :]  # the best of the last returns
+        near = back[
+            np.searchsorted(back, back[-1] - 0.1 * len(off)) :
+        ]  # the best of the last returns
         end = float(self.time[near[off[near].argmin()]])
-        how = "returns to its start" if off[near].min() < EXACT_RETURN else "nearly returns to its start"
+        how = (
+            "returns to its start"
+            if off[near].min() < EXACT_RETURN
+            else "nearly returns to its start"
+        )
         return end, [f"The motion {how} at {end:.6g} s, where the animation ends."]
 
     def film_notes(self, interval: float, seconds: float) -> list[str]:
@@ -204,28 +280,56 @@ class BodyAnimation:
             return []
         size = np.linalg.norm([self._record.columns[f"omega_lab_{k}"] for k in "xyz"], axis=0)
         turns = float(size.max() * interval / (2 * np.pi))
-        note = f"The body rotates up to {turns:.2g} times between two frames, so that it may seem to stand or to rotate"
-        note += f" backwards: an animation of {seconds * turns / MAX_ROTATION:.3g} s shows its rotation."
+        note = (
+            f"The body rotates up to {turns:.2g} times between two frames, so that it may seem to"
+            " stand or to rotate"
+        )
+        note += (
+            f" backwards: an animation of {seconds * turns / MAX_ROTATION:.3g} s shows its"
+            " rotation."
+        )
         return [note] if turns > MAX_ROTATION else []
 
     def page_part(self) -> PagePart:
-        short = lambda values: values.astype("<f4")  # noqa: E731
+        def short(values):
+            return values.astype("<f4")
+
         data = {
-            "time": self.time, "quaternion": short(self.quaternion), "position": short(self.position),
-            "path": short(self.path), "when": self.when, "angles": short(self.angles) if self.angles.size else None,
+            "time": self.time,
+            "quaternion": short(self.quaternion),
+            "position": short(self.position),
+            "path": short(self.path),
+            "when": self.when,
+            "angles": short(self.angles) if self.angles.size else None,
             "vectors": {name: short(values) for name, values in self.vectors.items()},
             "gravity": None if self.gravity is None else self.gravity.tolist(),
-            "vertices": self.mesh.vertices.round(6).tolist(), "faces": self.mesh.faces, "painted": self.mesh.painted,
-            "sphere": self.sphere, "axis": self.axis.tolist(), "centre": self.centre.tolist(), "pinned": self.pinned,
-            "rod": not self.mesh.stem, "unit": self.unit, "azimuth": self.azimuth,
-        }  # fmt: skip
-        chips = [(VECTORS[name][2], f"{VECTORS[name][3]}, at most {most}") for name, most in self.largest.items()]
+            "vertices": self.mesh.vertices.round(6).tolist(),
+            "faces": self.mesh.faces,
+            "painted": self.mesh.painted,
+            "sphere": self.sphere,
+            "axis": self.axis.tolist(),
+            "centre": self.centre.tolist(),
+            "pinned": self.pinned,
+            "rod": not self.mesh.stem,
+            "unit": self.unit,
+            "azimuth": self.azimuth,
+        }
+        chips = [
+            (VECTORS[name][2], f"{VECTORS[name][3]}, at most {most}")
+            for name, most in self.largest.items()
+        ]
         chips += [] if self.gravity is None else [("var(--ink)", "gravity g")]
-        trace = "path of the centre of mass" if not self.sphere else "path of the body axis on the sphere"
+        trace = (
+            "path of the centre of mass"
+            if not self.sphere
+            else "path of the body axis on the sphere"
+        )
         chips.append(("var(--cool)", trace))
         chip = '<span><i class="chip" style="background:{}"></i>{}</span>'
         legend = "".join(chip.format(color, html.escape(text)) for color, text in chips)
         usage = "Drag to rotate, wheel or pinch to zoom, double click to reset; space plays."
         usage += " A click on a plot jumps to it."
         picture = '<canvas id="film" role="img" aria-label="film of the body"></canvas>'
-        return PagePart(picture, legend, usage, data, self.notes, [read_asset("film.js"), read_asset("body.js")])
+        return PagePart(
+            picture, legend, usage, data, self.notes, [read_asset("film.js"), read_asset("body.js")]
+        )

@@ -17,7 +17,8 @@ from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
 CIRCLE_CORNERS, MIN_THICKNESS = 24, 0.02
 #: Longest side of a face of joined solids, as a fraction of the body's reach.
 LONGEST_FACE = 0.15
-#: Edges of a cuboid in half axes of the ellipsoid of the same inertia; thickness of a stem in its length.
+#: Edges of a cuboid in half axes of the ellipsoid of the same inertia; thickness of a stem in its
+#: length.
 CUBOID_EDGES, STEM_THICKNESS = (12 / 5) ** 0.5, 0.06
 EQUAL = "of the same mass and inertia"
 
@@ -44,11 +45,17 @@ def mesh_of(system: BodySystem) -> Mesh:
     mass, _, centre, _, _ = inertia_of(scene)
     wanted = scene.output.drawn_as
     if wanted is None and table.points is not None:
-        positions, masses = (np.array([getattr(p, key) for p in table.points]) for key in ("position_m", "mass_kg"))
-        return _points_mesh(positions if table.pinned else positions - masses @ positions / mass, masses)
+        positions, masses = (
+            np.array([getattr(p, key) for p in table.points]) for key in ("position_m", "mass_kg")
+        )
+        return _points_mesh(
+            positions if table.pinned else positions - masses @ positions / mass, masses
+        )
     if isinstance(wanted, Solid):
         stands = wanted.shape == "cone" and table.pinned
-        return _solid_mesh(wanted, np.array([0.0, 0.0, 0.75 * (wanted.height_m or 0.0)]) if stands else centre)
+        return _solid_mesh(
+            wanted, np.array([0.0, 0.0, 0.75 * (wanted.height_m or 0.0)]) if stands else centre
+        )
     if wanted is None and table.solid is not None:
         return _solid_mesh(table.solid, centre)
     if wanted is None and table.solids is not None:
@@ -59,7 +66,8 @@ def mesh_of(system: BodySystem) -> Mesh:
             for surface, part in zip(surfaces, table.solids, strict=True)
         ]
         return _cut(_joined(placed, "its solids"))
-    # a homogeneous body of this mass and inertia: a solid of revolution if two moments are equal, or else a cuboid
+    # a homogeneous body of this mass and inertia: a solid of revolution if two moments are equal,
+    # or else a cuboid
     tensor = inertia_at_centre(scene)
     if not tensor.any():
         return BALL._replace(about="a ball, as it is a point")
@@ -67,11 +75,15 @@ def mesh_of(system: BodySystem) -> Mesh:
     symmetric = axis_of_symmetry(moments)
     if wanted in (None, "top") and symmetric is not None:
         return _top_mesh(mass, moments, axes, symmetric, centre, table.pinned)
-    lengths = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))  # half axes of the ellipsoid
+    lengths = np.sqrt(
+        np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0)
+    )  # half axes of the ellipsoid
     lengths, unit, shape = np.maximum(lengths, MIN_THICKNESS * lengths.max()), BALL, "ellipsoid"
     if wanted != "ellipsoid":
         lengths, unit, shape = CUBOID_EDGES * lengths, CUBOID, "cuboid"
-    return unit._replace(vertices=(unit.vertices * lengths) @ axes.T + centre, about=f"the {shape} {EQUAL}")
+    return unit._replace(
+        vertices=(unit.vertices * lengths) @ axes.T + centre, about=f"the {shape} {EQUAL}"
+    )
 
 
 def _solid_mesh(solid: Solid, position: np.ndarray) -> Mesh:
@@ -80,15 +92,25 @@ def _solid_mesh(solid: Solid, position: np.ndarray) -> Mesh:
         size[axes] = solid.dimensions[name]
     unit = UNITS.get(solid.shape, BALL)
     about = f"{'an' if solid.shape[0] in 'aeiou' else 'a'} {solid.shape}"
-    return unit._replace(vertices=unit.vertices * np.maximum(size, MIN_THICKNESS * size.max()) + position, about=about)
+    return unit._replace(
+        vertices=unit.vertices * np.maximum(size, MIN_THICKNESS * size.max()) + position,
+        about=about,
+    )
 
 
 def _top_mesh(
-    mass: float, moments: np.ndarray, axes: np.ndarray, symmetric: int, centre: np.ndarray, pinned: bool
+    mass: float,
+    moments: np.ndarray,
+    axes: np.ndarray,
+    symmetric: int,
+    centre: np.ndarray,
+    pinned: bool,
 ) -> Mesh:
-    """The homogeneous cylinder, or ball, of these moments, on a stem if its pivot lies on the axis outside of it.
+    """The homogeneous cylinder, or ball, of these moments, on a stem if its pivot lies on the axis
+    outside of it.
 
-    A cylinder has m r²/2 about its axis and m (3 r² + h²)/12 about the others: there is one for any two moments.
+    A cylinder has m r²/2 about its axis and m (3 r² + h²)/12 about the others: there is one for any
+    two moments.
     """
     along, across = moments[symmetric], moments[symmetric - 1]
     far = float(np.linalg.norm(centre))
@@ -100,10 +122,19 @@ def _top_mesh(
         axis = -axis
     if is_ball:
         radius = float(np.sqrt(2.5 * along / mass))
-        half, rings = radius, [(radius * np.sin(a), radius * np.cos(a)) for a in np.linspace(np.pi, 0, 13)]
+        half, rings = (
+            radius,
+            [(radius * np.sin(a), radius * np.cos(a)) for a in np.linspace(np.pi, 0, 13)],
+        )
     else:
-        radius, height = float(np.sqrt(2 * along / mass)), float(np.sqrt(max(12 * across - 6 * along, 0.0) / mass))
-        radius, half = max(radius, MIN_THICKNESS * height), max(height, MIN_THICKNESS * 2 * radius) / 2
+        radius, height = (
+            float(np.sqrt(2 * along / mass)),
+            float(np.sqrt(max(12 * across - 6 * along, 0.0) / mass)),
+        )
+        radius, half = (
+            max(radius, MIN_THICKNESS * height),
+            max(height, MIN_THICKNESS * 2 * radius) / 2,
+        )
         rings = [(radius, -half), (radius, half)]
     about = f"the {'ball' if is_ball else 'cylinder'} {EQUAL}"
     stem = pinned and far > half and float(axis @ centre) > (1 - EQUAL_MOMENTS) * far
@@ -111,7 +142,12 @@ def _top_mesh(
         thick = min(STEM_THICKNESS * far, 0.5 * radius)
         if is_ball:
             rings[0] = (thick, -float(np.sqrt(radius**2 - thick**2)))
-        rings = [(0.0, -far), (thick, min(2 * thick - far, rings[0][1])), (thick, rings[0][1]), *rings[is_ball:]]
+        rings = [
+            (0.0, -far),
+            (thick, min(2 * thick - far, rings[0][1])),
+            (thick, rings[0][1]),
+            *rings[is_ball:],
+        ]
         about += ", on a stem"
     unit = _revolve(rings)
     frame = np.stack([right, np.cross(axis, right), axis])
@@ -159,7 +195,9 @@ def _cut(mesh: Mesh) -> Mesh:
             faces.append(face)
             painted.append(color)
             continue
-        u, v = np.meshgrid(np.linspace(0, 1, along + 1), np.linspace(0, 1, across + 1), indexing="ij")
+        u, v = np.meshgrid(
+            np.linspace(0, 1, along + 1), np.linspace(0, 1, across + 1), indexing="ij"
+        )
         weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=-1)
         first, row = len(vertices), across + 1
         vertices += [*(weights @ corners).reshape(-1, 3)]
@@ -171,13 +209,15 @@ def _cut(mesh: Mesh) -> Mesh:
 
 
 def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:
-    """A solid of revolution about axis 3 from circles (radius, z), from below; a quarter of its side is painted. A
-    `closed` one is a ring, without discs at its ends."""
+    """A solid of revolution about axis 3 from circles (radius, z), from below; a quarter of its
+    side is painted. A `closed` one is a ring, without discs at its ends."""
     n, corner = CIRCLE_CORNERS, np.arange(CIRCLE_CORNERS)
     angle = 2 * np.pi * corner / n
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     vertices = np.concatenate([np.column_stack([r * circle, np.full(n, z)]) for r, z in rings])
-    below = n * np.arange(len(rings) - 1)[:, None]  # the first corner of each strip between two circles
+    below = (
+        n * np.arange(len(rings) - 1)[:, None]
+    )  # the first corner of each strip between two circles
     i, j = below + corner, below + (corner + 1) % n
     faces = np.stack([i, j, j + n, i + n], axis=-1).reshape(-1, 4).tolist()
     painted = (corner < n // 4).tolist() * (len(rings) - 1)
@@ -185,20 +225,32 @@ def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:
         if rings[k][0] > 0 and not closed:
             ends, middle = list(range(k * n, (k + 1) * n)), len(vertices)
             vertices = np.vstack([vertices, [0.0, 0.0, rings[k][1]]])
-            faces += [[middle, *ends[: n // 4 + 1]][::order], [middle, *ends[n // 4 :], ends[0]][::order]]
+            faces += [
+                [middle, *ends[: n // 4 + 1]][::order],
+                [middle, *ends[n // 4 :], ends[0]][::order],
+            ]
             painted += [True, False]
     return Mesh(vertices, faces, painted, "")
 
 
-#: Surfaces of unit size, as `SOLIDS` has them; a sphere and an ellipsoid are balls, and a ring is a thin tube.
+#: Surfaces of unit size, as `SOLIDS` has them; a sphere and an ellipsoid are balls, and a ring is a
+#: thin tube.
 BALL = _revolve([(np.sin(a), np.cos(a)) for a in np.linspace(np.pi, 0, 13)])
 CYLINDER = _revolve([(1.0, -0.5), (1.0, 0.5)])
 CUBOID = Mesh(
     np.array(list(product([-0.5, 0.5], repeat=3))),
-    [[4, 6, 7, 5], [0, 1, 3, 2], [2, 3, 7, 6], [0, 4, 5, 1], [1, 5, 7, 3], [0, 2, 6, 4]], [True] + [False] * 5, "",
-)  # fmt: skip
+    [[4, 6, 7, 5], [0, 1, 3, 2], [2, 3, 7, 6], [0, 4, 5, 1], [1, 5, 7, 3], [0, 2, 6, 4]],
+    [True] + [False] * 5,
+    "",
+)
 UNITS = {
-    "cylinder": CYLINDER, "disk": CYLINDER, "cuboid": CUBOID, "rod": _revolve([(0.5, -0.5), (0.5, 0.5)]),
+    "cylinder": CYLINDER,
+    "disk": CYLINDER,
+    "cuboid": CUBOID,
+    "rod": _revolve([(0.5, -0.5), (0.5, 0.5)]),
     "cone": _revolve([(0.0, -0.75), (1.0, 0.25)]),
-    "ring": _revolve([(1 + 0.06 * np.cos(a), 0.5 * np.sin(a)) for a in [*np.linspace(0, 2 * np.pi, 9)[:8], 0]], True),
-}  # fmt: skip
+    "ring": _revolve(
+        [(1 + 0.06 * np.cos(a), 0.5 * np.sin(a)) for a in [*np.linspace(0, 2 * np.pi, 9)[:8], 0]],
+        True,
+    ),
+}

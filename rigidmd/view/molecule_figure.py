@@ -1,11 +1,11 @@
-"""Molecular models as text, a table of all or one in full, and as a picture: atoms as spheres, Lennard-Jones diameters,
-charges, massless sites, principal axes."""
+"""Molecular models as text, a table of all or one in full, and as a picture: atoms as spheres,
+Lennard-Jones diameters, charges, massless sites, principal axes."""
 
 import re
-import textwrap
 from collections import Counter
 from itertools import combinations
 from pathlib import Path
+from textwrap import shorten, wrap
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,9 @@ def models_table(molecules: list[Molecule]) -> str:
             dipole = f"{m.dipole_debye:.3f}" if m.charges.any() and m.radius > 0 else ""
             charges = " ".join(dict.fromkeys(f"{q:+.4g}" for q in m.charges if q))
             line = f"  {m.name:<19}{len(m.masses):>4}{m.mass:>9.4g}{dipole:>9}  "
-            lines.append(f"{line}{textwrap.shorten(charges, 21, placeholder=' ...'):<22}{short_source(m)}".rstrip())
+            lines.append(
+                f"{line}{shorten(charges, 21, placeholder=' ...'):<22}{short_source(m)}".rstrip()
+            )
         if len(lines) > 1:
             groups.append("\n".join(lines))
     return "\n\n".join(groups)
@@ -49,7 +51,10 @@ def molecule_text(m: Molecule) -> str:
     lines.append(f"  principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
     if m.kind == "linear" and m.charges.any() and not m.charge:
         lines.append(f"  quadrupole along the axis {m.quadrupole_debye_A[0, 0]:+.4f} D Å")
-    columns = "  site   element    mass u       x Å       y Å       z Å   charge e   sigma Å  epsilon kJ/mol        K"
+    columns = (
+        "  site   element    mass u       x Å       y Å       z Å   charge e   sigma Å  epsilon"
+        " kJ/mol        K"
+    )
     lines += ["", columns]
     for i, name in enumerate(m.site_names):
         x, y, z = np.round(m.positions_body[i], 5) + 0.0
@@ -57,16 +62,22 @@ def molecule_text(m: Molecule) -> str:
         element = m.elements[i] if m.elements[i] != "X" else ""
         well = ""
         if m.epsilon[i] > 0:
-            well = f"{m.sigma[i]:>10.6g}{m.epsilon[i] / KJ_PER_MOL:>16.6g}{m.epsilon[i] / BOLTZMANN:>9.5g}"
-        line = f"  {name:<7}{element:<7}{m.masses[i]:>10.4f}{x:>10.5f}{y:>10.5f}{z:>10.5f}{charge:>11}{well}"
+            in_kj, in_kelvin = m.epsilon[i] / KJ_PER_MOL, m.epsilon[i] / BOLTZMANN
+            well = f"{m.sigma[i]:>10.6g}{in_kj:>16.6g}{in_kelvin:>9.5g}"
+        position = f"{x:>10.5f}{y:>10.5f}{z:>10.5f}"
+        line = f"  {name:<7}{element:<7}{m.masses[i]:>10.4f}{position}{charge:>11}{well}"
         lines.append(line.rstrip())
     lines.append("")
     lengths, angles = _geometry(m)
     for name, text in (
-        ("lengths", lengths), ("angles", angles), ("mixing", m.mixing), ("note", m.note), ("source", m.source),
-    ):  # fmt: skip
+        ("lengths", lengths),
+        ("angles", angles),
+        ("mixing", m.mixing),
+        ("note", m.note),
+        ("source", m.source),
+    ):
         if text:
-            lines += textwrap.wrap(text, WIDTH, initial_indent=f"  {name:<8}", subsequent_indent=" " * 10)
+            lines += wrap(text, WIDTH, initial_indent=f"  {name:<8}", subsequent_indent=" " * 10)
     if m.residue_names:
         lines.append(f"  {'called':<8}{' '.join(m.residue_names)} in structure files")
     return "\n".join(lines)
@@ -75,7 +86,10 @@ def molecule_text(m: Molecule) -> str:
 def _geometry(m: Molecule) -> list[str]:
     """Lengths and angles of the links; equal ones are counted."""
     stems = [re.sub(r"(?<=\D)\d+$", "", name) for name in m.site_names]
-    kind = [stem if stems.count(stem) > 1 else name for stem, name in zip(stems, m.site_names, strict=True)]
+    kind = [
+        stem if stems.count(stem) > 1 else name
+        for stem, name in zip(stems, m.site_names, strict=True)
+    ]
     # charges that represent a multipole are left out: the table of sites shows them
     few = (m.masses == 0).sum() <= 2
     links = [(i, j) for i, j in bonds(m) if m.masses[j] > 0 or few]
@@ -86,22 +100,41 @@ def _geometry(m: Molecule) -> list[str]:
             (corner,) = {*one} & {*other}
             a, b = sorted(ends, key=lambda s: kind[s])
             to_a, to_b = distance(m, a, corner), distance(m, b, corner)
-            # an angle between two massless sites on an atom is listed; a site on a bisector is defined by its length
+            # an angle between two massless sites on an atom is listed; a site on a bisector is
+            # defined by its length
             ears = kind[a] == kind[b] and abs(to_a / to_b - 1) < 1e-6
             if ears or m.masses[a] > 0 < m.masses[b]:
                 u, v = (m.positions_body[[a, b]] - m.positions_body[corner]) / [[to_a], [to_b]]
                 angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v))
                 angles[f"{kind[a]}-{kind[corner]}-{kind[b]} {angle:.2f}°"] += 1
-    return [", ".join(w if n == 1 else f"{w} ({n})" for w, n in found.items()) for found in (lengths, angles)]
+    return [
+        ", ".join(w if n == 1 else f"{w} ({n})" for w, n in found.items())
+        for found in (lengths, angles)
+    ]
 
 
 EXTENSIONS = (".png", ".svg", ".pdf")
 #: Colours of the elements, after Corey, Pauling and Koltun, and of all others.
 COLOURS = {
-    "H": "#f0f0f0", "C": "#5a5f66", "N": "#3f63d6", "O": "#d8392f", "F": "#7cc95a", "S": "#e3bf2b", "Cl": "#3fa34d",
-    "Li": "#a374d5", "Na": "#8a4fc9", "K": "#7440b5", "Rb": "#60309c", "Cs": "#4d2384", "Br": "#9c4a2f", "I": "#7a3f8f",
-    "Ne": "#8fd3e0", "Ar": "#6fc1d3", "Kr": "#56a9c0", "Xe": "#3f8fa8",
-}  # fmt: skip
+    "H": "#f0f0f0",
+    "C": "#5a5f66",
+    "N": "#3f63d6",
+    "O": "#d8392f",
+    "F": "#7cc95a",
+    "S": "#e3bf2b",
+    "Cl": "#3fa34d",
+    "Li": "#a374d5",
+    "Na": "#8a4fc9",
+    "K": "#7440b5",
+    "Rb": "#60309c",
+    "Cs": "#4d2384",
+    "Br": "#9c4a2f",
+    "I": "#7a3f8f",
+    "Ne": "#8fd3e0",
+    "Ar": "#6fc1d3",
+    "Kr": "#56a9c0",
+    "Xe": "#3f8fa8",
+}
 OTHER = "#b0b4ba"
 #: Radius of a sphere as a fraction of the covalent radius, or else of the Lennard-Jones diameter.
 OF_COVALENT, OF_DIAMETER, LEAST = 0.62, 0.2, 0.22
@@ -118,18 +151,24 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     view = _view(m)
     seen: Any = m.positions_body @ view.T  # right, up, towards the viewer
     covalent = np.array([COVALENT.get(element, 0.0) for element in m.elements])
-    radius: Any = np.maximum(LEAST, np.where(covalent > 0, OF_COVALENT * covalent, OF_DIAMETER * m.sigma))
+    radius: Any = np.maximum(
+        LEAST, np.where(covalent > 0, OF_COVALENT * covalent, OF_DIAMETER * m.sigma)
+    )
     radius[m.masses == 0] = LEAST / 2
     reach = np.maximum(radius, np.where(m.epsilon > 0, m.sigma / 2, 0.0))
     half = float(1.12 * (np.abs(seen[:, :2]).max(axis=1) + reach).max())
     figure = new_figure(INCHES, INCHES * 1.12, layout=None)
-    axes = figure.add_axes((0.02, 0.02, 0.96, 0.96 / 1.12), aspect="equal", xlim=(-half, half), ylim=(-half, half))
+    axes = figure.add_axes(
+        (0.02, 0.02, 0.96, 0.96 / 1.12), aspect="equal", xlim=(-half, half), ylim=(-half, half)
+    )
     axes.set_axis_off()
     for i in np.flatnonzero(m.epsilon > 0).tolist():
         colour = COLOURS.get(m.elements[i], OTHER) if m.elements[i] != "H" else OTHER
         dashed = {"lw": 0.8, "ls": (0, (4, 3)), "zorder": 1}
         axes.add_patch(Circle(seen[i, :2], m.sigma[i] / 2, fc=colour, alpha=0.07, lw=0, zorder=1))
-        axes.add_patch(Circle(seen[i, :2], m.sigma[i] / 2, fill=False, ec=colour, alpha=0.45, **dashed))
+        axes.add_patch(
+            Circle(seen[i, :2], m.sigma[i] / 2, fill=False, ec=colour, alpha=0.45, **dashed)
+        )
     bonded = _links(axes, m, seen, radius)
     for i in np.argsort(seen[:, 2], kind="stable"):
         _sphere(axes, m, i, seen[i], radius[i])
@@ -142,16 +181,19 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     if m.radius > 0:
         lines.append(f"principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
     legend = [
-        (short_source(m), bool(m.source)), ("charges in e", m.charges.any()),
-        ("discs: Lennard-Jones diameters", (m.epsilon > 0).any()), ("diamonds: massless sites", (m.masses == 0).any()),
-    ]  # fmt: skip
+        (short_source(m), bool(m.source)),
+        ("charges in e", m.charges.any()),
+        ("discs: Lennard-Jones diameters", (m.epsilon > 0).any()),
+        ("diamonds: massless sites", (m.masses == 0).any()),
+    ]
     lines.append("; ".join(text for text, there in legend if there))
     figure.text(0.03, 0.942, "\n".join(lines), fontsize=FONT, linespacing=1.35, **plain)
     save_files(figure, path.with_suffix(""), [path.suffix[1:]])
 
 
 def _view(m: Molecule) -> np.ndarray:
-    """Rotation (3, 3) from the principal frame to right, up and towards the viewer; flat bodies face the viewer."""
+    """Rotation (3, 3) from the principal frame to right, up and towards the viewer; flat bodies
+    face the viewer."""
     if m.planar or m.kind in ("point", "linear"):
         return np.eye(3)
     a, b = np.radians([AZIMUTH, LIFT])
@@ -169,7 +211,13 @@ def _links(axes, m: Molecule, seen: np.ndarray, radius: np.ndarray) -> list[tupl
         along = (seen[j] - seen[i]) / np.linalg.norm(seen[j] - seen[i])
         ends = np.array([seen[i] + 0.9 * radius[i] * along, seen[j] - 0.9 * radius[j] * along])
         for colour, width in (("#8f949b", 7.0), ("#c9cdd2", 4.0)):
-            axes.plot(*ends[:, :2].T, color=colour, lw=width, solid_capstyle="butt", zorder=_order(ends[:, 2].mean()))
+            axes.plot(
+                *ends[:, :2].T,
+                color=colour,
+                lw=width,
+                solid_capstyle="butt",
+                zorder=_order(ends[:, 2].mean()),
+            )
         taken += [(*x, *x) for x in np.linspace(ends[0, :2], ends[1, :2], 12)]
     return taken
 
@@ -184,19 +232,26 @@ def _sphere(axes, m: Molecule, i: int, seen: Any, radius: float) -> None:
     from matplotlib.patches import Circle, RegularPolygon
 
     if m.masses[i] == 0:
-        axes.add_patch(RegularPolygon(seen[:2], 4, radius=radius, fc="white", ec=COOL, lw=1.5, zorder=6.5))
+        axes.add_patch(
+            RegularPolygon(seen[:2], 4, radius=radius, fc="white", ec=COOL, lw=1.5, zorder=6.5)
+        )
         return
     base, steps, order = np.array(to_rgb(COLOURS.get(m.elements[i], OTHER))), 24, _order(seen[2])
     for k in range(steps):
         fraction = k / (steps - 1)  # from the dark rim to the light spot
-        colour = np.clip(base * (0.72 + 0.33 * fraction) + 0.55 * max(0.0, fraction - 0.45) ** 2, 0, 1)
+        colour = np.clip(
+            base * (0.72 + 0.33 * fraction) + 0.55 * max(0.0, fraction - 0.45) ** 2, 0, 1
+        )
         x, y = seen[:2] + fraction * np.array([-0.32 * radius, 0.36 * radius])
-        axes.add_patch(Circle((x, y), radius * (1 - 0.93 * fraction), fc=colour, lw=0, zorder=order))
+        axes.add_patch(
+            Circle((x, y), radius * (1 - 0.93 * fraction), fc=colour, lw=0, zorder=order)
+        )
     axes.add_patch(Circle(seen[:2], radius, fill=False, ec=0.55 * base, lw=0.8, zorder=order))
 
 
 def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tuple]:
-    """Draw arrows along the axes, a ring for one towards the viewer. Returns boxes that labels must not cover."""
+    """Draw arrows along the axes, a ring for one towards the viewer. Returns boxes that labels must
+    not cover."""
     if m.radius == 0:
         return []
     taken = []
@@ -208,19 +263,39 @@ def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tu
             axes.plot(0, 0, marker="o", ms=9, mfc="none", mec=INK, mew=1.0, zorder=7)
             axes.plot(0, 0, marker=".", ms=4, color=INK, zorder=7)
             continue
-        style = {"arrowstyle": "-|>", "color": INK, "lw": 0.9, "alpha": 0.75, "shrinkA": 0, "shrinkB": 0}
+        style = {
+            "arrowstyle": "-|>",
+            "color": INK,
+            "lw": 0.9,
+            "alpha": 0.75,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
         axes.annotate("", tip[:2], (0, 0), arrowprops=style, zorder=3)
         at = tip[:2] + 0.04 * half * tip[:2] / np.linalg.norm(tip[:2])
-        axes.text(*at, str(k + 1), color=INK, fontsize=FONT, ha="center", va="center", style="italic", zorder=8)
+        axes.text(
+            *at,
+            str(k + 1),
+            color=INK,
+            fontsize=FONT,
+            ha="center",
+            va="center",
+            style="italic",
+            zorder=8,
+        )
         taken.append((*(at - 0.03 * half), *(at + 0.03 * half)))
         taken += [(*x, *x) for x in np.linspace(0, 1, 30)[:, None] * tip[:2]]
     return taken
 
 
-def _labels(axes, m: Molecule, centres: np.ndarray, radius: np.ndarray, half: float, taken: list[tuple]) -> None:
+def _labels(
+    axes, m: Molecule, centres: np.ndarray, radius: np.ndarray, half: float, taken: list[tuple]
+) -> None:
     """Draw names and charges in the first free direction, from outward on."""
     height = FONT * 1.25 / 72 * 2 * half / (INCHES * 0.96)
-    for i in sorted(range(len(radius)), key=lambda i: (m.masses[i] > 0, -np.linalg.norm(centres[i]))):
+    for i in sorted(
+        range(len(radius)), key=lambda i: (m.masses[i] > 0, -np.linalg.norm(centres[i]))
+    ):
         text = f"{m.site_names[i]} {m.charges[i]:+.5g}" if m.charges[i] else m.site_names[i]
         size = np.array([0.56 * height * len(text), height])
         x, y = centres[i]
@@ -234,7 +309,9 @@ def _labels(axes, m: Molecule, centres: np.ndarray, radius: np.ndarray, half: fl
                 centre = centres[i] + way * (radius[i] + gap * half) + way * size / 2
                 low, high = centre - size / 2, centre + size / 2
                 cost = ((low < boxes[:, 2:]) & (boxes[:, :2] < high)).all(axis=1).sum()
-                cost += (np.linalg.norm(np.clip(centres, low, high) - centres, axis=1) < radius).sum()
+                cost += (
+                    np.linalg.norm(np.clip(centres, low, high) - centres, axis=1) < radius
+                ).sum()
                 cost += 10 * (np.abs([low, high]).max() > 0.99 * half)
                 if best is None or cost < best[0]:
                     best = (cost, centre, low, high, gap)
@@ -245,5 +322,11 @@ def _labels(axes, m: Molecule, centres: np.ndarray, radius: np.ndarray, half: fl
         if gap > 0.02:
             near = np.clip(centres[i], low, high)
             axes.plot(*np.array([centres[i], near]).T, color=FAINT, lw=0.7, zorder=6.4)
-        style = {"color": INK, "fontsize": FONT, "ha": "center", "va": "center", "parse_math": False}
+        style = {
+            "color": INK,
+            "fontsize": FONT,
+            "ha": "center",
+            "va": "center",
+            "parse_math": False,
+        }
         axes.text(*centre, text, zorder=9, **style)

@@ -1,4 +1,5 @@
-"""The display of scenes, simulations, results (tables and a figure, light or dark) and animations in a notebook."""
+"""The display of scenes, simulations, results (tables and a figure, light or dark) and animations
+in a notebook."""
 
 import html
 from collections.abc import Iterable
@@ -39,11 +40,24 @@ if TYPE_CHECKING:
 
 STYLE = read_asset("notebook.css")
 #: What acts on a body: a table of its scene, and its title.
-ACTING = {"gravity": "gravity", "applied": "applied forces", "friction": "friction", "fluid": "a fluid",
-          "frame": "a moving frame", "wheels": "wheels", "changing_inertia": "changing inertia"}  # fmt: skip
-COULOMB = {"reaction_field": "reaction field", "ewald": "Ewald sum", "pme": "particle mesh Ewald",
-           "damped_shifted_force": "damped shifted force", "coulomb": "Coulomb", "none": "charges ignored",
-           None: "particle mesh Ewald or, without a box, Coulomb"}  # fmt: skip
+ACTING = {
+    "gravity": "gravity",
+    "applied": "applied forces",
+    "friction": "friction",
+    "fluid": "a fluid",
+    "frame": "a moving frame",
+    "wheels": "wheels",
+    "changing_inertia": "changing inertia",
+}
+COULOMB = {
+    "reaction_field": "reaction field",
+    "ewald": "Ewald sum",
+    "pme": "particle mesh Ewald",
+    "damped_shifted_force": "damped shifted force",
+    "coulomb": "Coulomb",
+    "none": "charges ignored",
+    None: "particle mesh Ewald or, without a box, Coulomb",
+}
 USER_FORCES = "user forces"
 
 TableRow = tuple[str, str]
@@ -82,13 +96,19 @@ def results_html(results: Results) -> str:
     left = f"{''.join(text)}{notes(summary['notes'])}"
     name, drawing = next(iter(drawn.items()), ("", None))
     right = _drawing(drawing, f"{results.system.scene.name}-{name}", f"figure: {name}")
-    return framed(results.system.scene.name, results._summary_line, f"{_sides(left, right)}{_columns(results)}")
+    return framed(
+        results.system.scene.name,
+        results._summary_line,
+        f"{_sides(left, right)}{_columns(results)}",
+    )
 
 
 @html_of.register
 def analysis_html(result: AnalysisResult) -> str:
     rows = [(value.name, _measured(value), value.note) for value in result.values]
-    right = _drawing(result.plot() if result.curves else None, f"analysis-{result.name}", result.about)
+    right = _drawing(
+        result.plot() if result.curves else None, f"analysis-{result.name}", result.about
+    )
     left = f"{table([], rows, words=True)}{notes(result.notes)}"
     return framed(result.name, result.about, _sides(left, right))
 
@@ -105,17 +125,23 @@ def _sides(left: str, right: str) -> str:
 
 
 def _drawing(drawing: "Picture | None", salt: str, about: str) -> str:
-    """A figure in the colours of the notebook, or on white if it has a shaded solid; empty without one."""
+    """A figure in the colours of the notebook, or on white if it has a shaded solid; empty without
+    one."""
     if drawing is None:
         return ""
     svg = figure(drawing, salt, about).replace("#000000", "var(--ink)")
-    svg = svg.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")  # not of the rest of the notebook
+    svg = svg.replace(
+        "*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin"
+    )  # not of the rest of the notebook
     return f'<div class="{"paper" if "<image" in svg else "figure"}">{svg}</div>'
 
 
 def framed(name: str, about: str, body: str) -> str:
     """A block of HTML in the style of the package, with a name and what it is."""
-    head = f'<div class="head">{html.escape(name)} <span class="faint">{html.escape(about)}</span></div>'
+    head = (
+        f'<div class="head">{html.escape(name)} <span'
+        f' class="faint">{html.escape(about)}</span></div>'
+    )
     return f'<style>{STYLE}</style><div class="rigidmd">{head}{body}</div>'
 
 
@@ -123,7 +149,10 @@ def _table(rows: Iterable[TableRow]) -> str:
     """A table in which equal names in successive rows appear once."""
     rows = list(rows)
     before = ["", *(name for name, _ in rows)]
-    text = [("" if name == last else name, value) for last, (name, value) in zip(before, rows, strict=False)]
+    text = [
+        ("" if name == last else name, value)
+        for last, (name, value) in zip(before, rows, strict=False)
+    ]
     return table([], text, words=True)
 
 
@@ -141,12 +170,19 @@ def _molecular_rows(scene: MolecularScene) -> Iterable[TableRow]:
     species = species_of(scene)
     for entry, molecule in zip(scene.molecules, species, strict=True):
         count = f"{entry.count} " if entry.count else ""
-        yield "molecules", f"{count}{molecule.name}: {molecule.description}{', frozen' if entry.frozen else ''}"
+        yield (
+            "molecules",
+            f"{count}{molecule.name}: {molecule.description}{', frozen' if entry.frozen else ''}",
+        )
     if scene.structure is not None:
         yield "start", f"from {scene.structure.file}"
     yield "box", _box(scene)
     forces = scene.forces
-    acting = ["Lennard-Jones"] if forces.lennard_jones and any((m.epsilon > 0).any() for m in species) else []
+    acting = (
+        ["Lennard-Jones"]
+        if forces.lennard_jones and any((m.epsilon > 0).any() for m in species)
+        else []
+    )
     acting += [COULOMB[forces.electrostatics]] if any(m.charges.any() for m in species) else []
     acting += [f"cutoff {forces.cutoff_A:g} Å"] if forces.cutoff_A and acting else []
     yield "forces", ", ".join(acting) or "none of the models"
@@ -174,16 +210,30 @@ def _box(scene: MolecularScene) -> str:
 def _body_rows(system: BodySystem) -> Iterable[TableRow]:
     scene, run = system.scene, system.scene.run
     pinned = "" if system.translates else ", pinned"
-    yield "body", f"{system.kind}{pinned}, {system.mass:g} kg, {system.degrees_of_freedom} degrees of freedom"
+    yield (
+        "body",
+        (
+            f"{system.kind}{pinned}, {system.mass:g} kg, {system.degrees_of_freedom} degrees of"
+            " freedom"
+        ),
+    )
     if system.rotates:
         moments = ", ".join(f"{x:.6g}" for x in system.inertia)
-        yield "moments", f"{moments} kg m² about the {'centre of mass' if system.translates else 'pivot'}"
+        yield (
+            "moments",
+            f"{moments} kg m² about the {'centre of mass' if system.translates else 'pivot'}",
+        )
         pose = system.pose(0.0, system.state)
-        angles = ", ".join(f"{x + 0.0:.6g}°" for x in np.degrees(to_euler_angles(pose.rotation)).round(9))
+        angles = ", ".join(
+            f"{x + 0.0:.6g}°" for x in np.degrees(to_euler_angles(pose.rotation)).round(9)
+        )
         spin = float(np.linalg.norm(pose.angular_velocity_body))
         motion = "at rest"
         if spin * run.duration_s > 1e-6:
-            motion = f"rotating at {spin:.6g} rad/s, {2 * np.pi / spin / run.timestep_s:.3g} steps per rotation"
+            motion = (
+                f"rotating at {spin:.6g} rad/s, {2 * np.pi / spin / run.timestep_s:.3g} steps per"
+                " rotation"
+            )
         yield "start", f"φ, θ, ψ = {angles}; {motion}"
     if acting := [word for name, word in ACTING.items() if getattr(scene, name)]:
         yield "acting", ", ".join(acting)
@@ -205,7 +255,9 @@ def _columns(results: Results) -> str:
             ends = " ... ".join(x if isinstance(x, str) else f"{x:.6g}" for x in values[[0, -1]])
         rows.append((Raw(" ".join(f"<code>{name}</code>" for name in names)), unit, ends, about))
     listed = table(["column", "unit", "first ... last", ""], rows, words=True)
-    return f"<details><summary>{len(results.units)} columns: results[name]</summary>{listed}</details>"
+    return (
+        f"<details><summary>{len(results.units)} columns: results[name]</summary>{listed}</details>"
+    )
 
 
 #: Most coordinates in a widget, which a notebook stores as text.
@@ -221,7 +273,10 @@ class AnimationPage:
         self.page = page
 
     def _repr_html_(self) -> str:
-        return f'<iframe srcdoc="{html.escape(self.page)}" style="width:100%;height:{HEIGHT}px;border:0"></iframe>'
+        return (
+            f'<iframe srcdoc="{html.escape(self.page)}"'
+            f' style="width:100%;height:{HEIGHT}px;border:0"></iframe>'
+        )
 
     def save(self, path: str | Path) -> Path:
         """Write the page, replacing a file of that name. Raises OutputError."""
@@ -231,15 +286,19 @@ class AnimationPage:
 
 
 def show(results: Results) -> "StructureWidget | AnimationPage":
-    """The animation of a run in a notebook: molecules by chemiscope, a body on a small page. Raises ImportError without
-    chemiscope, ValueError without a trajectory."""
+    """The animation of a run in a notebook: molecules by chemiscope, a body on a small page. Raises
+    ImportError without chemiscope, ValueError without a trajectory."""
     if isinstance(results.system, BodySystem):
         record = record_of(results.system, results.samples, results.summary)
-        return AnimationPage(page(record.scene.name, animation_parts(record, BodyAnimation(record)), FILM_STYLE))
+        return AnimationPage(
+            page(record.scene.name, animation_parts(record, BodyAnimation(record)), FILM_STYLE)
+        )
     try:
         import chemiscope
     except ImportError:
-        raise ImportError("rigidmd.view.show() of molecules needs chemiscope: pip install chemiscope") from None
+        raise ImportError(
+            "rigidmd.view.show() of molecules needs chemiscope: pip install chemiscope"
+        ) from None
     system = results.system
     massive = np.flatnonzero(system.sites.mass > 0)
     frames = _frames(results, system, max(2, MOST_COORDINATES // (3 * len(massive))))
@@ -248,10 +307,17 @@ def show(results: Results) -> "StructureWidget | AnimationPage":
     structures = []
     for k, positions in enumerate(np.round(frames.positions[:, massive].astype(float), 3)):
         x, y, z = positions.T.tolist()
-        structures.append({"size": len(massive), "names": elements, "x": x, "y": y, "z": z, "bonds": bonds})
+        structures.append(
+            {"size": len(massive), "names": elements, "x": x, "y": y, "z": z, "bonds": bonds}
+        )
         if frames.cells is not None:
             structures[k]["cell"] = frames.cells[k].ravel().tolist()
-    settings = {"unitCell": frames.cells is not None, "keepOrientation": True, "spaceFilling": False, "axes": "off"}
+    settings = {
+        "unitCell": frames.cells is not None,
+        "keepOrientation": True,
+        "spaceFilling": False,
+        "axes": "off",
+    }
     shown = chemiscope.show(
         structures,
         properties={"time": {"target": "structure", "values": frames.time.tolist(), "units": "ps"}},
@@ -276,8 +342,11 @@ def _frames(results: Results, system: System, most: int) -> Frames:
     stride = max(1, -(-count // most))
     chosen = results._frames[::stride]
     frames = Frames(
-        time=np.array([frame.time for frame in chosen]), positions=np.array([frame.positions for frame in chosen]),
-        cells=np.array([frame.cell for frame in chosen]) if system.density else None, count=count, stride=stride,
+        time=np.array([frame.time for frame in chosen]),
+        positions=np.array([frame.positions for frame in chosen]),
+        cells=np.array([frame.cell for frame in chosen]) if system.density else None,
+        count=count,
+        stride=stride,
         is_cut=False,
-    )  # fmt: skip
+    )
     return inside(frames, system.sites)

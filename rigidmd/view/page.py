@@ -1,4 +1,5 @@
-"""The template of all pages: one self-contained HTML file, readable on a phone, in the dark and in print."""
+"""The template of all pages: one self-contained HTML file, readable on a phone, in the dark and in
+print."""
 
 import html
 import io
@@ -8,7 +9,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rigidmd.core.files import write_text
-from rigidmd.figures.style import COOL, FAINT, INK, WARM, curve_style, drawing, save_figure, settings
+from rigidmd.figures.style import (
+    COOL,
+    FAINT,
+    INK,
+    WARM,
+    curve_style,
+    drawing,
+    save_figure,
+    settings,
+)
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
@@ -33,10 +43,12 @@ class PagePart(NamedTuple):
 
 
 def page(title: str, parts: Iterable[str], head: str = "") -> str:
-    """A whole page of HTML parts under a title (plain text). `head` is added to its head: more style or scripts."""
+    """A whole page of HTML parts under a title (plain text). `head` is added to its head: more
+    style or scripts."""
     title_html, body = html.escape(title), "\n".join(part for part in parts if part)
     return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">\
+<html lang="en"><head><meta charset="utf-8">\
+<meta name="viewport" content="width=device-width,initial-scale=1">\
 <title>{title_html}</title>
 <style>{STYLE}</style>{head}</head>
 <body>
@@ -57,20 +69,31 @@ def section(title: str, *parts: str, anchor: str = "") -> str:
     if not any(parts):
         return ""
     name = f' id="{html.escape(anchor)}"' if anchor else ""
-    return f"<section><h2{name}>{html.escape(title)}</h2>\n" + "\n".join(part for part in parts if part) + "</section>"
+    return (
+        f"<section><h2{name}>{html.escape(title)}</h2>\n"
+        + "\n".join(part for part in parts if part)
+        + "</section>"
+    )
 
 
 def table(
-    titles: Sequence[str], rows: Iterable[Sequence[object]], words: bool = False, marked: Mapping[str, object] = {}
+    titles: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    words: bool = False,
+    marked: Mapping[str, object] = {},
 ) -> str:
-    """A table of plain text, which scrolls if it is too wide. words: cells are sentences, aligned left. marked: cell of
-    the first column -> what is shown instead, such as one of `chips`"""
+    """A table of plain text, which scrolls if it is too wide. words: cells are sentences, aligned
+    left. marked: cell of the first column -> what is shown instead, such as one of `chips`"""
     head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
     kind = ' class="words"' if words else ""
     cells = [[_cell(marked.get(str(first), first)), *map(_cell, rest)] for first, *rest in rows]
     body = "".join(f"<tr>{''.join(line)}</tr>\n" for line in cells)
     top = f"<thead><tr>{head}</tr></thead>" if titles else ""
-    return f'<div class="scroll"><table{kind}>{top}<tbody>\n{body}</tbody></table></div>' if body else ""
+    return (
+        f'<div class="scroll"><table{kind}>{top}<tbody>\n{body}</tbody></table></div>'
+        if body
+        else ""
+    )
 
 
 class Raw(str):
@@ -92,7 +115,9 @@ def plain(value: object) -> str:
 def chips(names: Iterable[str]) -> dict[str, Raw]:
     """Names with the colours of their curves, as cells."""
     mark = '<span style="color:{}">■</span> {}'
-    return {name: Raw(mark.format(curve_style(k)["color"], plain(name))) for k, name in enumerate(names)}
+    return {
+        name: Raw(mark.format(curve_style(k)["color"], plain(name))) for k, name in enumerate(names)
+    }
 
 
 def items(lines: Iterable[object]) -> str:
@@ -110,7 +135,8 @@ def code(text: str) -> str:
 
 
 def figure(drawn, salt: str, about: str) -> str:
-    """A figure of Matplotlib as part of a page, whose colours it takes. salt: another one for each figure of a page."""
+    """A figure of Matplotlib as part of a page, whose colours it takes. salt: another one for each
+    figure of a page."""
     stream = io.StringIO()
     drawn.patch.set_visible(False)
     for axis in drawn.axes:
@@ -118,7 +144,9 @@ def figure(drawn, salt: str, about: str) -> str:
     with settings({"svg.fonttype": "none", "svg.hashsalt": salt}):
         save_figure(drawn, stream, format="svg", metadata={"Date": None, "Creator": None})
     found = stream.getvalue()
-    found = found[found.index("<svg") :].replace("<svg", f'<svg role="img" aria-label="{html.escape(about)}"', 1)
+    found = found[found.index("<svg") :].replace(
+        "<svg", f'<svg role="img" aria-label="{html.escape(about)}"', 1
+    )
     for color, name in ((INK, "ink"), (FAINT, "faint"), (COOL, "cool"), (WARM, "warm")):
         found = found.replace(color, f"var(--{name})")
     return found
@@ -128,4 +156,7 @@ def wide(drawn, salt: str, about: str) -> str:
     """A figure of several panels, which scrolls on a narrow screen."""
     width = 120 * drawn.get_figwidth()  # pixels
     style = f"max-width:{width:.0f}px;min-width:{min(620.0, 0.7 * width):.0f}px"
-    return f'<div class="scroll"><div class="wide" style="{style}">{figure(drawn, salt, about)}</div></div>'
+    return (
+        '<div class="scroll"><div class="wide"'
+        f' style="{style}">{figure(drawn, salt, about)}</div></div>'
+    )

@@ -1,4 +1,5 @@
-"""Plots of columns against time: small ones for pages, where animations add a cursor, figures, and live ones."""
+"""Plots of columns against time: small ones for pages, where animations add a cursor, figures, and
+live ones."""
 
 import time as clock
 from collections.abc import Sequence
@@ -14,7 +15,15 @@ from rigidmd.engines.samples import BODY_COLUMNS, MATRIX, Column, Samples
 from rigidmd.engines.system import System
 from rigidmd.figures.picture import Picture
 from rigidmd.figures.run import run_figures
-from rigidmd.figures.style import COLORS, FAINT, INK, new_figure, open_axis, shown_range, thin_series
+from rigidmd.figures.style import (
+    COLORS,
+    FAINT,
+    INK,
+    new_figure,
+    open_axis,
+    shown_range,
+    thin_series,
+)
 from rigidmd.io.progress import DisplayArea, in_notebook
 from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.record import Record
@@ -51,9 +60,14 @@ def _molecular_panels(record: Record) -> list[Panel]:
         return [(labels[name], seen[name] / per) for name in there]
 
     found = [
-        Panel("temperature (K)", curves(temperature_translation="translation", temperature_rotation="rotation")),
+        Panel(
+            "temperature (K)",
+            curves(temperature_translation="translation", temperature_rotation="rotation"),
+        ),
         Panel("potential energy (kJ/mol per molecule)", curves(n, potential="")),
-        Panel("drift of the conserved energy in a stage (kJ/mol per molecule)", curves(n, drift="")),
+        Panel(
+            "drift of the conserved energy in a stage (kJ/mol per molecule)", curves(n, drift="")
+        ),
         Panel("pressure (bar)", curves(pressure_bar="")),
     ]
     if "density" in seen and np.ptp(np.nan_to_num(seen["density"])) > 0:
@@ -67,7 +81,10 @@ def _body_panels(record: Record) -> list[Panel]:
     found = []
     if "theta" in seen:
         found.append(Panel("θ (°)", [("", np.degrees(seen["theta"]))]))
-        for name, key in (("φ", "phi"), ("ψ", "psi")):  # one panel each: precession is much slower than spin
+        for name, key in (
+            ("φ", "phi"),
+            ("ψ", "psi"),
+        ):  # one panel each: precession is much slower than spin
             angle = np.unwrap(seen[key])
             unit, size = ("turns", 2 * np.pi) if np.ptp(angle) > 2 * np.pi else ("°", np.pi / 180)
             found.append(Panel(f"{name} ({unit})", [("", angle / size)]))
@@ -77,15 +94,23 @@ def _body_panels(record: Record) -> list[Panel]:
         found.append(Panel("centre of mass (m)", [(k, seen[k]) for k in "xyz"]))
     parts = [(name, seen[name]) for name in ("kinetic", "potential", "energy") if name in seen]
     found.append(Panel("energies (J)", parts))
-    known = [name for name, values in seen.items() if name.endswith("_error") and np.isfinite(values).any()]
-    errors = [(name.removesuffix("_error"), np.maximum(np.abs(seen[name]), FLOOR)) for name in known]
-    found.append(Panel(f"relative errors of what is conserved (0 is drawn at {FLOOR:.0e})", errors, log=True))
+    known = [
+        name
+        for name, values in seen.items()
+        if name.endswith("_error") and np.isfinite(values).any()
+    ]
+    errors = [
+        (name.removesuffix("_error"), np.maximum(np.abs(seen[name]), FLOOR)) for name in known
+    ]
+    found.append(
+        Panel(f"relative errors of what is conserved (0 is drawn at {FLOOR:.0e})", errors, log=True)
+    )
     return found
 
 
 def plots_part(record: Record) -> str:
-    """All plots as HTML. Attributes for the animation: data-left and data-right, the ends of the time axis as fractions
-    of the width, data-from and data-to, its limits."""
+    """All plots as HTML. Attributes for the animation: data-left and data-right, the ends of the
+    time axis as fractions of the width, data-from and data-to, its limits."""
     figures = []
     for k, panel in enumerate(panels(record)):
         figure = new_figure(WIDTH, HEIGHT)
@@ -95,7 +120,10 @@ def plots_part(record: Record) -> str:
         axis.set_xlabel(f"time ({record.time_unit})", fontsize=8, color=INK)
         svg = figure_part(figure, f"panel{k}", panel.title)  # sets the position of the axis
         box, (left, right) = axis.get_position(), axis.get_xlim()
-        where = f'data-left="{box.x0:.5f}" data-right="{box.x1:.5f}" data-from="{left:.9g}" data-to="{right:.9g}"'
+        where = (
+            f'data-left="{box.x0:.5f}" data-right="{box.x1:.5f}" data-from="{left:.9g}"'
+            f' data-to="{right:.9g}"'
+        )
         figures.append(f"<figure {where}>{svg}</figure>")
     return f'<div class="plots">{"".join(figures)}</div>'
 
@@ -118,8 +146,15 @@ def draw_panel(axis, record: Record, panel: Panel) -> None:
     axis.margins(x=0)
     open_axis(axis, labelsize=8)
     if len(panel.curves) > 1:
-        axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.02), handlelength=1.2,
-                    borderaxespad=0.2, labelcolor=INK)  # fmt: skip
+        axis.legend(
+            frameon=False,
+            fontsize=8,
+            loc="upper left",
+            bbox_to_anchor=(1.0, 1.02),
+            handlelength=1.2,
+            borderaxespad=0.2,
+            labelcolor=INK,
+        )
 
 
 #: Inches: width of a figure, height of a panel, height of labels around the panels.
@@ -127,21 +162,25 @@ FIGURE_WIDTH, PANEL_HEIGHT, FIGURE_MARGIN = 7.2, 2.0, 0.6
 
 
 def record_of(
-    system: System | BodySystem, samples: Samples | Motion, summary: dict[str, Any] | None,
+    system: System | BodySystem,
+    samples: Samples | Motion,
+    summary: dict[str, Any] | None,
     names: Sequence[str] | None = None,
-) -> Record:  # fmt: skip
+) -> Record:
     """A run in memory as a record, with all its columns or with the named ones and the time."""
     wanted = samples.described if names is None else ("time", "stage", *names)
-    columns = {name: samples[name] for name in wanted if name in samples.described and name != MATRIX}
+    columns = {
+        name: samples[name] for name in wanted if name in samples.described and name != MATRIX
+    }
     return Record(Path(), system.scene, system, summary, columns, [])
 
 
 def plot(results: Results, *columns: str, log: bool = False) -> Picture:
     """A Matplotlib figure of a run, which a notebook displays and `savefig` writes.
 
-    columns : names of columns, drawn against time, with one panel for each unit; default: the main figure of the run
-        (energy.png, or the path of the axis of a body); or the name of another figure of a body ("angles",
-        "ellipsoids", "path", "invariants")
+    columns : names of columns, drawn against time, with one panel for each unit; default: the main
+        figure of the run (energy.png, or the path of the axis of a body); or the name of another
+        figure of a body ("angles", "ellipsoids", "path", "invariants")
     log : absolute values on a logarithmic axis. Raises KeyError
     """
     figures = {}
@@ -162,23 +201,34 @@ def check_names(names: Sequence[str], described: dict[str, Column], figures: Any
     known = [name for name, column in described.items() if column.unit and name != MATRIX]
     for name in (name for name in names if name not in known):
         if name in described:
-            raise KeyError(f"column {name!r} has {'matrices' if name == MATRIX else 'text'}, which are not plotted")
-        hint = did_you_mean(name, [*known, *figures]) or f"; there are {', '.join([*known, *figures])}"
+            raise KeyError(
+                f"column {name!r} has {'matrices' if name == MATRIX else 'text'}, which are not"
+                " plotted"
+            )
+        hint = (
+            did_you_mean(name, [*known, *figures]) or f"; there are {', '.join([*known, *figures])}"
+        )
         raise KeyError(f"no column {name!r}{hint}")
 
 
-def columns_figure(record: Record, names: Sequence[str], described: dict[str, Column], log: bool = False) -> Picture:
+def columns_figure(
+    record: Record, names: Sequence[str], described: dict[str, Column], log: bool = False
+) -> Picture:
     """Columns against time, with one panel for each unit."""
     units: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
         units.setdefault(described[name].unit, []).append(name)
-    figure = new_figure(FIGURE_WIDTH, PANEL_HEIGHT * len(units) + FIGURE_MARGIN, title=record.scene.name)
+    figure = new_figure(
+        FIGURE_WIDTH, PANEL_HEIGHT * len(units) + FIGURE_MARGIN, title=record.scene.name
+    )
     axes = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (unit, members) in zip(axes, units.items(), strict=True):
         title = axis_label(members[0], unit) if len(members) == 1 else ""
         suffix = "" if unit == "1" else f"{' ' * bool(title)}({unit})" if title else unit
         curves = [(axis_label(name, unit), record.columns[name]) for name in members]
-        draw_panel(axis, record, Panel("", [(label, np.abs(y) if log else y) for label, y in curves], log))
+        draw_panel(
+            axis, record, Panel("", [(label, np.abs(y) if log else y) for label, y in curves], log)
+        )
         if len(members) > 1:
             axis.legend(frameon=False, fontsize=8, labelcolor=INK)
         axis.set_ylabel(f"{title}{suffix}", fontsize=9, color=INK)
@@ -198,10 +248,12 @@ TIME_FRACTION = 0.2
 
 
 class LivePlot(Observer):
-    """Draws columns of the samples so far in the output of a notebook cell; elsewhere it does nothing.
+    """Draws columns of the samples so far in the output of a notebook cell; elsewhere it does
+    nothing.
 
     columns : names, as in `results[...]`; default: temperature and drift, for a body energy_error
-    interval : of the run (ps, s for a body) between two drawings; default: the interval of its samples
+    interval : of the run (ps, s for a body) between two drawings; default: the interval of its
+        samples
     pause : least seconds between two drawings, which take at most a fifth of the time
     """
 
@@ -242,10 +294,17 @@ class LivePlot(Observer):
         if len(samples) < 2:
             return
         described = samples.described
-        default = MOLECULES if "drift" in described else [name for name in BODY if name in described][:1]
+        default = (
+            MOLECULES if "drift" in described else [name for name in BODY if name in described][:1]
+        )
         names = self._columns or default
         check_names(names, described)
-        png, size = columns_figure(record_of(self._run.system, samples, None, names), names, described).png()
-        self._spot.show({"image/png": png, "text/plain": f"{', '.join(names)} against time"}, {"image/png": size})
+        png, size = columns_figure(
+            record_of(self._run.system, samples, None, names), names, described
+        ).png()
+        self._spot.show(
+            {"image/png": png, "text/plain": f"{', '.join(names)} against time"},
+            {"image/png": size},
+        )
         now = clock.monotonic()
         self._due = now + max(self._pause, (now - began) * (1 / TIME_FRACTION - 1))

@@ -1,4 +1,5 @@
-"""The page of a run: system, means with errors, plots, stability margins, files, how to repeat; and with its animation.
+"""The page of a run: system, means with errors, plots, stability margins, files, how to repeat; and
+with its animation.
 
 Chemiscope, whose JavaScript is in the page, draws the animation of molecules.
 """
@@ -32,7 +33,20 @@ from rigidmd.scene import Scene
 from rigidmd.view import plots
 from rigidmd.view.body_animation import BodyAnimation
 from rigidmd.view.molecule_animation import MoleculeAnimation
-from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, figure, items, notes, page, read_asset, section, table
+from rigidmd.view.page import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    Raw,
+    code,
+    figure,
+    items,
+    notes,
+    page,
+    read_asset,
+    section,
+    table,
+)
 
 REPORT = "report.html"
 #: Files of a run: name -> contents.
@@ -52,7 +66,8 @@ ABOUT = {
 
 
 def write_report(folder: Path, path: Path) -> tuple[Path, list[str]]:
-    """Write the page of the run in a folder. Returns its path, and notes on missing data. Raises OutputError."""
+    """Write the page of the run in a folder. Returns its path, and notes on missing data. Raises
+    OutputError."""
     record = read_record(folder)
     write_text(path, page(f"{record.scene.name}: a run of rigidmd", parts(record)))
     return path, record.missing
@@ -73,7 +88,9 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
     yield section("Stability margins", _margins(record))
     lines = describe(record.scene, user_code=False).splitlines()  # the output of `rigidmd check`
     start = lines.index("left out:") if "left out:" in lines else len(lines)
-    end = next((k for k in range(start + 1, len(lines)) if not lines[k].startswith("  ")), len(lines))
+    end = next(
+        (k for k in range(start + 1, len(lines)) if not lines[k].startswith("  ")), len(lines)
+    )
     yield section("System and interactions", code("\n".join([*lines[:start], *lines[end:]])))
     yield section("Not used, and why", items(line.strip() for line in lines[start + 1 : end]))
     yield section("Files", _files(record))
@@ -81,7 +98,8 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
 
 
 def _stages(record: Record) -> Iterator[str]:
-    """Means and drifts of the stages, as the summary has them, from log.csv, which a run that has not ended has too."""
+    """Means and drifts of the stages, as the summary has them, from log.csv, which a run that has
+    not ended has too."""
     system, samples, known = record.system, record.log, (record.summary or {}).get("stages", ())
     for row, k in enumerate(np.unique(samples["stage"]).tolist()):
         if not system.scene.stages[k].is_minimisation:
@@ -99,7 +117,15 @@ def _analyses(record: Record) -> Iterator[str]:
         for value in result.values:
             text = "" if value.value is None else format_with_error(value.value, value.error)
             time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
-            rows.append([value.name, text, value.unit if text and value.unit != "1" else "", time, value.note])
+            rows.append(
+                [
+                    value.name,
+                    text,
+                    value.unit if text and value.unit != "1" else "",
+                    time,
+                    value.note,
+                ]
+            )
         if not result.values and not result.curves:
             left_out += [f"{result.name}: {note}" for note in result.notes]
         else:
@@ -110,7 +136,9 @@ def _analyses(record: Record) -> Iterator[str]:
     if not rows and not figures and not left_out:
         return
     text = "; ".join(dict.fromkeys(phrases))
-    yield f'<p class="faint">Values ± one standard error, of {html.escape(text)}.</p>' if text else ""
+    yield (
+        f'<p class="faint">Values ± one standard error, of {html.escape(text)}.</p>' if text else ""
+    )
     yield table(["", "value", "unit", "correlation time (ps)", ""], rows, words=True)
     yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
     yield "<p>Skipped:</p>" + items(left_out) if left_out else ""
@@ -120,7 +148,9 @@ def _body_table(record: Record) -> str:
     of_invariants = BODY["energy_error"].names + BODY["L_error"].names
     errors = [name.removesuffix("_error") for name in record.columns if name in of_invariants]
     time = ("time", f"{record.time[-1]:g} s, {len(record.time)} samples")
-    found = motion_figures(record.columns, errors) | {"rates": (record.summary or {}).get("rates", {})}
+    found = motion_figures(record.columns, errors) | {
+        "rates": (record.summary or {}).get("rates", {})
+    }
     return table([], [time, *body_rows(found)], words=True)
 
 
@@ -131,16 +161,32 @@ def _margins(record: Record) -> str:
         stages = [{"name": record.scene.name, **summary}] if summary else []
         step, stable, unit = "timestep_s", "stable_timestep_s", "s"
     else:
-        stages, step, stable, unit = summary.get("stages", ()), "timestep_fs", "stable_timestep_fs", "fs"
+        stages, step, stable, unit = (
+            summary.get("stages", ()),
+            "timestep_fs",
+            "stable_timestep_fs",
+            "fs",
+        )
     for stage in stages:
         if stage.get(step) and stage.get(stable):
             fraction = stage[step] / stage[stable]
             kind, word = next(entry[1:] for entry in MARGINS if fraction <= entry[0])
             sizes = [f"{stage[step]:g}", f"{stage[stable]:.3g}", f"{100 * fraction:.2g} %"]
             rows.append([stage["name"], *sizes, Raw(f'<span class="{kind}">{word}</span>')])
-    more = "" if record.is_body else " Errors of averages grow long before: see `rigidmd accuracy --averages`."
-    text = f'<p class="faint">The longest stable step is estimated from the fastest motion at the start.{more}</p>'
-    return table(["stage", f"step ({unit})", f"longest stable ({unit})", "fraction", ""], rows) + text if rows else ""
+    more = (
+        ""
+        if record.is_body
+        else " Errors of averages grow long before: see `rigidmd accuracy --averages`."
+    )
+    text = (
+        '<p class="faint">The longest stable step is estimated from the fastest motion at the'
+        f" start.{more}</p>"
+    )
+    return (
+        table(["stage", f"step ({unit})", f"longest stable ({unit})", "fraction", ""], rows) + text
+        if rows
+        else ""
+    )
 
 
 #: Fraction of the longest stable step up to which a verdict holds.
@@ -153,7 +199,9 @@ def _files(record: Record) -> str:
     if output.trajectory:
         form = BY_EXTENSION[Path(output.trajectory).suffix]
         viewer = form.viewer.format(topology=output.topology, trajectory=output.trajectory)
-        about[output.trajectory] = f"positions{' and rotations' if form.rotations else ''} over time: {viewer}"
+        about[output.trajectory] = (
+            f"positions{' and rotations' if form.rotations else ''} over time: {viewer}"
+        )
     for path in sorted(record.folder.iterdir()):
         if path.name.startswith(".") or not path.is_file():
             continue
@@ -174,7 +222,11 @@ def _repeat(record: Record) -> Iterator[str]:
             value = ", ".join(f"{path} {digest}" for path, digest in value.items())
         rows += [[key.replace("_", " "), value]] if value else []
     yield table([], rows, words=True)
-    about = {"preparing_s": "to compile and prepare", "computing_s": "of steps", "wall_s": "in all, output included"}
+    about = {
+        "preparing_s": "to compile and prepare",
+        "computing_s": "of steps",
+        "wall_s": "in all, output included",
+    }
     seconds = [f"{summary[key]:.1f} s {phase}" for key, phase in about.items() if summary.get(key)]
     yield f"<p>{html.escape('; '.join(seconds))}.</p>" if seconds else ""
 
@@ -182,37 +234,57 @@ def _repeat(record: Record) -> Iterator[str]:
 VIEW = "view.html"
 FILM_STYLE = f"<style>{read_asset('film.css')}</style>"
 BAR = """<div class="bar noprint"><button id="film-play" aria-label="play">▶</button>
-<button id="film-back" aria-label="a frame back">◂</button><button id="film-on" aria-label="a frame on">▸</button>
+<button id="film-back" aria-label="a frame back">◂</button>
+<button id="film-on" aria-label="a frame on">▸</button>
 <input id="film-slider" type="range" min="0" max="100000" value="0" aria-label="time">
-<span id="film-clock" class="clock"></span><select id="film-speed" aria-label="speed"></select></div>"""
+<span id="film-clock" class="clock"></span>
+<select id="film-speed" aria-label="speed"></select></div>"""
 
 
-def animation_of(record: Record, most_frames: int | None = None) -> BodyAnimation | MoleculeAnimation:
-    """The animation of a run. most_frames : of molecules; default: as many as a page holds. Raises OutputError."""
+def animation_of(
+    record: Record, most_frames: int | None = None
+) -> BodyAnimation | MoleculeAnimation:
+    """The animation of a run. most_frames : of molecules; default: as many as a page holds. Raises
+    OutputError."""
     return BodyAnimation(record) if record.is_body else MoleculeAnimation(record, most_frames)
 
 
 def write_view(folder: Path, path: Path) -> tuple[Path, list[str]]:
-    """Write the page of the run in a folder. Returns its path, and notes on data left out. Raises OutputError."""
+    """Write the page of the run in a folder. Returns its path, and notes on data left out. Raises
+    OutputError."""
     record = read_record(folder)
     animation = animation_of(record)
     first, *others = animation_parts(record, animation)
-    write_text(path, page(f"{record.scene.name}: the animation of a run", [*parts(record, first), *others], FILM_STYLE))
+    write_text(
+        path,
+        page(
+            f"{record.scene.name}: the animation of a run",
+            [*parts(record, first), *others],
+            FILM_STYLE,
+        ),
+    )
     return path, [*record.missing, *animation.notes]
 
 
 def animation_parts(record: Record, animation: BodyAnimation | MoleculeAnimation) -> list[str]:
     """The animation next to the plots, its data and its scripts, as HTML."""
     part = animation.page_part()
-    left = f'<div><div class="stage">{part.picture}{BAR}<div class="readout" id="film-readout"></div></div>'
+    left = (
+        f'<div><div class="stage">{part.picture}{BAR}<div class="readout"'
+        ' id="film-readout"></div></div>'
+    )
     left += f'<p class="legend">{part.legend}</p><p class="faint noprint">{part.usage}</p>'
     left += f'<div class="faint">{items(part.notes)}</div></div>'
 
     def packed(values: np.ndarray) -> str:
         """The bytes of an array, as base64."""
-        return base64.b64encode(np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()).decode()
+        return base64.b64encode(
+            np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
+        ).decode()
 
-    data = json.dumps(part.data, ensure_ascii=False, separators=(",", ":"), allow_nan=False, default=packed)
+    data = json.dumps(
+        part.data, ensure_ascii=False, separators=(",", ":"), allow_nan=False, default=packed
+    )
     data = data.replace("<", "\\u003c")
     if any("</script" in text.lower() for text in part.scripts):
         raise ValueError("a script has the end tag of its element")
@@ -226,12 +298,18 @@ def animation_parts(record: Record, animation: BodyAnimation | MoleculeAnimation
 INDEX = "index.html"
 #: The default bodies.
 SHOWN = (
-    *(f"heavy_top_{k}" for k in range(1, 8)), "intermediate_axis", "sleeping_top", "gyrocompass", "dropped_stone",
-)  # fmt: skip
+    *(f"heavy_top_{k}" for k in range(1, 8)),
+    "intermediate_axis",
+    "sleeping_top",
+    "gyrocompass",
+    "dropped_stone",
+)
 #: Inches of a picture, and the fraction of the run that has passed in it.
 INCHES, RUN_FRACTION = 3.2, 0.62
-STYLE = """<style>.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,250px),1fr));gap:1rem}
-.cards a{color:inherit;text-decoration:none;border:1px solid var(--line);border-radius:8px;padding:.6rem;display:block}
+STYLE = """<style>
+.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,250px),1fr));gap:1rem}
+.cards a{color:inherit;text-decoration:none;border:1px solid var(--line);border-radius:8px;
+padding:.6rem;display:block}
 .cards img{width:100%;background:#fff;border-radius:4px}.cards b{display:block}</style>"""
 
 
@@ -239,14 +317,21 @@ def selected_bodies(names: list[str]) -> list[Example]:
     """The shipped bodies with these names, or those of SHOWN. Raises RigidMDError."""
     bodies = {example.name: example for example in examples() if example.is_body}
     if unknown := [name for name in names if name not in bodies]:
-        raise InputError("gallery", [f"unknown body {unknown[0]!r}; shipped are {', '.join(bodies)}"])
+        raise InputError(
+            "gallery", [f"unknown body {unknown[0]!r}; shipped are {', '.join(bodies)}"]
+        )
     return [bodies[name] for name in names or SHOWN]
 
 
 def write_gallery(
-    folder: Path, names: list[str], force: bool, command: str, progress: Callable[[str], object] = lambda name: None
+    folder: Path,
+    names: list[str],
+    force: bool,
+    command: str,
+    progress: Callable[[str], object] = lambda name: None,
 ) -> Path:
-    """Run bodies into folder/runs, write their pages and an index. Returns the path of the index. Raises OutputError.
+    """Run bodies into folder/runs, write their pages and an index. Returns the path of the index.
+    Raises OutputError.
 
     progress : called with the name of each body before it runs
     """

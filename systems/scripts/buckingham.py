@@ -10,7 +10,9 @@ argon = {
     "B": alpha / distance,
     "C": well * alpha / (alpha - 6) * distance**6,
 }
-potential = rigidmd.pair_law("A*exp(-B*r) - C/r**6", {"Ar": argon}, name="buckingham", truncation="switch")
+potential = rigidmd.pair_law(
+    "A*exp(-B*r) - C/r**6", {"Ar": argon}, name="buckingham", truncation="switch"
+)
 
 scene = rigidmd.Scene.from_dict(
     {
@@ -30,6 +32,12 @@ between -= 25 * np.rint(between / 25)
 r = np.linalg.norm(between, axis=-1)[np.triu_indices(256, 1)]
 r = r[r < 9]
 expected = (argon["A"] * np.exp(-argon["B"] * r) - argon["C"] / r**6).sum()
-print(results["buckingham"][-1], "kJ/mol;", expected, "without the switch; drift", results["drift"][-1])
+print(
+    results["buckingham"][-1],
+    "kJ/mol;",
+    expected,
+    "without the switch; drift",
+    results["drift"][-1],
+)
 assert abs(results["buckingham"][-1] / expected - 1) < 0.02
 assert abs(results["drift"][-1]) < 1e-3 * results["kinetic"][-1]

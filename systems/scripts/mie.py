@@ -12,7 +12,8 @@ class Mie(NamedTuple):
 
 
 def mie(p: Mie, r: float, inverse: float) -> tuple[float, float]:
-    """Energy (kJ/mol) and force (kJ/mol/Å) of C eps ((sigma/r)^14 - (sigma/r)^7), C = 4 for these powers."""
+    """Energy (kJ/mol) and force (kJ/mol/Å) of C eps ((sigma/r)^14 - (sigma/r)^7), C = 4 for these
+    powers."""
     seven = (p.sigma * inverse) ** 7
     u = 4 * p.epsilon * seven
     return u * (seven - 1), u * (14 * seven - 7) * inverse

@@ -12,7 +12,9 @@ scene = rigidmd.MolecularScene.from_dict(
     }
 )
 seen = []
-simulation = rigidmd.Simulation(scene, observers=[rigidmd.Every(0.02, lambda moment: seen.append(dipole(moment)))])
+simulation = rigidmd.Simulation(
+    scene, observers=[rigidmd.Every(0.02, lambda moment: seen.append(dipole(moment)))]
+)
 charge = simulation.system.of_sites(lambda molecule: molecule.charges)
 
 

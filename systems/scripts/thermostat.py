@@ -8,7 +8,8 @@ from rigidmd.units import BOLTZMANN
 
 
 class Berendsen(NamedTuple):
-    """Weak coupling (Berendsen et al. 1984); it samples no ensemble, and is for equilibration only."""
+    """Weak coupling (Berendsen et al. 1984); it samples no ensemble, and is for equilibration
+    only."""
 
     thermal_energy: float  # kT, u Å²/ps²
     rate: float  # 1/ps
@@ -29,8 +30,17 @@ def couple(thermostat, model, state, h, draw):
     state.energy_ledger[0] += heat  # energy less heat is conserved
 
 
-stage = {"ensemble": "nvt", "temperature_K": 330, "duration_ps": 2, "integrator": "baoab"}  # in the middle of a step
-water = {"box": {"density_g_cm3": 0.997}, "molecules": [{"model": "spce", "count": 216}], "stages": [stage]}
+stage = {
+    "ensemble": "nvt",
+    "temperature_K": 330,
+    "duration_ps": 2,
+    "integrator": "baoab",
+}  # in the middle of a step
+water = {
+    "box": {"density_g_cm3": 0.997},
+    "molecules": [{"model": "spce", "count": 216}],
+    "stages": [stage],
+}
 scene = rigidmd.MolecularScene.from_dict(water)
 freedom = rigidmd.Simulation(scene).system.freedom
 thermostat = Berendsen(BOLTZMANN * 330, 10.0, freedom.translation, freedom.rotation)

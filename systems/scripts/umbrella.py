@@ -28,9 +28,15 @@ def umbrella(term, state, load, tally):
 
 
 stage = {"ensemble": "nvt", "temperature_K": 94, "duration_ps": 4, "timestep_fs": 4}
-argon = {"box": {"lengths_A": 25}, "molecules": [{"model": "argon", "count": 256}], "stages": [stage]}
+argon = {
+    "box": {"lengths_A": 25},
+    "molecules": [{"model": "argon", "count": 256}],
+    "stages": [stage],
+}
 scene = rigidmd.Scene.from_dict(argon)
-results = rigidmd.Simulation(scene, forces=[Umbrella(np.full(10, 0.1), height=12.0, stiffness=500.0)]).run()
+results = rigidmd.Simulation(
+    scene, forces=[Umbrella(np.full(10, 0.1), height=12.0, stiffness=500.0)]
+).run()
 offset = np.sqrt(results["umbrella"] / 2.5)  # Å, from the energy 5/2 kJ/mol/Å² times its square
 print("from", offset[0], "to", offset[-1], "Å from its height in", results["time"][-1], "ps")
 assert offset[-1] < offset[0]

@@ -1,10 +1,12 @@
-"""The error of the energy on the step, for six waters with forces of GFN2-xTB: rigid in rigidmd, flexible in ASE.
+"""The error of the energy on the step, for six waters with forces of GFN2-xTB: rigid in rigidmd,
+flexible in ASE.
 
     pip install tblite
     python tests/benchmarks/calculators.py --figure rigidmd/docs/images/calculator_steps.png
 
-Both start from a minimum of their energy with momenta at 200 K, and take steps of velocity Verlet for 2 ps. The error is the
-standard deviation of the energy, divided by kT and the number of degrees of freedom (36 and 54).
+Both start from a minimum of their energy with momenta at 200 K, and take steps of velocity Verlet
+for 2 ps. The error is the standard deviation of the energy, divided by kT and the number of degrees
+of freedom (36 and 54).
 """
 
 import argparse
@@ -38,10 +40,17 @@ def calculator() -> TBLite:
 def rigid(atoms: Atoms, stage: dict):
     """Results of one stage."""
     scene = scene_from_atoms(
-        atoms, ["tip3p"], forces={"lennard_jones": False, "electrostatics": "none"}, seed=2, stages=[stage],
-        start={"temperature_K": TEMPERATURE}, output={"trajectory": False, "log_interval_ps": INTERVAL},
-    )  # fmt: skip
-    return Simulation(scene, forces=[CalculatorForce(calculator(), energy_noise_eV=1e-6)]).run(progress=False)
+        atoms,
+        ["tip3p"],
+        forces={"lennard_jones": False, "electrostatics": "none"},
+        seed=2,
+        stages=[stage],
+        start={"temperature_K": TEMPERATURE},
+        output={"trajectory": False, "log_interval_ps": INTERVAL},
+    )
+    return Simulation(scene, forces=[CalculatorForce(calculator(), energy_noise_eV=1e-6)]).run(
+        progress=False
+    )
 
 
 def flexible(start: Atoms, step: float) -> np.ndarray:
@@ -57,18 +66,24 @@ def flexible(start: Atoms, step: float) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--figure", type=Path)
     options = parser.parse_args()
     cell = molecule("H2O", cell=[3.0, 3.0, 3.0]).repeat((3, 2, 1))
     cell.set_cell(None)
-    start = rigid(cell, {"ensemble": "minimise", "force_limit_kJ_mol_A": 2.0, "torque_limit_kJ_mol": 2.0}).atoms()
+    start = rigid(
+        cell, {"ensemble": "minimise", "force_limit_kJ_mol_A": 2.0, "torque_limit_kJ_mol": 2.0}
+    ).atoms()
     curves = {"rigid, rigidmd": [], "flexible, ASE": []}
     for step in RIGID:
         results = rigid(start, {"duration_ps": DURATION, "timestep_fs": step})
         calls, seconds = results.summary["forces_by_python"]["TBLite"]
         curves["rigid, rigidmd"].append((step, results["drift"].std() / (36 * THERMAL)))
-        print(f"rigid    {step:5g} fs: {curves['rigid, rigidmd'][-1][1]:.2e}   {1000 * seconds / calls:.1f} ms a call")
+        print(
+            f"rigid    {step:5g} fs: {curves['rigid, rigidmd'][-1][1]:.2e}   {1000 * seconds / calls:.1f} ms a call"
+        )
     relaxed = start.copy()
     relaxed.calc = calculator()
     LBFGS(relaxed, logfile=None).run(fmax=0.02, steps=300)

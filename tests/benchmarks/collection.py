@@ -1,11 +1,12 @@
-"""The collection: error against run time of all integrators in ten scenes, with a page of the documentation.
+"""The collection: error against run time of all integrators in ten scenes, with a page of the
+documentation.
 
     python tests/benchmarks/collection.py            # measures what is missing, half an hour; NAME ... only these
     python tests/benchmarks/collection.py --force    # measures again
     python tests/benchmarks/collection.py --pages    # writes the page again, from the data
 
-writes rigidmd/docs/evidence/data/collection/NAME.csv (all trials) and NAME.json (advice, versions, machine),
-rigidmd/docs/images/collection_NAME.png and rigidmd/docs/evidence/collection.md.
+writes rigidmd/docs/evidence/data/collection/NAME.csv (all trials) and NAME.json (advice, versions,
+machine), rigidmd/docs/images/collection_NAME.png and rigidmd/docs/evidence/collection.md.
 """
 
 import argparse
@@ -31,23 +32,60 @@ REPEATS = 3
 TARGETS = (1e-3, 1e-5, 1e-7)  # errors of the energy in the table of all scenes
 #: Name -> what it is, file, settings.
 SCENES = {
-    "water_reaction_field": ("216 SPC/E waters, 298 K, with a reaction field", "water",
-                             ("forces.electrostatics=reaction_field", *LIQUID)),
-    "water_pme": ("216 SPC/E waters, 298 K, with PME", "water", ("forces.electrostatics=pme", *LIQUID)),
-    "nitrogen": ("500 nitrogen molecules, liquid at 77 K, without charges", "nitrogen",
-                 ("stages.0.duration_ps=5", *SMOOTH)),
+    "water_reaction_field": (
+        "216 SPC/E waters, 298 K, with a reaction field",
+        "water",
+        ("forces.electrostatics=reaction_field", *LIQUID),
+    ),
+    "water_pme": (
+        "216 SPC/E waters, 298 K, with PME",
+        "water",
+        ("forces.electrostatics=pme", *LIQUID),
+    ),
+    "nitrogen": (
+        "500 nitrogen molecules, liquid at 77 K, without charges",
+        "nitrogen",
+        ("stages.0.duration_ps=5", *SMOOTH),
+    ),
     "carbon_dioxide": ("256 molecules of CO2, a crystal at 150 K, with PME", "dry_ice", SMOOTH),
-    "benzene": ("64 benzene molecules (OPLS), liquid at 298 K, with PME", "water",
-                ('molecules=[{model="benzene_opls", count=64}]', "box.density_g_cm3=0.874",
-                 "forces.electrostatics=pme", "forces.mixing=geometric", *LIQUID)),
-    "ions_in_water": ("200 SPC/E waters with 4 sodium and 4 chloride ions, 298 K, with PME", "water",
-                      ('molecules=[{model="spce", count=200}, {model="na_spce", count=4}, {model="cl_spce", count=4}]',
-                       "box.density_g_cm3=1.03", "forces.electrostatics=pme", *LIQUID)),
-    "free_asymmetric_top": ("a free body with three different moments of inertia", "free_asymmetric_top", ()),
+    "benzene": (
+        "64 benzene molecules (OPLS), liquid at 298 K, with PME",
+        "water",
+        (
+            'molecules=[{model="benzene_opls", count=64}]',
+            "box.density_g_cm3=0.874",
+            "forces.electrostatics=pme",
+            "forces.mixing=geometric",
+            *LIQUID,
+        ),
+    ),
+    "ions_in_water": (
+        "200 SPC/E waters with 4 sodium and 4 chloride ions, 298 K, with PME",
+        "water",
+        (
+            'molecules=[{model="spce", count=200}, {model="na_spce", count=4}, {model="cl_spce", count=4}]',
+            "box.density_g_cm3=1.03",
+            "forces.electrostatics=pme",
+            *LIQUID,
+        ),
+    ),
+    "free_asymmetric_top": (
+        "a free body with three different moments of inertia",
+        "free_asymmetric_top",
+        (),
+    ),
     "heavy_top_3": ("a symmetric heavy top, released at rest at 40 degrees", "heavy_top_3", ()),
-    "fast_heavy_top": ("a fast heavy top, whose axis passes close to straight down", "fast_heavy_top", ()),
-    "body_in_fluid": ("a heavy ellipsoid that sinks in water, with resistance", "body_in_fluid", ("run.duration_s=2",)),
-}  # fmt: skip
+    "fast_heavy_top": (
+        "a fast heavy top, whose axis passes close to straight down",
+        "fast_heavy_top",
+        (),
+    ),
+    "body_in_fluid": (
+        "a heavy ellipsoid that sinks in water, with resistance",
+        "body_in_fluid",
+        ("run.duration_s=2",),
+    ),
+}
 
 
 def command_of(name: str) -> str:
@@ -67,17 +105,38 @@ def measure(name: str) -> None:
     found = accuracy_report.measure_accuracy(scene, repeats=REPEATS)
     system, reached = found.trial_system, {}
     for target in TARGETS:
-        points = {n: found.time_for(n, "energy_rms", target) for n in dict.fromkeys(t.integrator for t in found.trials)}
-        reached[f"{target:.0e}"] = {n: [p.seconds, p.step, p.spread] for n, p in points.items() if p is not None}
-    processor = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
+        points = {
+            n: found.time_for(n, "energy_rms", target)
+            for n in dict.fromkeys(t.integrator for t in found.trials)
+        }
+        reached[f"{target:.0e}"] = {
+            n: [p.seconds, p.step, p.spread] for n, p in points.items() if p is not None
+        }
+    processor = next(
+        line
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    )
     facts = {
-        "date": str(date.today()), "processor": processor.partition(": ")[2], "python": python_version(),
-        "versions": {package: version(package) for package in ("rigidmd", "numba", "numpy", "scipy")},
-        "unit": system.time_unit, "span": system.span, "energy_unit": system.energy_unit,
-        "order": {n: method.order for n, method in system.methods.items() if any(t.integrator == n for t in found.trials)},
+        "date": str(date.today()),
+        "processor": processor.partition(": ")[2],
+        "python": python_version(),
+        "versions": {
+            package: version(package) for package in ("rigidmd", "numba", "numpy", "scipy")
+        },
+        "unit": system.time_unit,
+        "span": system.span,
+        "energy_unit": system.energy_unit,
+        "order": {
+            n: method.order
+            for n, method in system.methods.items()
+            if any(t.integrator == n for t in found.trials)
+        },
         "median_spread": float(np.median([t.spread for t in found.trials if not t.diverged])),
-        "reference_error": found.reference_error, "reached": reached, "advice": accuracy_report.recommendations(found),
-    }  # fmt: skip
+        "reference_error": found.reference_error,
+        "reached": reached,
+        "advice": accuracy_report.recommendations(found),
+    }
     DATA.mkdir(exist_ok=True)
     accuracy_report.trial_table(found).write(DATA / f"{name}.csv")
     figure = accuracy_report.accuracy_figure(found)
@@ -87,7 +146,8 @@ def measure(name: str) -> None:
 
 
 def measured_order(rows: list[dict], error: str, floor: float) -> str:
-    """Slope of the log of an error over the log of the step, of the shortest steps above the floor; empty if unknown."""
+    """Slope of the log of an error over the log of the step, of the shortest steps above the floor;
+    empty if unknown."""
     points = [
         (float(next(v for k, v in row.items() if k.startswith("step"))), float(row[error]))
         for row in rows
@@ -98,11 +158,14 @@ def measured_order(rows: list[dict], error: str, floor: float) -> str:
 
 
 def table(titles: list[str], rows: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(row) + " |" for row in [titles, ["---"] * len(titles), *rows])
+    return "\n".join(
+        "| " + " | ".join(row) + " |" for row in [titles, ["---"] * len(titles), *rows]
+    )
 
 
 def summary_row(name: str, facts: dict) -> list[str]:
-    """The cheapest integrator at each target and how many times faster than velocity Verlet it is."""
+    """The cheapest integrator at each target and how many times faster than velocity Verlet it
+    is."""
     cells = []
     for reached in facts["reached"].values():
         best = min(reached, key=lambda n: reached[n][0], default=None)
@@ -122,15 +185,19 @@ def section_of(name: str, facts: dict) -> list[str]:
     with (DATA / f"{name}.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     trajectory = next(
-        key for key in ("error of Q", "error of X (Å)", "error of X (m)") if any(r.get(key) for r in rows)
+        key
+        for key in ("error of Q", "error of X (Å)", "error of X (m)")
+        if any(r.get(key) for r in rows)
     )
     unit, per = facts["unit"], "ps" if facts["unit"] == "fs" else "s"
     lines = []
     for n, order in facts["order"].items():
         mine = [row for row in rows if row["integrator"] == n]
         right = [float(r[f"step ({unit})"]) for r in mine if r[f"seconds per {per}"] != "fails"]
-        orders = [measured_order(mine, error, floor) for error, floor in
-                  (("energy rms", 1e-15), (trajectory, facts["reference_error"]))]  # fmt: skip
+        orders = [
+            measured_order(mine, error, floor)
+            for error, floor in (("energy rms", 1e-15), (trajectory, facts["reference_error"]))
+        ]
         fails = "yes" if len(right) < len(mine) else ""
         lines.append(
             [
@@ -143,43 +210,88 @@ def section_of(name: str, facts: dict) -> list[str]:
         )
     versions = ", ".join(f"{package} {number}" for package, number in facts["versions"].items())
     return [
-        f"## {name}", "", f"This scene is {SCENES[name][0]}.", "", "<!-- test: not run, it takes minutes -->", "```sh",
-        command_of(name), "```", "", f"![{name}: error against run time](../images/collection_{name}.png)", "",
-        *(f"- {line}" for line in facts["advice"]), "",
-        table(["method", "order", "measured, energy", f"measured, {trajectory.removeprefix('error of ').partition(' ')[0]}",
-               f"longest step that ran ({unit})", "a longer one failed"], lines), "",
+        f"## {name}",
+        "",
+        f"This scene is {SCENES[name][0]}.",
+        "",
+        "<!-- test: not run, it takes minutes -->",
+        "```sh",
+        command_of(name),
+        "```",
+        "",
+        f"![{name}: error against run time](../images/collection_{name}.png)",
+        "",
+        *(f"- {line}" for line in facts["advice"]),
+        "",
+        table(
+            [
+                "method",
+                "order",
+                "measured, energy",
+                f"measured, {trajectory.removeprefix('error of ').partition(' ')[0]}",
+                f"longest step that ran ({unit})",
+                "a longer one failed",
+            ],
+            lines,
+        ),
+        "",
         f"Versions: {versions}, Python {facts['python']}. Machine: {facts['processor']}, one thread. Date: {facts['date']}. "
         f"The median spread of the {REPEATS} timings of a trial is {facts['median_spread']:.0%}. "
-        f"All trials: [{name}.csv](data/collection/{name}.csv).", "",
-    ]  # fmt: skip
+        f"All trials: [{name}.csv](data/collection/{name}.csv).",
+        "",
+    ]
 
 
 def page_text() -> str:
     """The page, from the data."""
-    found = {name: json.loads((DATA / f"{name}.json").read_text(encoding="utf-8")) for name in SCENES
-             if (DATA / f"{name}.json").is_file()}  # fmt: skip
+    found = {
+        name: json.loads((DATA / f"{name}.json").read_text(encoding="utf-8"))
+        for name in SCENES
+        if (DATA / f"{name}.json").is_file()
+    }
     heads = [f"energy error of {target:.0e}" for target in TARGETS]
-    return "\n".join([
-        "# Collection", "", "Error against run time of every integrator in ten scenes, with versions, machine and failures.",
-        "", "<!-- written by python tests/benchmarks/collection.py from data/collection; do not edit -->", "",
-        "One command measures all scenes, draws the pictures and writes this page:", "",
-        "<!-- test: not run, it takes half an hour -->", "```sh", "python tests/benchmarks/collection.py", "```", "",
-        "Each row has the cheapest integrator for three errors of the energy, and how many times faster than",
-        "`velocity_verlet` it is at that error. The factor is absent where `velocity_verlet` is the cheapest or does not reach the",
-        "error with its shortest step. The unit of the error is kT per degree of freedom for molecules, over 0.1 ps, and the",
-        "largest kinetic energy for a body, over its run. High orders need smooth forces, so all molecules have",
-        '`forces.truncation = "smooth_switch"`. The cost is the median of three timings on a shared machine, and the spread of',
-        "the timings is given below for each scene; a factor within it is not printed.", "",
-        table(["scene", *heads], [summary_row(name, facts) for name, facts in found.items()]), "",
-        "The tables below have the order of each method and two measured orders: the slopes of the errors of the energy and of",
-        "the trajectory through the three shortest steps whose error is ten times above the rounding error or the error of the",
-        "reference. An empty cell has fewer than three such steps.", "",
-        *(line for name, facts in found.items() for line in section_of(name, facts)),
-    ]).rstrip() + "\n"  # fmt: skip
+    return (
+        "\n".join(
+            [
+                "# Collection",
+                "",
+                "Error against run time of every integrator in ten scenes, with versions, machine and failures.",
+                "",
+                "<!-- written by python tests/benchmarks/collection.py from data/collection; do not edit -->",
+                "",
+                "One command measures all scenes, draws the pictures and writes this page:",
+                "",
+                "<!-- test: not run, it takes half an hour -->",
+                "```sh",
+                "python tests/benchmarks/collection.py",
+                "```",
+                "",
+                "Each row has the cheapest integrator for three errors of the energy, and how many times faster than",
+                "`velocity_verlet` it is at that error. The factor is absent where `velocity_verlet` is the cheapest or does not reach the",
+                "error with its shortest step. The unit of the error is kT per degree of freedom for molecules, over 0.1 ps, and the",
+                "largest kinetic energy for a body, over its run. High orders need smooth forces, so all molecules have",
+                '`forces.truncation = "smooth_switch"`. The cost is the median of three timings on a shared machine, and the spread of',
+                "the timings is given below for each scene; a factor within it is not printed.",
+                "",
+                table(
+                    ["scene", *heads], [summary_row(name, facts) for name, facts in found.items()]
+                ),
+                "",
+                "The tables below have the order of each method and two measured orders: the slopes of the errors of the energy and of",
+                "the trajectory through the three shortest steps whose error is ten times above the rounding error or the error of the",
+                "reference. An empty cell has fewer than three such steps.",
+                "",
+                *(line for name, facts in found.items() for line in section_of(name, facts)),
+            ]
+        ).rstrip()
+        + "\n"
+    )
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--force", action="store_true")
     parser.add_argument("--pages", action="store_true")

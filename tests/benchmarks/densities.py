@@ -1,11 +1,13 @@
-"""The density of liquid water at 298.15 K and 1 bar, by rigidmd and by GROMACS side by side, with errors.
+"""The density of liquid water at 298.15 K and 1 bar, by rigidmd and by GROMACS side by side, with
+errors.
 
     python tests/benchmarks/densities.py --models spce,tip4p2005 --duration 2000
 
-512 molecules, cut-off 9 Å, PME, dispersion beyond the cut-off in the pressure, steps of 2 fs, one thread each, both at
-once. rigidmd: baoab with Langevin friction, stochastic cell rescaling, mixed precision. GROMACS: leap-frog, v-rescale,
-C-rescale. Both measure the kinetic energy where harmonic motions leave no error of the step in positions. Errors are
-standard errors by pymbar's statistical inefficiency; the first tenth of each run is left out.
+512 molecules, cut-off 9 Å, PME, dispersion beyond the cut-off in the pressure, steps of 2 fs, one
+thread each, both at once. rigidmd: baoab with Langevin friction, stochastic cell rescaling, mixed
+precision. GROMACS: leap-frog, v-rescale, C-rescale. Both measure the kinetic energy where harmonic
+motions leave no error of the step in positions. Errors are standard errors by pymbar's statistical
+inefficiency; the first tenth of each run is left out.
 """
 
 import argparse
@@ -27,11 +29,21 @@ RELAXATION = 0.4  # ps, of the barostats: shorter than the volume's own, near 1 
 
 def scene(model: str, *stages: dict) -> dict:
     """A scene of the liquid; `stages` begin at a guess of the density."""
-    common = {"temperature_K": TEMPERATURE, "timestep_fs": STEP, "integrator": "baoab", "thermostat": "langevin"}
+    common = {
+        "temperature_K": TEMPERATURE,
+        "timestep_fs": STEP,
+        "integrator": "baoab",
+        "thermostat": "langevin",
+    }
     return {
         "box": {"density_g_cm3": 0.99},
         "molecules": [{"model": model, "count": COUNT}],
-        "forces": {"cutoff_A": CUTOFF, "truncation": "shift", "tail_correction": True, "electrostatics": "pme"},
+        "forces": {
+            "cutoff_A": CUTOFF,
+            "truncation": "shift",
+            "tail_correction": True,
+            "electrostatics": "pme",
+        },
         "precision": "mixed",
         "threads": 1,
         "start": {"temperature_K": TEMPERATURE},
@@ -43,7 +55,9 @@ def scene(model: str, *stages: dict) -> dict:
 def own_density(model: str, duration: float) -> np.ndarray:
     """Density over time by rigidmd, g/cm³."""
     npt = {"ensemble": "npt", "pressure_bar": 1.0, "barostat_time_ps": RELAXATION}
-    results = Simulation(Scene.from_dict(scene(model, npt | {"duration_ps": duration}))).run(progress=True)
+    results = Simulation(Scene.from_dict(scene(model, npt | {"duration_ps": duration}))).run(
+        progress=True
+    )
     return results["density"][1:]
 
 
@@ -55,42 +69,78 @@ def begin_gromacs(model: str, duration: float, folder: Path) -> subprocess.Popen
     sites = sites_of(simulation.system, state)
     every = round(EVERY / (STEP * 1e-3))
     options = {
-        "integrator": "md", "dt": STEP * 1e-3, "nsteps": round(duration / (STEP * 1e-3)), "gen-vel": "yes",
-        "gen-temp": TEMPERATURE, "cutoff-scheme": "verlet", "nstlist": 20, "verlet-buffer-tolerance": 1e-4,
-        "rvdw": CUTOFF / 10, "rcoulomb": CUTOFF / 10, "vdw-modifier": "potential-shift", "DispCorr": "EnerPres",
-        "coulombtype": "PME", "tcoupl": "v-rescale", "tc-grps": "system", "tau-t": 0.5, "ref-t": TEMPERATURE,
-        "pcoupl": "C-rescale", "tau-p": RELAXATION, "ref-p": 1.0, "compressibility": 4.5e-5,
-        "nstenergy": every, "nstlog": 0,
-    }  # fmt: skip
+        "integrator": "md",
+        "dt": STEP * 1e-3,
+        "nsteps": round(duration / (STEP * 1e-3)),
+        "gen-vel": "yes",
+        "gen-temp": TEMPERATURE,
+        "cutoff-scheme": "verlet",
+        "nstlist": 20,
+        "verlet-buffer-tolerance": 1e-4,
+        "rvdw": CUTOFF / 10,
+        "rcoulomb": CUTOFF / 10,
+        "vdw-modifier": "potential-shift",
+        "DispCorr": "EnerPres",
+        "coulombtype": "PME",
+        "tcoupl": "v-rescale",
+        "tc-grps": "system",
+        "tau-t": 0.5,
+        "ref-t": TEMPERATURE,
+        "pcoupl": "C-rescale",
+        "tau-p": RELAXATION,
+        "ref-p": 1.0,
+        "compressibility": 4.5e-5,
+        "nstenergy": every,
+        "nstlog": 0,
+    }
     (folder / "run.mdp").write_text("".join(f"{key} = {value}\n" for key, value in options.items()))
     (folder / "run.gro").write_text(gro(sites, np.zeros_like(sites["position"])))
     (folder / "run.top").write_text(top(sites))
     gmx = [program("gmx"), "-quiet", "-nobackup"]
-    call([*gmx, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr"], folder)
+    call(
+        [*gmx, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr"], folder
+    )
     threads = ["-ntmpi", "1", "-ntomp", "1", "-notunepme"]
     with (folder / "said.txt").open("w") as said:
-        return subprocess.Popen([*gmx, "mdrun", "-deffnm", "run", *threads], cwd=folder, env=environment(),
-                                stdout=said, stderr=said)  # fmt: skip
+        return subprocess.Popen(
+            [*gmx, "mdrun", "-deffnm", "run", *threads],
+            cwd=folder,
+            env=environment(),
+            stdout=said,
+            stderr=said,
+        )
 
 
 def end_gromacs(run: subprocess.Popen, folder: Path) -> np.ndarray:
     """Its density over time, g/cm³."""
     if run.wait() != 0:
         raise SystemExit((folder / "said.txt").read_text()[-2000:])
-    call([program("gmx"), "-quiet", "energy", "-f", "run.edr", "-o", "run.xvg", "-dp"], folder, "Density\n\n")
-    lines = [line.split() for line in (folder / "run.xvg").read_text().splitlines() if line[0] not in "#@"]
+    call(
+        [program("gmx"), "-quiet", "energy", "-f", "run.edr", "-o", "run.xvg", "-dp"],
+        folder,
+        "Density\n\n",
+    )
+    lines = [
+        line.split()
+        for line in (folder / "run.xvg").read_text().splitlines()
+        if line[0] not in "#@"
+    ]
     return 1e-3 * np.array(lines, float)[1:, 1]
 
 
 def average(values: np.ndarray) -> tuple[float, float]:
     """Mean and standard error of a series without its first tenth."""
     kept = values[len(values) // 10 :]
-    return float(kept.mean()), float(kept.std(ddof=1) * np.sqrt(timeseries.statistical_inefficiency(kept) / len(kept)))
+    return float(kept.mean()), float(
+        kept.std(ddof=1) * np.sqrt(timeseries.statistical_inefficiency(kept) / len(kept))
+    )
 
 
 def main() -> None:
     """Run both engines for each model and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--models", default="spce,tip4p2005")
     parser.add_argument("--duration", type=float, default=2000.0, metavar="PS")
     parser.add_argument("--output", metavar="FILE", help="also keep the figures as JSON")
@@ -106,8 +156,13 @@ def main() -> None:
                 other = average(end_gromacs(run, Path(name)))
             finally:
                 run.kill()
-        difference, error = 100 * (own[0] / other[0] - 1), 100 * np.hypot(own[1], other[1]) / other[0]
-        told = [f"{value:.5f} ± {error:.5f}" for value, error in (own, other)] + [f"{difference:+.3f} ± {error:.3f}"]
+        difference, error = (
+            100 * (own[0] / other[0] - 1),
+            100 * np.hypot(own[1], other[1]) / other[0],
+        )
+        told = [f"{value:.5f} ± {error:.5f}" for value, error in (own, other)] + [
+            f"{difference:+.3f} ± {error:.3f}"
+        ]
         print(f"| {model} | {' | '.join(told)} |", flush=True)
         found[model] = {"rigidmd": own, "gromacs": other, "duration_ps": options.duration}
     if options.output:

@@ -1,9 +1,10 @@
-"""Whether `integrator = "auto"` keeps the error of the energy that it is asked for: rms error over the target.
+"""Whether `integrator = "auto"` keeps the error of the energy that it is asked for: rms error over
+the target.
 
     python tests/benchmarks/energy_errors.py --scenes water,smooth --targets 1e-4,1e-6 --ps 10
 
-The error is that of the whole stage and of its first 0.1 and 1 ps, in the target; beside them the force evaluations of the
-pilots in those of the stage.
+The error is that of the whole stage and of its first 0.1 and 1 ps, in the target; beside them the
+force evaluations of the pilots in those of the stage.
 """
 
 import argparse
@@ -19,13 +20,21 @@ from support import SCHEMES, choice
 from rigidmd import Scene, Simulation
 from rigidmd.errors import SimulationError
 
-WATER = {"box": {"lengths_A": 12.42}, "molecules": [{"model": "spce", "count": 64}], "start": {"temperature_K": 300.0}}
+WATER = {
+    "box": {"lengths_A": 12.42},
+    "molecules": [{"model": "spce", "count": 64}],
+    "start": {"temperature_K": 300.0},
+}
 CO2 = {
     "box": {"lengths_A": 17.0},
     "molecules": [{"model": "co2_trappe", "count": 50}],
     "start": {"temperature_K": 250.0},
 }
-ARGON = {"box": {"lengths_A": 17.0}, "molecules": [{"model": "argon", "count": 100}], "start": {"temperature_K": 120.0}}
+ARGON = {
+    "box": {"lengths_A": 17.0},
+    "molecules": [{"model": "argon", "count": 100}],
+    "start": {"temperature_K": 120.0},
+}
 SCENES = {
     "water": WATER | {"forces": {"cutoff_A": 6.0}},
     "smooth": WATER | {"forces": {"cutoff_A": 6.0, "truncation": "smooth_switch"}},
@@ -61,9 +70,15 @@ def of_molecules(name: str, target: float, duration: float) -> list[str]:
     scene = Scene.from_dict(SCENES[name] | {"stages": stages, "output": output})
     _, results, forces = counted(lambda: Simulation(scene))
     own = results["stage"] == 1
-    time, error = results["time"][own] - 3.0, results["drift"][own] / (2 * results["kinetic"][own].mean())
+    time, error = (
+        results["time"][own] - 3.0,
+        results["drift"][own] / (2 * results["kinetic"][own].mean()),
+    )
     stage = results.summary["stages"][1]
-    ratios = [float(np.sqrt(np.mean(error[time <= end + 1e-9] ** 2))) / target for end in (0.1, 1.0, duration)]
+    ratios = [
+        float(np.sqrt(np.mean(error[time <= end + 1e-9] ** 2))) / target
+        for end in (0.1, 1.0, duration)
+    ]
     of_stage = stage["steps"] * SCHEMES[stage["integrator"]].force_evaluations
     return [
         f"{stage['integrator']} {stage['timestep_fs']:.3g} fs",
@@ -74,22 +89,39 @@ def of_molecules(name: str, target: float, duration: float) -> list[str]:
 
 def of_top(target: float) -> list[str]:
     """The same of a heavy top, over its run of 1.7 s."""
-    changes = {"run.integrator": "auto", "run.energy_error": target, "run.timestep_s": 0.05, "output.interval_s": 0.1}
+    changes = {
+        "run.integrator": "auto",
+        "run.energy_error": target,
+        "run.timestep_s": 0.05,
+        "output.interval_s": 0.1,
+    }
     simulation, results, forces = counted(lambda: Simulation(Scene.read(TOP, changes)))
     run = simulation.scene.run
     error = float(np.sqrt(np.mean(results["energy_error"] ** 2))) / target
     of_run = run.duration_s / run.timestep_s * SCHEMES[run.integrator].force_evaluations
-    return [f"{run.integrator} {run.timestep_s:.3g} s", "", "", f"{error:.2f}", f"{forces / of_run:.2f}"]
+    return [
+        f"{run.integrator} {run.timestep_s:.3g} s",
+        "",
+        "",
+        f"{error:.2f}",
+        f"{forces / of_run:.2f}",
+    ]
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--scenes", default=",".join([*SCENES, "top"]), help=f"of {','.join(SCENES)},top; all")
-    parser.add_argument("--targets", default="1e-3,1e-4,1e-5,1e-6,1e-7", help="1e-3,1e-4,1e-5,1e-6,1e-7")
+    parser.add_argument(
+        "--scenes", default=",".join([*SCENES, "top"]), help=f"of {','.join(SCENES)},top; all"
+    )
+    parser.add_argument(
+        "--targets", default="1e-3,1e-4,1e-5,1e-6,1e-7", help="1e-3,1e-4,1e-5,1e-6,1e-7"
+    )
     parser.add_argument("--ps", type=float, default=10.0, help="length of the stage; 10")
     asked = parser.parse_args()
-    print("| scene | target | chosen | 0.1 ps | 1 ps | whole stage | pilots |\n|---|---|---|---|---|---|---|")
+    print(
+        "| scene | target | chosen | 0.1 ps | 1 ps | whole stage | pilots |\n|---|---|---|---|---|---|---|"
+    )
     for name in asked.scenes.split(","):
         for target in map(float, asked.targets.split(",")):
             try:

@@ -1,4 +1,5 @@
-"""The ten scenes of tests/scenes.py on rigidmd and another engine, a line each: for docs/evidence/validation.md.
+"""The ten scenes of tests/scenes.py on rigidmd and another engine, a line each: for
+docs/evidence/validation.md.
 
 python tests/benchmarks/engines.py [lammps|openmm]
 """
@@ -23,7 +24,9 @@ def main(engine: str) -> None:
     platform = {"platform": "Reference"} if engine == "openmm" else {}
     for name, (counts, sections) in SCENES.items():
         try:
-            found = verify(small_scene(counts, 15.0, **sections, engine={"name": engine} | platform))
+            found = verify(
+                small_scene(counts, 15.0, **sections, engine={"name": engine} | platform)
+            )
         except RigidMDError as error:
             print(f"| {name} | {error} |")
             continue

@@ -2,8 +2,9 @@
 
     python tests/benchmarks/ensembles.py --workloads W1,W2 --rounds 5
 
-All move the same start in steps of 2 fs in mixed precision, in turns in one process, and nobody looks. The thermostats and
-barostats have their default strengths. The workloads are those of peers.py.
+All move the same start in steps of 2 fs in mixed precision, in turns in one process, and nobody
+looks. The thermostats and barostats have their default strengths. The workloads are those of
+peers.py.
 """
 
 import argparse
@@ -32,8 +33,11 @@ STAGES = {
 WARM_UP = 200
 
 
-def measure(workload: str, folder: Path, rounds: int, seconds: float) -> dict[str, tuple[float, float]]:
-    """Of each ensemble its median steps a second, and the median of the ratios to constant energy."""
+def measure(
+    workload: str, folder: Path, rounds: int, seconds: float
+) -> dict[str, tuple[float, float]]:
+    """Of each ensemble its median steps a second, and the median of the ratios to constant
+    energy."""
     stages = [{"duration_ps": 1.0, "timestep_fs": 1e3 * STEP} | stage for stage in STAGES.values()]
     data = WORKLOADS[workload].scene(precision="mixed", stages=stages, output={"trajectory": False})
     run = Simulation(Scene.from_dict(data, folder))
@@ -46,7 +50,10 @@ def measure(workload: str, folder: Path, rounds: int, seconds: float) -> dict[st
     steps = max(50, round(seconds * warm[0]))
     found = [[speed(*mover, steps) for mover in movers] for _ in range(rounds)]
     return {
-        name: (statistics.median(one[k] for one in found), statistics.median(one[k] / one[0] for one in found))
+        name: (
+            statistics.median(one[k] for one in found),
+            statistics.median(one[k] / one[0] for one in found),
+        )
         for k, name in enumerate(STAGES)
     }
 
@@ -55,7 +62,9 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     names = list(WORKLOADS)
-    parser.add_argument("--workloads", type=choice(names), default=["W1", "W2"], help=f"of {','.join(names)}; W1,W2")
+    parser.add_argument(
+        "--workloads", type=choice(names), default=["W1", "W2"], help=f"of {','.join(names)}; W1,W2"
+    )
     parser.add_argument("--rounds", type=int, default=5, help="5")
     parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement; 2")
     asked = parser.parse_args()
@@ -65,7 +74,9 @@ def main() -> None:
     }
     print(f"| steps/s, and over nve | {' | '.join(found)} |\n|---|{'---|' * len(found)}")
     for name in STAGES:
-        cells = (f"{speed:.4g}, {ratio:.2f}" for speed, ratio in (own[name] for own in found.values()))
+        cells = (
+            f"{speed:.4g}, {ratio:.2f}" for speed, ratio in (own[name] for own in found.values())
+        )
         print(f"| {name} | {' | '.join(cells)} |")
 
 

@@ -20,14 +20,21 @@ def about(axis, angle):
     """The rotation matrix about lab axis 0 or 2."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     rotation = np.eye(3)
-    rotation[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+    rotation[[i, i, j, j], [i, j, i, j]] = (
+        np.cos(angle),
+        -np.sin(angle),
+        np.sin(angle),
+        np.cos(angle),
+    )
     return rotation
 
 
 Q = about(2, PHI) @ about(0, THETA) @ about(2, PSI)
 NODE = about(2, PHI) @ X
 #: Rows: to the right, upwards and towards the eye.
-VIEW = np.array([[-np.sin(0.593), np.cos(0.593), 0.0], [0.0, 0.0, 0.0], [np.cos(0.593), np.sin(0.593), 0.55]])
+VIEW = np.array(
+    [[-np.sin(0.593), np.cos(0.593), 0.0], [0.0, 0.0, 0.0], [np.cos(0.593), np.sin(0.593), 0.55]]
+)
 VIEW[2] /= np.linalg.norm(VIEW[2])
 VIEW[1] = np.cross(VIEW[2], VIEW[0])
 
@@ -48,7 +55,13 @@ def disc(first, second, color):
     depth = edge @ VIEW[2]
     axes.fill(*flat(edge).T, color=color, alpha=0.07, lw=0)
     for front, alpha, dashes in ((depth >= 0, 0.9, "-"), (depth < 0, 0.45, (0, (4, 3)))):
-        axes.plot(*np.where(front[:, None], flat(edge), np.nan).T, color=color, alpha=alpha, lw=1.0, ls=dashes)
+        axes.plot(
+            *np.where(front[:, None], flat(edge), np.nan).T,
+            color=color,
+            alpha=alpha,
+            lw=1.0,
+            ls=dashes,
+        )
 
 
 def arrow(tip, color, label, shift, width=2.0):
@@ -60,7 +73,9 @@ def arrow(tip, color, label, shift, width=2.0):
         "shrinkB": 0,
     }
     axes.annotate("", flat(tip), flat(np.zeros(3)), arrowprops=style, zorder=5)
-    axes.text(*(flat(tip) + shift), label, color=color, fontsize=17, ha="center", va="center", zorder=6)
+    axes.text(
+        *(flat(tip) + shift), label, color=color, fontsize=17, ha="center", va="center", zorder=6
+    )
 
 
 def arc(start, toward, angle, radius, color, label, reach=1.22, part=0.5):
@@ -69,7 +84,13 @@ def arc(start, toward, angle, radius, color, label, reach=1.22, part=0.5):
     path = radius * (np.cos(s) * start + np.sin(s) * toward)
     wedge = np.vstack([np.zeros(3), path])
     axes.fill(*flat(wedge).T, color=color, alpha=0.22, lw=0, zorder=2)
-    style = {"arrowstyle": "-|>,head_width=0.2,head_length=0.45", "color": color, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
+    style = {
+        "arrowstyle": "-|>,head_width=0.2,head_length=0.45",
+        "color": color,
+        "lw": 1.8,
+        "shrinkA": 0,
+        "shrinkB": 0,
+    }
     axes.plot(*flat(path[:-3]).T, color=color, lw=1.8, zorder=4)
     axes.annotate("", flat(path[-1]), flat(path[-4]), arrowprops=style, zorder=4)
     middle = reach * radius * (np.cos(part * angle) * start + np.sin(part * angle) * toward)
@@ -80,7 +101,14 @@ disc(X, Y, LAB)
 disc(Q[:, 0], Q[:, 1], BODY)
 line = np.array([-1.0, 1.25])[:, None] * NODE
 axes.plot(*flat(line).T, color=INK, lw=1.2, ls=(0, (6, 3)), zorder=3)
-axes.text(*(flat(1.36 * NODE) - (0.0, 0.01)), "line of nodes", color=INK, fontsize=12, ha="center", va="center")
+axes.text(
+    *(flat(1.36 * NODE) - (0.0, 0.01)),
+    "line of nodes",
+    color=INK,
+    fontsize=12,
+    ha="center",
+    va="center",
+)
 for axis, name, shift in ((X, "x", (-0.08, -0.03)), (Y, "y", (0.08, 0.0)), (Z, "z", (-0.08, 0.03))):
     arrow(1.25 * axis, LAB, f"${name}$", np.array(shift))
 for k, shift in enumerate(((0.08, 0.05), (-0.06, 0.07), (0.08, 0.05))):
@@ -99,4 +127,6 @@ axes.text(
     color=INK,
     fontsize=13,
 )
-figure.savefig(Path(__file__).parents[2] / "rigidmd" / "docs" / "images" / "euler_angles.png", dpi=130)
+figure.savefig(
+    Path(__file__).parents[2] / "rigidmd" / "docs" / "images" / "euler_angles.png", dpi=130
+)

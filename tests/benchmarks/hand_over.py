@@ -1,10 +1,11 @@
-"""From which size a hand-over to LAMMPS is worth it: steps a second of one scene on rigidmd and on LAMMPS, one core and two.
+"""From which size a hand-over to LAMMPS is worth it: steps a second of one scene on rigidmd and on
+LAMMPS, one core and two.
 
     python tests/benchmarks/hand_over.py
 
-SPC/E with PME at 1e-5, 9 Å, 2 fs, as `rigidmd run` runs it, in double precision and mixed. Engines take turns, three
-times; medians. The last column is the number of LAMMPS' ranks that would be as fast as two threads here, if it went on
-to scale as from one rank to two.
+SPC/E with PME at 1e-5, 9 Å, 2 fs, as `rigidmd run` runs it, in double precision and mixed. Engines
+take turns, three times; medians. The last column is the number of LAMMPS' ranks that would be as
+fast as two threads here, if it went on to scale as from one rank to two.
 """
 
 import json
@@ -50,9 +51,20 @@ RUNS = {
 def speed(scene: Path, options: tuple[str, ...]) -> float:
     """Steps a second of a run."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "rigidmd", "run", str(scene), "-o", f"{folder}/run", *options]
+        command = [
+            sys.executable,
+            "-m",
+            "rigidmd",
+            "run",
+            str(scene),
+            "-o",
+            f"{folder}/run",
+            *options,
+        ]
         subprocess.run(command, check=True, capture_output=True)
-        return json.loads((Path(folder) / "run" / "summary.json").read_text())["stages"][0]["steps_per_s"]
+        return json.loads((Path(folder) / "run" / "summary.json").read_text())["stages"][0][
+            "steps_per_s"
+        ]
 
 
 def main(counts: list[int]) -> None:
@@ -72,7 +84,9 @@ def main(counts: list[int]) -> None:
                     found[name].append(speed(scene, options))
         middle = {name: median(values) for name, values in found.items()}
         gain = middle["LAMMPS 2"] / middle["LAMMPS 1"]
-        doublings = log2(middle["mixed 2"] / middle["LAMMPS 1"]) / log2(gain) if gain > 1 else float("inf")
+        doublings = (
+            log2(middle["mixed 2"] / middle["LAMMPS 1"]) / log2(gain) if gain > 1 else float("inf")
+        )
         figures = " | ".join(f"{middle[name]:.3g}" for name in RUNS)
         print(f"| {count} | {figures} | {2**doublings:.0f} |", flush=True)
 

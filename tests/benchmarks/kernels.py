@@ -1,11 +1,14 @@
-"""What a pair of sites costs in each kernel, and where a step of a liquid goes: one core, every vector width.
+"""What a pair of sites costs in each kernel, and where a step of a liquid goes: one core, every
+vector width.
 
     python tests/benchmarks/kernels.py --workloads W1,W2,W3 --bits 512,256,128
 
-The liquids are those of peers.py. A lane is one site of a vector that meets another site; it is useful if the two
-are inside the cut-off and act on one another. Times are the shortest of many calls, since other programs can only add
-to them. A kernel is called several times by compiled code, and what a call from Python takes with no kernel at all,
-some milliseconds to find the types of so many arrays, is taken off. Each width runs in a process of its own, since it is chosen when the package is imported.
+The liquids are those of peers.py. A lane is one site of a vector that meets another site; it is
+useful if the two are inside the cut-off and act on one another. Times are the shortest of many
+calls, since other programs can only add to them. A kernel is called several times by compiled code,
+and what a call from Python takes with no kernel at all, some milliseconds to find the types of so
+many arrays, is taken off. Each width runs in a process of its own, since it is chosen when the
+package is imported.
 """
 
 import argparse
@@ -72,7 +75,9 @@ def entries_that_matter(pairs):
     clusters, per_cluster = pairs.clusters, len(pairs.row_end) * 4 // len(pairs.clusters.origin)
     for block in range(len(pairs.needed)):
         first = 0
-        for r in range(per_cluster * clusters.bounds[block], per_cluster * clusters.bounds[block + 1]):
+        for r in range(
+            per_cluster * clusters.bounds[block], per_cluster * clusters.bounds[block + 1]
+        ):
             found += end_of_row(pairs, r, moved) - first
             first = pairs.row_end[r]
     return found
@@ -121,13 +126,20 @@ def measure(job: dict) -> list[dict]:
     began = time.perf_counter()
     engine.advance(state, scheme, STEP, 2 * STEPS)
     step = 1e3 * (time.perf_counter() - began) / STEPS
-    common = {**job, "bits": SIMD_BITS, "lanes": SIMD_BITS // (8 * DTYPES[job["precision"]]().itemsize), "step": step}
+    common = {
+        **job,
+        "bits": SIMD_BITS,
+        "lanes": SIMD_BITS // (8 * DTYPES[job["precision"]]().itemsize),
+        "step": step,
+    }
     found = []
     for name, term in engine.workspaces.items():
         if isinstance(term, PairWorkspace):
             every = STEPS / max(1, builds_of(term) - builds[name])
             found.append(
-                common | {"kernel": f"{name}, {type(term.slot_potential).__name__}"} | of_pairs(term, state, every)
+                common
+                | {"kernel": f"{name}, {type(term.slot_potential).__name__}"}
+                | of_pairs(term, state, every)
             )
         elif hasattr(term, "mesh"):
             found.append(common | {"kernel": name, "mesh": of_mesh(term)})
@@ -143,7 +155,11 @@ def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
     """Times of the kernels of a law between pairs, whose list is built anew every so many steps."""
     load = no_load(state)
     pairs, blocks = term.pairs, len(term.pairs.needed)
-    code, lists, content = term.code, term.list_code, (term.slot_potential, pairs, term.sums, None, None)
+    code, lists, content = (
+        term.code,
+        term.list_code,
+        (term.slot_potential, pairs, term.sums, None, None),
+    )
     placed, on_sites = (pairs, term.sites, state), (term.sites, state, load, term.forces_in_slots)
     lanes, useful = lanes_of(term), useful_pairs(term, state)
     forces = milliseconds(run_blocks, code, "forces", content, blocks)
@@ -162,26 +178,46 @@ def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
         + milliseconds(run_blocks, lists, "fill", pairs, blocks)
     )
     return {
-        "every": every, "per_pair": 1e6 * forces / useful, "per_lane": 1e6 * forces / lanes, "useful": useful / lanes,
-        "parts": {"pairs": forces, "gather": gather, "follow": follow, "sites": place + loads, "list": build / every},
-    }  # fmt: skip
+        "every": every,
+        "per_pair": 1e6 * forces / useful,
+        "per_lane": 1e6 * forces / lanes,
+        "useful": useful / lanes,
+        "parts": {
+            "pairs": forces,
+            "gather": gather,
+            "follow": follow,
+            "sites": place + loads,
+            "list": build / every,
+        },
+    }
 
 
 def of_mesh(term: NamedTuple) -> dict[str, float]:
     """Times of the kernels of the mesh, ms."""
     content, blocks = (term.smooth, term.charge, term.spline, term.mesh), len(term.mesh.tallies)
     content_of = {"convolve": (term.smooth, term.mesh, None)}
-    times = {task: milliseconds(run_blocks, term.code, task, content_of.get(task, content), blocks) for task in MESH}
+    times = {
+        task: milliseconds(run_blocks, term.code, task, content_of.get(task, content), blocks)
+        for task in MESH
+    }
     return times | {"sort": milliseconds(run_once, term.code, "sort", content)}
 
 
 def main() -> None:
     """Measure and print both tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--workloads", type=choice(WORKLOADS), default=list(WORKLOADS), help="W1,W2,W3")
-    parser.add_argument("--bits", type=numbers(int), default=[SIMD_BITS], help="vector widths; 512,256,128")
-    parser.add_argument("--endings", type=choice(ENDINGS), default=list(ENDINGS), help="of mixed precision; double has "
-                        "the first of them")  # fmt: skip
+    parser.add_argument(
+        "--workloads", type=choice(WORKLOADS), default=list(WORKLOADS), help="W1,W2,W3"
+    )
+    parser.add_argument(
+        "--bits", type=numbers(int), default=[SIMD_BITS], help="vector widths; 512,256,128"
+    )
+    parser.add_argument(
+        "--endings",
+        type=choice(ENDINGS),
+        default=list(ENDINGS),
+        help="of mixed precision; double has the first of them",
+    )
     parser.add_argument("--job", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.job:
@@ -191,10 +227,16 @@ def main() -> None:
     for bits in asked.bits:
         for workload in asked.workloads:
             start_of(workload, "own")
-            for precision, ending in [*(("mixed", ending) for ending in asked.endings), ("double", asked.endings[0])]:
+            for precision, ending in [
+                *(("mixed", ending) for ending in asked.endings),
+                ("double", asked.endings[0]),
+            ]:
                 job = {"workload": workload, "precision": precision, "ending": ending}
                 command = [sys.executable, __file__, "--job", json.dumps(job)]
-                environment = os.environ | {"RIGIDMD_SIMD_BITS": str(bits), "NUMBA_NUM_THREADS": "1"}
+                environment = os.environ | {
+                    "RIGIDMD_SIMD_BITS": str(bits),
+                    "NUMBA_NUM_THREADS": "1",
+                }
                 done = subprocess.run(command, env=environment, capture_output=True, text=True)
                 if done.returncode:
                     sys.exit(done.stderr)
@@ -202,7 +244,9 @@ def main() -> None:
                 print(".", end="", file=sys.stderr, flush=True)
     of_pair, of_waves = [r for r in rows if "parts" in r], [r for r in rows if "mesh" in r]
     print(
-        "\n| | kernel | precision | ending | lanes | ns a useful pair | ns a lane | useful lanes |\n" + "|---" * 8 + "|"
+        "\n| | kernel | precision | ending | lanes | ns a useful pair | ns a lane | useful lanes |\n"
+        + "|---" * 8
+        + "|"
     )
     for r in of_pair:
         print(
@@ -224,7 +268,13 @@ def main() -> None:
                 f"| {r['every']:.1f} steps | {r['step']:.2f} |"
             )
     if of_waves:
-        print("\n| ms of a step | lanes | " + " | ".join(of_waves[0]["mesh"]) + " |\n" + "|---" * 8 + "|")
+        print(
+            "\n| ms of a step | lanes | "
+            + " | ".join(of_waves[0]["mesh"])
+            + " |\n"
+            + "|---" * 8
+            + "|"
+        )
     for r in of_waves:
         if r["ending"] == asked.endings[0]:
             parts = " | ".join(f"{part:.3f}" for part in r["mesh"].values())

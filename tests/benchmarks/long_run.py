@@ -1,11 +1,14 @@
-"""The rounding errors of 1e8 steps: how |L|, the energy and the orthogonality of Q change, in double and mixed precision.
+"""The rounding errors of 1e8 steps: how |L|, the energy and the orthogonality of Q change, in
+double and mixed precision.
 
-    python tests/benchmarks/long_run.py top_exact top_split heavy_top dimer_double dimer_mixed dimer_6_double dimer_6_mixed
+    python tests/benchmarks/long_run.py top_exact top_split heavy_top dimer_double dimer_mixed
+    dimer_6_double dimer_6_mixed
     python tests/benchmarks/long_run.py            # draws the figure and prints the table
 
-writes rigidmd/docs/evidence/data/long_run.json and rigidmd/docs/images/long_run.png. A curve is the root mean square
-change of a quantity in n steps, over all pairs of samples n steps apart in one run: a random walk of rounding errors has
-slope 1/2 (Brouwer 1937), a drift slope 1, a bounded error slope 0. The change over the whole run is one number besides.
+writes rigidmd/docs/evidence/data/long_run.json and rigidmd/docs/images/long_run.png. A curve is the
+root mean square change of a quantity in n steps, over all pairs of samples n steps apart in one
+run: a random walk of rounding errors has slope 1/2 (Brouwer 1937), a drift slope 1, a bounded error
+slope 0. The change over the whole run is one number besides.
 """
 
 import json
@@ -16,24 +19,82 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import FAINT, INK, SCHEMES, body_trial_system, curve_style, molecular_trial_system, new_figure, open_axis
+from support import (
+    FAINT,
+    INK,
+    SCHEMES,
+    body_trial_system,
+    curve_style,
+    molecular_trial_system,
+    new_figure,
+    open_axis,
+)
 
 from rigidmd import Scene, Simulation
 
 ROOT = Path(__file__).parents[2]
-DATA, IMAGE = (ROOT / "rigidmd" / "docs" / part for part in ("evidence/data/long_run.json", "images/long_run.png"))
+DATA, IMAGE = (
+    ROOT / "rigidmd" / "docs" / part
+    for part in ("evidence/data/long_run.json", "images/long_run.png")
+)
 #: Name -> text of the legend, scene, overrides, integrator, rotor, time step (s or fs), steps.
 CASES = {
-    "top_exact": ("free top, exact rotor", "free_asymmetric_top", {}, "velocity_verlet", "exact", 0.1, 10**8),
-    "top_split": ("free top, split rotor", "free_asymmetric_top", {}, "velocity_verlet", "split", 0.1, 10**8),
+    "top_exact": (
+        "free top, exact rotor",
+        "free_asymmetric_top",
+        {},
+        "velocity_verlet",
+        "exact",
+        0.1,
+        10**8,
+    ),
+    "top_split": (
+        "free top, split rotor",
+        "free_asymmetric_top",
+        {},
+        "velocity_verlet",
+        "split",
+        0.1,
+        10**8,
+    ),
     "heavy_top": ("heavy top, srkn_6", "heavy_top_3", {}, "srkn_6", "exact", 0.002, 10**8),
-    "dimer_double": ("two waters, velocity_verlet, double", "water_dimer", {"precision": "double"},
-                     "velocity_verlet", "exact", 0.5, 10**8),
-    "dimer_mixed": ("two waters, velocity_verlet, mixed", "water_dimer", {"precision": "mixed"},
-                    "velocity_verlet", "exact", 0.5, 2 * 10**7),
-    "dimer_6_double": ("two waters, srkn_6, double", "water_dimer", {"precision": "double"}, "srkn_6", "exact", 0.5, 10**7),
-    "dimer_6_mixed": ("two waters, srkn_6, mixed", "water_dimer", {"precision": "mixed"}, "srkn_6", "exact", 0.5, 10**6),
-}  # fmt: skip
+    "dimer_double": (
+        "two waters, velocity_verlet, double",
+        "water_dimer",
+        {"precision": "double"},
+        "velocity_verlet",
+        "exact",
+        0.5,
+        10**8,
+    ),
+    "dimer_mixed": (
+        "two waters, velocity_verlet, mixed",
+        "water_dimer",
+        {"precision": "mixed"},
+        "velocity_verlet",
+        "exact",
+        0.5,
+        2 * 10**7,
+    ),
+    "dimer_6_double": (
+        "two waters, srkn_6, double",
+        "water_dimer",
+        {"precision": "double"},
+        "srkn_6",
+        "exact",
+        0.5,
+        10**7,
+    ),
+    "dimer_6_mixed": (
+        "two waters, srkn_6, mixed",
+        "water_dimer",
+        {"precision": "mixed"},
+        "srkn_6",
+        "exact",
+        0.5,
+        10**6,
+    ),
+}
 QUANTITIES = {
     "L": "angular momentum, relative",
     "energy": "energy / kinetic energy",
@@ -44,12 +105,18 @@ FITTED = (1e3, 1e7)  # steps between which a slope is fitted
 
 
 def trial_system(scene: str, overrides: dict, rotor: str):
-    """The start of a scene with its methods, and the same in double precision, which measures energies."""
-    read = lambda more: Scene.read(ROOT / "systems" / f"{scene}.toml", more)  # noqa: E731
+    """The start of a scene with its methods, and the same in double precision, which measures
+    energies."""
+
+    def read(more):
+        return Scene.read(ROOT / "systems" / f"{scene}.toml", more)
+
     if "top" in scene:
         system = body_trial_system(read(overrides))[0]
         return system, system
-    simulations = [Simulation(read(more | {"threads": 1})) for more in (overrides, {"precision": "double"})]
+    simulations = [
+        Simulation(read(more | {"threads": 1})) for more in (overrides, {"precision": "double"})
+    ]
     return [molecular_trial_system(s.system, s.state, rotor, 0.1) for s in simulations]
 
 
@@ -70,7 +137,11 @@ def run(name: str) -> dict:
 
     def momenta() -> np.ndarray:
         found = np.einsum("nij,nj->ni", state.rotation, state.angular_momentum_body)
-        return found if mass is None else found + np.cross(state.position, mass[:, None] * state.velocity)
+        return (
+            found
+            if mass is None
+            else found + np.cross(state.position, mass[:, None] * state.velocity)
+        )
 
     size = np.linalg.norm(momenta(), axis=1).sum()
 
@@ -78,9 +149,12 @@ def run(name: str) -> dict:
         total = momenta().sum(axis=0) / size
         if scene.startswith("heavy"):
             total[:2] = 0.0  # gravity changes them
-        # Q Q' has the size of the error of Q'Q, and does not change when a rotation multiplies Q from the right
+        # Q Q' has the size of the error of Q'Q, and does not change when a rotation multiplies Q
+        # from the right
         gram = np.einsum("nij,nkj->nik", state.rotation, state.rotation) - np.eye(3)
-        return np.concatenate([total, [in_double.energy(judge, state) / system.kinetic], gram.ravel()])
+        return np.concatenate(
+            [total, [in_double.energy(judge, state) / system.kinetic], gram.ravel()]
+        )
 
     began, rows = time.perf_counter(), [sample()]
     spacing = steps // COARSE
@@ -92,7 +166,13 @@ def run(name: str) -> dict:
     fine, coarse = np.array(rows[: FINE + 1]), np.array(rows[FINE:])
     columns = {"L": slice(0, 3), "energy": slice(3, 4), "QTQ": slice(4, None)}
     print(f"{name}: {seconds:.0f} s", flush=True)
-    found = {"steps": steps, "timestep": step, "seconds": round(seconds, 1), "changes": {}, "whole": {}}
+    found = {
+        "steps": steps,
+        "timestep": step,
+        "seconds": round(seconds, 1),
+        "changes": {},
+        "whole": {},
+    }
     for quantity, part in columns.items():
         changes = {}
         for values, apart in ((fine[:, part], 10), (coarse[:, part], spacing)):
@@ -110,7 +190,9 @@ def fitted_slope(changes: list) -> float:
     """Exponent of the growth with the number of steps."""
     n, change = np.array(changes or [[1, 0]]).T
     kept = (n >= FITTED[0]) & (n <= FITTED[1]) & (change > 0)
-    return float(np.polyfit(np.log(n[kept]), np.log(change[kept]), 1)[0]) if kept.sum() > 2 else np.nan
+    return (
+        float(np.polyfit(np.log(n[kept]), np.log(change[kept]), 1)[0]) if kept.sum() > 2 else np.nan
+    )
 
 
 def draw(cases: dict) -> None:
@@ -120,7 +202,8 @@ def draw(cases: dict) -> None:
     for axis, (quantity, title) in zip(axes, QUANTITIES.items(), strict=True):
         for k, name in enumerate(case for case in CASES if case in cases):
             n, change = np.array(
-                [point for point in cases[name]["changes"].get(quantity, []) if point[1] > 0] or [[np.nan] * 2]
+                [point for point in cases[name]["changes"].get(quantity, []) if point[1] > 0]
+                or [[np.nan] * 2]
             ).T
             axis.loglog(n, change, ms=2.5, lw=1.1, label=CASES[name][0], **curve_style(k))
         axis.set_title(f"change of {title}", loc="left", fontsize=9, color=INK)
@@ -130,22 +213,41 @@ def draw(cases: dict) -> None:
         for power, text in ((0.5, "√n"), (1.0, "n")):
             axis.loglog(n, 1e-16 * (n / 10) ** power, "--", color=FAINT, lw=0.9)
             axis.annotate(
-                text, (1e5, 1e-16 * 1e4**power), xytext=(2, -9), textcoords="offset points", color=FAINT, fontsize=9
+                text,
+                (1e5, 1e-16 * 1e4**power),
+                xytext=(2, -9),
+                textcoords="offset points",
+                color=FAINT,
+                fontsize=9,
             )
         axis.set_xlabel("steps n", color=INK, fontsize=9)
         axis.set_ylim(limits)
         open_axis(axis)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, fontsize=8, loc="outside lower center", ncols=4, labelcolor=INK)
+    figure.legend(
+        handles,
+        labels,
+        frameon=False,
+        fontsize=8,
+        loc="outside lower center",
+        ncols=4,
+        labelcolor=INK,
+    )
     figure.savefig(IMAGE, dpi=110)
 
 
 def table(cases: dict) -> str:
     """Slopes and changes over the whole run, in Markdown."""
-    lines = ["| run | steps | L: slope | in all | energy: slope | in all | QᵀQ: slope | in all |", "|" + "---|" * 8]
+    lines = [
+        "| run | steps | L: slope | in all | energy: slope | in all | QᵀQ: slope | in all |",
+        "|" + "---|" * 8,
+    ]
     for name in (case for case in CASES if case in cases):
         found = cases[name]
-        cells = [f"{fitted_slope(found['changes'].get(q, [])):.2f} | {found['whole'][q]:.1e}" for q in QUANTITIES]
+        cells = [
+            f"{fitted_slope(found['changes'].get(q, [])):.2f} | {found['whole'][q]:.1e}"
+            for q in QUANTITIES
+        ]
         lines.append(f"| {CASES[name][0]} | {found['steps']:.0e} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -155,7 +257,10 @@ if __name__ == "__main__":
         found = run(name)
         cases = json.loads(DATA.read_text()) if DATA.is_file() else {}
         DATA.write_text(
-            json.dumps(cases | {name: found}, indent=1).replace("\n    ", " ").replace("\n   ]", "]") + "\n"
+            json.dumps(cases | {name: found}, indent=1)
+            .replace("\n    ", " ")
+            .replace("\n   ]", "]")
+            + "\n"
         )
     cases = json.loads(DATA.read_text())
     draw(cases)

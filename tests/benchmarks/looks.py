@@ -1,11 +1,13 @@
-"""What looks cost: steps a second of a run with its default output, against those of the engine alone.
+"""What looks cost: steps a second of a run with its default output, against those of the engine
+alone.
 
     python tests/benchmarks/looks.py --workloads 216,W1,W2,W3 --rounds 5
 
-Both move the same start at constant energy in steps of 2 fs, in one process: the engine takes half of its steps before each
-run and half of them after it, in one piece as in peers.py. The run is that of `rigidmd run`: a log, a trajectory, a
-checkpoint, the estimate of the longest stable step. Its time is that of its stages, looks included; the figure and the summary
-come after it. 216: the smallest box of scaling.py; the others are those of peers.py.
+Both move the same start at constant energy in steps of 2 fs, in one process: the engine takes half
+of its steps before each run and half of them after it, in one piece as in peers.py. The run is that
+of `rigidmd run`: a log, a trajectory, a checkpoint, the estimate of the longest stable step. Its
+time is that of its stages, looks included; the figure and the summary come after it. 216: the
+smallest box of scaling.py; the others are those of peers.py.
 """
 
 import argparse
@@ -30,7 +32,11 @@ WARM_UP = 200
 
 def scene(name: str, folder: Path, duration: float, **output) -> Scene:
     """The scene of a workload, for so many ps."""
-    more = {"precision": "mixed", "stages": [{"duration_ps": duration, "timestep_fs": 1e3 * STEP}], "output": output}
+    more = {
+        "precision": "mixed",
+        "stages": [{"duration_ps": duration, "timestep_fs": 1e3 * STEP}],
+        "output": output,
+    }
     if name == SMALL:
         return Scene.from_dict(small(1, **more), folder)
     return Scene.from_dict(WORKLOADS[name].scene(**more), folder)
@@ -47,7 +53,9 @@ def measure(name: str, folder: Path, rounds: int, seconds: float) -> dict:
     def of_run(steps: int) -> float:
         with tempfile.TemporaryDirectory() as out:
             whole = scene(name, folder, steps * STEP)
-            return steps / Simulation(whole, Path(out) / "run").run(progress=False).summary["wall_s"]
+            return (
+                steps / Simulation(whole, Path(out) / "run").run(progress=False).summary["wall_s"]
+            )
 
     of_engine(WARM_UP)
     steps = max(100, round(seconds * of_engine(WARM_UP)))
@@ -57,14 +65,20 @@ def measure(name: str, folder: Path, rounds: int, seconds: float) -> dict:
         before, run, after = of_engine(steps // 2), of_run(steps), of_engine(steps // 2)
         found.append((statistics.harmonic_mean([before, after]), run))
     engine_speed, run_speed = map(statistics.median, zip(*found, strict=True))
-    return {"engine": engine_speed, "run": run_speed, "ratio": statistics.median(run / bare for bare, run in found)}
+    return {
+        "engine": engine_speed,
+        "run": run_speed,
+        "ratio": statistics.median(run / bare for bare, run in found),
+    }
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     names = [SMALL, *WORKLOADS]
-    parser.add_argument("--workloads", type=choice(names), default=names, help=f"of {','.join(names)}; all")
+    parser.add_argument(
+        "--workloads", type=choice(names), default=names, help=f"of {','.join(names)}; all"
+    )
     parser.add_argument("--rounds", type=int, default=5, help="5")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each measurement; 10")
     asked = parser.parse_args()
@@ -75,7 +89,10 @@ def main() -> None:
             if name == SMALL:
                 relax(folder)
             found = measure(name, folder, asked.rounds, asked.seconds)
-        print(f"| {name} | {found['engine']:.4g} | {found['run']:.4g} | {found['ratio']:.3f} |", flush=True)
+        print(
+            f"| {name} | {found['engine']:.4g} | {found['run']:.4g} | {found['ratio']:.3f} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,12 @@
-"""What is measured of liquid water at 298.15 K, with errors: g(r), D, orientation, viscosity, dielectric constant.
+"""What is measured of liquid water at 298.15 K, with errors: g(r), D, orientation, viscosity,
+dielectric constant.
 
     python tests/benchmarks/measured.py --model spce --count 512 --duration 500 -o runs/measured
-    python tests/benchmarks/measured.py --model spce --count 216 --duration 3000 --interval 0.2 --only dielectric
+    python tests/benchmarks/measured.py --model spce --count 216 --duration 3000 --interval 0.2
+    --only dielectric
 
-PME, 10 Å (9 Å of 216), steps of 2 fs, mixed precision, the density given. The folder of the run keeps all figures.
+PME, 10 Å (9 Å of 216), steps of 2 fs, mixed precision, the density given. The folder of the run
+keeps all figures.
 """
 
 import argparse
@@ -18,12 +21,18 @@ from rigidmd import Scene, Simulation
 TEMPERATURE = 298.15
 
 
-def scene(model: str, count: int, density: float, duration: float, interval: float, only: list[str]) -> Scene:
+def scene(
+    model: str, count: int, density: float, duration: float, interval: float, only: list[str]
+) -> Scene:
     """The liquid in a cube, under velocity rescaling."""
     stage = {
-        "ensemble": "nvt", "temperature_K": TEMPERATURE, "duration_ps": duration, "timestep_fs": 2.0,
-        "integrator": "baoab", "thermostat": "velocity_rescaling",
-    }  # fmt: skip
+        "ensemble": "nvt",
+        "temperature_K": TEMPERATURE,
+        "duration_ps": duration,
+        "timestep_fs": 2.0,
+        "integrator": "baoab",
+        "thermostat": "velocity_rescaling",
+    }
     output = {"trajectory_interval_ps": interval, "figures": False}
     if not only or "viscosity" in only:
         output["pressure_tensor_interval_ps"] = 0.01
@@ -31,7 +40,11 @@ def scene(model: str, count: int, density: float, duration: float, interval: flo
         {
             "box": {"density_g_cm3": density},
             "molecules": [{"model": model, "count": count}],
-            "forces": {"cutoff_A": 10.0 if count >= 512 else 9.0, "electrostatics": "pme", "tail_correction": True},
+            "forces": {
+                "cutoff_A": 10.0 if count >= 512 else 9.0,
+                "electrostatics": "pme",
+                "tail_correction": True,
+            },
             "precision": "mixed",
             "start": {"temperature_K": TEMPERATURE},
             "stages": [stage],
@@ -42,7 +55,9 @@ def scene(model: str, count: int, density: float, duration: float, interval: flo
 
 def main() -> None:
     """Run the liquid, analyse it, print what was found."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", default="spce")
     parser.add_argument("--count", type=int, default=512)
     parser.add_argument("--density", type=float, default=0.997, metavar="G_CM3")
@@ -52,7 +67,9 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("runs/measured"), metavar="DIR")
     options = parser.parse_args()
     only = options.only
-    water = scene(options.model, options.count, options.density, options.duration, options.interval, only)
+    water = scene(
+        options.model, options.count, options.density, options.duration, options.interval, only
+    )
     Simulation(water, options.output).run(progress=True)
     done = analyse_folder(options.output, only)
     for told in [*done.frames_used["notes"], *done.results]:

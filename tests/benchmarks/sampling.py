@@ -1,23 +1,30 @@
-"""What an average costs: total error against computing time, for methods of rigidmd, GROMACS and OpenMM.
+"""What an average costs: total error against computing time, for methods of rigidmd, GROMACS and
+OpenMM.
 
     python tests/benchmarks/sampling.py runs/sampling --rounds 4
-    python tests/benchmarks/sampling.py runs/sampling --collect --json sampling.json --figure sampling.png
+    python tests/benchmarks/sampling.py runs/sampling --collect --json sampling.json --figure
+    sampling.png
 
-512 SPC/E waters at 298.15 K; cut-off 9 Å, Lennard-Jones switched over the last Å with tail corrections, PME. All engines have
-the same forces, one thread, and otherwise the settings that their users have: the step, the integrator and the coupling
-differ. Averages: U, the height of the first peak of g(r) of oxygens and D at 0.997 g/cm³, and the density at 1 bar.
+512 SPC/E waters at 298.15 K; cut-off 9 Å, Lennard-Jones switched over the last Å with tail
+corrections, PME. All engines have the same forces, one thread, and otherwise the settings that
+their users have: the step, the integrator and the coupling differ. Averages: U, the height of the
+first peak of g(r) of oxygens and D at 0.997 g/cm³, and the density at 1 bar.
 
-Many short runs (6 ps to relax, 48 ps sampled) from a few starts, in rounds of all methods and steps; a step of 1 fs in one
-round of four. Each leaves a small file, so that the command goes on where it was stopped, and several of them share the
-work: `--next N` does N runs and fails if none is left. Then, of each average,
+Many short runs (6 ps to relax, 48 ps sampled) from a few starts, in rounds of all methods and
+steps; a step of 1 fs in one round of four. Each leaves a small file, so that the command goes on
+where it was stopped, and several of them share the work: `--next N` does N runs and fails if none
+is left. Then, of each average,
 
-- the bias of a method at a step: its mean less the limit of all engines and methods at a step of zero, one weighted fit
-  linear in dt² (`extrapolate`);
-- the variance of a mean over 1 ns: from the scatter of blocks of 6 ps (for D of 24 ps) about the mean of their run, one
-  for Langevin dynamics and one for thermostats of the whole system; those of single methods are printed;
-- the cost: seconds of a processor (user and system) per ns, a median over runs. It hardly depends on what else runs.
+- the bias of a method at a step: its mean less the limit of all engines and methods at a step of
+  zero, one weighted fit linear in dt² (`extrapolate`);
+- the variance of a mean over 1 ns: from the scatter of blocks of 6 ps (for D of 24 ps) about the
+  mean of their run, one for Langevin dynamics and one for thermostats of the whole system; those of
+  single methods are printed;
+- the cost: seconds of a processor (user and system) per ns, a median over runs. It hardly depends
+  on what else runs.
 
-The total error after a time t is sqrt(bias² + variance / t); of the square of a bias that of its error is taken off.
+The total error after a time t is sqrt(bias² + variance / t); of the square of a bias that of its
+error is taken off.
 """
 
 import argparse
@@ -32,7 +39,18 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from peer_engines import Failed, Gromacs, OpenMM, Rigidmd, call, gro, openmm_system, program, sites_of, top
+from peer_engines import (
+    Failed,
+    Gromacs,
+    OpenMM,
+    Rigidmd,
+    call,
+    gro,
+    openmm_system,
+    program,
+    sites_of,
+    top,
+)
 from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -62,7 +80,14 @@ class Quantity(NamedTuple):
 
 
 QUANTITIES = {
-    "U": Quantity("potential energy", "kJ/mol", KT_PER_FREEDOM, "nvt", (0.01, 0.005), "kT per degree of freedom"),
+    "U": Quantity(
+        "potential energy",
+        "kJ/mol",
+        KT_PER_FREEDOM,
+        "nvt",
+        (0.01, 0.005),
+        "kT per degree of freedom",
+    ),
     "density": Quantity("density at 1 bar", "g/cm³", 0.0, "npt", (0.002, 0.001), "fraction"),
     "peak": Quantity("first peak of g(r)", "", 1.0, "nvt", (0.02, 0.005), "of 3.0"),
     "D": Quantity("diffusion coefficient", "1e-5 cm²/s", 0.0, "nvt", (0.05, 0.02), "fraction"),
@@ -78,28 +103,58 @@ class Method(NamedTuple):
     motion: bool = True  # whether it keeps the motion that D belongs to
 
 
-RESCALING, LANGEVIN, HYBRID = ({"thermostat": t} for t in ("velocity_rescaling", "langevin", "hybrid_monte_carlo"))
+RESCALING, LANGEVIN, HYBRID = (
+    {"thermostat": t} for t in ("velocity_rescaling", "langevin", "hybrid_monte_carlo")
+)
 METHODS = {
     "velocity_verlet + velocity_rescaling": Method(
-        "rigidmd", "#2b7fb8", (1, 2, 4, 6, 8), (2, 4), RESCALING | {"integrator": "velocity_verlet"}),
+        "rigidmd", "#2b7fb8", (1, 2, 4, 6, 8), (2, 4), RESCALING | {"integrator": "velocity_verlet"}
+    ),
     "velocity_verlet + nose_hoover": Method(
-        "rigidmd", "#8fb4cf", (4, 8), (), {"integrator": "velocity_verlet", "thermostat": "nose_hoover"}),
+        "rigidmd",
+        "#8fb4cf",
+        (4, 8),
+        (),
+        {"integrator": "velocity_verlet", "thermostat": "nose_hoover"},
+    ),
     "baoab + velocity_rescaling": Method(
-        "rigidmd", "#123d5c", (2, 4, 8), (4, 8), RESCALING | {"integrator": "baoab"}),
-    "baoab + langevin": Method("rigidmd", "#b8862d", (2, 4, 8), (4, 8), LANGEVIN | {"integrator": "baoab"}, False),
-    "srkn_4 + velocity_rescaling": Method("rigidmd", "#7a5ca3", (8,), (), RESCALING | {"integrator": "srkn_4"}),
+        "rigidmd", "#123d5c", (2, 4, 8), (4, 8), RESCALING | {"integrator": "baoab"}
+    ),
+    "baoab + langevin": Method(
+        "rigidmd", "#b8862d", (2, 4, 8), (4, 8), LANGEVIN | {"integrator": "baoab"}, False
+    ),
+    "srkn_4 + velocity_rescaling": Method(
+        "rigidmd", "#7a5ca3", (8,), (), RESCALING | {"integrator": "srkn_4"}
+    ),
     "velocity_verlet + hybrid_monte_carlo": Method(
-        "rigidmd", "#5aa79b", (2, 4), (), HYBRID | {"integrator": "velocity_verlet"}, False),
+        "rigidmd", "#5aa79b", (2, 4), (), HYBRID | {"integrator": "velocity_verlet"}, False
+    ),
     "two_stage + hybrid_monte_carlo": Method(
-        "rigidmd", "#1f6f63", (4, 8), (4,), HYBRID | {"integrator": "two_stage"}, False),
+        "rigidmd", "#1f6f63", (4, 8), (4,), HYBRID | {"integrator": "two_stage"}, False
+    ),
     "GROMACS md + v-rescale": Method(
-        "gromacs", "#c8553d", (1, 2, 4, 8), (2, 4),
-        {"integrator": "md", "tcoupl": "v-rescale", "tc-grps": "system", "tau-t": 0.1, "ref-t": TEMPERATURE}),
+        "gromacs",
+        "#c8553d",
+        (1, 2, 4, 8),
+        (2, 4),
+        {
+            "integrator": "md",
+            "tcoupl": "v-rescale",
+            "tc-grps": "system",
+            "tau-t": 0.1,
+            "ref-t": TEMPERATURE,
+        },
+    ),
     "GROMACS sd": Method(
-        "gromacs", "#e2a08f", (2, 4, 8), (),
-        {"integrator": "sd", "tc-grps": "system", "tau-t": 1.0, "ref-t": TEMPERATURE}, False),
+        "gromacs",
+        "#e2a08f",
+        (2, 4, 8),
+        (),
+        {"integrator": "sd", "tc-grps": "system", "tau-t": 1.0, "ref-t": TEMPERATURE},
+        False,
+    ),
     "OpenMM LangevinMiddle": Method("openmm", "#4f8a5b", (1, 2, 4, 8), (4,), {}, False),
-}  # fmt: skip
+}
 
 
 class Run(NamedTuple):
@@ -119,7 +174,11 @@ def runs(rounds: int) -> list[Run]:
     for number, ensemble in product(range(rounds), ("nvt", "npt")):
         for name, method in METHODS.items():
             steps = method.steps if ensemble == "nvt" else method.dense
-            found += [Run(ensemble, name, step, number) for step in steps if step > RARE or number % STARTS == 0]
+            found += [
+                Run(ensemble, name, step, number)
+                for step in steps
+                if step > RARE or number % STARTS == 0
+            ]
     return found
 
 
@@ -129,12 +188,21 @@ def scene(stage: dict, seed: int = 1, start: bool = True) -> dict:
         "box": None if start else {"density_g_cm3": DENSITY},
         "structure": {"file": "start.npz"} if start else None,
         "molecules": [{"model": "spce", "count": COUNT}],
-        "forces": {"cutoff_A": CUTOFF, "truncation": "switch", "switch_start_A": CUTOFF - SWITCH,
-                   "electrostatics": "pme", "ewald_cutoff_A": CUTOFF, "ewald_truncation": "plain"},
-        "precision": "mixed", "threads": 1, "seed": seed, "start": {"temperature_K": TEMPERATURE},
+        "forces": {
+            "cutoff_A": CUTOFF,
+            "truncation": "switch",
+            "switch_start_A": CUTOFF - SWITCH,
+            "electrostatics": "pme",
+            "ewald_cutoff_A": CUTOFF,
+            "ewald_truncation": "plain",
+        },
+        "precision": "mixed",
+        "threads": 1,
+        "seed": seed,
+        "start": {"temperature_K": TEMPERATURE},
         "stages": [{"temperature_K": TEMPERATURE} | stage],
         "output": {"trajectory": False, "figures": False, "log_interval_ps": EVERY},
-    }  # fmt: skip
+    }
 
 
 def simulate(data: dict, folder: Path, **options) -> Simulation:
@@ -143,7 +211,8 @@ def simulate(data: dict, folder: Path, **options) -> Simulation:
 
 
 def make_starts(folder: Path) -> None:
-    """STARTS states of the liquid, 12 ps apart, in folder/start0, start1, ...: start.npz of rigidmd, sites.npz of all sites."""
+    """STARTS states of the liquid, 12 ps apart, in folder/start0, start1, ...: start.npz of
+    rigidmd, sites.npz of all sites."""
     from peers import WORKLOADS, write_start
 
     stage = {"ensemble": "nvt", "integrator": "baoab", "thermostat": "langevin", "timestep_fs": 2.0}
@@ -153,13 +222,20 @@ def make_starts(folder: Path) -> None:
         if k >= 0:
             state, system = simulation.state, simulation.system
             (folder / f"start{k}").mkdir(exist_ok=True)
-            write_start(folder / f"start{k}", WORKLOADS["W2"], state.position, state.velocity, state.rotation,
-                        state.angular_momentum_body, state.cell[0, 0])  # fmt: skip
+            write_start(
+                folder / f"start{k}",
+                WORKLOADS["W2"],
+                state.position,
+                state.velocity,
+                state.rotation,
+                state.angular_momentum_body,
+                state.cell[0, 0],
+            )
             np.savez(folder / f"start{k}" / "sites.npz", **sites_of(system, state))
 
 
-# Each engine: the series (FRAMES + 1) of U in kJ/mol and density in g/cm³, positions (FRAMES + 1, COUNT, 3) of oxygens and
-# edges of the box in Å, and seconds of a processor per ns
+# Each engine: the series (FRAMES + 1) of U in kJ/mol and density in g/cm³, positions (FRAMES + 1,
+# COUNT, 3) of oxygens and edges of the box in Å, and seconds of a processor per ns
 
 
 def run_rigidmd(run: Run, folder: Path, start: Path) -> tuple:
@@ -172,10 +248,14 @@ def run_rigidmd(run: Run, folder: Path, start: Path) -> tuple:
     stage = METHODS[run.method].options | {"ensemble": run.ensemble, "timestep_fs": run.step}
     if stage["thermostat"] == "hybrid_monte_carlo":
         stage |= {"trajectory_steps": round(1000 * EVERY / run.step)}
-    stage |= {"duration_ps": FRAMES * EVERY} | ({"pressure_bar": 1.0} if run.ensemble == "npt" else {})
+    stage |= {"duration_ps": FRAMES * EVERY} | (
+        {"pressure_bar": 1.0} if run.ensemble == "npt" else {}
+    )
     simulation = simulate(scene(stage, 1 + run.round), start, observers=Every(EVERY, look))
     results = simulation.run(progress=False)
-    edges = (COUNT * simulation.system.species[0].mass / 0.602214076 / results["density"]) ** (1 / 3)
+    edges = (COUNT * simulation.system.species[0].mass / 0.602214076 / results["density"]) ** (
+        1 / 3
+    )
     cost = (clock[-1] - clock[RELAXED]) / NS
     return results["potential"], results["density"], np.array(frames), edges, cost
 
@@ -186,31 +266,77 @@ def run_gromacs(run: Run, folder: Path, start: Path) -> tuple:
     sites = dict(np.load(start / "sites.npz"))
     every = round(1000 * EVERY / run.step)
     options = {
-        "dt": run.step * 1e-3, "nsteps": FRAMES * every, "gen-vel": "yes", "gen-temp": TEMPERATURE,
-        "gen-seed": 1 + run.round, "ld-seed": 1 + run.round, "rvdw": CUTOFF / 10, "rcoulomb": CUTOFF / 10,
-        "vdw-modifier": "potential-switch", "rvdw-switch": (CUTOFF - SWITCH) / 10, "DispCorr": "AllEnerPres",
-        "coulombtype": "PME", "coulomb-modifier": "none", "nstenergy": every, "nstcalcenergy": every, "nstlog": 0,
-        "nstxout-compressed": every, "compressed-x-precision": 10000,
-    } | METHODS[run.method].options  # fmt: skip
+        "dt": run.step * 1e-3,
+        "nsteps": FRAMES * every,
+        "gen-vel": "yes",
+        "gen-temp": TEMPERATURE,
+        "gen-seed": 1 + run.round,
+        "ld-seed": 1 + run.round,
+        "rvdw": CUTOFF / 10,
+        "rcoulomb": CUTOFF / 10,
+        "vdw-modifier": "potential-switch",
+        "rvdw-switch": (CUTOFF - SWITCH) / 10,
+        "DispCorr": "AllEnerPres",
+        "coulombtype": "PME",
+        "coulomb-modifier": "none",
+        "nstenergy": every,
+        "nstcalcenergy": every,
+        "nstlog": 0,
+        "nstxout-compressed": every,
+        "compressed-x-precision": 10000,
+    } | METHODS[run.method].options
     if run.ensemble == "npt":
         options |= {"pcoupl": "C-rescale", "tau-p": 1.0, "ref-p": 1.0, "compressibility": 4.5e-5}
     (folder / "run.mdp").write_text("".join(f"{key} = {value}\n" for key, value in options.items()))
     (folder / "run.gro").write_text(gro(sites, np.zeros_like(sites["position"])))
     (folder / "run.top").write_text(top(sites))
     gmx = [program("gmx"), "-quiet", "-nobackup"]
-    call([*gmx, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr", "-maxwarn", 1], folder)
+    call(
+        [
+            *gmx,
+            "grompp",
+            "-f",
+            "run.mdp",
+            "-c",
+            "run.gro",
+            "-p",
+            "run.top",
+            "-o",
+            "run.tpr",
+            "-maxwarn",
+            1,
+        ],
+        folder,
+    )
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    call([*gmx, "mdrun", "-deffnm", "run", "-notunepme", "-noconfout", "-ntmpi", 1, "-ntomp", 1], folder)
+    call(
+        [*gmx, "mdrun", "-deffnm", "run", "-notunepme", "-noconfout", "-ntmpi", 1, "-ntomp", 1],
+        folder,
+    )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cost = (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime) / (FRAMES * EVERY * 1e-3)
+    cost = (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime) / (
+        FRAMES * EVERY * 1e-3
+    )
     wanted = "Potential\n" + ("Density\n" if run.ensemble == "npt" else "") + "\n"
     call([*gmx, "energy", "-f", "run.edr", "-o", "run.xvg", "-dp"], folder, wanted)
-    lines = [line.split() for line in (folder / "run.xvg").read_text().splitlines() if line[0] not in "#@"]
+    lines = [
+        line.split()
+        for line in (folder / "run.xvg").read_text().splitlines()
+        if line[0] not in "#@"
+    ]
     table = np.array(lines, float)
     density = 1e-3 * table[:, 2] if run.ensemble == "npt" else np.full(len(table), DENSITY)
     with XTCReader(str(folder / "run.xtc")) as trajectory:
-        seen = [(frame.positions[::3].astype(float), float(frame.dimensions[0])) for frame in trajectory]
-    return table[:, 1], density, np.array([at for at, _ in seen]), np.array([edge for _, edge in seen]), cost
+        seen = [
+            (frame.positions[::3].astype(float), float(frame.dimensions[0])) for frame in trajectory
+        ]
+    return (
+        table[:, 1],
+        density,
+        np.array([at for at, _ in seen]),
+        np.array([edge for _, edge in seen]),
+        cost,
+    )
 
 
 def run_openmm(run: Run, folder: Path, start: Path) -> tuple:
@@ -259,7 +385,8 @@ def peak_height(frames: np.ndarray, edges: np.ndarray) -> float:
 
 
 def diffusion(frames: np.ndarray, edge: float) -> float:
-    """D in 1e-5 cm²/s from the slope of the mean square displacement of oxygens, less that of their mean."""
+    """D in 1e-5 cm²/s from the slope of the mean square displacement of oxygens, less that of their
+    mean."""
     moves = np.diff(frames, axis=0)
     path = np.cumsum(moves - edge * np.round(moves / edge), axis=0)
     path -= path.mean(axis=1, keepdims=True)
@@ -273,14 +400,21 @@ def do(run: Run, folder: Path) -> None:
     engine = METHODS[run.method].engine
     with tempfile.TemporaryDirectory() as scratch:
         try:
-            function = {"rigidmd": run_rigidmd, "gromacs": run_gromacs, "openmm": run_openmm}[engine]
-            energy, density, frames, edges, cost = function(run, Path(scratch), folder / f"start{run.round % STARTS}")
+            function = {"rigidmd": run_rigidmd, "gromacs": run_gromacs, "openmm": run_openmm}[
+                engine
+            ]
+            energy, density, frames, edges, cost = function(
+                run, Path(scratch), folder / f"start{run.round % STARTS}"
+            )
         except (Failed, RigidMDError) as error:
             run.file(folder).write_text(json.dumps({"failure": str(error)[:300]}) + "\n")
             return
     blocks = np.split(np.arange(RELAXED + 1, FRAMES + 1), BLOCKS)
     halves = np.split(np.arange(RELAXED + 1, FRAMES + 1), 2)
-    found = {"cost_s_per_ns": cost, "U": [float(np.mean(energy[block])) / COUNT for block in blocks]}
+    found = {
+        "cost_s_per_ns": cost,
+        "U": [float(np.mean(energy[block])) / COUNT for block in blocks],
+    }
     if run.ensemble == "npt":
         found["density"] = [float(np.mean(density[block])) for block in blocks]
     else:
@@ -304,7 +438,9 @@ def do_next(folder: Path, rounds: int) -> bool:
         finally:
             claim.unlink()
         print(
-            f"{time.strftime('%H:%M:%S')} {run.file(folder).stem}: {run.file(folder).read_text()}", end="", flush=True
+            f"{time.strftime('%H:%M:%S')} {run.file(folder).stem}: {run.file(folder).read_text()}",
+            end="",
+            flush=True,
         )
         return True
     return False
@@ -324,7 +460,9 @@ class Point(NamedTuple):
     spread: float  # of the mean over 1 ns, statistical
 
     def total_error(self, seconds):
-        return np.sqrt(max(0.0, self.bias**2 - self.bias_error**2) + self.spread**2 * self.cost / seconds)
+        return np.sqrt(
+            max(0.0, self.bias**2 - self.bias_error**2) + self.spread**2 * self.cost / seconds
+        )
 
     def seconds_to(self, target: float) -> float:
         """Computing time to a total error; infinite where the bias exceeds it."""
@@ -347,7 +485,8 @@ def read(folder: Path) -> dict[tuple[str, str, float], list[dict]]:
 
 
 def analyse(name: str, found: dict) -> dict:
-    """Of a quantity its limit, those of the engines alone, variances of methods over that of all, and points."""
+    """Of a quantity its limit, those of the engines alone, variances of methods over that of all,
+    and points."""
     quantity = QUANTITIES[name]
     values = {
         (method, step): [np.ravel(result[name]) for result in results]
@@ -362,15 +501,27 @@ def analyse(name: str, found: dict) -> dict:
     per_run = {}  # variance of a run's average: one for Langevin dynamics, one for thermostats of the whole
     for motion in {METHODS[method].motion for method in squares}:
         alike = [method for method in squares if METHODS[method].motion == motion]
-        variance = sum(squares[method] for method in alike) / sum(freedom[method] for method in alike)
+        variance = sum(squares[method] for method in alike) / sum(
+            freedom[method] for method in alike
+        )
         per_run |= dict.fromkeys(alike, variance / (2 if name == "D" else BLOCKS))
-    means = {key: MeanAtStep(*key, float(np.mean([x.mean() for x in blocks])),
-                             float(np.sqrt(per_run[key[0]] / len(blocks)))) for key, blocks in values.items()}  # fmt: skip
+    means = {
+        key: MeanAtStep(
+            *key,
+            float(np.mean([x.mean() for x in blocks])),
+            float(np.sqrt(per_run[key[0]] / len(blocks))),
+        )
+        for key, blocks in values.items()
+    }
     fit = extrapolate(list(means.values()))
     scale = quantity.scale or fit.limit
     engines = {}
     for engine in dict.fromkeys(METHODS[method].engine for method, _ in values):
-        some = [m for m in means.values() if METHODS[m.method].engine == engine and m.timestep <= fit.longest]
+        some = [
+            m
+            for m in means.values()
+            if METHODS[m.method].engine == engine and m.timestep <= fit.longest
+        ]
         engines[engine] = list(extrapolate(some)[:2])
     points = []
     for (method, step), mean in means.items():
@@ -378,38 +529,68 @@ def analyse(name: str, found: dict) -> dict:
         bias, error = (x / scale for x in fit.bias(mean))
         spread = float(np.sqrt(per_run[method] * NS)) / scale
         points.append(
-            Point(method, step, len(costs), mean.mean, mean.error, bias, error, float(np.median(costs)), spread)
+            Point(
+                method,
+                step,
+                len(costs),
+                mean.mean,
+                mean.error,
+                bias,
+                error,
+                float(np.median(costs)),
+                spread,
+            )
         )
-    ratios = {m: [squares[m] / freedom[m] / pooled, float(np.sqrt(2 / freedom[m]))] for m in squares if freedom[m]}
-    return {"limit": [fit.limit, fit.limit_error], "longest_step_fs": fit.longest, "limits_of_engines": engines,
-            "variances_over_that_of_all": ratios, "points": points}  # fmt: skip
+    ratios = {
+        m: [squares[m] / freedom[m] / pooled, float(np.sqrt(2 / freedom[m]))]
+        for m in squares
+        if freedom[m]
+    }
+    return {
+        "limit": [fit.limit, fit.limit_error],
+        "longest_step_fs": fit.longest,
+        "limits_of_engines": engines,
+        "variances_over_that_of_all": ratios,
+        "points": points,
+    }
 
 
 def cell(points: list[Point], target: float) -> str:
-    """The shortest time to a total error and its step; with ? where two errors more of the bias would exceed the target."""
+    """The shortest time to a total error and its step; with ? where two errors more of the bias
+    would exceed the target."""
     best = min(points, key=lambda point: point.seconds_to(target))
     needed = best.seconds_to(target)
     if needed == np.inf:
         return "not reached"
     unsure = " ?" if abs(best.bias) + 2 * best.bias_error > target else ""
-    return f"{needed:.2g} ({best.step:g} fs{unsure})" if needed < 99.5 else f"{needed:.0f} ({best.step:g} fs{unsure})"
+    return (
+        f"{needed:.2g} ({best.step:g} fs{unsure})"
+        if needed < 99.5
+        else f"{needed:.0f} ({best.step:g} fs{unsure})"
+    )
 
 
 def print_tables(result: dict) -> None:
     for name, one in result.items():
         quantity = QUANTITIES[name]
-        print(f"\n{quantity.title}: limit {one['limit'][0]:.5g} ± {one['limit'][1]:.2g} {quantity.unit}, steps up to "
-              f"{one['longest_step_fs']:g} fs")  # fmt: skip
+        print(
+            f"\n{quantity.title}: limit {one['limit'][0]:.5g} ± {one['limit'][1]:.2g} {quantity.unit}, steps up to "
+            f"{one['longest_step_fs']:g} fs"
+        )
         for engine, (limit, error) in one["limits_of_engines"].items():
             print(f"  {engine} alone: {limit:.5g} ± {error:.2g}")
         for method, (ratio, error) in one["variances_over_that_of_all"].items():
             print(f"  variance of {method} over that of all: {ratio:.2f} ± {error:.2f}")
         goals = " | ".join(f"s to {target:g} (step)" for target in quantity.targets)
-        print(f"| method | bias at each step, {quantity.error_unit} | s/ns | {goals} |\n|---|---|---|---|---|")
+        print(
+            f"| method | bias at each step, {quantity.error_unit} | s/ns | {goals} |\n|---|---|---|---|---|"
+        )
         for method in METHODS:
             points = [point for point in one["points"] if point.method == method]
             if points:
-                biases = ", ".join(f"{p.step:g} fs: {p.bias:+.4f} ± {p.bias_error:.4f}" for p in points)
+                biases = ", ".join(
+                    f"{p.step:g} fs: {p.bias:+.4f} ± {p.bias_error:.4f}" for p in points
+                )
                 costs = ", ".join(f"{p.cost:.0f}" for p in points)
                 cells = [cell(points, target) for target in quantity.targets]
                 print(f"| {method} | {biases} | {costs} | {' | '.join(cells)} |")
@@ -418,7 +599,9 @@ def print_tables(result: dict) -> None:
 def draw(result: dict, path: Path) -> None:
     """Total error against computing time: of each method, at each time, with its best step."""
     figure = Figure(figsize=(4.5 * len(result), 4.8), layout="constrained")
-    for axis, (name, one) in zip(figure.subplots(1, len(result), squeeze=False).flat, result.items(), strict=True):
+    for axis, (name, one) in zip(
+        figure.subplots(1, len(result), squeeze=False).flat, result.items(), strict=True
+    ):
         quantity = QUANTITIES[name]
         times = np.geomspace(1, 1e4, 200)
         for method, look in METHODS.items():
@@ -429,12 +612,24 @@ def draw(result: dict, path: Path) -> None:
                 unknown = np.array([point.bias_error for point in points])[best]
                 error = errors.min(axis=0)
                 axis.plot(times, error, ":", color=look.color, lw=1.2)
-                axis.plot(times, np.where(error >= 2 * unknown, error, np.nan), color=look.color, lw=1.8, label=method)
+                axis.plot(
+                    times,
+                    np.where(error >= 2 * unknown, error, np.nan),
+                    color=look.color,
+                    lw=1.8,
+                    label=method,
+                )
         for target in quantity.targets:
             axis.axhline(target, color=FAINT, lw=0.8, zorder=0)
-        axis.set(xscale="log", yscale="log", xlim=(times[0], times[-1]),
-                 ylim=(quantity.targets[1] / 5, None), title=quantity.title,
-                 xlabel="computing time on one core, s", ylabel=f"total error, {quantity.error_unit}")  # fmt: skip
+        axis.set(
+            xscale="log",
+            yscale="log",
+            xlim=(times[0], times[-1]),
+            ylim=(quantity.targets[1] / 5, None),
+            title=quantity.title,
+            xlabel="computing time on one core, s",
+            ylabel=f"total error, {quantity.error_unit}",
+        )
         axis.title.set_color(INK)
         axis.spines[["top", "right"]].set_visible(False)
     handles, labels = figure.axes[0].get_legend_handles_labels()
@@ -443,10 +638,14 @@ def draw(result: dict, path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, help="of the runs; what is there is not run again")
     parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--next", type=int, metavar="N", help="do N runs; exit status 1 if none is left")
+    parser.add_argument(
+        "--next", type=int, metavar="N", help="do N runs; exit status 1 if none is left"
+    )
     parser.add_argument("--collect", action="store_true", help="run nothing")
     parser.add_argument("--json", type=Path, help="what was found, and the averages of all runs")
     parser.add_argument("--figure", type=Path)
@@ -455,18 +654,32 @@ def main() -> None:
     if not options.collect and not (options.folder / f"start{STARTS - 1}" / "sites.npz").exists():
         make_starts(options.folder)
     if options.next:
-        sys.exit(0 if any([do_next(options.folder, options.rounds) for _ in range(options.next)]) else 1)
+        sys.exit(
+            0 if any([do_next(options.folder, options.rounds) for _ in range(options.next)]) else 1
+        )
     while not options.collect and do_next(options.folder, options.rounds):
         pass
     found = read(options.folder)
     there = {ensemble for ensemble, _, _ in found}
-    result = {name: analyse(name, found) for name, quantity in QUANTITIES.items() if quantity.ensemble in there}
+    result = {
+        name: analyse(name, found)
+        for name, quantity in QUANTITIES.items()
+        if quantity.ensemble in there
+    }
     print_tables(result)
     if options.json:
         versions = [engine.version() for engine in (Rigidmd, Gromacs, OpenMM)]
-        tables = {name: one | {"points": [p._asdict() for p in one["points"]]} for name, one in result.items()}
-        every = [{"ensemble": e, "method": m, "step_fs": s, "runs": results} for (e, m, s), results in found.items()]
-        options.json.write_text(json.dumps({"versions": versions, **tables, "all": every}, indent=1) + "\n")
+        tables = {
+            name: one | {"points": [p._asdict() for p in one["points"]]}
+            for name, one in result.items()
+        }
+        every = [
+            {"ensemble": e, "method": m, "step_fs": s, "runs": results}
+            for (e, m, s), results in found.items()
+        ]
+        options.json.write_text(
+            json.dumps({"versions": versions, **tables, "all": every}, indent=1) + "\n"
+        )
     if options.figure:
         draw(result, options.figure)
 

@@ -1,11 +1,14 @@
-"""What a step of liquid SPC/E costs from 216 molecules to millions, on one core and on several: time and memory.
+"""What a step of liquid SPC/E costs from 216 molecules to millions, on one core and on several:
+time and memory.
 
-    python tests/benchmarks/scaling.py --copies 1,2,4,8,17 --cores 1,2 --precision mixed --figure scaling.png
+    python tests/benchmarks/scaling.py --copies 1,2,4,8,17 --cores 1,2 --precision mixed --figure
+    scaling.png
 
-The liquid is W1 of peers.py: cut-off 9 Å, reaction field, steps of 2 fs at constant energy. A box of 216 waters that has
-come to rest is copied along each edge, so every size is the same liquid. Each size runs in a process of its own, so that
-its peak of memory is its own. The start is the time from the state on disk to the end of the first step. Lists are built
-before the clock of the steps starts, and rebuilt while it runs. No variable about threads is set: it is measured as users have
+The liquid is W1 of peers.py: cut-off 9 Å, reaction field, steps of 2 fs at constant energy. A box
+of 216 waters that has come to rest is copied along each edge, so every size is the same liquid.
+Each size runs in a process of its own, so that its peak of memory is its own. The start is the time
+from the state on disk to the end of the first step. Lists are built before the clock of the steps
+starts, and rebuilt while it runs. No variable about threads is set: it is measured as users have
 it.
 """
 
@@ -39,14 +42,23 @@ SECONDS = 3.0
 def scene(copies: int, precision: str, **changes) -> dict:
     """The scene of so many copies along each edge."""
     molecules = [{**WORK.molecules, "count": UNIT * copies**3}]
-    return WORK.scene(box={"lengths_A": EDGE * copies}, molecules=molecules, precision=precision, **changes)
+    return WORK.scene(
+        box={"lengths_A": EDGE * copies}, molecules=molecules, precision=precision, **changes
+    )
 
 
 def relax(folder: Path) -> None:
     """A box of liquid, folder/start.npz."""
-    stage = {"ensemble": "nvt", "temperature_K": WORK.temperature, "timestep_fs": 2.0, "duration_ps": 10.0,
-             "thermostat_time_ps": 0.1}  # fmt: skip
-    state = Simulation(Scene.from_dict(scene(1, "mixed", structure=None, stages=[stage]))).run().state
+    stage = {
+        "ensemble": "nvt",
+        "temperature_K": WORK.temperature,
+        "timestep_fs": 2.0,
+        "duration_ps": 10.0,
+        "thermostat_time_ps": 0.1,
+    }
+    state = (
+        Simulation(Scene.from_dict(scene(1, "mixed", structure=None, stages=[stage]))).run().state
+    )
     keep(folder, 1, state)
 
 
@@ -67,13 +79,15 @@ def keep(folder: Path, copies: int, state) -> None:
 
 
 def measure(job: dict) -> dict:
-    """Seconds to start, seconds a step for each number of cores, and the peak of memory, of one size; in a process of
-    its own."""
+    """Seconds to start, seconds a step for each number of cores, and the peak of memory, of one
+    size; in a process of its own."""
     one = Simulation(Scene.from_dict(scene(1, job["precision"]), Path(job["folder"])))
     with tempfile.TemporaryDirectory() as folder:
         keep(Path(folder), job["copies"], one.state)
         began = time.perf_counter()
-        simulation = Simulation(Scene.from_dict(scene(job["copies"], job["precision"]), Path(folder)))
+        simulation = Simulation(
+            Scene.from_dict(scene(job["copies"], job["precision"]), Path(folder))
+        )
         start = time.perf_counter() - began
     engine, state = simulation.engine, simulation.state
     scheme, done = SCHEMES["velocity_verlet"], 1
@@ -96,7 +110,13 @@ def measure(job: dict) -> dict:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     arrays = array_bytes((state, engine.load, engine.model, tuple(engine.workspaces.values())))
     molecules = UNIT * job["copies"] ** 3
-    return {"molecules": molecules, "start": start, "seconds": seconds, "peak": peak, "arrays": arrays}
+    return {
+        "molecules": molecules,
+        "start": start,
+        "seconds": seconds,
+        "peak": peak,
+        "arrays": arrays,
+    }
 
 
 def draw(rows: list[dict], cores: list[int], path: Path) -> None:
@@ -109,7 +129,9 @@ def draw(rows: list[dict], cores: list[int], path: Path) -> None:
         time_axis.plot(count, cost, "o-", color=color, label=f"{k} core{'s' * (k > 1)}")
     time_axis.set_ylabel("µs a molecule and step")
     time_axis.legend(frameon=False)
-    memory_axis.plot(count, [row["arrays"] / row["molecules"] / 1e3 for row in rows], "o-", color="#5c6270")
+    memory_axis.plot(
+        count, [row["arrays"] / row["molecules"] / 1e3 for row in rows], "o-", color="#5c6270"
+    )
     memory_axis.set_ylabel("kB of arrays a molecule")
     for axis in (time_axis, memory_axis):
         axis.set_xscale("log")
@@ -122,7 +144,9 @@ def draw(rows: list[dict], cores: list[int], path: Path) -> None:
 def main() -> None:
     """Measure every size and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--copies", type=numbers(int), default=[1, 2, 4, 8, 17], help="along each edge; 1,2,4,8,17")
+    parser.add_argument(
+        "--copies", type=numbers(int), default=[1, 2, 4, 8, 17], help="along each edge; 1,2,4,8,17"
+    )
     parser.add_argument("--cores", type=numbers(int), default=[1, 2], help="1,2")
     parser.add_argument("--precision", choices=("double", "mixed"), default="mixed")
     parser.add_argument("--figure", type=Path, help="file for a picture")
@@ -133,12 +157,21 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         relax(Path(folder))
-        per_step = "".join(f" µs a molecule and step, {k} core{'s' * (k > 1)} |" for k in asked.cores)
-        print(f"| molecules | start, s |{per_step} steps/s | arrays, kB a molecule | peak of the process, GB |")
+        per_step = "".join(
+            f" µs a molecule and step, {k} core{'s' * (k > 1)} |" for k in asked.cores
+        )
+        print(
+            f"| molecules | start, s |{per_step} steps/s | arrays, kB a molecule | peak of the process, GB |"
+        )
         print("|---" * (5 + len(asked.cores)) + "|", flush=True)
         rows = []
         for copies in asked.copies:
-            job = {"copies": copies, "cores": asked.cores, "precision": asked.precision, "folder": folder}
+            job = {
+                "copies": copies,
+                "cores": asked.cores,
+                "precision": asked.precision,
+                "folder": folder,
+            }
             command = [sys.executable, __file__, "--job", json.dumps(job)]
             done = subprocess.run(command, env=environment(), capture_output=True, text=True)
             if done.returncode:

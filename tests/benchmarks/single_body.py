@@ -1,11 +1,13 @@
-"""Error against run time of a heavy top, every integrator of the engine and SciPy's DOP853, alternating in one run.
+"""Error against run time of a heavy top, every integrator of the engine and SciPy's DOP853,
+alternating in one run.
 
     python tests/benchmarks/single_body.py
 
-writes single_body.csv and single_body.png of the documentation and prints the table of the benchmarks. The top is that of
-systems/heavy_top_3.toml for 20 nutations; the error is that of Q at the end against the elliptic solution. SciPy solves
-the 12-variable system (direction cosines and angular velocity) once with a right-hand side in plain Python as a user
-would write it, once through this engine (integrator = "dop853"). Medians of five; one thread.
+writes single_body.csv and single_body.png of the documentation and prints the table of the
+benchmarks. The top is that of systems/heavy_top_3.toml for 20 nutations; the error is that of Q at
+the end against the elliptic solution. SciPy solves the 12-variable system (direction cosines and
+angular velocity) once with a right-hand side in plain Python as a user would write it, once through
+this engine (integrator = "dop853"). Medians of five; one thread.
 """
 
 import csv
@@ -54,11 +56,19 @@ def main():
     def slopes(t, y):
         q11, q12, q13, q21, q22, q23, q31, q32, q33, p, q, r = y
         return [
-            q12 * r - q13 * q, q13 * p - q11 * r, q11 * q - q12 * p,
-            q22 * r - q23 * q, q23 * p - q21 * r, q21 * q - q22 * p,
-            q32 * r - q33 * q, q33 * p - q31 * r, q31 * q - q32 * p,
-            ((i1 - i3) * q * r + mgl * q32) / i1, ((i3 - i1) * p * r - mgl * q31) / i1, 0.0,
-        ]  # fmt: skip
+            q12 * r - q13 * q,
+            q13 * p - q11 * r,
+            q11 * q - q12 * p,
+            q22 * r - q23 * q,
+            q23 * p - q21 * r,
+            q21 * q - q22 * p,
+            q32 * r - q33 * q,
+            q33 * p - q31 * r,
+            q31 * q - q32 * p,
+            ((i1 - i3) * q * r + mgl * q32) / i1,
+            ((i3 - i1) * p * r - mgl * q31) / i1,
+            0.0,
+        ]
 
     def flows(name, n):
         engine, state = system.engine(), start.copy()
@@ -68,17 +78,24 @@ def main():
 
     def python(tolerance):
         began = time.perf_counter()
-        y = solve_ivp(slopes, (0, end), y0, method="DOP853", rtol=tolerance, atol=tolerance).y[:, -1]
+        y = solve_ivp(slopes, (0, end), y0, method="DOP853", rtol=tolerance, atol=tolerance).y[
+            :, -1
+        ]
         return time.perf_counter() - began, y[:9].reshape(3, 3)
 
     def compiled(tolerance):
-        engine, solver = OdeEngine(system.body, system.terms), Solver("dop853", "matrix", end, tolerance, tolerance)
+        engine, solver = (
+            OdeEngine(system.body, system.terms),
+            Solver("dop853", "matrix", end, tolerance, tolerance),
+        )
         state = engine.begin(start, solver)
         began = time.perf_counter()
         engine.advance(state, solver, end, 1)
         return time.perf_counter() - began, state.rotation[0]
 
-    cases = [(name, n, lambda name=name, n=n: flows(name, n)) for name, ns in STEPS.items() for n in ns]
+    cases = [
+        (name, n, lambda name=name, n=n: flows(name, n)) for name, ns in STEPS.items() for n in ns
+    ]
     cases += [(PYTHON, tolerance, lambda t=tolerance: python(t)) for tolerance in TOLERANCES]
     cases += [(COMPILED, tolerance, lambda t=tolerance: compiled(t)) for tolerance in TOLERANCES]
     seconds = {key[:2]: [] for key in cases}
@@ -89,10 +106,15 @@ def main():
             if repeat:  # the first one compiles
                 seconds[name, setting].append(spent)
             errors[name, setting] = float(np.abs(rotation - exact).max())
-    rows = [(name, setting, median(seconds[name, setting]), errors[name, setting]) for name, setting, _ in cases]
+    rows = [
+        (name, setting, median(seconds[name, setting]), errors[name, setting])
+        for name, setting, _ in cases
+    ]
     with (DOCS / "evidence" / "data" / "single_body.csv").open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["method", "steps a nutation or tolerance", "seconds", "error of Q at the end"])
+        writer.writerow(
+            ["method", "steps a nutation or tolerance", "seconds", "error of Q at the end"]
+        )
         writer.writerows(rows)
     speed(system, start, top)
     table(rows)
@@ -112,7 +134,10 @@ def speed(system, start, top):
 
 def curve(rows, names):
     """(errors, seconds) of the fastest of these methods for each error, errors descending."""
-    points = sorted(((error, spent) for name, _, spent, error in rows if name in names), key=lambda point: point[1])
+    points = sorted(
+        ((error, spent) for name, _, spent, error in rows if name in names),
+        key=lambda point: point[1],
+    )
     front = []
     for error, spent in points:
         if not front or error < front[-1][0]:
@@ -135,7 +160,10 @@ def table(rows):
         "| error of Q | best integrator here | DOP853, slopes in Python | ratio | DOP853 through this engine | ratio |\n|---|---|---|---|---|---|"
     )
     for error in (1e-4, 1e-6, 1e-8, 1e-10):
-        best = min(STEPS, key=lambda name: np.nan_to_num(seconds_for(error, curve(rows, (name,))), nan=np.inf))
+        best = min(
+            STEPS,
+            key=lambda name: np.nan_to_num(seconds_for(error, curve(rows, (name,))), nan=np.inf),
+        )
         a, b, c = (seconds_for(error, front) for front in (own, python, compiled))
         print(
             f"| {error:.0e} | {best}, {a * 1e3:.2f} ms | {b * 1e3:.0f} ms | {b / a:.0f} | {c * 1e3:.0f} ms | {c / a:.0f} |"
@@ -151,12 +179,23 @@ def draw(rows):
     colors = dict(
         zip(
             [*STEPS, PYTHON, COMPILED],
-            ["#8fb4cf", "#5a93bb", "#2b6f9e", "#123d5c", "#9bbf9f", "#4f8a5b", "#c8553d", "#e2a08f"],
+            [
+                "#8fb4cf",
+                "#5a93bb",
+                "#2b6f9e",
+                "#123d5c",
+                "#9bbf9f",
+                "#4f8a5b",
+                "#c8553d",
+                "#e2a08f",
+            ],
             strict=True,
         )
     )
     for name, color in colors.items():
-        errors, spent = zip(*[(error, spent) for method, _, spent, error in rows if method == name], strict=True)
+        errors, spent = zip(
+            *[(error, spent) for method, _, spent, error in rows if method == name], strict=True
+        )
         axis.loglog(spent, errors, "o-", ms=4, lw=1.3, color=color, label=name.replace("_", " "))
     axis.set_xlabel("seconds")
     axis.set_ylabel("error of Q after 20 nutations")

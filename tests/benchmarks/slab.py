@@ -1,12 +1,14 @@
-"""Density and surface tension of a slab of water by rigidmd and by GROMACS: the same model, box, cutoffs and sums.
+"""Density and surface tension of a slab of water by rigidmd and by GROMACS: the same model, box,
+cutoffs and sums.
 
     python tests/benchmarks/slab.py runs/slab --engine rigidmd --temperature 300 --ps 1000
     python tests/benchmarks/slab.py runs/slab --engine gromacs --temperature 300 --ps 1000
 
-systems/water_slab.toml, for the time that is given after 60 ps of equilibration. GROMACS has the export of that scene with
-the settings below, among them sums of dispersion over images (LJ-PME, geometric, as rigidmd) and the correction of slabs
-(3dc). Its list has a fixed buffer: the default of its version 2022 is none for a slab that fills a third of the box.
-Both are analysed by the same functions, GROMACS after its own 60 ps.
+systems/water_slab.toml, for the time that is given after 60 ps of equilibration. GROMACS has the
+export of that scene with the settings below, among them sums of dispersion over images (LJ-PME,
+geometric, as rigidmd) and the correction of slabs (3dc). Its list has a fixed buffer: the default
+of its version 2022 is none for a slab that fills a third of the box. Both are analysed by the same
+functions, GROMACS after its own 60 ps.
 """
 
 import argparse
@@ -21,38 +23,83 @@ from support import Slab, fitted, mean_and_error
 
 SCENE = Path(__file__).parents[2] / "systems" / "water_slab.toml"
 EQUILIBRATION, BLOCKS = 60.0, 10
-TIMESTEP, SAMPLES, FRAMES = 0.002, 25, 600  # ps; steps between pressure tensors and between frames of GROMACS
+TIMESTEP, SAMPLES, FRAMES = (
+    0.002,
+    25,
+    600,
+)  # ps; steps between pressure tensors and between frames of GROMACS
 SETTINGS = {
-    "integrator": "md", "dt": TIMESTEP, "comm-mode": "Linear", "nstcomm": 100, "nstenergy": SAMPLES,
-    "nstcalcenergy": SAMPLES, "nstxout-compressed": FRAMES, "vdwtype": "PME", "lj-pme-comb-rule": "Geometric",
-    "ewald-rtol-lj": 1e-3, "tcoupl": "v-rescale", "tau-t": 1.0, "ewald-geometry": "3dc", "rlist": 1.3,
-    "verlet-buffer-tolerance": -1, "nstlist": 20,
-}  # fmt: skip
+    "integrator": "md",
+    "dt": TIMESTEP,
+    "comm-mode": "Linear",
+    "nstcomm": 100,
+    "nstenergy": SAMPLES,
+    "nstcalcenergy": SAMPLES,
+    "nstxout-compressed": FRAMES,
+    "vdwtype": "PME",
+    "lj-pme-comb-rule": "Geometric",
+    "ewald-rtol-lj": 1e-3,
+    "tcoupl": "v-rescale",
+    "tau-t": 1.0,
+    "ewald-geometry": "3dc",
+    "rlist": 1.3,
+    "verlet-buffer-tolerance": -1,
+    "nstlist": 20,
+}
 
 
 def by_rigidmd(folder: Path, temperature: float, ps: float) -> None:
     """Run the scene on one thread and print its density and surface tension."""
     changes = ["threads=1", f"stages.production.duration_ps={ps:g}"]
-    changes += [f"stages.{stage}.temperature_K={temperature:g}" for stage in ("equilibration", "production")]
-    command = ["rigidmd", "run", SCENE, *(word for change in changes for word in ("--set", change)), "-o", folder]
+    changes += [
+        f"stages.{stage}.temperature_K={temperature:g}" for stage in ("equilibration", "production")
+    ]
+    command = [
+        "rigidmd",
+        "run",
+        SCENE,
+        *(word for change in changes for word in ("--set", change)),
+        "-o",
+        folder,
+    ]
     subprocess.run(list(map(str, command)), check=True)
-    subprocess.run(["rigidmd", "analyse", str(folder), "--only", "interfaces,surface_tension"], check=True)
+    subprocess.run(
+        ["rigidmd", "analyse", str(folder), "--only", "interfaces,surface_tension"], check=True
+    )
 
 
 def by_gromacs(folder: Path, temperature: float, ps: float) -> None:
     """Run the export of the scene on one thread and print its density and surface tension."""
-    lacking = ["--set", "forces.ewald_slab=", "--set", "forces.dispersion=", "--to", "gromacs", "-o", folder]
+    lacking = [
+        "--set",
+        "forces.ewald_slab=",
+        "--set",
+        "forces.dispersion=",
+        "--to",
+        "gromacs",
+        "-o",
+        folder,
+    ]
     subprocess.run(list(map(str, ["rigidmd", "export", SCENE, *lacking])), check=True)
     written = [line.split("=") for line in (folder / "2_production.mdp").read_text().splitlines()]
-    whole = {key.strip(): value.strip() for key, value in written} | SETTINGS | {"ref-t": temperature}
+    whole = (
+        {key.strip(): value.strip() for key, value in written} | SETTINGS | {"ref-t": temperature}
+    )
     before = "conf.gro"
     for name, length in (("equilibration", EQUILIBRATION), ("production", ps)):
         of_stage = whole | {"nsteps": round(length / TIMESTEP)}
         if name == "equilibration":
-            of_stage |= {"continuation": "no", "gen-vel": "yes", "gen-temp": temperature, "gen-seed": 5}
+            of_stage |= {
+                "continuation": "no",
+                "gen-vel": "yes",
+                "gen-temp": temperature,
+                "gen-seed": 5,
+            }
         text = "".join(f"{key} = {value}\n" for key, value in of_stage.items())
         (folder / f"{name}.mdp").write_text(text)
-        files = f"-f {name}.mdp -c {before} -p topol.top -po {name}_all.mdp -o {name}.tpr -maxwarn 3"
+        files = (
+            f"-f {name}.mdp -c {before} -p topol.top -po {name}_all.mdp -o {name}.tpr -maxwarn 3"
+        )
         for words in (f"grompp {files}", f"mdrun -deffnm {name} -ntmpi 1 -ntomp 1"):
             subprocess.run(["gmx", *words.split()], cwd=folder, check=True)
         before = f"{name}.gro -t {name}.cpt"
@@ -64,8 +111,14 @@ def measured(folder: Path) -> tuple[str, str]:
     from MDAnalysis import Universe
 
     command = ["gmx", "energy", "-f", "production.edr", "-o", "tension.xvg"]
-    subprocess.run(command, cwd=folder, input="#Surf*SurfTen\n", text=True, check=True, capture_output=True)
-    lines = [line.split() for line in (folder / "tension.xvg").read_text().splitlines() if line[0] not in "#@"]
+    subprocess.run(
+        command, cwd=folder, input="#Surf*SurfTen\n", text=True, check=True, capture_output=True
+    )
+    lines = [
+        line.split()
+        for line in (folder / "tension.xvg").read_text().splitlines()
+        if line[0] not in "#@"
+    ]
     tension, error = mean_and_error(np.array(lines, float)[:, 1] / 20)  # of two interfaces, bar nm
     universe = Universe(str(folder / "equilibration.gro"), str(folder / "production.xtc"))
     atoms = universe.select_atoms("not name MW")
@@ -87,7 +140,9 @@ def measured(folder: Path) -> tuple[str, str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Density and surface tension of a slab by rigidmd or GROMACS.")
+    parser = argparse.ArgumentParser(
+        description="Density and surface tension of a slab by rigidmd or GROMACS."
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--engine", choices=["rigidmd", "gromacs"], required=True)
     parser.add_argument("--temperature", type=float, default=300.0, help="K; 300")

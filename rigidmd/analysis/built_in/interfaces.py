@@ -1,4 +1,5 @@
-"""Slabs between two vapours: coexisting densities, width and orientation at the interface, surface tension."""
+"""Slabs between two vapours: coexisting densities, width and orientation at the interface, surface
+tension."""
 
 import warnings
 from typing import NamedTuple
@@ -33,7 +34,8 @@ FEWEST = 1e-3
 
 
 class Slab(NamedTuple):
-    """Distances from the middle of a slab along its normal, which is an edge at right angles to the others."""
+    """Distances from the middle of a slab along its normal, which is an edge at right angles to the
+    others."""
 
     axis: int
     area: float  # Å²
@@ -67,18 +69,22 @@ def slab_of(frames: RigidFrames, axis: str) -> Slab:
     def centred(fraction: np.ndarray) -> np.ndarray:
         return ((fraction - middle + 0.5) % 1.0 - 0.5) * height[:, None]
 
-    area, centre = float(np.mean(frames.volume / height)), frames.positions[:, :, k] / height[:, None]
+    area, centre = (
+        float(np.mean(frames.volume / height)),
+        frames.positions[:, :, k] / height[:, None],
+    )
     return Slab(k, area, float(height.mean()), centred(at), centred(centre), mass)
 
 
 def profile(z: np.ndarray, liquid: float, vapour: float, half: float, width: float) -> np.ndarray:
-    """Density at a distance z from the middle of a slab of thickness 2 half: the tanh profile of its interfaces."""
+    """Density at a distance z from the middle of a slab of thickness 2 half: the tanh profile of
+    its interfaces."""
     return 0.5 * (liquid + vapour) - 0.5 * (liquid - vapour) * np.tanh((z - half) / width)
 
 
 def fitted(z: np.ndarray, density: np.ndarray, height: float) -> np.ndarray:
-    """Parameters of `profile` (densities in g/cm³, lengths in Å) for densities (bins,) at distances z in a box of this
-    height. Raises OutputError."""
+    """Parameters of `profile` (densities in g/cm³, lengths in Å) for densities (bins,) at distances
+    z in a box of this height. Raises OutputError."""
     top, low = float(np.quantile(density, 0.95)), float(density[-len(z) // 5 :].mean())
     half = float(np.sum(density - low) * (z[1] - z[0]) / max(top - low, 1e-9 * top))
     try:
@@ -116,7 +122,9 @@ def profiles_of(runs: Runs, axis: str) -> Profiles:
     densities = []
     for slab in slabs:
         volume = 2 * slab.area * np.diff(edges)
-        masses = [np.histogram(np.abs(frame), edges, weights=slab.mass)[0] for frame in slab.distance]
+        masses = [
+            np.histogram(np.abs(frame), edges, weights=slab.mass)[0] for frame in slab.distance
+        ]
         densities.append(np.array(masses) / volume / GRAM_PER_CM3)
     return Profiles(slabs, height, 0.5 * (edges[1:] + edges[:-1]), densities)
 
@@ -124,20 +132,29 @@ def profiles_of(runs: Runs, axis: str) -> Profiles:
 def _changes_of_fit(z: np.ndarray, densities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     """Parameters (f, 4) that follow to first order from the densities (f, bins) of each frame."""
     steps = 1e-6 * np.maximum(np.abs(parameters), 1e-3)
-    shifted = [(profile(z, *(parameters + step)), profile(z, *(parameters - step))) for step in np.diag(steps)]
-    slopes = np.array([(after - before) / (2 * step) for (after, before), step in zip(shifted, steps, strict=True)]).T
+    shifted = [
+        (profile(z, *(parameters + step)), profile(z, *(parameters - step)))
+        for step in np.diag(steps)
+    ]
+    slopes = np.array(
+        [
+            (after - before) / (2 * step)
+            for (after, before), step in zip(shifted, steps, strict=True)
+        ]
+    ).T
     return parameters + (densities - profile(z, *parameters)) @ np.linalg.pinv(slopes).T
 
 
 @built_in("interfaces of a slab: coexisting densities, width, orientation", position=32)
 def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
-    """Densities of liquid and vapour, thickness of the slab and width of its interfaces, from a fit of
+    """Densities of liquid and vapour, thickness of the slab and width of its interfaces, from a fit
+    of
 
     rho(z) = (rho_l + rho_v)/2 - (rho_l - rho_v)/2 tanh((z - z0)/d)
 
-    to the profile about the middle of the slab, averaged over both sides (Rowlinson & Widom 1982). Errors of one run
-    are from the correlated series of what each frame changes in the fit. The curve also has the mean cosine of dipoles
-    with the outward normal. Raises OutputError.
+    to the profile about the middle of the slab, averaged over both sides (Rowlinson & Widom 1982).
+    Errors of one run are from the correlated series of what each frame changes in the fit. The
+    curve also has the mean cosine of dipoles with the outward normal. Raises OutputError.
     """
     seen = profiles_of(runs, axis)
     means = [densities.mean(axis=0) for densities in seen.densities]
@@ -161,7 +178,9 @@ def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
         error = None if errors[k] is None else factor * float(errors[k] or 0.0)
         tau = correlation_time_of(runs, [of_run[:, k] for of_run in series])
         if error is None:
-            found.values.append(too_short(name, unit, factor * float(whole[k]), None, "too short for an error", tau))
+            found.values.append(
+                too_short(name, unit, factor * float(whole[k]), None, "too short for an error", tau)
+            )
         else:
             found.values.append(Value(name, unit, factor * float(whole[k]), error, tau, note))
     axis_of_curve = ("distance from the middle (A)", seen.z)
@@ -172,12 +191,15 @@ def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
         if kind.molecule.has_dipole and runs.has_rotations:
             mean = _mean_cosine(runs, seen, kind)
             title = f"mean cosine of dipoles {kind.name}"
-            found.curves.append(Curve(f"dipoles_{kind.name}", curve.axis, "mean cosine", {title: mean}, level=0.0))
+            found.curves.append(
+                Curve(f"dipoles_{kind.name}", curve.axis, "mean cosine", {title: mean}, level=0.0)
+            )
     return found
 
 
 def _mean_cosine(runs: Runs, seen: Profiles, kind: Kind) -> np.ndarray:
-    """Mean cosine (bins,) of the dipoles of a species with the outward normal; NaN where there are few."""
+    """Mean cosine (bins,) of the dipoles of a species with the outward normal; NaN where there are
+    few."""
     dipole = kind.molecule.charges @ kind.molecule.positions_body
     count, total = np.zeros(len(seen.z)), np.zeros(len(seen.z))
     for run, slab in zip(runs.members, seen.slabs, strict=True):
@@ -185,22 +207,30 @@ def _mean_cosine(runs: Runs, seen: Profiles, kind: Kind) -> np.ndarray:
         at = slab.centre[:, kind.index]
         count += np.histogram(np.abs(at), seen.edges)[0]
         total += np.histogram(np.abs(at), seen.edges, weights=cosine * np.sign(at))[0]
-    return np.divide(total, count, out=np.full(len(seen.z), np.nan), where=count > FEWEST * count.max())
+    return np.divide(
+        total, count, out=np.full(len(seen.z), np.nan), where=count > FEWEST * count.max()
+    )
 
 
 @built_in("surface tension of a slab from the pressure tensor", position=105)
 def surface_tension(runs: Runs, axis: str = "z") -> AnalysisResult:
-    """Surface tension (mN/m) of the two interfaces of a slab: L/2 <P_N - P_T> (Kirkwood & Buff 1949), with the edge L
-    and the pressure P_N along the normal, and the mean pressure P_T across it. Raises OutputError."""
+    """Surface tension (mN/m) of the two interfaces of a slab: L/2 <P_N - P_T> (Kirkwood & Buff
+    1949), with the edge L and the pressure P_N along the normal, and the mean pressure P_T across
+    it. Raises OutputError."""
     seen = profiles_of(runs, axis)
     fitted(seen.z, runs.mean([densities.mean(axis=0) for densities in seen.densities]), seen.height)
     samples = [_tension_of(run, slab) for run, slab in zip(runs.members, seen.slabs, strict=True)]
     series = [values for _, values in samples]
     value, error = mean_of_series(runs, series)
     spans = [float(time[-1] - time[0]) for time, _ in samples]
-    of_runs = [correlation_time(values, span / (len(values) - 1)) for values, span in zip(series, spans, strict=True)]
+    of_runs = [
+        correlation_time(values, span / (len(values) - 1))
+        for values, span in zip(series, spans, strict=True)
+    ]
     fewest = min(map(len, series))
-    running = np.mean([np.cumsum(values[:fewest]) for values in series], axis=0) / np.arange(1, fewest + 1)
+    running = np.mean([np.cumsum(values[:fewest]) for values in series], axis=0) / np.arange(
+        1, fewest + 1
+    )
     some = np.unique(np.linspace(fewest // 20, fewest - 1, 500).astype(int))
     found = AnalysisResult("surface_tension", f"surface tension across {axis}")
     time, title = ("Time (ps)", samples[0][0][some]), "running mean (mN/m)"
@@ -208,7 +238,9 @@ def surface_tension(runs: Runs, axis: str = "z") -> AnalysisResult:
     is_cut = runs.system.scene.forces.dispersion == "cutoff"
     note = "of the forces in the run: without dispersion beyond the cutoff" if is_cut else ""
     tau = float(np.mean(of_runs))
-    found.values.append(converged_value("surface tension", "mN/m", value, error, sum(spans), tau, note))
+    found.values.append(
+        converged_value("surface tension", "mN/m", value, error, sum(spans), tau, note)
+    )
     return found
 
 
@@ -216,13 +248,16 @@ def _tension_of(frames: RigidFrames, slab: Slab) -> tuple[np.ndarray, np.ndarray
     """Times (l,), ps, and surface tensions (l,), mN/m. Raises OutputError."""
     time, pressure = _pressures(frames)
     if len(time) < 2:
-        raise OutputError("a surface tension needs samples of the pressure tensor: there are fewer than two")
+        raise OutputError(
+            "a surface tension needs samples of the pressure tensor: there are fewer than two"
+        )
     normal = pressure[slab.axis]
     return time, 0.5 * slab.height * 1.5 * (normal - pressure.mean(axis=0)) * BAR / MN_PER_M
 
 
 def _pressures(frames: RigidFrames) -> tuple[np.ndarray, np.ndarray]:
-    """Times (l,), ps, and diagonal of the pressure tensor (3, l), bar, from its file or the log. Raises OutputError."""
+    """Times (l,), ps, and diagonal of the pressure tensor (3, l), bar, from its file or the log.
+    Raises OutputError."""
     if frames.tensor is not None:
         return frames.tensor[:, 0], frames.tensor[:, 1:4].T
     found = [frames.columns.get(f"pressure_{x}{x}") for x in "xyz"]

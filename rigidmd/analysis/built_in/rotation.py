@@ -1,5 +1,5 @@
-"""Rotation, spectra and dipoles: orientational correlation, rotational diffusion, densities of states; the dielectric
-constant from the fluctuation of the total dipole."""
+"""Rotation, spectra and dipoles: orientational correlation, rotational diffusion, densities of
+states; the dielectric constant from the fluctuation of the total dipole."""
 
 from collections.abc import Callable
 from typing import Any
@@ -29,11 +29,14 @@ from rigidmd.mechanics.inertia import rotational_freedom
 from rigidmd.run.rigid_fit import Kind
 from rigidmd.units import COULOMB, DEBYE
 
-TAIL = 0.05  # correlation at which the integral of a correlation function is continued by an exponential
-#: Correlation at the longest lag above which the integral has no value: too much of it would be that exponential.
+#: correlation at which the integral of a correlation function is continued by an exponential
+TAIL = 0.05
+#: Correlation at the longest lag above which the integral has no value: too much of it would be
+#: that exponential.
 HIGH = 0.2
 SLOWEST = 0.98  # largest correlation at the longest lag from which the decay time is estimated
-#: Largest root mean square rotation between two frames, rad, at which rotations about the body's axes can be summed.
+#: Largest root mean square rotation between two frames, rad, at which rotations about the body's
+#: axes can be summed.
 LARGEST_ROTATION = 0.7
 CLOSE = 0.5  # least correlation of a velocity over one interval of frames for a spectrum
 PER_CM = 0.0299792458  # 1/cm in 1/ps
@@ -44,12 +47,17 @@ def _axes(kind: Kind) -> list[int]:
     return [0] if rotational_freedom(kind.molecule.kind) == 2 else [0, 1, 2]
 
 
-@built_in("orientational correlation C1 and C2 about each body axis, and rotational diffusion", position=70)
+@built_in(
+    "orientational correlation C1 and C2 about each body axis, and rotational diffusion",
+    position=70,
+)
 def orientation(runs: Runs) -> AnalysisResult:
-    """C_l(t) = <P_l(u(0)·u(t))>, l = 1, 2, of principal axes u, correlation times (ps), rotational diffusion (1/ps).
+    """C_l(t) = <P_l(u(0)·u(t))>, l = 1, 2, of principal axes u, correlation times (ps), rotational
+    diffusion (1/ps).
 
-    Axes are those of `rigidmd models NAME`, ascending in inertia; a linear molecule has one. Rotational diffusion is
-    the slope of the mean squared rotation about an axis of the body, summed over frames. Raises OutputError.
+    Axes are those of `rigidmd models NAME`, ascending in inertia; a linear molecule has one.
+    Rotational diffusion is the slope of the mean squared rotation about an axis of the body, summed
+    over frames. Raises OutputError.
     """
     if not (kinds := [kind for kind in runs.moving if kind.molecule.degrees_of_freedom > 3]):
         raise OutputError("no molecule of this run rotates")
@@ -73,7 +81,10 @@ def orientation(runs: Runs) -> AnalysisResult:
                 return np.stack([first, second])
 
             values, errors = with_group_error(
-                runs, kind, compute, lambda both: np.stack([np.append(c, _integral(c, interval)) for c in both])
+                runs,
+                kind,
+                compute,
+                lambda both: np.stack([np.append(c, _integral(c, interval)) for c in both]),
             )
             for l in (0, 1):  # noqa: E741
                 C, doubt = values[l, :-1], errors[l, :-1]
@@ -81,19 +92,25 @@ def orientation(runs: Runs) -> AnalysisResult:
                 tau, error = float(values[l, -1]), float(errors[l, -1])
                 name = f"tau{l + 1} of {kind.name}, axis {axis + 1}"
                 if C[-1] > HIGH:
-                    # an exponential falls to HIGH at a lag, and a run is 2 BLOCKS times as long as its longest lag
+                    # an exponential falls to HIGH at a lag, and a run is 2 BLOCKS times as long as
+                    # its longest lag
                     need = 2 * BLOCKS * time[-1] * np.log(HIGH) / np.log(min(float(C[-1]), SLOWEST))
                     about = "about" if C[-1] < SLOWEST else "more than"
                     why = (
-                        f"C{l + 1} is still {C[-1]:.2f} after {time[-1]:.3g} ps, too short for a value; it needs "
-                        f"{about} {need:.2g} ps"
+                        f"C{l + 1} is still {C[-1]:.2f} after {time[-1]:.3g} ps, too short for a"
+                        f" value; it needs {about} {need:.2g} ps"
                     )
                     found.values.append(too_short(name, "ps", tau, None, why))
                     continue
                 low, note = int(C.argmin()), ""
                 if C[low] < -max(TAIL, 3 * float(np.nan_to_num(doubt[low]))):
-                    note = f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is {C[low]:.2f}"
-                found.values.append(converged_value(name, "ps", tau, error, runs.span, tau, note, BLOCKS))
+                    note = (
+                        f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is"
+                        f" {C[low]:.2f}"
+                    )
+                found.values.append(
+                    converged_value(name, "ps", tau, error, runs.span, tau, note, BLOCKS)
+                )
         found.values += _rotational_diffusion(runs, kind, interval, lags)
     return found
 
@@ -107,7 +124,8 @@ def _axis_along_dipole(kind: Kind) -> int | None:
 
 
 def _integral(values: np.ndarray, interval: float) -> float:
-    """Integral of a correlation function that begins at 1: to where it has decayed, then an exponential."""
+    """Integral of a correlation function that begins at 1: to where it has decayed, then an
+    exponential."""
     below = np.flatnonzero(values < TAIL)
     end = int(below[0]) if len(below) else len(values) - 1
     body = float(np.trapezoid(values[: end + 1], dx=interval))
@@ -123,7 +141,9 @@ def _rotations(frames: RigidFrames, kind: Kind) -> np.ndarray:
     """Rotation vectors between frames along the body's axes (f - 1, k, 3), rad."""
     Q = frames.Q[:, kind.index]
     between = np.einsum("fnji,fnjk->fnik", Q[:-1], Q[1:])
-    return Rotation.from_matrix(between.reshape(-1, 3, 3)).as_rotvec().reshape(*between.shape[:2], 3)
+    return (
+        Rotation.from_matrix(between.reshape(-1, 3, 3)).as_rotvec().reshape(*between.shape[:2], 3)
+    )
 
 
 def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) -> list[Value]:
@@ -133,7 +153,10 @@ def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) ->
     rms = float(np.sqrt(runs.mean(squares)))
     names = [f"D_rot of {kind.name}, axis {k + 1}" for k in range(3)]
     if rms > LARGEST_ROTATION:
-        note = f"molecules rotate by {np.degrees(rms):.0f}° between frames, every {interval:g} ps: write more of them"
+        note = (
+            f"molecules rotate by {np.degrees(rms):.0f}° between frames, every {interval:g} ps:"
+            " write more of them"
+        )
         return [Value(name, "1/ps", None, None, None, note) for name in names]
     first = max(1, lags // 5)
     time = interval * np.arange(first, lags)
@@ -141,7 +164,9 @@ def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) ->
     def slopes(part: RigidFrames, group: Kind) -> np.ndarray:
         rotations = _rotations(part, group)
         path = np.concatenate([np.zeros_like(rotations[:1]), np.cumsum(rotations, axis=0)])
-        seen = np.stack([squared_displacement(path[..., k : k + 1], lags)[first:] for k in range(3)], axis=1)
+        seen = np.stack(
+            [squared_displacement(path[..., k : k + 1], lags)[first:] for k in range(3)], axis=1
+        )
         return (time - time.mean()) @ seen / np.sum((time - time.mean()) ** 2) / 2
 
     values, errors = with_group_error(runs, kind, slopes)
@@ -152,47 +177,70 @@ def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) ->
     ]
 
 
-@built_in("spectra and correlations of velocities, angular velocities and angular momenta", position=80)
+@built_in(
+    "spectra and correlations of velocities, angular velocities and angular momenta", position=80
+)
 def spectrum(runs: Runs) -> AnalysisResult:
-    """Densities of states (cm) of translation and of rotation about each body axis, from the power of velocities and
-    angular velocities, and their correlation functions. The integral over wave numbers is the number of degrees of
-    freedom of a molecule. Needs frames with velocities, every few fs. Raises OutputError."""
+    """Densities of states (cm) of translation and of rotation about each body axis, from the power
+    of velocities and angular velocities, and their correlation functions. The integral over wave
+    numbers is the number of degrees of freedom of a molecule. Needs frames with velocities, every
+    few fs. Raises OutputError."""
     if any(run.velocities is None or run.L is None for run in runs.members):
         kinds = " or ".join(written(lambda form: form.velocities))
-        raise OutputError(f"a spectrum needs velocities in the frames: a trajectory file of type {kinds} has them")
+        raise OutputError(
+            f"a spectrum needs velocities in the frames: a trajectory file of type {kinds} has them"
+        )
     interval, lags = interval_and_lags(runs, "a spectrum")
     size = min(runs.frame_count // BLOCKS, runs.shortest)
     found = AnalysisResult("spectrum", "densities of states")
     wavenumbers = np.fft.rfftfreq(size, interval) / PER_CM
     power = Curve("spectrum", ("wave number (1/cm)", wavenumbers), "density of states (cm)", {})
-    memory = Curve("velocity_correlation", ("Time (ps)", interval * np.arange(lags)), "correlation", {}, level=0.0)
+    memory = Curve(
+        "velocity_correlation",
+        ("Time (ps)", interval * np.arange(lags)),
+        "correlation",
+        {},
+        level=0.0,
+    )
     found.curves += [power, memory]
     for kind in runs.moving:
         if kind.molecule.degrees_of_freedom > 3:
-            momenta = lambda part, group: _normalised(_lab_momenta(part, group), lags)  # noqa: E731
+
+            def momenta(part, group):
+                return _normalised(_lab_momenta(part, group), lags)
+
             memory.add(f"correlation L {kind.name}", *with_group_error(runs, kind, momenta))
         for title, (weight, of) in _rates(kind).items():
-            seen, errors = with_group_error(runs, kind, lambda part, group, of=of: _normalised(of(part, group), lags))
+            seen, errors = with_group_error(
+                runs, kind, lambda part, group, of=of: _normalised(of(part, group), lags)
+            )
             if not seen[1] > CLOSE:
                 raise OutputError(
-                    f"frames every {interval:g} ps are not enough for a spectrum: {title} decays between "
-                    "them; output.trajectory_interval_ps = 0.004 suits water"
+                    f"frames every {interval:g} ps are not enough for a spectrum: {title} decays"
+                    " between them; output.trajectory_interval_ps = 0.004 suits water"
                 )
             memory.add(f"correlation {title}", seen, errors)
 
-            def states(part: RigidFrames, group: Kind, of=of, weight=weight / runs.thermal_energy) -> np.ndarray:
-                """2 weight times the power of series (f, n, d) a wave number, sum over d and mean over n; cm."""
+            def states(
+                part: RigidFrames, group: Kind, of=of, weight=weight / runs.thermal_energy
+            ) -> np.ndarray:
+                """2 weight times the power of series (f, n, d) a wave number, sum over d and mean
+                over n; cm."""
                 values, total = of(part, group), 0.0
                 for first in range(0, values.shape[1], 256):
                     some = values[:, first : first + 256].reshape(len(values), -1)
                     no: Any = False  # which the types of SciPy do not know
-                    total = total + signal.welch(some, 1 / interval, "hann", size, detrend=no, axis=0)[1].sum(axis=1)
+                    total = total + signal.welch(
+                        some, 1 / interval, "hann", size, detrend=no, axis=0
+                    )[1].sum(axis=1)
                 return weight * np.asarray(total) * PER_CM / values.shape[1]
 
             power.add(title, *with_group_error(runs, kind, states))
             top = int(np.argmax(power.columns[title][1:])) + 1
             at, half = float(wavenumbers[top]), float(wavenumbers[1] / 2)
-            found.values.append(Value(f"highest peak of {title}", "1/cm", at, half, None, "half the resolution"))
+            found.values.append(
+                Value(f"highest peak of {title}", "1/cm", at, half, None, "half the resolution")
+            )
     highest, fine = 1 / (2 * interval * PER_CM), wavenumbers[1]
     resolved = f"wave numbers up to {highest:.4g}/cm, in steps of {fine:.2g}/cm"
     found.notes.append(f"frames every {interval:g} ps resolve {resolved}")
@@ -200,16 +248,25 @@ def spectrum(runs: Runs) -> AnalysisResult:
 
 
 def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[RigidFrames, Kind], Any]]]:
-    """The velocities of a species by name: mass or moment of inertia, and a function that returns their series."""
+    """The velocities of a species by name: mass or moment of inertia, and a function that returns
+    their series."""
     name, moments = kind.name, kind.molecule.inertia.tolist()
-    found: dict[str, Any] = {f"V {name}": (kind.molecule.mass, lambda part, group: part.velocities[:, group.index])}
+    found: dict[str, Any] = {
+        f"V {name}": (kind.molecule.mass, lambda part, group: part.velocities[:, group.index])
+    }
     if kind.molecule.degrees_of_freedom <= 3:
         return found
     if len(_axes(kind)) == 1:  # its two other axes are equivalent
-        found[f"omega {name}"] = moments[2], lambda part, group: _lab_momenta(part, group) / moments[2]
+        found[f"omega {name}"] = (
+            moments[2],
+            lambda part, group: _lab_momenta(part, group) / moments[2],
+        )
     else:
         for k, moment in enumerate(moments):
-            of = lambda part, group, k=k, moment=moment: part.L[:, group.index, k : k + 1] / moment  # noqa: E731
+
+            def of(part, group, k=k, moment=moment):
+                return part.L[:, group.index, k : k + 1] / moment
+
             found[f"omega {name} axis {k + 1}"] = moment, of
     return found
 
@@ -226,13 +283,14 @@ def _normalised(values: np.ndarray, lags: int) -> np.ndarray:
 
 
 def total_dipole(frames: RigidFrames) -> np.ndarray:
-    """Total dipole of the molecules in each frame (f, 3), e Å. Raises OutputError if a molecule has a net charge."""
+    """Total dipole of the molecules in each frame (f, 3), e Å. Raises OutputError if a molecule has
+    a net charge."""
     total = np.zeros((len(frames), 3))
     for kind in frames.kinds:
         if kind.molecule.charge:
             raise OutputError(
-                f"{kind.name} has a net charge: the dipole of ions depends on the origin, and ions conduct, so "
-                "the fluctuation gives no dielectric constant"
+                f"{kind.name} has a net charge: the dipole of ions depends on the origin, and ions"
+                " conduct, so the fluctuation gives no dielectric constant"
             )
         dipole_body = kind.molecule.charges @ kind.molecule.positions_body
         if frames.Q.shape[1]:
@@ -242,46 +300,61 @@ def total_dipole(frames: RigidFrames) -> np.ndarray:
 
 @built_in("dielectric constant from the fluctuation of the total dipole", position=90)
 def dielectric(runs: Runs) -> AnalysisResult:
-    """The static dielectric constant, with the boundary condition of the scene: tin foil or a permittivity around the
-    sphere of Ewald sums or the cavity of a reaction field (Neumann 1983, Mol. Phys. 50, 841).
+    """The static dielectric constant, with the boundary condition of the scene: tin foil or a
+    permittivity around the sphere of Ewald sums or the cavity of a reaction field (Neumann 1983,
+    Mol. Phys. 50, 841).
 
-    The mean dipole is 0 by symmetry, and is not subtracted: its square in a run of length T would take the fraction
-    2 tau/T of the fluctuation. Where something breaks the symmetry, it is subtracted and that fraction is added.
-    Raises OutputError.
+    The mean dipole is 0 by symmetry, and is not subtracted: its square in a run of length T would
+    take the fraction 2 tau/T of the fluctuation. Where something breaks the symmetry, it is
+    subtracted and that fraction is added. Raises OutputError.
     """
     around = _permittivity_around(runs)
     dipoles = [total_dipole(run) for run in runs.members]
     if not any(kind.molecule.has_dipole for kind in runs.kinds):
         raise OutputError("no molecule has a dipole: its fluctuation gives no dielectric constant")
-    correlation = float(np.mean([correlation_time_of(runs, [M[:, k] for M in dipoles]) for k in range(3)]))
+    correlation = float(
+        np.mean([correlation_time_of(runs, [M[:, k] for M in dipoles]) for k in range(3)])
+    )
     cause = _broken_symmetry(runs)
     centre, lost = np.zeros(3), 0.0
     if cause:
-        centre, lost = runs.mean([M.mean(axis=0) for M in dipoles]), min(0.5, 2 * correlation / runs.span)
+        centre, lost = (
+            runs.mean([M.mean(axis=0) for M in dipoles]),
+            min(0.5, 2 * correlation / runs.span),
+        )
     squares = [np.sum((M - centre) ** 2, axis=1) / (1 - lost) for M in dipoles]
-    per_square = 4 * np.pi * COULOMB / (3 * runs.volume * runs.thermal_energy)  # y = <M²>/(3 eps0 V kT)
+    per_square = (
+        4 * np.pi * COULOMB / (3 * runs.volume * runs.thermal_energy)
+    )  # y = <M²>/(3 eps0 V kT)
     size, error = mean_of_series(runs, squares)
     y = per_square * size
     found = AnalysisResult("dielectric", "dielectric constant")
     if y >= 2 * around + 1:
         raise OutputError(
-            f"the dipole fluctuates more than it can with a permittivity of {around:g} around: the run is too short, "
-            "or the liquid freezes or is polarised"
+            f"the dipole fluctuates more than it can with a permittivity of {around:g} around: the"
+            " run is too short, or the liquid freezes or is polarised"
         )
     epsilon, slope = _of_fluctuation(y, around)
     # error of the squares, but not less than of three Gaussian numbers with this correlation time
-    relative_error = max(float(error or 0.0) / (size or np.inf), np.sqrt(2 * correlation / (3 * runs.span)))
+    relative_error = max(
+        float(error or 0.0) / (size or np.inf), np.sqrt(2 * correlation / (3 * runs.span))
+    )
     spread = relative_error * y * float(slope)
     surroundings = "tin foil" if np.isinf(around) else f"a permittivity of {around:g}"
     electrostatics = runs.system.scene.forces.electrostatics
-    note = f"{surroundings} around, {electrostatics}; correlation time of the dipole {correlation:.3g} ps"
+    note = (
+        f"{surroundings} around, {electrostatics}; correlation time of the dipole"
+        f" {correlation:.3g} ps"
+    )
     name, value = "dielectric constant", float(epsilon)
     found.values.append(converged_value(name, "1", value, spread, runs.span, correlation, note))
     for k, axis in enumerate("xyz"):
         mean, doubt = mean_of_series(runs, [M[:, k] / DEBYE for M in dipoles])
         name = f"mean total dipole along {axis}"
         if doubt is None:
-            found.values.append(too_short(name, "D", mean, None, "too short for an error", correlation))
+            found.values.append(
+                too_short(name, "D", mean, None, "too short for an error", correlation)
+            )
         else:
             found.values.append(Value(name, "D", mean, doubt, correlation))
     if cause:
@@ -299,24 +372,31 @@ def dielectric(runs: Runs) -> AnalysisResult:
 
 
 def _permittivity_around(runs: Runs) -> float:
-    """Permittivity around the sphere of Ewald sums or the cavity of a reaction field; infinity for tin foil. Raises
-    OutputError where the fluctuation of the dipole gives no dielectric constant."""
+    """Permittivity around the sphere of Ewald sums or the cavity of a reaction field; infinity for
+    tin foil. Raises OutputError where the fluctuation of the dipole gives no dielectric
+    constant."""
     forces = runs.system.scene.forces
     if not runs.has_box:
         raise OutputError("a dielectric constant needs a box")
     if not any(m.charges.any() for m in runs.system.species):
         raise OutputError("a dielectric constant needs molecules with charges")
     if runs.system.scene.fields.electric_V_per_nm is not None:
-        raise OutputError("an electric field acts: the fluctuation of the dipole gives no dielectric constant there")
+        raise OutputError(
+            "an electric field acts: the fluctuation of the dipole gives no dielectric constant"
+            " there"
+        )
     if forces.ewald_slab:
-        raise OutputError("a slab has no dielectric constant: leave forces.ewald_slab out, in a box without vacuum")
+        raise OutputError(
+            "a slab has no dielectric constant: leave forces.ewald_slab out, in a box without"
+            " vacuum"
+        )
     if forces.electrostatics in ("ewald", "pme"):
         return forces.ewald_surface_permittivity
     if forces.electrostatics == "reaction_field":
         return forces.reaction_field_permittivity
     raise OutputError(
-        f"electrostatics = {forces.electrostatics!r} has no known boundary for the fluctuation of the dipole; use "
-        "pme, ewald or reaction_field"
+        f"electrostatics = {forces.electrostatics!r} has no known boundary for the fluctuation of"
+        " the dipole; use pme, ewald or reaction_field"
     )
 
 
@@ -330,8 +410,8 @@ def _broken_symmetry(runs: Runs) -> str:
 
 
 def _of_fluctuation(y, around: float):
-    """epsilon from y = (<M²> - <M>²)/(3 eps0 V kT), and its derivative with y; around: permittivity outside. NaN for y
-    of 2 around + 1 and above, which no epsilon has.
+    """epsilon from y = (<M²> - <M>²)/(3 eps0 V kT), and its derivative with y; around: permittivity
+    outside. NaN for y of 2 around + 1 and above, which no epsilon has.
 
     (eps - 1)(2 around + 1)/(2 around + eps) = y, and eps - 1 = y with tin foil.
     """

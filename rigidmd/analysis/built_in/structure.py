@@ -1,6 +1,7 @@
 """Structure: g(r), structure factor, density profile, hydrogen bonds."""
 
 from collections.abc import Callable
+from functools import partial
 from itertools import combinations_with_replacement, product
 
 import numpy as np
@@ -26,27 +27,36 @@ from rigidmd.run.rigid_fit import Kind
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
 
-#: Molecules in all frames together for g(r) and hydrogen bonds, and for S(k); more frames add little.
+#: Molecules in all frames together for g(r) and hydrogen bonds, and for S(k); more frames add
+#: little.
 ENOUGH_MOLECULES, ENOUGH_MOLECULES_K = 200_000, 100_000
 FEWEST, MOST = 20, 500  # frames
 #: Å: largest distance and width of bins of g(r), unless others are given.
 LARGEST, WIDTH = 10.0, 0.05
 #: 1/Å: largest wave vector and width of bins of S(k); most wave vectors of a bin.
 K_MAX, K_WIDTH, VECTORS_PER_BIN = 8.0, 0.1, 24
-#: Blocks of frames for errors of peaks; least fraction of the variance of blocks by which their correlation reduces it.
+#: Blocks of frames for errors of peaks; least fraction of the variance of blocks by which their
+#: correlation reduces it.
 PEAK_BLOCKS, LEAST_INDEPENDENT = 10, 0.25
-#: Å and degrees: largest O···O and H-O···O of a hydrogen bond (Luzar & Chandler 1996, Nature 379, 55).
+#: Å and degrees: largest O···O and H-O···O of a hydrogen bond (Luzar & Chandler 1996, Nature 379,
+#: 55).
 BOND_DISTANCE, BOND_ANGLE = 3.5, 30.0
 BONDING = ("N", "O", "F")  # donors and acceptors of hydrogen bonds
 
 
 @built_in("radial distribution functions g(r) of sites of different molecules", position=10)
 def rdf(
-    runs: Runs, first: str = "", second: str = "", largest: float | None = None, width: float = WIDTH
+    runs: Runs,
+    first: str = "",
+    second: str = "",
+    largest: float | None = None,
+    width: float = WIDTH,
 ) -> AnalysisResult:
-    """g(r) of two sites, elements or species (centres of mass); default: all pairs of elements, in mixtures of species.
+    """g(r) of two sites, elements or species (centres of mass); default: all pairs of elements, in
+    mixtures of species.
 
-    g counts pairs of different molecules against the number that there are, so that it is 1 far away in a small box
+    g counts pairs of different molecules against the number that there are, so that it is 1 far
+    away in a small box
     too. largest, width : Å. Each frame has its own cell. Raises OutputError.
     """
     if not runs.has_box:
@@ -75,14 +85,18 @@ def rdf(
         mean, error = _mean_of_frames(thinned, g)
         curve.columns[title] = mean
         within = mean * shells * density
-        curve.columns[f"n {a}-{b}"] = np.cumsum(within) - 0.5 * within  # up to the middle of each bin
+        curve.columns[f"n {a}-{b}"] = (
+            np.cumsum(within) - 0.5 * within
+        )  # up to the middle of each bin
         if error is not None:
             curve.errors[title] = error
         found.values += _peaks(f"{a}-{b}", r, thinned, g, shells * density)
     return found
 
 
-def _g_of_frames(frames: RigidFrames, a: str, b: str, pair_count: int, width: float, shells: np.ndarray) -> np.ndarray:
+def _g_of_frames(
+    frames: RigidFrames, a: str, b: str, pair_count: int, width: float, shells: np.ndarray
+) -> np.ndarray:
     """g of two sites in each frame (f, bins). width, shells : of the bins, Å and Å³"""
     g = np.empty((len(frames), len(shells)))
     for k in range(len(frames)):
@@ -94,8 +108,11 @@ def _g_of_frames(frames: RigidFrames, a: str, b: str, pair_count: int, width: fl
 
 
 def _thinned(runs: Runs, enough: int) -> tuple[Runs, list[str]]:
-    """Evenly spaced frames with about `enough` molecules in total, and a note if these are not all frames."""
-    most = min(MOST, max(FEWEST, enough // len(runs.system.model.species))) * max(1.0, len(runs.members) / BLOCKS)
+    """Evenly spaced frames with about `enough` molecules in total, and a note if these are not all
+    frames."""
+    most = min(MOST, max(FEWEST, enough // len(runs.system.model.species))) * max(
+        1.0, len(runs.members) / BLOCKS
+    )
     every = max(1, -(-runs.frame_count // int(most)))
     found = Runs(tuple(run[::every] for run in runs.members))
     note = f"of {found.frame_count} of {runs.frame_count} frames, evenly spaced"
@@ -103,14 +120,16 @@ def _thinned(runs: Runs, enough: int) -> tuple[Runs, list[str]]:
 
 
 def _mean_of_frames(runs: Runs, values: list[np.ndarray]) -> Measured | tuple[np.ndarray, None]:
-    """Mean of arrays (f, p) of the frames of each run, and its error: of one run from blocks, of several from their
-    scatter; None with few frames."""
+    """Mean of arrays (f, p) of the frames of each run, and its error: of one run from blocks, of
+    several from their scatter; None with few frames."""
     means = [of_run.mean(axis=0) for of_run in values]
     if runs.are_several:
         return runs.estimate(means, lambda mean: mean)
     if len(values[0]) < 2 * BLOCKS:
         return means[0], None
-    return means[0], error_of_mean([part.mean(axis=0) for part in np.array_split(values[0], BLOCKS)])
+    return means[0], error_of_mean(
+        [part.mean(axis=0) for part in np.array_split(values[0], BLOCKS)]
+    )
 
 
 def _pairs(runs: Runs) -> list[tuple[str, str]]:
@@ -118,7 +137,9 @@ def _pairs(runs: Runs) -> list[tuple[str, str]]:
     names = [kind.name for kind in runs.kinds]
     if len(set(names)) == 1:
         m = runs.kinds[0].molecule
-        elements = dict.fromkeys(e for e, mass in zip(m.elements, m.masses, strict=True) if mass > 0 and e != "X")
+        elements = dict.fromkeys(
+            e for e, mass in zip(m.elements, m.masses, strict=True) if mass > 0 and e != "X"
+        )
         names = list(elements) or names
     return list(combinations_with_replacement(dict.fromkeys(names), 2))
 
@@ -131,8 +152,11 @@ def _pair_count(frames: RigidFrames, a: str, b: str) -> int:
     return len(first) * len(second) - int(same)
 
 
-def _peaks(name: str, r: np.ndarray, runs: Runs, frames: list[np.ndarray], filled: np.ndarray) -> list[Value]:
-    """Position and height of the first peak, and neighbours up to the first minimum, if there is a peak.
+def _peaks(
+    name: str, r: np.ndarray, runs: Runs, frames: list[np.ndarray], filled: np.ndarray
+) -> list[Value]:
+    """Position and height of the first peak, and neighbours up to the first minimum, if there is a
+    peak.
 
     frames : g(r) of each frame (f, bins) of each run; filled (bins,) : neighbours where g is 1
     """
@@ -140,11 +164,14 @@ def _peaks(name: str, r: np.ndarray, runs: Runs, frames: list[np.ndarray], fille
     edges = np.append(r - 0.5 * width, r[-1] + 0.5 * width)
 
     def valley(g: np.ndarray, top: int) -> float:
-        """Position of the first minimum after a peak, from a fit of a cubic, as single bins are noisy."""
+        """Position of the first minimum after a peak, from a fit of a cubic, as single bins are
+        noisy."""
         low = top + int(np.argmin(g[top : top + max(3, int(0.9 * top))]))
         reach = max(2, (low - top) // 3)
         near = slice(max(top, low - reach), low + reach + 1)
-        skew, bend, tilt, _ = np.polyfit(r[near] - r[low], g[near], 3) if len(r[near]) > 4 else np.zeros(4)
+        skew, bend, tilt, _ = (
+            np.polyfit(r[near] - r[low], g[near], 3) if len(r[near]) > 4 else np.zeros(4)
+        )
         root = bend**2 - 3 * skew * tilt
         shift = -tilt / (bend + np.sqrt(root)) if bend > 0 and root >= 0 else 0.0
         return float(r[low] + np.clip(shift, -reach * width, reach * width))
@@ -176,11 +203,19 @@ def _peaks(name: str, r: np.ndarray, runs: Runs, frames: list[np.ndarray], fille
     if runs.are_several:
         errors = runs.estimate([of_run.mean(axis=0) for of_run in frames], seen_near)[1].tolist()
     elif len(frames[0]) >= 2 * BLOCKS:
-        samples = max(inefficiency(series - series.mean()) for series in (frames[0][:, top], inside[0]))
+        samples = max(
+            inefficiency(series - series.mean()) for series in (frames[0][:, top], inside[0])
+        )
         of_blocks, left_out = _errors_over_blocks(frames[0], seen_near, samples)
         errors = np.maximum(of_blocks, left_out).tolist()
-        errors[2] = float(np.hypot(of_blocks[2], left_out[2]) / np.sqrt(2))  # jumps of the minimum count once
-    titles = (("first peak", "Å"), ("height of that peak", "1"), ("neighbours up to the first minimum", "1"))
+        errors[2] = float(
+            np.hypot(of_blocks[2], left_out[2]) / np.sqrt(2)
+        )  # jumps of the minimum count once
+    titles = (
+        ("first peak", "Å"),
+        ("height of that peak", "1"),
+        ("neighbours up to the first minimum", "1"),
+    )
     return [
         Value(f"g {name}: {title}", unit, float(value), None if e is None else float(e), tau)
         for (title, unit), value, e in zip(titles, whole, errors, strict=True)
@@ -188,14 +223,18 @@ def _peaks(name: str, r: np.ndarray, runs: Runs, frames: list[np.ndarray], fille
 
 
 def _shift_of_vertex(low: float, middle: float, high: float) -> float:
-    """Where the parabola through three points at -1, 0, 1 has its highest point; 0 if it has none."""
+    """Where the parabola through three points at -1, 0, 1 has its highest point; 0 if it has
+    none."""
     bend = low - 2 * middle + high
     return float(0.5 * (low - high) / bend) if bend < 0 else 0.0
 
 
-def _errors_over_blocks(frames: np.ndarray, conclude: Callable[[np.ndarray], np.ndarray], samples: float) -> Measured:
-    """Two estimates of the standard errors of what follows from the mean of frames (f, ...): the scatter of blocks of
-    frames, whose means are noisy, and that of leaving out one block after another, which sees few of the jumps.
+def _errors_over_blocks(
+    frames: np.ndarray, conclude: Callable[[np.ndarray], np.ndarray], samples: float
+) -> Measured:
+    """Two estimates of the standard errors of what follows from the mean of frames (f, ...): the
+    scatter of blocks of frames, whose means are noisy, and that of leaving out one block after
+    another, which sees few of the jumps.
 
     samples : frames for each independent one
     """
@@ -210,7 +249,8 @@ def _errors_over_blocks(frames: np.ndarray, conclude: Callable[[np.ndarray], np.
 
 
 def _first_top(g: np.ndarray) -> int:
-    """Index of the first peak: the highest point from where g exceeds 1 to where it falls below 1."""
+    """Index of the first peak: the highest point from where g exceeds 1 to where it falls below
+    1."""
     above = np.flatnonzero(g > 1.0)
     if len(above) == 0:
         return 0
@@ -225,7 +265,8 @@ def _first_top(g: np.ndarray) -> int:
 
 @built_in("structure factor S(k) of the centres of mass", position=20)
 def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> AnalysisResult:
-    """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box; without a name, of the
+    """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box;
+    without a name, of the
     centres of all molecules. largest : 1/Å. Raises OutputError."""
     if not runs.has_box:
         raise OutputError("a structure factor needs a box")
@@ -251,11 +292,15 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
 
     values = [of_frames(run) for run in thinned.members]
     mean, error_of_curve = _mean_of_frames(thinned, values)
-    length = np.bincount(members, np.linalg.norm(vectors @ reciprocal, axis=1)) / np.bincount(members)
+    length = np.bincount(members, np.linalg.norm(vectors @ reciprocal, axis=1)) / np.bincount(
+        members
+    )
     title = f"S {name or 'centres'}"
     curve = Curve("structure_factor", ("k (1/A)", length), "S(k)", {title: mean}, level=1.0)
     vectors_used = f"at most {VECTORS_PER_BIN} k-vectors in each of {bins} bins"
-    found = AnalysisResult("structure_factor", "structure factor", curves=[curve], notes=[*notes, vectors_used])
+    found = AnalysisResult(
+        "structure_factor", "structure factor", curves=[curve], notes=[*notes, vectors_used]
+    )
     if error_of_curve is not None:
         curve.errors[title] = error_of_curve
         top = int(np.argmax(mean))
@@ -268,11 +313,14 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
 
 
 def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Integer wave vectors (w, 3), one of k and -k, and the bin of each; evenly chosen in bins with many."""
+    """Integer wave vectors (w, 3), one of k and -k, and the bin of each; evenly chosen in bins with
+    many."""
     reach = np.ceil(largest / heights(reciprocal)).astype(int)
     found, bin_index = [], []
     for h in range(reach[0] + 1):
-        rest = np.array(list(product([h], range(-reach[1], reach[1] + 1), range(-reach[2], reach[2] + 1))))
+        rest = np.array(
+            list(product([h], range(-reach[1], reach[1] + 1), range(-reach[2], reach[2] + 1)))
+        )
         if h == 0:
             rest = rest[(rest[:, 1] > 0) | ((rest[:, 1] == 0) & (rest[:, 2] > 0))]
         size = np.linalg.norm(rest @ reciprocal, axis=1)
@@ -290,15 +338,20 @@ def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.n
 
 @built_in("profile of the density along an axis of the box", position=30)
 def density_profile(runs: Runs, axis: str = "z", bins: int = 100) -> AnalysisResult:
-    """Mass density (g/cm³) of each species along an edge of the box: x, y or z for a, b or c. Raises OutputError."""
+    """Mass density (g/cm³) of each species along an edge of the box: x, y or z for a, b or c.
+    Raises OutputError."""
     if axis not in ("x", "y", "z"):
-        raise OutputError(f"unknown axis {axis!r}; name x, y or z (the edges a, b and c of the box)")
+        raise OutputError(
+            f"unknown axis {axis!r}; name x, y or z (the edges a, b and c of the box)"
+        )
     if not runs.has_box:
         raise OutputError("a profile of the density needs a box")
     if bins < 1:
         raise OutputError(f"a profile needs at least one bin, not {bins}")
     k = "xyz".index(axis)
-    height = float(runs.mean([np.mean([heights(cell)[k] for cell in run.cell]) for run in runs.members]))
+    height = float(
+        runs.mean([np.mean([heights(cell)[k] for cell in run.cell]) for run in runs.members])
+    )
 
     def profile(part: RigidFrames, kind: Kind) -> np.ndarray:
         across, total = np.linalg.inv(part.cell)[:, :, k], np.zeros(bins)
@@ -307,40 +360,57 @@ def density_profile(runs: Runs, axis: str = "z", bins: int = 100) -> AnalysisRes
             if part.Q.shape[1]:
                 at = at + part.Q[:, kind.index] @ kind.molecule.positions_body[site]
             inside = np.einsum("fni,fi->fn", at, across) % 1.0
-            total += mass * np.bincount(np.minimum((inside * bins).astype(int), bins - 1).ravel(), minlength=bins)
+            total += mass * np.bincount(
+                np.minimum((inside * bins).astype(int), bins - 1).ravel(), minlength=bins
+            )
         return total * bins / len(part) / float(part.volume.mean()) / GRAM_PER_CM3
+
+    def profile_of_all(kinds, part) -> np.ndarray:
+        return np.sum([profile(part, kind) for kind in kinds], axis=0)
 
     at = (np.arange(bins) + 0.5) * height / bins
     curve = Curve("density_profile", (f"{axis} (A)", at), "density (g/cm³)", {})
     for name in dict.fromkeys(kind.name for kind in runs.kinds):
         of_name = [kind for kind in runs.kinds if kind.name == name]  # frozen and mobile ones
-        together = lambda part, of_name=of_name: np.sum([profile(part, kind) for kind in of_name], axis=0)  # noqa: E731
+        together = partial(profile_of_all, of_name)
         curve.add(f"density {name} (g/cm3)", *with_block_error(runs, together))
     return AnalysisResult("density_profile", f"density along {axis}", curves=[curve])
 
 
 @built_in("hydrogen bonds for each molecule, by distances and angles", position=40)
-def hydrogen_bonds(runs: Runs, distance: float = BOND_DISTANCE, angle: float = BOND_ANGLE) -> AnalysisResult:
-    """Mean number of hydrogen bonds of a molecule, as donor and acceptor: heavy sites (N, O, F) closer than `distance`
-    (Å), with an angle to the bond of the hydrogen below `angle` (degrees). Raises OutputError."""
+def hydrogen_bonds(
+    runs: Runs, distance: float = BOND_DISTANCE, angle: float = BOND_ANGLE
+) -> AnalysisResult:
+    """Mean number of hydrogen bonds of a molecule, as donor and acceptor: heavy sites (N, O, F)
+    closer than `distance` (Å), with an angle to the bond of the hydrogen below `angle` (degrees).
+    Raises OutputError."""
     if not any(_donors(kind.molecule) for kind in runs.kinds):
         why = "no molecule has a hydrogen bonded to nitrogen, oxygen or fluorine"
         raise OutputError(f"{why}: there are no hydrogen bonds")
     thinned, notes = _thinned(runs, ENOUGH_MOLECULES)
     number = len(runs.system.model.species)
     bonds = [
-        np.array([_bonds(run, k, distance, angle) for k in range(len(run))]) for run in thinned.members
+        np.array([_bonds(run, k, distance, angle) for k in range(len(run))])
+        for run in thinned.members
     ]  # (f, n) each
     each = [of_run.mean(axis=1) for of_run in bonds]
     value, error = mean_of_series(thinned, each)
     most = int(max(of_run.max() for of_run in bonds)) + 1
     fractions = [[np.mean(of_run == k) for k in range(most)] for of_run in bonds]
     axis = ("hydrogen bonds", np.arange(most))
-    curve = Curve("hydrogen_bonds", axis, "fraction of molecules", {"share": thinned.mean(fractions)}, bars=True)
+    curve = Curve(
+        "hydrogen_bonds",
+        axis,
+        "fraction of molecules",
+        {"share": thinned.mean(fractions)},
+        bars=True,
+    )
     about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
     tau = correlation_time_of(thinned, each)
     found = Value("hydrogen bonds of a molecule", "1", value, error, tau, about)
-    return AnalysisResult("hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], notes)
+    return AnalysisResult(
+        "hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], notes
+    )
 
 
 def _donors(molecule: Molecule) -> list[tuple[int, int]]:
@@ -357,7 +427,11 @@ def _donors(molecule: Molecule) -> list[tuple[int, int]]:
 
 def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float) -> np.ndarray:
     """Hydrogen bonds of each molecule (n,) in a frame."""
-    heavy, owner, arms = [], [], []  # arms (sites, 3) to the first hydrogen of each, the second, ...; NaN without one
+    heavy, owner, arms = (
+        [],
+        [],
+        [],
+    )  # arms (sites, 3) to the first hydrogen of each, the second, ...; NaN without one
     most = len(max((_donors(kind.molecule) for kind in frames.kinds), key=len))
     for kind in frames.kinds:
         centre = frames.positions[frame, kind.index]
@@ -379,7 +453,11 @@ def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float) -> np
     counts = np.zeros(len(frames.system.model.species))
     for arm in np.concatenate(arms, axis=1):
         to = arm[both[:, 0]]
-        cosine = np.einsum("pi,pi->p", to, way) / np.linalg.norm(to, axis=1) / np.linalg.norm(way, axis=1)
+        cosine = (
+            np.einsum("pi,pi->p", to, way)
+            / np.linalg.norm(to, axis=1)
+            / np.linalg.norm(way, axis=1)
+        )
         bonded = cosine > np.cos(np.radians(angle))
         np.add.at(counts, who[both[bonded]].ravel(), 1.0)
     return counts

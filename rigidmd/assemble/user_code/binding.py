@@ -1,4 +1,5 @@
-"""Binds user code to a system: forces and a thermostat become terms, and errors in their code become messages."""
+"""Binds user code to a system: forces and a thermostat become terms, and errors in their code
+become messages."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,7 +31,9 @@ from rigidmd.scene.molecules import name_of
 #: Names that a force cannot have, and what they are.
 RESERVED = {
     **dict.fromkeys((LOAD, BOX, TRAJECTORY), "the name of a part of checkpoints"),
-    **dict.fromkeys(("tail", "lennard_jones_tail"), "the name of the energy of the tail correction"),
+    **dict.fromkeys(
+        ("tail", "lennard_jones_tail"), "the name of the energy of the tail correction"
+    ),
     **dict.fromkeys(IN_LOGS, "a column of the log"),
 }
 
@@ -43,7 +46,10 @@ def custom_forces(scene: MolecularScene) -> list[Any]:
             found.append(_custom(scene, entry, f"forces.custom.{k}"))
         except (SceneError, ValueError) as error:
             module = entry.module if isinstance(error, SceneError) else None
-            faults += [(module, f"forces.custom.{k}: {fault}") for fault in getattr(error, "errors", [error])]
+            faults += [
+                (module, f"forces.custom.{k}: {fault}")
+                for fault in getattr(error, "errors", [error])
+            ]
     if faults:  # each file once
         messages = {module or fault: fault for module, fault in reversed(faults)}
         raise SceneError(scene.source, list(messages.values())[::-1])
@@ -55,13 +61,23 @@ def _custom(scene: MolecularScene, entry: CustomForce, key: str) -> Any:
         pairs = {pair.sites: pair.parameters for pair in entry.pairs}
         table = None if entry.table is None else scene.path(entry.table)
         return pair_law(
-            entry.energy, entry.parameters or None, table=table, sites=entry.sites, pairs=pairs, mixing=entry.mixing,
-            truncation=entry.truncation, cutoff_A=entry.cutoff_A, switch_start_A=entry.switch_start_A, name=entry.name,
-        )  # fmt: skip
+            entry.energy,
+            entry.parameters or None,
+            table=table,
+            sites=entry.sites,
+            pairs=pairs,
+            mixing=entry.mixing,
+            truncation=entry.truncation,
+            cutoff_A=entry.cutoff_A,
+            switch_start_A=entry.switch_start_A,
+            name=entry.name,
+        )
     module = trusted_module(scene.path(entry.module), f"{key}.module")
     if not hasattr(module, entry.name):
         there = [name for name in vars(module) if not name.startswith("_")]
-        raise ValueError(f"name: {entry.module} has no {entry.name}{did_you_mean(entry.name, there) or ''}")
+        raise ValueError(
+            f"name: {entry.module} has no {entry.name}{did_you_mean(entry.name, there) or ''}"
+        )
     made = getattr(module, entry.name)
     if isinstance(made, type) or (callable(made) and not isinstance(made, Force)):
         try:
@@ -69,7 +85,9 @@ def _custom(scene: MolecularScene, entry: CustomForce, key: str) -> Any:
         except (Exception, SystemExit) as error:  # user code may raise anything
             raise ValueError(f"{entry.name}(...) raised {describe_error(error)}") from error
     elif entry.parameters:
-        raise ValueError(f"parameters would do nothing: {entry.name} is an object, which is not called")
+        raise ValueError(
+            f"parameters would do nothing: {entry.name} is an object, which is not called"
+        )
     return made
 
 
@@ -83,20 +101,31 @@ def user_errors_explained(system: System) -> Iterator[None]:
     except CompileError as error:
         if not system.user_terms and system.thermostat is None:
             raise
-        names = ", ".join([*system.user_terms, *(["the thermostat"] if system.thermostat is not None else [])])
-        raise SceneError(system.scene.source, [f"{names}: cannot be compiled{describe_compile_error(error)}"]) from None
+        names = ", ".join(
+            [*system.user_terms, *(["the thermostat"] if system.thermostat is not None else [])]
+        )
+        raise SceneError(
+            system.scene.source, [f"{names}: cannot be compiled{describe_compile_error(error)}"]
+        ) from None
 
 
 def with_user_code(system: System) -> System:
-    """The system with [[forces.custom]] and terms and thermostat from Python. Raises SceneError with all errors."""
+    """The system with [[forces.custom]] and terms and thermostat from Python. Raises SceneError
+    with all errors."""
     scene, (added, thermostat) = system.scene, system.scene.user_code
     forces = [*custom_forces(scene), *added]
     wanted = [*(entry.name for entry in scene.forces.custom), *map(name_of, added)]
     names = distinct(wanted, [*system.terms, *system.constants])
-    found = replace(system, python_forces={}, thermostat=thermostat, user_terms={}, notes=[*system.notes])
+    found = replace(
+        system, python_forces={}, thermostat=thermostat, user_terms={}, notes=[*system.notes]
+    )
     found = replace(found, warnings=[*system.warnings])
     terms, tails = {}, [] if system.tail is None else [system.tail]
-    faults = [f"{name} is {RESERVED[name]}; name the force otherwise" for name in names if name in RESERVED]
+    faults = [
+        f"{name} is {RESERVED[name]}; name the force otherwise"
+        for name in names
+        if name in RESERVED
+    ]
     changed = np.zeros(3, bool)  # whether they may change components of the total momentum
     for name, made in zip(names, forces, strict=True):
         try:
@@ -106,33 +135,51 @@ def with_user_code(system: System) -> System:
             terms[name] = term
         except (SceneError, UserForceError, ValueError) as error:
             faults += [f"{name}: {fault}" for fault in getattr(error, "errors", [error])]
-    if thermostat is not None and not (type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")):
-        need = "a NamedTuple of a class with rigidmd.compiled_thermostat nor has a method for_stage(system, k)"
+    if thermostat is not None and not (
+        type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")
+    ):
+        need = (
+            "a NamedTuple of a class with rigidmd.compiled_thermostat nor has a method"
+            " for_stage(system, k)"
+        )
         faults.append(f"thermostat: {thermostat!r:.60} is neither {need}")
     if faults:
         raise SceneError(scene.source, faults)
     if thermostat is not None:
-        found.notes.append(f"thermostat: {name_of(thermostat)}, from Python, replaces the thermostats of all stages")
+        found.notes.append(
+            f"thermostat: {name_of(thermostat)}, from Python, replaces the thermostats of all"
+            " stages"
+        )
     model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~changed)
     # Forces computed by Python come first: as long as they are missing, no other need be computed.
     terms = {name: terms[name] for name in found.python_forces} | system.terms | terms
     return replace(
-        found, scene=with_momentum_removal(scene, model.keeps_momentum), terms=terms, model=model,
-        freedom=count_degrees_of_freedom(model), tail=sum_of_tails(tails),
-    )  # fmt: skip
+        found,
+        scene=with_momentum_removal(scene, model.keeps_momentum),
+        terms=terms,
+        model=model,
+        freedom=count_degrees_of_freedom(model),
+        tail=sum_of_tails(tails),
+    )
 
 
 def _term(made: Any, name: str, system: System, found: System, tails: list[Tail]) -> NamedTuple:
-    """The term of one object for a system. Its function, description and notes are added to `found`, its tail
-    correction to `tails`. Raises PairPotentialError, ValueError, UserForceError."""
+    """The term of one object for a system. Its function, description and notes are added to
+    `found`, its tail correction to `tails`. Raises PairPotentialError, ValueError,
+    UserForceError."""
     if isinstance(made, PairLaw):
         term, formula, tail, notes, warnings = made.bind(system)
         if formula.error:
-            found.notes.append(f"{name}: the error of its spline is {formula.error:.1e} of its deepest energy")
+            found.notes.append(
+                f"{name}: the error of its spline is {formula.error:.1e} of its deepest energy"
+            )
         found.notes.extend(f"{name}: {note}" for note in notes)
         found.warnings.extend(f"{name} {warning}" for warning in warnings)
         tails += [] if tail is None else [tail]
-        cutoff, truncation = made.cutoff_A or system.cutoff, made.truncation or system.scene.forces.truncation
+        cutoff, truncation = (
+            made.cutoff_A or system.cutoff,
+            made.truncation or system.scene.forces.truncation,
+        )
         reach = f"cutoff {cutoff:g} Å, {truncation}" if cutoff < inf else "no cutoff"
         found.user_terms[name] = f"{formula.text}, {len(term.group)} sites, {reach}"
         return term
@@ -151,8 +198,15 @@ def _term(made: Any, name: str, system: System, found: System, tails: list[Tail]
     if isinstance(made, PairForces):  # with a potential that is not a `PairLaw`
         check_cutoff(made.potential.cutoff, system)  # type: ignore[attr-defined]  # every pair potential has a cutoff
     if not (isinstance(made, PairForces) or type(made) in FORCES):
-        compiled = "a NamedTuple of a class with rigidmd.compiled_force, or an object whose term(system) makes one"
-        raise ValueError(f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_law, {compiled}")
-    numbers = ", ".join(f"{key} = {x:.6g}" for key, x in made._asdict().items() if isinstance(x, int | float))
+        compiled = (
+            "a NamedTuple of a class with rigidmd.compiled_force, or an object whose term(system)"
+            " makes one"
+        )
+        raise ValueError(
+            f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_law, {compiled}"
+        )
+    numbers = ", ".join(
+        f"{key} = {x:.6g}" for key, x in made._asdict().items() if isinstance(x, int | float)
+    )
     found.user_terms[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
     return made

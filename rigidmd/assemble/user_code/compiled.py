@@ -20,7 +20,8 @@ from rigidmd.errors import SceneError
 from rigidmd.scene.molecules import name_of
 from rigidmd.units import FEMTOSECOND
 
-#: Largest difference by rounding between a change of the kinetic energy and of the ledger, as a fraction of the energy.
+#: Largest difference by rounding between a change of the kinetic energy and of the ledger, as a
+#: fraction of the energy.
 LEDGER_ERROR = 1e-9
 
 
@@ -36,15 +37,21 @@ def check_compiled_code(system: System, state: State) -> list[str]:
         after, function = state.copy(), THERMOSTATS[type(thermostat)]
         if wrong := _faults(name, function, (thermostat, system.model, after, h, 0)):
             faults += wrong
-        elif _kinetic_energy(system, state) == 0:  # at rest, a factor of the momenta may be infinite
+        elif (
+            _kinetic_energy(system, state) == 0
+        ):  # at rest, a factor of the momenta may be infinite
             continue
         elif not after.is_finite:
-            faults.append(f"{name}: {_place(function)} makes momenta that are not finite, in a time of {h:g} ps")
+            faults.append(
+                f"{name}: {_place(function)} makes momenta that are not finite, in a time of"
+                f" {h:g} ps"
+            )
         elif (missing := _missing_heat(system, state, after)) is not None:
             change, heat, kinetic = missing
             notes.append(
-                f"{name} changes the kinetic energy by {change / kinetic:.2g} of it and adds {heat / kinetic:.2g} to "
-                "state.energy_ledger[0]: the conserved energy will drift by the difference"
+                f"{name} changes the kinetic energy by {change / kinetic:.2g} of it and adds"
+                f" {heat / kinetic:.2g} to state.energy_ledger[0]: the conserved energy will drift"
+                " by the difference"
             )
     if faults:
         raise SceneError(system.scene.source, list(dict.fromkeys(faults)))
@@ -67,14 +74,19 @@ def _thermostats(system: System) -> Iterator[tuple[str, Any, float]]:
 
 def _faults(name: str, function: Callable, arguments: tuple) -> list[str]:
     """The error of a function that cannot be compiled, or reads or writes beyond an array."""
-    arguments_for_python = tuple(part.copy() if isinstance(part, State) else part for part in arguments)
+    arguments_for_python = tuple(
+        part.copy() if isinstance(part, State) else part for part in arguments
+    )
     try:
         with_checked_indices(function)(*arguments)
     except CompileError as error:
         return [f"{name}: {_place(function)} cannot be compiled{describe_compile_error(error)}"]
     except IndexError:
         hint = "masses and moments are by species: model.mass[model.species[m]]"
-        return [f"{name}: {_place_of_index_error(function, arguments_for_python)} has an index beyond an array; {hint}"]
+        return [
+            f"{name}: {_place_of_index_error(function, arguments_for_python)} has an index beyond"
+            f" an array; {hint}"
+        ]
     return []
 
 
@@ -83,7 +95,9 @@ def _missing_heat(system: System, before: State, after: State) -> tuple[float, f
     two differ."""
     old, new = _kinetic_energy(system, before), _kinetic_energy(system, after)
     change, heat = new - old, float(after.energy_ledger[HEAT] - before.energy_ledger[HEAT])
-    return (change, heat, max(old, new)) if abs(change - heat) > LEDGER_ERROR * max(old, new) else None
+    return (
+        (change, heat, max(old, new)) if abs(change - heat) > LEDGER_ERROR * max(old, new) else None
+    )
 
 
 def _kinetic_energy(system: System, state: State) -> float:
@@ -102,12 +116,19 @@ def describe_compile_error(error: CompileError) -> str:
     of_user = [(file, int(line)) for file, line in files if _is_of_user(file)]
     where = f" ({_quoted(*of_user[0])})" if of_user else ""
     if plain := re.findall(r"Untyped global name '(\w+)'", text):
-        return f"{where}: it uses {plain[-1]}, which is not compiled: if it is a function, put numba.njit before it"
+        return (
+            f"{where}: it uses {plain[-1]}, which is not compiled: if it is a function, put"
+            " numba.njit before it"
+        )
     if bound := re.search(
-        r"Cannot bind 'args=(.*?) kws=.*?' to signature '(\(.*?\))' due to \"TypeError: (.*?)\"", text
+        r"Cannot bind 'args=(.*?) kws=.*?' to signature '(\(.*?\))' due to \"TypeError: (.*?)\"",
+        text,
     ):
         callee = re.search(r"<function (\w+) at", text[bound.end() :])
-        return f"{where}: {callee[1] if callee else 'a function'}{bound[2]} is called with wrong arguments: {bound[3]}"
+        return (
+            f"{where}: {callee[1] if callee else 'a function'}{bound[2]} is called with wrong"
+            f" arguments: {bound[3]}"
+        )
     if unknown := re.search(r"Unknown attribute '(\w+)' of type (\w+)", text):
         return f"{where}: Numba knows no attribute {unknown[1]!r} of {unknown[2]}"
     if unknown := re.findall(r">>> (\S.*)", text):
@@ -150,7 +171,11 @@ def _place_of_index_error(function: Callable, arguments: tuple) -> str:
     try:
         plain(*arguments)
     except IndexError as error:
-        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_of_user(frame.filename)]
+        frames = [
+            frame
+            for frame in traceback.extract_tb(error.__traceback__)
+            if _is_of_user(frame.filename)
+        ]
         if frames:
             return f"{plain.__name__} ({_quoted(frames[-1].filename, frames[-1].lineno or 0)})"
     except Exception:  # what only compiled code can do

@@ -32,20 +32,25 @@ class ValuesAtCutoff(NamedTuple):
     cutoff: float  # Å
     energy: float
     force: float
-    change: float  # largest change of the energy up to twice the cutoff; 0 if the potential ends at its cutoff
+    # largest change of the energy up to twice the cutoff; 0 if the potential ends at its cutoff
+    change: float
 
     @classmethod
-    def of(cls, radial: Callable[[float], tuple], cutoff: float, ends_there: bool) -> "ValuesAtCutoff":
+    def of(
+        cls, radial: Callable[[float], tuple], cutoff: float, ends_there: bool
+    ) -> "ValuesAtCutoff":
         """ends_there : whether the potential is not known beyond the cutoff"""
         if cutoff == inf:
             return cls(cutoff, 0.0, 0.0, 0.0)
         energy, force, _ = radial(cutoff)
-        beyond = [] if ends_there else [abs(radial(x * cutoff)[0] - energy) for x in (1.25, 1.5, 2.0)]
+        beyond = (
+            [] if ends_there else [abs(radial(x * cutoff)[0] - energy) for x in (1.25, 1.5, 2.0)]
+        )
         return cls(cutoff, energy, force, max([x for x in beyond if isfinite(x)], default=0.0))
 
     def lost(self, truncation: TruncationName) -> float:
-        """What the truncation changes: the jump of the energy, its change beyond the cutoff, and the work of the force
-        over a tenth of the cutoff, whichever is largest."""
+        """What the truncation changes: the jump of the energy, its change beyond the cutoff, and
+        the work of the force over a tenth of the cutoff, whichever is largest."""
         jump = abs(self.energy) if truncation == "plain" else 0.0
         return max(jump, self.change, 0.1 * self.cutoff * abs(self.force))
 
@@ -53,9 +58,9 @@ class ValuesAtCutoff(NamedTuple):
         """A sentence. scale : what `thermal` is, such as kT at 298 K"""
         energy, force = (f"{value / KJ_PER_MOL:.3g}" for value in (self.energy, self.force))
         text = (
-            f"is {energy} kJ/mol ({self.energy / thermal:.2g} {scale}) at its cutoff of {self.cutoff:g} Å "
-            f"with truncation = {truncation}, between {between}, and its force is {force} kJ/mol/Å; beyond "
-            "it does not act"
+            f"is {energy} kJ/mol ({self.energy / thermal:.2g} {scale}) at its cutoff of"
+            f" {self.cutoff:g} Å with truncation = {truncation}, between {between}, and its force"
+            f" is {force} kJ/mol/Å; beyond it does not act"
         )
         if self.change > abs(self.energy):
             text += f", where it would change by {self.change / thermal:.2g} {scale}"
@@ -63,17 +68,22 @@ class ValuesAtCutoff(NamedTuple):
 
 
 def energy_scale(system: System) -> tuple[float, str]:
-    """The smallest kT of a scene, or else its deepest well between two sites (u Å²/ps²), and its name; 0 without."""
+    """The smallest kT of a scene, or else its deepest well between two sites (u Å²/ps²), and its
+    name; 0 without."""
     scene = system.scene
     temperatures = [x for stage in scene.stages for x in stage.temperatures if x > 0]
     temperature = min(temperatures, default=scene.start.temperature_K or 0.0)
     if temperature:
         return BOLTZMANN * temperature, f"kT at {temperature:g} K"
-    return max((float(m.epsilon.max()) for m in system.species), default=0.0) or inf, "of the deepest well"
+    return (
+        max((float(m.epsilon.max()) for m in system.species), default=0.0) or inf,
+        "of the deepest well",
+    )
 
 
 def minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | None:
-    """The distance (Å) of the minimum of an energy, if it lies beyond the cutoff, within which sites only repel."""
+    """The distance (Å) of the minimum of an energy, if it lies beyond the cutoff, within which
+    sites only repel."""
     if cutoff == inf:
         return None
 
@@ -94,4 +104,6 @@ def check_cutoff(cutoff: float, system: System) -> None:
     if cutoff == inf and system.space.volume < inf:
         raise PairPotentialError("it has no cutoff, and the box is periodic: set cutoff_A")
     if not cutoff <= half:
-        raise PairPotentialError(f"its cutoff of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
+        raise PairPotentialError(
+            f"its cutoff of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å"
+        )

@@ -41,19 +41,23 @@ class NotFiniteError(UserForceError):
 
 
 class Force:
-    """A force on molecules in plain Python: derive a class from it and define `on_sites` or `on_molecules`.
+    """A force on molecules in plain Python: derive a class from it and define `on_sites` or
+    `on_molecules`.
 
     class Spring(rigidmd.Force):
         def on_molecules(self, state):
             return 0.5 * (state.position**2).sum(), -state.position
 
-    It is called once for every new set of positions, between steps of the compiled loop; a `compiled_force` is faster.
+    It is called once for every new set of positions, between steps of the compiled loop; a
+    `compiled_force` is faster.
 
     name : in logs and messages; default: the name of the class
-    changes_momentum : which components of the total momentum it may change; False for forces between molecules
-    tied_to_places : whether its energy depends on absolute positions, which excludes a barostat. If False, its virial
-        must be the last of the returned values
-    energy_noise : random error of its energies, kJ/mol, for the comparison with its forces at the start of a run
+    changes_momentum : which components of the total momentum it may change; False for forces
+        between molecules
+    tied_to_places : whether its energy depends on absolute positions, which excludes a barostat. If
+        False, its virial must be the last of the returned values
+    energy_noise : random error of its energies, kJ/mol, for the comparison with its forces at the
+        start of a run
     """
 
     name: ClassVar[str | None] = None
@@ -62,17 +66,21 @@ class Force:
     energy_noise: ClassVar[float] = 0.0
 
     def begin(self, system: System) -> None:
-        """Called once with the system, which has `sites` (names, elements, masses, charges), `species` and `model`."""
+        """Called once with the system, which has `sites` (names, elements, masses, charges),
+        `species` and `model`."""
 
     def on_sites(self, position: np.ndarray, state: State) -> tuple:
-        """(energy in kJ/mol, forces (s, 3) on all sites in kJ/mol/Å) at their positions (s, 3), Å, not wrapped.
+        """(energy in kJ/mol, forces (s, 3) on all sites in kJ/mol/Å) at their positions (s, 3), Å,
+        not wrapped.
 
-        Sites are those of `system.sites`, in its order. A third value is the molecular virial (3, 3), kJ/mol.
+        Sites are those of `system.sites`, in its order. A third value is the molecular virial (3,
+        3), kJ/mol.
         """
         raise NotImplementedError
 
     def on_molecules(self, state: State) -> tuple:
-        """(energy in kJ/mol, forces (n, 3) on centres of mass in kJ/mol/Å, torques (n, 3) in kJ/mol, body frame).
+        """(energy in kJ/mol, forces (n, 3) on centres of mass in kJ/mol/Å, torques (n, 3) in
+        kJ/mol, body frame).
 
         Torques may be left out. A fourth value is the molecular virial (3, 3), kJ/mol.
         """
@@ -80,7 +88,8 @@ class Force:
 
 
 class BoundForce:
-    """A `Force` in a system: calls it, checks the values, and converts forces on sites to forces on bodies.
+    """A `Force` in a system: calls it, checks the values, and converts forces on sites to forces on
+    bodies.
 
     calls, seconds : how often it was called, and the time that this took
     may_diverge : whether values that are not finite are passed to the steps, as in trajectories of
@@ -117,7 +126,9 @@ class BoundForce:
     def _evaluate(self, workspace: PythonForcesWorkspace, state: State) -> None:
         state = State(*(_read_only(array) for array in state))
         if self._by_site:
-            energy, force, torque, virial = self._of_sites(_read_only(self.system.site_positions(state)), state)
+            energy, force, torque, virial = self._of_sites(
+                _read_only(self.system.site_positions(state)), state
+            )
         else:
             energy, force, torque, virial = self._parts(self._called("on_molecules", state), 4)
         self._fill(workspace.force, force, "forces")
@@ -149,7 +160,9 @@ class BoundForce:
     def _parts(self, found: Any, most: int) -> list:
         """Energy and three further values, None for omitted ones."""
         if not isinstance(found, tuple) or not 2 <= len(found) <= most:
-            given = f"{len(found)} values" if isinstance(found, tuple) else f"{type(found).__name__}"
+            given = (
+                f"{len(found)} values" if isinstance(found, tuple) else f"{type(found).__name__}"
+            )
             more = " and perhaps torques and a virial" if most == 4 else " and perhaps a virial"
             raise self._error(f"{given}; it must return a tuple of an energy, forces{more}")
         try:
@@ -159,7 +172,12 @@ class BoundForce:
         return [energy, *found[1:], *[None] * (4 - len(found))]
 
     def _fill(
-        self, target: np.ndarray, given: Any, what: str, molecule: np.ndarray | None = None, unit: float = KJ_PER_MOL
+        self,
+        target: np.ndarray,
+        given: Any,
+        what: str,
+        molecule: np.ndarray | None = None,
+        unit: float = KJ_PER_MOL,
     ) -> None:
         """Copy given values times a unit to an array of the workspace; None is 0."""
         if given is None:
@@ -190,13 +208,18 @@ class BoundForce:
         except (Exception, SystemExit) as error:  # user code may raise anything
             last = traceback.extract_tb(error.__traceback__)[-1]
             where = f", line {last.lineno} of {last.filename}"
-            raise UserForceError(f"{what} of the force {self.name} raised {describe_error(error)}{where}") from error
+            raise UserForceError(
+                f"{what} of the force {self.name} raised {describe_error(error)}{where}"
+            ) from error
 
 
 def real_numbers(given: Any) -> np.ndarray | None:
-    """An array of real numbers; None for anything else, such as complex numbers and masked values."""
+    """An array of real numbers; None for anything else, such as complex numbers and masked
+    values."""
     try:
-        return None if np.iscomplexobj(given) or np.ma.is_masked(given) else np.asarray(given, float)
+        return (
+            None if np.iscomplexobj(given) or np.ma.is_masked(given) else np.asarray(given, float)
+        )
     except (TypeError, ValueError):
         return None
 
@@ -212,5 +235,7 @@ def changes_momentum(term: Any) -> np.ndarray:
     given = getattr(term, "changes_momentum", EVERY)
     each = given if isinstance(given, tuple | list | np.ndarray) else (given,)
     if len(each) not in (1, 3) or not all(isinstance(one, bool | np.bool_) for one in each):
-        raise ValueError(f"changes_momentum is {given!r:.60}, must be three truth values, for x, y, z")
+        raise ValueError(
+            f"changes_momentum is {given!r:.60}, must be three truth values, for x, y, z"
+        )
     return np.array(np.broadcast_to(given, 3), bool)

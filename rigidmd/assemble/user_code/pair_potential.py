@@ -1,6 +1,6 @@
-"""Pair potentials of users: the sites that they act on, their parameters and their cutoff schemes."""
+"""Pair potentials of users: the sites that they act on, their parameters and their cutoff
+schemes."""
 
-# isort: skip_file
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,8 +11,13 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from rigidmd.assemble.user_code.cutoffs import (
-    LARGEST_AT_CUTOFF, PairPotentialError, ValuesAtCutoff, check_cutoff, energy_scale, minimum_beyond,
-)  # fmt: skip
+    LARGEST_AT_CUTOFF,
+    PairPotentialError,
+    ValuesAtCutoff,
+    check_cutoff,
+    energy_scale,
+    minimum_beyond,
+)
 from rigidmd.assemble.user_code.tables import Columns, read_columns
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces, pair_forces
@@ -20,12 +25,20 @@ from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
 from rigidmd.forces.parts import Tail, gather_per_molecule, inner_pairs, sites_named, sum_of_tails
 from rigidmd.forces.potentials.custom import CustomPotential, tail_of_pair
 from rigidmd.forces.potentials.formulas import (
-    DISTANCE, Formula, FormulaError, formula_of_function, formula_of_table,
-)  # fmt: skip
+    DISTANCE,
+    Formula,
+    FormulaError,
+    formula_of_function,
+    formula_of_table,
+)
 from rigidmd.forces.potentials.truncation import (
-    TRUNCATIONS, TruncationName, default_switch_start, short_cutoff_note, truncation_of,
+    TRUNCATIONS,
+    TruncationName,
+    default_switch_start,
+    short_cutoff_note,
+    truncation_of,
     truncation_terms,
-)  # fmt: skip
+)
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean, not_none
 
@@ -70,7 +83,9 @@ class PairLaw:
                 r, energy, force, name = self.table
                 return formula_of_table(r, energy, cutoff, force, name)
             if isinstance(self.energy, str):
-                from rigidmd.forces.potentials.text_formulas import formula_of_text  # SymPy is slow to import
+                from rigidmd.forces.potentials.text_formulas import (
+                    formula_of_text,  # SymPy is slow to import
+                )
 
                 return formula_of_text(self.energy, self.constants)
         except FormulaError as error:
@@ -78,7 +93,8 @@ class PairLaw:
         return not_none(self.formula_of_function)
 
     def bind(self, system: System) -> BoundPotential:
-        """The potential between the sites of a system. Raises PairPotentialError with all errors."""
+        """The potential between the sites of a system. Raises PairPotentialError with all
+        errors."""
         forces = system.scene.forces
         cutoff = self.cutoff_A or system.cutoff
         check_cutoff(cutoff, system)
@@ -88,16 +104,25 @@ class PairLaw:
             raise PairPotentialError(f"switch_start_A would do nothing with truncation = {name!r}")
         start = (given or default_switch_start(name, cutoff)) if "switch" in name else cutoff
         if not start <= cutoff:
-            raise PairPotentialError(f"switch_start_A = {start:g} is beyond the cutoff of {cutoff:g} Å")
+            raise PairPotentialError(
+                f"switch_start_A = {start:g} is beyond the cutoff of {cutoff:g} Å"
+            )
         formula = self.formula(cutoff)
         types = _SiteTypes(self, formula, system.species)
-        indices = [np.flatnonzero([entry is not None for entry in entries]) for entries in types.of_species]
+        indices = [
+            np.flatnonzero([entry is not None for entry in entries]) for entries in types.of_species
+        ]
         if not any(len(sites) for sites in indices):
             raise PairPotentialError("no site of the scene has its parameters")
         index = system.model.species
-        offsets = [m.positions_body[sites] for m, sites in zip(system.species, indices, strict=True)]
+        offsets = [
+            m.positions_body[sites] for m, sites in zip(system.species, indices, strict=True)
+        ]
         sites = sites_of(index, offsets, system.model.inverse_inertia)
-        kinds = [np.array([types.all.index(entry) for entry in entries if entry], int) for entries in types.of_species]
+        kinds = [
+            np.array([types.all.index(entry) for entry in entries if entry], int)
+            for entries in types.of_species
+        ]
         kind = gather_per_molecule(kinds, index)
         shape = truncation_of(name, cutoff, start)
         count = len(types.all)
@@ -115,11 +140,19 @@ class PairLaw:
                 ends[:, i, j] = truncation_terms(name, shape, radial)
                 values = [] if cutoff == inf else [*radial(cutoff), *radial(0.9 * cutoff)]
                 if forces.tail_correction and formula.shared:
-                    raise FormulaError("a table is finite, and forces.tail_correction needs its energy beyond")
+                    raise FormulaError(
+                        "a table is finite, and forces.tail_correction needs its energy beyond"
+                    )
                 if forces.tail_correction:
-                    part = tail_of_pair(radial, tuple(ends[:, i, j].tolist()), shape, inner.between(i, j))
+                    part = tail_of_pair(
+                        radial, tuple(ends[:, i, j].tolist()), shape, inner.between(i, j)
+                    )
                     pairs = float(members[i] * members[j]) * (1.0 if i == j else 2.0)
-                    tails.append(Tail(pairs * part.energy_volume, pairs * part.pressure_square, part.constant))
+                    tails.append(
+                        Tail(
+                            pairs * part.energy_volume, pairs * part.pressure_square, part.constant
+                        )
+                    )
                 if not np.isfinite([*values, *numbers[:, i, j], *ends[:, i, j]]).all():
                     raise FormulaError("it has no finite value at the cutoff")
             except (FormulaError, ArithmeticError, ValueError, TypeError) as error:
@@ -139,16 +172,25 @@ class PairLaw:
             raise PairPotentialError("no pair of sites of the scene has parameters")
         first = np.argwhere(acts)[0]
         potential = CustomPotential(
-            cutoff, shape, formula.kind(*(float(x) for x in numbers[:, first[0], first[1]])), formula.shared,
-            kind.astype(np.int32), np.where(acts > 0, numbers, numbers[:, first[0], first[1]][:, None, None]), ends,
+            cutoff,
+            shape,
+            formula.kind(*(float(x) for x in numbers[:, first[0], first[1]])),
+            formula.shared,
+            kind.astype(np.int32),
+            np.where(acts > 0, numbers, numbers[:, first[0], first[1]][:, None, None]),
+            ends,
             acts,
-        )  # fmt: skip
-        term = pair_forces(potential, sites, exclusion_groups(sites, (system.model.inverse_mass == 0)[index]))
+        )
+        term = pair_forces(
+            potential, sites, exclusion_groups(sites, (system.model.inverse_mass == 0)[index])
+        )
         notes = [short_cutoff_note(cutoff, max(short)[1], max(short)[0])] if short else []
         warnings = [max(unfinished)[1]] if unfinished else []
         if formula.error > SPLINE_ERROR:
             advice = "use smaller intervals"
-            warnings.append(f"the error of its spline is {formula.error:.1e} of its deepest energy: {advice}")
+            warnings.append(
+                f"the error of its spline is {formula.error:.1e} of its deepest energy: {advice}"
+            )
         return BoundPotential(term, formula, sum_of_tails(tails), notes, warnings)
 
 
@@ -157,31 +199,57 @@ class _SiteTypes:
 
     def __init__(self, potential: PairLaw, formula: Formula, species: list[Molecule]):
         self._potential, self._formula = potential, formula
-        known = dict.fromkeys(name for m in species for site in m.site_names for name in (site, f"{m.name}.{site}"))
+        known = dict.fromkeys(
+            name for m in species for site in m.site_names for name in (site, f"{m.name}.{site}")
+        )
         known |= dict.fromkeys(e for m in species for e in m.elements)
-        listed = [*(potential.of_sites or {}), *potential.sites, *(name for pair in potential.pairs for name in pair)]
+        listed = [
+            *(potential.of_sites or {}),
+            *potential.sites,
+            *(name for pair in potential.pairs for name in pair),
+        ]
         self._named = {name: sites_named(species, name) for name in listed}
-        unknown = [name for name, sites in self._named.items() if not any(mask.any() for mask in sites)]
+        unknown = [
+            name for name, sites in self._named.items() if not any(mask.any() for mask in sites)
+        ]
         there = f"; there are {', '.join(known)}"
         faults = [f"no site is {name!r}{did_you_mean(name, known) or there}" for name in unknown]
-        self._needed = [name for name in formula.parameters if name not in potential.constants and not formula.shared]
+        self._needed = [
+            name
+            for name in formula.parameters
+            if name not in potential.constants and not formula.shared
+        ]
         of_pairs = [("-".join(pair), given) for pair, given in potential.pairs.items()]
         for where, given in [*(potential.of_sites or {}).items(), *of_pairs]:
             faults += [f"{where}: there is no {name}" for name in self._needed if name not in given]
-            faults += [f"{where}: {self._unknown(name)}" for name in given if name not in formula.parameters]
+            faults += [
+                f"{where}: {self._unknown(name)}"
+                for name in given
+                if name not in formula.parameters
+            ]
         if potential.of_sites == {} and not potential.pairs:
             faults += [f"there is no {name} among its parameters" for name in self._needed]
         # the formula may have the number of a constant in place of its name
         text = potential.energy if isinstance(potential.energy, str) else ""
         there_too = {*formula.parameters, *re.findall(r"[^\W\d]\w*", text)}
         faults += [self._unknown(name) for name in potential.constants if name not in there_too]
-        faults += [f"mixing: {self._unknown(name)}" for name in potential.mixing if name not in formula.parameters]
-        twice = [pair for pair in potential.pairs if pair[0] < pair[1] and pair[::-1] in potential.pairs]
+        faults += [
+            f"mixing: {self._unknown(name)}"
+            for name in potential.mixing
+            if name not in formula.parameters
+        ]
+        twice = [
+            pair for pair in potential.pairs if pair[0] < pair[1] and pair[::-1] in potential.pairs
+        ]
         faults += [f"pairs: {'-'.join(pair)} is given twice" for pair in twice]
         if faults:
             raise PairPotentialError(*faults)
-        self.of_species = [[self._kind(k, m, i) for i in range(len(m.masses))] for k, m in enumerate(species)]
-        self.all = sorted({entry for sites in self.of_species for entry in sites if entry is not None}, key=repr)
+        self.of_species = [
+            [self._kind(k, m, i) for i in range(len(m.masses))] for k, m in enumerate(species)
+        ]
+        self.all = sorted(
+            {entry for sites in self.of_species for entry in sites if entry is not None}, key=repr
+        )
         self._first = {
             entry: f"{m.name}.{m.site_names[i]}"
             for m, sites in reversed(list(zip(species, self.of_species, strict=True)))
@@ -198,9 +266,12 @@ class _SiteTypes:
         return self._first[self.all[k]]
 
     def _kind(self, k: int, m: Molecule, i: int) -> tuple | None:
-        """Parameters of a site, and whether it is each site of `pairs`; None if the potential does not act on it."""
+        """Parameters of a site, and whether it is each site of `pairs`; None if the potential does
+        not act on it."""
         given = self._parameters(k, m, i)
-        sides = tuple(bool(self._named[name][k][i]) for pair in self._potential.pairs for name in pair)
+        sides = tuple(
+            bool(self._named[name][k][i]) for pair in self._potential.pairs for name in pair
+        )
         acts = given is not None or any(sides)
         return (None if given is None else tuple(sorted(given.items())), sides) if acts else None
 
@@ -210,11 +281,20 @@ class _SiteTypes:
             return None
         if potential.of_sites is None and not self._formula.shared:
             given = m.parameters[i]
-            return {name: given[name] for name in self._needed} if all(name in given for name in self._needed) else None
+            return (
+                {name: given[name] for name in self._needed}
+                if all(name in given for name in self._needed)
+                else None
+            )
         if not potential.of_sites:
             return None if potential.pairs else {"scale": 1.0} if potential.of_sites is None else {}
         named = [name for name in potential.of_sites if self._named[name][k][i]]
-        ranked = (f"{m.name}.{m.site_names[i]}", f"{m.name}.{m.elements[i]}", m.site_names[i], m.elements[i])
+        ranked = (
+            f"{m.name}.{m.site_names[i]}",
+            f"{m.name}.{m.elements[i]}",
+            m.site_names[i],
+            m.elements[i],
+        )
         return next((potential.of_sites[name] for name in ranked if name in named), None)
 
     def pairs(self, faults: list[str]) -> Iterator[tuple[int, int, dict[str, float]]]:
@@ -230,7 +310,9 @@ class _SiteTypes:
                 if found is not None:
                     yield i, j, dict(self._potential.constants) | found
 
-    def _mixed(self, given: dict, other: dict, i: int, j: int, faults: list[str]) -> dict[str, float] | None:
+    def _mixed(
+        self, given: dict, other: dict, i: int, j: int, faults: list[str]
+    ) -> dict[str, float] | None:
         found = {}
         for name, a in given.items():
             b, usual = other[name], "arithmetic" if name.lower().startswith("sig") else "geometric"
@@ -243,35 +325,49 @@ class _SiteTypes:
             elif rule == "harmonic" and a + b != 0:
                 found[name] = 2 * a * b / (a + b)
             else:
-                what = f"{name} of {self.example(i)} and {self.example(j)}, {a:g} and {b:g}, have no {rule} mean"
-                faults.append(f"{what}: give {name} of that pair in pairs, or another rule in mixing")
+                what = (
+                    f"{name} of {self.example(i)} and {self.example(j)}, {a:g} and {b:g}, have no"
+                    f" {rule} mean"
+                )
+                faults.append(
+                    f"{what}: give {name} of that pair in pairs, or another rule in mixing"
+                )
                 return None
         return found
 
 
 def pair_law(
-    energy: "str | Callable | None" = None, parameters: Mapping[str, Any] | None = None, *,
-    table: "tuple[Sequence[float], ...] | str | Path | None" = None, sites: Sequence[str] = (),
-    pairs: Mapping[tuple[str, str], Any] | None = None, mixing: Mapping[str, Rule] | None = None,
-    truncation: TruncationName | None = None, cutoff_A: float | None = None, switch_start_A: float | None = None,
+    energy: "str | Callable | None" = None,
+    parameters: Mapping[str, Any] | None = None,
+    *,
+    table: "tuple[Sequence[float], ...] | str | Path | None" = None,
+    sites: Sequence[str] = (),
+    pairs: Mapping[tuple[str, str], Any] | None = None,
+    mixing: Mapping[str, Rule] | None = None,
+    truncation: TruncationName | None = None,
+    cutoff_A: float | None = None,
+    switch_start_A: float | None = None,
     name: str = "",
-) -> PairLaw:  # fmt: skip
+) -> PairLaw:
     """A pair potential between sites of different molecules, for `Simulation(scene, forces=[...])`.
 
     rigidmd.pair_law("A*exp(-B*r) - C/r**6", {"Ar": {"A": 1.6e6, "B": 4.4, "C": 6.2e3}})
 
-    energy : the energy in kJ/mol of the distance r in Å and of named parameters, as a text: + - * / ** and exp, log,
-        sqrt, sin, cos; its force is its derivative. Or a function f(p, r) that gives (energy, -dE/dr), where p has
-        the parameters; it may also have the arguments r2 (r²) and inverse (1/r), and is compiled for vectors
-    parameters : site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a dictionary, or the
-        NamedTuple that a function expects. Or plain numbers, the same for all sites. Default: `parameters` of the sites
-        in the models' files
-    table : instead of an energy, distances in Å, energies in kJ/mol and perhaps forces -dE/dr in kJ/mol/Å, which a
-        spline interpolates; or a file with these columns. Nearer than the first distance the energy rises as r⁻¹²
+    energy : the energy in kJ/mol of the distance r in Å and of named parameters, as a text: + - * /
+        ** and exp, log, sqrt, sin, cos; its force is its derivative. Or a function f(p, r) that
+        gives (energy, -dE/dr), where p has the parameters; it may also have the arguments r2 (r²)
+        and inverse (1/r), and is compiled for vectors
+    parameters : site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a
+        dictionary, or the NamedTuple that a function expects. Or plain numbers, the same for all
+        sites. Default: `parameters` of the sites in the models' files
+    table : instead of an energy, distances in Å, energies in kJ/mol and perhaps forces -dE/dr in
+        kJ/mol/Å, which a spline interpolates; or a file with these columns. Nearer than the first
+        distance the energy rises as r⁻¹²
     sites : the only sites that it acts on
-    pairs : (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it acts on them only
-    mixing : parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites; default: arithmetic for
-        names that begin with sig, else geometric
+    pairs : (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it
+        acts on them only
+    mixing : parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites;
+        default: arithmetic for names that begin with sig, else geometric
     truncation, switch_start_A, cutoff_A : as in [forces] of the scene, which are the defaults
     name : in the log and in messages
 
@@ -288,7 +384,9 @@ def pair_law(
     columns = read_columns(Path(table)) if isinstance(table, str | Path) else None
     if columns is None and table is not None:
         if not (isinstance(table, tuple | list) and len(table) in (2, 3)):
-            raise ValueError("table must be a file, or lists: distances in Å, energies in kJ/mol, perhaps forces")
+            raise ValueError(
+                "table must be a file, or lists: distances in Å, energies in kJ/mol, perhaps forces"
+            )
         columns = Columns(table[0], table[1], table[2] if len(table) > 2 else None)
     if not isinstance(name, str):
         raise ValueError(f"name is {name!r:.60}, must be a text")
@@ -300,28 +398,57 @@ def pair_law(
     if parameters is not None:
         parameters = _mapping("parameters", parameters)
         given[1:1] = parameters.values()
-        flat = [key for key, value in parameters.items() if isinstance(value, int | float | np.number)]
+        flat = [
+            key for key, value in parameters.items() if isinstance(value, int | float | np.number)
+        ]
         if flat and len(flat) < len(parameters):
             others = ", ".join(str(key) for key in parameters if key not in flat)
-            either = "parameters are either numbers, the same for all sites, or tables of numbers by site"
+            either = (
+                "parameters are either numbers, the same for all sites, or tables of numbers by"
+                " site"
+            )
             raise ValueError(f"{either}; {flat[0]} is a number, and {others} is not")
         constants = _numbers("parameters", parameters) if flat else {}
-        of_sites = {} if flat else {key: _numbers(f"parameters of {key}", x) for key, x in parameters.items()}
+        of_sites = (
+            {}
+            if flat
+            else {key: _numbers(f"parameters of {key}", x) for key, x in parameters.items()}
+        )
     for key, value in (pairs or {}).items():
-        if not (isinstance(key, tuple) and len(key) == 2 and all(isinstance(one, str) for one in key)):
+        if not (
+            isinstance(key, tuple) and len(key) == 2 and all(isinstance(one, str) for one in key)
+        ):
             raise ValueError(f"pairs: {key!r} is not a pair of names of sites")
         of_pairs[key] = _numbers(f"parameters of {'-'.join(key)}", value)
     for key, value in (("cutoff_A", cutoff_A), ("switch_start_A", switch_start_A)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value > 0):
+        if value is not None and (
+            isinstance(value, bool) or not isinstance(value, int | float) or not value > 0
+        ):
             raise ValueError(f"{key} is {value!r}, must be a number above 0")
     usual = "table" if table is not None else getattr(energy, "__name__", "pair_law")
-    kinds = [type(value) for value in given if hasattr(value, "_asdict")]  # a NamedTuple that a function expects
+    kinds = [
+        type(value) for value in given if hasattr(value, "_asdict")
+    ]  # a NamedTuple that a function expects
     kind = kinds[-1] if kinds else None
-    formula = formula_of_function(energy, kind) if energy is not None and not isinstance(energy, str) else None
+    formula = (
+        formula_of_function(energy, kind)
+        if energy is not None and not isinstance(energy, str)
+        else None
+    )
     return PairLaw(
-        energy, columns, constants, of_sites, tuple(sites), of_pairs, dict(mixing or {}), truncation, cutoff_A,
-        switch_start_A, name or ("pair_law" if usual == "<lambda>" else usual), formula,
-    )  # fmt: skip
+        energy,
+        columns,
+        constants,
+        of_sites,
+        tuple(sites),
+        of_pairs,
+        dict(mixing or {}),
+        truncation,
+        cutoff_A,
+        switch_start_A,
+        name or ("pair_law" if usual == "<lambda>" else usual),
+        formula,
+    )
 
 
 def _mapping(where: str, given: Any) -> Mapping[str, Any]:
@@ -336,8 +463,15 @@ def _numbers(where: str, given: Any) -> dict[str, float]:
     """Parameters as a dictionary of finite numbers. Raises ValueError."""
     given = _mapping(where, given)
     for key, value in given.items():
-        if not isinstance(value, int | float | np.number) or isinstance(value, bool) or not isfinite(value):
+        if (
+            not isinstance(value, int | float | np.number)
+            or isinstance(value, bool)
+            or not isfinite(value)
+        ):
             raise ValueError(f"{where}: {key} is {value!r}, must be a finite number")
     if taken := [key for key in given if key in (DISTANCE, "pi")]:
-        raise ValueError(f"{where}: {taken[0]} is the {'distance' if taken[0] == DISTANCE else 'number pi'}; rename it")
+        raise ValueError(
+            f"{where}: {taken[0]} is the {'distance' if taken[0] == DISTANCE else 'number pi'};"
+            " rename it"
+        )
     return {str(key): float(value) for key, value in given.items()}

@@ -1,4 +1,5 @@
-"""Python files with user code, which run only if the user trusts them: forces of a scene, and analyses."""
+"""Python files with user code, which run only if the user trusts them: forces of a scene, and
+analyses."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,8 +16,9 @@ _TRUSTED: set[str] = set()
 
 
 def trust(path: str | Path) -> None:
-    """Allow scenes to run a Python file with these contents, at any path. Raises SceneError. The code can do anything
-    that you can do: read it before. On the command line, --trust FILE does the same."""
+    """Allow scenes to run a Python file with these contents, at any path. Raises SceneError. The
+    code can do anything that you can do: read it before. On the command line, --trust FILE does the
+    same."""
     _TRUSTED.add(digest_of(_source(Path(path), option("trust"))))
 
 

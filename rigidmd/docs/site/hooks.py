@@ -18,11 +18,20 @@ from rigidmd.core.shipped import SECTIONS
 README = Path(__file__).parents[3] / "README.md"
 #: Live pages: scene, options of the run.
 LIVE = {
-    "heavy_top_3": (), "intermediate_axis": (), "dry_ice": ("--set", "output.trajectory_interval_ps=0.1"),
-    "water": ("--set", "stages.production.duration_ps=2", "--set", "output.trajectory_interval_ps=0.1"),
-}  # fmt: skip
+    "heavy_top_3": (),
+    "intermediate_axis": (),
+    "dry_ice": ("--set", "output.trajectory_interval_ps=0.1"),
+    "water": (
+        "--set",
+        "stages.production.duration_ps=2",
+        "--set",
+        "output.trajectory_interval_ps=0.1",
+    ),
+}
 API = ("rigidmd", "rigidmd.view", "rigidmd.analysis", "rigidmd.ase", "rigidmd.errors")
-CSS = """math { font-family: "Latin Modern Math", "STIX Two Math", "Cambria Math", "DejaVu Math TeX Gyre", math; }
+CSS = """math {
+  font-family: "Latin Modern Math", "STIX Two Math", "Cambria Math", "DejaVu Math TeX Gyre", math;
+}
 .md-typeset math { font-size: 1.08em; }
 .md-typeset math mi[mathvariant^=bold] { font-weight: bold; }
 .md-typeset mtd[columnalign=right] { text-align: right; }
@@ -30,43 +39,68 @@ CSS = """math { font-family: "Latin Modern Math", "STIX Two Math", "Cambria Math
 .md-typeset td:first-child code, .md-typeset th code { white-space: nowrap; }
 .md-typeset div.arithmatex { overflow-x: auto; overflow-y: hidden; padding: .3em 0; }
 .md-typeset .docstring { white-space: pre-line; }
-.md-typeset table:not([class]) td, .md-typeset table:not([class]) th { padding: .5em .8em; min-width: 0; }
+.md-typeset table:not([class]) td, .md-typeset table:not([class]) th {
+  padding: .5em .8em; min-width: 0;
+}
 """
 
 
 def on_config(config):
     config.nav = [
         {"Home": ["index.md"]},
-        *({folder.capitalize(): [f"{folder}/{name}.md" for name in names]} for folder, names in SECTIONS.items()),
+        *(
+            {folder.capitalize(): [f"{folder}/{name}.md" for name in names]}
+            for folder, names in SECTIONS.items()
+        ),
     ]
-    next(group["Reference"] for group in config.nav if "Reference" in group).append("reference/api.md")
+    next(group["Reference"] for group in config.nav if "Reference" in group).append(
+        "reference/api.md"
+    )
     return config
 
 
 def on_files(files, config):
     front = README.read_text(encoding="utf-8").replace("rigidmd/docs/", "")
     live = [f"[{name}](live/{name}.html)" for name in LIVE]
-    front += f"\n## Live pages\n\nPages that `rigidmd view` wrote of shipped scenes: {', '.join(live)}.\n"
+    front += (
+        "\n## Live pages\n\nPages that `rigidmd view` wrote of shipped scenes:"
+        f" {', '.join(live)}.\n"
+    )
     files.append(File.generated(config, "index.md", content=front))
     files.append(File.generated(config, "reference/api.md", content=_api()))
     files.append(File.generated(config, "site.css", content=CSS))
     for name in LIVE:
-        files.append(File.generated(config, f"live/{name}.html", abs_src_path=str(_live_page(name))))
+        files.append(
+            File.generated(config, f"live/{name}.html", abs_src_path=str(_live_page(name)))
+        )
     return files
 
 
 def _api() -> str:
     """A page with every public name of the Python interface."""
-    lines = ["# Python interface", "", "Every public class and function, from the docstrings of the package.", ""]
+    lines = [
+        "# Python interface",
+        "",
+        "Every public class and function, from the docstrings of the package.",
+        "",
+    ]
     for module in map(import_module, API):
         lines += [f"## {module.__name__}", "", (module.__doc__ or "").partition("\n")[0], ""]
-        for name, member in ((name, getattr(module, name)) for name in sorted(getattr(module, "__all__", ()))):
+        for name, member in (
+            (name, getattr(module, name)) for name in sorted(getattr(module, "__all__", ()))
+        ):
             if not callable(member):
                 continue
             lines += [*_entry("###", name, member), ""]
-            methods = vars(member).items() if inspect.isclass(member) and not issubclass(member, Exception) else ()
+            methods = (
+                vars(member).items()
+                if inspect.isclass(member) and not issubclass(member, Exception)
+                else ()
+            )
             for method, found in methods:
-                if not method.startswith(("_", "model_")) and (callable(found) or isinstance(found, property)):
+                if not method.startswith(("_", "model_")) and (
+                    callable(found) or isinstance(found, property)
+                ):
                     lines += [*_entry("####", f"{name}.{method}", found), ""]
     return "\n".join(lines)
 
@@ -96,7 +130,11 @@ def _entry(rank: str, name: str, member: object) -> list[str]:
 def _live_page(name: str) -> Path:
     """The page that `rigidmd view` writes of a run of a shipped scene."""
     folder = Path(tempfile.mkdtemp())
-    for command in (("new", name), ("run", f"{name}.toml", "-o", "run", *LIVE[name]), ("view", "run")):
+    for command in (
+        ("new", name),
+        ("run", f"{name}.toml", "-o", "run", *LIVE[name]),
+        ("view", "run"),
+    ):
         subprocess.run([sys.executable, "-P", "-m", "rigidmd", *command], cwd=folder, check=True)
     return next((folder / "run").glob("*.html"))
 
@@ -107,7 +145,9 @@ def on_page_markdown(markdown, page, config, files):
     def link(found: re.Match) -> str:
         text, target = found.groups()
         path = normpath(Path(page.file.src_uri).parent / target.partition("#")[0])
-        return found[0] if re.match(r"#|https?:", target) or files.get_file_from_path(path) else text
+        return (
+            found[0] if re.match(r"#|https?:", target) or files.get_file_from_path(path) else text
+        )
 
     return re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", link, markdown)
 
@@ -120,4 +160,9 @@ def on_page_content(content, page, config, files):
         display = "block" if opening == r"\[" else "inline"
         return f'<{tag} class="arithmatex">{convert(tex.strip(), display=display)}</{tag}>'
 
-    return re.sub(r'<(span|div) class="arithmatex">(\\[\[(])(.*?)\\[\])]</\1>', equation, content, flags=re.DOTALL)
+    return re.sub(
+        r'<(span|div) class="arithmatex">(\\[\[(])(.*?)\\[\])]</\1>',
+        equation,
+        content,
+        flags=re.DOTALL,
+    )

@@ -1,1 +1,2 @@
-"""The engine that runs compiled code on the cores of one machine, for molecules and for a single body."""
+"""The engine that runs compiled code on the cores of one machine, for molecules and for a single
+body."""

@@ -1,10 +1,9 @@
 """The engine that runs compiled code on the CPU, for molecules and for a single body.
 
-This is the Python side of the kernels: it owns their lists, grids, sums and machine code, enlarges arrays when a kernel
-returns that one is full, and raises exceptions for status codes.
+This is the Python side of the kernels: it owns their lists, grids, sums and machine code, enlarges
+arrays when a kernel returns that one is full, and raises exceptions for status codes.
 """
 
-# isort: skip_file
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, cast
@@ -16,9 +15,18 @@ from rigidmd.compile.kernels import CompileError
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import (
-    BEHIND_WALL, CELL_CHANGED, EXAMPLE, LIST_FULL, NEEDS_PYTHON_FORCES, NOT_FINITE, NOW, TALLY_SIZE, Load, State,
+    BEHIND_WALL,
+    CELL_CHANGED,
+    EXAMPLE,
+    LIST_FULL,
+    NEEDS_PYTHON_FORCES,
+    NOT_FINITE,
+    NOW,
+    TALLY_SIZE,
+    Load,
+    State,
     no_load,
-)  # fmt: skip
+)
 from rigidmd.dynamics.barostats import barostat_workspace
 from rigidmd.dynamics.body_step_loop import Body, advance_body
 from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
@@ -53,7 +61,8 @@ from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 __all__ = ["BehindWallError", "CompileError", "CpuEngine", "Precision"]
 
 Precision = Literal["double", "mixed"]
-#: Owners of arrays in `Engine.memory` besides the terms; the arrays of a barostat, and of hybrid Monte Carlo.
+#: Owners of arrays in `Engine.memory` besides the terms; the arrays of a barostat, and of hybrid
+#: Monte Carlo.
 LOAD, BOX, TRAJECTORY = "load", "box", "trajectory"
 BOX_FIELDS = ("tally", "known", "counts")
 TRAJECTORY_FIELDS = ("energies", "known", "sums")
@@ -71,13 +80,15 @@ ROUNDING = {np.float64: 1e-8, np.float32: 1e-3}
 class LastAdvance:
     """What the last call of `CpuEngine.advance` has left.
 
-    The load, the energies and the sums of the engine belong to `state` alone, and to its positions only while
-    `is_current`, which `forget` and `change` end, and steps that end without forces.
+    The load, the energies and the sums of the engine belong to `state` alone, and to its positions
+    only while `is_current`, which `forget` and `change` end, and steps that end without forces.
     """
 
     state: State | None = None
     is_current: bool = False
-    observed: Load | None = None  # the copy of the load that `evaluate_current` has returned, to which the sums belong
+    observed: Load | None = (
+        None  # the copy of the load that `evaluate_current` has returned, to which the sums belong
+    )
 
 
 class CpuEngine(Engine):
@@ -85,30 +96,43 @@ class CpuEngine(Engine):
 
     model : the constant part of the system
     terms : name -> term, in the order in which forces are added
-    precision : arithmetic between sites; "mixed": pairs in single precision, sums and motion in double
+    precision : arithmetic between sites; "mixed": pairs in single precision, sums and motion in
+        double
     skin : extra radius of neighbour lists, Å; affects speed only
-    python_forces : name of a term that Python computes -> its function, as the term's workspace calls it
-    threads : number of threads, at most `NUMBA_NUM_THREADS`; None for all of them; affects speed only
-    needs_virials : whether every step needs virials and no energies, as for a piston; affects speed only
+    python_forces : name of a term that Python computes -> its function, as the term's workspace
+        calls it
+    threads : number of threads, at most `NUMBA_NUM_THREADS`; None for all of them; affects speed
+        only
+    needs_virials : whether every step needs virials and no energies, as for a piston; affects speed
+        only
     """
 
     is_repeatable = True
 
     def __init__(
-        self, model: Model | Body, terms: dict[str, NamedTuple], precision: Precision = "double", skin: float = 1.9,
-        python_forces: dict[str, Callable] | None = None, threads: int | None = None, needs_virials: bool = False
-    ):  # fmt: skip
+        self,
+        model: Model | Body,
+        terms: dict[str, NamedTuple],
+        precision: Precision = "double",
+        skin: float = 1.9,
+        python_forces: dict[str, Callable] | None = None,
+        threads: int | None = None,
+        needs_virials: bool = False,
+    ):
         self.model, self.terms = model, terms
         self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin, needs_virials)
         self._python_forces = python_forces or {}
         self.threads = threads
         self.load: Load | None = None
-        # What terms and couplings remember. The other attributes can be made from these and the state at any time.
+        # What terms and couplings remember. The other attributes can be made from these and the
+        # state at any time.
         self._workspaces: tuple[NamedTuple, ...] | None = None
         self._couplings = CouplingWorkspaces(thermostat_workspace(), None, None)
         self._last = LastAdvance()
         self._dispatchers: dict[str, TermDispatcher] = {}
-        self._bound: tuple[tuple, Any] | None = None  # the step loop, with the objects that it is bound to
+        self._bound: tuple[tuple, Any] | None = (
+            None  # the step loop, with the objects that it is bound to
+        )
 
     @property
     def names(self) -> list[str]:
@@ -131,22 +155,40 @@ class CpuEngine(Engine):
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """The variables of the thermostat and the barostat of a scheme, at rest."""
         integrator = _as_scheme(integrator)
-        return np.zeros(sum(getattr(flow, "variables", 0) for flow in (integrator.thermostat, integrator.barostat)))
+        return np.zeros(
+            sum(
+                getattr(flow, "variables", 0)
+                for flow in (integrator.thermostat, integrator.barostat)
+            )
+        )
 
-    def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
+    def advance(
+        self,
+        state: State,
+        integrator: Scheme | Solver,
+        dt: float,
+        until: int,
+        observed: bool = False,
+    ) -> None:
         integrator = _as_scheme(integrator)
         workspaces = self._prepare(state)
         keep_time(state, dt)
         last = self._last
-        if state is not last.state and "steps" in self._dispatchers:  # its energies belong to another state
+        if (
+            state is not last.state and "steps" in self._dispatchers
+        ):  # its energies belong to another state
             self._dispatchers["steps"].table.tallies_valid[0] = 0
         if self.load is None:
             self.load = no_load(state)
         last.state, last.observed = state, None
         move = self._move_molecules if isinstance(self.model, Model) else self._move_body
-        last.is_current = move(state, self.load, integrator, workspaces, (float(dt), int(until), observed))
+        last.is_current = move(
+            state, self.load, integrator, workspaces, (float(dt), int(until), observed)
+        )
 
-    def _move_molecules(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
+    def _move_molecules(
+        self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps
+    ) -> bool:
         """Advance molecules. Returns whether the load belongs to the new positions."""
         model = cast(Model, self.model_for(integrator))
 
@@ -158,7 +200,9 @@ class CpuEngine(Engine):
         if "steps" not in self._dispatchers:
             self._compile(lambda: new_advance(self._new_dispatcher("steps", workspaces)))
         dispatcher = self._dispatcher("steps", workspaces)
-        advance = self._bind((self.model, integrator, state, load, dispatcher), lambda: new_advance(dispatcher))
+        advance = self._bind(
+            (self.model, integrator, state, load, dispatcher), lambda: new_advance(dispatcher)
+        )
         advance.begin(*step, self._last.is_current)
         other = advance.gradient and advance.gradient.load
         dispatcher.bind(workspaces, state, load, other)
@@ -166,18 +210,26 @@ class CpuEngine(Engine):
             dispatcher.bind(self._handle_status(status, state), state, load, other)
         return advance.loaded
 
-    def _move_body(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
+    def _move_body(
+        self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps
+    ) -> bool:
         """Advance a body. Returns whether the load belongs to the new position."""
 
         def flows_and_gradient() -> tuple[FlowArrays, GradientWorkspace | None]:
-            return flow_arrays(integrator), gradient_workspace(state) if integrator.has_gradient else None
+            return flow_arrays(integrator), (
+                gradient_workspace(state) if integrator.has_gradient else None
+            )
 
         flows, gradient = self._bind((integrator, state), flows_and_gradient)
         model, (dt, until, _) = self.model_for(integrator), step
         progress = np.array([0, self._last.is_current, 0], np.int64)
-        while status := advance_body(model, state, load, workspaces, flows, gradient, dt, until, progress):
+        while status := advance_body(
+            model, state, load, workspaces, flows, gradient, dt, until, progress
+        ):
             workspaces = self._handle_status(status, state)
-        return progress[LOADED] != 0  # also False after no step, because then no forces were evaluated
+        return (
+            progress[LOADED] != 0
+        )  # also False after no step, because then no forces were evaluated
 
     def _bind(self, objects: tuple, make: Callable[[], Any]) -> Any:
         """What `make` returns, which is kept while it is bound to the same objects."""
@@ -186,7 +238,8 @@ class CpuEngine(Engine):
         return self._bound[1]
 
     def _couplings_of(self, integrator: Scheme, state: State) -> CouplingWorkspaces:
-        """What thermostat, barostat and trajectories of an integrator remember; made at their first use."""
+        """What thermostat, barostat and trajectories of an integrator remember; made at their first
+        use."""
         heat, box, trajectory = self._couplings
         if integrator.barostat is not None:
             box = box or barostat_workspace(state)
@@ -209,9 +262,14 @@ class CpuEngine(Engine):
         return TermDispatcher(workspaces, USES[use], with_rates=use == "steps")
 
     def model_for(self, scheme: Scheme) -> Model | Body:
-        """The model with the rotor of a scheme. The exact rotor differs only for asymmetric bodies."""
+        """The model with the rotor of a scheme. The exact rotor differs only for asymmetric
+        bodies."""
         rotor = self.model.rotor
-        if scheme.exact_rotor and isinstance(rotor, SplitRotor) and (rotor.symmetry == NO_SYMMETRY).any():
+        if (
+            scheme.exact_rotor
+            and isinstance(rotor, SplitRotor)
+            and (rotor.symmetry == NO_SYMMETRY).any()
+        ):
             return self.model._replace(rotor=ExactRotor(*rotor))
         return self.model
 
@@ -226,13 +284,19 @@ class CpuEngine(Engine):
     def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
         moving, last = self._dispatchers.get("steps"), self._last
         is_current = state is last.state and last.is_current
-        if self.load is None or moving is None or not (is_current and moving.table.tallies_valid[0]):
+        if (
+            self.load is None
+            or moving is None
+            or not (is_current and moving.table.tallies_valid[0])
+        ):
             return self.evaluate(state)
         last.observed, tallies = self._copies(self.load, moving)
         return last.observed, tallies
 
     def sums(self, state: State, load: Load) -> StateSums | None:
-        return self._bound[1].sums if self._bound is not None and load is self._last.observed else None
+        return (
+            self._bound[1].sums if self._bound is not None and load is self._last.observed else None
+        )
 
     def extent(self, state: State) -> LargestValues | None:
         last = self._last
@@ -244,11 +308,17 @@ class CpuEngine(Engine):
         """A copy of a load, and the tally of each term."""
         tallies = dispatcher.table.tallies
         virials = tallies[:, 1:].copy().reshape(-1, 3, 3)
-        by_term = [Tally(energy, virial) for energy, virial in zip(tallies[:, 0].tolist(), virials, strict=True)]
-        return Load(load.force.copy(), load.torque_body.copy()), dict(zip(self.names, by_term, strict=False))
+        by_term = [
+            Tally(energy, virial)
+            for energy, virial in zip(tallies[:, 0].tolist(), virials, strict=True)
+        ]
+        return Load(load.force.copy(), load.torque_body.copy()), dict(
+            zip(self.names, by_term, strict=False)
+        )
 
     def memory(self) -> dict[str, np.ndarray] | None:
-        """Neighbour lists as last built, forces at the present positions, and the memory of the barostat."""
+        """Neighbour lists as last built, forces at the present positions, and the memory of the
+        barostat."""
         owners = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
         if self.load is not None and self._last.is_current:
             owners[LOAD] = self.load._asdict()
@@ -256,7 +326,11 @@ class CpuEngine(Engine):
             owners[BOX] = {key: getattr(box, key) for key in BOX_FIELDS}
         if (trajectory := self._couplings.trajectory) is not None:
             owners[TRAJECTORY] = {key: getattr(trajectory, key) for key in TRAJECTORY_FIELDS}
-        return {f"{owner}.{key}": array for owner, arrays in owners.items() for key, array in arrays.items()}
+        return {
+            f"{owner}.{key}": array
+            for owner, arrays in owners.items()
+            for key, array in arrays.items()
+        }
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         self._prepare(state)
@@ -265,7 +339,10 @@ class CpuEngine(Engine):
             owner, _, key = name.rpartition(".")
             kept.setdefault(owner, {})[key] = array
         if unknown := kept.keys() - {*self.names, LOAD, BOX, TRAJECTORY}:
-            raise ValueError(f"an engine of {', '.join(self.names)} has no memory of {', '.join(sorted(unknown))}")
+            raise ValueError(
+                f"an engine of {', '.join(self.names)} has no memory of"
+                f" {', '.join(sorted(unknown))}"
+            )
         self._recall_lists(state, kept)
         self.load, self._last = no_load(state), LastAdvance(is_current=LOAD in kept)
         self._dispatchers.pop("steps", None)  # its energies belong to another state
@@ -289,14 +366,21 @@ class CpuEngine(Engine):
 
     def _recall_lists(self, state: State, kept: dict[str, dict[str, np.ndarray]]) -> None:
         """Make new workspaces, with the neighbour lists that were kept: all of them or none."""
-        spaces, now = tuple(with_code(workspace) for workspace in self.new_workspaces(state)), float(state.time[NOW])
+        spaces, now = (
+            tuple(with_code(workspace) for workspace in self.new_workspaces(state)),
+            float(state.time[NOW]),
+        )
         if kept.keys() & set(self.names):
             pairs = zip(self.names, spaces, strict=False)
-            spaces = tuple(restored(workspace, kept.get(name, {}), self._setup.skin, now) for name, workspace in pairs)
+            spaces = tuple(
+                restored(workspace, kept.get(name, {}), self._setup.skin, now)
+                for name, workspace in pairs
+            )
         self._workspaces = with_common_scratch(spaces)
 
     def _check_recalled(self, state: State, kept: dict[str, dict[str, np.ndarray]]) -> None:
-        """Raise ValueError unless the kept forces are those that the kept lists give at the state."""
+        """Raise ValueError unless the kept forces are those that the kept lists give at the
+        state."""
         try:
             load, tallies = self.evaluate(state)
         except SimulationError as error:
@@ -306,25 +390,37 @@ class CpuEngine(Engine):
             if np.abs(found - there).max(initial=0.0) > rounding * np.abs(found).max(initial=0.0):
                 raise ValueError(f"its state has another {name} than was kept with it")
         lists = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
-        same = all(np.array_equal(array, kept[name][key]) for name, of in lists.items() for key, array in of.items())
+        same = all(
+            np.array_equal(array, kept[name][key])
+            for name, of in lists.items()
+            for key, array in of.items()
+        )
         if BOX in kept or TRAJECTORY in kept:
             terms = np.array([[tally.energy, *tally.virial.flat] for tally in tallies.values()])
             _, box, trajectory = self._couplings
             first = int(self._setup.needs_virials)  # a piston needs no energies
             there = [box.tally[0, first:]] if box is not None and box.known[0] else []
-            there += [trajectory.energies[:1]] if trajectory is not None and trajectory.known[0] else []
+            there += (
+                [trajectory.energies[:1]] if trajectory is not None and trajectory.known[0] else []
+            )
             for values in there:
                 found = terms.sum(0)[first : first + len(values)]
                 if (np.abs(found - values) > rounding * np.abs(terms).sum(0).max()).any():
                     raise ValueError("its state has another energy or virial than was kept with it")
-            if not same:  # they were built for a trial box or the end of a trajectory that was rejected
+            if (
+                not same
+            ):  # they were built for a trial box or the end of a trajectory that was rejected
                 self._recall_lists(state, kept)
         elif not same:
             raise ValueError("its neighbour lists are not those of its state")
 
     @property
     def moves(self) -> tuple[int, int]:
-        return (0, 0) if (box := self._couplings.box) is None else (int(box.counts[0]), int(box.counts[1]))
+        return (
+            (0, 0)
+            if (box := self._couplings.box) is None
+            else (int(box.counts[0]), int(box.counts[1]))
+        )
 
     @property
     def trajectories(self) -> np.ndarray | None:
@@ -342,31 +438,44 @@ class CpuEngine(Engine):
         return {name: passes_of(workspace, into) for name, workspace in workspaces}
 
     def new_workspaces(self, state: State) -> tuple[NamedTuple, ...]:
-        """New workspaces for the cell of a state, without machine code. Their arrays show the memory needed."""
+        """New workspaces for the cell of a state, without machine code. Their arrays show the
+        memory needed."""
         setup = self._setup._replace(cell=state.cell)
-        return with_common_scratch(tuple(workspace_of(term, setup) for term in self.terms.values())) or (NoForce(),)
+        return with_common_scratch(
+            tuple(workspace_of(term, setup) for term in self.terms.values())
+        ) or (NoForce(),)
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
-        """Check the arrays of a state for compiled code, and return the workspaces, which the first use makes."""
+        """Check the arrays of a state for compiled code, and return the workspaces, which the first
+        use makes."""
         for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
             if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
-                kind = f"a contiguous, writable array of {example.dtype} in C order with {example.ndim} axes"
-                raise TypeError(f"state.{name} must be {kind} (core.state.state_of makes a state of any arrays)")
+                kind = (
+                    f"a contiguous, writable array of {example.dtype} in C order with"
+                    f" {example.ndim} axes"
+                )
+                raise TypeError(
+                    f"state.{name} must be {kind} (core.state.state_of makes a state of any arrays)"
+                )
         if isinstance(self.model, Model):
             set_threads(usable_threads(self.threads))
         if self._workspaces is None:
             spaces = self.new_workspaces(state)
-            self._compile(lambda: TermDispatcher(tuple(map(with_code, spaces)), USES["observations"]))
+            self._compile(
+                lambda: TermDispatcher(tuple(map(with_code, spaces)), USES["observations"])
+            )
             self._workspaces = tuple(map(with_code, spaces))
         return self._workspaces
 
     def _compile(self, make: Callable[[], object]) -> None:
-        """Compile all code that a function makes for molecules; a body has too little for a second process."""
+        """Compile all code that a function makes for molecules; a body has too little for a second
+        process."""
         if isinstance(self.model, Model):
             compile_together(make)
 
     def _handle_status(self, status: int, state: State) -> tuple[NamedTuple, ...]:
-        """Handle a status code of a kernel, and return the workspaces with which to call it again."""
+        """Handle a status code of a kernel, and return the workspaces with which to call it
+        again."""
         workspaces = self._prepare(state)
         if status in (LIST_FULL, CELL_CHANGED):
             enlarged = tuple(with_capacity(workspace, state.cell) for workspace in workspaces)
@@ -374,7 +483,11 @@ class CpuEngine(Engine):
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
         elif status == BEHIND_WALL:
-            found = [workspace.behind(state) for workspace in workspaces if isinstance(workspace, LennardJonesWalls)]
+            found = [
+                workspace.behind(state)
+                for workspace in workspaces
+                if isinstance(workspace, LennardJonesWalls)
+            ]
             raise BehindWallError(*next(behind for behind in found if behind is not None))
         elif status == NEEDS_PYTHON_FORCES:
             for name, workspace in zip(self.names, workspaces, strict=False):
@@ -392,7 +505,9 @@ def _as_scheme(integrator: Scheme | Solver) -> Scheme:
 
 def _are_same(objects: tuple, others: tuple) -> bool:
     """Whether two tuples have the same objects."""
-    return len(objects) == len(others) and all(one is other for one, other in zip(objects, others, strict=True))
+    return len(objects) == len(others) and all(
+        one is other for one, other in zip(objects, others, strict=True)
+    )
 
 
 def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
@@ -400,7 +515,9 @@ def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
     for name, array in kept.items():
         there = getattr(arrays, name)
         if (there.shape, there.dtype) != (array.shape, array.dtype):
-            raise ValueError(f"{name} has the shape {array.shape}, not {there.shape}, or is of another type")
+            raise ValueError(
+                f"{name} has the shape {array.shape}, not {there.shape}, or is of another type"
+            )
         if not np.isfinite(array).all():
             raise ValueError(f"{name} is not finite")
         there[:] = array

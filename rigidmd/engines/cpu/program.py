@@ -51,7 +51,8 @@ class Row(NamedTuple):
 def program_of(engine: CpuEngine, state: State, scheme: Scheme) -> list[Row]:
     """The rows of a step of molecules, in order. Nothing is compiled.
 
-    Forces are evaluated before the first kick after a drift. The last evaluation of a step serves the next one.
+    Forces are evaluated before the first kick after a drift. The last evaluation of a step serves
+    the next one.
     """
     blocks = blocks_of(len(state.position))
     forces = [
@@ -65,7 +66,9 @@ def program_of(engine: CpuEngine, state: State, scheme: Scheme) -> list[Row]:
         if flow.kind == KICK and positions_are_new:
             rows += [Row("forces at the new positions", 1, EVERY_STEP), *forces]
             positions_are_new = False
-        rows.append(Row(_describe(flow, scheme), blocks if flow.kind != BAROSTAT else 1, EVERY_STEP))
+        rows.append(
+            Row(_describe(flow, scheme), blocks if flow.kind != BAROSTAT else 1, EVERY_STEP)
+        )
         positions_are_new |= flow.kind == DRIFT
     if positions_are_new:
         rows += [Row("forces, with the next step", 1, EVERY_STEP), *forces]
@@ -80,19 +83,23 @@ class Profile(NamedTuple):
     """Median times of a step and its rows, without energies."""
 
     step: float  # s
-    rows: list[tuple[str, float]]  # text and s of each row of the forces; the last one is the rest of the step
+    rows: list[
+        tuple[str, float]
+    ]  # text and s of each row of the forces; the last one is the rest of the step
 
 
 def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Profile:
     """Measure the rows of the forces over some steps from a state, which is copied. dt in ps.
 
-    Each row is timed by itself, after steps that move the molecules, so that the list is updated as in a run.
-    Raises SimulationError.
+    Each row is timed by itself, after steps that move the molecules, so that the list is updated as
+    in a run. Raises SimulationError.
     """
     state = engine.begin(state, scheme)
     engine.advance(state, scheme, dt, SETTLING)
     rows = engine.rows_of_steps()
-    texts = [f"{name}: {one.text}" for name, passes in engine.passes(state).items() for one in passes]
+    texts = [
+        f"{name}: {one.text}" for name, passes in engine.passes(state).items() for one in passes
+    ]
     used = [k for k, when in enumerate(rows.when) if when & FORCES_ONLY]
     times: dict[int, list[float]] = {k: [] for k in used}
     steps: list[float] = []
@@ -115,7 +122,10 @@ def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Pr
 def describe_profile(profile: Profile) -> str:
     """A table of the rows of a profile, with their fractions of a step."""
     width = max(len(text) for text, _ in profile.rows)
-    lines = [f"  {text:<{width}} {1e6 * spent:>9.1f} {spent / profile.step:>6.1%}" for text, spent in profile.rows]
+    lines = [
+        f"  {text:<{width}} {1e6 * spent:>9.1f} {spent / profile.step:>6.1%}"
+        for text, spent in profile.rows
+    ]
     return "\n".join([f"  {'a step':<{width}} {1e6 * profile.step:>9.1f} µs", *lines])
 
 
@@ -142,5 +152,8 @@ def _describe(flow: Flow, scheme: Scheme) -> str:
 def describe_program(rows: list[Row]) -> str:
     """A table of the rows of a program."""
     width = max(len(row.text) for row in rows)
-    lines = [f"{k:>4}  {row.text:<{width}} {row.blocks:>6}  {row.when}".rstrip() for k, row in enumerate(rows, 1)]
+    lines = [
+        f"{k:>4}  {row.text:<{width}} {row.blocks:>6}  {row.when}".rstrip()
+        for k, row in enumerate(rows, 1)
+    ]
     return "\n".join([f"{'row':>4}  {'':<{width}} blocks  only", *lines])

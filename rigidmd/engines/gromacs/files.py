@@ -1,8 +1,9 @@
-"""What GROMACS can express, and its input files for a system: coordinates, topology, settings of each stage, and a
-script that runs them.
+"""What GROMACS can express, and its input files for a system: coordinates, topology, settings of
+each stage, and a script that runs them.
 
-GROMACS constrains the distance of two points, or those of three by SETTLE, which is analytic. So linear molecules, and
-molecules whose mass is in a plane, are possible, with all other sites virtual. Its units are nm, ps, u, e, kJ/mol.
+GROMACS constrains the distance of two points, or those of three by SETTLE, which is analytic. So
+linear molecules, and molecules whose mass is in a plane, are possible, with all other sites
+virtual. Its units are nm, ps, u, e, kJ/mol.
 """
 
 from math import inf
@@ -36,7 +37,8 @@ SEEDS = 2**31 - 1
 
 
 def gromacs_points(molecule: Molecule) -> MassPoints:
-    """The mass points of a molecule. The first of three is the apex of an isosceles triangle, as SETTLE needs it."""
+    """The mass points of a molecule. The first of three is the apex of an isosceles triangle, as
+    SETTLE needs it."""
     body = mass_points(molecule)
     if len(body.mass) != 3 or (body.site < 0).all():
         return body
@@ -50,62 +52,115 @@ _INTEGRATOR, *_LIMITS = moves("GROMACS", "molecules")
 TRANSLATIONS = Translations(
     "GROMACS",
     scene=(
-        Key("forces.truncation", {  # vdw-modifier
-            "plain": "None", "shift": "Potential-shift", "force_switch": "Force-switch", "switch": "Potential-switch",
-        }, matters=lambda view: view.lennard_jones),
+        Key(
+            "forces.truncation",
+            {  # vdw-modifier
+                "plain": "None",
+                "shift": "Potential-shift",
+                "force_switch": "Force-switch",
+                "switch": "Potential-switch",
+            },
+            matters=lambda view: view.lennard_jones,
+        ),
         Key("forces.dispersion", {"cutoff": ""}),
-        Key("forces.electrostatics", {"none": "Cut-off", "reaction_field": "Reaction-Field", "pme": "PME"},
-            matters=lambda view: view.coulomb),
-        Key("forces.reaction_field_truncation", {None: "", "plain": "None", "shift": "Potential-shift"}),
+        Key(
+            "forces.electrostatics",
+            {"none": "Cut-off", "reaction_field": "Reaction-Field", "pme": "PME"},
+            matters=lambda view: view.coulomb,
+        ),
+        Key(
+            "forces.reaction_field_truncation",
+            {None: "", "plain": "None", "shift": "Potential-shift"},
+        ),
         Key("forces.ewald_truncation", {None: "", "plain": "None", "shift": "Potential-shift"}),
     ),
     stage=(
-        Key("ensemble", {"nve": "", "nvt": "", "npt": "", "nph": Missing("the export to GROMACS has only npt")}),
-        Key("thermostat", {  # integrator and tcoupl
-            None: ("md-vv", "no"), "nose_hoover": ("md-vv", "nose-hoover"), "langevin": ("sd", "no"),
-            "velocity_rescaling": ("md", "v-rescale"),
-            "andersen": Missing("GROMACS' Andersen thermostat does not act on whole molecules"),
-        }),
+        Key(
+            "ensemble",
+            {"nve": "", "nvt": "", "npt": "", "nph": Missing("the export to GROMACS has only npt")},
+        ),
+        Key(
+            "thermostat",
+            {  # integrator and tcoupl
+                None: ("md-vv", "no"),
+                "nose_hoover": ("md-vv", "nose-hoover"),
+                "langevin": ("sd", "no"),
+                "velocity_rescaling": ("md", "v-rescale"),
+                "andersen": Missing("GROMACS' Andersen thermostat does not act on whole molecules"),
+            },
+        ),
         Key("barostat", {None: "no", "cell_rescaling": "C-rescale"}),
-        Key("pressure_coupling", {"isotropic": "isotropic", "semi_isotropic": "semiisotropic"},
-            "GROMACS' cell_rescaling has isotropic and semi_isotropic"),
-        _INTEGRATOR, Key("rotor", SPLIT, "GROMACS rotates molecules by constrained distances"),
+        Key(
+            "pressure_coupling",
+            {"isotropic": "isotropic", "semi_isotropic": "semiisotropic"},
+            "GROMACS' cell_rescaling has isotropic and semi_isotropic",
+        ),
+        _INTEGRATOR,
+        Key("rotor", SPLIT, "GROMACS rotates molecules by constrained distances"),
     ),
     limits=(
-        Limit("no box or no cutoff: GROMACS computes pairs within a cutoff in a periodic box",
-            lambda view: not view.is_periodic or view.system.cutoff == inf),
-        Limit("frozen molecules: GROMACS would compute forces between them", lambda view: view.frozen.any()),
-        Limit("{}: GROMACS has no rigid bodies whose mass is neither on a line nor in a plane",
-            lambda view: ", ".join(m.name for m in view.system.species if len(gromacs_points(m).mass) > 3)),
-        Limit("several kinds of planar molecules: GROMACS' SETTLE has one kind of triangle",
-            lambda view: sum(len(gromacs_points(m).mass) == 3 for m in view.system.species) > 1),
+        Limit(
+            "no box or no cutoff: GROMACS computes pairs within a cutoff in a periodic box",
+            lambda view: not view.is_periodic or view.system.cutoff == inf,
+        ),
+        Limit(
+            "frozen molecules: GROMACS would compute forces between them",
+            lambda view: view.frozen.any(),
+        ),
+        Limit(
+            "{}: GROMACS has no rigid bodies whose mass is neither on a line nor in a plane",
+            lambda view: ", ".join(
+                m.name for m in view.system.species if len(gromacs_points(m).mass) > 3
+            ),
+        ),
+        Limit(
+            "several kinds of planar molecules: GROMACS' SETTLE has one kind of triangle",
+            lambda view: sum(len(gromacs_points(m).mass) == 3 for m in view.system.species) > 1,
+        ),
     ),
     stage_limits=(
         *_LIMITS,
-        Limit("thermostat = 'nose_hoover' with a barostat: GROMACS has no cell_rescaling with velocity Verlet",
-            lambda stage: stage.has_barostat and stage.thermostat_kind == "nose_hoover"),
-        Limit("pressure_bar changes over the stage: GROMACS keeps it constant",
-            lambda stage: stage.has_barostat and stage.pressures[0] != stage.pressures[1]),
+        Limit(
+            "thermostat = 'nose_hoover' with a barostat: GROMACS has no cell_rescaling with"
+            " velocity Verlet",
+            lambda stage: stage.has_barostat and stage.thermostat_kind == "nose_hoover",
+        ),
+        Limit(
+            "pressure_bar changes over the stage: GROMACS keeps it constant",
+            lambda stage: stage.has_barostat and stage.pressures[0] != stage.pressures[1],
+        ),
     ),
-)  # fmt: skip
+)
 
 
 def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]:
-    """Write the files for a system that begins at a state, and return their names. Raises OutputError."""
+    """Write the files for a system that begins at a state, and return their names. Raises
+    OutputError."""
     bodies = [gromacs_points(m) for m in view.system.species]
-    stages = [(k, stage) for k, stage in enumerate(view.system.scene.stages) if not stage.is_minimisation]
-    names = distinct([as_identifier(f"{n}_{stage.label}") for n, (_, stage) in enumerate(stages, 1)])
-    script = ["#!/bin/sh", "# Written by rigidmd: runs the stages with GROMACS, one after the other.", "set -e"]
+    stages = [
+        (k, stage) for k, stage in enumerate(view.system.scene.stages) if not stage.is_minimisation
+    ]
+    names = distinct(
+        [as_identifier(f"{n}_{stage.label}") for n, (_, stage) in enumerate(stages, 1)]
+    )
+    script = [
+        "#!/bin/sh",
+        "# Written by rigidmd: runs the stages with GROMACS, one after the other.",
+        "set -e",
+    ]
     before = f"-c {COORDINATES}"
     for name in map(quote, names):
-        script += [f"gmx grompp -f {name}.mdp {before} -p {TOPOLOGY} -po {name}_all.mdp -o {name}.tpr"]
+        script += [
+            f"gmx grompp -f {name}.mdp {before} -p {TOPOLOGY} -po {name}_all.mdp -o {name}.tpr"
+        ]
         script += [f'gmx mdrun -deffnm {name} "$@"']
         before = f"-c {name}.gro -t {name}.cpt"
     text = {
-        COORDINATES: _coordinates(view, bodies, state), TOPOLOGY: _topology(view, bodies),
+        COORDINATES: _coordinates(view, bodies, state),
+        TOPOLOGY: _topology(view, bodies),
         **{f"{name}.mdp": _settings(view, k) for name, (k, _) in zip(names, stages, strict=True)},
         SCRIPT: "\n".join([*script, ""]),
-    }  # fmt: skip
+    }
     for name, content in text.items():
         write_text(folder / name, content)
     (folder / SCRIPT).chmod(0o755)
@@ -122,7 +177,9 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
         gather_per_molecule([body.position_body[body.site < 0] for body in bodies], species),
         gather_per_molecule([body.mass[body.site < 0] for body in bodies], species),
     )
-    more, more_velocity = RigidBodies(system, extra).points(state) if len(extra.mass) else np.zeros((2, 0, 3))
+    more, more_velocity = (
+        RigidBodies(system, extra).points(state) if len(extra.mass) else np.zeros((2, 0, 3))
+    )
     width = DECIMALS + 5
     rows, s, e = [], 0, 0
     for n, k in enumerate(species):
@@ -132,15 +189,20 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
         positions = np.concatenate([at[s : s + count], more[e : e + added]])
         velocities = np.concatenate([velocity[s : s + count], more_velocity[e : e + added]])
         for name, x, v in zip(names, positions, velocities, strict=True):
-            head = f"{(n + 1) % 100000:5d}{as_word(m.residue_names[0]):<5}{name:>5}{(len(rows) + 1) % 100000:5d}"
+            residue = f"{(n + 1) % 100000:5d}{as_word(m.residue_names[0]):<5}"
+            head = f"{residue}{name:>5}{(len(rows) + 1) % 100000:5d}"
             where = "".join(f"{value * NM:{width}.{DECIMALS}f}" for value in x)
-            rows.append(head + where + "".join(f"{value * NM:{width}.{DECIMALS + 1}f}" for value in v))
+            rows.append(
+                head + where + "".join(f"{value * NM:{width}.{DECIMALS + 1}f}" for value in v)
+            )
         s, e = s + count, e + added
     a, b, c = state.cell * NM
     is_tilted = state.cell[np.tril_indices(3, -1)].any()
     box = [a[0], b[1], c[2]] + ([a[1], a[2], b[0], b[2], c[0], c[1]] if is_tilted else [])
     last = " ".join(f"{value:.{DECIMALS}f}" for value in box)
-    return "\n".join([f"{system.scene.name}, written by rigidmd", str(len(rows)), *rows, last]) + "\n"
+    return (
+        "\n".join([f"{system.scene.name}, written by rigidmd", str(len(rows)), *rows, last]) + "\n"
+    )
 
 
 def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
@@ -170,7 +232,9 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndarray, name: str) -> list[str]:
+def _molecule(
+    view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndarray, name: str
+) -> list[str]:
     where, mass = body.particles(len(m.masses))
     charges = np.zeros(len(mass))
     charges[: len(m.charges)] = m.charges if view.coulomb is not None else 0.0
@@ -178,7 +242,9 @@ def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndar
     names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(body.extra))]
     lines = ["[ moleculetype ]", "; name nrexcl", f"{name} 1", "", "[ atoms ]"]
     residue = as_word(m.residue_names[0])
-    for i, (kind_name, atom, charge, of_atom) in enumerate(zip(types, names, charges, mass, strict=True), 1):
+    for i, (kind_name, atom, charge, of_atom) in enumerate(
+        zip(types, names, charges, mass, strict=True), 1
+    ):
         lines.append(f"{i} {kind_name} 1 {residue} {atom} 1 {charge:.12g} {of_atom:.12g}")
     at = [int(p) + 1 for p in where]
     if len(at) == 3:
@@ -195,7 +261,10 @@ def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndar
         lines.append(f"{k + 1} {points} {out}")
     if len(mass) > 1:
         lines += ["", "[ exclusions ]"]
-        lines += [" ".join(str(j + 1) for j in [i, *range(i + 1, len(mass))]) for i in range(len(mass) - 1)]
+        lines += [
+            " ".join(str(j + 1) for j in [i, *range(i + 1, len(mass))])
+            for i in range(len(mass) - 1)
+        ]
     return lines
 
 
@@ -207,33 +276,58 @@ def _settings(view: ForceFieldView, k: int) -> str:
     def every(interval: float) -> int:
         return max(1, round(interval * 1e3 / stage.timestep_fs))
 
-    keeps, interval = system.freedom_in(k).translation < 3 * len(system.model.species), system.removes_momentum_every
+    keeps, interval = (
+        system.freedom_in(k).translation < 3 * len(system.model.species),
+        system.removes_momentum_every,
+    )
     integrator, _ = TRANSLATIONS.of("thermostat")[stage.thermostat]
     found: dict[str, object] = {
-        "integrator": integrator, "dt": f"{stage.timestep_fs * 1e-3:.12g}", "nsteps": stage.steps,
-        "comm-mode": "Linear" if keeps else "None", "nstcomm": every(interval) if interval else 100,
-        "nstlog": every(scene.output.log_interval_ps), "nstenergy": every(scene.output.log_interval_ps),
-        "nstxout-compressed": every(scene.output.trajectory_interval_ps) if scene.output.trajectory else 0,
-        "continuation": "yes", "gen-vel": "no", "cutoff-scheme": "Verlet", "pbc": "xyz", "rlist": f"{cutoff:.12g}",
-        "rvdw": f"{cutoff:.12g}", "rcoulomb": f"{cutoff:.12g}", "vdwtype": "Cut-off", "constraint-algorithm": "lincs",
-        "lincs-order": 8, "lincs-iter": 4, "DispCorr": "AllEnerPres" if system.tail is not None else "no",
+        "integrator": integrator,
+        "dt": f"{stage.timestep_fs * 1e-3:.12g}",
+        "nsteps": stage.steps,
+        "comm-mode": "Linear" if keeps else "None",
+        "nstcomm": every(interval) if interval else 100,
+        "nstlog": every(scene.output.log_interval_ps),
+        "nstenergy": every(scene.output.log_interval_ps),
+        "nstxout-compressed": (
+            every(scene.output.trajectory_interval_ps) if scene.output.trajectory else 0
+        ),
+        "continuation": "yes",
+        "gen-vel": "no",
+        "cutoff-scheme": "Verlet",
+        "pbc": "xyz",
+        "rlist": f"{cutoff:.12g}",
+        "rvdw": f"{cutoff:.12g}",
+        "rcoulomb": f"{cutoff:.12g}",
+        "vdwtype": "Cut-off",
+        "constraint-algorithm": "lincs",
+        "lincs-order": 8,
+        "lincs-iter": 4,
+        "DispCorr": "AllEnerPres" if system.tail is not None else "no",
         "ld-seed": (scene.seed * 1000 + k) % SEEDS,
-    }  # fmt: skip
+    }
     if view.lennard_jones is not None:
         found["vdw-modifier"] = TRANSLATIONS.of("forces.truncation")[view.truncation]
         if "switch" in view.truncation:
             found["rvdw-switch"] = f"{(scene.forces.switch_start_A or 0.0) * NM:.12g}"
-    return "".join(f"{key:<24} = {value}\n" for key, value in (found | _coulomb(view) | _couplings(stage)).items())
+    return "".join(
+        f"{key:<24} = {value}\n"
+        for key, value in (found | _coulomb(view) | _couplings(stage)).items()
+    )
 
 
 def _coulomb(view: ForceFieldView) -> dict[str, object]:
     law, mesh = view.coulomb, view.system.terms.get("coulomb_reciprocal")
-    found: dict[str, object] = {"coulombtype": TRANSLATIONS.of("forces.electrostatics")[view.electrostatics]}
+    found: dict[str, object] = {
+        "coulombtype": TRANSLATIONS.of("forces.electrostatics")[view.electrostatics]
+    }
     if isinstance(law, ScreenedCoulomb) and isinstance(mesh, Pme):
         found["coulomb-modifier"] = "Potential-shift" if law.shift else "None"
         # GROMACS needs one cutoff; rtol is that of alpha there
         found["ewald-rtol"] = f"{float(erfc(law.alpha * view.system.cutoff)):.12g}"
-        found |= {f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)} | {"pme-order": mesh.order}
+        found |= {f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)} | {
+            "pme-order": mesh.order
+        }
     elif isinstance(law, ReactionField):
         permittivity = view.system.scene.forces.reaction_field_permittivity
         found["epsilon-rf"] = 0 if permittivity == inf else f"{permittivity:.12g}"
@@ -245,13 +339,20 @@ def _couplings(stage: Stage) -> dict[str, object]:
         return {"tcoupl": "no", "pcoupl": "no"}
     first, last = stage.temperatures
     found: dict[str, object] = {
-        "tcoupl": TRANSLATIONS.of("thermostat")[stage.thermostat][1], "pcoupl": "no", "tc-grps": "System",
-        "ref-t": f"{first:.12g}", "tau-t": f"{stage.thermostat_time:.12g}",
-    }  # fmt: skip
+        "tcoupl": TRANSLATIONS.of("thermostat")[stage.thermostat][1],
+        "pcoupl": "no",
+        "tc-grps": "System",
+        "ref-t": f"{first:.12g}",
+        "tau-t": f"{stage.thermostat_time:.12g}",
+    }
     if stage.thermostat_kind == "nose_hoover":
         found["nh-chain-length"] = stage.nose_hoover_links
     if first != last:
-        found |= {"annealing": "single", "annealing-npoints": 2, "annealing-time": f"0 {stage.duration:.12g}"}
+        found |= {
+            "annealing": "single",
+            "annealing-npoints": 2,
+            "annealing-time": f"0 {stage.duration:.12g}",
+        }
         found["annealing-temp"] = f"{first:.12g} {last:.12g}"
     if stage.has_barostat:
         pressure, count = stage.pressures[0], 1 if stage.pressure_coupling == "isotropic" else 2
@@ -261,5 +362,5 @@ def _couplings(stage: Stage) -> dict[str, object]:
             "tau-p": f"{stage.barostat_time:.12g}",
             "ref-p": " ".join(f"{value:.12g}" for value in (pressure[0], pressure[2])[:count]),
             "compressibility": " ".join([f"{stage.compressibility:.12g}"] * count),
-        }  # fmt: skip
+        }
     return found

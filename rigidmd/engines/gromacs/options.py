@@ -3,6 +3,9 @@
 from rigidmd.engines.registry import Program
 
 PROGRAM = Program(
-    "GROMACS", "GROMACS has its own package", "files:TRANSLATIONS", writer="files:write_gromacs",
+    "GROMACS",
+    "GROMACS has its own package",
+    "files:TRANSLATIONS",
+    writer="files:write_gromacs",
     command="sh run.sh",
-)  # fmt: skip
+)

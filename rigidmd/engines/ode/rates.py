@@ -1,4 +1,5 @@
-"""The compiled equations of motion of a single body as a first-order system, for general ODE solvers."""
+"""The compiled equations of motion of a single body as a first-order system, for general ODE
+solvers."""
 
 from math import hypot, sin
 
@@ -44,14 +45,16 @@ def read(form, model, state, time, y):
 
 @kernel(from_python=True)
 def write_rates(form, model, terms, state, load, time, y, dy):
-    """Write the rates of all variables into dy; returns a status code. Lab vectors are along the axes of the frame. See
-    "The equations of motion" in the theory chapter `bodies`."""
+    """Write the rates of all variables into dy; returns a status code. Lab vectors are along the
+    axes of the frame. See "The equations of motion" in the theory chapter `bodies`."""
     read(form, model, state, time, y)
     status = compute_body_load(terms, state, load)
     if status != OK:
         return status
     velocity, omega = relative_motion(model, state)
-    dy[-1] = total_power(terms, state, velocity, omega) + add_resistance(model.resistance, state, load, velocity, omega)
+    dy[-1] = total_power(terms, state, velocity, omega) + add_resistance(
+        model.resistance, state, load, velocity, omega
+    )
     W = frame_rate(model.frame, time)
     n = form.variables
     for m in range(len(state.rotation)):
@@ -62,11 +65,24 @@ def write_rates(form, model, terms, state, load, time, y, dy):
             i = (k + 1) % 3
             j = (k + 2) % 3
             inertia, growth, _, motor = moment_rates(model.rotor, time, k)
-            torque = load.torque_body[m, k] + L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]
+            torque = (
+                load.torque_body[m, k]
+                + L[i] * y[n + j]
+                - L[j] * y[n + i]
+                - motor
+                - growth * y[n + k]
+            )
             for b in range(len(state.position)):
                 pi = model.translation.mass * body_component(q, state.velocity[b], i)
                 pj = model.translation.mass * body_component(q, state.velocity[b], j)
-                torque += pi * pj * (1 / inertial_mass(model.translation, j) - 1 / inertial_mass(model.translation, i))
+                torque += (
+                    pi
+                    * pj
+                    * (
+                        1 / inertial_mass(model.translation, j)
+                        - 1 / inertial_mass(model.translation, i)
+                    )
+                )
             dy[n + k] = torque / inertia if inertia > 0 else 0.0
             dy[-1] -= (motor + 0.5 * growth * y[n + k]) * y[n + k]
         n += 3
@@ -82,7 +98,8 @@ def write_rates(form, model, terms, state, load, time, y, dy):
 
 @kernel(from_python=True)
 def is_singular(form, y, dy, dt):
-    """Whether theta is within a step of 0 or pi, or so near that phi and psi lose half of their digits."""
+    """Whether theta is within a step of 0 or pi, or so near that phi and psi lose half of their
+    digits."""
     if form.variables != 3:
         return False
     s = abs(sin(y[1]))
@@ -91,7 +108,8 @@ def is_singular(form, y, dy, dt):
 
 @kernel(from_python=True)
 def rk4(form, model, terms, state, load, y, stages, dt, until, cursor):
-    """Classical Runge-Kutta until state.step is `until`. cursor (1,): stages done in a step; stages (5, variables)."""
+    """Classical Runge-Kutta until state.step is `until`. cursor (1,): stages done in a step; stages
+    (5, variables)."""
     shift = (0.0, 0.5, 0.5, 1.0)
     while state.step[NOW] < until:
         time = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
@@ -99,7 +117,9 @@ def rk4(form, model, terms, state, load, y, stages, dt, until, cursor):
             k = cursor[0]
             for i in range(len(y)):
                 stages[4, i] = y[i] + shift[k] * dt * stages[max(k - 1, 0), i] if k else y[i]
-            status = write_rates(form, model, terms, state, load, time + shift[k] * dt, stages[4], stages[k])
+            status = write_rates(
+                form, model, terms, state, load, time + shift[k] * dt, stages[4], stages[k]
+            )
             if status != OK:
                 return status
             if k == 0 and is_singular(form, y, stages[0], dt):

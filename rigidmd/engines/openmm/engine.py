@@ -1,11 +1,10 @@
 """The engine that runs OpenMM, on one of its platforms.
 
-Two contexts hold the system. One moves it, with several terms in one force where that is faster. The other evaluates it
-term by term, so that observations leave no trace in the motion. OpenMM has no virial: the molecular virial follows from
-energies at scaled centres of mass.
+Two contexts hold the system. One moves it, with several terms in one force where that is faster.
+The other evaluates it term by term, so that observations leave no trace in the motion. OpenMM has
+no virial: the molecular virial follows from energies at scaled centres of mass.
 """
 
-# isort: skip_file
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,17 @@ from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.openmm.options import FIXED_PRECISIONS, PLATFORMS, precision_of
 from rigidmd.engines.openmm.system import (
-    NM, TOLERANCES, Group, extra_forces, integration_groups, integrator_of, layout, library, openmm_system, step,
-)  # fmt: skip
+    NM,
+    TOLERANCES,
+    Group,
+    extra_forces,
+    integration_groups,
+    integrator_of,
+    layout,
+    library,
+    openmm_system,
+    step,
+)
 from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
@@ -27,12 +35,14 @@ from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL
 ANGSTROM = 1 / NM  # Å per nm
 #: kJ/mol/nm in u Å/ps².
 FORCE = KJ_PER_MOL * NM
-#: Strain of the finite differences for the virial, for energies in double precision or not. The error of a difference
-#: is a few hundred times the strain squared, plus rounding divided by the strain.
+#: Strain of the finite differences for the virial, for energies in double precision or not. The
+#: error of a difference is a few hundred times the strain squared, plus rounding divided by the
+#: strain.
 STRAIN = {True: 2e-5, False: 5e-4}
-#: Limits of relative errors of forces by the arithmetic, and of the virial by its differences. Measured: 6e-6 and 1e-4
-#: on CPU, 0 and 1.4e-5 on Reference (216 TIP4P/2005 and 500 argon, cutoff 9 Å). On CUDA the same in mixed and in single
-#: precision: 5e-6 and 2e-4 (216 SPC/E, 216 TIP4P/2005 and, of the force scale, 500 argon; H200).
+#: Limits of relative errors of forces by the arithmetic, and of the virial by its differences.
+#: Measured: 6e-6 and 1e-4 on CPU, 0 and 1.4e-5 on Reference (216 TIP4P/2005 and 500 argon, cutoff 9
+#: Å). On CUDA the same in mixed and in single precision: 5e-6 and 2e-4 (216 SPC/E, 216 TIP4P/2005
+#: and, of the force scale, 500 argon; H200).
 ERRORS = {"double": (0.0, 1e-4), "mixed": (2e-5, 1e-3), "single": (2e-5, 1e-3)}
 
 
@@ -54,27 +64,37 @@ def properties_of(platform: str, precision: str | None, threads: int | None) -> 
 
 
 class OpenmmEngine(ExternalEngine):
-    """Moves molecules by OpenMM. Raises EngineError if it is not installed. `system.TRANSLATIONS` has all it can do."""
+    """Moves molecules by OpenMM. Raises EngineError if it is not installed. `system.TRANSLATIONS`
+    has all it can do."""
 
     length_tolerance = 2.0**-24  # SETTLE has its distances in single precision, on all platforms
 
-    def __init__(self, system: System, stage: int = 0, platform: str = "CPU", precision: str | None = None):
+    def __init__(
+        self, system: System, stage: int = 0, platform: str = "CPU", precision: str | None = None
+    ):
         mm = library()
         super().__init__(system, stage)
         view, there = self._view, _platforms()
         if platform not in there:
             known = "" if platform in PLATFORMS else f"; OpenMM knows {', '.join(PLATFORMS)}"
             cuda = "; pip install 'openmm[cuda12]' installs it" if platform == "CUDA" else ""
-            raise EngineError(f"OpenMM has no platform {platform!r} here: there are {', '.join(there)}{known}{cuda}")
+            raise EngineError(
+                f"OpenMM has no platform {platform!r} here: there are"
+                f" {', '.join(there)}{known}{cuda}"
+            )
         properties = properties_of(platform, precision, system.scene.threads)
         self.version = f"OpenMM {mm.__version__} on {platform}"
         self._particles = layout(view)
         self._precision = precision_of(platform, precision)
         self.force_tolerance, self.virial_tolerance = ERRORS[self._precision]
-        self._integrator = integrator_of(view, stage, TOLERANCES[properties.get("Precision", "double")])
+        self._integrator = integrator_of(
+            view, stage, TOLERANCES[properties.get("Precision", "double")]
+        )
         rest = mm.VerletIntegrator(0.001)
         try:
-            evaluated, moved = (openmm_system(self._particles, system.state.cell, apart) for apart in (True, False))
+            evaluated, moved = (
+                openmm_system(self._particles, system.state.cell, apart) for apart in (True, False)
+            )
             for force in extra_forces(view, stage):
                 moved.addForce(force)
             self._evaluating_context = mm.Context(evaluated, rest, there[platform], properties)
@@ -92,26 +112,39 @@ class OpenmmEngine(ExternalEngine):
             step(self._integrator, steps)
         except library().OpenMMException as error:
             if "NaN" in str(error):
-                raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan))) from None
+                raise NotFiniteError(
+                    state._replace(position=np.full_like(state.position, np.nan))
+                ) from None
             raise SimulationError(f"OpenMM stopped: {error}") from None
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         if self._evaluated is None or not same_state(self._evaluated[0], state):
             self._put(self._evaluating_context, state)
             acting = self._groups - {Group.STEP_LENNARD_JONES, Group.STEP_COULOMB}
-            on_all = self._evaluating_context.getState(getForces=True, groups=acting).getForces(asNumpy=True)._value
+            on_all = (
+                self._evaluating_context.getState(getForces=True, groups=acting)
+                .getForces(asNumpy=True)
+                ._value
+            )
             # the forces on mass points include those of virtual sites
             bodies, force = self._particles.bodies, on_all[self._particles.point] * FORCE
             position = bodies.points(state)[0]
             virial = self._virial(state, bodies.intramolecular_virial(position, force))
-            self._evaluated = state.copy(), bodies.load(state, position, force), self._tallies(state, virial)
+            self._evaluated = (
+                state.copy(),
+                bodies.load(state, position, force),
+                self._tallies(state, virial),
+            )
         _, load, tallies = self._evaluated
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
     def memory(self) -> dict[str, np.ndarray]:
         """OpenMM's checkpoint of the context: particles, random numbers, thermostat."""
         content = self._moving_context.createCheckpoint() if self._known_state is not None else b""
-        return {"context": np.frombuffer(content, np.uint8).copy(), "heat": np.array([self._heat_offset])}
+        return {
+            "context": np.frombuffer(content, np.uint8).copy(),
+            "heat": np.array([self._heat_offset]),
+        }
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         kept = memory["context"]
@@ -151,19 +184,27 @@ class OpenmmEngine(ExternalEngine):
         velocity = had.getVelocities(asNumpy=True)._value[point] * ANGSTROM
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
-        cell = had.getPeriodicBoxVectors(asNumpy=True)._value * ANGSTROM if self._stage.has_barostat else state.cell
+        cell = (
+            had.getPeriodicBoxVectors(asNumpy=True)._value * ANGSTROM
+            if self._stage.has_barostat
+            else state.cell
+        )
         found = self._particles.bodies.state(state, position, velocity, cell)
-        if self._stage.has_barostat:  # OpenMM wraps molecules into the box whenever it changes the box
-            moved = found.position @ np.linalg.inv(cell) - state.position @ np.linalg.inv(state.cell)
+        if (
+            self._stage.has_barostat
+        ):  # OpenMM wraps molecules into the box whenever it changes the box
+            moved = found.position @ np.linalg.inv(cell) - state.position @ np.linalg.inv(
+                state.cell
+            )
             found.position[:] -= np.rint(moved) @ cell
         for mine, its in zip(state[:5], found[:5], strict=True):
             mine[:] = its
         state.energy_ledger[HEAT] = self._heat_offset + self._heat(state)
 
     def _heat(self, state: State) -> float:
-        """Heat from a thermostat, up to a constant: the gain of the energy, u Å²/ps². OpenMM computes the energy of a
-        Nosé-Hoover chain, but its velocities are half a step off, so that no conserved energy exists at any one
-        time."""
+        """Heat from a thermostat, up to a constant: the gain of the energy, u Å²/ps². OpenMM
+        computes the energy of a Nosé-Hoover chain, but its velocities are half a step off, so that
+        no conserved energy exists at any one time."""
         if self.conserves_energy:
             return 0.0
         energy = _energy_of(self._moving_context, integration_groups(self._stage))
@@ -176,20 +217,31 @@ class OpenmmEngine(ExternalEngine):
         def energy(group: int) -> float:
             return _energy_of(self._evaluating_context, {group})
 
-        found = {"lennard_jones": energy(Group.LENNARD_JONES)} if Group.LENNARD_JONES in self._groups else {}
+        found = (
+            {"lennard_jones": energy(Group.LENNARD_JONES)}
+            if Group.LENNARD_JONES in self._groups
+            else {}
+        )
         view, law = self._view, self._view.coulomb
         if isinstance(law, ScreenedCoulomb):
             alpha, charge = law.alpha, view.charge * COULOMB_CHARGE
             even = background(float(charge.sum()) ** 2, alpha).strength / state.volume
-            found["coulomb_real"] = energy(Group.COULOMB_PAIRS) - self._excluded_energy(state, alpha)
+            found["coulomb_real"] = energy(Group.COULOMB_PAIRS) - self._excluded_energy(
+                state, alpha
+            )
             if law.shift:
                 found["coulomb_real"] += energy(Group.STEP_COULOMB)
-            found["coulomb_reciprocal"] = energy(Group.RECIPROCAL) - self_energy(charge, alpha) - even
+            found["coulomb_reciprocal"] = (
+                energy(Group.RECIPROCAL) - self_energy(charge, alpha) - even
+            )
             if "coulomb_background" in view.system.terms:
                 found["coulomb_background"] = even
         elif law is not None:
             found["coulomb"] = energy(Group.COULOMB_PAIRS)
-        return {name: Tally(float(u), np.zeros((3, 3)) if k else virial) for k, (name, u) in enumerate(found.items())}
+        return {
+            name: Tally(float(u), np.zeros((3, 3)) if k else virial)
+            for k, (name, u) in enumerate(found.items())
+        }
 
     def _excluded_energy(self, state: State, alpha: float) -> float:
         """The reciprocal energy of excluded pairs, which OpenMM subtracts."""
@@ -197,7 +249,9 @@ class OpenmmEngine(ExternalEngine):
         species = view.system.model.species
         for k, m in enumerate(view.system.species):
             count = int(((species == k) & ~view.frozen).sum())
-            total += count * intramolecular_energy(m.charges * COULOMB_CHARGE, m.positions_body, alpha)
+            total += count * intramolecular_energy(
+                m.charges * COULOMB_CHARGE, m.positions_body, alpha
+            )
         still = view.frozen[view.system.sites.molecule] & (view.charge != 0)
         if still.any():
             position = view.system.site_positions(state)[still]
@@ -205,14 +259,16 @@ class OpenmmEngine(ExternalEngine):
         return total
 
     def _virial(self, state: State, intramolecular: np.ndarray) -> np.ndarray:
-        """The symmetric part of the molecular virial (3, 3): the decrease of the energy as centres of mass separate.
+        """The symmetric part of the molecular virial (3, 3): the decrease of the energy as centres
+        of mass separate.
 
         Energies are continuous at the cutoff. 0 without a box.
 
-        intramolecular : sum of F (x) d over mass points, which the virial of all sites (symmetric) has in addition
+        intramolecular : sum of F (x) d over mass points, which the virial of all sites (symmetric)
+            has in addition
 
-        If the scene has no output of the pressure tensor, only the trace is computed and each axis gets a third. That
-        takes two energies instead of twelve at each observation.
+        If the scene has no output of the pressure tensor, only the trace is computed and each axis
+        gets a third. That takes two energies instead of twelve at each observation.
         """
         virial, strain = np.zeros((3, 3)), STRAIN[self._precision == "double"]
         if not self._view.is_periodic:
@@ -224,7 +280,10 @@ class OpenmmEngine(ExternalEngine):
             energy = []
             for sign in (-1, 1):
                 by = np.eye(3) + sign * strain * along
-                self._put(self._evaluating_context, state._replace(position=state.position @ by, cell=state.cell @ by))
+                self._put(
+                    self._evaluating_context,
+                    state._replace(position=state.position @ by, cell=state.cell @ by),
+                )
                 energy.append(_energy_of(self._evaluating_context, groups))
             return (energy[1] - energy[0]) / (2 * strain)
 
@@ -234,7 +293,9 @@ class OpenmmEngine(ExternalEngine):
         for row, column in zip(*np.tril_indices(3), strict=True):  # the cell stays triangular
             along = np.zeros((3, 3))
             along[row, column] = 1.0
-            element = -slope(along) + (intramolecular[column, row] - intramolecular[row, column]) / 2
+            element = (
+                -slope(along) + (intramolecular[column, row] - intramolecular[row, column]) / 2
+            )
             virial[row, column] = virial[column, row] = element
         return virial
 

@@ -1,6 +1,6 @@
-"""Export to OpenMM: a folder with system, integrators and state as XML, and a script that runs the stages."""
+"""Export to OpenMM: a folder with system, integrators and state as XML, and a script that runs the
+stages."""
 
-# isort: skip_file
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,8 +10,17 @@ from rigidmd.core.plain_text import in_comment
 from rigidmd.core.state import State
 from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.openmm.system import (
-    KICK, MOVES, NM, TOLERANCES, Layout, extra_forces, integrator_of, layout, library, openmm_system,
-)  # fmt: skip
+    KICK,
+    MOVES,
+    NM,
+    TOLERANCES,
+    Layout,
+    extra_forces,
+    integrator_of,
+    layout,
+    library,
+    openmm_system,
+)
 
 if TYPE_CHECKING:
     from openmm.app import Topology
@@ -23,16 +32,22 @@ TEXT = Path(__file__).with_name("run.txt").read_text(encoding="utf-8")
 
 
 def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
-    """Write the folder for a system at a state; returns names of files. Raises OutputError or EngineError."""
+    """Write the folder for a system at a state; returns names of files. Raises OutputError or
+    EngineError."""
     mm = library()
     particles = layout(view)
     position, velocity = (values * NM for values in particles.positions(state))
     made = openmm_system(particles, state.cell, separate=False)
-    context = mm.Context(made, mm.VerletIntegrator(0.001), mm.Platform.getPlatformByName("Reference"))
+    context = mm.Context(
+        made, mm.VerletIntegrator(0.001), mm.Platform.getPlatformByName("Reference")
+    )
     context.setPositions(position)
     context.setVelocities(velocity)
     serialize = mm.XmlSerializer.serialize
-    text = {SYSTEM: serialize(made), STATE: serialize(context.getState(positions=True, velocities=True))}
+    text = {
+        SYSTEM: serialize(made),
+        STATE: serialize(context.getState(positions=True, velocities=True)),
+    }
     rows = []
     scene = view.system.scene
     for k, stage in enumerate(scene.stages):
@@ -53,10 +68,15 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     text[SCRIPT] = re.sub(f"{{({'|'.join(values)})}}", lambda found: values[found[1]], TEXT)
     for name, content in text.items():
         write_text(folder / name, content)
-    with atomic_file(folder / TOPOLOGY) as temporary, open(temporary, "w", encoding="utf-8") as file:
+    with (
+        atomic_file(folder / TOPOLOGY) as temporary,
+        open(temporary, "w", encoding="utf-8") as file,
+    ):
         from openmm import Vec3, app
 
-        app.PDBFile.writeFile(_topology(particles), [Vec3(*row) for row in (position / NM).tolist()], file)  # Å
+        app.PDBFile.writeFile(
+            _topology(particles), [Vec3(*row) for row in (position / NM).tolist()], file
+        )  # Å
     return [*text, TOPOLOGY]
 
 

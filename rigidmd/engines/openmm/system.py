@@ -1,7 +1,9 @@
-"""What OpenMM can express, and a system as an `openmm.System`: particles, constraints, virtual sites, groups of forces.
+"""What OpenMM can express, and a system as an `openmm.System`: particles, constraints, virtual
+sites, groups of forces.
 
-OpenMM has no rigid bodies. Mass points with constrained distances represent them (`rigid_bodies.MassPoints`), and all
-other sites are virtual. OpenMM's units are nm, ps, u, e and kJ/mol.
+OpenMM has no rigid bodies. Mass points with constrained distances represent them
+(`rigid_bodies.MassPoints`), and all other sites are virtual. OpenMM's units are nm, ps, u, e and
+kJ/mol.
 """
 
 import re
@@ -41,8 +43,8 @@ PME_ORDER = 5
 
 
 def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
-    """A grid for splines of an order with the accuracy of the scene's Ewald sum: the grid of the scene if the order of
-    its splines is not higher. None if no grid reaches the accuracy."""
+    """A grid for splines of an order with the accuracy of the scene's Ewald sum: the grid of the
+    scene if the order of its splines is not higher. None if no grid reaches the accuracy."""
     system, law = view.system, view.coulomb
     pme = system.terms.get("coulomb_reciprocal")
     if isinstance(pme, Pme) and pme.order <= order:
@@ -50,7 +52,9 @@ def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
         return a, b, c
     if not isinstance(law, ScreenedCoulomb) or system.space.volume == inf:
         return None
-    charges = charges_in(system.species, np.bincount(system.model.species, minlength=len(system.species)))
+    charges = charges_in(
+        system.species, np.bincount(system.model.species, minlength=len(system.species))
+    )
     real_space = real_error(charges, law.alpha, law.cutoff, system.space.volume)
     error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - real_space**2, 0.0))
     found = pme_grid_for(charges, law.alpha, cell_of(system.space), error, order)
@@ -58,51 +62,102 @@ def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
 
 
 _INTEGRATOR, *_LIMITS = moves("OpenMM", "molecules")
-_NO_GRID = f"no grid for OpenMM's splines, of order {PME_ORDER}, reaches the requested accuracy; request a lower one"
+_NO_GRID = (
+    f"no grid for OpenMM's splines, of order {PME_ORDER}, reaches the requested accuracy; request a"
+    " lower one"
+)
 #: What OpenMM can express, and how.
 TRANSLATIONS = Translations(
     "OpenMM",
     scene=(
-        Key("forces.truncation", dict.fromkeys(TRUNCATIONS, "formula"), matters=lambda view: view.is_truncated),
+        Key(
+            "forces.truncation",
+            dict.fromkeys(TRUNCATIONS, "formula"),
+            matters=lambda view: view.is_truncated,
+        ),
         Key("forces.dispersion", {"cutoff": ""}),
         Key("forces.reaction_field_truncation", dict.fromkeys((None, *TRUNCATIONS), "formula")),
-        Key("forces.electrostatics", {
-            "none": "", "coulomb": "", "reaction_field": "formula", "damped_shifted_force": "formula", "ewald": "PME",
-            "pme": "PME",
-        }, matters=lambda view: view.coulomb),
+        Key(
+            "forces.electrostatics",
+            {
+                "none": "",
+                "coulomb": "",
+                "reaction_field": "formula",
+                "damped_shifted_force": "formula",
+                "ewald": "PME",
+                "pme": "PME",
+            },
+            matters=lambda view: view.coulomb,
+        ),
         Key("forces.ewald_truncation", {None: "", "plain": "", "shift": "energy of a step"}),
-        Key("run.remove_momentum_interval_ps", {None: "", False: ""},
-            "the engine openmm removes no momentum; leave it out"),
+        Key(
+            "run.remove_momentum_interval_ps",
+            {None: "", False: ""},
+            "the engine openmm removes no momentum; leave it out",
+        ),
     ),
     stage=(
-        Key("ensemble", {"nve": "", "nvt": "", "npt": "",
-            "nph": Missing("OpenMM has no barostat without a thermostat")}),
-        Key("thermostat", {None: "velocity Verlet", "nose_hoover": "NoseHooverIntegrator",
-            "langevin": "LangevinMiddleIntegrator"}, "OpenMM has nose_hoover and langevin for constrained molecules"),
-        Key("barostat", {None: "", "monte_carlo": "MonteCarloBarostat"},
-            "OpenMM moves the box by monte_carlo, which is isotropic in a scene"),
+        Key(
+            "ensemble",
+            {
+                "nve": "",
+                "nvt": "",
+                "npt": "",
+                "nph": Missing("OpenMM has no barostat without a thermostat"),
+            },
+        ),
+        Key(
+            "thermostat",
+            {
+                None: "velocity Verlet",
+                "nose_hoover": "NoseHooverIntegrator",
+                "langevin": "LangevinMiddleIntegrator",
+            },
+            "OpenMM has nose_hoover and langevin for constrained molecules",
+        ),
+        Key(
+            "barostat",
+            {None: "", "monte_carlo": "MonteCarloBarostat"},
+            "OpenMM moves the box by monte_carlo, which is isotropic in a scene",
+        ),
         Key("pressure_coupling", {"isotropic": ""}),
-        _INTEGRATOR, Key("rotor", SPLIT, "OpenMM rotates molecules by constrained distances"),
+        _INTEGRATOR,
+        Key("rotor", SPLIT, "OpenMM rotates molecules by constrained distances"),
     ),
     limits=(
-        Limit("forces.ewald_cutoff_A = {:g}: OpenMM has one cutoff for all forces; leave it out, or take cutoff_A",
-            lambda view: view.has_ewald_sum and view.coulomb.cutoff != view.system.cutoff and view.coulomb.cutoff),
-        Limit(f"forces.electrostatics = {{!r}}: {_NO_GRID}",
-            lambda view: view.has_ewald_sum and grid_for(view, PME_ORDER) is None and view.electrostatics),
-        Limit("a barostat with frozen molecules: OpenMM would move them with the box",
-            lambda view: view.frozen.any() and view.has_barostat),
+        Limit(
+            "forces.ewald_cutoff_A = {:g}: OpenMM has one cutoff for all forces; leave it out, or"
+            " take cutoff_A",
+            lambda view: (
+                view.has_ewald_sum
+                and view.coulomb.cutoff != view.system.cutoff
+                and view.coulomb.cutoff
+            ),
+        ),
+        Limit(
+            f"forces.electrostatics = {{!r}}: {_NO_GRID}",
+            lambda view: (
+                view.has_ewald_sum and grid_for(view, PME_ORDER) is None and view.electrostatics
+            ),
+        ),
+        Limit(
+            "a barostat with frozen molecules: OpenMM would move them with the box",
+            lambda view: view.frozen.any() and view.has_barostat,
+        ),
     ),
     stage_limits=(
         *_LIMITS,
-        Limit("temperature_K or pressure_bar changes over the stage: OpenMM keeps them constant",
-            lambda stage: stage.ramps),
+        Limit(
+            "temperature_K or pressure_bar changes over the stage: OpenMM keeps them constant",
+            lambda stage: stage.ramps,
+        ),
     ),
-)  # fmt: skip
+)
 
 
 class Group:
-    """Force groups of a system. A step group subtracts the jump of the pair energies at the cutoff: it exerts no force,
-    and energies with it are continuous. TAIL is the tail correction."""
+    """Force groups of a system. A step group subtracts the jump of the pair energies at the cutoff:
+    it exerts no force, and energies with it are continuous. TAIL is the tail correction."""
 
     LENNARD_JONES, COULOMB_PAIRS, RECIPROCAL, STEP_LENNARD_JONES, STEP_COULOMB, TAIL = range(6)
 
@@ -117,7 +172,8 @@ def library() -> Any:
 
 
 class Layout(NamedTuple):
-    """The particles of a system: sites and mass points, molecule by molecule. q particles, p mass points, s sites."""
+    """The particles of a system: sites and mass points, molecule by molecule. q particles, p mass
+    points, s sites."""
 
     view: ForceFieldView
     bodies: RigidBodies  # of the mass points
@@ -127,7 +183,9 @@ class Layout(NamedTuple):
     point: np.ndarray  # (p,) particle of each mass point
     of_species: list[MassPoints]
     first: np.ndarray  # (n,) first particle of each molecule
-    local: list[np.ndarray]  # for each species the particles of its mass points, counted from `first`
+    local: list[
+        np.ndarray
+    ]  # for each species the particles of its mass points, counted from `first`
 
     def positions(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Positions, Å, and velocities, Å/ps, of all particles (q, 3) at a state."""
@@ -138,7 +196,8 @@ class Layout(NamedTuple):
         return at, velocity
 
     def excluded(self) -> list[tuple[int, int]]:
-        """Pairs of particles that do not interact: within a molecule, and between frozen molecules."""
+        """Pairs of particles that do not interact: within a molecule, and between frozen
+        molecules."""
         pairs = []
         for a, n in zip(self.first, np.diff([*self.first, len(self.mass)]), strict=True):
             pairs += [(int(a) + i, int(a) + j) for i in range(n) for j in range(i + 1, n)]
@@ -149,16 +208,22 @@ class Layout(NamedTuple):
 
 
 def layout(view: ForceFieldView) -> Layout:
-    """The particles that represent a system: for each molecule its sites, in order, then its other mass points."""
+    """The particles that represent a system: for each molecule its sites, in order, then its other
+    mass points."""
     system = view.system
     species, frozen = system.model.species, system.model.inverse_mass == 0
-    bodies = [mass_points(m, bool(is_frozen)) for m, is_frozen in zip(system.species, frozen, strict=True)]
+    bodies = [
+        mass_points(m, bool(is_frozen)) for m, is_frozen in zip(system.species, frozen, strict=True)
+    ]
     local, mass = [], []
     for m, body, is_frozen in zip(system.species, bodies, frozen, strict=True):
         at, of_particles = body.particles(len(m.masses))
         local.append(at)
         mass.append(np.zeros_like(of_particles) if is_frozen else of_particles)
-    count, sites = np.array([len(of_species) for of_species in mass])[species], system.sites_per_molecule
+    count, sites = (
+        np.array([len(of_species) for of_species in mass])[species],
+        system.sites_per_molecule,
+    )
     first, molecule = np.cumsum(count) - count, np.repeat(np.arange(len(species)), count)
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
     points = Points(
@@ -167,17 +232,23 @@ def layout(view: ForceFieldView) -> Layout:
         gather_per_molecule([body.mass for body in bodies], species),
     )
     return Layout(
-        view, RigidBodies(system, points), gather_per_molecule(mass, species), molecule,
-        np.repeat(first, sites) + within, np.concatenate([first[i] + local[k] for i, k in enumerate(species)]),
-        bodies, first, local,
-    )  # fmt: skip
+        view,
+        RigidBodies(system, points),
+        gather_per_molecule(mass, species),
+        molecule,
+        np.repeat(first, sites) + within,
+        np.concatenate([first[i] + local[k] for i, k in enumerate(species)]),
+        bodies,
+        first,
+        local,
+    )
 
 
 def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openmm.System":
     """The `openmm.System` with all forces except a barostat, and the initial cell (3, 3).
 
-    separate : whether Lennard-Jones and Coulomb forces are separate even if one force can have both, which is faster: a
-        step of 512 waters with PME takes 8 ms instead of 11 on two cores
+    separate : whether Lennard-Jones and Coulomb forces are separate even if one force can have
+        both, which is faster: a step of 512 waters with PME takes 8 ms instead of 11 on two cores
     """
     mm, view = library(), particles.view
     made = mm.System()
@@ -192,7 +263,9 @@ def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openm
         for i, j, distance in body.distances:
             made.addConstraint(where[i], where[j], distance * NM)
         for k, site in body.virtual_sites.items():
-            made.setVirtualSite(int(a) + k, _openmm_virtual_site(where, site.weight.tolist(), site.cross))
+            made.setVirtualSite(
+                int(a) + k, _openmm_virtual_site(where, site.weight.tolist(), site.cross)
+            )
     excluded = particles.excluded()
     for force, group in _forces(particles, separate):
         force.setForceGroup(group)
@@ -222,7 +295,9 @@ def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
     """The forces of a system with their groups."""
     found, view = [], particles.view
     law, coulomb, plain = view.lennard_jones, view.coulomb, _builtin_lennard_jones(view)
-    has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (coulomb is not None and coulomb.cutoff == inf)
+    has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (
+        coulomb is not None and coulomb.cutoff == inf
+    )
     together = plain is not None and has_charge_force and not separate
     if law is not None and view.epsilon.any():
         if plain is None:
@@ -230,7 +305,11 @@ def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
         elif not together:
             force = _nonbonded(particles, law.cutoff, np.zeros_like(view.charge), plain)
             found.append((force, Group.LENNARD_JONES))
-        if view.is_periodic and isinstance(law.truncation, Unmodified) and view.truncation == "plain":
+        if (
+            view.is_periodic
+            and isinstance(law.truncation, Unmodified)
+            and view.truncation == "plain"
+        ):
             found.append((_custom_lennard_jones(particles, step=True), Group.STEP_LENNARD_JONES))
     if coulomb is not None and has_charge_force:
         force = _nonbonded(particles, coulomb.cutoff, view.charge, plain if together else None)
@@ -242,20 +321,25 @@ def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
             height = f"{-float(erfc(coulomb.alpha * coulomb.cutoff)) / coulomb.cutoff!r}"
             found.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     elif coulomb is not None and not isinstance(coulomb, ScreenedCoulomb):
-        found.append((_custom_coulomb(particles, coulomb_formula(coulomb, 1.0)), Group.COULOMB_PAIRS))
+        found.append(
+            (_custom_coulomb(particles, coulomb_formula(coulomb, 1.0)), Group.COULOMB_PAIRS)
+        )
         is_plain = view.scene.forces.reaction_field_truncation == "plain"
         if view.is_periodic and is_plain and isinstance(coulomb, ReactionField):
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
             found.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     if (tail := view.system.tail) is not None:
-        energy, constant = float(tail.energy_volume) / KJ_PER_MOL * NM**3, float(tail.constant) / KJ_PER_MOL
+        energy, constant = (
+            float(tail.energy_volume) / KJ_PER_MOL * NM**3,
+            float(tail.constant) / KJ_PER_MOL,
+        )
         found.append((library().CustomVolumeForce(f"{energy!r}/v+({constant!r})"), Group.TAIL))
     return found
 
 
 def _builtin_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
-    """sigma and epsilon of kinds if OpenMM has the Lennard-Jones potential of the scene built in, and those of all
-    pairs follow by Lorentz-Berthelot rules, else None."""
+    """sigma and epsilon of kinds if OpenMM has the Lennard-Jones potential of the scene built in,
+    and those of all pairs follow by Lorentz-Berthelot rules, else None."""
     law = view.lennard_jones
     if law is None or not (law.cutoff == inf or view.truncation in ("plain", "switch")):
         return None
@@ -266,7 +350,10 @@ def _builtin_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray
 
 
 def _nonbonded(
-    particles: Layout, cutoff: float, charge: np.ndarray, lennard_jones: tuple[np.ndarray, np.ndarray] | None
+    particles: Layout,
+    cutoff: float,
+    charge: np.ndarray,
+    lennard_jones: tuple[np.ndarray, np.ndarray] | None,
 ) -> Any:
     """A NonbondedForce between charges (s,) of sites, and with sigma and epsilon of kinds."""
     view, rows = particles.view, np.zeros((len(particles.mass), 3))
@@ -289,7 +376,9 @@ def _nonbonded(
 def _within(force: Any, view: ForceFieldView, cutoff: float) -> Any:
     """The same force, within a cutoff (Å) unless it is infinite."""
     if cutoff < inf:
-        force.setNonbondedMethod(force.CutoffPeriodic if view.is_periodic else force.CutoffNonPeriodic)
+        force.setNonbondedMethod(
+            force.CutoffPeriodic if view.is_periodic else force.CutoffNonPeriodic
+        )
         force.setCutoffDistance(cutoff * NM)
     return force
 
@@ -307,14 +396,16 @@ def _custom(particles: Layout, cutoff: float, formula: str, name: str, of_sites:
 
 
 def _custom_lennard_jones(particles: Layout, step: bool = False) -> Any:
-    """The Lennard-Jones potential as a formula, or its step at the cutoff; linear in c12 and c6, from tables of kinds.
-    Kind 0 is for mass points without a site."""
+    """The Lennard-Jones potential as a formula, or its step at the cutoff; linear in c12 and c6,
+    from tables of kinds. Kind 0 is for mass points without a site."""
     view = particles.view
     law = not_none(view.lennard_jones)
     if step:
         formula = f"c6*{law.cutoff**-6!r}-c12*{law.cutoff**-12!r}"
     else:
-        of12, of6 = (lennard_jones_formula(law, *c, 1.0).split(";", 1) for c in ((1.0, 0.0), (0.0, 1.0)))
+        of12, of6 = (
+            lennard_jones_formula(law, *c, 1.0).split(";", 1) for c in ((1.0, 0.0), (0.0, 1.0))
+        )
         definitions = f";{of12[1]}" if len(of12) == 2 else ""
         formula = f"c12*({of12[0]})+c6*({of6[0]}){definitions}"
     formula += "; c12=table12(kind1,kind2); c6=table6(kind1,kind2)"
@@ -323,7 +414,9 @@ def _custom_lennard_jones(particles: Layout, step: bool = False) -> Any:
     c6 = 4 * view.epsilon * six / KJ_PER_MOL
     for name, table in (("table12", c6 * six), ("table6", c6)):
         padded = np.pad(table, ((1, 0), (1, 0)))
-        force.addTabulatedFunction(name, library().Discrete2DFunction(*padded.shape, padded.ravel().tolist()))
+        force.addTabulatedFunction(
+            name, library().Discrete2DFunction(*padded.shape, padded.ravel().tolist())
+        )
     return force
 
 
@@ -341,7 +434,8 @@ KICK, MOVES = "kick", "moves"
 SEEDS = 2**31 - 1
 #: Interval, in steps, of a removal of momentum that never happens.
 NEVER = 2**31 - 1
-#: Relative tolerance of constrained distances by precision, which is double on the platforms Reference and CPU.
+#: Relative tolerance of constrained distances by precision, which is double on the platforms
+#: Reference and CPU.
 TOLERANCES = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 
 
@@ -355,7 +449,9 @@ def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> An
     elif stage.thermostat_kind == "nose_hoover":
         # OpenMM has the angular frequency of a chain, a scene its period
         frequency = 2 * pi / stage.thermostat_time
-        made = mm.NoseHooverIntegrator(stage.temperatures[0], frequency, dt, stage.nose_hoover_links)
+        made = mm.NoseHooverIntegrator(
+            stage.temperatures[0], frequency, dt, stage.nose_hoover_links
+        )
     else:
         made = _velocity_verlet(dt)
     made.setConstraintTolerance(distance_tolerance)
@@ -366,8 +462,9 @@ def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> An
 def _velocity_verlet(dt: float) -> Any:
     """Velocity Verlet with constrained distances, to be stepped by `step`.
 
-    Leapfrog steps with half a kick at either end give the same positions and velocities (RATTLE; Andersen 1983, J.
-    Comput. Phys. 52, 24) without forces within a step, where OpenMM has not yet computed the virtual sites.
+    Leapfrog steps with half a kick at either end give the same positions and velocities (RATTLE;
+    Andersen 1983, J. Comput. Phys. 52, 24) without forces within a step, where OpenMM has not yet
+    computed the virtual sites.
     """
     made = library().CustomIntegrator(dt)
     made.addGlobalVariable(KICK, 1.0)
@@ -398,7 +495,8 @@ def step(integrator: Any, steps: int) -> None:
 
 
 def integration_groups(stage: Stage) -> set[int]:
-    """The force groups that move a stage: those with forces, and energies that a barostat needs in addition."""
+    """The force groups that move a stage: those with forces, and energies that a barostat needs in
+    addition."""
     groups = {Group.LENNARD_JONES, Group.COULOMB_PAIRS, Group.RECIPROCAL}
     if stage.has_barostat:
         # it compares energies; the pressure agrees with the forces if energies are continuous
@@ -407,14 +505,18 @@ def integration_groups(stage: Stage) -> set[int]:
 
 
 def extra_forces(view: ForceFieldView, k: int) -> list:
-    """The forces of stage k in addition to its integrator: a barostat, and a remover of momentum that makes OpenMM
-    subtract the degrees of freedom of the total momentum."""
+    """The forces of stage k in addition to its integrator: a barostat, and a remover of momentum
+    that makes OpenMM subtract the degrees of freedom of the total momentum."""
     mm, stage, system = library(), view.system.scene.stages[k], view.system
     found = []
-    if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int((~view.frozen).sum()):
+    if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int(
+        (~view.frozen).sum()
+    ):
         found.append(mm.CMMotionRemover(NEVER))
     if stage.has_barostat:
-        barostat = mm.MonteCarloBarostat(stage.pressures[0][0], stage.temperatures[0], stage.moves_every)
+        barostat = mm.MonteCarloBarostat(
+            stage.pressures[0][0], stage.temperatures[0], stage.moves_every
+        )
         barostat.setRandomNumberSeed(_seed(view, k) % (SEEDS - 1) + 1)
         found.append(barostat)
     return found

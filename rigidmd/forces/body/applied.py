@@ -1,4 +1,5 @@
-"""External forces on a single body: weight, buoyancy, forces from a scene, and forces from a Python function."""
+"""External forces on a single body: weight, buoyancy, forces from a scene, and forces from a Python
+function."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -20,7 +21,8 @@ class SteadyForce(NamedTuple):
 
 
 class TimeDependentForce(NamedTuple):
-    """A force at a point of the body and a torque, functions of time, along the axes of the lab or of the body."""
+    """A force at a point of the body and a torque, functions of time, along the axes of the lab or
+    of the body."""
 
     force: TimeFunction
     torque: TimeFunction
@@ -50,7 +52,8 @@ class PythonForce(NamedTuple):
 
 
 class PythonForceWorkspace(NamedTuple):
-    """Workspace of a `PythonForce`; it requests new values (NEEDS_PYTHON_FORCES) whenever positions have changed."""
+    """Workspace of a `PythonForce`; it requests new values (NEEDS_PYTHON_FORCES) whenever positions
+    have changed."""
 
     fresh: np.ndarray  # (1,) 1 if the values are those at the present positions
     force_lab: np.ndarray  # (3,)
@@ -59,7 +62,8 @@ class PythonForceWorkspace(NamedTuple):
     time_dependent = True
 
     def update(self, function: Callable[[float, State], tuple], state: State) -> None:
-        """Call a function of (time, state) for a force (3,) in the lab frame and a torque (3,) in the body frame."""
+        """Call a function of (time, state) for a force (3,) in the lab frame and a torque (3,) in
+        the body frame."""
         self.force_lab[:], self.torque_body[:] = function(float(state.time[0]), state)
         self.fresh[0] = 1
 
@@ -78,7 +82,8 @@ def _add_steady_force(term, state, load, tally):
 
 @kernel(inline=True)
 def steady_energy(term, position, rotation):
-    """-F . (X + Q point) of the body; position and rotation as in State, empty where the body has none."""
+    """-F . (X + Q point) of the body; position and rotation as in State, empty where the body has
+    none."""
     energy = 0.0
     for i in range(3):
         x = 0.0
@@ -93,7 +98,8 @@ def steady_energy(term, position, rotation):
 
 @kernel(from_python=True)
 def steady_energies(term, position, rotation):
-    """`steady_energy` at t times, (t,); position and rotation as in State, stacked along a new axis 0."""
+    """`steady_energy` at t times, (t,); position and rotation as in State, stacked along a new axis
+    0."""
     energy = np.empty(len(position))
     for t in range(len(energy)):
         energy[t] = steady_energy(term, position[t], rotation[t])

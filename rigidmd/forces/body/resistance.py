@@ -1,5 +1,6 @@
-"""Resistance: bearings, air and fluids that take energy from a single body, along and about its axes. It acts within
-the kick, by a closed form at fixed positions: see the theory chapter `bodies`."""
+"""Resistance: bearings, air and fluids that take energy from a single body, along and about its
+axes. It acts within the kick, by a closed form at fixed positions: see the theory chapter
+`bodies`."""
 
 from math import copysign, exp, expm1, log1p, sqrt
 from typing import NamedTuple
@@ -9,7 +10,13 @@ import numpy as np
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.core.state import WORK
 from rigidmd.mechanics.free_rotor import NoRotor, moments
-from rigidmd.mechanics.translation import NoTranslation, body_component, body_vector, frame_rate, inertial_mass
+from rigidmd.mechanics.translation import (
+    NoTranslation,
+    body_component,
+    body_vector,
+    frame_rate,
+    inertial_mass,
+)
 
 MAX_ITERATIONS = 100  # for |v|; about six are needed
 SPEED_TOLERANCE = 1e-14  # relative error of |v|
@@ -20,8 +27,9 @@ class NoResistance(NamedTuple):
 
 
 class Resistance(NamedTuple):
-    """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), for each body axis. v and
-    w are relative to the frame; |v| and |w| are the lengths of the vectors."""
+    """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), for
+    each body axis. v and w are relative to the frame; |v| and |w| are the lengths of the
+    vectors."""
 
     linear: np.ndarray  # (3,)
     quadratic: np.ndarray  # (3,)
@@ -32,7 +40,8 @@ class Resistance(NamedTuple):
 
 @chosen_by_type(inline=True)
 def kick_with_resistance(resistance, translation, rotor, frame, state, load, h):
-    """Change the momenta of a single body by a load and resistance for a time h at fixed positions, in place."""
+    """Change the momenta of a single body by a load and resistance for a time h at fixed positions,
+    in place."""
     flies, turns = not is_a(translation, NoTranslation), not is_a(rotor, NoRotor)
     if is_a(resistance, NoResistance):
 
@@ -42,7 +51,9 @@ def kick_with_resistance(resistance, translation, rotor, frame, state, load, h):
                     state.velocity[m, k] += h / translation.mass * load.force[m, k]
             for m in range(len(load.torque_body)):
                 for k in range(3):
-                    if moments(rotor, state.time[0], k)[0] > 0:  # an axis without inertia has no momentum
+                    if (
+                        moments(rotor, state.time[0], k)[0] > 0
+                    ):  # an axis without inertia has no momentum
                         state.angular_momentum_body[m, k] += h * load.torque_body[m, k]
 
         return kick_freely
@@ -67,10 +78,18 @@ def kick_rotation(resistance, rotor, frame, state, load, h):
     i2, h2 = moments(rotor, state.time[0], 2)
     inverse, carried = (i0, i1, i2), (h0, h1, h2)
     dragged = body_vector(q, W)
-    before = ((L[0] - h0) * i0 - dragged[0], (L[1] - h1) * i1 - dragged[1], (L[2] - h2) * i2 - dragged[2])
+    before = (
+        (L[0] - h0) * i0 - dragged[0],
+        (L[1] - h1) * i1 - dragged[1],
+        (L[2] - h2) * i2 - dragged[2],
+    )
     torque = load.torque_body[0]
     pushes = (i0 * torque[0], i1 * torque[1], i2 * torque[2])
-    dry, linear, quadratic = resistance.rotation_dry, resistance.rotation_linear, resistance.rotation_quadratic
+    dry, linear, quadratic = (
+        resistance.rotation_dry,
+        resistance.rotation_linear,
+        resistance.rotation_quadratic,
+    )
     dries = (i0 * dry[0], i1 * dry[1], i2 * dry[2])
     size = midpoint_speed(before, pushes, dries, inverse, linear, quadratic, h)
     for k in range(3):
@@ -85,9 +104,12 @@ def kick_rotation(resistance, rotor, frame, state, load, h):
 
 @kernel
 def midpoint_speed(before, pushes, dries, inverse, linear, quadratic, h):
-    """|v| at the middle of a kick with the resistance that this |v| causes; all arguments per unit inertia. The
-    computed |v| minus the assumed |v| changes sign between 0 and the largest |v| that the load can cause; regula falsi
-    (Illinois) finds the root. With a single guess a fast body would stop at the middle, or not be braked at all."""
+    """|v| at the middle of a kick with the resistance that this |v| causes.
+
+    All arguments are per unit inertia. The computed |v| minus the assumed |v| changes sign between
+    0 and the largest |v| that the load can cause; regula falsi (Illinois) finds the root. With a
+    single guess a fast body would stop at the middle, or not be braked at all.
+    """
     if quadratic[0] == 0.0 and quadratic[1] == 0.0 and quadratic[2] == 0.0:
         return 0.0
     low, high = 0.0, 0.0
@@ -101,7 +123,9 @@ def midpoint_speed(before, pushes, dries, inverse, linear, quadratic, h):
     side = 0
     for _ in range(MAX_ITERATIONS):
         size = (low * below - high * above) / (below - above)
-        found = speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, size) - size
+        found = (
+            speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, size) - size
+        )
         if abs(found) <= SPEED_TOLERANCE * size or high - low <= SPEED_TOLERANCE * high:
             return size
         if found > 0.0:
@@ -129,7 +153,8 @@ def speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, 
 
 @chosen_by_type
 def kick_translation(resistance, translation, rotor, frame, state, load, h):
-    """Change the velocity (or impulse over mass) by force and resistance; |v| is found like |w| in `kick_rotation`."""
+    """Change the velocity (or impulse over mass) by force and resistance; |v| is found like |w| in
+    `kick_rotation`."""
     turns = not is_a(rotor, NoRotor)
 
     def kick_translation(resistance, translation, rotor, frame, state, load, h):
@@ -138,13 +163,25 @@ def kick_translation(resistance, translation, rotor, frame, state, load, h):
         V = state.velocity[0]
         F = load.force[0]
         wind = (W[1] * x[2] - W[2] * x[1], W[2] * x[0] - W[0] * x[2], W[0] * x[1] - W[1] * x[0])
-        mass = (inertial_mass(translation, 0), inertial_mass(translation, 1), inertial_mass(translation, 2))
+        mass = (
+            inertial_mass(translation, 0),
+            inertial_mass(translation, 1),
+            inertial_mass(translation, 2),
+        )
         inverse = (1 / mass[0], 1 / mass[1], 1 / mass[2])
         if turns:
             q = state.rotation[0]
             v, u, f = body_vector(q, V), body_vector(q, wind), body_vector(q, F)
-            per_momentum = (translation.mass * inverse[0], translation.mass * inverse[1], translation.mass * inverse[2])
-            before = (per_momentum[0] * v[0] - u[0], per_momentum[1] * v[1] - u[1], per_momentum[2] * v[2] - u[2])
+            per_momentum = (
+                translation.mass * inverse[0],
+                translation.mass * inverse[1],
+                translation.mass * inverse[2],
+            )
+            before = (
+                per_momentum[0] * v[0] - u[0],
+                per_momentum[1] * v[1] - u[1],
+                per_momentum[2] * v[2] - u[2],
+            )
             pulls = (f[0] * inverse[0], f[1] * inverse[1], f[2] * inverse[2])
         else:
             before = (V[0] - wind[0], V[1] - wind[1], V[2] - wind[2])
@@ -152,11 +189,17 @@ def kick_translation(resistance, translation, rotor, frame, state, load, h):
         linear, quadratic = resistance.linear, resistance.quadratic
         size = midpoint_speed(before, pulls, (0.0, 0.0, 0.0), inverse, linear, quadratic, h)
         for k in range(3):
-            after, flown = resisted_motion(before[k], pulls[k], 0.0, (linear[k] + quadratic[k] * size) * inverse[k], h)
-            state.energy_ledger[WORK] += mass[k] * (0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown)
+            after, flown = resisted_motion(
+                before[k], pulls[k], 0.0, (linear[k] + quadratic[k] * size) * inverse[k], h
+            )
+            state.energy_ledger[WORK] += mass[k] * (
+                0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown
+            )
             gain = (after - before[k]) * mass[k] / translation.mass
             if turns:
-                for i in range(3):  # along axis k only, so that components along the other axes do not change
+                for i in range(
+                    3
+                ):  # along axis k only, so that components along the other axes do not change
                     V[i] += state.rotation[0, i, k] * gain
             else:
                 V[k] += gain
@@ -166,7 +209,8 @@ def kick_translation(resistance, translation, rotor, frame, state, load, h):
 
 @kernel
 def resisted_motion(speed, push, dry, linear, h):
-    """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia; dry, linear >= 0."""
+    """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia;
+    dry, linear >= 0."""
     s = abs(speed)
     sign = copysign(1.0, speed)
     if s == 0.0:
@@ -194,7 +238,8 @@ def linear_drag_motion(s, net, linear, h):
 
 @kernel(inline=True)
 def drag_integrals(linear, h):
-    """(1 - e^-x)/linear and (h - (1 - e^-x)/linear)/linear with x = linear h; h and h²/2 without resistance."""
+    """(1 - e^-x)/linear and (h - (1 - e^-x)/linear)/linear with x = linear h; h and h²/2 without
+    resistance."""
     x = linear * h
     if x < 1e-2:  # a series avoids the difference of nearly equal numbers
         return (
@@ -207,7 +252,8 @@ def drag_integrals(linear, h):
 
 @chosen_by_type
 def add_resistance(resistance, state, load, velocity, omega):
-    """Add resistance to a load, and return its power; velocity (lab), angular velocity (body) relative to the frame."""
+    """Add resistance to a load, and return its power; velocity (lab), angular velocity (body)
+    relative to the frame."""
     if is_a(resistance, NoResistance):
         return lambda resistance, state, load, velocity, omega: 0.0
 
@@ -216,7 +262,11 @@ def add_resistance(resistance, state, load, velocity, omega):
         for m in range(len(load.force)):
             size = sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
             for k in range(3):
-                v = body_component(state.rotation[m], velocity, k) if len(state.rotation) else velocity[k]
+                v = (
+                    body_component(state.rotation[m], velocity, k)
+                    if len(state.rotation)
+                    else velocity[k]
+                )
                 f = -(resistance.linear[k] + resistance.quadratic[k] * size) * v
                 power += f * v
                 if len(state.rotation):
@@ -227,7 +277,10 @@ def add_resistance(resistance, state, load, velocity, omega):
         for m in range(len(load.torque_body)):
             size = sqrt(omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2)
             for k in range(3):
-                torque = -(resistance.rotation_linear[k] + resistance.rotation_quadratic[k] * size) * omega[k]
+                torque = (
+                    -(resistance.rotation_linear[k] + resistance.rotation_quadratic[k] * size)
+                    * omega[k]
+                )
                 load.torque_body[m, k] += torque
                 power += torque * omega[k]
         return power

@@ -9,7 +9,12 @@ from scipy.special import erf
 from rigidmd.compile import implements
 from rigidmd.core.state import OK
 from rigidmd.forces import terms
-from rigidmd.forces.neighbors.sites import BodySites, CentralSites, compute_site_positions, load_molecule
+from rigidmd.forces.neighbors.sites import (
+    BodySites,
+    CentralSites,
+    compute_site_positions,
+    load_molecule,
+)
 from rigidmd.forces.neighbors.space import volume_of
 from rigidmd.forces.terms import Setup
 
@@ -28,7 +33,8 @@ def background(square: float, alpha: float) -> Background:
 
 
 class MeanDispersion(NamedTuple):
-    """The k-vector 0 of dispersion: the attraction of uniform densities, energy -pi^(3/2) beta³/(6 V) (sum of c)²."""
+    """The k-vector 0 of dispersion: the attraction of uniform densities, energy -pi^(3/2) beta³/(6
+    V) (sum of c)²."""
 
     strength: float  # energy times the volume, u Å⁵/ps²
 
@@ -43,10 +49,12 @@ def _add_background(term, state, load, tally):
 
 
 class SurfaceDipole(NamedTuple):
-    """Response of the surroundings of all images to their dipole M = sum q r: energy sum_k strength_k M_k² / V.
+    """Response of the surroundings of all images to their dipole M = sum q r: energy sum_k
+    strength_k M_k² / V.
 
-    A medium around a large sphere of boxes has the strength 2 pi/(2 eps + 1) along each axis. A slab in vacuum has 2 pi
-    along its normal (Yeh & Berkowitz 1999, J. Chem. Phys. 111, 3155, eq. 10), which leaves the field of a single slab.
+    A medium around a large sphere of boxes has the strength 2 pi/(2 eps + 1) along each axis. A
+    slab in vacuum has 2 pi along its normal (Yeh & Berkowitz 1999, J. Chem. Phys. 111, 3155, eq.
+    10), which leaves the field of a single slab.
     """
 
     strength: tuple[float, float, float]
@@ -79,7 +87,8 @@ def _add_surface_dipole(term, state, load, tally):
             term.site_force[i, k] = -2 * per_dipole_square * term.charge[i] * dipole
         energy += per_dipole_square * dipole * dipole
     if tally is not None:
-        # the virial: f (x) x of the sites at fixed volume, and the energy, which is proportional to 1/V
+        # the virial: f (x) x of the sites at fixed volume, and the energy, which is proportional to
+        # 1/V
         for k in (0, 1, 5, 9):
             tally[k] += energy
         for i in range(len(term.charge)):
@@ -93,13 +102,14 @@ def _add_surface_dipole(term, state, load, tally):
 
 
 def self_energy(charge: np.ndarray, alpha: float) -> float:
-    """Energy that removes the interaction of each charge with its own screening charge. charge (s,) in units where q²/r
-    is an energy in u Å²/ps²"""
+    """Energy that removes the interaction of each charge with its own screening charge. charge (s,)
+    in units where q²/r is an energy in u Å²/ps²"""
     return -alpha / sqrt(pi) * float(charge @ charge)
 
 
 def intramolecular_energy(charge: np.ndarray, position: np.ndarray, alpha: float) -> float:
-    """Energy that removes the pairs inside one molecule from the sum over k, a constant; position (s, 3) in Å."""
+    """Energy that removes the pairs inside one molecule from the sum over k, a constant; position
+    (s, 3) in Å."""
     i, j = np.triu_indices(len(charge), 1)
     r = np.linalg.norm(position[i] - position[j], axis=1)
     return -float(np.sum(charge[i] * charge[j] * erf(alpha * r) / r))

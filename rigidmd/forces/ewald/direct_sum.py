@@ -1,12 +1,11 @@
 """Ewald sums: charges in a periodic box with all their images, and the direct sum over k-vectors.
 
-See the theory chapter `interactions` for the six terms of the energy. They are, in its order: the pairs inside the
-cutoff, `screened_coulomb.ScreenedCoulomb`; the sum over k-vectors, `EwaldSum` or `pme.Pme`; and of `corrections`:
-`self_energy`, `intramolecular_energy`, `Background`, `SurfaceDipole`. Charges are in units where q²/r is an energy. The
-cell may have any shape.
+See the theory chapter `interactions` for the six terms of the energy. They are, in its order: the
+pairs inside the cutoff, `screened_coulomb.ScreenedCoulomb`; the sum over k-vectors, `EwaldSum` or
+`pme.Pme`; and of `corrections`: `self_energy`, `intramolecular_energy`, `Background`,
+`SurfaceDipole`. Charges are in units where q²/r is an energy. The cell may have any shape.
 """
 
-# isort: skip_file
 from math import pi
 from typing import NamedTuple
 
@@ -16,7 +15,13 @@ from rigidmd.compile import BLOCKS, Pass, kernel, load_arguments, task
 from rigidmd.compile.simd import broadcast, lane_count, lanes_of, load, store, sum_lanes
 from rigidmd.core.state import TALLY_SIZE
 from rigidmd.forces.ewald.smooth import InverseR, Smooth, slope, strength_times_square
-from rigidmd.forces.neighbors.sites import BodySites, CentralSites, load_passes, position_pass, virial_buffer
+from rigidmd.forces.neighbors.sites import (
+    BodySites,
+    CentralSites,
+    load_passes,
+    position_pass,
+    virial_buffer,
+)
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import Evaluation, Setup
 
@@ -24,7 +29,8 @@ SAME_BASIS = np.eye(3, dtype=int)  #: of a cell whose edges are those of its des
 
 
 class KVectors(NamedTuple):
-    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns along n_z; the other half are minus these."""
+    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns along n_z; the other half are
+    minus these."""
 
     column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, index of that vector in the sum
     count: np.ndarray  # (columns,) number of n_z
@@ -40,10 +46,11 @@ class KVectors(NamedTuple):
 def k_vectors_up_to(
     most: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = SAME_BASIS
 ) -> KVectors:
-    """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` if given.
+    """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` if
+    given.
 
-    basis (3, 3) : integers; the edges of this cell are `basis` times those of another cell of the same lattice, and the
-        bounds apply to n in that cell
+    basis (3, 3) : integers; the edges of this cell are `basis` times those of another cell of the
+        same lattice, and the bounds apply to n in that cell
     """
     square = np.inf if largest_square is None else largest_square
 
@@ -55,9 +62,13 @@ def k_vectors_up_to(
 
 
 def k_vectors_within(
-    reciprocal: np.ndarray, radius: float, limit: tuple[int, int, int] | None = None, basis: np.ndarray = SAME_BASIS
+    reciprocal: np.ndarray,
+    radius: float,
+    limit: tuple[int, int, int] | None = None,
+    basis: np.ndarray = SAME_BASIS,
 ) -> KVectors:
-    """All n != 0 with |k| up to `radius` (1/Å), and with |n_x|, |n_y|, |n_z| up to `limit` if given.
+    """All n != 0 with |k| up to `radius` (1/Å), and with |n_x|, |n_y|, |n_z| up to `limit` if
+    given.
 
     reciprocal (3, 3) : rows 2 pi times the reciprocal edges, 1/Å
     basis : for the limit, see `k_vectors_up_to`
@@ -67,7 +78,9 @@ def k_vectors_within(
 
     def inside(n: np.ndarray) -> np.ndarray:
         short = ((n @ reciprocal) ** 2).sum(axis=-1) <= radius**2
-        return short if limit is None else short & (np.abs(_in_other(n, basis)) <= limit).all(axis=-1)
+        return (
+            short if limit is None else short & (np.abs(_in_other(n, basis)) <= limit).all(axis=-1)
+        )
 
     return _in_columns(most if limit is None else np.minimum(most, np.abs(basis) @ limit), inside)
 
@@ -86,7 +99,9 @@ def _in_columns(most, inside) -> KVectors:
         n = np.stack(np.broadcast_arrays(x, y[:, None], z), axis=-1)
         found = inside(n) & ((x > 0) | (y[:, None] > 0) | (z > 0))
         here = np.flatnonzero(found.any(axis=1))
-        columns.append(np.stack([np.full(len(here), x), y[here], z[found[here].argmax(axis=1)]], axis=1))
+        columns.append(
+            np.stack([np.full(len(here), x), y[here], z[found[here].argmax(axis=1)]], axis=1)
+        )
         counts.append(np.count_nonzero(found[here], axis=1))
     count = np.concatenate(counts).astype(np.int64)
     ends = np.cumsum(count)
@@ -94,7 +109,9 @@ def _in_columns(most, inside) -> KVectors:
     blocks = max(1, min(BLOCKS, len(count)))
     block_ends = np.searchsorted(ends, np.linspace(0, total, blocks + 1)[1:-1])
     column = np.column_stack([np.concatenate(columns), ends - count]).astype(np.int64)
-    return KVectors(column, count, np.array([mx, my, mz]), np.array([0, *block_ends, len(count)], np.int64))
+    return KVectors(
+        column, count, np.array([mx, my, mz]), np.array([0, *block_ends, len(count)], np.int64)
+    )
 
 
 class KSpaceSums(NamedTuple):
@@ -117,7 +134,9 @@ class KSpaceSums(NamedTuple):
 
 class EwaldSum(NamedTuple):
     smooth: Smooth
-    charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²; of dispersion c, where c²/r⁶ is
+    charge: (
+        np.ndarray
+    )  # (s,) in units where q²/r is an energy in u Å²/ps²; of dispersion c, where c²/r⁶ is
     sites: BodySites | CentralSites
     k_vectors: KVectors
 
@@ -130,12 +149,20 @@ class EwaldSum(NamedTuple):
         slots = -(-s // lane_count(np.float64)) * lane_count(np.float64)
         angles = (3, int(k_vectors.most.max()) + 1, slots)
         sums = KSpaceSums(
-            cell=np.zeros((3, 3)), reciprocal=np.zeros((3, 3)), position=np.zeros((s, 3)), force=np.zeros((s, 3)),
-            charge=np.concatenate([self.charge, np.zeros(slots - s)]), cosine=np.zeros(angles), sine=np.zeros(angles),
-            strength=np.zeros(k_vectors.total // 2), real=np.zeros(k_vectors.total // 2),
-            imaginary=np.zeros(k_vectors.total // 2), force_by_component=np.zeros((3, slots)),
-            tallies=np.zeros((len(k_vectors.bounds) - 1, TALLY_SIZE)), virial=virial_buffer(),
-        )  # fmt: skip
+            cell=np.zeros((3, 3)),
+            reciprocal=np.zeros((3, 3)),
+            position=np.zeros((s, 3)),
+            force=np.zeros((s, 3)),
+            charge=np.concatenate([self.charge, np.zeros(slots - s)]),
+            cosine=np.zeros(angles),
+            sine=np.zeros(angles),
+            strength=np.zeros(k_vectors.total // 2),
+            real=np.zeros(k_vectors.total // 2),
+            imaginary=np.zeros(k_vectors.total // 2),
+            force_by_component=np.zeros((3, slots)),
+            tallies=np.zeros((len(k_vectors.bounds) - 1, TALLY_SIZE)),
+            virial=virial_buffer(),
+        )
         return EwaldWorkspace(self.smooth, self.sites, k_vectors, sums)
 
 
@@ -156,7 +183,11 @@ class EwaldWorkspace(NamedTuple):
         blocks = len(sums.tallies)
         return [
             position_pass(self.sites, into.state, sums.position),
-            Pass("strengths of k-vectors, if the cell has changed", _follow_cell, (*content, into.state)),
+            Pass(
+                "strengths of k-vectors, if the cell has changed",
+                _follow_cell,
+                (*content, into.state),
+            ),
             Pass("phases of sites", _compute_phases, content, blocks),
             Pass("structure factors", _sum_structure_factors, content, blocks),
             Pass("forces on sites", _compute_forces, content, blocks),
@@ -166,14 +197,19 @@ class EwaldWorkspace(NamedTuple):
 
 @kernel
 def invert_cell(cell, reciprocal):
-    """Write 2 pi times the reciprocal edges of a cell (3, 3) into the rows of `reciprocal`; returns the volume."""
+    """Write 2 pi times the reciprocal edges of a cell (3, 3) into the rows of `reciprocal`; returns
+    the volume."""
     volume = 0.0
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         for c in range(3):
             a, b = (c + 1) % 3, (c + 2) % 3
             reciprocal[k, c] = cell[i, a] * cell[j, b] - cell[i, b] * cell[j, a]
-        volume = cell[k, 0] * reciprocal[k, 0] + cell[k, 1] * reciprocal[k, 1] + cell[k, 2] * reciprocal[k, 2]
+        volume = (
+            cell[k, 0] * reciprocal[k, 0]
+            + cell[k, 1] * reciprocal[k, 1]
+            + cell[k, 2] * reciprocal[k, 2]
+        )
     for k in range(3):
         for c in range(3):
             reciprocal[k, c] *= 2 * pi / volume
@@ -204,7 +240,8 @@ def _set_strengths(k_vectors, sums, smooth, volume):
 
 @task(count_references=False)
 def _compute_phases(arguments, block):
-    """exp(2 pi i n x) of the sites of a block, by recurrence: one complex product for each multiple of the angle."""
+    """exp(2 pi i n x) of the sites of a block, by recurrence: one complex product for each multiple
+    of the angle."""
     _smooth, k_vectors, sums = load_arguments(arguments)
     blocks, s = len(sums.tallies), len(sums.position)
     for i in range(s * block // blocks, s * (block + 1) // blocks):
@@ -237,7 +274,8 @@ def _times(a, b):
 
 @task(count_references=False)
 def _sum_structure_factors(arguments, block):
-    """S(k) of the columns of a block, with energy and virial; then S(k) is multiplied by 2 strength for the forces."""
+    """S(k) of the columns of a block, with energy and virial; then S(k) is multiplied by 2 strength
+    for the forces."""
     smooth, k_vectors, sums = load_arguments(arguments)
     column, width = k_vectors.column, lanes_of(sums.charge)
     sums.tallies[block] = 0.0
@@ -253,7 +291,9 @@ def _sum_structure_factors(arguments, block):
                 real = broadcast(0.0, sums.charge)
                 imaginary = broadcast(0.0, sums.charge)
                 for at in range(batch, end, width):
-                    plane = _times(_phase(sums, 0, column[c, 0], at), _phase(sums, 1, column[c, 1], at))
+                    plane = _times(
+                        _phase(sums, 0, column[c, 0], at), _phase(sums, 1, column[c, 1], at)
+                    )
                     phase = _times(plane, _phase(sums, 2, column[c, 2] + n, at))
                     charge = load(sums.charge, at)
                     real = real + charge * phase[0]
@@ -270,8 +310,8 @@ def _sum_structure_factors(arguments, block):
 
 @kernel(inline=True, count_references=False)
 def add_k_vector(tally, energy, n, b, smooth):
-    """Add energy and virial (Nose & Klein 1983) of k = 2 pi n times the reciprocal edges, with the rows of b (3, 3) 2
-    pi times these."""
+    """Add energy and virial (Nose & Klein 1983) of k = 2 pi n times the reciprocal edges, with the
+    rows of b (3, 3) 2 pi times these."""
     k = (
         n[0] * b[0, 0] + n[1] * b[1, 0] + n[2] * b[2, 0],
         n[0] * b[0, 1] + n[1] * b[1, 1] + n[2] * b[2, 1],
@@ -290,7 +330,9 @@ def _compute_forces(arguments, block):
     _smooth, k_vectors, sums = load_arguments(arguments)
     column, width = k_vectors.column, lanes_of(sums.charge)
     blocks, vectors = len(sums.tallies), len(sums.charge) // width
-    for at in range(width * (vectors * block // blocks), width * (vectors * (block + 1) // blocks), width):
+    for at in range(
+        width * (vectors * block // blocks), width * (vectors * (block + 1) // blocks), width
+    ):
         zero = broadcast(0.0, sums.charge)
         fx, fy, fz = zero, zero, zero
         for c in range(len(column)):
@@ -303,9 +345,21 @@ def _compute_forces(arguments, block):
                 flat = flat + push
                 high = high + push * (z + 0.0)
             x, y = column[c, 0] + 0.0, column[c, 1] + 0.0
-            fx = fx + flat * (x * sums.reciprocal[0, 0] + y * sums.reciprocal[1, 0]) + high * sums.reciprocal[2, 0]
-            fy = fy + flat * (x * sums.reciprocal[0, 1] + y * sums.reciprocal[1, 1]) + high * sums.reciprocal[2, 1]
-            fz = fz + flat * (x * sums.reciprocal[0, 2] + y * sums.reciprocal[1, 2]) + high * sums.reciprocal[2, 2]
+            fx = (
+                fx
+                + flat * (x * sums.reciprocal[0, 0] + y * sums.reciprocal[1, 0])
+                + high * sums.reciprocal[2, 0]
+            )
+            fy = (
+                fy
+                + flat * (x * sums.reciprocal[0, 1] + y * sums.reciprocal[1, 1])
+                + high * sums.reciprocal[2, 1]
+            )
+            fz = (
+                fz
+                + flat * (x * sums.reciprocal[0, 2] + y * sums.reciprocal[1, 2])
+                + high * sums.reciprocal[2, 2]
+            )
         charge = load(sums.charge, at)
         for k, f in enumerate((charge * fx, charge * fy, charge * fz)):
             store(sums.force_by_component[k], at, f)
@@ -317,7 +371,8 @@ def _compute_forces(arguments, block):
 def ewald_sum_in_numpy(
     charge: np.ndarray, position: np.ndarray, cell: np.ndarray, alpha: float, k_vectors: KVectors
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3), in NumPy."""
+    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3), in
+    NumPy."""
     reciprocal = 2 * pi * np.linalg.inv(cell).T
     turns = position @ reciprocal.T
     energy, force, virial = 0.0, np.zeros_like(position), np.zeros((3, 3))
@@ -331,5 +386,7 @@ def ewald_sum_in_numpy(
         of = strength * np.abs(sum_lanes) ** 2
         energy += of.sum()
         force += (2 * strength * (np.conj(sum_lanes) * phase).imag) @ k
-        virial += of.sum() * np.eye(3) - np.einsum("k,ki,kj->ij", of * (2 / k2 + 1 / (2 * alpha**2)), k, k)
+        virial += of.sum() * np.eye(3) - np.einsum(
+            "k,ki,kj->ij", of * (2 / k2 + 1 / (2 * alpha**2)), k, k
+        )
     return float(energy), force, virial

@@ -1,9 +1,10 @@
-"""Dispersion by Ewald sums, forces.dispersion = "ewald" and "pme": settings, terms, constants of rigid molecules.
+"""Dispersion by Ewald sums, forces.dispersion = "ewald" and "pme": settings, terms, constants of
+rigid molecules.
 
-The pairs within the cutoff are in the Lennard-Jones potential, see `potentials.lennard_jones.ScreenedDispersion`.
+The pairs within the cutoff are in the Lennard-Jones potential, see
+`potentials.lennard_jones.ScreenedDispersion`.
 """
 
-# isort: skip_file
 from math import inf, pi, sqrt
 from typing import Any
 
@@ -11,14 +12,28 @@ import numpy as np
 
 from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
-    MAX_ALPHA_CUTOFF, Dispersing, alpha_for, charges_in, k_cutoff_for, pme_error, pme_grid_for, real_error,
-)  # fmt: skip
+    MAX_ALPHA_CUTOFF,
+    Dispersing,
+    alpha_for,
+    charges_in,
+    k_cutoff_for,
+    pme_error,
+    pme_grid_for,
+    real_error,
+)
 from rigidmd.forces.ewald.smooth import InverseR6
 from rigidmd.forces.neighbors.space import cell_of
-from rigidmd.forces.parts import Composition, Interactions, Settings, SystemParts, gather_per_molecule
+from rigidmd.forces.parts import (
+    Composition,
+    Interactions,
+    Settings,
+    SystemParts,
+    gather_per_molecule,
+)
 from rigidmd.units import KJ_PER_MOL
 
-#: Default of forces.dispersion_accuracy, with which the pairs that are left out change the pressure of water by 1 bar.
+#: Default of forces.dispersion_accuracy, with which the pairs that are left out change the pressure
+#: of water by 1 bar.
 ACCURACY = 5e-5
 MOST_K_VECTORS_IN_ALL = 2e7  #: as for charges
 
@@ -42,23 +57,35 @@ def settings(forces: Any, composition: Composition, cutoff: float | None) -> Set
     part = _error(accuracy, species, counts) * sqrt(composition.filled / 2)
     beta = float(forces.dispersion_beta_per_A or alpha_for(sites, cutoff, space.volume, part))
     numbers = {"dispersion_accuracy": accuracy, "dispersion_beta_per_A": beta}
-    unreachable = f"forces.dispersion_accuracy = {accuracy:g} cannot be reached at beta = {beta:.3g} 1/Å"
+    unreachable = (
+        f"forces.dispersion_accuracy = {accuracy:g} cannot be reached at beta = {beta:.3g} 1/Å"
+    )
     if beta * cutoff > MAX_ALPHA_CUTOFF:
-        return Settings(numbers, [f"{unreachable} with a cutoff of {cutoff:g} Å; use a longer one or a smaller beta"])
+        return Settings(
+            numbers,
+            [f"{unreachable} with a cutoff of {cutoff:g} Å; use a longer one or a smaller beta"],
+        )
     if forces.dispersion == "ewald":
         radius = k_cutoff_for(sites, beta, 2 * pi * np.linalg.inv(cell).T, part)
         if (count := radius**3 * space.volume / (6 * pi**2)) > MOST_K_VECTORS_IN_ALL:
-            return Settings(numbers, [f"{where} needs about {count:.2g} k-vectors: use pme or a lower accuracy"])
+            return Settings(
+                numbers, [f"{where} needs about {count:.2g} k-vectors: use pme or a lower accuracy"]
+            )
         return Settings(numbers, [])
     grid, order = forces.dispersion_grid, forces.dispersion_order
     is_given_cell = np.array_equal(composition.basis, direct_sum.SAME_BASIS)
     if grid is not None and len(set(grid)) > 1 and not is_given_cell:
         fault = f"the box is the equivalent cell with {composition.cell}: give three equal numbers"
-        return Settings(numbers, [f"forces.dispersion_grid = {list(grid)} refers to a cell with a large tilt; {fault}"])
+        return Settings(
+            numbers,
+            [f"forces.dispersion_grid = {list(grid)} refers to a cell with a large tilt; {fault}"],
+        )
     if grid is None or order is None:
         found = pme_grid_for(sites, beta, cell, part, order, grid)
         if found is None:
-            return Settings(numbers, [f"{unreachable} on a grid; use a lower accuracy or a longer cutoff"])
+            return Settings(
+                numbers, [f"{unreachable} on a grid; use a lower accuracy or a longer cutoff"]
+            )
         grid, order = found
         grid = grid if is_given_cell else (max(grid),) * 3
     return Settings(numbers | {"dispersion_order": order, "dispersion_grid": grid}, [])
@@ -66,13 +93,22 @@ def settings(forces: Any, composition: Composition, cutoff: float | None) -> Set
 
 def _error(accuracy: float, species: list[Any], counts: np.ndarray) -> float:
     """The error of a force (u Å/ps²) that is meant by an accuracy."""
-    found = [m.epsilon[m.epsilon > 0] / m.sigma[m.epsilon > 0] for m, n in zip(species, counts, strict=True) if n]
+    found = [
+        m.epsilon[m.epsilon > 0] / m.sigma[m.epsilon > 0]
+        for m, n in zip(species, counts, strict=True)
+        if n
+    ]
     return accuracy * 24 * float(np.concatenate(found).max())
 
 
 def interactions(parts: SystemParts) -> Interactions:
     """The sum over k-vectors, and its constants."""
-    forces, species, counts, volume = parts.scene.forces, parts.species, parts.counts, parts.space.volume
+    forces, species, counts, volume = (
+        parts.scene.forces,
+        parts.species,
+        parts.counts,
+        parts.space.volume,
+    )
     present = [np.flatnonzero(m.dispersion) for m in species]
     strengths = [m.dispersion[i] for m, i in zip(species, present, strict=True)]
     strength, sites = gather_per_molecule(strengths, parts.model.species), parts.sites(present)
@@ -81,8 +117,13 @@ def interactions(parts: SystemParts) -> Interactions:
     k_space = _error(forces.dispersion_accuracy, species, counts) * sqrt(parts.filled / 2)
     if forces.dispersion == "ewald":
         reciprocal = 2 * pi * np.linalg.inv(cell).T
-        vectors = direct_sum.k_vectors_within(reciprocal, k_cutoff_for(dispersing, beta, reciprocal, k_space))
-        term, how = direct_sum.EwaldSum(smooth, strength, sites, vectors), f"{vectors.total} k-vectors"
+        vectors = direct_sum.k_vectors_within(
+            reciprocal, k_cutoff_for(dispersing, beta, reciprocal, k_space)
+        )
+        term, how = (
+            direct_sum.EwaldSum(smooth, strength, sites, vectors),
+            f"{vectors.total} k-vectors",
+        )
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 
@@ -97,10 +138,19 @@ def interactions(parts: SystemParts) -> Interactions:
         inside -= float(n * np.sum(m.dispersion[i] * m.dispersion[j] * smooth.energy(r)))
     terms = {
         "dispersion_reciprocal": term,
-        "dispersion_mean": corrections.MeanDispersion(-(pi**1.5) * beta**3 / 6 * float(strength.sum()) ** 2),
+        "dispersion_mean": corrections.MeanDispersion(
+            -(pi**1.5) * beta**3 / 6 * float(strength.sum()) ** 2
+        ),
     }
-    constants = {"dispersion_self": beta**6 / 12 * float(strength @ strength), "dispersion_intramolecular": inside}
-    error = np.hypot(k_space, real_error(dispersing, beta, cutoff, volume)) / sqrt(parts.filled) / KJ_PER_MOL
+    constants = {
+        "dispersion_self": beta**6 / 12 * float(strength @ strength),
+        "dispersion_intramolecular": inside,
+    }
+    error = (
+        np.hypot(k_space, real_error(dispersing, beta, cutoff, volume))
+        / sqrt(parts.filled)
+        / KJ_PER_MOL
+    )
     note = (
         f"dispersion by {forces.dispersion}: beta {beta:.6g} 1/Å, {how}; "
         f"estimated rms error of its force on a site: {error:.2g} kJ/(mol Å)"

@@ -1,7 +1,8 @@
-"""Estimated errors of Ewald sums, and the settings that keep them within an accuracy: theory chapter `interactions`.
+"""Estimated errors of Ewald sums, and the settings that keep them within an accuracy: theory
+chapter `interactions`.
 
-The unit of an error, the rms over sites, is COULOMB, the force between two charges e at a distance of 1 Å; for
-dispersion it is u Å/ps².
+The unit of an error, the rms over sites, is COULOMB, the force between two charges e at a distance
+of 1 Å; for dispersion it is u Å/ps².
 """
 
 from bisect import bisect_left
@@ -16,16 +17,19 @@ from scipy.special import erfcx, gammaincc
 from rigidmd.forces.neighbors.space import Space, longest_gaps
 
 MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
-#: Along an edge in estimates: errors depend on the spacing, not on the number of points. With 16 they are good to 5 %.
+#: Along an edge in estimates: errors depend on the spacing, not on the number of points. With 16
+#: they are good to 5 %.
 MAX_PROXY_POINTS, SEARCH_PROXY_POINTS = 32, 16
-#: Shortest real-space cutoff that is tried; time of a pair within a cutoff and a margin, on the scale of the costs of
-#: grids. Measured in mixed precision with 12288 sites, cutoffs of 6 to 9 Å and accuracies of 1e-4 to 1e-5.
+#: Shortest real-space cutoff that is tried; time of a pair within a cutoff and a margin, on the
+#: scale of the costs of grids. Measured in mixed precision with 12288 sites, cutoffs of 6 to 9 Å
+#: and accuracies of 1e-4 to 1e-5.
 SHORTEST_CUTOFF, LIST_MARGIN, PAIR_NS = 5.0, 1.0, 1.0
 ORDERS = (4, 5, 6, 7, 8)
 COARSE_SPACING = 3.0  # Å, for a liquid
 SPACINGS = COARSE_SPACING * 0.98 ** np.arange(-250, 150)  # Å, from which grids are chosen
 MAX_GRID_POINTS = 2**16  # along an edge: enough for 0.1 mm
-#: Distances inside molecules that agree to FINE digits (Å) count as equal, with MANY_CHARGES those in bins of COARSE Å.
+#: Distances inside molecules that agree to FINE digits (Å) count as equal, with MANY_CHARGES those
+#: in bins of COARSE Å.
 FINE, COARSE, MANY_CHARGES = 6, 0.1, 200
 
 
@@ -34,10 +38,13 @@ class Charges(NamedTuple):
 
     count: int  # charged sites
     square: float  # sum of q², e²
-    pairs: np.ndarray  # (p, 2) q_i q_j (e²), in both orders, and distance (Å) of pairs of sites inside molecules
+    pairs: (
+        np.ndarray
+    )  # (p, 2) q_i q_j (e²), in both orders, and distance (Å) of pairs of sites inside molecules
 
     def form(self, k: np.ndarray) -> np.ndarray:
-        """Sum over molecules of |sum q exp(i k r)|², averaged over orientations, e²; k (1/Å) of any shape."""
+        """Sum over molecules of |sum q exp(i k r)|², averaged over orientations, e²; k (1/Å) of any
+        shape."""
         found = np.full(np.shape(k), self.square)
         for product, distance in self.pairs:
             found += product * np.sinc(k * distance / pi)
@@ -53,7 +60,8 @@ class Charges(NamedTuple):
         return 8 * np.exp(-(k**2) / (2 * alpha**2))
 
     def beyond(self, alpha: float, cutoff: float, volume: float) -> float:
-        """Error from the pairs beyond the cutoff (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq. 18)."""
+        """Error from the pairs beyond the cutoff (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq.
+        18)."""
         return 2 * self.square / sqrt(self.count * cutoff * volume) * exp(-((alpha * cutoff) ** 2))
 
 
@@ -76,25 +84,32 @@ class Dispersing(Charges):
 
 
 def charges_in(
-    species: list[Any], counts: np.ndarray, of: Callable[[Any], np.ndarray] = lambda m: m.charges,
+    species: list[Any],
+    counts: np.ndarray,
+    of: Callable[[Any], np.ndarray] = lambda m: m.charges,
     kind: type[Charges] = Charges,
-) -> Charges:  # fmt: skip
-    """The charges, or other strengths `of` a molecule (s,), in `counts` molecules of each species, each a
-    `scene.models.Molecule`."""
+) -> Charges:
+    """The charges, or other strengths `of` a molecule (s,), in `counts` molecules of each species,
+    each a `scene.models.Molecule`."""
     square, count, products, distances = 0.0, 0, [np.zeros(0)], [np.zeros(0)]
     for m, n in zip(species, map(int, counts), strict=True):
         charge, position = of(m)[of(m) != 0], m.positions_body[of(m) != 0]
         count += n * len(charge)
         square += n * float(charge @ charge)
         i, j = np.tril_indices(len(charge), -1)
-        product, distance = 2 * n * (charge[i] * charge[j]), np.linalg.norm(position[i] - position[j], axis=1)
+        product, distance = (
+            2 * n * (charge[i] * charge[j]),
+            np.linalg.norm(position[i] - position[j], axis=1),
+        )
         if len(charge) > MANY_CHARGES:
             bins = np.rint(distance / COARSE).astype(int)
             product, distance = np.bincount(bins, product), COARSE * np.arange(bins.max() + 1)
         products.append(product)
         distances.append(np.round(distance, FINE))
     # sums of the products over pairs of one distance, in order of appearance
-    distance, first, which = np.unique(np.concatenate(distances), return_index=True, return_inverse=True)
+    distance, first, which = np.unique(
+        np.concatenate(distances), return_index=True, return_inverse=True
+    )
     sums, order = np.zeros(len(first)), np.argsort(first)
     np.add.at(sums, which, np.concatenate(products))
     rounded = [round(d, FINE) for d in distance[order].tolist()]
@@ -120,16 +135,23 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
     return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
 
 
-def filled_fraction(species: list[Any], counts: np.ndarray, space: Space, position: np.ndarray) -> float:
-    """The part of a periodic box that contains the molecules, at most 1; 1 for charges without size. The density of
-    this part decides on the errors.
+def filled_fraction(
+    species: list[Any], counts: np.ndarray, space: Space, position: np.ndarray
+) -> float:
+    """The part of a periodic box that contains the molecules, at most 1; 1 for charges without
+    size. The density of this part decides on the errors.
 
-    It is not larger than the molecules are where they touch each other: a dilute box may contain such a cluster. Nor
-    than the part of each edge with molecules at the start, from their centres of mass `position` (n, 3): a slab.
+    It is not larger than the molecules are where they touch each other: a dilute box may contain
+    such a cluster. Nor than the part of each edge with molecules at the start, from their centres
+    of mass `position` (n, 3): a slab.
     """
-    diameters = np.array([2 * np.linalg.norm(m.positions_body, axis=1).max() + max(m.sigma) for m in species])
+    diameters = np.array(
+        [2 * np.linalg.norm(m.positions_body, axis=1).max() + max(m.sigma) for m in species]
+    )
     touching = float(counts @ diameters**3) / space.volume
-    empty = np.maximum(longest_gaps(space, position) - diameters[counts > 0].max(), 0.0) / space.edges
+    empty = (
+        np.maximum(longest_gaps(space, position) - diameters[counts > 0].max(), 0.0) / space.edges
+    )
     return min(1.0, touching, float(np.prod(1 - empty))) or 1.0
 
 
@@ -161,11 +183,16 @@ def k_cutoff_of_count(count: int, volume: float) -> float:
 
 
 def pme_error(
-    charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int,
+    charges: Charges,
+    alpha: float,
+    cell: np.ndarray,
+    grid: tuple[int, int, int],
+    order: int,
     proxy_points: int = MAX_PROXY_POINTS,
-) -> float:  # fmt: skip
-    """Error of smooth PME with the influence function G of `pme`, on a grid in a cell (3, 3), rows the edges. See the
-    theory chapter `interactions` (Hockney & Eastwood 1988, 8-22; Stern & Calkins 2008, J. Chem. Phys. 128, 214106)."""
+) -> float:
+    """Error of smooth PME with the influence function G of `pme`, on a grid in a cell (3, 3), rows
+    the edges. See the theory chapter `interactions` (Hockney & Eastwood 1988, 8-22; Stern & Calkins
+    2008, J. Chem. Phys. 128, 214106)."""
     grid = np.array(grid)
     volume = abs(np.linalg.det(cell))
     points = np.minimum(grid, proxy_points)
@@ -191,7 +218,9 @@ def pme_error(
     influence = square * g * kept / (whole * weakened)
     here = charges.form(np.sqrt(square))
     wrong = square * (g - influence * kept) ** 2 * here
-    wrong += influence**2 * (kept * here * (weakened - kept * square) + (whole - kept) * weakened * charges.square)
+    wrong += influence**2 * (
+        kept * here * (weakened - kept * square) + (whole - kept) * weakened * charges.square
+    )
     wrong[0, 0, 0] = 0.0
     twice = np.full(wrong.shape[2], 2.0)
     twice[0] = 1.0
@@ -199,11 +228,14 @@ def pme_error(
         twice[-1] = 1.0
     left = float((wrong * twice).sum()) / (volume * abs(np.linalg.det(proxy)))
     beyond = k_space_error(charges, alpha, k_cutoff_of_count(int(np.prod(grid)), volume), volume)
-    return float(np.hypot(sqrt(charges.square / charges.count * max(left, 0.0)), beyond))  # rounding can be negative
+    return float(
+        np.hypot(sqrt(charges.square / charges.count * max(left, 0.0)), beyond)
+    )  # rounding can be negative
 
 
 def fft_size(least: float) -> int:
-    """The smallest number of points, at least `least`, without prime factors above 7: fast for FFTs."""
+    """The smallest number of points, at least `least`, without prime factors above 7: fast for
+    FFTs."""
     n = max(8, int(np.ceil(least - 1e-9)))
     while True:
         left = n
@@ -216,25 +248,39 @@ def fft_size(least: float) -> int:
 
 
 def pme_grid_for(
-    charges: Charges, alpha: float, cell: np.ndarray, error: float,
-    order: int | None = None, grid: tuple[int, int, int] | None = None,
-) -> tuple[tuple[int, int, int], int] | None:  # fmt: skip
-    """The fastest grid and spline order with at most this error; None if none has. order, grid : fixed, if given"""
+    charges: Charges,
+    alpha: float,
+    cell: np.ndarray,
+    error: float,
+    order: int | None = None,
+    grid: tuple[int, int, int] | None = None,
+) -> tuple[tuple[int, int, int], int] | None:
+    """The fastest grid and spline order with at most this error; None if none has. order, grid :
+    fixed, if given"""
     return _fastest_grid(charges, alpha, cell, error, order, grid, MAX_PROXY_POINTS)[1]
 
 
 def _fastest_grid(
-    charges: Charges, alpha: float, cell: np.ndarray, error: float, order: int | None = None,
-    grid: tuple[int, int, int] | None = None, proxy_points: int = SEARCH_PROXY_POINTS,
-) -> tuple[float, tuple[tuple[int, int, int], int] | None]:  # fmt: skip
-    """Approximate time (ns) of the reciprocal part on one core with the fastest grid and order, and these; infinite and
-    None without any."""
+    charges: Charges,
+    alpha: float,
+    cell: np.ndarray,
+    error: float,
+    order: int | None = None,
+    grid: tuple[int, int, int] | None = None,
+    proxy_points: int = SEARCH_PROXY_POINTS,
+) -> tuple[float, tuple[tuple[int, int, int], int] | None]:
+    """Approximate time (ns) of the reciprocal part on one core with the fastest grid and order, and
+    these; infinite and None without any."""
     edges = np.linalg.norm(cell, axis=1)
     sensible = SPACINGS[edges.max() / SPACINGS <= MAX_GRID_POINTS]
-    grids = [tuple(fft_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]
+    grids = (
+        [tuple(fft_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]
+    )
     best, cheapest = None, inf
     for p in ORDERS if order is None else (order,):
-        k = bisect_left(grids, -error, key=lambda of, p=p: -pme_error(charges, alpha, cell, of, p, proxy_points))
+        k = bisect_left(
+            grids, -error, key=lambda of, p=p: -pme_error(charges, alpha, cell, of, p, proxy_points)
+        )
         if k < len(grids):
             # measured with 12288 sites, orders 4 to 8, grids of 32³ to 54³
             cost = charges.count * (20 + 2.4 * p**2) + 8.0 * float(np.prod(grids[k]))
@@ -245,14 +291,19 @@ def _fastest_grid(
 
 def fastest_cutoff(
     charges: Charges, cell: np.ndarray, longest: float, error: float, filled: float
-) -> float | None:  # fmt: skip
-    """The real-space cutoff (Å), at most `longest`, with which PME is fastest if real and reciprocal space each have
-    this error; None if no cutoff reaches it. filled : see `filled_fraction`"""
+) -> float | None:
+    """The real-space cutoff (Å), at most `longest`, with which PME is fastest if real and
+    reciprocal space each have this error; None if no cutoff reaches it. filled : see
+    `filled_fraction`"""
     volume, cutoffs = abs(float(np.linalg.det(cell))), np.arange(SHORTEST_CUTOFF, longest, 0.5)
 
     @cache
     def cost(k: int) -> float:
-        pairs = charges.count**2 / 2 * min(1.0, 4 / 3 * pi * (cutoffs[k] + LIST_MARGIN) ** 3 / (filled * volume))
+        pairs = (
+            charges.count**2
+            / 2
+            * min(1.0, 4 / 3 * pi * (cutoffs[k] + LIST_MARGIN) ** 3 / (filled * volume))
+        )
         alpha = alpha_for(charges, cutoffs[k], volume, error)
         return PAIR_NS * pairs + _fastest_grid(charges, alpha, cell, error)[0]
 
@@ -267,12 +318,15 @@ def fastest_cutoff(
     return None if best is None or cost(best) == inf else float(cutoffs[best])
 
 
-ALIASES = 30  # largest |m| in sums; its term is 1e-7 of the first for order 3, less for higher orders
+ALIASES = (
+    30  # largest |m| in sums; its term is 1e-7 of the first for order 3, less for higher orders
+)
 
 
 class Aliases(NamedTuple):
-    """Sums over the aliases of each Fourier component along one axis (points,), in the order of an FFT. Spreading
-    charges by B-splines (see `pme.weights`) multiplies component n of K points by sinc(n/K)^p."""
+    """Sums over the aliases of each Fourier component along one axis (points,), in the order of an
+    FFT. Spreading charges by B-splines (see `pme.weights`) multiplies component n of K points by
+    sinc(n/K)^p."""
 
     n: np.ndarray  # -K/2 < n <= K/2
     odd: np.ndarray  # n, but 0 where n and -n are the same component
@@ -290,6 +344,10 @@ def aliases(points: int, order: int) -> Aliases:
     nyquist = 2 * n == points
     first = np.where(nyquist, 0.0, (every * squared).sum(axis=1))
     return Aliases(
-        n, np.where(nyquist, 0, n), np.sinc(n / points) ** (2 * order), squared.sum(axis=1), first,
+        n,
+        np.where(nyquist, 0, n),
+        np.sinc(n / points) ** (2 * order),
+        squared.sum(axis=1),
+        first,
         (every**2 * squared).sum(axis=1),
-    )  # fmt: skip
+    )

@@ -1,6 +1,6 @@
-"""Ewald sums of a scene, electrostatics = "ewald" and "pme": settings, terms, constants of rigid molecules."""
+"""Ewald sums of a scene, electrostatics = "ewald" and "pme": settings, terms, constants of rigid
+molecules."""
 
-# isort: skip_file
 from math import inf, pi, prod, sqrt
 from typing import Any
 
@@ -10,9 +10,19 @@ from rigidmd.core.state import State
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
-    COARSE_SPACING, MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, alpha_for, charges_in, fastest_cutoff, k_cutoff_for,
-    k_cutoff_of_count, k_space_error, pme_error, pme_grid_for, real_error,
-)  # fmt: skip
+    COARSE_SPACING,
+    MAX_ALPHA_CUTOFF,
+    MAX_GRID_POINTS,
+    alpha_for,
+    charges_in,
+    fastest_cutoff,
+    k_cutoff_for,
+    k_cutoff_of_count,
+    k_space_error,
+    pme_error,
+    pme_grid_for,
+    real_error,
+)
 from rigidmd.forces.ewald.smooth import InverseR
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
@@ -20,10 +30,11 @@ from rigidmd.forces.parts import Composition, Interactions, Settings, SystemPart
 from rigidmd.forces.potentials.screened_coulomb import screened_coulomb, screening_errors
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
-#: Default of forces.ewald_accuracy: for SPC/E at 9 Å GROMACS' defaults have 9e-5 and OpenMM's 8e-5 by `errors`.
+#: Default of forces.ewald_accuracy: for SPC/E at 9 Å GROMACS' defaults have 9e-5 and OpenMM's 8e-5
+#: by `errors`.
 ACCURACY = 5e-5
-#: Longest real-space cutoff that PME chooses in a liquid, Å, and as a fraction of half an edge of the box, which may
-#: shrink. In a dilute box it is longer, as distances between molecules are.
+#: Longest real-space cutoff that PME chooses in a liquid, Å, and as a fraction of half an edge of
+#: the box, which may shrink. In a dilute box it is longer, as distances between molecules are.
 LONGEST_CUTOFF, SHRINKAGE = 14.0, 0.9
 #: Largest number of k-vectors along an edge, as for forces.ewald_k_max: more would take all memory.
 MOST_K_VECTORS = 1000
@@ -32,8 +43,9 @@ MOST_K_VECTORS_IN_ALL = 2e7  # with which a step with 1000 sites takes half a mi
 NEUTRAL = 1e-10
 #: Least empty part of the box along the normal of a slab, as a fraction of the longest edge across.
 LEAST_VACUUM = 0.5
-#: Largest error of the polynomials in single precision between unit charges, as a fraction of the real-space error.
-#: With it the measured error of PME on 4096 waters, 3.3e-5 e²/Å², is the same as with all terms of the polynomials.
+#: Largest error of the polynomials in single precision between unit charges, as a fraction of the
+#: real-space error. With it the measured error of PME on 4096 waters, 3.3e-5 e²/Å², is the same as
+#: with all terms of the polynomials.
 FIT_ERROR_FRACTION = 0.02
 
 
@@ -41,12 +53,15 @@ def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
     """Messages on keys of [forces] that this box does not allow."""
     if space.volume == inf:
         instead = "use coulomb, the sum over all pairs"
-        return [f"forces.electrostatics = {forces.electrostatics!r} needs a periodic box; {instead}"]
+        return [
+            f"forces.electrostatics = {forces.electrostatics!r} needs a periodic box; {instead}"
+        ]
     return screening_errors("ewald_alpha_per_A", forces.ewald_alpha_per_A, cutoff)
 
 
 def settings(forces: Any, composition: Composition, cutoff: float, is_external: bool) -> Settings:
-    """The keys of [forces] that follow from the accuracy. ewald_accuracy becomes None when all of them are set.
+    """The keys of [forces] that follow from the accuracy. ewald_accuracy becomes None when all of
+    them are set.
 
     cutoff : of Lennard-Jones, Å; is_external : whether another program computes the forces
     """
@@ -57,14 +72,24 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
         return Settings(numbers, [])
     accuracy = forces.ewald_accuracy or ACCURACY
     filled = composition.filled
-    part = accuracy * sqrt(filled / 2)  # of the real-space and of the reciprocal error, at the mean density
-    free = (forces.ewald_cutoff_A, forces.ewald_alpha_per_A, forces.pme_order, forces.pme_grid) == (None,) * 4
+    part = accuracy * sqrt(
+        filled / 2
+    )  # of the real-space and of the reciprocal error, at the mean density
+    free = (forces.ewald_cutoff_A, forces.ewald_alpha_per_A, forces.pme_order, forces.pme_grid) == (
+        None,
+    ) * 4
     if forces.electrostatics == "pme" and free and not is_external:
-        longest = min(LONGEST_CUTOFF * filled ** (-1 / 3), SHRINKAGE * min(composition.space.edges) / 2)
+        longest = min(
+            LONGEST_CUTOFF * filled ** (-1 / 3), SHRINKAGE * min(composition.space.edges) / 2
+        )
         cutoff = fastest_cutoff(charges, cell, longest, part, filled) or cutoff
     cutoff = numbers["ewald_cutoff_A"] = forces.ewald_cutoff_A or cutoff
-    unreachable = f"forces.ewald_accuracy = {accuracy:g}{_default(forces.ewald_accuracy)} cannot be reached"
-    alpha = float(forces.ewald_alpha_per_A or alpha_for(charges, cutoff, composition.space.volume, part))
+    unreachable = (
+        f"forces.ewald_accuracy = {accuracy:g}{_default(forces.ewald_accuracy)} cannot be reached"
+    )
+    alpha = float(
+        forces.ewald_alpha_per_A or alpha_for(charges, cutoff, composition.space.volume, part)
+    )
     if alpha * cutoff > MAX_ALPHA_CUTOFF:
         return Settings(numbers, [f"{unreachable} with a cutoff of {cutoff:g} Å; use a longer one"])
     numbers |= {"ewald_alpha_per_A": alpha, "ewald_accuracy": None}
@@ -73,10 +98,21 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
         radius = forces.ewald_k_radius_per_A
         if not forces.sets_k_vectors:
             radius = float(k_cutoff_for(charges, alpha, 2 * pi * np.linalg.inv(cell).T, part))
-        if radius is not None and forces.ewald_k_max is None and radius * longest > 2 * pi * MOST_K_VECTORS:
-            given = f"forces.ewald_k_radius_per_A = {radius:g}{_default(forces.ewald_k_radius_per_A)}"
-            return Settings(numbers, [f"{given} is more than {MOST_K_VECTORS} k-vectors along an edge of the box"])
-        if (count := _number_of_k_vectors(forces, radius, composition.space.volume)) > MOST_K_VECTORS_IN_ALL:
+        if (
+            radius is not None
+            and forces.ewald_k_max is None
+            and radius * longest > 2 * pi * MOST_K_VECTORS
+        ):
+            given = (
+                f"forces.ewald_k_radius_per_A = {radius:g}{_default(forces.ewald_k_radius_per_A)}"
+            )
+            return Settings(
+                numbers,
+                [f"{given} is more than {MOST_K_VECTORS} k-vectors along an edge of the box"],
+            )
+        if (
+            count := _number_of_k_vectors(forces, radius, composition.space.volume)
+        ) > MOST_K_VECTORS_IN_ALL:
             fault = f"needs about {count:.2g} k-vectors, more than {MOST_K_VECTORS_IN_ALL:.2g}"
             advice = "use pme, a lower accuracy, fewer k-vectors or a smaller box"
             return Settings(numbers, [f"forces.electrostatics = 'ewald' {fault}: {advice}"])
@@ -85,9 +121,9 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
     has_given_cell = np.array_equal(composition.basis, direct_sum.SAME_BASIS)
     if grid is not None and len(set(grid)) > 1 and not has_given_cell:
         fault = (
-            f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt; the box is the "
-            f"equivalent cell with {composition.cell}. Give this cell as the box, or three equal numbers, or leave "
-            "pme_grid out"
+            f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt; the"
+            f" box is the equivalent cell with {composition.cell}. Give this cell as the box, or"
+            " three equal numbers, or leave pme_grid out"
         )
         return Settings(numbers, [fault])
     if grid is None or order is None:
@@ -97,7 +133,10 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
             return Settings(numbers, [f"forces.electrostatics = 'pme': {fault}"])
         if found is None:
             given = " with the given forces.pme_order or pme_grid" if order or grid else ""
-            fault = f"{unreachable}{given} at alpha = {alpha:.3g} 1/Å; use a lower accuracy or a longer cutoff"
+            fault = (
+                f"{unreachable}{given} at alpha = {alpha:.3g} 1/Å; use a lower accuracy or a longer"
+                " cutoff"
+            )
             return Settings(numbers, [fault])
         grid, order = found
     numbers["pme_order"] = order
@@ -115,20 +154,30 @@ def _default(given: object) -> str:
 def _number_of_k_vectors(forces: Any, radius: float | None, volume: float) -> float:
     """Approximate number of k-vectors within a radius (1/Å) and the limits of [forces]."""
     most = forces.ewald_k_max
-    boxed = inf if most is None else prod(2.0 * n + 1 for n in (most if isinstance(most, tuple) else (most,) * 3))
+    boxed = (
+        inf
+        if most is None
+        else prod(2.0 * n + 1 for n in (most if isinstance(most, tuple) else (most,) * 3))
+    )
     return min(boxed, inf if radius is None else radius**3 * volume / (6 * pi**2))
 
 
 def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | None]:
-    """Errors of real space and of k-space (e²/Å², see `ewald.errors`), and the k-vectors; with PME these are only for
-    the interactions of frozen molecules, and None without any. Raises SceneError."""
+    """Errors of real space and of k-space (e²/Å², see `ewald.errors`), and the k-vectors; with PME
+    these are only for the interactions of frozen molecules, and None without any. Raises
+    SceneError."""
     forces, volume, cell = parts.scene.forces, parts.space.volume, cell_of(parts.space)
     alpha, charges = forces.ewald_alpha_per_A, charges_in(parts.species, parts.counts)
-    real, reciprocal = real_error(charges, alpha, forces.ewald_cutoff_A, volume), 2 * pi * np.linalg.inv(cell).T
+    real, reciprocal = (
+        real_error(charges, alpha, forces.ewald_cutoff_A, volume),
+        2 * pi * np.linalg.inv(cell).T,
+    )
     if parts.grid is not None:
         error, vectors = pme_error(charges, alpha, cell, parts.grid, forces.pme_order), None
         if not parts.moves[parts.model.species].all():
-            vectors = direct_sum.k_vectors_within(reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * error))
+            vectors = direct_sum.k_vectors_within(
+                reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * error)
+            )
         return real, error, vectors
     most, radius = forces.ewald_k_max, forces.ewald_k_radius_per_A
     if isinstance(most, int):
@@ -138,22 +187,38 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
     else:
         vectors = direct_sum.k_vectors_within(reciprocal, radius, most, parts.basis)
     if vectors.total == 0:
-        raise SceneError(parts.scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no k-vector"])
-    return real, k_space_error(charges, alpha, k_cutoff_of_count(vectors.total, volume), volume), vectors
+        raise SceneError(
+            parts.scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no k-vector"]
+        )
+    return (
+        real,
+        k_space_error(charges, alpha, k_cutoff_of_count(vectors.total, volume), volume),
+        vectors,
+    )
 
 
 def interactions(parts: SystemParts) -> Interactions:
     """The charges of a scene with an Ewald sum. Raises SceneError."""
-    forces, (sites, charge_e), (real, k_space, vectors) = parts.scene.forces, parts.charged(), _errors(parts)
+    forces, (sites, charge_e), (real, k_space, vectors) = (
+        parts.scene.forces,
+        parts.charged(),
+        _errors(parts),
+    )
     real, k_space = real / sqrt(parts.filled), k_space / sqrt(parts.filled)
-    alpha, cutoff, charge = forces.ewald_alpha_per_A, forces.ewald_cutoff_A, charge_e * COULOMB_CHARGE
+    alpha, cutoff, charge = (
+        forces.ewald_alpha_per_A,
+        forces.ewald_cutoff_A,
+        charge_e * COULOMB_CHARGE,
+    )
     shifted = forces.ewald_truncation == "shift"
     potential = screened_coulomb(charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * real)
     if parts.grid is None:
         assert vectors is not None  # with PME only, there may be none
         reciprocal = direct_sum.EwaldSum(InverseR(alpha), charge, sites, vectors)
         how = f"{vectors.total} k-vectors, |n| up to {' '.join(map(str, vectors.most))}"
-        if forces.ewald_k_max is not None and not np.array_equal(parts.basis, direct_sum.SAME_BASIS):
+        if forces.ewald_k_max is not None and not np.array_equal(
+            parts.basis, direct_sum.SAME_BASIS
+        ):
             how += "; they are the k-vectors that ewald_k_max means in the given cell"
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
@@ -162,19 +227,27 @@ def interactions(parts: SystemParts) -> Interactions:
         how = f"grid {' x '.join(map(str, parts.grid))}, splines of order {forces.pme_order}"
     terms = {"coulomb_real": parts.pair_forces(potential, sites), "coulomb_reciprocal": reciprocal}
     constants = {
-        # The shift applies to all charges within the cutoff of a charge, which together are nearly neutral, including
-        # the charge itself and its molecule. The pair loop leaves these out; this constant adds them.
+        # The shift applies to all charges within the cutoff of a charge, which together are nearly
+        # neutral, including the charge itself and its molecule. The pair loop leaves these out;
+        # this constant adds them.
         "coulomb_self": parts.sum_over_molecules(
-            lambda q, x: corrections.self_energy(q, alpha) - 0.5 * potential.shift * float(q.sum()) ** 2
+            lambda q, x: (
+                corrections.self_energy(q, alpha) - 0.5 * potential.shift * float(q.sum()) ** 2
+            )
         ),
-        "coulomb_intramolecular": parts.sum_over_molecules(lambda q, x: corrections.intramolecular_energy(q, x, alpha)),
+        "coulomb_intramolecular": parts.sum_over_molecules(
+            lambda q, x: corrections.intramolecular_energy(q, x, alpha)
+        ),
     }
     error = float(np.hypot(real, k_space))
     notes = [
         f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cutoff {cutoff:g} Å, {how}"
         + ("" if potential.shift == 0 else "; energies of real space shifted to 0 at the cutoff"),
-        f"estimated rms error of the force on a site: {error:.2g} e²/Å² = {error * COULOMB / KJ_PER_MOL:.2g} "
-        f"kJ/(mol Å); {real:.2g} beyond the cutoff, {k_space:.2g} in the reciprocal part",
+        (
+            f"estimated rms error of the force on a site: {error:.2g} e²/Å² ="
+            f" {error * COULOMB / KJ_PER_MOL:.2g} kJ/(mol Å); {real:.2g} beyond the cutoff,"
+            f" {k_space:.2g} in the reciprocal part"
+        ),
     ]
     frozen_sites = ~parts.moves[parts.model.species][sites.molecule]
     net, net_frozen = charge.sum(), charge[frozen_sites].sum()
@@ -182,8 +255,9 @@ def interactions(parts: SystemParts) -> Interactions:
     if not neutral:
         terms["coulomb_background"] = corrections.background(net**2 - net_frozen**2, alpha)
         notes.append(
-            f"the box has a net charge of {charge_e.sum():+.6g} e; an even background of the opposite charge "
-            "makes it neutral, and energies and pressure depend on the size of the box"
+            f"the box has a net charge of {charge_e.sum():+.6g} e; an even background of the"
+            " opposite charge makes it neutral, and energies and pressure depend on the size of"
+            " the box"
         )
     if any(strength := _surface_strength(forces)):
         key = "ewald_slab" if forces.ewald_slab else "ewald_surface_permittivity"
@@ -196,7 +270,9 @@ def interactions(parts: SystemParts) -> Interactions:
     pressure = 0.0
     if frozen_sites.any():
         assert vectors is not None  # with frozen molecules there are some
-        constants["coulomb_frozen"], pressure = _frozen_correction(parts, sites, charge * frozen_sites, vectors)
+        constants["coulomb_frozen"], pressure = _frozen_correction(
+            parts, sites, charge * frozen_sites, vectors
+        )
     return Interactions(terms, constants, pressure, None, error * COULOMB, tuple(notes))
 
 
@@ -216,7 +292,8 @@ def _surface_strength(forces: Any) -> tuple[float, float, float]:
 
 
 def _checked_slab(parts: SystemParts, sites: BodySites | CentralSites, charge: np.ndarray) -> str:
-    """A note on the vacuum around a slab. Raises SceneError where it is too thin, and for other wrong geometries."""
+    """A note on the vacuum around a slab. Raises SceneError where it is too thin, and for other
+    wrong geometries."""
     k, cell, faults = "xyz".index(parts.scene.forces.ewald_slab), cell_of(parts.space), []
     across = [i for i in range(3) if i != k]
     if cell[k, across].any() or cell[across, k].any():
@@ -227,24 +304,36 @@ def _checked_slab(parts: SystemParts, sites: BodySites | CentralSites, charge: n
     gaps = np.diff(sorted_at, append=sorted_at[0] + height)
     gap, boundary = float(gaps.max()), sorted_at[gaps.argmax()] + gaps.max() / 2
     note = (
-        f"{gap:.3g} Å along {parts.scene.forces.ewald_slab} are empty, {gap / lateral:.2g} of the longest edge across"
+        f"{gap:.3g} Å along {parts.scene.forces.ewald_slab} are empty, {gap / lateral:.2g} of the"
+        " longest edge across"
     )
     if gap < LEAST_VACUUM * lateral:
-        faults.append(f"{note}, which has to be at least {LEAST_VACUUM:g}: add vacuum, or leave ewald_slab out")
+        faults.append(
+            f"{note}, which has to be at least {LEAST_VACUUM:g}: add vacuum, or leave"
+            " ewald_slab out"
+        )
     net = np.abs(np.bincount(sites.molecule, charge)) > NEUTRAL * np.abs(charge).max()
     if len(set(np.floor((centre[np.flatnonzero(net)] - boundary) / height))) > 1:
-        faults.append("charged molecules are in different images of the slab: shift the structure until it is whole")
+        faults.append(
+            "charged molecules are in different images of the slab: shift the structure until it is"
+            " whole"
+        )
     if faults:
         raise SceneError(parts.scene.source, [f"forces.ewald_slab: {fault}" for fault in faults])
     left = np.exp(-2 * pi * gap / lateral)
-    return f"ewald_slab: {note}; of the field at the surface, images along it have at most {left:.1g}"
+    return (
+        f"ewald_slab: {note}; of the field at the surface, images along it have at most {left:.1g}"
+    )
 
 
 def _frozen_correction(
-    parts: SystemParts, sites: BodySites | CentralSites, charge: np.ndarray, vectors: direct_sum.KVectors
+    parts: SystemParts,
+    sites: BodySites | CentralSites,
+    charge: np.ndarray,
+    vectors: direct_sum.KVectors,
 ) -> tuple[float, float]:
-    """Constant energy and pressure that cancel the interactions between frozen molecules in sums over images. charge
-    (s,) is 0 for sites that move."""
+    """Constant energy and pressure that cancel the interactions between frozen molecules in sums
+    over images. charge (s,) is 0 for sites that move."""
     state, forces, volume = parts.state, parts.scene.forces, parts.space.volume
     arms = _arms(state, sites)
     position = state.position[sites.molecule] + arms

@@ -1,13 +1,15 @@
-"""Smooth particle mesh Ewald: the reciprocal part of an Ewald sum on a grid, by fast Fourier transforms.
+"""Smooth particle mesh Ewald: the reciprocal part of an Ewald sum on a grid, by fast Fourier
+transforms.
 
-    charges -> grid -> Fourier transform, times the influence function -> potential on the grid -> forces
+    charges -> grid -> Fourier transform, times the influence function -> potential on the grid ->
+    forces
 
-See the theory chapter `interactions`. The work is divided into blocks of planes, of rows of Fourier components, and of
-sites. Sites are sorted by plane, and each plane is written by one block. The number of blocks does not depend on the
-number of threads, so the result is the same bit for bit. This module needs rocket-fft; only scenes with PME import it.
+See the theory chapter `interactions`. The work is divided into blocks of planes, of rows of Fourier
+components, and of sites. Sites are sorted by plane, and each plane is written by one block. The
+number of blocks does not depend on the number of threads, so the result is the same bit for bit.
+This module needs rocket-fft; only scenes with PME import it.
 """
 
-# isort: skip_file
 from math import factorial, pi
 from typing import NamedTuple
 
@@ -32,7 +34,13 @@ from rigidmd.core.state import NOT_FINITE, TALLY_SIZE
 from rigidmd.forces.ewald.direct_sum import add_k_vector, invert_cell
 from rigidmd.forces.ewald.errors import aliases
 from rigidmd.forces.ewald.smooth import InverseR, Smooth, strength_times_square
-from rigidmd.forces.neighbors.sites import BodySites, CentralSites, load_passes, position_pass, virial_buffer
+from rigidmd.forces.neighbors.sites import (
+    BodySites,
+    CentralSites,
+    load_passes,
+    position_pass,
+    virial_buffer,
+)
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import FORCES_ONLY, TALLIED, Evaluation, Setup
 
@@ -41,16 +49,20 @@ SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, on
 
 
 def weights(order: int) -> np.ndarray:
-    """(order, order) coefficients [j, t] of u'^j in the weight of grid point floor(x) + t, u' = x - floor(x) - 1/2.
-    The cardinal B-spline M_p of an order p is a polynomial of degree p - 1 between neighbouring points, p points wide
-    and p - 2 times differentiable (Essmann et al. 1995, eq. 4.1)."""
+    """(order, order) coefficients [j, t] of u'^j in the weight of grid point floor(x) + t, u' = x -
+    floor(x) - 1/2. The cardinal B-spline M_p of an order p is a polynomial of degree p - 1 between
+    neighbouring points, p points wide and p - 2 times differentiable (Essmann et al. 1995, eq.
+    4.1)."""
     spline = BSpline.basis_element(np.arange(order + 1), extrapolate=False)
     middle = order - 0.5 - np.arange(order)
-    return np.array([spline.derivative(j)(middle) / factorial(j) if j else spline(middle) for j in range(order)])
+    return np.array(
+        [spline.derivative(j)(middle) / factorial(j) if j else spline(middle) for j in range(order)]
+    )
 
 
 class Spline(NamedTuple):
-    """Splines of one order, with weights as vectors of four numbers up to order 4, of eight up to order 8."""
+    """Splines of one order, with weights as vectors of four numbers up to order 4, of eight up to
+    order 8."""
 
     nodes: tuple[int, ...]  # 0 ... order - 1; its length is a constant at compile time
     value: np.ndarray  # (width order,) coefficients of the weights, see `weights`
@@ -58,7 +70,8 @@ class Spline(NamedTuple):
 
 
 class PmeMesh(NamedTuple):
-    """The grid and its arrays. Rows are longer than the grid, so that splines do not wrap around."""
+    """The grid and its arrays. Rows are longer than the grid, so that splines do not wrap
+    around."""
 
     points: np.ndarray  # (3,) number along a, b, c
     bounds: np.ndarray  # (3, blocks + 1) of planes, rows of Fourier components and sites
@@ -67,7 +80,9 @@ class PmeMesh(NamedTuple):
     position: np.ndarray  # (s, 3)
     force: np.ndarray  # (s, 3)
     corner: np.ndarray  # (s, 3) int32 first grid point to which a site is spread
-    offset: np.ndarray  # (s, 4) position of a site minus corner minus 1/2, in grid cells; its charge
+    offset: (
+        np.ndarray
+    )  # (s, 4) position of a site minus corner minus 1/2, in grid cells; its charge
     order: np.ndarray  # (s,) int32 sites sorted by the plane of their corner
     first: np.ndarray  # (n_a + 1,) plane p has sites order[first[p]] ... order[first[p + 1] - 1]
     grid: np.ndarray  # (n_a, n_b + order - 1, n_c + width) charges, then potential
@@ -109,15 +124,25 @@ class Pme(NamedTuple):
         spectrum_shape = (grid[0], grid[1], grid[2] // 2 + 1)
         mesh = PmeMesh(
             points=np.array(grid, np.int64),
-            bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(), cell=np.zeros((3, 3)),
-            reciprocal=np.zeros((3, 3)), position=np.zeros((s, 3)), force=np.zeros((s, 3)),
-            corner=np.zeros((s, 3), np.int32), offset=np.zeros((s, 4), kind), order=np.zeros(s, np.int32),
+            bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(),
+            cell=np.zeros((3, 3)),
+            reciprocal=np.zeros((3, 3)),
+            position=np.zeros((s, 3)),
+            force=np.zeros((s, 3)),
+            corner=np.zeros((s, 3), np.int32),
+            offset=np.zeros((s, 4), kind),
+            order=np.zeros(s, np.int32),
             first=np.zeros(grid[0] + 1, np.int64),
             grid=np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind),
-            spectrum=np.zeros(spectrum_shape, pair), influence=np.zeros(spectrum_shape, kind), alias=table,
-            axes=np.arange(3)[:, None], tallies=np.zeros((blocks, TALLY_SIZE)), virial=virial_buffer(),
-            not_finite=np.zeros(blocks, np.bool_), weight=np.zeros((blocks, 64), kind),
-        )  # fmt: skip
+            spectrum=np.zeros(spectrum_shape, pair),
+            influence=np.zeros(spectrum_shape, kind),
+            alias=table,
+            axes=np.arange(3)[:, None],
+            tallies=np.zeros((blocks, TALLY_SIZE)),
+            virial=virial_buffer(),
+            not_finite=np.zeros(blocks, np.bool_),
+            weight=np.zeros((blocks, 64), kind),
+        )
         return PmeWorkspace(self.smooth, self.charge, self.sites, spline, mesh)
 
 
@@ -142,17 +167,34 @@ class PmeWorkspace(NamedTuple):
         return self._replace(code=Code(influence=(_set_influence, self._content)))
 
     def passes(self, into: Evaluation) -> list[Pass]:
-        """Positions; the influence function, if the cell has changed; charges on the grid, and the forces."""
+        """Positions; the influence function, if the cell has changed; charges on the grid, and the
+        forces."""
         mesh, content = self.mesh, self._content
         blocks = len(mesh.tallies)
         return [
             position_pass(self.sites, into.state, mesh.position),
-            Pass("influence function, if the cell has changed", _follow_cell, (self.code, *content, into.state)),
+            Pass(
+                "influence function, if the cell has changed",
+                _follow_cell,
+                (self.code, *content, into.state),
+            ),
             Pass("positions in grid cells", _scale_positions, content, blocks),
             Pass("sort sites by plane", _sort_sites, (*content, into.status)),
             Pass("charges on the grid, transform of planes", _spread_charges, content, blocks),
-            Pass("transform across planes, times influence", _convolve, (self.smooth, mesh, None), blocks, FORCES_ONLY),
-            Pass("the same, with energy and virial", _convolve, (self.smooth, mesh, mesh.tallies), blocks, TALLIED),
+            Pass(
+                "transform across planes, times influence",
+                _convolve,
+                (self.smooth, mesh, None),
+                blocks,
+                FORCES_ONLY,
+            ),
+            Pass(
+                "the same, with energy and virial",
+                _convolve,
+                (self.smooth, mesh, mesh.tallies),
+                blocks,
+                TALLIED,
+            ),
             Pass("transform of planes to the potential", _transform_back, content, blocks),
             Pass("forces on sites", _interpolate_forces, content, blocks),
             *load_passes(self.sites, into, mesh.force, mesh),
@@ -165,19 +207,26 @@ def _follow_cell(arguments, block):
     code, smooth, charge, spline, mesh, state = load_arguments(arguments)
     if follow_cell(state.cell, mesh.cell):
         invert_cell(mesh.cell, mesh.reciprocal)
-        call_blocks(code, "influence", pack_arguments((smooth, charge, spline, mesh)), len(mesh.tallies))
+        call_blocks(
+            code, "influence", pack_arguments((smooth, charge, spline, mesh)), len(mesh.tallies)
+        )
 
 
 @task(count_references=False)
 def _set_influence(arguments, block):
-    """The influence function for a block of rows: k² g U²/(sum U² sum k² U²), with g of the kernel."""
+    """The influence function for a block of rows: k² g U²/(sum U² sum k² U²), with g of the
+    kernel."""
     smooth, _charge, _spline, mesh = load_arguments(arguments)
     b, of = mesh.reciprocal, mesh.alias
-    volume = 8 * pi**3 / abs(
-        b[0, 0] * (b[1, 1] * b[2, 2] - b[1, 2] * b[2, 1])
-        - b[0, 1] * (b[1, 0] * b[2, 2] - b[1, 2] * b[2, 0])
-        + b[0, 2] * (b[1, 0] * b[2, 1] - b[1, 1] * b[2, 0])
-    )  # fmt: skip
+    volume = (
+        8
+        * pi**3
+        / abs(
+            b[0, 0] * (b[1, 1] * b[2, 2] - b[1, 2] * b[2, 1])
+            - b[0, 1] * (b[1, 0] * b[2, 2] - b[1, 2] * b[2, 0])
+            + b[0, 2] * (b[1, 0] * b[2, 1] - b[1, 1] * b[2, 0])
+        )
+    )
     for x in range(mesh.spectrum.shape[0]):
         for y in range(mesh.bounds[1, block], mesh.bounds[1, block + 1]):
             for z in range(mesh.spectrum.shape[2]):
@@ -189,11 +238,18 @@ def _set_influence(arguments, block):
                         if d == e:
                             other, last = (d + 1) % 3, (d + 2) % 3
                             square += metric * of[d, 0, at[d]] ** 2
-                            weakened += metric * of[d, 5, at[d]] * of[other, 3, at[other]] * of[last, 3, at[last]]
+                            weakened += (
+                                metric
+                                * of[d, 5, at[d]]
+                                * of[other, 3, at[other]]
+                                * of[last, 3, at[last]]
+                            )
                         else:
                             last = 3 - d - e
                             square += metric * of[d, 1, at[d]] * of[e, 1, at[e]]
-                            weakened += metric * of[d, 4, at[d]] * of[e, 4, at[e]] * of[last, 3, at[last]]
+                            weakened += (
+                                metric * of[d, 4, at[d]] * of[e, 4, at[e]] * of[last, 3, at[last]]
+                            )
                 unaliased = of[0, 2, x] * of[1, 2, y] * of[2, 2, z]
                 whole = of[0, 3, x] * of[1, 3, y] * of[2, 3, z]
                 mesh.influence[x, y, z] = 0.0
@@ -246,7 +302,8 @@ def _sort_sites(arguments, block):
 
 @chosen_by_type(inline=True, count_references=False)
 def load_vector(spline, array, index):
-    """Numbers of an array from an index on, as a vector of four or eight, as the weights of the spline."""
+    """Numbers of an array from an index on, as a vector of four or eight, as the weights of the
+    spline."""
     if spline.types[0].count <= 4:
         return lambda spline, array, index: load_four(array, index)
     return lambda spline, array, index: load_eight(array, index)
@@ -266,8 +323,8 @@ def slopes_at(spline, offset):
 
 @kernel(inline=True, count_references=False)
 def _polynomials(spline, coefficients, powers, offset):
-    """Polynomials in `offset`, one in each lane, from coefficients (powers width,). powers : a tuple, whose length is a
-    constant at compile time, so that the loop is unrolled"""
+    """Polynomials in `offset`, one in each lane, from coefficients (powers width,). powers : a
+    tuple, whose length is a constant at compile time, so that the loop is unrolled"""
     terms = len(powers)
     width = len(coefficients) // terms
     found = load_vector(spline, coefficients, width * (terms - 1))
@@ -320,7 +377,8 @@ def _convolve(arguments, block):
 
 @kernel(inline=True, count_references=False)
 def convolve_block(smooth, mesh, tallies, block):
-    """Multiply a block of rows by the influence function; energy and virial into `tallies` unless None."""
+    """Multiply a block of rows by the influence function; energy and virial into `tallies` unless
+    None."""
     low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
     spectrum, of, b = mesh.spectrum, mesh.alias, mesh.reciprocal
     if tallies is not None:
@@ -336,7 +394,9 @@ def convolve_block(smooth, mesh, tallies, block):
                     multiplicity = 0.5 if z == 0 or 2 * z == mesh.points[2] else 1.0
                     real, imaginary = float(value.real), float(value.imag)
                     energy = multiplicity * strength * (real * real + imaginary * imaginary)
-                    add_k_vector(tallies[block], energy, (of[0, 0, x], of[1, 0, y], of[2, 0, z]), b, smooth)
+                    add_k_vector(
+                        tallies[block], energy, (of[0, 0, x], of[1, 0, y], of[2, 0, z]), b, smooth
+                    )
     c2c(spectrum[:, low:high], spectrum[:, low:high], mesh.axes[0], False, 1.0, 1)
 
 
@@ -361,7 +421,8 @@ def _transform_back(arguments, block):
 
 @task(count_references=False)
 def _interpolate_forces(arguments, block):
-    """Forces on the sites of a block: minus the gradient of the potential at each site, times its charge."""
+    """Forces on the sites of a block: minus the gradient of the potential at each site, times its
+    charge."""
     _smooth, charge, spline, mesh = load_arguments(arguments)
     na = mesh.points[0]
     order = len(spline.nodes)
@@ -395,4 +456,6 @@ def _interpolate_forces(arguments, block):
         gb = -charge[i] * mesh.points[1] * sum_lanes(along_b * z) * (0.5 / pi)
         gc = -charge[i] * mesh.points[2] * sum_lanes(along_c * dz) * (0.5 / pi)
         for k in range(3):
-            mesh.force[i, k] = ga * mesh.reciprocal[0, k] + gb * mesh.reciprocal[1, k] + gc * mesh.reciprocal[2, k]
+            mesh.force[i, k] = (
+                ga * mesh.reciprocal[0, k] + gb * mesh.reciprocal[1, k] + gc * mesh.reciprocal[2, k]
+            )

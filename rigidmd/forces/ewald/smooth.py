@@ -1,4 +1,5 @@
-"""What is summed over k-vectors: the smooth part of a pair potential, c_i c_j times a function of r for strengths c.
+"""What is summed over k-vectors: the smooth part of a pair potential, c_i c_j times a function of r
+for strengths c.
 
 The direct sum and PME are the same for each kernel, which is chosen at compile time.
 """
@@ -21,7 +22,10 @@ class InverseR(NamedTuple):
 
     def force_over_r(self, r: np.ndarray) -> np.ndarray:
         """-(du/dr)/r at r > 0."""
-        return erf(self.alpha * r) / r**3 - 2 * self.alpha / sqrt(pi) * np.exp(-((self.alpha * r) ** 2)) / r**2
+        return (
+            erf(self.alpha * r) / r**3
+            - 2 * self.alpha / sqrt(pi) * np.exp(-((self.alpha * r) ** 2)) / r**2
+        )
 
 
 class InverseR6(NamedTuple):
@@ -75,4 +79,9 @@ def _slope_of_dispersion(smooth, k2):
     if b > LARGEST_B:
         return 0.0
     fall, rest = exp(-b * b), sqrt(pi) * b * erfc(b)
-    return 3 * (fall - rest) / ((1 - 2 * b * b) * fall + 2 * b * b * rest) / (2 * smooth.alpha * smooth.alpha)
+    return (
+        3
+        * (fall - rest)
+        / ((1 - 2 * b * b) * fall + 2 * b * b * rest)
+        / (2 * smooth.alpha * smooth.alpha)
+    )

@@ -1,4 +1,5 @@
-"""A harmonic restraint of the distance between two molecules, or between the centres of mass of two groups of them."""
+"""A harmonic restraint of the distance between two molecules, or between the centres of mass of two
+groups of them."""
 
 from math import sqrt
 from typing import Any, NamedTuple
@@ -16,10 +17,12 @@ LEAST_BARRIER = 15.0
 
 
 class DistanceRestraint(NamedTuple):
-    """U = stiffness/2 (r - distance)², with r from the centre of one group to the nearest image of the other centre.
+    """U = stiffness/2 (r - distance)², with r from the centre of one group to the nearest image of
+    the other centre.
 
-    The members of a group are taken at the images nearest to its first molecule. The force on a group acts on its
-    members by their fractions of its mass, without torques, and the total momentum does not change.
+    The members of a group are taken at the images nearest to its first molecule. The force on a
+    group acts on its members by their fractions of its mass, without torques, and the total
+    momentum does not change.
     """
 
     first: np.ndarray  # (a,) int64, molecules of a group
@@ -39,8 +42,8 @@ class DistanceRestraint(NamedTuple):
 
 
 def nearest_images(vectors: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) to nearest images in a cell (3, 3), exact up to half its smallest height; unchanged if its edges
-    are infinite."""
+    """Vectors (..., 3) to nearest images in a cell (3, 3), exact up to half its smallest height;
+    unchanged if its edges are infinite."""
     found = np.array(vectors, float)
     if np.isfinite(cell[0, 0]):
         for k in (2, 1, 0):
@@ -53,7 +56,9 @@ def _centre_in(state: State, members: np.ndarray, fraction: np.ndarray) -> np.nd
     return origin + fraction @ nearest_images(state.position[members] - origin, state.cell)
 
 
-def distance_restraint(parts: SystemParts, entry: Any, where: str, faults: list[str]) -> DistanceRestraint | None:
+def distance_restraint(
+    parts: SystemParts, entry: Any, where: str, faults: list[str]
+) -> DistanceRestraint | None:
     """The term of one of fields.restraints with `between`."""
     state, n, before = parts.state, len(parts.model.species), len(faults)
     groups = [np.array(group) - 1 for group in entry.groups]
@@ -66,7 +71,9 @@ def distance_restraint(parts: SystemParts, entry: Any, where: str, faults: list[
         faults.append(f"{where} would do nothing: all its molecules are frozen")
     mass = [parts.model.mass[parts.model.species[group]] for group in groups]
     fractions = [of / of.sum() for of in mass]
-    found = DistanceRestraint(*groups, *fractions, entry.distance_A, entry.stiffness[0] * KJ_PER_MOL)
+    found = DistanceRestraint(
+        *groups, *fractions, entry.distance_A, entry.stiffness[0] * KJ_PER_MOL
+    )
     if np.isfinite(state.cell[0, 0]):
         faults += _faults_in_box(found, parts, where)
     return found if len(faults) == before else None
@@ -82,15 +89,17 @@ def _faults_in_box(term: DistanceRestraint, parts: SystemParts, where: str) -> l
     faults = []
     if barrier <= LEAST_BARRIER * BOLTZMANN * max(temperatures):
         faults.append(
-            f"{where}.distance_A = {term.distance:g}: the distance may come near half the smallest height of the box, "
-            f"{half:.6g} Å, where the nearest image changes; use a larger box or a higher stiffness_kJ_mol_A2"
+            f"{where}.distance_A = {term.distance:g}: the distance may come near half the smallest"
+            f" height of the box, {half:.6g} Å, where the nearest image changes; use a larger box"
+            " or a higher stiffness_kJ_mol_A2"
         )
     for group in (term.first, term.second):
         arms = nearest_images(parts.state.position[group] - parts.state.position[group[0]], cell)
         if (longest := float(np.linalg.norm(arms, axis=1).max())) > 0.5 * half:
             faults.append(
-                f"{where}.between: molecules of a group are {longest:.3g} Å from its first one, more than a quarter of "
-                f"the smallest height of the box ({2 * half:.3g} Å): their nearest images would change"
+                f"{where}.between: molecules of a group are {longest:.3g} Å from its first one,"
+                f" more than a quarter of the smallest height of the box ({2 * half:.3g} Å): their"
+                " nearest images would change"
             )
     return faults
 
@@ -116,7 +125,10 @@ def _centre(state, members, fraction):
     for k in range(len(members)):
         m = members[k]
         dx, dy, dz = _nearest(
-            state.cell, state.position[m, 0] - x0, state.position[m, 1] - y0, state.position[m, 2] - z0
+            state.cell,
+            state.position[m, 0] - x0,
+            state.position[m, 1] - y0,
+            state.position[m, 2] - z0,
         )
         x, y, z = x + fraction[k] * dx, y + fraction[k] * dy, z + fraction[k] * dz
     return x, y, z

@@ -1,8 +1,9 @@
-"""A uniform electric field on molecules, steady or oscillating: U = -E . M, see the theory chapter `interactions`.
+"""A uniform electric field on molecules, steady or oscillating: U = -E . M, see the theory chapter
+`interactions`.
 
-Every kick adds the work of an oscillating field, -(dE/dt) . M, over its part of the step to the energy ledger. This is
-the flow of the momentum that is conjugate to time as a coordinate, so energy less work is conserved as well as any
-Hamiltonian.
+Every kick adds the work of an oscillating field, -(dE/dt) . M, over its part of the step to the
+energy ledger. This is the flow of the momentum that is conjugate to time as a coordinate, so energy
+less work is conserved as well as any Hamiltonian.
 """
 
 from math import cos, pi, radians, sin
@@ -26,7 +27,8 @@ class ElectricField(NamedTuple):
 
     @property
     def changes_momentum(self) -> np.ndarray:
-        """Components (3,) of the total momentum that it changes: those along the field, unless the charges cancel."""
+        """Components (3,) of the total momentum that it changes: those along the field, unless the
+        charges cancel."""
         charge = self.charge[self.species]
         cancels = abs(charge.sum()) <= 1e-10 * np.abs(charge).sum()
         return np.zeros(3, bool) if cancels else self.field != 0
@@ -52,19 +54,27 @@ class OscillatingField(NamedTuple):
     tied_to_places = ElectricField.tied_to_places
 
 
-def term(parts: SystemParts, fields: Any, where: str, faults: list[str]) -> ElectricField | OscillatingField | None:
+def term(
+    parts: SystemParts, fields: Any, where: str, faults: list[str]
+) -> ElectricField | OscillatingField | None:
     """The term of fields.electric_V_per_nm."""
     if not any(fields.electric_V_per_nm):
         return None
     charge = np.where(parts.moves, [m.charge for m in parts.species], 0.0)
-    dipole = np.where(parts.moves[:, None], [m.charges @ m.positions_body for m in parts.species], 0.0)
+    dipole = np.where(
+        parts.moves[:, None], [m.charges @ m.positions_body for m in parts.species], 0.0
+    )
     present = np.unique(parts.model.species)
     if not (charge[present].any() or dipole[present].any()):
         faults.append(f"{where} would do nothing: no molecule that moves has a charge")
-    steady = ElectricField(parts.model.species, charge, dipole, np.array(fields.electric_V_per_nm) * VOLT_PER_NM)
+    steady = ElectricField(
+        parts.model.species, charge, dipole, np.array(fields.electric_V_per_nm) * VOLT_PER_NM
+    )
     if fields.electric_frequency_per_ps is None:
         return steady
-    return OscillatingField(*steady, 2 * pi * fields.electric_frequency_per_ps, radians(fields.electric_phase_deg))
+    return OscillatingField(
+        *steady, 2 * pi * fields.electric_frequency_per_ps, radians(fields.electric_phase_deg)
+    )
 
 
 @implements(add_forces, ElectricField)
@@ -113,4 +123,8 @@ def _along_moment(term, state):
 
 @implements(energy_rate, OscillatingField)
 def _rate_of_oscillating_field(term, state):
-    return term.frequency * sin(term.frequency * state.time[NOW] + term.phase) * _along_moment(term, state)
+    return (
+        term.frequency
+        * sin(term.frequency * state.time[NOW] + term.phase)
+        * _along_moment(term, state)
+    )

@@ -21,19 +21,25 @@ class PythonForces(NamedTuple):
     def workspace(self, setup: Setup) -> "PythonForcesWorkspace":
         n = self.molecules
         return PythonForcesWorkspace(
-            np.zeros(1, np.int64), np.zeros((n, 3)), np.zeros((n if self.turns else 0, 3)), np.zeros(TALLY_SIZE)
+            np.zeros(1, np.int64),
+            np.zeros((n, 3)),
+            np.zeros((n if self.turns else 0, 3)),
+            np.zeros(TALLY_SIZE),
         )
 
 
 class PythonForcesWorkspace(NamedTuple):
-    """Workspace of a `PythonForces`; it requests new values (NEEDS_PYTHON_FORCES) whenever positions have changed."""
+    """Workspace of a `PythonForces`; it requests new values (NEEDS_PYTHON_FORCES) whenever
+    positions have changed."""
 
     fresh: np.ndarray  # (1,) 1 if the values are those at the present positions
     force: np.ndarray  # (n, 3) lab, u Å/ps²
     torque_body: np.ndarray  # (n, 3), u Å²/ps²
     tally: np.ndarray  # (10,) energy and molecular virial
 
-    def update(self, function: Callable[["PythonForcesWorkspace", State], None], state: State) -> None:
+    def update(
+        self, function: Callable[["PythonForcesWorkspace", State], None], state: State
+    ) -> None:
         """Let a function write the forces at a state into this workspace."""
         function(self, state)
 

@@ -1,4 +1,5 @@
-"""Harmonic restraints of the centres of mass of some molecules to reference positions in the lab."""
+"""Harmonic restraints of the centres of mass of some molecules to reference positions in the
+lab."""
 
 from typing import Any, NamedTuple
 
@@ -13,7 +14,8 @@ from rigidmd.units import KJ_PER_MOL
 
 
 class Restraints(NamedTuple):
-    """U = sum over restrained molecules and axes of stiffness/2 (R - reference)². R is never wrapped."""
+    """U = sum over restrained molecules and axes of stiffness/2 (R - reference)². R is never
+    wrapped."""
 
     molecule: np.ndarray  # (r,) int64, each once
     reference: np.ndarray  # (r, 3) lab frame, Å
@@ -27,7 +29,9 @@ class Restraints(NamedTuple):
         return self.stiffness != 0
 
 
-def term(parts: SystemParts, entry: Any, where: str, faults: list[str]) -> "Restraints | DistanceRestraint | None":
+def term(
+    parts: SystemParts, entry: Any, where: str, faults: list[str]
+) -> "Restraints | DistanceRestraint | None":
     """The term of one of fields.restraints."""
     if entry.between is not None:
         return distance_restraint(parts, entry, where, faults)
@@ -35,11 +39,14 @@ def term(parts: SystemParts, entry: Any, where: str, faults: list[str]) -> "Rest
     name = entry.species or names[0]
     of_species = np.array([m.name == name for m in parts.species])[index]
     wrong = (
-        f" is required: there are {', '.join(names)}" if entry.species is None and len(names) > 1
-        else f": there is no {name!r}; there are {', '.join(names)}" if name not in names
-        else f": the structure file has no {name}" if not of_species.any()
+        f" is required: there are {', '.join(names)}"
+        if entry.species is None and len(names) > 1
+        else f": there is no {name!r}; there are {', '.join(names)}"
+        if name not in names
+        else f": the structure file has no {name}"
+        if not of_species.any()
         else ""
-    )  # fmt: skip
+    )
     if wrong:
         faults.append(f"{where}.species{wrong}")
         return None
@@ -49,14 +56,20 @@ def term(parts: SystemParts, entry: Any, where: str, faults: list[str]) -> "Rest
         if fault:
             faults.append(f"{where}.molecules: {fault}")
         elif not moves[mask].all():
-            faults.append(f"{where}.molecules: {numbers} includes frozen molecules, which do not move")
+            faults.append(
+                f"{where}.molecules: {numbers} includes frozen molecules, which do not move"
+            )
         restrained |= mask
     if not restrained.any():
         if entry.molecules is None:
             faults.append(f"{where} would do nothing: all {name} are frozen")
         return None
     molecule = np.flatnonzero(restrained)
-    position = parts.state.position[molecule] if entry.position_A is None else [entry.position_A] * len(molecule)
+    position = (
+        parts.state.position[molecule]
+        if entry.position_A is None
+        else [entry.position_A] * len(molecule)
+    )
     return Restraints(molecule, np.array(position, float), np.array(entry.stiffness) * KJ_PER_MOL)
 
 

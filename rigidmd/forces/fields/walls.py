@@ -1,7 +1,8 @@
-"""One or two flat walls perpendicular to an axis of the lab, which act on sites at unwrapped positions.
+"""One or two flat walls perpendicular to an axis of the lab, which act on sites at unwrapped
+positions.
 
-See the theory chapter `interactions`. The Lennard-Jones 9-3 wall is not defined on and behind the wall: a site there
-ends the evaluation with BEHIND_WALL.
+See the theory chapter `interactions`. The Lennard-Jones 9-3 wall is not defined on and behind the
+wall: a site there ends the evaluation with BEHIND_WALL.
 """
 
 from math import inf, isnan
@@ -40,7 +41,8 @@ class LennardJonesWalls(NamedTuple):
         return np.arange(3) == self.axis
 
     def behind(self, state: State) -> tuple[int, str] | None:
-        """The molecule of the site that is furthest behind a wall, or on it, and where; None if all are in front."""
+        """The molecule of the site that is furthest behind a wall, or on it, and where; None if all
+        are in front."""
         m = self.sites.molecule
         x = state.position[m, self.axis]  # of the sites
         if isinstance(self.sites, BodySites):
@@ -48,12 +50,16 @@ class LennardJonesWalls(NamedTuple):
         if not len(x):
             return None
         site, depth = max(
-            ((int(x.argmin()), self.lower - x.min()), (int(x.argmax()), x.max() - self.upper)), key=lambda end: end[1]
+            ((int(x.argmin()), self.lower - x.min()), (int(x.argmax()), x.max() - self.upper)),
+            key=lambda end: end[1],
         )
         if depth < 0:
             return None
         wall, axis = self.lower if x[site] <= self.lower else self.upper, "xyz"[self.axis]
-        return int(m[site]), f"has a site at {axis} = {x[site]:.6g} Å, behind the wall at {axis} = {wall:g} Å"
+        return (
+            int(m[site]),
+            f"has a site at {axis} = {x[site]:.6g} Å, behind the wall at {axis} = {wall:g} Å",
+        )
 
 
 class HarmonicWalls(NamedTuple):
@@ -69,8 +75,11 @@ class HarmonicWalls(NamedTuple):
     tied_to_places = True
 
 
-def term(parts: SystemParts, walls: Any, where: str, faults: list[str]) -> LennardJonesWalls | HarmonicWalls:
-    """The term of one of fields.walls. The messages on the gap between walls follow those on the last of them."""
+def term(
+    parts: SystemParts, walls: Any, where: str, faults: list[str]
+) -> LennardJonesWalls | HarmonicWalls:
+    """The term of one of fields.walls. The messages on the gap between walls follow those on the
+    last of them."""
     points, index = _acted_on(walls, parts.species, parts.moves), parts.model.species
     faults += [
         f"{where}: {m.name} has no site with Lennard-Jones parameters, and would pass the walls; "
@@ -87,7 +96,9 @@ def term(parts: SystemParts, walls: Any, where: str, faults: list[str]) -> Lenna
         found = LennardJonesWalls(*positions, walls.sigma_A, epsilon, cutoff, sites)
         if (behind := found.behind(parts.state)) is not None:
             m, reason = behind
-            faults.append(f"{where}: at the start, molecule {m + 1} ({parts.species[index[m]].name}) {reason}")
+            faults.append(
+                f"{where}: at the start, molecule {m + 1} ({parts.species[index[m]].name}) {reason}"
+            )
     if walls is parts.scene.fields.walls[-1]:
         faults += _gap_errors(parts)
     return found
@@ -95,12 +106,16 @@ def term(parts: SystemParts, walls: Any, where: str, faults: list[str]) -> Lenna
 
 def _acted_on(walls: Any, species: list[Any], moves: np.ndarray) -> list[np.ndarray]:
     """Points (k, 3) of each species on which walls act, body frame, Å; none of frozen species."""
-    offsets = [np.zeros((1, 3)) if walls.acts_on == "centres" else m.positions_body[m.epsilon > 0] for m in species]
+    offsets = [
+        np.zeros((1, 3)) if walls.acts_on == "centres" else m.positions_body[m.epsilon > 0]
+        for m in species
+    ]
     return [points if free else points[:0] for points, free in zip(offsets, moves, strict=True)]
 
 
 def _gap_errors(parts: SystemParts) -> list[str]:
-    """Messages on walls that do not fit into a periodic box, or too close to their periodic images."""
+    """Messages on walls that do not fit into a periodic box, or too close to their periodic
+    images."""
     fields, space = parts.scene.fields, parts.space
     if isinstance(space, Unbounded):
         return []
@@ -110,15 +125,18 @@ def _gap_errors(parts: SystemParts) -> list[str]:
     for axis, name in enumerate("xyz"):
         if (bounds := fields.bounds(axis)) is None:
             continue
-        protrusion = min(_protrusion(walls, parts) for walls in fields.walls if walls.direction == axis)
+        protrusion = min(
+            _protrusion(walls, parts) for walls in fields.walls if walls.direction == axis
+        )
         width, edge = bounds[1] - bounds[0], space.edges[axis]
         least = width + 2 * protrusion + cutoff
         if edge < least:
             sites = f", {2 * protrusion:.3g} Å by which sites may protrude," if protrusion else ""
             faults.append(
-                f"fields.walls: along {name} the box is {edge:g} Å, and must be {least:.6g} Å at least: {width:g} Å "
-                f"between the walls{sites} and the cutoff of {cutoff:g} Å, so that molecules at one wall do not "
-                "interact with periodic images of molecules at the other"
+                f"fields.walls: along {name} the box is {edge:g} Å, and must be {least:.6g} Å at"
+                f" least: {width:g} Å between the walls{sites} and the cutoff of {cutoff:g} Å, so"
+                " that molecules at one wall do not interact with periodic images of molecules at"
+                " the other"
             )
     return faults
 
@@ -135,7 +153,8 @@ def _protrusion(walls: Any, parts: SystemParts) -> float:
 
 
 def range_of_centres(walls: Any, species: list[Any]) -> tuple[float, float]:
-    """Range (lower, upper) of centres of mass that is free for every orientation between walls, Å."""
+    """Range (lower, upper) of centres of mass that is free for every orientation between walls,
+    Å."""
     points = np.concatenate(_acted_on(walls, species, np.ones(len(species), bool)))
     margin = float(np.linalg.norm(points, axis=1).max(initial=0.0))
     margin += WELL * walls.sigma_A if walls.kind == "lj93" else 0.0
@@ -144,7 +163,8 @@ def range_of_centres(walls: Any, species: list[Any]) -> tuple[float, float]:
 
 @chosen_by_type(inline=True)
 def add_site_force(sites, state, load, m, i, axis, force):
-    """Add a force along a lab axis on site i of molecule m to the force and torque on the molecule."""
+    """Add a force along a lab axis on site i of molecule m to the force and torque on the
+    molecule."""
     if is_a(sites, CentralSites):
 
         def push_centre(sites, state, load, m, i, axis, force):

@@ -1,12 +1,13 @@
-"""Sites sorted in space into clusters as large as a vector, so that pair loops load neighbours with one instruction.
+"""Sites sorted in space into clusters as large as a vector, so that pair loops load neighbours with
+one instruction.
 
-A slot is a position in that order. Coordinates are stored relative to the origin of their cluster, so that float32 is
-accurate enough: 2e-7 Å for sites within reach of one another. Arrays of positions and forces hold x, y, z of a cluster
-as three consecutive vectors; slot k of cluster c has its x at `3 * width * c + k`. Tasks have the arguments (pairs,
-sites, state) with a `lists.PairList`, or `pairs` alone.
+A slot is a position in that order. Coordinates are stored relative to the origin of their cluster,
+so that float32 is accurate enough: 2e-7 Å for sites within reach of one another. Arrays of
+positions and forces hold x, y, z of a cluster as three consecutive vectors; slot k of cluster c has
+its x at `3 * width * c + k`. Tasks have the arguments (pairs, sites, state) with a
+`lists.PairList`, or `pairs` alone.
 """
 
-# isort: skip_file
 from math import ceil, floor, inf, nan
 from typing import NamedTuple
 
@@ -14,50 +15,81 @@ import numpy as np
 
 from rigidmd.compile import BLOCKS, MOST_BLOCKS, kernel, load_arguments, task
 from rigidmd.compile.simd import (
-    lane_count, lanes_of, largest_lane, load, load_scalar, mask_bits, square_root, store, zeros,
-)  # fmt: skip
+    lane_count,
+    lanes_of,
+    largest_lane,
+    load,
+    load_scalar,
+    mask_bits,
+    square_root,
+    store,
+    zeros,
+)
 from rigidmd.forces.neighbors.sites import index_of_x, locate_site, predict_site
 
 BUILT, LEAD_TIME = 0, 1  # columns of PairList.times
 MAX_SERIAL_SITES = 128  # in one block
-MAX_DISTANCE = 1e9  # in list radii from the origin, which are no longer than a box: 32 bits can count the boxes
+#: in list radii from the origin, which are no longer than a box: 32 bits can count the boxes
+MAX_DISTANCE = 1e9
 
 
 class Clusters(NamedTuple):
-    """The sites of one potential in clusters; the last cluster is padded with copies of the last site."""
+    """The sites of one potential in clusters; the last cluster is padded with copies of the last
+    site."""
 
     bounds: np.ndarray  # (blocks + 1,) block b has clusters bounds[b] ... bounds[b + 1] - 1
     slot: np.ndarray  # (s,) int32 the slot of each site
     boxes: np.ndarray  # (s, 3) int32 number of edges by which a site is shifted into the brick
     origin: np.ndarray  # (4 clusters,) x, y, z, 0 of each cluster, in the box, Å
-    local: np.ndarray  # (3 slots,) positions relative to the origins, Å; scratch while sites are sorted
-    scratch: np.ndarray  # (3 slots,) memory of the next three, which are used only while a list is built
+    local: (
+        np.ndarray
+    )  # (3 slots,) positions relative to the origins, Å; scratch while sites are sorted
+    scratch: (
+        np.ndarray
+    )  # (3 slots,) memory of the next three, which are used only while a list is built
     order: np.ndarray  # (slots,) int32 the site in each slot
     group: np.ndarray  # (slots,) int32 group of the site in each slot
     half_square: np.ndarray  # (slots,) half the squares of `reference` as vectors, Å²
     reference: np.ndarray  # (3 slots,) the positions for which the sites were sorted, as `local`
     moved: np.ndarray  # (slots,) distance of each site from there, Å
-    largest_displacement: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
-    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a block of molecules, Å
+    largest_displacement: (
+        np.ndarray
+    )  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
+    extent: (
+        np.ndarray
+    )  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a block of molecules, Å
 
 
 def clusters_of(sites: int, dtype: type) -> Clusters:
     """Arrays for the clusters of `sites` sites, with positions of a NumPy dtype."""
     width = lane_count(dtype)
     count = max(1, ceil(sites / width))
-    # Each block has sums for the clusters that its rows reach, a layer of the box about as thick as the cutoff. The
-    # number of blocks grows like the edge of the box, so that the memory for the sums is proportional to the sites.
-    blocks = min(max(BLOCKS, min(MOST_BLOCKS, int(0.2 * np.cbrt(sites)))), count) if sites > MAX_SERIAL_SITES else 1
+    # Each block has sums for the clusters that its rows reach, a layer of the box about as thick as
+    # the cutoff. The number of blocks grows like the edge of the box, so that the memory for the
+    # sums is proportional to the sites.
+    blocks = (
+        min(max(BLOCKS, min(MOST_BLOCKS, int(0.2 * np.cbrt(sites)))), count)
+        if sites > MAX_SERIAL_SITES
+        else 1
+    )
     slots = count * width
     scratch = zeros(3 * slots, dtype)
     half_square, order, group = scratch.reshape(3, slots)
     return Clusters(
-        bounds=np.linspace(0, count, blocks + 1).astype(np.int64), slot=np.zeros(sites, np.int32),
-        boxes=np.zeros((sites, 3), np.int32), origin=zeros(4 * count, np.float64), local=zeros(3 * slots, dtype),
-        scratch=scratch, order=order.view(np.int32)[:slots], group=group.view(np.int32)[:slots],
-        half_square=half_square, reference=zeros(3 * slots, dtype), moved=zeros(slots, dtype),
-        extent=np.zeros((blocks, 6)), largest_displacement=np.zeros(blocks),
-    )  # fmt: skip
+        bounds=np.linspace(0, count, blocks + 1).astype(np.int64),
+        slot=np.zeros(sites, np.int32),
+        boxes=np.zeros((sites, 3), np.int32),
+        origin=zeros(4 * count, np.float64),
+        local=zeros(3 * slots, dtype),
+        scratch=scratch,
+        order=order.view(np.int32)[:slots],
+        group=group.view(np.int32)[:slots],
+        half_square=half_square,
+        reference=zeros(3 * slots, dtype),
+        moved=zeros(slots, dtype),
+        extent=np.zeros((blocks, 6)),
+        largest_displacement=np.zeros(blocks),
+    )
 
 
 def order_of(clusters: Clusters) -> np.ndarray:
@@ -77,11 +109,13 @@ def _molecules_of_block(sites, blocks, block):
 
 @task(count_references=False)
 def wrap_sites(arguments, block):
-    """Write positions in the brick of the sites of a block of molecules into `local`, for `bin_sites`.
+    """Write positions in the brick of the sites of a block of molecules into `local`, for
+    `bin_sites`.
 
-    The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space like the cell. The
-    positions are predicted for the lead time of the list, see `predict_site`. `extent` gets their extent, or NaN if a
-    coordinate is farther from the origin than MAX_DISTANCE, or is not finite.
+    The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space
+    like the cell. The positions are predicted for the lead time of the list, see `predict_site`.
+    `extent` gets their extent, or NaN if a coordinate is farther from the origin than MAX_DISTANCE,
+    or is not finite.
     """
     pairs, sites, state = load_arguments(arguments)
     clusters, cell, lead = pairs.clusters, pairs.cell, pairs.times[LEAD_TIME]
@@ -106,9 +140,9 @@ def wrap_sites(arguments, block):
 
 @task(count_references=False)
 def bin_sites(arguments, block):
-    """Write the bins of the sites of a block of molecules, and heights within bins, into `slot` and `moved`. Bins form
-    columns along z, as wide as a cluster. They run up one column and down the next, so that a cluster that begins in
-    one column and ends in the next is compact too."""
+    """Write the bins of the sites of a block of molecules, and heights within bins, into `slot` and
+    `moved`. Bins form columns along z, as wide as a cluster. They run up one column and down the
+    next, so that a cluster that begins in one column and ends in the next is compact too."""
     pairs, sites, _ = load_arguments(arguments)
     clusters = pairs.clusters
     low, extent, (nx, ny, nz) = _bins(clusters)
@@ -127,7 +161,8 @@ def bin_sites(arguments, block):
 
 @kernel
 def sort_into_clusters(clusters):
-    """Sort sites by bin and height; `set_origins` must follow. False if the extent is not finite."""
+    """Sort sites by bin and height; `set_origins` must follow. False if the extent is not
+    finite."""
     s = len(clusters.slot)
     _, extent, (nx, ny, nz) = _bins(clusters)
     if not extent[0] >= 0:
@@ -156,8 +191,8 @@ def sort_into_clusters(clusters):
 
 @kernel(inline=True)
 def _bins(clusters):
-    """Lowest corner of all sites in the brick, their extents, and the number of bins along each axis. The first extent
-    is NaN if there is none."""
+    """Lowest corner of all sites in the brick, their extents, and the number of bins along each
+    axis. The first extent is NaN if there is none."""
     low, high = (inf, inf, inf), (-inf, -inf, -inf)
     lost = False
     for block in range(len(clusters.extent)):
@@ -189,7 +224,8 @@ def _count_boxes(boxes, cell, i, at):
 
 @kernel(inline=True)
 def _in_brick(boxes, cell, i, at):
-    """Position of site i, at (x, y, z), with the shift into the brick of when sites were sorted, Å."""
+    """Position of site i, at (x, y, z), with the shift into the brick of when sites were sorted,
+    Å."""
     x, y, z = at
     back = boxes[np.uint64(i)]
     a, b, c = back[0], back[1], back[2]
@@ -209,14 +245,18 @@ def _bin(x, extent, count):
 
 @task(count_references=False)
 def set_origins(arguments, block):
-    """Set origins and references of newly sorted clusters; the origin is the centre of the bounding box."""
+    """Set origins and references of newly sorted clusters; the origin is the centre of the bounding
+    box."""
     pairs, sites, state = load_arguments(arguments)
     clusters, cell, lead = pairs.clusters, pairs.cell, pairs.times[LEAD_TIME]
     width = lanes_of(clusters.local)
     order, origin, reference = clusters.order, clusters.origin, clusters.reference
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         base = _ahead_in_brick(clusters, cell, sites, state, order[width * c], lead)
-        low, high = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)  # relative to the first site, so that float32 is accurate
+        low, high = (
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, 0.0),
+        )  # relative to the first site, so that float32 is accurate
         for slot in range(width * c, width * (c + 1)):
             at = _ahead_in_brick(clusters, cell, sites, state, order[slot], lead)
             x, y, z = at[0] - base[0], at[1] - base[1], at[2] - base[2]
@@ -248,13 +288,15 @@ def _ahead_in_brick(clusters, cell, sites, state, i, lead):
 @kernel(inline=True)
 def _ahead(sites, state, m, i, lead):
     """`predict_site`; for lead = 0 the present position, which does not need finite velocities."""
-    return predict_site(sites, state, m, i, lead) if lead != 0.0 else locate_site(sites, state, m, i)
+    return (
+        predict_site(sites, state, m, i, lead) if lead != 0.0 else locate_site(sites, state, m, i)
+    )
 
 
 @kernel(inline=True)
 def _pair_up(order, at, width, first, end):
-    """Reorder slots first ... end - 1 of a cluster so that the two sites of each row are near one another. `at` has
-    their positions and is reordered with them."""
+    """Reorder slots first ... end - 1 of a cluster so that the two sites of each row are near one
+    another. `at` has their positions and is reordered with them."""
     vectors = 2 * (first // width) * width
     for a in range(first, end - 2, 2):
         nearest, nearest2 = a + 1, inf
@@ -275,13 +317,16 @@ def restore_half_squares(clusters):
     width = lanes_of(clusters.local)
     for slot in range(len(clusters.order)):
         clusters.half_square[slot] = 0.0
-        for n in range(3 * width * (slot // width) + slot % width, 3 * width * (slot // width + 1), width):
+        for n in range(
+            3 * width * (slot // width) + slot % width, 3 * width * (slot // width + 1), width
+        ):
             clusters.half_square[slot] += 0.5 * clusters.reference[n] ** 2
 
 
 @task(count_references=False)
 def set_local(arguments, block):
-    """Set `local` of the sites of a block of molecules to the present positions; padding stays at its reference."""
+    """Set `local` of the sites of a block of molecules to the present positions; padding stays at
+    its reference."""
     pairs, sites, state = load_arguments(arguments)
     clusters, cell = pairs.clusters, pairs.cell
     width = lanes_of(clusters.local)
@@ -304,7 +349,8 @@ def set_local(arguments, block):
 
 @task(count_references=False)
 def measure_displacements(arguments, block):
-    """Set `moved`, and `largest_displacement` of a block, infinite if a displacement exceeds half the skin."""
+    """Set `moved`, and `largest_displacement` of a block, infinite if a displacement exceeds half
+    the skin."""
     pairs = load_arguments(arguments)
     clusters, limit = pairs.clusters, 0.5 * (pairs.skin - pairs.slack[0])
     width = lanes_of(clusters.local)

@@ -1,9 +1,11 @@
-"""Neighbour lists: for each row of sites of one potential, the clusters that may have a site within the cutoff.
+"""Neighbour lists: for each row of sites of one potential, the clusters that may have a site within
+the cutoff.
 
-A row is two sites near one another, so that what is loaded of a cluster serves both. The rows of a cluster have almost
-the same neighbours: these are listed once, with the vectors between origins, and an entry of a row is an index in that
-list. The clusters of each row are sorted into shells by distance; the displacements of the sites determine how many
-shells can matter. See the theory chapter `interactions` for when a list is valid.
+A row is two sites near one another, so that what is loaded of a cluster serves both. The rows of a
+cluster have almost the same neighbours: these are listed once, with the vectors between origins,
+and an entry of a row is an index in that list. The clusters of each row are sorted into shells by
+distance; the displacements of the sites determine how many shells can matter. See the theory
+chapter `interactions` for when a list is valid.
 
 This module has the list and how it is read; `update` decides when it is rebuilt, `rows` fills it.
 """
@@ -29,7 +31,8 @@ MAX_BEYOND = 2**8 - 1
 LONGEST_SKIN = 0.45  # of the smallest edge
 ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
 
-# Columns of PairList.needed and PairList.counters. WINDOW: number of clusters behind the block that its rows reach.
+# Columns of PairList.needed and PairList.counters. WINDOW: number of clusters behind the block that
+# its rows reach.
 ENTRIES, MASKED, NEIGHBORS, WINDOW, NEIGHBORS_OF_ONE = 0, 1, 2, 3, 4
 USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
 
@@ -37,9 +40,10 @@ USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
 class PairList(NamedTuple):
     """Rows of clusters for the sites of one potential.
 
-    Cluster c of block b has the neighbours neighbors[b, first:end] with end = neighbor_end[c], first =
-    neighbor_end[c - 1], or 0 for the first cluster of a block. A neighbour is an image of a cluster, stored as the
-    integer IMAGES * cluster + image number; `shift` has its displacement. An entry of a row is an index in these.
+    Cluster c of block b has the neighbours neighbors[b, first:end] with end = neighbor_end[c],
+    first = neighbor_end[c - 1], or 0 for the first cluster of a block. A neighbour is an image of a
+    cluster, stored as the integer IMAGES * cluster + image number; `shift` has its displacement. An
+    entry of a row is an index in these.
     """
 
     cutoff: float  # Å
@@ -54,17 +58,31 @@ class PairList(NamedTuple):
     multiple: np.ndarray  # (IMAGES, 3) int32 edges a, b, c by which each image is displaced
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
     slack: np.ndarray  # (1,) the largest displacement of an image since the list was built, Å
-    row_end: np.ndarray  # (rows,) int32 end in entries[b] of row r (slots 2 r and 2 r + 1); row r + 1 begins there
-    beyond: np.ndarray  # (rows, SHELLS) uint8 number of entries at the end of a row that are beyond shell k
+    row_end: (
+        np.ndarray
+    )  # (rows,) int32 end in entries[b] of row r (slots 2 r and 2 r + 1); row r + 1 begins there
+    beyond: (
+        np.ndarray
+    )  # (rows, SHELLS) uint8 number of entries at the end of a row that are beyond shell k
     entries: np.ndarray  # (blocks, capacity) uint16
     masked_end: np.ndarray  # (rows,) int32 end of each row in masked[b]
-    masked: np.ndarray  # (blocks, capacity, 2) int32 entry; lanes that interact with each site, MASK_BITS bits each
+    masked: (
+        np.ndarray
+    )  # (blocks, capacity, 2) int32 entry; lanes that interact with each site, MASK_BITS bits each
     neighbor_end: np.ndarray  # (clusters,) int32
     neighbors: np.ndarray  # (blocks, capacity) int32
-    origin_vector: np.ndarray  # (blocks, 3 capacity) to the origin of c from a neighbour, Å; (blocks, 0) in float64
-    needed: np.ndarray  # (blocks, 5) capacity expected or needed: ENTRIES, MASKED, ... NEIGHBORS_OF_ONE
-    counters: np.ndarray  # (4,) valid (0 or 1), number of builds, status of the last update, number of images
-    times: np.ndarray  # (2,) time of the build, NaN before the first; lead time of the references; ps
+    origin_vector: (
+        np.ndarray
+    )  # (blocks, 3 capacity) to the origin of c from a neighbour, Å; (blocks, 0) in float64
+    needed: (
+        np.ndarray
+    )  # (blocks, 5) capacity expected or needed: ENTRIES, MASKED, ... NEIGHBORS_OF_ONE
+    counters: (
+        np.ndarray
+    )  # (4,) valid (0 or 1), number of builds, status of the last update, number of images
+    times: (
+        np.ndarray
+    )  # (2,) time of the build, NaN before the first; lead time of the references; ps
 
 
 @kernel(inline=True)
@@ -81,53 +99,75 @@ def image_number(image):
 
 @kernel(inline=True)
 def behind_block(bounds, block, cluster):
-    """Number of clusters on the ring from the end of a block to a cluster; -1 for a cluster of the block."""
+    """Number of clusters on the ring from the end of a block to a cluster; -1 for a cluster of the
+    block."""
     first, end = bounds[block], bounds[block + 1]
     if first <= cluster < end:
         return -1
     return cluster - end + (bounds[len(bounds) - 1] if cluster < end else 0)
 
 
-def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
-    """A list that is built at its first use, with the capacity that evenly distributed sites need. cell : (3, 3). reach
-    : largest distance between sites of one group, Å; infinite if it is not known"""
+def empty_list(
+    cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type
+) -> PairList:
+    """A list that is built at its first use, with the capacity that evenly distributed sites need.
+    cell : (3, 3). reach : largest distance between sites of one group, Å; infinite if it is not
+    known"""
     clusters = clusters_of(len(group), dtype)
     blocks, slots = len(clusters.largest_displacement), len(clusters.order)
     rows = slots // 2
     count = len(clusters.origin) // 4
     most_rows = rows // count * int(np.diff(clusters.bounds).max())  # of a block
     capacity = ceil(_expected_neighbors(cell, count, cutoff + skin, 1.0) * most_rows)
-    neighbors = ceil(_expected_neighbors(cell, count, cutoff + skin, 1.75) * most_rows * count / rows)
+    neighbors = ceil(
+        _expected_neighbors(cell, count, cutoff + skin, 1.75) * most_rows * count / rows
+    )
     needed = np.zeros((blocks, 5), np.int64)
     needed[:, WINDOW] = _expected_window(cell, count, blocks, cutoff + skin)
     skin = _fitting_skin(cell, cutoff, skin)
     # masked entries per row, measured: argon 1.1, water 1.5
     return PairList(
-        cutoff=cutoff, skin=skin, shells_per_A=(SHELLS - 1) / skin, reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
-        group=group, cell=cell.copy(), built=cell.copy(), clusters=clusters, tree=empty_tree(count),
-        multiple=np.zeros((IMAGES, 3), np.int32), shift=zeros(4 * IMAGES, np.float64), slack=np.zeros(1),
-        row_end=np.zeros(rows, np.int32), beyond=np.zeros((rows, SHELLS), np.uint8),
-        entries=np.empty((blocks, capacity), np.uint16), masked_end=np.zeros(rows, np.int32),
-        masked=np.empty((blocks, ceil(1.5 * most_rows), 2), np.int32), neighbor_end=np.zeros(count, np.int32),
+        cutoff=cutoff,
+        skin=skin,
+        shells_per_A=(SHELLS - 1) / skin,
+        reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
+        group=group,
+        cell=cell.copy(),
+        built=cell.copy(),
+        clusters=clusters,
+        tree=empty_tree(count),
+        multiple=np.zeros((IMAGES, 3), np.int32),
+        shift=zeros(4 * IMAGES, np.float64),
+        slack=np.zeros(1),
+        row_end=np.zeros(rows, np.int32),
+        beyond=np.zeros((rows, SHELLS), np.uint8),
+        entries=np.empty((blocks, capacity), np.uint16),
+        masked_end=np.zeros(rows, np.int32),
+        masked=np.empty((blocks, ceil(1.5 * most_rows), 2), np.int32),
+        neighbor_end=np.zeros(count, np.int32),
         neighbors=np.empty((blocks, neighbors), np.int32),
-        origin_vector=_origin_vector_buffer(blocks, neighbors, dtype), needed=needed, counters=np.zeros(4, np.int64),
+        origin_vector=_origin_vector_buffer(blocks, neighbors, dtype),
+        needed=needed,
+        counters=np.zeros(4, np.int64),
         times=np.array([nan, 0.0]),
-    )  # fmt: skip
+    )
 
 
 def _origin_vector_buffer(blocks: int, neighbors: int, dtype: type) -> np.ndarray:
-    """An array for `PairList.origin_vector`; empty in float64, where it would need much memory and save no time."""
+    """An array for `PairList.origin_vector`; empty in float64, where it would need much memory and
+    save no time."""
     return np.empty((blocks, 3 * neighbors if dtype == np.float32 else 0), dtype)
 
 
 def _fitting_skin(cell: np.ndarray, cutoff: float, skin: float) -> float:
-    """The skin, shortened if second images could come within reach between builds, for which IMAGES is too small."""
+    """The skin, shortened if second images could come within reach between builds, for which IMAGES
+    is too small."""
     return min(skin, LONGEST_SKIN * cell.diagonal().min()) if cutoff < inf else inf
 
 
 def _expected_neighbors(cell: np.ndarray, count: int, radius: float, size: float) -> float:
-    """Half the expected number of clusters within a radius of sites; 0 if the density is not known. size : 1 for a row,
-    which is small, 1.75 for a whole cluster: water needs 1.6 to 1.7"""
+    """Half the expected number of clusters within a radius of sites; 0 if the density is not known.
+    size : 1 for a row, which is small, 1.75 for a whole cluster: water needs 1.6 to 1.7"""
     if radius == inf:
         return count / 2 + 1
     volume = cell.diagonal().prod()
@@ -135,8 +175,12 @@ def _expected_neighbors(cell: np.ndarray, count: int, radius: float, size: float
         return 0.0
     cluster = volume / count
     edge = size * np.cbrt(cluster)
-    near = edge**3 + 6 * edge**2 * radius + 3 * pi * edge * radius**2 + 4 / 3 * pi * radius**3  # Steiner's formula
-    return min(0.42 * near / cluster, count / 2) + 1  # a sixth less than half: measured, cubes have corners
+    near = (
+        edge**3 + 6 * edge**2 * radius + 3 * pi * edge * radius**2 + 4 / 3 * pi * radius**3
+    )  # Steiner's formula
+    return (
+        min(0.42 * near / cluster, count / 2) + 1
+    )  # a sixth less than half: measured, cubes have corners
 
 
 def _expected_window(cell: np.ndarray, count: int, blocks: int, radius: float) -> int:
@@ -144,7 +188,9 @@ def _expected_window(cell: np.ndarray, count: int, blocks: int, radius: float) -
     volume = cell.diagonal().prod()
     if volume == inf or radius == inf:
         return 0
-    layers = (radius + 2 * np.cbrt(volume / count)) / cell[0, 0]  # clusters are sorted along x first
+    layers = (radius + 2 * np.cbrt(volume / count)) / cell[
+        0, 0
+    ]  # clusters are sorted along x first
     return min(count - count // blocks, ceil(count * min(layers, 0.5)))
 
 
@@ -153,7 +199,8 @@ CHECKPOINTED = ("boxes", "origin", "reference")
 
 
 def checkpoint_arrays(pairs: PairList) -> dict[str, np.ndarray]:
-    """The arrays from which `restored` makes this list again, bit for bit, although sites have moved since."""
+    """The arrays from which `restored` makes this list again, bit for bit, although sites have
+    moved since."""
     found = {"skin": np.array(pairs.skin)}
     if pairs.counters[USABLE] == 1:
         found |= {name: getattr(pairs.clusters, name) for name in CHECKPOINTED}
@@ -161,9 +208,13 @@ def checkpoint_arrays(pairs: PairList) -> dict[str, np.ndarray]:
     return found
 
 
-def restored(pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: float, now: float) -> PairList:
-    """The new list with the clusters and the skin of a checkpoint; `update.refill` must follow if there are clusters.
-    requested_skin : in Å. now : the present time, ps. Raises ValueError if the arrays do not fit such a list."""
+def restored(
+    pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: float, now: float
+) -> PairList:
+    """The new list with the clusters and the skin of a checkpoint; `update.refill` must follow if
+    there are clusters.
+    requested_skin : in Å. now : the present time, ps. Raises ValueError if the arrays do not fit
+        such a list."""
     clusters, cell = pairs.clusters, pairs.cell
     like = {name: getattr(clusters, name) for name in (*CHECKPOINTED, "order")}
     like |= {"built": pairs.built, "times": pairs.times}
@@ -176,7 +227,9 @@ def restored(pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: flo
         if name in arrays and name not in ("skin", "built") and not np.isfinite(found).all():
             raise ValueError(f"{name} of a neighbour list is not finite")
     skin = float(arrays["skin"])
-    if not (min(pairs.skin, 2 * LONGEST_SKIN * pairs.cutoff) <= skin <= max(pairs.skin, requested_skin)):
+    if not (
+        min(pairs.skin, 2 * LONGEST_SKIN * pairs.cutoff) <= skin <= max(pairs.skin, requested_skin)
+    ):
         raise ValueError(f"a neighbour list has the skin {skin:g} Å")
     pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
     if "order" not in arrays:
@@ -200,13 +253,15 @@ def restored(pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: flo
 
 
 def with_capacity(pairs: PairList, cell: np.ndarray) -> PairList:
-    """The list with the capacity that its last build needed and a tenth more, and a skin that fits into the cell.
-    Raises SimulationError if the cell has become too small for the cutoff, or too many sites are within it."""
+    """The list with the capacity that its last build needed and a tenth more, and a skin that fits
+    into the cell. Raises SimulationError if the cell has become too small for the cutoff, or too
+    many sites are within it."""
     if pairs.counters[STATUS] == CELL_CHANGED:
         if 2 * pairs.cutoff > cell.diagonal().min():
             raise SimulationError(
-                f"the box has become too small for the cutoff of {pairs.cutoff:g} Å: half its smallest edge is "
-                f"{cell.diagonal().min() / 2:.4g} Å. Begin with a larger box, or take a shorter cutoff"
+                f"the box has become too small for the cutoff of {pairs.cutoff:g} Å: half its"
+                f" smallest edge is {cell.diagonal().min() / 2:.4g} Å. Begin with a larger box, or"
+                " take a shorter cutoff"
             )
         skin = _fitting_skin(cell, pairs.cutoff, pairs.skin)
         pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
@@ -223,7 +278,9 @@ def with_capacity(pairs: PairList, cell: np.ndarray) -> PairList:
     if neighbors > pairs.neighbors.shape[1]:
         capacity = int(1.1 * neighbors) + 16
         origin_vector = _origin_vector_buffer(blocks, capacity, pairs.origin_vector.dtype)
-        pairs = pairs._replace(neighbors=np.empty((blocks, capacity), np.int32), origin_vector=origin_vector)
+        pairs = pairs._replace(
+            neighbors=np.empty((blocks, capacity), np.int32), origin_vector=origin_vector
+        )
     return pairs
 
 
@@ -238,7 +295,8 @@ def most_needed(pairs, k):
 
 @kernel(inline=True)
 def largest_displacement(pairs):
-    """The largest displacement of an image of a site from its reference, Å; infinite if the list is not valid."""
+    """The largest displacement of an image of a site from its reference, Å; infinite if the list is
+    not valid."""
     found = 0.0
     for block in range(len(pairs.needed)):
         found = max(found, pairs.clusters.largest_displacement[block])
@@ -247,7 +305,8 @@ def largest_displacement(pairs):
 
 @kernel(inline=True)
 def end_of_row(pairs, r, displacement):
-    """End of the entries of row r that can have a site inside the cutoff; `displacement` as above, Å."""
+    """End of the entries of row r that can have a site inside the cutoff; `displacement` as above,
+    Å."""
     moved = max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
     shell = min(SHELLS - 1, ceil((moved + displacement) * pairs.shells_per_A))
     return pairs.row_end[r] - pairs.beyond[r, shell]

@@ -1,8 +1,8 @@
-"""Forces between pairs of sites: the one loop for every pair potential. It finds the pairs and their images, sums
-energies, virial and forces, and adds the forces to the bodies. A potential is an `@implements(pair)` for its
-NamedTuple, which puts its numbers for each site into the order of the slots (`arrange`)."""
+"""Forces between pairs of sites: the one loop for every pair potential. It finds the pairs and
+their images, sums energies, virial and forces, and adds the forces to the bodies. A potential is an
+`@implements(pair)` for its NamedTuple, which puts its numbers for each site into the order of the
+slots (`arrange`)."""
 
-# isort: skip_file
 from math import inf
 from typing import NamedTuple
 
@@ -11,27 +11,74 @@ from numba import types
 
 from rigidmd.compile import BoundTask, Code, Pass, chosen_by_type, kernel, load_arguments, task
 from rigidmd.compile.simd import (
-    add_lane_sums, align_stack, broadcast, convert_to, extract_lane, lane_count, lanes_of, load, load_broadcast,
-    load_four, load_scalar, mask_from_bits, select, store, sum_lanes, to_double, zeros,
-)  # fmt: skip
+    add_lane_sums,
+    align_stack,
+    broadcast,
+    convert_to,
+    extract_lane,
+    lane_count,
+    lanes_of,
+    load,
+    load_broadcast,
+    load_four,
+    load_scalar,
+    mask_from_bits,
+    select,
+    store,
+    sum_lanes,
+    to_double,
+    zeros,
+)
 from rigidmd.core.state import LIST_FULL, OK, TALLY_SIZE
 from rigidmd.forces.neighbors import lists
 from rigidmd.forces.neighbors.lists import (
-    BUILDS, MASK_BITS, STATUS, USABLE, WINDOW, PairList, behind_block, cluster_of, empty_list, end_of_row, image_number,
-    largest_displacement, most_needed,
-)  # fmt: skip
-from rigidmd.forces.neighbors.sites import BodySites, CentralSites, InSlots, load_passes, virial_buffer
+    BUILDS,
+    MASK_BITS,
+    STATUS,
+    USABLE,
+    WINDOW,
+    PairList,
+    behind_block,
+    cluster_of,
+    empty_list,
+    end_of_row,
+    image_number,
+    largest_displacement,
+    most_needed,
+)
+from rigidmd.forces.neighbors.sites import (
+    BodySites,
+    CentralSites,
+    InSlots,
+    load_passes,
+    virial_buffer,
+)
 from rigidmd.forces.neighbors.update import list_code, refill, update_pair_list
-from rigidmd.forces.terms import FORCES_ONLY, TALLIED, WITH_ENERGIES, WITH_VIRIALS, Evaluation, Setup
+from rigidmd.forces.terms import (
+    FORCES_ONLY,
+    TALLIED,
+    WITH_ENERGIES,
+    WITH_VIRIALS,
+    Evaluation,
+    Setup,
+)
 
 
 class PairSums(NamedTuple):
-    forces: np.ndarray  # (3 slots,) on each site, from the rows of its block, then from all; as Clusters.local
-    forces_behind: np.ndarray  # (blocks, capacity) forces from the rows of a block on the clusters behind it
-    force_at_change: np.ndarray  # (blocks, 3 lanes) force on a row at the last change of image, see `_change_image`
+    forces: (
+        np.ndarray
+    )  # (3 slots,) on each site, from the rows of its block, then from all; as Clusters.local
+    forces_behind: (
+        np.ndarray
+    )  # (blocks, capacity) forces from the rows of a block on the clusters behind it
+    force_at_change: (
+        np.ndarray
+    )  # (blocks, 3 lanes) force on a row at the last change of image, see `_change_image`
     tallies: np.ndarray  # (blocks, 10)
     virial: np.ndarray  # see `virial_buffer`
-    arranged: np.ndarray  # (1,) the build of the list for which the numbers of the potential are in the slots
+    arranged: (
+        np.ndarray
+    )  # (1,) the build of the list for which the numbers of the potential are in the slots
 
 
 class PairForces(NamedTuple):
@@ -65,7 +112,8 @@ class PairForces(NamedTuple):
 
 class PairWorkspace(NamedTuple):
     potential: NamedTuple
-    slot_potential: NamedTuple  # the numbers of the potential in the order of slots, in the precision of the loop
+    # the numbers of the potential in the order of slots, in the precision of the loop
+    slot_potential: NamedTuple
     sites: BodySites | CentralSites
     pairs: PairList
     sums: PairSums
@@ -97,7 +145,8 @@ class PairWorkspace(NamedTuple):
         return self._replace(list_code=list_code(self.pairs, self.sites))
 
     def passes(self, into: Evaluation) -> list[Pass]:
-        """Update of the list; forces of rows, with what else is needed; their sums on sites and molecules."""
+        """Update of the list; forces of rows, with what else is needed; their sums on sites and
+        molecules."""
         pairs, sums, sites, tallies = self.pairs, self.sums, self.sites, self.sums.tallies
         blocks, content = len(tallies), (self.slot_potential, pairs, sums)
         moved = (self.list_code, pairs, sites, into.state, into.status)
@@ -111,7 +160,9 @@ class PairWorkspace(NamedTuple):
         when = WITH_ENERGIES if self.needs_virials else TALLIED
         found.append(Pass("forces and energies of pairs", _sum_forces, energies, blocks, when))
         if self.needs_virials:
-            found.append(Pass("forces and virials of pairs", _sum_forces, virials, blocks, WITH_VIRIALS))
+            found.append(
+                Pass("forces and virials of pairs", _sum_forces, virials, blocks, WITH_VIRIALS)
+            )
         found += [
             Pass("sum forces on sites", _gather_forces, (pairs, sums, None), blocks, FORCES_ONLY),
             Pass("sum forces on sites", _gather_forces, (pairs, sums, tallies), blocks, TALLIED),
@@ -130,7 +181,8 @@ class PairWorkspace(NamedTuple):
         return lists.checkpoint_arrays(self.pairs)
 
     def restore(self, arrays: dict[str, np.ndarray], skin: float, now: float) -> "PairWorkspace":
-        """With the list of a checkpoint; needs machine code. Raises ValueError if the arrays do not fit this term."""
+        """With the list of a checkpoint; needs machine code. Raises ValueError if the arrays do not
+        fit this term."""
         found = self._replace(pairs=lists.restored(self.pairs, arrays, skin, now))
         while "order" in arrays and found._refill() != OK:
             found = found.with_capacity(found.pairs.cell)
@@ -141,7 +193,10 @@ class PairWorkspace(NamedTuple):
         status = np.zeros(1, np.int64)
         BoundTask(_refill_list, (self.list_code, self.pairs, status))()
         if status[0] == OK:
-            BoundTask(_arrange_numbers, (self.potential, self.slot_potential, self.pairs, self.sums, status))()
+            BoundTask(
+                _arrange_numbers,
+                (self.potential, self.slot_potential, self.pairs, self.sums, status),
+            )()
         return int(status[0])
 
 
@@ -150,13 +205,17 @@ def _buffer_behind(pairs: PairList, blocks: int, clusters: int) -> np.ndarray:
     return zeros((blocks, 3 * lane_count(dtype) * clusters), dtype)
 
 
-def pair_forces(potential: NamedTuple, sites: BodySites | CentralSites, group: np.ndarray | None = None) -> PairForces:
-    """The term of a potential with a `cutoff`; by default, sites of one molecule do not interact."""
+def pair_forces(
+    potential: NamedTuple, sites: BodySites | CentralSites, group: np.ndarray | None = None
+) -> PairForces:
+    """The term of a potential with a `cutoff`; by default, sites of one molecule do not
+    interact."""
     return PairForces(potential, sites, sites.molecule if group is None else group)
 
 
 def _diameter(sites: BodySites | CentralSites) -> float:
-    """An upper limit of the distance between sites of a molecule, Å: the longest diagonal of boxes around them."""
+    """An upper limit of the distance between sites of a molecule, Å: the longest diagonal of boxes
+    around them."""
     if not isinstance(sites, BodySites) or not len(sites.molecule):
         return 0.0
     starts, offsets = np.unique(sites.kind[np.diff(sites.first) > 0]), sites.offset_body
@@ -165,15 +224,18 @@ def _diameter(sites: BodySites | CentralSites) -> float:
 
 
 def pair(potential, i, j, r2):
-    """(energy, force/r) of the site in slot i with those in slots j, j + 1, ... at squared distances r2, as vectors.
-    Valid below cutoff²; a positive force repels."""
-    raise TypeError(f"{type(potential).__name__} is not a pair potential, or this was called outside compiled code")
+    """(energy, force/r) of the site in slot i with those in slots j, j + 1, ... at squared
+    distances r2, as vectors. Valid below cutoff²; a positive force repels."""
+    raise TypeError(
+        f"{type(potential).__name__} is not a pair potential, or this was called outside compiled"
+        " code"
+    )
 
 
 @chosen_by_type
 def arrange(slot_potential, potential, order):
-    """Write the numbers of the site in each slot into `slot_potential`; `order` has the site in each slot. Potentials
-    with other numbers of sites than a charge implement it."""
+    """Write the numbers of the site in each slot into `slot_potential`; `order` has the site in
+    each slot. Potentials with other numbers of sites than a charge implement it."""
     if "charge" in slot_potential.fields:
 
         def arrange_charges(slot_potential, potential, order):
@@ -221,19 +283,26 @@ def _gather_forces(arguments, block):
 
 @kernel(inline=True, count_references=False)
 def block_forces(potential, pairs, into, tallies, energies, block):
-    """Forces from the rows of one block: on the sites of the block into `forces`, on others into `forces_behind`.
+    """Forces from the rows of one block: on the sites of the block into `forces`, on others into
+    `forces_behind`.
 
-    into : `PairSums`. tallies : (blocks, 10) for a part of the virial, or None. energies : the same array, or None
+    into : `PairSums`. tallies : (blocks, 10) for a part of the virial, or None. energies : the same
+        array, or None
 
-    The distance of two sites is the difference of their positions in the box, less the shift of an image. So the virial
-    is the sum over sites of f (x) position, see `gather_block`, less the sum over entries of the force on the row (x)
-    shift. The latter is added here when the image changes along a row. That is seldom: in each shell the entries of one
-    image are consecutive, and rows far from the edges have no other image.
+    The distance of two sites is the difference of their positions in the box, less the shift of an
+    image. So the virial is the sum over sites of f (x) position, see `gather_block`, less the sum
+    over entries of the force on the row (x) shift. The latter is added here when the image changes
+    along a row. That is seldom: in each shell the entries of one image are consecutive, and rows
+    far from the edges have no other image.
     """
     align_stack()
     clusters = pairs.clusters
     width = lanes_of(clusters.local)
-    forces, behind, force_at_change = into.forces, into.forces_behind[block], into.force_at_change[block]
+    forces, behind, force_at_change = (
+        into.forces,
+        into.forces_behind[block],
+        into.force_at_change[block],
+    )
     bounds = (clusters.bounds[block], clusters.bounds[block + 1])
     forces[3 * width * bounds[0] : 3 * width * bounds[1]] = 0.0
     behind[: 3 * width * pairs.needed[block, WINDOW]] = 0.0
@@ -245,23 +314,46 @@ def block_forces(potential, pairs, into, tallies, energies, block):
     moved = largest_displacement(pairs)
     first_met = first_entry = first_special = 0
     for c in range(bounds[0], bounds[1]):
-        neighbors, origin_vector = pairs.neighbors[block, first_met:], pairs.origin_vector[block, 3 * first_met :]
+        neighbors, origin_vector = (
+            pairs.neighbors[block, first_met:],
+            pairs.origin_vector[block, 3 * first_met :],
+        )
         for i in range(width * c, width * (c + 1), 2):
             at = 2 * width * c + i
             here = (
                 (clusters.local[at], clusters.local[at + width], clusters.local[at + 2 * width]),
-                (clusters.local[at + 1], clusters.local[at + width + 1], clusters.local[at + 2 * width + 1]),
+                (
+                    clusters.local[at + 1],
+                    clusters.local[at + width + 1],
+                    clusters.local[at + 2 * width + 1],
+                ),
             )
             still = (zero, zero, zero)
             sums, number = (still, still, zero), 0
             for n in range(first_special, pairs.masked_end[i // 2]):
-                other, image, between = _displacements(pairs, c, here, neighbors, origin_vector, masked[n, 0])
+                other, image, between = _displacements(
+                    pairs, c, here, neighbors, origin_vector, masked[n, 0]
+                )
                 if tallies is not None:
-                    number = _change_image(pairs, number, image_number(image), sums, force_at_change, tallies[block])
+                    number = _change_image(
+                        pairs, number, image_number(image), sums, force_at_change, tallies[block]
+                    )
                 masks = (masked[n, 1] & ((1 << MASK_BITS) - 1), masked[n, 1] >> MASK_BITS)
-                sums = _interact(potential, pairs, bounds, i, other, between, masks, forces, behind, sums, energies)
-            # Displacements are computed one entry ahead: otherwise instructions that wait for them fill the queues of
-            # the processor before instructions of the next entry can enter.
+                sums = _interact(
+                    potential,
+                    pairs,
+                    bounds,
+                    i,
+                    other,
+                    between,
+                    masks,
+                    forces,
+                    behind,
+                    sums,
+                    energies,
+                )
+            # Displacements are computed one entry ahead: otherwise instructions that wait for them
+            # fill the queues of the processor before instructions of the next entry can enter.
             last = end_of_row(pairs, i // 2, moved) - 1
             other = image = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
@@ -274,9 +366,23 @@ def block_forces(potential, pairs, into, tallies, energies, block):
                     pairs, c, here, neighbors, origin_vector, load_scalar(entries, min(n + 1, last))
                 )
                 if tallies is not None:
-                    number = _change_image(pairs, number, image_number(image), sums, force_at_change, tallies[block])
+                    number = _change_image(
+                        pairs, number, image_number(image), sums, force_at_change, tallies[block]
+                    )
                 unmasked = (None, None)
-                sums = _interact(potential, pairs, bounds, i, other, between, unmasked, forces, behind, sums, energies)
+                sums = _interact(
+                    potential,
+                    pairs,
+                    bounds,
+                    i,
+                    other,
+                    between,
+                    unmasked,
+                    forces,
+                    behind,
+                    sums,
+                    energies,
+                )
                 other, image, between = ahead, its_image, after
             if tallies is not None:
                 _change_image(pairs, number, 0, sums, force_at_change, tallies[block])
@@ -290,8 +396,9 @@ def block_forces(potential, pairs, into, tallies, energies, block):
 
 @kernel(inline=True)
 def _change_image(pairs, number, now, sums, force_at_change, tally):
-    """Account for the shift of an image, if the next entry has another image; returns the next image number. The force
-    on the row since the last change (x) the shift of the image is subtracted from the tally."""
+    """Account for the shift of an image, if the next entry has another image; returns the next
+    image number. The force on the row since the last change (x) the shift of the image is
+    subtracted from the tally."""
     if now != number:
         width = lanes_of(force_at_change)
         on_one, on_two, _ = sums
@@ -299,7 +406,10 @@ def _change_image(pairs, number, now, sums, force_at_change, tally):
         if number != 0:
             at = 4 * number
             a, b, c = pairs.shift[at], pairs.shift[at + 1], pairs.shift[at + 2]
-            fx, fy = sum_lanes(x - load(force_at_change, 0)), sum_lanes(y - load(force_at_change, width))
+            fx, fy = (
+                sum_lanes(x - load(force_at_change, 0)),
+                sum_lanes(y - load(force_at_change, width)),
+            )
             fz = sum_lanes(z - load(force_at_change, 2 * width))
             _add_symmetric_virial(tally, (-fx * a, -fx * b, -fx * c, -fy * b, -fy * c, -fz * c))
         store(force_at_change, 0, x)
@@ -317,8 +427,8 @@ def _add_symmetric_virial(tally, virial):
 
 @kernel(inline=True)
 def _displacements(pairs, c, here, neighbors, origin_vector, number):
-    """The cluster and the image of an entry, and displacements from its sites, as vectors, to the two sites of the row.
-    The displacements are as in `_separation`."""
+    """The cluster and the image of an entry, and displacements from its sites, as vectors, to the
+    two sites of the row. The displacements are as in `_separation`."""
     local = pairs.clusters.local
     width = lanes_of(local)
     image = load_scalar(neighbors, number)
@@ -333,19 +443,25 @@ def _displacements(pairs, c, here, neighbors, origin_vector, number):
 
 @chosen_by_type(inline=True)
 def load_origin_vector(pairs, c, neighbors, vectors, number):
-    """Vector from the origin of a neighbour to the origin of cluster c, Å. In single precision it is stored: to compute
-    it would take a sixth of the time of all pairs."""
+    """Vector from the origin of a neighbour to the origin of cluster c, Å. In single precision it
+    is stored: to compute it would take a sixth of the time of all pairs."""
     if vectors.dtype.bitwidth == 32:
 
         def stored(pairs, c, neighbors, vectors, number):
             at = 3 * number
-            return load_broadcast(vectors, at), load_broadcast(vectors, at + 1), load_broadcast(vectors, at + 2)
+            return (
+                load_broadcast(vectors, at),
+                load_broadcast(vectors, at + 1),
+                load_broadcast(vectors, at + 2),
+            )
 
         return stored
 
     def computed(pairs, c, neighbors, vectors, number):
         origin, image = pairs.clusters.origin, load_scalar(neighbors, number)
-        there = load_four(pairs.shift, 4 * image_number(image)) + load_four(origin, 4 * cluster_of(image))
+        there = load_four(pairs.shift, 4 * image_number(image)) + load_four(
+            origin, 4 * cluster_of(image)
+        )
         vector = load_four(origin, 4 * c) - there
         x, y, z = extract_lane(vector, 0), extract_lane(vector, 1), extract_lane(vector, 2)
         local = pairs.clusters.local
@@ -362,10 +478,12 @@ def _separation(here, x, y, z):
 
 
 @kernel(inline=True)
-def _interact(potential, pairs, bounds, i, other, between, masks, forces, forces_behind, sums, energies):
-    """Forces between the sites in slots i, i + 1 and those of a cluster, and energies unless None. They are added to
-    `sums` and to `forces`, or to `forces_behind` if the cluster is not in the block. bounds : of the block, see
-    `Clusters`"""
+def _interact(
+    potential, pairs, bounds, i, other, between, masks, forces, forces_behind, sums, energies
+):
+    """Forces between the sites in slots i, i + 1 and those of a cluster, and energies unless None.
+    They are added to `sums` and to `forces`, or to `forces_behind` if the cluster is not in the
+    block. bounds : of the block, see `Clusters`"""
     width = lanes_of(pairs.clusters.local)
     on_one, on_two, energy = sums
     ax, ay, az, _ = between[0]
@@ -378,7 +496,8 @@ def _interact(potential, pairs, bounds, i, other, between, masks, forces, forces
     if (other >= first) & (other < end):
         at, there = other, forces
     at = 3 * width * at
-    # Each product is in one expression with the sum to which it is added, so that they become one multiply-add.
+    # Each product is in one expression with the sum to which it is added, so that they become one
+    # multiply-add.
     store(there, at, load(there, at) - one * ax - two * bx)
     store(there, at + width, load(there, at + width) - one * ay - two * by)
     store(there, at + 2 * width, load(there, at + 2 * width) - one * az - two * bz)
@@ -391,7 +510,8 @@ def _interact(potential, pairs, bounds, i, other, between, masks, forces, forces
 
 @kernel(inline=True)
 def _masked_pair(potential, i, j, r2, mask):
-    """Force over distance on a site from each of a vector of others, and the energies; 0 where there is none."""
+    """Force over distance on a site from each of a vector of others, and the energies; 0 where
+    there is none."""
     counts = r2 < potential.cutoff * potential.cutoff
     if mask is not None:
         counts = counts & mask_from_bits(mask, r2)
@@ -401,9 +521,10 @@ def _masked_pair(potential, i, j, r2, mask):
 
 @kernel(inline=True, count_references=False)
 def gather_block(pairs, forces, forces_behind, tallies, block):
-    """Forces on the sites of a block from its rows and from those of other blocks, added in a fixed order. With
-    tallies, the rest of the virial is added: the sum over sites of f (x) position. All forces add up to zero, so
-    positions may be relative to any cluster: with small positions, the rounding error of forces has little effect."""
+    """Forces on the sites of a block from its rows and from those of other blocks, added in a fixed
+    order. With tallies, the rest of the virial is added: the sum over sites of f (x) position. All
+    forces add up to zero, so positions may be relative to any cluster: with small positions, the
+    rounding error of forces has little effect."""
     clusters = pairs.clusters
     origin = clusters.origin
     middle = 4 * (len(origin) // 8)
@@ -422,13 +543,25 @@ def gather_block(pairs, forces, forces_behind, tallies, block):
             z = to_double(load(local, at + 2 * width)) + (origin[4 * c + 2] - origin[middle + 2])
             fx, fy, fz = force
             virial = (
-                virial[0] + fx * x, virial[1] + fx * y, virial[2] + fx * z,
-                virial[3] + fy * y, virial[4] + fy * z, virial[5] + fz * z,
-            )  # fmt: skip
+                virial[0] + fx * x,
+                virial[1] + fx * y,
+                virial[2] + fx * z,
+                virial[3] + fy * y,
+                virial[4] + fy * z,
+                virial[5] + fz * z,
+            )
     if tallies is not None:
         xx, xy, xz, yy, yz, zz = virial
         _add_symmetric_virial(
-            tallies[block], (sum_lanes(xx), sum_lanes(xy), sum_lanes(xz), sum_lanes(yy), sum_lanes(yz), sum_lanes(zz))
+            tallies[block],
+            (
+                sum_lanes(xx),
+                sum_lanes(xy),
+                sum_lanes(xz),
+                sum_lanes(yy),
+                sum_lanes(yz),
+                sum_lanes(zz),
+            ),
         )
 
 
@@ -437,7 +570,11 @@ def _gathered(pairs, forces, forces_behind, c):
     """The forces on the sites of a cluster, in double precision."""
     width, bounds = lanes_of(pairs.clusters.local), pairs.clusters.bounds
     at = 3 * width * c
-    x, y, z = to_double(load(forces, at)), to_double(load(forces, at + width)), to_double(load(forces, at + 2 * width))
+    x, y, z = (
+        to_double(load(forces, at)),
+        to_double(load(forces, at + width)),
+        to_double(load(forces, at + 2 * width)),
+    )
     for b in range(len(forces_behind)):
         behind = behind_block(bounds, b, c)
         if 0 <= behind < pairs.needed[b, WINDOW]:

@@ -1,6 +1,6 @@
-"""The rows of a neighbour list: which clusters go into which row and shell, and which of them need a mask."""
+"""The rows of a neighbour list: which clusters go into which row and shell, and which of them need
+a mask."""
 
-# isort: skip_file
 from math import inf
 from typing import NamedTuple
 
@@ -8,13 +8,33 @@ import numpy as np
 
 from rigidmd.compile import kernel, load_arguments, task
 from rigidmd.compile.simd import (
-    broadcast, lanes_of, load, load_broadcast, load_scalar, load_with_lanes_of, mask_bits, pairwise_minimum,
-    square_root, store_even_lanes,
-)  # fmt: skip
+    broadcast,
+    lanes_of,
+    load,
+    load_broadcast,
+    load_scalar,
+    load_with_lanes_of,
+    mask_bits,
+    pairwise_minimum,
+    square_root,
+    store_even_lanes,
+)
 from rigidmd.forces.neighbors.lists import (
-    ENTRIES, IMAGES, IMAGES_FOUND, MASK_BITS, MASKED, MAX_BEYOND, NEIGHBORS, NEIGHBORS_OF_ONE, ROUNDING, SHELLS, WINDOW,
-    behind_block, cluster_of, image_number,
-)  # fmt: skip
+    ENTRIES,
+    IMAGES,
+    IMAGES_FOUND,
+    MASK_BITS,
+    MASKED,
+    MAX_BEYOND,
+    NEIGHBORS,
+    NEIGHBORS_OF_ONE,
+    ROUNDING,
+    SHELLS,
+    WINDOW,
+    behind_block,
+    cluster_of,
+    image_number,
+)
 from rigidmd.forces.neighbors.tree import ahead, families_within_reach, near
 
 OUT_OF_REACH = SHELLS  # kind of a candidate that a row does not need; kinds below are shells
@@ -26,11 +46,18 @@ class Scratch(NamedTuple):
     stack: np.ndarray  # (levels, 2) for families_within_reach
     low: np.ndarray  # (3,) of a box, shifted by an image
     high: np.ndarray  # (3,)
-    family: np.ndarray  # (capacity,) families of clusters near some clusters, as IMAGES * family + number of the image
-    candidate: np.ndarray  # (capacity + arity,) images of clusters that may be neighbours; finally the neighbours
+    # (capacity,) families of clusters near some clusters, as IMAGES * family + number of the image
+    family: np.ndarray
+    candidate: (
+        np.ndarray
+    )  # (capacity + arity,) images of clusters that may be neighbours; finally the neighbours
     close: np.ndarray  # (capacity,) those of them that may need a mask
-    kind: np.ndarray  # ((capacity + 1) * rows,) uint8 kind of candidate n in row k of the cluster, at n * rows + k
-    kind_end: np.ndarray  # (rows, KINDS) uint32 entries of each kind, then the next index (unsigned: not tested)
+    kind: (
+        np.ndarray
+    )  # ((capacity + 1) * rows,) uint8 kind of candidate n in row k of the cluster, at n * rows + k
+    kind_end: (
+        np.ndarray
+    )  # (rows, KINDS) uint32 entries of each kind, then the next index (unsigned: not tested)
     sorted: np.ndarray  # (rows of a cluster, capacity) uint16 entries in the order of their kinds
     filled: np.ndarray  # (5,) of the block so far, see PairList.needed
 
@@ -46,15 +73,22 @@ def fill_rows(arguments, block):
 
 @kernel(inline=True)
 def _fill_block(pairs, block, capacity):
-    """Fill the rows of one block. Entries beyond the capacity are counted but not stored. Returns 0, or the capacity
-    needed for candidates if it is too small; the rows are then incomplete."""
+    """Fill the rows of one block. Entries beyond the capacity are counted but not stored. Returns
+    0, or the capacity needed for candidates if it is too small; the rows are then incomplete."""
     clusters = pairs.clusters
     arity, rows = lanes_of(pairs.tree.low), lanes_of(clusters.local) // 2
     scratch = Scratch(
-        np.empty((len(pairs.tree.level), 2), np.int64), np.empty(3), np.empty(3), np.empty(capacity, np.int64),
-        np.empty(capacity + arity, np.int64), np.empty(capacity, np.int64), np.empty(rows * (capacity + 1), np.uint8),
-        np.empty((rows, KINDS), np.uint32), np.empty((rows, capacity), np.uint16), np.zeros(5, np.int64),
-    )  # fmt: skip
+        np.empty((len(pairs.tree.level), 2), np.int64),
+        np.empty(3),
+        np.empty(3),
+        np.empty(capacity, np.int64),
+        np.empty(capacity + arity, np.int64),
+        np.empty(capacity, np.int64),
+        np.empty(rows * (capacity + 1), np.uint8),
+        np.empty((rows, KINDS), np.uint32),
+        np.empty((rows, capacity), np.uint16),
+        np.zeros(5, np.int64),
+    )
     end = clusters.bounds[block + 1]
     for first in range(clusters.bounds[block], end, arity):
         last = min(first + arity, end)
@@ -73,8 +107,8 @@ def _fill_block(pairs, block, capacity):
 
 @kernel(inline=True, count_references=False)
 def _find_families(pairs, first, end, scratch):
-    """Find families of clusters that may be within reach of clusters first ... end - 1. Returns their number, which may
-    exceed the capacity."""
+    """Find families of clusters that may be within reach of clusters first ... end - 1. Returns
+    their number, which may exceed the capacity."""
     tree, into, low, high = pairs.tree, scratch.family, scratch.low, scratch.high
     radius = _reach(pairs)
     families = 0
@@ -92,7 +126,9 @@ def _find_families(pairs, first, end, scratch):
             continue
         count = len(pairs.clusters.origin) // 4
         stack, radius2 = scratch.stack, radius * radius
-        found = families_within_reach(tree, low, high, radius2, first, end, count, stack, into, families)
+        found = families_within_reach(
+            tree, low, high, radius2, first, end, count, stack, into, families
+        )
         for n in range(families, min(found, len(into))):
             into[n] = IMAGES * into[n] + image
         families = found
@@ -107,9 +143,9 @@ def _reach(pairs):
 
 @kernel(inline=True, count_references=False)
 def _find_candidates(pairs, c, scratch, families):
-    """Find candidates for the rows of a cluster: clusters and images whose box is within reach of its box. Returns
-    their number, which may exceed the capacity. There are no branches: a candidate out of reach is overwritten by the
-    next one."""
+    """Find candidates for the rows of a cluster: clusters and images whose box is within reach of
+    its box. Returns their number, which may exceed the capacity. There are no branches: a candidate
+    out of reach is overwritten by the next one."""
     tree, into, shift = pairs.tree, scratch.candidate, pairs.shift
     arity = lanes_of(tree.low)
     count = len(pairs.clusters.origin) // 4
@@ -118,8 +154,16 @@ def _find_candidates(pairs, c, scratch, families):
     for n in range(families):
         first, image = arity * cluster_of(scratch.family[n]), image_number(scratch.family[n])
         at = 4 * image
-        low = tree.low[0, c] - shift[at], tree.low[1, c] - shift[at + 1], tree.low[2, c] - shift[at + 2]
-        high = tree.high[0, c] - shift[at], tree.high[1, c] - shift[at + 1], tree.high[2, c] - shift[at + 2]
+        low = (
+            tree.low[0, c] - shift[at],
+            tree.low[1, c] - shift[at + 1],
+            tree.low[2, c] - shift[at + 2],
+        )
+        high = (
+            tree.high[0, c] - shift[at],
+            tree.high[1, c] - shift[at + 1],
+            tree.high[2, c] - shift[at + 2],
+        )
         found = near(tree, first, low, high, radius * radius) & ahead(c, count, first, arity)
         for k in range(arity):
             into[candidates] = IMAGES * (first + k) + image
@@ -162,7 +206,11 @@ def _fill_rows(pairs, block, c, scratch, candidates):
 @kernel(inline=True)
 def _store_neighbors(pairs, block, c, scratch, count):
     """Store the neighbours of a cluster: the first of the candidates."""
-    there, origin_vector, filled = pairs.neighbors[block], pairs.origin_vector[block], scratch.filled
+    there, origin_vector, filled = (
+        pairs.neighbors[block],
+        pairs.origin_vector[block],
+        scratch.filled,
+    )
     first = filled[NEIGHBORS]
     for n in range(count):
         other, image = cluster_of(scratch.candidate[n]), image_number(scratch.candidate[n])
@@ -179,8 +227,9 @@ def _store_neighbors(pairs, block, c, scratch, count):
 
 @kernel(inline=True)
 def _sort_by_kind(pairs, c, scratch, count):
-    """Write the entries of each row of a cluster by their kinds; `kind_end` then has the end of each kind. The rows are
-    done together: while an entry of one row waits for the entry before it, the other rows proceed."""
+    """Write the entries of each row of a cluster by their kinds; `kind_end` then has the end of
+    each kind. The rows are done together: while an entry of one row waits for the entry before it,
+    the other rows proceed."""
     rows = lanes_of(pairs.clusters.local) // 2
     kind_end, kind = scratch.kind_end, scratch.kind
     kind_end[:] = 0
@@ -198,8 +247,9 @@ def _sort_by_kind(pairs, c, scratch, count):
 
 @kernel(inline=True)
 def _begin_kinds(beyond, kind_end):
-    """Where the entries of each kind begin in a row, from their numbers; how many are beyond each shell. `beyond` is
-    limited by its type: entries above the limit are treated as if they were inside the shell."""
+    """Where the entries of each kind begin in a row, from their numbers; how many are beyond each
+    shell. `beyond` is limited by its type: entries above the limit are treated as if they were
+    inside the shell."""
     inside = 0
     for k in range(SHELLS):
         inside += kind_end[k]
@@ -214,8 +264,9 @@ def _begin_kinds(beyond, kind_end):
 
 @kernel(inline=True)
 def _find_kinds(pairs, c, scratch, candidates):
-    """Reduce the candidates to those that a row of the cluster needs, and find their kinds; returns their number. There
-    are no unpredictable branches, so the processor works on several candidates at a time."""
+    """Reduce the candidates to those that a row of the cluster needs, and find their kinds; returns
+    their number. There are no unpredictable branches, so the processor works on several candidates
+    at a time."""
     rows = lanes_of(pairs.clusters.local) // 2
     candidate, close = scratch.candidate, scratch.close
     last = len(pairs.clusters.origin) // 4 - 1  # the cluster that may have slots without a site
@@ -236,9 +287,10 @@ def _find_kinds(pairs, c, scratch, candidates):
 
 @kernel(inline=True)
 def _find_kinds_of_candidate(pairs, c, kind, candidate, at):
-    """Write the kind of a candidate in each row of a cluster, from kind[at] on, as if no entry needed a mask. Returns
-    whether a row needs it, and whether some sites are as near as sites of one group can be. The sites of the cluster
-    are the lanes, and the loop runs over the sites of the candidate: there are no sums across lanes."""
+    """Write the kind of a candidate in each row of a cluster, from kind[at] on, as if no entry
+    needed a mask. Returns whether a row needs it, and whether some sites are as near as sites of
+    one group can be. The sites of the cluster are the lanes, and the loop runs over the sites of
+    the candidate: there are no sums across lanes."""
     clusters = pairs.clusters
     reference = clusters.reference
     width = lanes_of(reference)
@@ -247,8 +299,9 @@ def _find_kinds_of_candidate(pairs, c, kind, candidate, at):
     x = load(reference, begin) + _origin_vector(pairs, c, other, image, 0)
     y = load(reference, begin + width) + _origin_vector(pairs, c, other, image, 1)
     z = load(reference, begin + 2 * width) + _origin_vector(pairs, c, other, image, 2)
-    # |x - y|²/2 = |x|²/2 - x y + |y|²/2: three multiply-adds for each y. Their rounding error, bounded by |x|² + |y|²,
-    # is subtracted. Two minima are independent of each other, which is faster.
+    # |x - y|²/2 = |x|²/2 - x y + |y|²/2: three multiply-adds for each y. Their rounding error,
+    # bounded by |x|² + |y|², is subtracted. Two minima are independent of each other, which is
+    # faster.
     one, two = broadcast(inf, reference), broadcast(inf, reference)
     for lane in range(0, width, 2):
         one = min(one, _half_square_less_product(clusters, other, lane, x, y, z))
@@ -258,7 +311,9 @@ def _find_kinds_of_candidate(pairs, c, kind, candidate, at):
     if pairs.cutoff < inf:
         distance = square_root(max(pairwise_minimum(nearest2), 0.0))
         scale = pairs.shells_per_A
-        shell = distance * (scale * (1 - ROUNDING)) + (1 - pairs.cutoff * scale)  # 1 to 2 in the first beyond
+        shell = distance * (scale * (1 - ROUNDING)) + (
+            1 - pairs.cutoff * scale
+        )  # 1 to 2 in the first beyond
         kinds = min(max(shell, 0.0), float(OUT_OF_REACH))
     store_even_lanes(kind, at, kinds)
     return mask_bits(kinds < float(OUT_OF_REACH)) != 0, mask_bits(nearest2 <= pairs.reach2) != 0
@@ -270,7 +325,9 @@ def _half_square_less_product(clusters, other, lane, x, y, z):
     reference = clusters.reference
     width = lanes_of(reference)
     at = 3 * width * other + lane
-    rest = load_broadcast(clusters.half_square, width * other + lane) - z * load_broadcast(reference, at + 2 * width)
+    rest = load_broadcast(clusters.half_square, width * other + lane) - z * load_broadcast(
+        reference, at + 2 * width
+    )
     return rest - y * load_broadcast(reference, at + width) - x * load_broadcast(reference, at)
 
 
@@ -289,12 +346,15 @@ def _mark_entries_to_mask(pairs, c, kind, candidate, at):
             mates = mates | (group == clusters.group[width * other + lane])
         special = mask_bits(mates)
     for row in range(width // 2):
-        kind[at + row] = NEEDS_MASK if special >> 2 * row & 3 else kind[at + row]  # always written: no branch
+        kind[at + row] = (
+            NEEDS_MASK if special >> 2 * row & 3 else kind[at + row]
+        )  # always written: no branch
 
 
 @kernel(inline=True)
 def _mask_of_lanes(pairs, i, candidate, radius2):
-    """The sites of a candidate that interact with the site in slot i, as bits; 0 if none is inside the radius."""
+    """The sites of a candidate that interact with the site in slot i, as bits; 0 if none is inside
+    the radius."""
     if i >= len(pairs.group):
         return 0
     clusters = pairs.clusters
@@ -305,13 +365,25 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     at = 2 * width * c + i
     start = 3 * width * other
     dx = reference[at] + _origin_vector(pairs, c, other, image, 0) - load(reference, start)
-    dy = reference[at + width] + _origin_vector(pairs, c, other, image, 1) - load(reference, start + width)
-    dz = reference[at + 2 * width] + _origin_vector(pairs, c, other, image, 2) - load(reference, start + 2 * width)
-    left_out = mask_bits(load_with_lanes_of(clusters.group, width * other, reference) == clusters.group[i])
+    dy = (
+        reference[at + width]
+        + _origin_vector(pairs, c, other, image, 1)
+        - load(reference, start + width)
+    )
+    dz = (
+        reference[at + 2 * width]
+        + _origin_vector(pairs, c, other, image, 2)
+        - load(reference, start + 2 * width)
+    )
+    left_out = mask_bits(
+        load_with_lanes_of(clusters.group, width * other, reference) == clusters.group[i]
+    )
     if other == c:
         left_out |= (2 << (i - width * c)) - 1  # each pair once
     if other == len(clusters.origin) // 4 - 1:
-        left_out |= all_lanes ^ (all_lanes >> (len(clusters.order) - len(pairs.group)))  # slots without a site
+        left_out |= all_lanes ^ (
+            all_lanes >> (len(clusters.order) - len(pairs.group))
+        )  # slots without a site
     meets = all_lanes & ~left_out
     return meets if mask_bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
 
@@ -326,7 +398,10 @@ def update_origin_vectors(arguments, block):
     first = 0
     for c in range(pairs.clusters.bounds[block], pairs.clusters.bounds[block + 1]):
         for n in range(first, pairs.neighbor_end[c]):
-            other, image = cluster_of(pairs.neighbors[block, n]), image_number(pairs.neighbors[block, n])
+            other, image = (
+                cluster_of(pairs.neighbors[block, n]),
+                image_number(pairs.neighbors[block, n]),
+            )
             if image != 0:
                 for k in range(3):
                     origin_vector[3 * n + k] = _origin_vector(pairs, c, other, image, k)
@@ -335,6 +410,7 @@ def update_origin_vectors(arguments, block):
 
 @kernel(inline=True)
 def _origin_vector(pairs, c, other, image, k):
-    """Component k of the vector from the image of another cluster's origin to the origin of cluster c, Å."""
+    """Component k of the vector from the image of another cluster's origin to the origin of cluster
+    c, Å."""
     clusters = pairs.clusters
     return clusters.origin[4 * c + k] - pairs.shift[4 * image + k] - clusters.origin[4 * other + k]

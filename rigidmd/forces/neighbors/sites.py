@@ -1,15 +1,24 @@
-"""Sites of one potential: their positions for a state of the bodies, and the forces and torques on the bodies.
+"""Sites of one potential: their positions for a state of the bodies, and the forces and torques on
+the bodies.
 
 Each potential has a list of the sites that take part in it. Sites of one molecule are consecutive.
 """
 
-# isort: skip_file
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 
-from rigidmd.compile import BLOCKS, MOST_BLOCKS, Pass, chosen_by_type, is_a, kernel, load_arguments, task
+from rigidmd.compile import (
+    BLOCKS,
+    MOST_BLOCKS,
+    Pass,
+    chosen_by_type,
+    is_a,
+    kernel,
+    load_arguments,
+    task,
+)
 from rigidmd.compile.simd import lane_count, lanes_of, load_scalar
 from rigidmd.core.state import State
 from rigidmd.forces.terms import TALLIED, Evaluation
@@ -23,14 +32,21 @@ MOLECULES_PER_BLOCK = 4096  # if there are more blocks than the minimum
 @kernel(from_python=True)
 def blocks_of(molecules):
     """Number of blocks in which molecules are moved: one, on this thread, for few molecules."""
-    return max(BLOCKS, min(MOST_BLOCKS, molecules // MOLECULES_PER_BLOCK)) if molecules > SERIAL_MOLECULES else 1
+    return (
+        max(BLOCKS, min(MOST_BLOCKS, molecules // MOLECULES_PER_BLOCK))
+        if molecules > SERIAL_MOLECULES
+        else 1
+    )
 
 
 @kernel(inline=True)
 def molecules_of_block(molecules, block, together):
-    """First and end of the molecules of a block: whole groups of `together` molecules, except the last."""
+    """First and end of the molecules of a block: whole groups of `together` molecules, except the
+    last."""
     blocks, groups = blocks_of(molecules), (molecules + together - 1) // together
-    return together * (groups * block // blocks), min(molecules, together * (groups * (block + 1) // blocks))
+    return together * (groups * block // blocks), min(
+        molecules, together * (groups * (block + 1) // blocks)
+    )
 
 
 class BodySites(NamedTuple):
@@ -39,12 +55,18 @@ class BodySites(NamedTuple):
     first: np.ndarray  # (n + 1,) int32 molecule m has sites first[m] ... first[m + 1] - 1
     molecule: np.ndarray  # (s,) int32 molecule of each site
     kind: np.ndarray  # (n,) int32 index in offset_body of the first site of each molecule
-    offset_body: np.ndarray  # (rows, 3) from the centre of mass, body frame, Å; stored once for each species
-    inverse_inertia: np.ndarray  # (rows, 3) of the molecule of each row, 1/(u Å²); 0 if the moment is 0
+    offset_body: (
+        np.ndarray
+    )  # (rows, 3) from the centre of mass, body frame, Å; stored once for each species
+    inverse_inertia: (
+        np.ndarray
+    )  # (rows, 3) of the molecule of each row, 1/(u Å²); 0 if the moment is 0
 
     def offsets(self) -> np.ndarray:
         """Offsets (s, 3) of all sites, body frame, Å."""
-        return self.offset_body[(self.kind - self.first[:-1])[self.molecule] + np.arange(len(self.molecule))]
+        return self.offset_body[
+            (self.kind - self.first[:-1])[self.molecule] + np.arange(len(self.molecule))
+        ]
 
 
 class CentralSites(NamedTuple):
@@ -58,8 +80,11 @@ class CentralSites(NamedTuple):
         return np.zeros((len(self.molecule), 3))
 
 
-def sites_of(species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np.ndarray) -> BodySites | CentralSites:
-    """The sites of molecules whose species (n,) are given, with offsets[k] (sites, 3) in species k, body frame, Å.
+def sites_of(
+    species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np.ndarray
+) -> BodySites | CentralSites:
+    """The sites of molecules whose species (n,) are given, with offsets[k] (sites, 3) in species k,
+    body frame, Å.
     inverse_inertia : (species, 3) as in `Model`"""
     counts = np.array([len(of_species) for of_species in offsets])
     first = np.concatenate([[0], np.cumsum(counts[species])]).astype(np.int32)
@@ -72,12 +97,18 @@ def sites_of(species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np
     kind = (np.cumsum(counts) - counts)[species].astype(np.int32)
     if np.array_equal(kind, species):
         kind = species.astype(np.int32, copy=False)  # the same array for both
-    return BodySites(first, molecule, kind, np.ascontiguousarray(offset), np.repeat(inverse_inertia, counts, axis=0))
+    return BodySites(
+        first,
+        molecule,
+        kind,
+        np.ascontiguousarray(offset),
+        np.repeat(inverse_inertia, counts, axis=0),
+    )
 
 
 def exclusion_groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
-    """Exclusion group of each site (s,): the molecule, or one group for all frozen molecules. Sites of a group do not
-    interact. frozen (n,) : whether each molecule is frozen
+    """Exclusion group of each site (s,): the molecule, or one group for all frozen molecules. Sites
+    of a group do not interact. frozen (n,) : whether each molecule is frozen
     """
     if not frozen.any():
         return sites.molecule
@@ -112,7 +143,11 @@ def site_vector(vectors, i):
     def from_slot(vectors, i):
         value, width = vectors.value, lanes_of(vectors.value)
         at = index_of_x(load_scalar(vectors.slot, i), width)
-        return load_scalar(value, at), load_scalar(value, at + width), load_scalar(value, at + 2 * width)
+        return (
+            load_scalar(value, at),
+            load_scalar(value, at + width),
+            load_scalar(value, at + 2 * width),
+        )
 
     return from_slot
 
@@ -121,7 +156,11 @@ def site_vector(vectors, i):
 def locate_site(sites, state, m, i):
     """Position (x, y, z) of site i of molecule m, lab frame, Å."""
     if is_a(sites, CentralSites):
-        return lambda sites, state, m, i: (state.position[m, 0], state.position[m, 1], state.position[m, 2])
+        return lambda sites, state, m, i: (
+            state.position[m, 0],
+            state.position[m, 1],
+            state.position[m, 2],
+        )
 
     def locate_site(sites, state, m, i):
         x, y, z = site_offset_lab(sites, state, m, i)
@@ -133,7 +172,8 @@ def locate_site(sites, state, m, i):
 
 @chosen_by_type(inline=True)
 def predict_site(sites, state, m, i, lead):
-    """Position of site i of molecule m after a time `lead` at constant velocity and angular velocity, Å."""
+    """Position of site i of molecule m after a time `lead` at constant velocity and angular
+    velocity, Å."""
     if is_a(sites, CentralSites):
         return lambda sites, state, m, i, lead: (
             state.position[m, 0] + lead * state.velocity[m, 0],
@@ -143,13 +183,21 @@ def predict_site(sites, state, m, i, lead):
 
     def predict_site(sites, state, m, i, lead):
         q, centre, velocity, momentum = (
-            state.rotation[m], state.position[m], state.velocity[m], state.angular_momentum_body[m]
-        )  # fmt: skip
+            state.rotation[m],
+            state.position[m],
+            state.velocity[m],
+            state.angular_momentum_body[m],
+        )
         row = sites.kind[m] - sites.first[m] + i
         offset, inverse = sites.offset_body[row], sites.inverse_inertia[row]
-        # Cayley rotation by 2 atan(|a|) about a = lead omega / 2, which keeps distances within a molecule
+        # Cayley rotation by 2 atan(|a|) about a = lead omega / 2, which keeps distances within a
+        # molecule
         half = 0.5 * lead
-        a, b, c = half * inverse[0] * momentum[0], half * inverse[1] * momentum[1], half * inverse[2] * momentum[2]
+        a, b, c = (
+            half * inverse[0] * momentum[0],
+            half * inverse[1] * momentum[1],
+            half * inverse[2] * momentum[2],
+        )
         x, y, z = offset[0], offset[1], offset[2]
         factor = 2 / (1 + a * a + b * b + c * c)
         u, v, w = factor * (b * z - c * y), factor * (c * x - a * z), factor * (a * y - b * x)
@@ -189,7 +237,9 @@ def load_molecule(sites, state, load, m, site_force):
         m = np.uint64(m)  # an unsigned index is not tested for being negative
         q, force, torque = state.rotation[m], load.force[m], load.torque_body[m]
         begin = sites.kind[m] - sites.first[m]
-        sum_x = sum_y = sum_z = turn_x = turn_y = turn_z = 0.0  # kept in registers until the last site
+        sum_x = sum_y = sum_z = turn_x = turn_y = turn_z = (
+            0.0  # kept in registers until the last site
+        )
         for i in range(sites.first[m], sites.first[np.uint64(m + 1)]):
             fx, fy, fz = site_vector(site_force, i)
             sum_x, sum_y, sum_z = sum_x + fx, sum_y + fy, sum_z + fz
@@ -212,10 +262,13 @@ def load_molecule(sites, state, load, m, site_force):
 
 @kernel(from_python=True)
 def compute_site_positions(sites, state, site_position):
-    """Write the positions of all sites into site_position (s, 3), lab frame; molecules are not wrapped."""
+    """Write the positions of all sites into site_position (s, 3), lab frame; molecules are not
+    wrapped."""
     for m in range(len(state.position)):
         for i in range(sites.first[m], sites.first[m + 1]):
-            site_position[i, 0], site_position[i, 1], site_position[i, 2] = locate_site(sites, state, m, i)
+            site_position[i, 0], site_position[i, 1], site_position[i, 2] = locate_site(
+                sites, state, m, i
+            )
 
 
 @task()
@@ -225,7 +278,9 @@ def _compute_positions_of_block(arguments, block):
     first, end = molecules_of_block(len(state.position), block, 1)
     for m in range(first, end):
         for i in range(sites.first[m], sites.first[m + 1]):
-            site_position[i, 0], site_position[i, 1], site_position[i, 2] = locate_site(sites, state, m, i)
+            site_position[i, 0], site_position[i, 1], site_position[i, 2] = locate_site(
+                sites, state, m, i
+            )
 
 
 @task()
@@ -239,7 +294,8 @@ def _load_block(arguments, block):
 
 @task()
 def _sum_offset_virial_of_block(arguments, block):
-    """Sums of f (x) (x_site - X_molecule) over the molecules of a block (`blocks_of`), into a row (9,) of `virial`."""
+    """Sums of f (x) (x_site - X_molecule) over the molecules of a block (`blocks_of`), into a row
+    (9,) of `virial`."""
     sites, state, site_force, virial = load_arguments(arguments)
     virial[block] = 0.0
     first, end = molecules_of_block(len(state.position), block, 1)
@@ -255,7 +311,10 @@ def _sum_offset_virial_of_block(arguments, block):
 def position_pass(sites: BodySites | CentralSites, state: State, position: np.ndarray) -> Pass:
     """`compute_site_positions` into an array (s, 3)."""
     return Pass(
-        "positions of sites", _compute_positions_of_block, (sites, state, position), blocks_of(len(state.position))
+        "positions of sites",
+        _compute_positions_of_block,
+        (sites, state, position),
+        blocks_of(len(state.position)),
     )
 
 
@@ -283,7 +342,8 @@ def load_passes(
 
 
 def virial_buffer() -> np.ndarray:
-    """Array for the sums of `_sum_offset_virial_of_block`: 9 for each block, which has two cache lines."""
+    """Array for the sums of `_sum_offset_virial_of_block`: 9 for each block, which has two cache
+    lines."""
     return np.zeros((MOST_BLOCKS, 16))
 
 
@@ -298,7 +358,8 @@ def _sum_tallies(arguments, block):
 
 @task()
 def _subtract_offset_virial(arguments, block):
-    """Convert the site virial in a tally to the molecular virial: subtract sum f (x) (x_site - X_molecule)."""
+    """Convert the site virial in a tally to the molecular virial: subtract sum f (x) (x_site -
+    X_molecule)."""
     virial, tally = load_arguments(arguments)
     for b in range(len(virial)):
         for k in range(9):

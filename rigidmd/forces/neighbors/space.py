@@ -27,9 +27,9 @@ class Orthorhombic(NamedTuple):
 
 
 class Triclinic(NamedTuple):
-    """Periodic box of any shape: a = (x, 0, 0), b = (xy, y, 0), c = (xz, yz, z), Å; the names are those of LAMMPS. A
-    brick with edges x, y, z repeats along a, b and c without gaps too. Sites are shifted into that brick, where lists
-    for an orthorhombic box are used."""
+    """Periodic box of any shape: a = (x, 0, 0), b = (xy, y, 0), c = (xz, yz, z), Å; the names are
+    those of LAMMPS. A brick with edges x, y, z repeats along a, b and c without gaps too. Sites are
+    shifted into that brick, where lists for an orthorhombic box are used."""
 
     x: float
     y: float
@@ -57,7 +57,8 @@ Space = Orthorhombic | Triclinic | Unbounded
 
 
 def space_of(cell: np.ndarray | None) -> Space:
-    """The space with this cell matrix (3, 3), rows a, b, c with a along x and b in the xy plane, Å; None for no box."""
+    """The space with this cell matrix (3, 3), rows a, b, c with a along x and b in the xy plane, Å;
+    None for no box."""
     if cell is None or cell[0, 0] == inf:
         return Unbounded()
     (x, _, _), (xy, y, _), (xz, yz, z) = (map(float, row) for row in cell)
@@ -90,7 +91,8 @@ def fractions(space: Space, position: np.ndarray) -> np.ndarray:
 
 
 def longest_gaps(space: Space, position: np.ndarray) -> np.ndarray:
-    """The longest part (3,) of each edge of a periodic box without any of the positions (n, 3), Å."""
+    """The longest part (3,) of each edge of a periodic box without any of the positions (n, 3),
+    Å."""
     fraction = np.sort(fractions(space, position) % 1.0, axis=0)
     return np.diff(fraction, axis=0, append=fraction[:1] + 1.0).max(axis=0) * space.edges
 

@@ -1,7 +1,9 @@
-"""A tree of bounding boxes of clusters. It finds clusters within reach of one another in O(N log N) for any shape.
+"""A tree of bounding boxes of clusters. It finds clusters within reach of one another in O(N log N)
+for any shape.
 
-A node has as many children as a vector of float64 has lanes, so one vector comparison tests all of them. The tree is
-searched once for some clusters near one another, down to families; each of the clusters then tests their boxes.
+A node has as many children as a vector of float64 has lanes, so one vector comparison tests all of
+them. The tree is searched once for some clusters near one another, down to families; each of the
+clusters then tests their boxes.
 """
 
 from math import ceil, inf
@@ -14,7 +16,8 @@ from rigidmd.compile.simd import lane_count, lanes_of, load, lowest_bit, mask_bi
 
 
 class BoxTree(NamedTuple):
-    """Boxes of clusters (level 0), of groups of such boxes, called families (level 1), and so on up to one family."""
+    """Boxes of clusters (level 0), of groups of such boxes, called families (level 1), and so on up
+    to one family."""
 
     low: np.ndarray  # (3, nodes) the levels one after the other, each padded with empty boxes
     high: np.ndarray  # (3, nodes)
@@ -56,11 +59,12 @@ def fit_boxes(arguments, block):
 
 @kernel(inline=True, count_references=False)
 def families_within_reach(tree, low, high, radius2, first, end, clusters, stack, found, count):
-    """Write to found[count:], ascending, families that may have clusters closer than a radius to a box (3,), (3,).
+    """Write to found[count:], ascending, families that may have clusters closer than a radius to a
+    box (3,), (3,).
 
-    Family f has clusters arity * f ... arity * (f + 1) - 1. Only those are taken that have a cluster at most half
-    way round the ring ahead of one of clusters first ... end - 1. Returns the new count, which may exceed len(found);
-    stack (levels, 2) is scratch.
+    Family f has clusters arity * f ... arity * (f + 1) - 1. Only those are taken that have a
+    cluster at most half way round the ring ahead of one of clusters first ... end - 1. Returns the
+    new count, which may exceed len(found); stack (levels, 2) is scratch.
     """
     arity = lanes_of(tree.low)
     top = len(tree.level) - 2
@@ -87,13 +91,16 @@ def families_within_reach(tree, low, high, radius2, first, end, clusters, stack,
             depth += 1
             size //= arity
             stack[depth, 0] = node * arity
-            stack[depth, 1] = near(tree, tree.level[top + 1 - depth] + node * arity, low, high, radius2)
+            stack[depth, 1] = near(
+                tree, tree.level[top + 1 - depth] + node * arity, low, high, radius2
+            )
     return count
 
 
 @kernel(inline=True)
 def near(tree, node, low, high, radius2):
-    """Which of the boxes from a node on, as many as its siblings, are closer than a radius to a box, as bits."""
+    """Which of the boxes from a node on, as many as its siblings, are closer than a radius to a
+    box, as bits."""
     dx = max(max(load(tree.low[0], node) - high[0], low[0] - load(tree.high[0], node)), 0.0)
     dy = max(max(load(tree.low[1], node) - high[1], low[1] - load(tree.high[1], node)), 0.0)
     dz = max(max(load(tree.low[2], node) - high[2], low[2] - load(tree.high[2], node)), 0.0)
@@ -102,8 +109,8 @@ def near(tree, node, low, high, radius2):
 
 @kernel(inline=True)
 def ahead(c, clusters, first, arity):
-    """Which of clusters first ... first + arity - 1 are at most half way round the ring ahead of cluster c, as bits. Of
-    two clusters opposite one another the second is ahead of the first."""
+    """Which of clusters first ... first + arity - 1 are at most half way round the ring ahead of
+    cluster c, as bits. Of two clusters opposite one another the second is ahead of the first."""
     passed = _bits_below(c - first, arity)
     beyond = _bits_below(c + clusters // 2 + 1 - first, arity)
     around = _bits_below(c + (clusters - 1) // 2 + 1 - clusters - first, arity)

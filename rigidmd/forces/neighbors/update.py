@@ -1,26 +1,45 @@
-"""Update of a neighbour list: its sites move with the bodies, and it is rebuilt when it is not valid any longer."""
+"""Update of a neighbour list: its sites move with the bodies, and it is rebuilt when it is not
+valid any longer."""
 
-# isort: skip_file
 from math import ceil, floor, inf, sqrt
 
 from rigidmd.compile import Code, call, call_blocks, kernel, load_arguments, pack_arguments, task
 from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, NOW, OK
 from rigidmd.forces.neighbors.clusters import (
-    BUILT, LEAD_TIME, bin_sites, measure_displacements, restore_half_squares, set_local, set_origins,
-    sort_into_clusters, wrap_sites,
-)  # fmt: skip
+    BUILT,
+    LEAD_TIME,
+    bin_sites,
+    measure_displacements,
+    restore_half_squares,
+    set_local,
+    set_origins,
+    sort_into_clusters,
+    wrap_sites,
+)
 from rigidmd.forces.neighbors.lists import (
-    BUILDS, ENTRIES, IMAGES_FOUND, LONGEST_SKIN, MASKED, MAX_NEIGHBORS, NEIGHBORS, NEIGHBORS_OF_ONE, STATUS, USABLE,
-    PairList, largest_displacement, most_needed,
-)  # fmt: skip
+    BUILDS,
+    ENTRIES,
+    IMAGES_FOUND,
+    LONGEST_SKIN,
+    MASKED,
+    MAX_NEIGHBORS,
+    NEIGHBORS,
+    NEIGHBORS_OF_ONE,
+    STATUS,
+    USABLE,
+    PairList,
+    largest_displacement,
+    most_needed,
+)
 from rigidmd.forces.neighbors.rows import fill_rows, update_origin_vectors
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.neighbors.tree import fit_boxes
 from rigidmd.forces.terms import copy
 
-#: A list is built for positions predicted ahead by this fraction of the lifetime of the last list. With a larger one
-#: sites are farther from the predictions on average, and the loop has to work through more shells.
+#: A list is built for positions predicted ahead by this fraction of the lifetime of the last list.
+#: With a larger one sites are farther from the predictions on average, and the loop has to work
+#: through more shells.
 LEAD_FRACTION = 0.25
 
 
@@ -28,22 +47,30 @@ def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
     """The machine code of the tasks that update a list."""
     site_arguments = (pairs, sites, EXAMPLE[0])
     return Code(
-        origin_vectors=(update_origin_vectors, pairs), local=(set_local, site_arguments),
-        displacements=(measure_displacements, pairs), wrap=(wrap_sites, site_arguments),
-        bin=(bin_sites, site_arguments), sort=(_sort_sites, pairs), origins=(set_origins, site_arguments),
-        boxes=(fit_boxes, pairs), fill=(fill_rows, pairs),
-    )  # fmt: skip
+        origin_vectors=(update_origin_vectors, pairs),
+        local=(set_local, site_arguments),
+        displacements=(measure_displacements, pairs),
+        wrap=(wrap_sites, site_arguments),
+        bin=(bin_sites, site_arguments),
+        sort=(_sort_sites, pairs),
+        origins=(set_origins, site_arguments),
+        boxes=(fit_boxes, pairs),
+        fill=(fill_rows, pairs),
+    )
 
 
 @kernel(count_references=False)
 def update_list(pairs, code, sites, state):
-    """Move the clusters with the molecules, and rebuild the list if it is not valid; a status code."""
+    """Move the clusters with the molecules, and rebuild the list if it is not valid; a status
+    code."""
     blocks = len(pairs.needed)
     arguments = pack_arguments(pairs)
     site_arguments = pack_arguments((pairs, sites, state))
     if follow_cell(state.cell, pairs.cell):
         for k in range(9):
-            if pairs.cell[k // 3, k % 3] != pairs.cell[k // 3, k % 3]:  # NaN, which comparisons do not detect
+            if (
+                pairs.cell[k // 3, k % 3] != pairs.cell[k // 3, k % 3]
+            ):  # NaN, which comparisons do not detect
                 pairs.counters[USABLE] = 0
                 return NOT_FINITE
         if pairs.counters[USABLE] == 1:
@@ -128,21 +155,24 @@ def _shortest(cell):
 def _cell_fits(pairs):
     """Whether the cell is large enough for the cutoff and the skin."""
     shortest = _shortest(pairs.cell)
-    return pairs.cutoff == inf or (2 * pairs.cutoff <= shortest and pairs.skin <= LONGEST_SKIN * shortest)
+    return pairs.cutoff == inf or (
+        2 * pairs.cutoff <= shortest and pairs.skin <= LONGEST_SKIN * shortest
+    )
 
 
 @kernel
 def _max_slack(pairs):
-    """How far images may move until the list is built again, Å. Images are sought within a radius that is larger by
-    this: an image that was left out, and may move by twice as much as those that were found, stays out of reach. 0 if
-    such a search could find more images than the capacity."""
+    """How far images may move until the list is built again, Å. Images are sought within a radius
+    that is larger by this: an image that was left out, and may move by twice as much as those that
+    were found, stays out of reach. 0 if such a search could find more images than the capacity."""
     is_short = pairs.cutoff < inf and 2.5 * pairs.skin <= _shortest(pairs.built)
     return 0.25 * pairs.skin if is_short else 0.0
 
 
 @kernel
 def _move_images(pairs):
-    """Move the images with the cell. Whether the list is still valid; `update_origin_vectors` must follow."""
+    """Move the images with the cell. Whether the list is still valid; `update_origin_vectors` must
+    follow."""
     farthest2 = 0.0
     for n in range(pairs.counters[IMAGES_FOUND]):
         moved2 = 0.0
@@ -175,13 +205,15 @@ def _sort_sites(arguments, block):
 
 @kernel
 def _find_images(pairs):
-    """Find the images of the brick (see `clusters`) near it in the present cell. Shift 0 is the first. Bricks are
-    stacked in layers along c and in rows along b. The radius is not longer than any edge, so there are 27 images in an
-    orthorhombic box and up to 48 in a triclinic one."""
+    """Find the images of the brick (see `clusters`) near it in the present cell. Shift 0 is the
+    first. Bricks are stacked in layers along c and in rows along b. The radius is not longer than
+    any edge, so there are 27 images in an orthorhombic box and up to 48 in a triclinic one."""
     cell, multiple = pairs.cell, pairs.multiple
     copy(cell, pairs.built)
     pairs.slack[0] = 0.0
-    radius = min(pairs.cutoff + pairs.skin + _max_slack(pairs), _shortest(cell))  # rounding may exceed it
+    radius = min(
+        pairs.cutoff + pairs.skin + _max_slack(pairs), _shortest(cell)
+    )  # rounding may exceed it
     multiple[0, 0] = multiple[0, 1] = multiple[0, 2] = 0
     found = 1
     for z in range(-1, 2):
@@ -204,7 +236,8 @@ def _find_images(pairs):
 
 @kernel
 def _images_along(cell, k, offset, radius):
-    """First and last multiple of edge k that brings a brick at an offset within a radius of the brick at 0."""
+    """First and last multiple of edge k that brings a brick at an offset within a radius of the
+    brick at 0."""
     edge = cell[k, k]
     if edge == inf:
         return 0, 0

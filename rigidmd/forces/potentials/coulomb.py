@@ -1,6 +1,6 @@
-"""Coulomb potential with a reaction field: q_i q_j (1/r + field r²) within a cutoff, a dielectric beyond it."""
+"""Coulomb potential with a reaction field: q_i q_j (1/r + field r²) within a cutoff, a dielectric
+beyond it."""
 
-# isort: skip_file
 from math import inf, sqrt
 from typing import Any, NamedTuple
 
@@ -12,15 +12,29 @@ from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.parts import Interactions, SystemParts
 from rigidmd.forces.potentials.truncation import (
-    NO_SWITCH, SWITCHES, SwitchCorrection, SwitchTerm, Truncation, TruncationName, TruncationTerms, correction,
-    needs_root, switch_correction_of, switch_term, switch_term_of, truncated, truncation_of, truncation_terms,
-)  # fmt: skip
+    NO_SWITCH,
+    SWITCHES,
+    SwitchCorrection,
+    SwitchTerm,
+    Truncation,
+    TruncationName,
+    TruncationTerms,
+    correction,
+    needs_root,
+    switch_correction_of,
+    switch_term,
+    switch_term_of,
+    truncated,
+    truncation_of,
+    truncation_terms,
+)
 from rigidmd.units import COULOMB_CHARGE
 
 
 class ReactionField(NamedTuple):
-    """q_i q_j (1/r + field r²), truncated at the cutoff; field is k of the theory chapter `interactions` (Tironi et al.
-    1995, J. Chem. Phys. 102, 5451). Without a cutoff the field is 0: plain Coulomb."""
+    """q_i q_j (1/r + field r²), truncated at the cutoff; field is k of the theory chapter
+    `interactions` (Tironi et al. 1995, J. Chem. Phys. 102, 5451). Without a cutoff the field is 0:
+    plain Coulomb."""
 
     cutoff: float  # Å
     truncation: Truncation
@@ -32,7 +46,8 @@ class ReactionField(NamedTuple):
     acts_on_charges = True
 
     def for_slots(self, slots: int, dtype: type) -> "ReactionField":
-        """The potential with an array for the charges in slots, in the precision of the pair loop."""
+        """The potential with an array for the charges in slots, in the precision of the pair
+        loop."""
         powers = {1: 1.0, 0: self.terms[0], -2: self.field}
         switched = switch_correction_of(self.truncation, powers, dtype) or switch_term_of(
             self.truncation, powers, dtype
@@ -41,7 +56,11 @@ class ReactionField(NamedTuple):
 
 
 def reaction_field(
-    charge_e: np.ndarray, cutoff: float, permittivity: float = inf, name: TruncationName = "plain", start: float = 0.0
+    charge_e: np.ndarray,
+    cutoff: float,
+    permittivity: float = inf,
+    name: TruncationName = "plain",
+    start: float = 0.0,
 ) -> ReactionField:
     """The potential for sites with charges (s,) in e; a permittivity of `inf` means a conductor."""
     truncation = truncation_of(name, cutoff, start)
@@ -51,14 +70,16 @@ def reaction_field(
     def at(r: float) -> tuple[float, float, float]:
         return 1 / r + field * r**2, 1 / r**2 - 2 * field * r, -2 / r**3 - 2 * field
 
-    # A switching function multiplies the energy near the cutoff, which must be small there, so the energy is first
-    # shifted to zero at the cutoff. Unshifted, a pair of unit charges would lose 230 kJ/mol between 8 and 9 Å.
+    # A switching function multiplies the energy near the cutoff, which must be small there, so the
+    # energy is first shifted to zero at the cutoff. Unshifted, a pair of unit charges would lose
+    # 230 kJ/mol between 8 and 9 Å.
     terms = truncation_terms("shift" if name in SWITCHES else name, truncation, at)
     return ReactionField(cutoff, truncation, terms, field, charge_e * COULOMB_CHARGE)
 
 
 def interactions(parts: SystemParts) -> Interactions:
-    """The charges of a scene with electrostatics = "reaction_field", and "coulomb", which has no cutoff."""
+    """The charges of a scene with electrostatics = "reaction_field", and "coulomb", which has no
+    cutoff."""
     forces, (sites, charge) = parts.scene.forces, parts.charged()
     cutoff = (forces.cutoff_A if forces.electrostatics == "reaction_field" else None) or inf
     start, name = forces.switch_start_A or cutoff, forces.reaction_field_truncation or "plain"
@@ -74,7 +95,8 @@ def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
     """Messages on keys of [forces] that this box does not allow."""
     if forces.electrostatics == "coulomb" and space.volume < inf:
         return [
-            "forces.electrostatics = 'coulomb' is for open boxes; in a periodic one use pme, ewald or reaction_field"
+            "forces.electrostatics = 'coulomb' is for open boxes; in a periodic one use pme, ewald"
+            " or reaction_field"
         ]
     return []
 
@@ -97,7 +119,9 @@ def radial(potential, r2):
     """(energy, force/r) of two unit charges at squared distance r2, a number or a vector."""
     inverse, one, two = powers(potential.truncation, potential.switched, r2)
     u = inverse + potential.field * r2 + potential.terms[0]
-    w = (1 + switch_term(potential.truncation, potential.switched, r2 * inverse)) * one * two - 2 * potential.field
+    w = (
+        1 + switch_term(potential.truncation, potential.switched, r2 * inverse)
+    ) * one * two - 2 * potential.field
     w = w + correction(potential.truncation, potential.switched, r2)
     return truncated(potential.truncation, potential.terms, potential.switched, r2, inverse, u, w)
 
@@ -110,8 +134,9 @@ def _pair(potential, i, j, r2):
 
 
 def self_energy(potential: ReactionField, position: np.ndarray) -> float:
-    """Energy (u Å²/ps²) of the charges of one molecule in their reaction field, a constant. position (s, 3) of the
-    charged sites of the molecule, in the order of the first s of potential.charge."""
+    """Energy (u Å²/ps²) of the charges of one molecule in their reaction field, a constant.
+    position (s, 3) of the charged sites of the molecule, in the order of the first s of
+    potential.charge."""
     charge = potential.charge[: len(position)]
     energy = 0.5 * charge @ charge * potential.terms[0]
     for i in range(len(position)):

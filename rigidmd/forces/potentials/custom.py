@@ -1,11 +1,10 @@
 """User pair potentials: a formula with its parameters, truncated and mixed like Lennard-Jones.
 
 A formula is a NamedTuple class, whose fields are the parameters of a pair of sites, with an
-`@implements(energy_and_force_at)`, which `formulas` writes. The parameters are numbers if all sites are of one kind, or
-vectors that the pair loop reads from a table.
+`@implements(energy_and_force_at)`, which `formulas` writes. The parameters are numbers if all sites
+are of one kind, or vectors that the pair loop reads from a table.
 """
 
-# isort: skip_file
 from collections.abc import Callable
 from math import inf, pi
 from typing import NamedTuple
@@ -18,8 +17,14 @@ from rigidmd.compile.simd import evaluate_cubic, inverse, inverse_square_root, l
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.parts import InnerPairs, Tail
 from rigidmd.forces.potentials.truncation import (
-    ForceShifted, Truncation, TruncationTerms, Unmodified, integral_of_removed_energy, removed_energy, truncated,
-)  # fmt: skip
+    ForceShifted,
+    Truncation,
+    TruncationTerms,
+    Unmodified,
+    integral_of_removed_energy,
+    removed_energy,
+    truncated,
+)
 
 
 class CustomPotential(NamedTuple):
@@ -31,16 +36,21 @@ class CustomPotential(NamedTuple):
     shared: tuple  # what a formula needs besides its parameters, the same for all kinds
     kind: np.ndarray  # (s,) kind of each site
     parameters: np.ndarray  # (parameters, kinds, kinds)
-    terms_of_kinds: np.ndarray  # (4, kinds, kinds) see truncation.truncation_terms; 0 without interaction
+    terms_of_kinds: (
+        np.ndarray
+    )  # (4, kinds, kinds) see truncation.truncation_terms; 0 without interaction
     interacts: np.ndarray  # (kinds, kinds) 1 or 0
 
     def for_slots(self, slots: int, dtype: type) -> "CustomOneKind | CustomManyKinds":
-        """What the pair loop reads: numbers if all sites are of one kind, else tables for all slots."""
+        """What the pair loop reads: numbers if all sites are of one kind, else tables for all
+        slots."""
         head, kinds = self[:4], self.parameters.shape[1]
         if kinds == 1:
             return CustomOneKind(*head, tuple(float(x) for x in self.terms_of_kinds[:, 0, 0]))
         count = len(self.parameters) + 5
-        return CustomManyKinds(*head, np.zeros(slots, np.int32), zeros(count * kinds * slots, dtype), kinds * slots)
+        return CustomManyKinds(
+            *head, np.zeros(slots, np.int32), zeros(count * kinds * slots, dtype), kinds * slots
+        )
 
 
 class CustomOneKind(NamedTuple):
@@ -52,21 +62,26 @@ class CustomOneKind(NamedTuple):
 
 
 class CustomManyKinds(NamedTuple):
-    """A user potential with its numbers for each kind and the site in each slot, so that the loop needs no gathers."""
+    """A user potential with its numbers for each kind and the site in each slot, so that the loop
+    needs no gathers."""
 
     cutoff: float
     truncation: Truncation
     formula: NamedTuple
     shared: tuple
     kind: np.ndarray  # (slots,)
-    table: np.ndarray  # (numbers kinds slots,) of a pair: whether it interacts, 4 truncation terms, parameters
+    table: (
+        np.ndarray
+    )  # (numbers kinds slots,) of a pair: whether it interacts, 4 truncation terms, parameters
     stride: int  # kinds slots
 
 
 def energy_and_force_at(formula, shared, r2, inverse1, inverse2):
-    """(energy, force/r) of a formula at squared distances r2, with 1/r and 1/r²; u Å²/ps², scalars or vectors. inverse1
-    is 0 if neither the formula nor the truncation uses it."""
-    raise TypeError(f"{type(formula).__name__} is not a formula, or this was called outside compiled code")
+    """(energy, force/r) of a formula at squared distances r2, with 1/r and 1/r²; u Å²/ps², scalars
+    or vectors. inverse1 is 0 if neither the formula nor the truncation uses it."""
+    raise TypeError(
+        f"{type(formula).__name__} is not a formula, or this was called outside compiled code"
+    )
 
 
 @implements(pairs.pair, CustomOneKind, inline=True)
@@ -78,9 +93,14 @@ def _pair_of_one_kind(potential, i, j, r2):
 def _pair(potential, i, j, r2):
     types = dict(zip(CustomManyKinds._fields, potential.types, strict=True))
     formula, truncation = types["formula"].instance_class, types["truncation"]
-    names = [f"load(potential.table, at + {5 + p} * potential.stride)" for p in range(len(formula._fields))]
+    names = [
+        f"load(potential.table, at + {5 + p} * potential.stride)"
+        for p in range(len(formula._fields))
+    ]
     terms = ["0.0"] * 4
-    for k in range(1 if is_a(truncation, Unmodified) else 4 if is_a(truncation, ForceShifted) else 0):
+    for k in range(
+        1 if is_a(truncation, Unmodified) else 4 if is_a(truncation, ForceShifted) else 0
+    ):
         terms[k] = f"load(potential.table, at + {1 + k} * potential.stride)"
     source = "\n".join(
         (
@@ -88,11 +108,17 @@ def _pair(potential, i, j, r2):
             "    at = potential.kind[i] * len(potential.kind) + j",
             f"    formula = Formula({', '.join(names)})",
             f"    u, w = energy_and_force(potential, formula, ({', '.join(terms)}), r2)",
-            "    interacts = load(potential.table, at) > 0.5",  # a formula may be NaN without interaction
+            # a formula may be NaN without interaction
+            "    interacts = load(potential.table, at) > 0.5",
             "    return select(interacts, u, 0.0), select(interacts, w, 0.0)",
         )
     )
-    names_in = {"Formula": formula, "load": load, "select": select, "energy_and_force": energy_and_force}
+    names_in = {
+        "Formula": formula,
+        "load": load,
+        "select": select,
+        "energy_and_force": energy_and_force,
+    }
     exec(source, names_in)
     return names_in["pair"]
 
@@ -133,10 +159,14 @@ def _arrange(slot_potential, potential, order):
 
 
 def tail_of_pair(
-    radial: Callable[[float], tuple], terms: TruncationTerms, truncation: Truncation, inner: InnerPairs | None = None
+    radial: Callable[[float], tuple],
+    terms: TruncationTerms,
+    truncation: Truncation,
+    inner: InnerPairs | None = None,
 ) -> Tail:
-    """The tail correction of one pair of sites, with the constant of the `inner` pairs, which are all of these kinds.
-    See `lennard_jones.tail`. Raises ArithmeticError if the energy falls too slowly."""
+    """The tail correction of one pair of sites, with the constant of the `inner` pairs, which are
+    all of these kinds. See `lennard_jones.tail`. Raises ArithmeticError if the energy falls too
+    slowly."""
     cutoff = truncation.cutoff
     far = [abs(radial(factor * cutoff)[0]) * factor**3 for factor in (1.0, 1e3)]
     if far[1] > 0.1 * far[0]:
@@ -147,10 +177,16 @@ def tail_of_pair(
 
     beyond = quad(lambda r: r**2 * radial(r)[0], cutoff, inf, limit=200)[0]
     removed = beyond + integral_of_removed_energy(energy, truncation, terms)
-    jump = (radial(cutoff)[0] + terms[0]) * cutoff**3 / 3 if isinstance(truncation, Unmodified) else 0.0
+    jump = (
+        (radial(cutoff)[0] + terms[0]) * cutoff**3 / 3
+        if isinstance(truncation, Unmodified)
+        else 0.0
+    )
     constant = 0.0
     if inner is not None:
-        constant = -float(inner.count @ removed_energy(energy, truncation, terms, inner.distance)) / 2
+        constant = (
+            -float(inner.count @ removed_energy(energy, truncation, terms, inner.distance)) / 2
+        )
     return Tail(2 * pi * removed, 2 * pi * (removed + jump), constant)
 
 
@@ -159,7 +195,9 @@ class Table(NamedTuple):
 
     first: float  # the least r², Å²
     per_step: float  # 1/(step of r²), 1/Å²
-    coefficients: np.ndarray  # (4 steps,) u Å²/ps²; of each step c0 ... c3, energy = sum of ck x^k, 0 <= x <= 1
+    coefficients: (
+        np.ndarray
+    )  # (4 steps,) u Å²/ps²; of each step c0 ... c3, energy = sum of ck x^k, 0 <= x <= 1
 
 
 class Tabulated(NamedTuple):

@@ -1,4 +1,5 @@
-"""Formulas of user pair potentials: from a function, from a table; `text_formulas` has those from a text."""
+"""Formulas of user pair potentials: from a function, from a table; `text_formulas` has those from a
+text."""
 
 import contextlib
 import inspect
@@ -21,13 +22,15 @@ DISTANCE = "r"
 Radial = Callable[[float], tuple[float, float, float]]
 STEPS = 4096  #: intervals of r² in a table, equally spaced
 LEAST_ROWS = 8  #: of a table of a user
-#: Largest difference of an energy and the trapezoidal integral of its force between two rows, relative to the largest
-#: change of the energy between rows.
+#: Largest difference of an energy and the trapezoidal integral of its force between two rows,
+#: relative to the largest change of the energy between rows.
 WRONG_FORCE = 0.3
 #: Largest absolute value of an energy (kJ/mol) or a force of a table: products of a few are finite.
 LARGEST_VALUE = 1e30
-#: Neighbouring intervals of a table that differ by more than this factor separate parts of it. A part
-#: of longer intervals than its neighbour with fewer than LEAST_ROWS of them is a gap: it is not known how
+#: Neighbouring intervals of a table that differ by more than this factor separate parts of it. A
+#: part
+#: of longer intervals than its neighbour with fewer than LEAST_ROWS of them is a gap: it is not
+#: known how
 #: far the spline is off in it.
 UNEQUAL = 3.0
 #: Largest error of the spline of a table, relative to its deepest energy.
@@ -35,11 +38,14 @@ LARGEST_ERROR = 0.1
 
 
 class Formula(NamedTuple):
-    """A radial potential: energies in kJ/mol and distances in Å for users, u Å²/ps² in compiled code."""
+    """A radial potential: energies in kJ/mol and distances in Å for users, u Å²/ps² in compiled
+    code."""
 
     text: str  # for messages
     parameters: tuple[str, ...]  # names of the parameters of a pair of sites
-    numbers: Callable[[Mapping[str, float]], tuple[float, ...]]  # the fields of `kind` from the parameters
+    numbers: Callable[
+        [Mapping[str, float]], tuple[float, ...]
+    ]  # the fields of `kind` from the parameters
     radial: Callable[[Mapping[str, float]], Radial]  # of the parameters of a pair
     kind: type  # the NamedTuple class of the formula in compiled code
     shared: tuple = ()
@@ -50,7 +56,7 @@ class FormulaError(ValueError):
     """A formula that cannot be used, and why."""
 
 
-# --- from a function -------------------------------------------------------------------------------------------------
+# --- from a function ------------------------------------------------------------------------------
 
 _COUNT = itertools.count()
 #: Arguments that a user function may have besides the parameters.
@@ -58,10 +64,12 @@ ARGUMENTS = ("r", "r2", "inverse")
 
 
 def formula_of_function(function: Callable, kind: type | None = None) -> Formula:
-    """The formula of a function f(p, r) that returns (energy in kJ/mol, -dE/dr in kJ/mol/Å) for the parameters p.
+    """The formula of a function f(p, r) that returns (energy in kJ/mol, -dE/dr in kJ/mol/Å) for the
+    parameters p.
 
-    It is compiled for vectors of distances: arithmetic, and exp, log, pow, sin, cos, sqrt, fabs of Python's `math`. It
-    may also have arguments named r2 (r²) and inverse (1/r), which save a division.
+    It is compiled for vectors of distances: arithmetic, and exp, log, pow, sin, cos, sqrt, fabs of
+    Python's `math`. It may also have arguments named r2 (r²) and inverse (1/r), which save a
+    division.
     kind : NamedTuple class of the parameters; default: the annotation of p. Raises FormulaError.
     """
     function = getattr(function, "py_func", function)
@@ -72,15 +80,18 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
     strange = [one.name for one in arguments[1:] if one.name not in ARGUMENTS]
     if not arguments or len(arguments) < 2 or strange:
         raise FormulaError(
-            f"{name} has the arguments ({', '.join(one.name for one in arguments)}); it needs the parameters, then r, "
-            "and may have r2 and inverse"
+            f"{name} has the arguments ({', '.join(one.name for one in arguments)}); it needs the"
+            " parameters, then r, and may have r2 and inverse"
         )
     if kind is None:
-        with contextlib.suppress(NameError, SyntaxError, AttributeError, TypeError):  # of annotations that are text
+        with contextlib.suppress(
+            NameError, SyntaxError, AttributeError, TypeError
+        ):  # of annotations that are text
             kind = inspect.get_annotations(function, eval_str=True).get(arguments[0].name)
     if not (isinstance(kind, type) and issubclass(kind, tuple) and getattr(kind, "_fields", ())):
         raise FormulaError(
-            f"the parameters of {name} are not known: annotate {arguments[0].name} with a NamedTuple class"
+            f"the parameters of {name} are not known: annotate {arguments[0].name} with a"
+            " NamedTuple class"
         )
     formula_class = _class_for(kind, function)
     given = [one.name for one in arguments[1:]]
@@ -92,7 +103,8 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
             energy, force = map(float, found)
         except (Exception, SystemExit) as error:  # a user function may raise anything
             raise FormulaError(
-                f"{name} at r = {distance:g} Å must give (energy, force), two numbers; {describe_error(error)}"
+                f"{name} at r = {distance:g} Å must give (energy, force), two numbers;"
+                f" {describe_error(error)}"
             ) from error
         return energy * KJ_PER_MOL, force * KJ_PER_MOL
 
@@ -100,22 +112,35 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
         def value(distance: float) -> tuple[float, float, float]:
             energy, force = called(values, distance)
             step = 1e-5 * distance
-            slope = (called(values, distance + step)[1] - called(values, distance - step)[1]) / (2 * step)
+            slope = (called(values, distance + step)[1] - called(values, distance - step)[1]) / (
+                2 * step
+            )
             return energy, force, slope
 
         return value
 
     return Formula(
-        name, formula_class._fields, lambda values: tuple(values[field] for field in formula_class._fields), radial,
+        name,
+        formula_class._fields,
+        lambda values: tuple(values[field] for field in formula_class._fields),
+        radial,
         formula_class,
-    )  # fmt: skip
+    )
 
 
 def _class_for(kind: type, function: Callable) -> type:
-    """A new class for a function, by which compiled code finds it: with the values that the function uses now."""
-    module, name = function.__module__, f"{kind.__qualname__.rpartition('.')[2]}_of_{function.__name__}"
-    formula_class = type(name, (kind,), {"__module__": module, "__qualname__": name, "uses_root": True})
-    formula_class.__name__ = f"{name}_{next(_COUNT)}"  # Numba takes classes of one name for one type
+    """A new class for a function, by which compiled code finds it: with the values that the
+    function uses now."""
+    module, name = (
+        function.__module__,
+        f"{kind.__qualname__.rpartition('.')[2]}_of_{function.__name__}",
+    )
+    formula_class = type(
+        name, (kind,), {"__module__": module, "__qualname__": name, "uses_root": True}
+    )
+    formula_class.__name__ = (  # Numba takes classes of one name for one type
+        f"{name}_{next(_COUNT)}"
+    )
     compiled = compile_user_function(function, inline=True)
     asked = tuple(name for name in list(inspect.signature(function).parameters)[1:])
     values = {"r": "r2 * inverse1", "r2": "r2", "inverse": "inverse1"}
@@ -130,29 +155,43 @@ def _class_for(kind: type, function: Callable) -> type:
     return formula_class
 
 
-# --- from a table ----------------------------------------------------------------------------------------------------
+# --- from a table ---------------------------------------------------------------------------------
 
 
 def formula_of_table(
-    distance: Sequence[float], energy: Sequence[float], cutoff: float, force: Sequence[float] | None = None,
+    distance: Sequence[float],
+    energy: Sequence[float],
+    cutoff: float,
+    force: Sequence[float] | None = None,
     name: str = "a table",
-) -> Formula:  # fmt: skip
-    """The formula of energies (kJ/mol) at ascending distances (Å), which must reach from contact to the cutoff.
+) -> Formula:
+    """The formula of energies (kJ/mol) at ascending distances (Å), which must reach from contact to
+    the cutoff.
 
-    The table is interpolated by a cubic spline, or by cubics with the given forces -dE/dr (kJ/mol/Å) at the distances,
-    and tabulated again at equal steps of r² for the pair loop. The force is the derivative of that table. Nearer than
-    the first distance a the energy is E(a) + a F(a)/12 ((a/r)¹² - 1), down to a/2, and a straight line in r² below.
-    `error` is the error of the spline, which has the order 4, estimated by its difference from one through every second
-    value, plus the error of the second table. Raises FormulaError, also for gaps in the table and for large errors.
+    The table is interpolated by a cubic spline, or by cubics with the given forces -dE/dr
+    (kJ/mol/Å) at the distances, and tabulated again at equal steps of r² for the pair loop. The
+    force is the derivative of that table. Nearer than the first distance a the energy is E(a) + a
+    F(a)/12 ((a/r)¹² - 1), down to a/2, and a straight line in r² below. `error` is the error of the
+    spline, which has the order 4, estimated by its difference from one through every second value,
+    plus the error of the second table. Raises FormulaError, also for gaps in the table and for
+    large errors.
     """
     try:
         r, u = np.asarray(distance, float), np.asarray(energy, float)
         f = None if force is None else np.asarray(force, float)
     except (TypeError, ValueError):
-        raise FormulaError(f"{name} is two lists of numbers: distances in Å, energies in kJ/mol") from None
-    if r.ndim != 1 or r.shape != u.shape or len(r) < LEAST_ROWS or (f is not None and f.shape != r.shape):
         raise FormulaError(
-            f"{name} needs {LEAST_ROWS} distances or more, with one energy each; these are {r.shape} and {u.shape}"
+            f"{name} is two lists of numbers: distances in Å, energies in kJ/mol"
+        ) from None
+    if (
+        r.ndim != 1
+        or r.shape != u.shape
+        or len(r) < LEAST_ROWS
+        or (f is not None and f.shape != r.shape)
+    ):
+        raise FormulaError(
+            f"{name} needs {LEAST_ROWS} distances or more, with one energy each; these are"
+            f" {r.shape} and {u.shape}"
         )
     finite = np.isfinite(r).all() and np.isfinite(u).all() and (f is None or np.isfinite(f).all())
     if not (finite and (np.diff(r) > 0).all() and r[0] > 0):
@@ -161,7 +200,10 @@ def formula_of_table(
     if size_of_rows.max() > LARGEST_VALUE:
         row = int(size_of_rows.argmax())
         least = "begin it at larger distances: nearer than its first one the energy rises as r⁻¹²"
-        raise FormulaError(f"{name} has {size_of_rows[row]:g} at {r[row]:g} Å, more than {LARGEST_VALUE:g}; {least}")
+        raise FormulaError(
+            f"{name} has {size_of_rows[row]:g} at {r[row]:g} Å, more than {LARGEST_VALUE:g};"
+            f" {least}"
+        )
     if cutoff == inf or r[-1] < cutoff * (1 - 1e-12):
         unit = "; is it in nm?" if r[-1] < 3 < cutoff <= 10 * r[-1] * 1.01 else ""
         raise FormulaError(f"{name} ends at {r[-1]:g} Å, before the cutoff of {cutoff:g} Å{unit}")
@@ -173,26 +215,36 @@ def formula_of_table(
 
     def interpolated(rows: slice) -> PPoly:
         values = KJ_PER_MOL * u[rows]
-        return CubicSpline(r[rows], values) if f is None else CubicHermiteSpline(r[rows], values, -KJ_PER_MOL * f[rows])
+        return (
+            CubicSpline(r[rows], values)
+            if f is None
+            else CubicHermiteSpline(r[rows], values, -KJ_PER_MOL * f[rows])
+        )
 
     spline, coarse = interpolated(slice(None)), interpolated(slice(None, None, 2))
     slope = spline(r[[0, -1]], 1) / (2 * r[[0, -1]])  # by r²
     if not slope[0] < 0:
-        raise FormulaError(f"{name} begins at {r[0]:g} Å, where it does not repel: begin it at shorter distances")
+        raise FormulaError(
+            f"{name} begins at {r[0]:g} Å, where it does not repel: begin it at shorter distances"
+        )
     square = np.linspace(r[0] ** 2, r[-1] ** 2, STEPS + 1)
     read = CubicSpline(square, spline(np.sqrt(square)), bc_type=((1, slope[0]), (1, slope[1])))
     step = square[1] - square[0]
     middle = np.sqrt(0.5 * (square[1:] + square[:-1]))
     near = middle[spline(middle) < 10 * KJ_PER_MOL * size]
     near = near[near <= r[::2][-1]]
-    # of the order of the fourth power of an interval, of the spline and of the one through every second value
+    # of the order of the fourth power of an interval, of the spline and of the one through every
+    # second value
     fine, twice = (_interval_at(near, distances) ** 4 for distances in (r, r[::2]))
     error = np.abs((coarse(near) - spline(near)) * fine / (twice - fine)).max(initial=0.0)
-    error = float(error + np.abs(read(near**2) - spline(near)).max(initial=0.0)) / (KJ_PER_MOL * size)
+    error = float(error + np.abs(read(near**2) - spline(near)).max(initial=0.0)) / (
+        KJ_PER_MOL * size
+    )
     if error > LARGEST_ERROR:
         raise FormulaError(
-            f"{name}: the error of its spline is {error:.2g} of its deepest energy, {size:.3g} kJ/mol, must be below "
-            f"{LARGEST_ERROR:g}. Use smaller intervals, and check its rows for slips"
+            f"{name}: the error of its spline is {error:.2g} of its deepest energy, {size:.3g}"
+            f" kJ/mol, must be below {LARGEST_ERROR:g}. Use smaller intervals, and check its rows"
+            " for slips"
         )
     if (steps := int(0.75 * square[0] / step)) > 0:
         inner = square[0] - step * np.arange(steps, -1, -1.0)
@@ -214,7 +266,9 @@ def formula_of_table(
 
     table = Table(float(read.x[0]), float(1 / step), coefficients)
     text = f"{name} of {len(r)} energies from {r[0]:g} to {r[-1]:g} Å"
-    return Formula(text, ("scale",), lambda values: (values["scale"],), radial, Tabulated, table, error)
+    return Formula(
+        text, ("scale",), lambda values: (values["scale"],), radial, Tabulated, table, error
+    )
 
 
 def _interval_at(distance: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -226,10 +280,19 @@ def _check_intervals(name: str, r: np.ndarray, cutoff: float) -> None:
     """Raise FormulaError if distances r have a gap before the cutoff, see UNEQUAL."""
     length = np.diff(r)
     ratio = length[1:] / length[:-1]
-    begins = [0, *(np.flatnonzero((ratio > UNEQUAL) | (ratio < 1 / UNEQUAL)) + 1).tolist(), len(length)]
+    begins = [
+        0,
+        *(np.flatnonzero((ratio > UNEQUAL) | (ratio < 1 / UNEQUAL)) + 1).tolist(),
+        len(length),
+    ]
     for first, end in itertools.pairwise(begins):
         beside = [length[k] for k in (first - 1, end) if 0 <= k < len(length)]
-        if beside and end - first < LEAST_ROWS and length[first:end].min() > min(beside) and r[first] < cutoff:
+        if (
+            beside
+            and end - first < LEAST_ROWS
+            and length[first:end].min() > min(beside)
+            and r[first] < cutoff
+        ):
             k = first + int(length[first:end].argmax())
             raise FormulaError(
                 f"{name} has a gap from {r[k]:g} to {r[k + 1]:g} Å, next to intervals of "
@@ -245,6 +308,7 @@ def _check_forces(name: str, r: np.ndarray, u: np.ndarray, f: np.ndarray, high: 
     k = int(off.argmax())
     if off[k] > WRONG_FORCE * np.abs(gained).max(where=u[:-1] <= high, initial=0.0):
         raise FormulaError(
-            f"{name}: the forces are not -dE/dr. From {r[k]:g} to {r[k + 1]:g} Å the energy changes by {gained[k]:.4g} "
-            f"kJ/mol, with these forces it would by {-mean[k]:.4g}. Have they another sign or unit?"
+            f"{name}: the forces are not -dE/dr. From {r[k]:g} to {r[k + 1]:g} Å the energy changes"
+            f" by {gained[k]:.4g} kJ/mol, with these forces it would by {-mean[k]:.4g}. Have they"
+            " another sign or unit?"
         )

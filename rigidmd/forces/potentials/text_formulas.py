@@ -1,8 +1,10 @@
-"""Formulas of user pair potentials from the text of an energy. Only scenes with such a text import SymPy.
+"""Formulas of user pair potentials from the text of an energy. Only scenes with such a text import
+SymPy.
 
-The force is the derivative of the energy. What does not depend on the distance is computed once for each pair of kinds,
-so that 4 eps ((sig/r)**12 - (sig/r)**6) is as fast as the built-in Lennard-Jones. The code is written as a module that
-is named by its contents, so that its compiled code is kept on disk (`core.user_modules`).
+The force is the derivative of the energy. What does not depend on the distance is computed once for
+each pair of kinds, so that 4 eps ((sig/r)**12 - (sig/r)**6) is as fast as the built-in
+Lennard-Jones. The code is written as a module that is named by its contents, so that its compiled
+code is kept on disk (`core.user_modules`).
 """
 
 import ast
@@ -25,13 +27,16 @@ from rigidmd.units import KJ_PER_MOL
 FUNCTIONS = {"exp": exp, "log": log, "sqrt": sqrt, "sin": sin, "cos": cos}
 OPERATORS = {ast.Add: add, ast.Sub: sub, ast.Mult: mul, ast.Div: truediv, ast.Pow: pow}
 MAX_TEXT_LENGTH, MAX_POWER, MAX_NODES, MAX_DEPTH = 2000, 200, 200, 20
-MAX_DIGITS = 300  #: decimal digits of numbers in a formula, before or behind the point, with powers multiplied out
-#: Prefixes of the parameters of a formula and of what is computed from them, so that no name occurs twice.
+#: decimal digits of numbers in a formula, before or behind the point, with powers multiplied out
+MAX_DIGITS = 300
+#: Prefixes of the parameters of a formula and of what is computed from them, so that no name occurs
+#: twice.
 PARAMETER_PREFIX, CONSTANT_PREFIX = "own_", "whole_"
 
 
 def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -> Formula:
-    """The formula of an energy (kJ/mol) such as "A*exp(-B*r) - C/r**6", of r (Å) and named parameters.
+    """The formula of an energy (kJ/mol) such as "A*exp(-B*r) - C/r**6", of r (Å) and named
+    parameters.
 
     constants : values of parameters that are the same for all sites. Raises FormulaError.
     """
@@ -44,19 +49,31 @@ def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -
         u = sympy.Add(*(round(KJ_PER_MOL) * term for term in _terms(found, r)))
         hoisted, total = _hoisted(u, r)
         of: dict[sympy.Expr, sympy.Expr] = {}
-        force = sympy.Add(*(-r * _derivative(term, r, of) for term in sympy.Add.make_args(total)))  # force/r times r²
+        force = sympy.Add(
+            *(-r * _derivative(term, r, of) for term in sympy.Add.make_args(total))
+        )  # force/r times r²
         fields = sorted((total.free_symbols | force.free_symbols) - {r}, key=str)
         source = _source(energy, total, force, fields, r)
     except FormulaError:
         raise
-    except (ArithmeticError, ValueError, TypeError, RecursionError, MemoryError) as error:  # of SymPy and mpmath
-        raise FormulaError(f"{energy!r} cannot be differentiated: {describe_error(error)}") from None
+    except (
+        ArithmeticError,
+        ValueError,
+        TypeError,
+        RecursionError,
+        MemoryError,
+    ) as error:  # of SymPy and mpmath
+        raise FormulaError(
+            f"{energy!r} cannot be differentiated: {describe_error(error)}"
+        ) from None
     module = module_of(source.encode(), f"<pair potential {energy}>")
     names = {symbol.name[len(PARAMETER_PREFIX) :]: symbol for symbol in symbols}
 
     def numbers(given: Mapping[str, float]) -> tuple[float, ...]:
         values = {symbol: given[name] for name, symbol in names.items()}
-        return tuple(_jet(hoisted.get(symbol, symbol), values, r, 0.0)[0] for symbol in fields) or (0.0,)
+        return tuple(_jet(hoisted.get(symbol, symbol), values, r, 0.0)[0] for symbol in fields) or (
+            0.0,
+        )
 
     def radial(given: Mapping[str, float]) -> Radial:
         values = {symbol: given[name] for name, symbol in names.items()}
@@ -71,7 +88,8 @@ def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -
 
 
 def _derivative(e: sympy.Expr, r: sympy.Symbol, known: dict[sympy.Expr, sympy.Expr]) -> sympy.Expr:
-    """The derivative by r. SymPy's derivative determines the sign of every part, in a time like 2**depth."""
+    """The derivative by r. SymPy's derivative determines the sign of every part, in a time like
+    2**depth."""
     if e not in known:
         args, inner = e.args, [_derivative(part, r, known) for part in e.args]
         if not inner:
@@ -79,7 +97,9 @@ def _derivative(e: sympy.Expr, r: sympy.Symbol, known: dict[sympy.Expr, sympy.Ex
         elif e.is_Add:
             found = sympy.Add(*inner)
         elif e.is_Mul:
-            found = sympy.Add(*(sympy.Mul(*args[:k], d, *args[k + 1 :]) for k, d in enumerate(inner) if d != 0))
+            found = sympy.Add(
+                *(sympy.Mul(*args[:k], d, *args[k + 1 :]) for k, d in enumerate(inner) if d != 0)
+            )
         elif e.is_Pow and inner[1] == 0:
             found = args[1] * args[0] ** (args[1] - 1) * inner[0]
         elif e.is_Pow:
@@ -91,7 +111,8 @@ def _derivative(e: sympy.Expr, r: sympy.Symbol, known: dict[sympy.Expr, sympy.Ex
 
 
 def _jet(e: sympy.Expr, values: Mapping[sympy.Symbol, float], r: sympy.Symbol, x: float) -> tuple:
-    """An expression at r = x with its first and second derivative. Raises FormulaError where it is not real."""
+    """An expression at r = x with its first and second derivative. Raises FormulaError where it is
+    not real."""
     if e.is_Symbol:
         return (x, 1.0, 0.0) if e == r else (values[e], 0.0, 0.0)
     if not e.args:
@@ -107,10 +128,18 @@ def _jet(e: sympy.Expr, values: Mapping[sympy.Symbol, float], r: sympy.Symbol, x
     try:
         if e.is_Pow and parts[1][1:] == (0.0, 0.0):
             n = parts[1][0]
-            f = [a**n, n * a ** (n - 1) if n else 0.0, n * (n - 1) * a ** (n - 2) if n * (n - 1) else 0.0]
+            f = [
+                a**n,
+                n * a ** (n - 1) if n else 0.0,
+                n * (n - 1) * a ** (n - 2) if n * (n - 1) else 0.0,
+            ]
         elif e.is_Pow:  # the exponential of n log(a)
             n, m, k = parts[1]
-            a, b, c = n * log(a), m * log(a) + n * b / a, k * log(a) + 2 * m * b / a + n * (c / a - (b / a) ** 2)
+            a, b, c = (
+                n * log(a),
+                m * log(a) + n * b / a,
+                k * log(a) + 2 * m * b / a + n * (c / a - (b / a) ** 2),
+            )
             f = [exp(a)] * 3
         else:
             f = {
@@ -129,7 +158,8 @@ def _jet(e: sympy.Expr, values: Mapping[sympy.Symbol, float], r: sympy.Symbol, x
 
 
 def _terms(u: sympy.Expr, r: sympy.Symbol) -> list[sympy.Expr]:
-    """The terms of a sum, multiplied by factors without r. Nothing else is expanded, which could take too long."""
+    """The terms of a sum, multiplied by factors without r. Nothing else is expanded, which could
+    take too long."""
     found = []
     for term in sympy.Add.make_args(u):
         factor, rest = term.as_independent(r, as_Add=False)
@@ -153,7 +183,8 @@ def _hoisted(u: sympy.Expr, r: sympy.Symbol) -> tuple[dict[sympy.Symbol, sympy.E
 
 
 def _source(energy: str, total, force, fields: list, r) -> str:
-    """The source of the module of a formula with the energy `total` and the force times r, `force`."""
+    """The source of the module of a formula with the energy `total` and the force times r,
+    `force`."""
     powers: dict[int, sympy.Symbol] = {}
 
     def named(power):
@@ -214,7 +245,9 @@ def _powers_of(powers: Mapping[int, Any]) -> list[str]:
         return name
 
     for n, symbol in sorted(powers.items(), key=lambda item: abs(item[0])):
-        value = power(abs(n), *(("r", "r2", "r_to") if n > 0 else ("inverse1", "inverse2", "r_over")))
+        value = power(
+            abs(n), *(("r", "r2", "r_to") if n > 0 else ("inverse1", "inverse2", "r_over"))
+        )
         if value != symbol.name:
             lines[symbol.name] = f"{symbol.name} = {value}"
     return list(lines.values())
@@ -243,7 +276,8 @@ def _code(e) -> str:
 
 
 def _parsed(energy: str, constants: Mapping[str, float]) -> sympy.Expr:
-    """An energy as a SymPy expression, parsed without running it: arithmetic and `FUNCTIONS`. Raises FormulaError."""
+    """An energy as a SymPy expression, parsed without running it: arithmetic and `FUNCTIONS`.
+    Raises FormulaError."""
     if len(energy) > MAX_TEXT_LENGTH:
         raise FormulaError(f"it has {len(energy)} characters, the limit is {MAX_TEXT_LENGTH}")
     try:
@@ -251,7 +285,9 @@ def _parsed(energy: str, constants: Mapping[str, float]) -> sympy.Expr:
     except (SyntaxError, ValueError, MemoryError, RecursionError):
         reserved = [word for word in re.findall(r"[^\W\d]\w*", energy) if keyword.iskeyword(word)]
         why = f": {reserved[0]} is a reserved word of Python" if reserved else ""
-        raise FormulaError(f"{energy!r} is not a formula such as A*exp(-B*r) - C/r**6{why}") from None
+        raise FormulaError(
+            f"{energy!r} is not a formula such as A*exp(-B*r) - C/r**6{why}"
+        ) from None
     if sum(1 for _ in ast.walk(tree)) > MAX_NODES:
         raise FormulaError(f"it has more than {MAX_NODES} numbers, names and operations")
     found = _read(tree.body, constants, 0).value
@@ -271,20 +307,28 @@ class _Part(NamedTuple):
 def _number(x: float, what: str) -> _Part:
     """A number of a formula. Raises FormulaError."""
     if isinstance(x, complex) or not isfinite(x) or (x and not abs(log10(abs(x))) <= MAX_DIGITS):
-        raise FormulaError(f"{what} is not a real number between 1e-{MAX_DIGITS} and 1e{MAX_DIGITS}")
+        raise FormulaError(
+            f"{what} is not a real number between 1e-{MAX_DIGITS} and 1e{MAX_DIGITS}"
+        )
     whole = 2 * x == int(2 * x) and abs(x) < 1e9  # and halves, for square roots
-    return _Part(sympy.Rational(int(2 * x), 2) if whole else sympy.Float(x), x, abs(log10(abs(x))) if x else 0.0)
+    return _Part(
+        sympy.Rational(int(2 * x), 2) if whole else sympy.Float(x),
+        x,
+        abs(log10(abs(x))) if x else 0.0,
+    )
 
 
 def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
-    """A node of a formula as a SymPy expression. Raises FormulaError. Numbers are computed here, because those of SymPy
-    are exact, and may be too long for any memory."""
+    """A node of a formula as a SymPy expression. Raises FormulaError. Numbers are computed here,
+    because those of SymPy are exact, and may be too long for any memory."""
 
     def inner(of: ast.AST, more: int = 1) -> _Part:
         return _read(of, constants, depth + more)
 
     if depth > MAX_DEPTH:
-        raise FormulaError(f"it has more than {MAX_DEPTH} functions, powers and brackets inside one another")
+        raise FormulaError(
+            f"it has more than {MAX_DEPTH} functions, powers and brackets inside one another"
+        )
     what = shorten_text(ast.unparse(node))
     try:
         match node:
@@ -300,24 +344,32 @@ def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
                 return _Part(sympy.Symbol(f"{PARAMETER_PREFIX}{name}", real=True), None, 0.0)
             case ast.UnaryOp(op=ast.USub() | ast.UAdd() as op, operand=of):
                 part, sign = inner(of, 0), 1 if isinstance(op, ast.UAdd) else -1
-                return part._replace(value=sign * part.value, number=part.number and sign * part.number)
+                return part._replace(
+                    value=sign * part.value, number=part.number and sign * part.number
+                )
             case ast.BinOp(op=ast.BitXor()):
                 raise FormulaError(f"{what}: powers are written **, as in r**6")
             case ast.BinOp(op=op, left=left, right=right) if type(op) in OPERATORS:
                 is_power = isinstance(op, ast.Pow)
-                return _combined(OPERATORS[type(op)], inner(left, int(is_power)), inner(right), is_power, what)
+                return _combined(
+                    OPERATORS[type(op)], inner(left, int(is_power)), inner(right), is_power, what
+                )
             case ast.Call(func=ast.Name(id=name), args=[of], keywords=[]) if name in FUNCTIONS:
                 part = inner(of)
                 if part.number is not None:
                     return _number(FUNCTIONS[name](part.number), what)
                 if name == "sqrt":
                     return part._replace(value=sympy.sqrt(part.value))
-                digits = part.digits * (10 ** min(part.digits, 9) if name == "exp" and part.has_log else 1)
+                digits = part.digits * (
+                    10 ** min(part.digits, 9) if name == "exp" and part.has_log else 1
+                )
                 _check(digits, part.power, what)
                 value = getattr(sympy, name)(part.value)
                 return _Part(value, None, digits, part.power, part.has_log or name == "log")
             case ast.Call(func=ast.Name(id=name)):
-                raise FormulaError(f"{name} is not a function of one number among {', '.join(FUNCTIONS)}")
+                raise FormulaError(
+                    f"{name} is not a function of one number among {', '.join(FUNCTIONS)}"
+                )
     except ZeroDivisionError:
         raise FormulaError(f"{what} divides by 0") from None
     except (OverflowError, ValueError) as error:
@@ -333,11 +385,16 @@ def _combined(function: Callable, first: _Part, second: _Part, is_power: bool, w
         return _number(function(first.number, second.number), what)
     digits, power = first.digits + second.digits + 1, max(first.power, second.power)
     if is_power and second.number is not None:
-        digits, power = first.digits * abs(second.number), first.power * max(1.0, abs(second.number))
+        digits, power = (
+            first.digits * abs(second.number),
+            first.power * max(1.0, abs(second.number)),
+        )
     _check(digits, power, what)
     if function is truediv and second.value == 0:
         raise ZeroDivisionError
-    return _Part(function(first.value, second.value), None, digits, power, first.has_log or second.has_log)
+    return _Part(
+        function(first.value, second.value), None, digits, power, first.has_log or second.has_log
+    )
 
 
 def _check(digits: float, power: float, what: str) -> None:

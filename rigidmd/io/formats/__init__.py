@@ -1,7 +1,8 @@
-"""File formats of structures and trajectories: a module here registers its formats, and states everything about them.
+"""File formats of structures and trajectories: a module here registers its formats, and states
+everything about them.
 
-No other code of rigidmd names an extension. A module in this folder is found by being there; `register` adds a format
-from outside.
+No other code of rigidmd names an extension. A module in this folder is found by being there;
+`register` adds a format from outside.
 """
 
 import re
@@ -16,9 +17,10 @@ import numpy as np
 
 from rigidmd.io.formats.atoms import Atoms, Frame
 
-#: The system of a run, of a package above. All have `state`, `sites` with arrays `name`, `element`, `mass`, `molecule`,
-#: `residue_names`, `site_positions(state, wrapped)`, `site_velocities(state)`. Those of molecules also have `species`,
-#: a `scene.models.Molecule` of each kind, `model.species`, `of_sites(function)` and `centres(state, wrapped)`.
+#: The system of a run, of a package above. All have `state`, `sites` with arrays `name`, `element`,
+#: `mass`, `molecule`, `residue_names`, `site_positions(state, wrapped)`, `site_velocities(state)`.
+#: Those of molecules also have `species`, a `scene.models.Molecule` of each kind, `model.species`,
+#: `of_sites(function)` and `centres(state, wrapped)`.
 System = Any
 Encode = Callable[[Frame, int], bytes]
 
@@ -26,33 +28,45 @@ Encode = Callable[[Frame, int], bytes]
 class Format(NamedTuple):
     """A file format. What it cannot do is None or False."""
 
-    extensions: tuple[str, ...]  # in lower case; the first is written. None if it is known by its content only
+    extensions: tuple[
+        str, ...
+    ]  # in lower case; the first is written. None if it is known by its content only
     name: str = ""  # in messages; default: its extensions
 
-    # As a structure. For each structure in a text `read` returns a function that returns its atoms; with `has_types`
-    # its last argument is structure.atom_types.
+    # As a structure. For each structure in a text `read` returns a function that returns its atoms;
+    # with `has_types` its last argument is structure.atom_types.
     read: Callable[..., list[Callable[[], Atoms]]] | None = None  # (path, lines)
-    content: re.Pattern[str] | None = None  # recognises the begin of a text whose extension is unknown
+    content: re.Pattern[str] | None = (
+        None  # recognises the begin of a text whose extension is unknown
+    )
     has_types: bool = False
     crystals: bool = False  # every structure is the unit cell of a crystal
-    # A frame of a trajectory, 1 for the first, -1 for the last; with `has_types` as `read`. If the format has no names,
-    # `read_arrays` returns the position (n, 3), and velocity and cell (3, 3) if it has them, in another process: a
-    # damaged file may crash it.
+    # A frame of a trajectory, 1 for the first, -1 for the last; with `has_types` as `read`. If the
+    # format has no names, `read_arrays` returns the position (n, 3), and velocity and cell (3, 3)
+    # if it has them, in another process: a damaged file may crash it.
     read_frame: Callable[..., Atoms] | None = None  # (path, frame)
-    read_arrays: Callable[[str, int, int], dict[str, np.ndarray]] | None = None  # (path, frame, number of atoms)
+    read_arrays: Callable[[str, int, int], dict[str, np.ndarray]] | None = (
+        None  # (path, frame, number of atoms)
+    )
 
-    # As a trajectory. A format is written by `encoder`: (system, interval ps, whether with velocities) -> function of a
-    # frame and its index k that returns the bytes to append, for k = 0 with the head of the file. `counter` is the
-    # position and the `struct` format of the number of frames in the file. `writer` is a class for all other formats of
-    # molecules, see `frame_file.FrameFile`.
+    # As a trajectory. A format is written by `encoder`: (system, interval ps, whether with
+    # velocities) -> function of a frame and its index k that returns the bytes to append, for k = 0
+    # with the head of the file. `counter` is the position and the `struct` format of the number of
+    # frames in the file. `writer` is a class for all other formats of molecules, see
+    # `frame_file.FrameFile`.
     encoder: Callable[[Any, float, bool], Encode] | None = None
     counter: tuple[int, str] = (0, "")
     writer: Callable[..., Any] | None = None
-    # A `reader` has `count` frames of `sites` sites, `frame(k)` and `close()`, and raises only OSError and ValueError.
+    # A `reader` has `count` frames of `sites` sites, `frame(k)` and `close()`, and raises only
+    # OSError and ValueError.
     reader: Callable[[Path], Any] | None = None  # default: the reader of MDAnalysis
     mdanalysis: str = ""  # its name in MDAnalysis, if that is not its extension
-    check: Callable[[str, int, int], dict[str, np.ndarray]] | None = None  # reads all frames, in another process
-    times: re.Pattern[bytes] | None = None  # lines in a text of which MDAnalysis reads no (1) cell and no (2) time
+    check: Callable[[str, int, int], dict[str, np.ndarray]] | None = (
+        None  # reads all frames, in another process
+    )
+    times: re.Pattern[bytes] | None = (
+        None  # lines in a text of which MDAnalysis reads no (1) cell and no (2) time
+    )
     velocities: bool = False  # what it can store
     rotations: bool = False
     double: bool = False  # numbers in double precision
@@ -69,7 +83,8 @@ class Format(NamedTuple):
         return self.read_frame is not None or self.read_arrays is not None
 
     def exceeded(self, positions: np.ndarray) -> float | None:
-        """The limit, Å, beyond which a position (s, 3) is; None if the format can hold all of them."""
+        """The limit, Å, beyond which a position (s, 3) is; None if the format can hold all of
+        them."""
         least, largest = self.limits
         return least if positions.min() < least else largest if positions.max() > largest else None
 
@@ -77,8 +92,14 @@ class Format(NamedTuple):
 #: Formats by extension, and formats that are recognised by their content.
 BY_EXTENSION: dict[str, Format] = {}
 BY_CONTENT: list[Format] = []
-#: Default names of files of a run, of the topology of a body, with bonds, and of the `ase.Atoms` of a scene.
-TRAJECTORY, TOPOLOGY, BODY_TOPOLOGY, STRUCTURE = "trajectory.xtc", "topology.gro", "topology.pdb", "atoms.xyz"
+#: Default names of files of a run, of the topology of a body, with bonds, and of the `ase.Atoms` of
+#: a scene.
+TRAJECTORY, TOPOLOGY, BODY_TOPOLOGY, STRUCTURE = (
+    "trajectory.xtc",
+    "topology.gro",
+    "topology.pdb",
+    "atoms.xyz",
+)
 
 
 def register(form: Format) -> None:
@@ -117,4 +138,6 @@ def written(wanted: Callable[[Format], Any]) -> tuple[str, ...]:
 
 find_modules()
 #: Names of topology files that are found next to a trajectory, as in the folder of a run.
-TOPOLOGIES = tuple(f"{Path(TOPOLOGY).stem}{name}" for name in written(lambda form: form.write_topology))
+TOPOLOGIES = tuple(
+    f"{Path(TOPOLOGY).stem}{name}" for name in written(lambda form: form.write_topology)
+)

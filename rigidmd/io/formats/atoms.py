@@ -1,4 +1,5 @@
-"""What readers of formats share: atoms and frames, elements from names and masses, numbers in lines of text."""
+"""What readers of formats share: atoms and frames, elements from names and masses, numbers in lines
+of text."""
 
 import re
 from collections.abc import Sequence
@@ -11,12 +12,26 @@ from rigidmd.core.toml import parse_whole_number
 from rigidmd.errors import StructureError
 
 SAME_MASS = 0.01  # relative difference of the masses of one element
-HEAVY_HYDROGEN = {"D": 2.014101777844, "T": 3.01604928132}  # u, AME2020; ASE has no symbols for them
+HEAVY_HYDROGEN = {
+    "D": 2.014101777844,
+    "T": 3.01604928132,
+}  # u, AME2020; ASE has no symbols for them
 #: Names of ions in CHARMM's force fields that do not begin with their elements.
-CHARMM_IONS = {"SOD": "Na", "POT": "K", "CES": "Cs", "CLA": "Cl", "LIT": "Li", "RUB": "Rb", "CAL": "Ca", "BAR": "Ba"}
-#: CHARMM's names of the oxygen and the massless site of four-site waters, both of which begin like oxygen.
+CHARMM_IONS = {
+    "SOD": "Na",
+    "POT": "K",
+    "CES": "Cs",
+    "CLA": "Cl",
+    "LIT": "Li",
+    "RUB": "Rb",
+    "CAL": "Ca",
+    "BAR": "Ba",
+}
+#: CHARMM's names of the oxygen and the massless site of four-site waters, both of which begin like
+#: oxygen.
 CHARMM_WATER = ("OH2", "OM")
-#: Names of massless sites: M of four-site waters, L of five-site ones, and the names that programs give them.
+#: Names of massless sites: M of four-site waters, L of five-site ones, and the names that programs
+#: give them.
 MASSLESS_NAME = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM?|VS|XX?|Q)\d*", re.IGNORECASE)
 
 
@@ -24,8 +39,12 @@ class Atoms(NamedTuple):
     """The n atoms of a file, in Å, ps and u."""
 
     names: list[str]
-    elements: list[str]  # "" if the format has only names; X for massless sites, D and T for heavy hydrogen
-    residue: list[tuple]  # (number or None, name, ...), differs between neighbours; () without residues
+    elements: list[
+        str
+    ]  # "" if the format has only names; X for massless sites, D and T for heavy hydrogen
+    residue: list[
+        tuple
+    ]  # (number or None, name, ...), differs between neighbours; () without residues
     position: np.ndarray  # (n, 3) Å
     velocity: np.ndarray | None = None  # (n, 3) Å/ps; rows of NaN for atoms without one
     cell: np.ndarray | None = None  # (3, 3), rows a, b, c, Å
@@ -39,10 +58,15 @@ def structure_error(path: Path, message: str) -> StructureError:
 
 
 def element_of(name: str, vocabulary: frozenset[str] = frozenset()) -> str:
-    """The element at the start of an atom's name, one of `vocabulary` if possible; X for massless sites, "" if none."""
+    """The element at the start of an atom's name, one of `vocabulary` if possible; X for massless
+    sites, "" if none."""
     letters = re.split(r"[^A-Za-z]", name.lstrip("0123456789 "), maxsplit=1)[0]
     one, two = letters[:1].upper(), letters[:2].capitalize()
-    if len(two) == 2 and (letters[:2] == two or letters.upper() in ("CL", "BR")) and is_element(two):
+    if (
+        len(two) == 2
+        and (letters[:2] == two or letters.upper() in ("CL", "BR"))
+        and is_element(two)
+    ):
         return two
     found = next((e for e in (two, one) if e in vocabulary), "")
     if not found and MASSLESS_NAME.fullmatch(name):
@@ -57,28 +81,42 @@ def is_element(symbol: str) -> bool:
 
 
 def element_of_mass(mass: float) -> str:
-    """The element, or heavy hydrogen, of this mass (u); "" if there is none, as for united atoms."""
+    """The element, or heavy hydrogen, of this mass (u); "" if there is none, as for united
+    atoms."""
     from ase.data import atomic_masses, chemical_symbols
 
-    known = {e: float(m) for e, m in zip(chemical_symbols, atomic_masses, strict=True) if e != "X"} | HEAVY_HYDROGEN
+    known = {
+        e: float(m) for e, m in zip(chemical_symbols, atomic_masses, strict=True) if e != "X"
+    } | HEAVY_HYDROGEN
     nearest = min(known, key=lambda element: abs(known[element] - mass))
     return nearest if abs(known[nearest] - mass) <= SAME_MASS * mass else ""
 
 
 def names_of_types(
-    path: Path, types: list[str], listed: list[str], names: dict[str, str], atom_types: dict[str, str] | None
+    path: Path,
+    types: list[str],
+    listed: list[str],
+    names: dict[str, str],
+    atom_types: dict[str, str] | None,
 ) -> list[str]:
-    """The name of each atom of these types: by structure.atom_types, else by the file, else the type itself.
+    """The name of each atom of these types: by structure.atom_types, else by the file, else the
+    type itself.
 
     listed : all types of the file. names : of types, in the file. Raises StructureError.
     """
     if atom_types is None:
         return [names.get(kind, kind) for kind in types]
     present = sorted({*types, *listed}, key=lambda kind: (parse_whole_number(kind) or 0, kind))
-    given = {kind: next((key for key in (kind, names.get(kind)) if key in atom_types), None) for kind in present}
+    given = {
+        kind: next((key for key in (kind, names.get(kind)) if key in atom_types), None)
+        for kind in present
+    }
     errors = []
     if unknown := [key for key in atom_types if key not in given.values()]:
-        errors.append(f"structure.atom_types: unknown type {', '.join(unknown)}; there are {', '.join(present)}")
+        errors.append(
+            f"structure.atom_types: unknown type {', '.join(unknown)}; there are"
+            f" {', '.join(present)}"
+        )
     if unnamed := [kind for kind, key in given.items() if key is None]:
         errors.append(f"structure.atom_types has no name for type {', '.join(unnamed)}")
     if errors:
@@ -87,7 +125,8 @@ def names_of_types(
 
 
 class Frame(NamedTuple):
-    """A frame of a trajectory. If a run writes a file, it keeps only the times of frames in memory."""
+    """A frame of a trajectory. If a run writes a file, it keeps only the times of frames in
+    memory."""
 
     time: float  # ps
     positions: Any = None  # (s, 3) sites, Å
@@ -112,7 +151,9 @@ def atom_count(path: Path, line: int, text: str, available: int) -> int:
     if count is None:
         raise unexpected(path, line, "the number of atoms", text)
     if count > available:
-        raise structure_error(path, f"line {line} promises {count} atoms, {max(0, available)} are there: truncated?")
+        raise structure_error(
+            path, f"line {line} promises {count} atoms, {max(0, available)} are there: truncated?"
+        )
     return count
 
 
@@ -130,7 +171,8 @@ def numbers(path: Path, line: int, words: list[str], what: str) -> list[float]:
 
 
 def table(path: Path, rows: list[tuple[int, list[str]]], what: str) -> np.ndarray:
-    """Words of lines, each with its number, as numbers (n, k). Raises StructureError as `numbers` does."""
+    """Words of lines, each with its number, as numbers (n, k). Raises StructureError as `numbers`
+    does."""
     try:
         return np.array([words for _, words in rows], float) if rows else np.zeros((0, 3))
     except ValueError:

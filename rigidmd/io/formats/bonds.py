@@ -1,6 +1,8 @@
-"""Bonds for viewers and topology files: those of molecules, and the edges between the points of a single body.
+"""Bonds for viewers and topology files: those of molecules, and the edges between the points of a
+single body.
 
-A system is an `engines.system.System` or an `engines.body_system.BodySystem`, a molecule a `scene.models.Molecule`.
+A system is an `engines.system.System` or an `engines.body_system.BodySystem`, a molecule a
+`scene.models.Molecule`.
 """
 
 from itertools import pairwise
@@ -10,8 +12,8 @@ import numpy as np
 
 from rigidmd.mechanics.inertia import SOLIDS
 
-#: Difference of the normals of two triangles of one flat side of a hull. Thickness relative to the size below which
-#: points lie in a plane or on a line.
+#: Difference of the normals of two triangles of one flat side of a hull. Thickness relative to the
+#: size below which points lie in a plane or on a line.
 FLAT, THIN = 1e-6, 1e-9
 
 
@@ -22,15 +24,21 @@ def connections(system: Any, massless: bool = False) -> np.ndarray:
     each molecule is connected."""
     if hasattr(system, "species"):
         starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
-        chosen = [[pair for pair in bonds(m) if massless or m.masses[pair[1]] > 0] for m in system.species]
+        chosen = [
+            [pair for pair in bonds(m) if massless or m.masses[pair[1]] > 0] for m in system.species
+        ]
         links = [np.array(pairs, int).reshape(-1, 2) for pairs in chosen]
-        return np.concatenate([start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)])
+        return np.concatenate(
+            [start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)]
+        )
     first = 0 if system.translates else 1  # the pivot is the first point
     points, body = system.points[first:], system.scene.body
     if body.points is not None:
         pairs = first + shortest_links(points)
     elif body.solids is not None:
-        pairs = first + _edges_of_solids(points, [len(SOLIDS[part.shape].outline) for part in body.solids])
+        pairs = first + _edges_of_solids(
+            points, [len(SOLIDS[part.shape].outline) for part in body.solids]
+        )
     else:
         pairs = first + _hull(points)
     if first and len(points):
@@ -41,7 +49,11 @@ def connections(system: Any, massless: bool = False) -> np.ndarray:
 
 def charges(system: Any) -> np.ndarray:
     """Charges (s,) of all sites, e; 0 for a single body."""
-    return system.of_sites(lambda m: m.charges) if hasattr(system, "species") else np.zeros(len(system.points))
+    return (
+        system.of_sites(lambda m: m.charges)
+        if hasattr(system, "species")
+        else np.zeros(len(system.points))
+    )
 
 
 def shortest_links(points: np.ndarray) -> np.ndarray:
@@ -75,7 +87,8 @@ def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
-    """Edges of the convex hull of points in space, in a plane or on a line. Points inside have none."""
+    """Edges of the convex hull of points in space, in a plane or on a line. Points inside have
+    none."""
     from scipy.spatial import ConvexHull
 
     if len(points) < 2:
@@ -95,7 +108,9 @@ def _hull(points: np.ndarray) -> np.ndarray:
             pair = tuple(sorted((int(corners[i]), int(corners[j]))))
             normals.setdefault(pair, []).append(equation[:3])  # pyright: ignore[reportArgumentType]
     # without the diagonals of flat sides
-    return np.array([pair for pair, (one, other) in normals.items() if np.abs(one - other).max() > FLAT])
+    return np.array(
+        [pair for pair, (one, other) in normals.items() if np.abs(one - other).max() > FLAT]
+    )
 
 
 #: Covalent radii, Å (Cordero et al. 2008, Dalton Trans. 2832), of the elements in rigid models.
@@ -105,10 +120,15 @@ SLACK = 1.25
 
 
 def bonds(m: Any) -> list[tuple[int, int]]:
-    """Bonds, heavier site first: atoms within bonding distance, shortest links, massless sites to nearest atoms."""
+    """Bonds, heavier site first: atoms within bonding distance, shortest links, massless sites to
+    nearest atoms."""
     from scipy.spatial.distance import cdist
 
-    x, atoms, massless = m.positions_body, np.flatnonzero(m.masses > 0), np.flatnonzero(m.masses == 0)
+    x, atoms, massless = (
+        m.positions_body,
+        np.flatnonzero(m.masses > 0),
+        np.flatnonzero(m.masses == 0),
+    )
     radius = SLACK * np.array([COVALENT.get(m.elements[i], 0.0) for i in atoms])
     bonded = cdist(x[atoms], x[atoms]) <= radius[:, None] + radius
     bonded[tuple(shortest_links(x[atoms]).T)] = True

@@ -1,4 +1,5 @@
-"""CIF of crystals and mmCIF of molecules. gemmi reads the syntax; the module `crystal` applies the symmetry."""
+"""CIF of crystals and mmCIF of molecules. gemmi reads the syntax; the module `crystal` applies the
+symmetry."""
 
 import re
 from collections import Counter
@@ -10,7 +11,14 @@ import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Format, register
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, MASSLESS_NAME, Atoms, element_of, is_element, structure_error
+from rigidmd.io.formats.atoms import (
+    HEAVY_HYDROGEN,
+    MASSLESS_NAME,
+    Atoms,
+    element_of,
+    is_element,
+    structure_error,
+)
 from rigidmd.io.formats.cells import cell_of, describe_cell
 from rigidmd.io.formats.crystal import (
     IDENTITY,
@@ -36,10 +44,14 @@ from rigidmd.units import GRAM_PER_CM3
 FULL = 0.999
 #: Relative difference of two densities that rounding and the choice of masses explain.
 SAME_DENSITY = 0.02
-#: Relative difference of a matrix in an mmCIF from that of its cell in the standard orientation, by printed digits.
+#: Relative difference of a matrix in an mmCIF from that of its cell in the standard orientation, by
+#: printed digits.
 SAME_MATRIX = 1e-3
 MOST_LISTED = 6  # atoms in a message
-CELL = [f"_cell_{part}" for part in ("length_a", "length_b", "length_c", "angle_alpha", "angle_beta", "angle_gamma")]
+CELL = [
+    f"_cell_{part}"
+    for part in ("length_a", "length_b", "length_c", "angle_alpha", "angle_beta", "angle_gamma")
+]
 OPERATIONS = ("_space_group_symop_operation_xyz", "_symmetry_equiv_pos_as_xyz")
 HALL = ("_space_group_name_hall", "_symmetry_space_group_name_hall")
 NAMES = (
@@ -55,11 +67,19 @@ SYSTEMS = ("_space_group_crystal_system", "_symmetry_cell_setting")
 LISTED = "its list of operations"
 MODEL = "_atom_site_pdbx_pdb_model_num"
 #: Neighbouring residues of an mmCIF differ in one of these.
-RESIDUE = ("label_asym_id", "auth_asym_id", "label_seq_id", "auth_seq_id", "pdbx_pdb_ins_code", "label_comp_id")
+RESIDUE = (
+    "label_asym_id",
+    "auth_asym_id",
+    "label_seq_id",
+    "auth_seq_id",
+    "pdbx_pdb_ins_code",
+    "label_comp_id",
+)
 
 
 class Block:
-    """The values of a data block by tag, in lower case and with _ for the . of mmCIF; None for values not given."""
+    """The values of a data block by tag, in lower case and with _ for the . of mmCIF; None for
+    values not given."""
 
     def __init__(self, block):
         self._raw: dict[str, list[str]] = {}
@@ -77,7 +97,10 @@ class Block:
         """All values of a tag; none if the block does not have it."""
         import gemmi
 
-        return [None if gemmi.cif.is_null(raw) else gemmi.cif.as_string(raw).strip() for raw in self._raw.get(tag, ())]
+        return [
+            None if gemmi.cif.is_null(raw) else gemmi.cif.as_string(raw).strip()
+            for raw in self._raw.get(tag, ())
+        ]
 
     def first(self, *tags: str) -> str | None:
         """The first value that one of the tags has."""
@@ -90,7 +113,9 @@ def _tag(tag: str) -> str:
 
 def number_of(text: str | None) -> tuple[float, float]:
     """A number and its standard uncertainty, as of 0.1185(5); NaN and 0 if the text is not one."""
-    match = re.fullmatch(r"([-+]?(?:\d+\.?(\d*)|\.(\d+))(?:[eE][-+]?\d+)?)(?:\((\d+)\))?", text or "")
+    match = re.fullmatch(
+        r"([-+]?(?:\d+\.?(\d*)|\.(\d+))(?:[eE][-+]?\d+)?)(?:\((\d+)\))?", text or ""
+    )
     if not match:
         return np.nan, 0.0
     digits = len(match[2] or match[3] or "")
@@ -137,12 +162,16 @@ def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
     position = _coordinates(path, sites, names, "fract" if is_fractional else "cartn")
     if cell is None and is_fractional:
         raise structure_error(path, f"has no cell: {CELL[0]} to {CELL[-1]} are missing")
-    if cell is None or (not is_fractional and np.allclose(cell, np.eye(3))):  # the placeholder of the PDB
+    if cell is None or (
+        not is_fractional and np.allclose(cell, np.eye(3))
+    ):  # the placeholder of the PDB
         return Atoms(names, elements, residue, position, cell=cell)
     if not is_fractional:
         position = _to_fractional(block, position, cell)
     operations, notes = _symmetry(path, block, cell)
-    kinds = [element or element_of(name) or name for name, element in zip(names, elements, strict=True)]
+    kinds = [
+        element or element_of(name) or name for name, element in zip(names, elements, strict=True)
+    ]
     try:
         whole = unit_cell(position, kinds, _radii(kinds), operations, cell)
     except NoSymmetry as error:
@@ -165,7 +194,8 @@ def _as_read(notes: list[str]) -> str:
 
 
 class AtomSites:
-    """The columns of some atoms, without those flagged as dummies, whose coordinates have no meaning."""
+    """The columns of some atoms, without those flagged as dummies, whose coordinates have no
+    meaning."""
 
     def __init__(self, block: Block, rows: list[int]):
         flags = block.column("_atom_site_calc_flag")
@@ -202,7 +232,9 @@ class AtomSites:
         keys = list(zip(*(self.column(part) for part in RESIDUE), strict=True))
         numbers = [
             author or label
-            for label, author in zip(self.column("label_seq_id"), self.column("auth_seq_id"), strict=True)
+            for label, author in zip(
+                self.column("label_seq_id"), self.column("auth_seq_id"), strict=True
+            )
         ]
         residues, count = [], 0
         for k, name in enumerate(self.column("label_comp_id")):
@@ -212,7 +244,8 @@ class AtomSites:
 
 
 def _element(symbol: str) -> str:
-    """The element of a type such as C, Cl, O2- or D; X for massless sites; "" if it may be two elements or none."""
+    """The element of a type such as C, Cl, O2- or D; X for massless sites; "" if it may be two
+    elements or none."""
     match = re.fullmatch(r"([A-Za-z]{1,2})[\d.]*[-+]?\d*", symbol)
     letters = match[1] if match else ""
     element = letters.capitalize()
@@ -226,35 +259,53 @@ def _radii(kinds: list[str]) -> np.ndarray:
     """Covalent radii, Å."""
     from ase.data import atomic_numbers, covalent_radii
 
-    known = {kind: "H" if kind in HEAVY_HYDROGEN else kind if is_element(kind) else "X" for kind in set(kinds)}
+    known = {
+        kind: "H" if kind in HEAVY_HYDROGEN else kind if is_element(kind) else "X"
+        for kind in set(kinds)
+    }
     return np.array([covalent_radii[atomic_numbers[known[kind]]] for kind in kinds])
 
 
 def _check_order(path: Path, sites: AtomSites) -> None:
     """Raise StructureError for a disordered crystal."""
     if len(alternatives := sorted({x for x in sites.column("label_alt_id") if x})) > 1:
-        raise structure_error(path, f"has alternate locations {', '.join(alternatives)}; keep one of them")
+        raise structure_error(
+            path, f"has alternate locations {', '.join(alternatives)}; keep one of them"
+        )
     given = sites.column("occupancy")
     occupancies = [(1.0, 0.0) if text is None else number_of(text) for text in given]
     if sites.has("cartn_x") and not any(value for value, _ in occupancies):
         return  # as OpenMM writes them
     names = sites.names()[0]
-    if wrong := sorted({f"{text}" for text, (x, _) in zip(given, occupancies, strict=True) if not 0 <= x <= 2 - FULL}):
+    if wrong := sorted(
+        {
+            f"{text}"
+            for text, (x, _) in zip(given, occupancies, strict=True)
+            if not 0 <= x <= 2 - FULL
+        }
+    ):
         raise structure_error(path, f"some of its sites have the occupancy {', '.join(wrong)}")
-    partial_sites = sorted({
-        f"{name} {value:g}"
-        for name, (value, error) in zip(names, occupancies, strict=True)
-        if value < FULL and value + error < 1
-    })  # fmt: skip
+    partial_sites = sorted(
+        {
+            f"{name} {value:g}"
+            for name, (value, error) in zip(names, occupancies, strict=True)
+            if value < FULL and value + error < 1
+        }
+    )
     groups = sorted({group for group in sites.column("disorder_group") if group})
     if partial_sites:
-        listed = ", ".join(partial_sites[:MOST_LISTED]) + (", ..." if len(partial_sites) > MOST_LISTED else "")
+        listed = ", ".join(partial_sites[:MOST_LISTED]) + (
+            ", ..." if len(partial_sites) > MOST_LISTED else ""
+        )
         found = f"some of its sites are occupied only partly ({listed})"
     elif len(groups) > 1 or any(group.startswith("-") for group in groups):
         found = f"its atoms are in disorder groups {', '.join(groups)}"
     else:
         return
-    hint = "in which every site is occupied or left out (for ices, GenIce makes proton-disordered ones)"
+    hint = (
+        "in which every site is occupied or left out (for ices, GenIce makes proton-disordered"
+        " ones)"
+    )
     consequence = "so that molecules are unknown. Give one arrangement of it"
     raise structure_error(path, f"{found}: the crystal is disordered, {consequence}, {hint}")
 
@@ -265,16 +316,21 @@ def _coordinates(path: Path, sites: AtomSites, names: list[str], axes: str) -> n
     position = np.array([[number_of(text)[0] for text in column] for column in columns]).T
     if len(bad := np.flatnonzero(np.isnan(position).any(axis=1))):
         found = " ".join(str(column[bad[0]]) for column in columns)
-        raise structure_error(path, f"atom {names[bad[0]]} has no position, expected three numbers, found {found}")
+        raise structure_error(
+            path, f"atom {names[bad[0]]} has no position, expected three numbers, found {found}"
+        )
     return position.reshape(-1, 3)
 
 
 def _cell(path: Path, block: Block) -> np.ndarray | None:
-    """The cell (3, 3) in the standard orientation; None if the file has none. Raises StructureError."""
+    """The cell (3, 3) in the standard orientation; None if the file has none. Raises
+    StructureError."""
     texts = [block.first(tag) for tag in CELL]
     if not any(texts):
         return None
-    if missing := [tag for tag, text in zip(CELL, texts, strict=True) if np.isnan(number_of(text)[0])]:
+    if missing := [
+        tag for tag, text in zip(CELL, texts, strict=True) if np.isnan(number_of(text)[0])
+    ]:
         raise structure_error(path, f"its cell is incomplete: {', '.join(missing)} is not a number")
     cell = cell_of([number_of(text)[0] for text in texts])
     if cell is None:
@@ -283,9 +339,12 @@ def _cell(path: Path, block: Block) -> np.ndarray | None:
 
 
 def _to_fractional(block: Block, position: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Fractional coordinates of positions (n, 3) in Å, by the matrix in an mmCIF if the orientation is not standard."""
+    """Fractional coordinates of positions (n, 3) in Å, by the matrix in an mmCIF if the orientation
+    is not standard."""
     standard = np.linalg.inv(cell).T
-    matrix = [[block.first(f"_atom_sites_fract_transf_matrix[{i}][{j}]") for j in "123"] for i in "123"]
+    matrix = [
+        [block.first(f"_atom_sites_fract_transf_matrix[{i}][{j}]") for j in "123"] for i in "123"
+    ]
     shift = [block.first(f"_atom_sites_fract_transf_vector[{i}]") for i in "123"]
     w = np.array([[number_of(text)[0] for text in row] for row in matrix])
     t = np.array([number_of(text)[0] for text in shift])
@@ -298,9 +357,9 @@ def _to_fractional(block: Block, position: np.ndarray, cell: np.ndarray) -> np.n
 def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """The symmetry operations (g, 3, 4), and notes on where they are from.
 
-    The list of operations of a file defines the symmetry; without one it is defined by its Hall symbol, its
-    Hermann-Mauguin symbol, or the number of its space group, in this order. Statements of less rank select among the
-    settings that are possible.
+    The list of operations of a file defines the symmetry; without one it is defined by its Hall
+    symbol, its Hermann-Mauguin symbol, or the number of its space group, in this order. Statements
+    of less rank select among the settings that are possible.
     """
     statements = [*_listed(path, block), *_tabulated(block)]
     if not statements:
@@ -308,7 +367,9 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
             message = f"its space group {stated} is unknown: give its operations ({OPERATIONS[0]})"
             raise structure_error(path, message)
         is_crystal = "_atom_site_fract_x" in block
-        note = "no symmetry operations in the file: its atoms were taken as all atoms of the unit cell"
+        note = (
+            "no symmetry operations in the file: its atoms were taken as all atoms of the unit cell"
+        )
         return IDENTITY, [note] if is_crystal else []
     used, *others = statements
     settings = [setting for setting in used.settings if keep_cell(setting.operations, cell)]
@@ -328,7 +389,9 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
     operations = settings[0].operations
     notes = [_described(settings, used)]
     if contradicting:
-        notes.append(f"{' and '.join(other.what for other in contradicting)} would be another symmetry")
+        notes.append(
+            f"{' and '.join(other.what for other in contradicting)} would be another symmetry"
+        )
     system = block.first(*SYSTEMS)
     of_system = settings_of_system(system) if system else []
     if of_system and not any(keep_cell(setting.operations, cell) for setting in of_system):
@@ -340,7 +403,8 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
 
 
 def _described(settings: list[Setting], used: Statement) -> str:
-    """Where the operations of the first setting are from, and which other ones the file may mean."""
+    """Where the operations of the first setting are from, and which other ones the file may
+    mean."""
     chosen, *possible = settings
     if used.what == LISTED and len(chosen.operations) == 1:
         return "x,y,z is the only symmetry operation in the file"
@@ -351,8 +415,13 @@ def _described(settings: list[Setting], used: Statement) -> str:
     note = f"{count} of {used.what}, as the file lists none"
     if not possible:
         return note
-    names = ", ".join(setting.name for setting in possible[:MOST_LISTED]) + (", ..." if possible[MOST_LISTED:] else "")
-    return f"{note}: the setting {chosen.name} was assumed, which the file does not state (it may be {names})"
+    names = ", ".join(setting.name for setting in possible[:MOST_LISTED]) + (
+        ", ..." if possible[MOST_LISTED:] else ""
+    )
+    return (
+        f"{note}: the setting {chosen.name} was assumed, which the file does not state (it may be"
+        f" {names})"
+    )
 
 
 def _listed(path: Path, block: Block) -> Iterator[Statement]:
@@ -365,17 +434,23 @@ def _listed(path: Path, block: Block) -> Iterator[Statement]:
             try:
                 operations.append(parse_operation(text))
             except ValueError as error:
-                message = f"{tag}: expected an operation such as x,1/2-y,z, found {text[:40]!r} ({error})"
+                message = (
+                    f"{tag}: expected an operation such as x,1/2-y,z, found {text[:40]!r} ({error})"
+                )
                 raise structure_error(path, message) from None
         if operations:
             lists.append(canonical(operations))
     if not lists:
         return
     if len(lists) > 1 and not np.array_equal(*lists):
-        raise structure_error(path, f"its two lists of operations differ, {' and '.join(OPERATIONS)}: keep one")
+        raise structure_error(
+            path, f"its two lists of operations differ, {' and '.join(OPERATIONS)}: keep one"
+        )
     if not is_group(lists[0]):
         count = len(lists[0])
-        raise structure_error(path, f"its {count} symmetry operations are not a group: is one missing or misprinted?")
+        raise structure_error(
+            path, f"its {count} symmetry operations are not a group: is one missing or misprinted?"
+        )
     yield Statement(LISTED, [Setting(LISTED, lists[0])])
 
 
@@ -395,31 +470,48 @@ def _tabulated(block: Block) -> Iterator[Statement]:
         yield Statement(f"its coordinate system code {code}", settings)
 
 
-def _contents(block: Block, kinds: list[str], whole: UnitCell, cell: np.ndarray, order: int) -> list[str]:
-    """Notes on the numbers of atoms and the density of the unit cell, compared with what the file states."""
+def _contents(
+    block: Block, kinds: list[str], whole: UnitCell, cell: np.ndarray, order: int
+) -> list[str]:
+    """Notes on the numbers of atoms and the density of the unit cell, compared with what the file
+    states."""
     from ase.data import atomic_masses, atomic_numbers
 
     count = Counter(kinds[k] for k in whole.owner)
     massive = {kind: n for kind, n in count.items() if is_element(kind) or kind in HEAVY_HYDROGEN}
     mass = sum(
-        n * (HEAVY_HYDROGEN[e] if e in HEAVY_HYDROGEN else atomic_masses[atomic_numbers[e]]) for e, n in massive.items()
+        n * (HEAVY_HYDROGEN[e] if e in HEAVY_HYDROGEN else atomic_masses[atomic_numbers[e]])
+        for e, n in massive.items()
     )
     volume = abs(np.linalg.det(cell))
     density = mass / volume / GRAM_PER_CM3
     notes = []
     if order > 1:
         found = " ".join(f"{kind}{n}" for kind, n in sorted(count.items()))
-        origin = f"{len(kinds)} atom{'s' * (len(kinds) > 1)} in the file, {whole.special} on special positions"
-        notes.append(f"its cell of {volume:.5g} Å³ holds {found}, {density:.4g} g/cm³, from {origin}")
+        origin = (
+            f"{len(kinds)} atom{'s' * (len(kinds) > 1)} in the file, {whole.special} on special"
+            " positions"
+        )
+        notes.append(
+            f"its cell of {volume:.5g} Å³ holds {found}, {density:.4g} g/cm³, from {origin}"
+        )
     if whole.copies:
-        notes.append(f"{whole.copies} atoms of the file are images of others by symmetry and count once")
+        notes.append(
+            f"{whole.copies} atoms of the file are images of others by symmetry and count once"
+        )
     stated = number_of(block.first("_exptl_crystal_density_diffrn"))[0]
     if stated > 0 and abs(density - stated) > SAME_DENSITY * stated:
-        notes.append(f"the density in the file is {stated:g} g/cm³, but its atoms make {density:.4g} g/cm³")
+        notes.append(
+            f"the density in the file is {stated:g} g/cm³, but its atoms make {density:.4g} g/cm³"
+        )
     formula = _formula(block.first("_chemical_formula_sum") or "")
     units = number_of(block.first("_cell_formula_units_z"))[0]
     multiples = {units, 1.0}  # 1: pymatgen gives the formula of the cell
-    if formula and units > 0 and not any(massive == {e: n * z for e, n in formula.items()} for z in multiples):
+    if (
+        formula
+        and units > 0
+        and not any(massive == {e: n * z for e, n in formula.items()} for z in multiples)
+    ):
         wanted = " ".join(f"{element}{n * units:g}" for element, n in sorted(formula.items()))
         there = " ".join(f"{element}{n}" for element, n in sorted(massive.items()))
         notes.append(f"its formula and Z are {wanted} in the cell, but its atoms make {there}")
@@ -432,7 +524,11 @@ def _formula(text: str) -> dict[str, float]:
     return {word[1]: float(word[2] or 1) for word in words if word} if all(words) else {}
 
 
-register(Format(
-    (".cif", ".mmcif"), read=read_cif, crystals=True,
-    content=re.compile(r"\A(?:[ \t]*(?:#.*)?\n)*[ \t]*data_\S", re.IGNORECASE),
-))  # fmt: skip
+register(
+    Format(
+        (".cif", ".mmcif"),
+        read=read_cif,
+        crystals=True,
+        content=re.compile(r"\A(?:[ \t]*(?:#.*)?\n)*[ \t]*data_\S", re.IGNORECASE),
+    )
+)

@@ -1,7 +1,9 @@
-"""The symmetry of a crystal: operations from what a file states about them, and the atoms that they make.
+"""The symmetry of a crystal: operations from what a file states about them, and the atoms that they
+make.
 
-A symmetry operation maps fractional coordinates x to W x + w. Operations (g, 3, 4) are the integers 24 W and 24 w, as
-in gemmi, whose tables of space groups are used: all translations of space groups are multiples of 1/24.
+A symmetry operation maps fractional coordinates x to W x + w. Operations (g, 3, 4) are the integers
+24 W and 24 w, as in gemmi, whose tables of space groups are used: all translations of space groups
+are multiples of 1/24.
 Source: International Tables for Crystallography A, chapters 1.3 to 1.5.
 """
 
@@ -20,10 +22,11 @@ if TYPE_CHECKING:
 #: Denominator of gemmi's operations.
 WHOLE = 24
 IDENTITY = WHOLE * np.eye(3, 4, dtype=int)[None]
-#: An operation keeps the lengths and angles of the cell to this fraction of the square of its longest edge: 1 % of an
-#: edge, 1 degree.
+#: An operation keeps the lengths and angles of the cell to this fraction of the square of its
+#: longest edge: 1 % of an edge, 1 degree.
 KEEPS_CELL = 0.02
-#: Two images of an atom within this fraction of its covalent radius are one atom on a special position.
+#: Two images of an atom within this fraction of its covalent radius are one atom on a special
+#: position.
 SAME_ATOM = 0.5
 MONOCLINIC = range(3, 16)  # numbers of space groups
 #: Names of the two origins and of the two cells of a space group in files of ICSD and of others.
@@ -80,7 +83,8 @@ def is_group(operations: np.ndarray) -> bool:
 
 
 def keep_cell(operations: np.ndarray, cell: np.ndarray) -> bool:
-    """Whether operations are rotations and reflections in this cell (3, 3): W^T G W = G for its metric tensor G."""
+    """Whether operations are rotations and reflections in this cell (3, 3): W^T G W = G for its
+    metric tensor G."""
     metric = cell @ cell.T
     w = operations[:, :, :3] / WHOLE
     change = np.einsum("aji,jk,akl->ail", w, metric, w) - metric
@@ -100,7 +104,8 @@ class TableEntry(NamedTuple):
 
 @cache
 def _table() -> list[TableEntry]:
-    """All settings of the space groups: standard ones, origin choice 1 and hexagonal cells come first."""
+    """All settings of the space groups: standard ones, origin choice 1 and hexagonal cells come
+    first."""
     import gemmi
 
     return [_entry(group) for group in gemmi.spacegroup_table()]
@@ -130,7 +135,8 @@ def settings_of_number(number: int) -> list[Setting]:
 
 
 def settings_of_system(system: str) -> list[Setting]:
-    """Settings of a crystal system; hexagonal, trigonal and rhombohedral ones are not distinguished in files."""
+    """Settings of a crystal system; hexagonal, trigonal and rhombohedral ones are not distinguished
+    in files."""
     alike = ("hexagonal", "trigonal", "rhombohedral")
     wanted = alike if system.lower() in alike else (system.lower(),)
     return settings_where(lambda entry: entry.system in wanted)
@@ -154,8 +160,9 @@ def settings_of_hall(symbol: str) -> list[Setting]:
 def settings_of_name(name: str) -> list[Setting]:
     """The settings that a Hermann-Mauguin symbol may mean; none if it is unknown.
 
-    Spaces, underscores, 2(1) and 2~1~ are understood, also full symbols (P 2/m 2/m 2/m), and symbols of monoclinic
-    groups without their 1s (P 21/n). A code after a colon, or ICSD's Z, S, H or R after a space, selects a setting.
+    Spaces, underscores, 2(1) and 2~1~ are understood, also full symbols (P 2/m 2/m 2/m), and
+    symbols of monoclinic groups without their 1s (P 21/n). A code after a colon, or ICSD's Z, S, H
+    or R after a space, selects a setting.
     """
     import gemmi
 
@@ -168,14 +175,20 @@ def settings_of_name(name: str) -> list[Setting]:
     for symbol, code in attempts:
         for key in (_key(symbol), _short(_key(symbol))):
             if found := [
-                entry.setting for entry in _table() if key in entry.keys and (not code or code in entry.codes)
+                entry.setting
+                for entry in _table()
+                if key in entry.keys and (not code or code in entry.codes)
             ]:
                 return found
     symbol, code = attempts[0]
-    group = gemmi.find_spacegroup_by_name(symbol)  # other symbols of the same setting: H 3, F d 3 m, C m c e
+    group = gemmi.find_spacegroup_by_name(
+        symbol
+    )  # other symbols of the same setting: H 3, F d 3 m, C m c e
     if group is None:
         return []
-    return settings_where(lambda entry: entry.symbol == group.hm and (not code or code in entry.codes))
+    return settings_where(
+        lambda entry: entry.symbol == group.hm and (not code or code in entry.codes)
+    )
 
 
 def _key(symbol: str) -> str:
@@ -203,14 +216,22 @@ class UnitCell(NamedTuple):
 
 
 def unit_cell(
-    fractional: np.ndarray, kinds: Sequence[str], radii: np.ndarray, operations: np.ndarray, cell: np.ndarray
+    fractional: np.ndarray,
+    kinds: Sequence[str],
+    radii: np.ndarray,
+    operations: np.ndarray,
+    cell: np.ndarray,
 ) -> UnitCell:
     """All atoms of the cell (3, 3), each once. Atoms on special positions are put exactly there.
 
-    fractional : (n, 3) coordinates of the atoms of the file. kinds : what atoms at one position must share.
+    fractional : (n, 3) coordinates of the atoms of the file. kinds : what atoms at one position
+        must share.
     radii : (n,) covalent radii, Å. Raises NoSymmetry.
     """
-    parts = [_images(x, SAME_ATOM * radius, operations, cell) for x, radius in zip(fractional, radii, strict=True)]
+    parts = [
+        _images(x, SAME_ATOM * radius, operations, cell)
+        for x, radius in zip(fractional, radii, strict=True)
+    ]
     owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     images = np.concatenate(parts) if parts else np.zeros((0, 3))
     special = sum(len(part) < len(operations) for part in parts)
@@ -220,7 +241,9 @@ def unit_cell(
     first, second = np.minimum(owner[i], owner[j]), np.maximum(owner[i], owner[j])
     near = (distance <= SAME_ATOM * np.minimum(radii[first], radii[second])) & (first != second)
     copies = set()
-    for one, other, length in zip(first[near].tolist(), second[near].tolist(), distance[near].tolist(), strict=True):
+    for one, other, length in zip(
+        first[near].tolist(), second[near].tolist(), distance[near].tolist(), strict=True
+    ):
         if kinds[one] != kinds[other]:
             raise NoSymmetry(f"atoms {one + 1} and {other + 1} are {length:.2g} Å apart")
         if one not in copies:
@@ -229,8 +252,11 @@ def unit_cell(
     return UnitCell(owner[kept], images[kept], special, len(copies))
 
 
-def _images(x: np.ndarray, tolerance: float, operations: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """The images (k, 3) of an atom at fractional coordinates x, which is first moved onto its special position."""
+def _images(
+    x: np.ndarray, tolerance: float, operations: np.ndarray, cell: np.ndarray
+) -> np.ndarray:
+    """The images (k, 3) of an atom at fractional coordinates x, which is first moved onto its
+    special position."""
     if len(operations) == 1:
         return x[None]
     w, t = operations[:, :, :3] / WHOLE, operations[:, :, 3] / WHOLE

@@ -1,4 +1,5 @@
-"""Base of the trajectory files of molecules that a library writes with a table of frames inside the file (GSD, ASE)."""
+"""Base of the trajectory files of molecules that a library writes with a table of frames inside the
+file (GSD, ASE)."""
 
 import contextlib
 import zlib
@@ -24,10 +25,11 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 class FrameFile:
-    """Writes frames to a file, each to the disk at once. For the arguments see `io.trajectory.TrajectoryFile`.
+    """Writes frames to a file, each to the disk at once. For the arguments see
+    `io.trajectory.TrajectoryFile`.
 
-    The table of frames moves within a growing file. So a resumed run copies the frames up to the checkpoint to a new
-    file, which has the same bytes as the file of a run without interruption.
+    The table of frames moves within a growing file. So a resumed run copies the frames up to the
+    checkpoint to a new file, which has the same bytes as the file of a run without interruption.
 
     Raises OutputError, here and in every method.
     """
@@ -37,9 +39,18 @@ class FrameFile:
     _frame: Callable[[State, float, int], Any]  # the frame of a state, as `_append` takes it
     _append: Callable[[Any, Any], None]  # (file, frame)
     _arrays: Callable[[Any], Iterable[np.ndarray]]  # of a frame, for the checksum
-    _stored_frames: Callable[[int], Iterator[Any]]  # the first of the file; raises as `_kept_frames` catches
+    _stored_frames: Callable[
+        [int], Iterator[Any]
+    ]  # the first of the file; raises as `_kept_frames` catches
 
-    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
+    def __init__(
+        self,
+        path: Path,
+        system: System,
+        velocities: bool,
+        wrapped: bool,
+        kept: Sequence[int] | None = None,
+    ):
         self._path, self._system = path, system
         self._velocities, self._wrapped = velocities, wrapped
         self._sum, self._frames, self._kept = 0, 0, kept
@@ -53,7 +64,8 @@ class FrameFile:
 
     @property
     def kept(self) -> tuple[int, int]:
-        """Checksum and number of all frames, which are on the disk. Raises OutputError, see `check` too."""
+        """Checksum and number of all frames, which are on the disk. Raises OutputError, see `check`
+        too."""
         self.check()
         return self._sum, self._frames
 
@@ -76,7 +88,10 @@ class FrameFile:
             self._open_new()
             return
         with self._writing():
-            with atomic_file(self._path) as temporary, contextlib.closing(self._open(temporary, "w")) as new:
+            with (
+                atomic_file(self._path) as temporary,
+                contextlib.closing(self._open(temporary, "w")) as new,
+            ):
                 for frame in self._kept_frames():
                     self._append(new, frame)
             self._file = self._open(self._path, "a")
@@ -104,9 +119,14 @@ class FrameFile:
                 yield frame
                 self._count(frame)
         except (ValueError, RuntimeError, KeyError, OSError) as error:
-            raise OutputError(f"{self._path} cannot be read to continue it: {_reason(error)}") from None
+            raise OutputError(
+                f"{self._path} cannot be read to continue it: {_reason(error)}"
+            ) from None
         if self._sum != kept_sum:
-            raise OutputError(f"{self._path} has changed or is damaged: its checksum is not that of what was written")
+            raise OutputError(
+                f"{self._path} has changed or is damaged: its checksum is not that of what was"
+                " written"
+            )
 
     def _count(self, frame: Any) -> None:
         self._frames += 1

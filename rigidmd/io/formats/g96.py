@@ -59,7 +59,14 @@ def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atom
             raise unexpected(path, number, "residue number, residue name, atom name", line.strip())
         names.append(words[2])
         residue.append((parse_whole_number(words[0]), words[1]))
-    return Atoms(names, [""] * len(names), residue, position, velocity if len(velocity) else None, _box(path, frame))
+    return Atoms(
+        names,
+        [""] * len(names),
+        residue,
+        position,
+        velocity if len(velocity) else None,
+        _box(path, frame),
+    )
 
 
 def _vectors(path: Path, frame: dict[str, Lines], blocks: tuple[str, ...]) -> np.ndarray:
@@ -70,7 +77,9 @@ def _vectors(path: Path, frame: dict[str, Lines], blocks: tuple[str, ...]) -> np
     for number, line in frame.get(name, ()):
         words = line[start:].split()
         if len(words) != 3:
-            raise unexpected(path, number, f"three numbers of {name} from column {start + 1}", line.strip())
+            raise unexpected(
+                path, number, f"three numbers of {name} from column {start + 1}", line.strip()
+            )
         rows.append(numbers(path, number, words, f"three numbers of {name}"))
     return 10 * np.array(rows).reshape(-1, 3)
 
@@ -89,6 +98,10 @@ def _box(path: Path, frame: dict[str, Lines]) -> np.ndarray | None:
     return 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
 
 
-register(Format(
-    (".g96",), read=read_g96, content=re.compile(r"\ATITLE[ \t]*\n(?:.*\n)*?(?:TIMESTEP|POSITION)"),
-))  # fmt: skip
+register(
+    Format(
+        (".g96",),
+        read=read_g96,
+        content=re.compile(r"\ATITLE[ \t]*\n(?:.*\n)*?(?:TIMESTEP|POSITION)"),
+    )
+)

@@ -1,4 +1,5 @@
-"""GRO, of GROMACS. ASE reads neither more digits, nor several frames, nor velocities of some atoms only."""
+"""GRO, of GROMACS. ASE reads neither more digits, nor several frames, nor velocities of some atoms
+only."""
 
 import re
 from collections.abc import Callable
@@ -28,7 +29,9 @@ def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
         box = first + 2 + count
         if box >= len(lines):
             found = f"{max(0, len(lines) - first - 3)} are there: truncated?"
-            raise structure_error(path, f"line {first + 2} promises {count} atoms and a box, {found}")
+            raise structure_error(
+                path, f"line {first + 2} promises {count} atoms and a box, {found}"
+            )
         what = "the box, 3 or 9 numbers (is the number of atoms right?)"
         edges = numbers(path, box + 1, lines[box].split(), what)
         if len(edges) not in (3, 9):
@@ -39,16 +42,22 @@ def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
 
 
 def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[float]) -> Atoms:
-    """The frame in lines `first` to `box`. Column width is the distance between decimal points, as in GROMACS."""
+    """The frame in lines `first` to `box`. Column width is the distance between decimal points, as
+    in GROMACS."""
     names, residue = [], []
     position, velocity = np.zeros((box - first - 2, 3)), np.full((box - first - 2, 3), np.nan)
-    points = [m.start() for m in re.finditer(r"\.", lines[first + 2][20:])] if box > first + 2 else []
+    points = (
+        [m.start() for m in re.finditer(r"\.", lines[first + 2][20:])] if box > first + 2 else []
+    )
     width = points[1] - points[0] if len(points) > 1 else 8
     cuts = list(pairwise(range(20, 21 + 6 * width, width)))
     for k in range(first + 2, box):
         line = lines[k]
         values = [line[a:b].strip() for a, b in cuts]
-        what = f"an atom of a .gro with coordinates in columns of {width} (is the number of atoms right?)"
+        what = (
+            f"an atom of a .gro with coordinates in columns of {width} (is the number of atoms"
+            " right?)"
+        )
         position[k - first - 2] = numbers(path, k + 1, values[:3], what)
         given = [v for v in values[3:] if v]
         if len(given) == 3:
@@ -65,8 +74,12 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
     return Atoms(names, [""] * len(names), residue, 10 * position, moving, cell)
 
 
-register(Format(
-    (".gro",), read=read_gro, write_topology=lambda path, sites: sites.write(str(path)),
-    limits=(-9999.9, 99999.9),  # columns of eight
-    content=re.compile(r"\A(?:[ \t]*\n)*.*\n[ \t]*\d+[ \t]*\n.{20}( *-?\d+\.\d+){3}"),
-))  # fmt: skip
+register(
+    Format(
+        (".gro",),
+        read=read_gro,
+        write_topology=lambda path, sites: sites.write(str(path)),
+        limits=(-9999.9, 99999.9),  # columns of eight
+        content=re.compile(r"\A(?:[ \t]*\n)*.*\n[ \t]*\d+[ \t]*\n.{20}( *-?\d+\.\d+){3}"),
+    )
+)

@@ -1,9 +1,10 @@
 """GSD, the format of HOOMD: trajectories of molecules with rotations and angular momenta.
 
-A molecule of several sites is a rigid body as in HOOMD: a central particle with mass, moments of inertia, orientation
-and angular momentum, and its sites as constituent particles. A molecule of one site is a free particle. In a file the
-box is centred at the origin and particles are wrapped, with their image numbers; here the box begins at the origin and
-positions are unwrapped. Files are read chunk by chunk, and sizes are checked before arrays are allocated.
+A molecule of several sites is a rigid body as in HOOMD: a central particle with mass, moments of
+inertia, orientation and angular momentum, and its sites as constituent particles. A molecule of one
+site is a free particle. In a file the box is centred at the origin and particles are wrapped, with
+their image numbers; here the box begins at the origin and positions are unwrapped. Files are read
+chunk by chunk, and sizes are checked before arrays are allocated.
 """
 
 import contextlib
@@ -39,7 +40,9 @@ class Particles(NamedTuple):
     cell: np.ndarray | None  # (3, 3) rows a, b, c
     label: list[str]  # (N,) names of types
     body: np.ndarray  # (N,) number of the body; of the particle itself without a body
-    owner: np.ndarray  # (N,) index of the central particle of the body; of the particle itself without one
+    owner: (
+        np.ndarray
+    )  # (N,) index of the central particle of the body; of the particle itself without one
     position: np.ndarray  # (N, 3) lab frame, molecules whole
     orientation: np.ndarray  # (N, 4) wxyz, normalised
     velocity: np.ndarray | None  # (N, 3)
@@ -49,8 +52,8 @@ class Particles(NamedTuple):
 
     @property
     def site_masses(self) -> np.ndarray | None:
-        """Masses of the sites (s,), if those of each body add up to the mass of its central particle: HOOMD does not
-        use masses of constituents, which may have any value."""
+        """Masses of the sites (s,), if those of each body add up to the mass of its central
+        particle: HOOMD does not use masses of constituents, which may have any value."""
         sites, body = self.sites, self.owner[self.sites]
         total = np.bincount(body, self.mass[sites], len(self.owner))
         centres = np.unique(body)
@@ -73,10 +76,13 @@ class Particles(NamedTuple):
         return from_quaternion(self.orientation[self.centres])
 
     def site_velocities(self) -> np.ndarray | None:
-        """Velocities of the sites, from the rigid bodies, because HOOMD stores none of constituents."""
+        """Velocities of the sites, from the rigid bodies, because HOOMD stores none of
+        constituents."""
         if self.velocity is None:
             return None
-        inverse = np.divide(1.0, self.inertia, out=np.zeros_like(self.inertia), where=self.inertia > 0)
+        inverse = np.divide(
+            1.0, self.inertia, out=np.zeros_like(self.inertia), where=self.inertia > 0
+        )
         body = self.owner[self.sites]
         omega = (self.angular_momentum_body * inverse)[body]
         lab = np.einsum("sij,sj->si", from_quaternion(self.orientation[body]), omega)
@@ -84,7 +90,8 @@ class Particles(NamedTuple):
 
 
 class GsdReader:
-    """Reads the frames of a file. Methods raise OSError or ValueError. `count` is the number of frames."""
+    """Reads the frames of a file. Methods raise OSError or ValueError. `count` is the number of
+    frames."""
 
     def __init__(self, path: Path):
         import gsd.fl
@@ -114,7 +121,9 @@ class GsdReader:
         if (names := self._chunk(frame, "particles/types")) is not None:
             if names.ndim != 2 or names.dtype.itemsize != 1:
                 raise ValueError("its names of types are not text")
-            types = [row.tobytes().split(b"\0", 1)[0].decode("utf-8", errors="replace") for row in names]
+            types = [
+                row.tobytes().split(b"\0", 1)[0].decode("utf-8", errors="replace") for row in names
+            ]
         if not 0 <= kind.min() <= kind.max() < len(types):
             raise ValueError(f"frame {frame + 1} has a particle without a type")
         body = of("body", (), -1).astype(np.int32).astype(int)  # -1 is often stored unsigned
@@ -140,17 +149,25 @@ class GsdReader:
         moving = self._chunk(frame, "particles/velocity") is not None
         return Particles(
             step=0 if step is None else int(step.flat[0]),
-            time=nan if time is None or time.size != 1 else float(time.flat[0]), cell=cell,
-            label=[types[k] for k in kind], body=body, owner=_owners(body, position, inertia), position=position,
-            orientation=orientation, velocity=of("velocity", (3,), 0).astype(float) if moving else None,
+            time=nan if time is None or time.size != 1 else float(time.flat[0]),
+            cell=cell,
+            label=[types[k] for k in kind],
+            body=body,
+            owner=_owners(body, position, inertia),
+            position=position,
+            orientation=orientation,
+            velocity=of("velocity", (3,), 0).astype(float) if moving else None,
             angular_momentum_body=_vector_part(orientation, of("angmom", (4,), 0).astype(float)),
-            inertia=inertia, mass=of("mass", (), 1).astype(float),
-        )  # fmt: skip
+            inertia=inertia,
+            mass=of("mass", (), 1).astype(float),
+        )
 
     def frame(self, k: int) -> Frame:
         found = self.read(k)
         where = found.position[found.sites]
-        return Frame(found.time, where, found.cell, found.site_velocities(), found.rotation(), found.step)
+        return Frame(
+            found.time, where, found.cell, found.site_velocities(), found.rotation(), found.step
+        )
 
     @property
     def sites(self) -> int:
@@ -165,29 +182,37 @@ class GsdReader:
                     return self._file.read_chunk(frame=k, name=name)
         return None
 
-    def _of_particles(self, frame: int, n: int, name: str, width: tuple[int, ...], default: Any) -> np.ndarray:
+    def _of_particles(
+        self, frame: int, n: int, name: str, width: tuple[int, ...], default: Any
+    ) -> np.ndarray:
         """A property of all particles (n, *width)."""
         found = self._chunk(frame, f"particles/{name}")
         if found is None:
             return np.broadcast_to(np.asarray(default), (n, *width))
         if found.shape != (n, *width):
-            raise ValueError(f"frame {frame + 1}: particles/{name} is of {found.shape}, must be {(n, *width)}")
+            raise ValueError(
+                f"frame {frame + 1}: particles/{name} is of {found.shape}, must be {(n, *width)}"
+            )
         return found
 
 
 def _owners(body: np.ndarray, position: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """The central particle (N,) of each particle, itself without one. A body has one if the particle of its number has
-    moments of inertia, or is where one of the others is, which then has all mass; else it consists of sites alone."""
+    """The central particle (N,) of each particle, itself without one. A body has one if the
+    particle of its number has moments of inertia, or is where one of the others is, which then has
+    all mass; else it consists of sites alone."""
     index = np.arange(len(body))
     others = index[body != index]
     nearest = np.full(len(body), np.inf)
-    np.minimum.at(nearest, body[others], np.linalg.norm(position[others] - position[body[others]], axis=1))
+    np.minimum.at(
+        nearest, body[others], np.linalg.norm(position[others] - position[body[others]], axis=1)
+    )
     is_central = np.isfinite(nearest) & (inertia.any(axis=1) | (nearest <= COINCIDENT))
     return np.where(is_central[body], body, index)
 
 
 def _whole_bodies(position: np.ndarray, body: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Positions (N, 3) of a file without image numbers, in which the particles of each body are near each other."""
+    """Positions (N, 3) of a file without image numbers, in which the particles of each body are
+    near each other."""
     position, size = position.copy(), np.bincount(body, minlength=len(body))
     order = np.argsort(body, kind="stable")
     for count in np.unique(size[size > 1]):
@@ -219,7 +244,8 @@ def _vector_part(orientation: np.ndarray, momentum: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Within it, errors of the library become ValueError; it allocates arrays before it checks the size of the file."""
+    """Within it, errors of the library become ValueError; it allocates arrays before it checks the
+    size of the file."""
     try:
         yield
     except (RuntimeError, KeyError, MemoryError) as error:
@@ -231,9 +257,22 @@ DOT = 0.1
 
 
 class GsdFile(FrameFile):
-    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
-        """Set the constant properties. Particles are molecules, then the sites of molecules with several sites."""
-        self._changing = ["position", "image", "orientation", *(("velocity", "angmom") if velocities else ())]
+    def __init__(
+        self,
+        path: Path,
+        system: System,
+        velocities: bool,
+        wrapped: bool,
+        kept: Sequence[int] | None = None,
+    ):
+        """Set the constant properties. Particles are molecules, then the sites of molecules with
+        several sites."""
+        self._changing = [
+            "position",
+            "image",
+            "orientation",
+            *(("velocity", "angmom") if velocities else ()),
+        ]
         molecule, species = system.sites.molecule, system.model.species
         single = np.bincount(molecule) == 1
         n = len(single)
@@ -251,12 +290,16 @@ class GsdFile(FrameFile):
         charge[particle] = charges(system)
         central = set(label[:n][~single])
         self._constant: dict[str, Any] = {
-            "types": types, "typeid": np.array([types.index(name) for name in label]),
-            "type_shapes": [{"type": "Sphere", "diameter": DOT} if name in central else {} for name in types],
+            "types": types,
+            "typeid": np.array([types.index(name) for name in label]),
+            "type_shapes": [
+                {"type": "Sphere", "diameter": DOT} if name in central else {} for name in types
+            ],
             "body": np.concatenate([np.where(single, -1, np.arange(n)), molecule[constituent]]),
-            "mass": np.concatenate([mass, system.sites.mass[constituent]]), "charge": charge,
+            "mass": np.concatenate([mass, system.sites.mass[constituent]]),
+            "charge": charge,
             "moment_inertia": np.vstack([moments, np.zeros((len(self._constituent), 3))]),
-        }  # fmt: skip
+        }
         self._bonds = particle[connections(system)]
         super().__init__(path, system, velocities, wrapped, kept)
 
@@ -267,7 +310,8 @@ class GsdFile(FrameFile):
 
     def _append(self, file: Any, frame: Any) -> None:
         file.append(frame)
-        file.file.flush()  # after every frame, so that offsets of chunks do not depend on the time of a flush
+        # after every frame, so that offsets of chunks do not depend on the time of a flush
+        file.file.flush()
 
     def _stored_frames(self, count: int) -> Iterator[Any]:
         with contextlib.closing(GsdReader(self._path)) as reader:
@@ -283,13 +327,28 @@ class GsdFile(FrameFile):
 
         system, sites = self._system, self._constituent
         owner, n = system.sites.molecule[sites], len(state.position)
-        orientation = to_quaternion(state.rotation) if len(state.rotation) else np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-        position = np.vstack([system.centres(state, self._wrapped), system.site_positions(state, self._wrapped)[sites]])
+        orientation = (
+            to_quaternion(state.rotation)
+            if len(state.rotation)
+            else np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+        )
+        position = np.vstack(
+            [
+                system.centres(state, self._wrapped),
+                system.site_positions(state, self._wrapped)[sites],
+            ]
+        )
         image = np.zeros(position.shape)
         if np.isfinite(state.cell).all():
             image = np.floor(np.linalg.solve(state.cell.T, position.T).T)
-            position = position - (image + 0.5) @ state.cell  # in the box that is centred at the origin
-        found = {"position": position, "image": image, "orientation": np.vstack([orientation, orientation[owner]])}
+            position = (
+                position - (image + 0.5) @ state.cell
+            )  # in the box that is centred at the origin
+        found = {
+            "position": position,
+            "image": image,
+            "orientation": np.vstack([orientation, orientation[owner]]),
+        }
         if self._velocities:
             found["velocity"] = np.vstack([state.velocity, system.site_velocities(state)[sites]])
             found["angmom"] = np.zeros((n + len(sites), 4))
@@ -302,8 +361,11 @@ class GsdFile(FrameFile):
         frame.log[TIME] = np.array([time])
         frame.particles.N, frame.bonds.N = len(position), len(self._bonds)
         for name, values in found.items():
-            # in the type of the file, because the library compares it with the first frame and leaves equal chunks out
-            setattr(frame.particles, name, values.astype(np.int32 if name == "image" else np.float32))
+            # in the type of the file, because the library compares it with the first frame and
+            # leaves equal chunks out
+            setattr(
+                frame.particles, name, values.astype(np.int32 if name == "image" else np.float32)
+            )
         if self._frames == 0:
             for name, values in self._constant.items():
                 setattr(frame.particles, name, values)
@@ -312,11 +374,16 @@ class GsdFile(FrameFile):
         return frame
 
     def _arrays(self, frame: Any) -> list[np.ndarray]:
-        return [frame.configuration.box, frame.log[TIME], *(getattr(frame.particles, name) for name in self._changing)]
+        return [
+            frame.configuration.box,
+            frame.log[TIME],
+            *(getattr(frame.particles, name) for name in self._changing),
+        ]
 
 
 def _labels(system: System) -> np.ndarray:
-    """Type of each site (s,): its element, or its name without element, with the species if it is ambiguous."""
+    """Type of each site (s,): its element, or its name without element, with the species if it is
+    ambiguous."""
     kinds = defaultdict(set)  # properties of sites by name, and by species and name
 
     def names_of(m: Any) -> list[str]:
@@ -347,15 +414,32 @@ def read_frame(path: Path, frame: int, atom_types: dict[str, str] | None = None)
     types = [found.label[site] for site in sites]
     names = {label: label.rsplit(".", 1)[-1] for label in types}  # a type may be species.name
     # a body is named by the type of its central particle
-    is_named = np.isin(np.arange(len(found.body)), found.body[sites][found.owner[sites] == found.body[sites]])
-    residue = [(int(body) + 1, found.label[body] if is_named[body] else "") for body in found.body[sites]]
+    is_named = np.isin(
+        np.arange(len(found.body)), found.body[sites][found.owner[sites] == found.body[sites]]
+    )
+    residue = [
+        (int(body) + 1, found.label[body] if is_named[body] else "") for body in found.body[sites]
+    ]
     return Atoms(
-        names_of_types(path, types, [], names, atom_types), [""] * len(types), residue, found.position[sites],
-        found.site_velocities(), found.cell, found.site_masses if atom_types is None else None,
-    )  # fmt: skip
+        names_of_types(path, types, [], names, atom_types),
+        [""] * len(types),
+        residue,
+        found.position[sites],
+        found.site_velocities(),
+        found.cell,
+        found.site_masses if atom_types is None else None,
+    )
 
 
-register(Format(
-    (".gsd",), read_frame=read_frame, has_types=True, writer=GsdFile, reader=GsdReader, velocities=True, rotations=True,
-    viewer="ovito {trajectory}",
-))  # fmt: skip
+register(
+    Format(
+        (".gsd",),
+        read_frame=read_frame,
+        has_types=True,
+        writer=GsdFile,
+        reader=GsdReader,
+        velocities=True,
+        rotations=True,
+        viewer="ovito {trajectory}",
+    )
+)

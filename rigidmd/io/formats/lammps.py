@@ -1,6 +1,6 @@
-"""Readers of LAMMPS' data files and text dumps. Atoms have types, which get names from labels, masses or the scene."""
+"""Readers of LAMMPS' data files and text dumps. Atoms have types, which get names from labels,
+masses or the scene."""
 
-# isort: skip_file
 import re
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -13,12 +13,21 @@ import numpy as np
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Format, register
 from rigidmd.io.formats.atoms import (
-    HEAVY_HYDROGEN, Atoms, atom_count, element_of_mass, is_element, names_of_types, numbers, structure_error, table,
+    HEAVY_HYDROGEN,
+    Atoms,
+    atom_count,
+    element_of_mass,
+    is_element,
+    names_of_types,
+    numbers,
+    structure_error,
+    table,
     unexpected,
-)  # fmt: skip
+)
 from rigidmd.io.formats.through_ase import ASE_VELOCITY
 
-#: Columns of the section Atoms by atom style. Three image numbers may follow. a, b, c are columns that are not used.
+#: Columns of the section Atoms by atom style. Three image numbers may follow. a, b, c are columns
+#: that are not used.
 STYLES = {
     style: columns.split()
     for columns, styles in {
@@ -37,7 +46,14 @@ STYLES = {
 #: Styles that a section Atoms without a style may have, if exactly one of them fits.
 GUESSED = ("atomic", "charge", "molecular", "full")
 #: Names of columns in a comment after Atoms.
-COLUMN = {"atom-id": "id", "mol-id": "mol", "molecule-id": "mol", "molecule": "mol", "atom-type": "type", "charge": "q"}
+COLUMN = {
+    "atom-id": "id",
+    "mol-id": "mol",
+    "molecule-id": "mol",
+    "molecule": "mol",
+    "atom-type": "type",
+    "charge": "q",
+}
 UNITS = re.compile(r"units\s*=?\s*(real|metal|si|cgs|electron)\b")
 #: Columns with labels of types in a dump.
 LABELS = ("typelabel", "label")
@@ -51,8 +67,11 @@ class Row(NamedTuple):
     comment: str
 
 
-def read_data(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
-    """The structure of a data file. The first line may name the units. Real and metal differ only in velocities."""
+def read_data(
+    path: Path, lines: list[str], atom_types: dict[str, str] | None
+) -> list[Callable[[], Atoms]]:
+    """The structure of a data file. The first line may name the units. Real and metal differ only
+    in velocities."""
     rows = head = []  # before the first section
     styles, sections = {}, {}  # the comment after the name, and the rows, of each section
     for number, line in enumerate(lines[1:], 2):
@@ -65,18 +84,32 @@ def read_data(path: Path, lines: list[str], atom_types: dict[str, str] | None) -
             rows.append(Row(number, words, comment.strip()))
     found = [row for row in head if row.words[1:] == ["atoms"]]
     if not found:
-        raise structure_error(path, "has no line with the number of atoms before its sections, such as '3 atoms'")
+        raise structure_error(
+            path, "has no line with the number of atoms before its sections, such as '3 atoms'"
+        )
     rows = sections.get("Atoms", [])
     count = atom_count(path, found[0].line, found[0].words[0], len(rows))
     if count != len(rows):
-        raise structure_error(path, f"line {found[0].line} promises {count} atoms, the section Atoms has {len(rows)}")
-    return [partial(_data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types)] if rows else []
+        raise structure_error(
+            path, f"line {found[0].line} promises {count} atoms, the section Atoms has {len(rows)}"
+        )
+    return (
+        [partial(_data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types)]
+        if rows
+        else []
+    )
 
 
-def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, list[Row]], atom_types) -> Atoms:
+def _data_atoms(
+    path: Path, title: str, head, style: str, sections: dict[str, list[Row]], atom_types
+) -> Atoms:
     """The atoms in order of their numbers. style: the comment after Atoms"""
     rows = sections["Atoms"]
-    labels = {row.words[0]: row.words[1] for row in sections.get("Atom Type Labels", []) if len(row.words) == 2}
+    labels = {
+        row.words[0]: row.words[1]
+        for row in sections.get("Atom Type Labels", [])
+        if len(row.words) == 2
+    }
     number_of = {label: number for number, label in labels.items()}
     names, mass_of = dict(labels), {}
     for row in sections.get("Masses", []):
@@ -93,39 +126,59 @@ def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, li
             raise unexpected(path, line, f"an atom ({' '.join(column)})", " ".join(words))
     rows = sorted(rows, key=lambda row: parse_whole_number(row.words[column["id"]]) or 0)
     cell = _box(path, head)
-    position = table(path, [(r.line, r.words[column["x"] : column["x"] + 3]) for r in rows], "three coordinates")
+    position = table(
+        path, [(r.line, r.words[column["x"] : column["x"] + 3]) for r in rows], "three coordinates"
+    )
     images = [row.words[width : width + 3] for row in rows]
     if cell is not None and all(len(of) == 3 for of in images):
-        position += table(path, [(r.line, of) for r, of in zip(rows, images, strict=True)], "three images") @ cell
+        position += (
+            table(path, [(r.line, of) for r, of in zip(rows, images, strict=True)], "three images")
+            @ cell
+        )
     types = [number_of.get(word := row.words[column["type"]], word) for row in rows]
     masses = None
     if mass_of:
         if lacking := sorted({kind for kind in types if kind not in mass_of}):
-            raise structure_error(path, f"its section Masses has no mass of type {', '.join(lacking)}")
+            raise structure_error(
+                path, f"its section Masses has no mass of type {', '.join(lacking)}"
+            )
         masses = np.array([mass_of[kind] for kind in types])
-    elif atom_types is None and all(parse_whole_number(kind) is not None and kind not in names for kind in types):
+    elif atom_types is None and all(
+        parse_whole_number(kind) is not None and kind not in names for kind in types
+    ):
         hint = "name its atom types by structure.atom_types"
-        raise structure_error(path, f"has no section Masses, and its atom types are unknown: {hint}")
+        raise structure_error(
+            path, f"has no section Masses, and its atom types are unknown: {hint}"
+        )
     element = {kind: element_of_mass(mass) for kind, mass in mass_of.items()}
     found = Atoms(
-        names_of_types(path, types, [*mass_of], names, atom_types), [element.get(kind, "") for kind in types],
-        _residues([row.words[column["mol"]] for row in rows] if "mol" in column else []) or [()] * len(rows), position,
-        cell=cell, masses=masses,
-    )  # fmt: skip
+        names_of_types(path, types, [*mass_of], names, atom_types),
+        [element.get(kind, "") for kind in types],
+        _residues([row.words[column["mol"]] for row in rows] if "mol" in column else [])
+        or [()] * len(rows),
+        position,
+        cell=cell,
+        masses=masses,
+    )
     moving = {row.words[0]: (row.line, row.words[1:4]) for row in sections.get("Velocities", [])}
     velocity = None
     if moving:
         given = [moving.get(row.words[column["id"]], (0, ["nan"] * 3)) for row in rows]
         velocity = table(path, given, "an atom and its three velocities")
-    return _in_our_units(found, velocity, title, "its first line does not name its units ('units = real')")
+    return _in_our_units(
+        found, velocity, title, "its first line does not name its units ('units = real')"
+    )
 
 
 def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[str, int]:
-    """The columns of the atoms: by style or names after Atoms, else the only style that fits. Raises StructureError."""
+    """The columns of the atoms: by style or names after Atoms, else the only style that fits.
+    Raises StructureError."""
     words = [COLUMN.get(word, word) for word in re.split(r"[\s,]+", style.lower())]
     width, line, basic = len(rows[0].words), rows[0].line, STYLES["atomic"]
     if words[0] == "hybrid":
-        columns = list(dict.fromkeys([*basic, *(name for part in words[1:] for name in STYLES.get(part, ()))]))
+        columns = list(
+            dict.fromkeys([*basic, *(name for part in words[1:] for name in STYLES.get(part, ()))])
+        )
     elif words[0] in STYLES:
         columns = STYLES[words[0]]
     elif set(basic) <= set(words):
@@ -135,17 +188,24 @@ def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[s
         if len(fitting) != 1:
             hint = f"such as 'Atoms # molecular' (known are {', '.join(STYLES)}, hybrid)"
             problem = f"line {line}: the meaning of the {width} columns of its atoms is ambiguous"
-            raise structure_error(path, f"{problem}: write the atom style after the name of the section, {hint}")
+            raise structure_error(
+                path, f"{problem}: write the atom style after the name of the section, {hint}"
+            )
         [columns] = fitting
     if width - len(columns) not in (0, 3):
         usual = f"{len(columns)} columns ({' '.join(columns)})"
-        raise structure_error(path, f"line {line}: an atom of style {style!r} has {usual}, found {width}")
+        raise structure_error(
+            path, f"line {line}: an atom of style {style!r} has {usual}, found {width}"
+        )
     return {name: columns.index(name) for name in columns}
 
 
 def _fits(columns: list[str], rows: list[Row], known: set[str]) -> bool:
     """Whether all rows can have these columns, and three image numbers or nothing after them."""
-    kind, whole = columns.index("type"), [k for k, name in enumerate(columns) if name in ("id", "mol")]
+    kind, whole = (
+        columns.index("type"),
+        [k for k, name in enumerate(columns) if name in ("id", "mol")],
+    )
     for row in rows:
         words, images = row.words, [word.lstrip("+-") for word in row.words[len(columns) :]]
         if len(words) < len(columns) or len(images) not in (0, 3):
@@ -159,7 +219,12 @@ def _fits(columns: list[str], rows: list[Row], known: set[str]) -> bool:
 
 def _box(path: Path, head: list[Row]) -> np.ndarray | None:
     """The cell (3, 3); None without one."""
-    by_name = {" ".join(words[k:]): (row.line, words[:k]) for row in head for words in [row.words] for k in (2, 3, 4)}
+    by_name = {
+        " ".join(words[k:]): (row.line, words[:k])
+        for row in head
+        for words in [row.words]
+        for k in (2, 3, 4)
+    }
     if "avec" in by_name:
         edges = [by_name.get(name, (1, [])) for name in ("avec", "bvec", "cvec")]
         return table(path, edges, "three components of an edge")
@@ -172,7 +237,9 @@ def _box(path: Path, head: list[Row]) -> np.ndarray | None:
     low, high = table(path, [by_name[line] for line in lines], "two bounds of the box").T
     cell = np.diag(high - low)
     if "xy xz yz" in by_name:
-        cell[1, 0], cell[2, 0], cell[2, 1] = numbers(path, *by_name["xy xz yz"], "three tilts of the box")
+        cell[1, 0], cell[2, 0], cell[2, 1] = numbers(
+            path, *by_name["xy xz yz"], "three tilts of the box"
+        )
     return cell
 
 
@@ -183,7 +250,8 @@ def _residues(numbers_of: Iterable[str]) -> list[tuple]:
 
 
 def _in_our_units(found: Atoms, velocity: np.ndarray | None, title: str, unknown: str) -> Atoms:
-    """Atoms in Å, ps and u. If the title names no units, lengths are in Å and velocities are not used."""
+    """Atoms in Å, ps and u. If the title names no units, lengths are in Å and velocities are not
+    used."""
     from ase.calculators.lammps import convert
 
     if (units := UNITS.search(title)) is None:
@@ -195,24 +263,46 @@ def _in_our_units(found: Atoms, velocity: np.ndarray | None, title: str, unknown
 
     speed = converted(velocity, "velocity")
     return found._replace(
-        position=converted(found.position, "distance"), cell=converted(found.cell, "distance"),
+        position=converted(found.position, "distance"),
+        cell=converted(found.cell, "distance"),
         masses=converted(found.masses, "mass"),
-        velocity=None if speed is None else np.where(np.isfinite(speed), speed * ASE_VELOCITY, np.nan),
-    )  # fmt: skip
+        velocity=None
+        if speed is None
+        else np.where(np.isfinite(speed), speed * ASE_VELOCITY, np.nan),
+    )
 
 
-def read_dump(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
-    units = next((lines[k + 1].strip() for k, line in enumerate(lines[:-1]) if line.startswith("ITEM: UNITS")), "")
+def read_dump(
+    path: Path, lines: list[str], atom_types: dict[str, str] | None
+) -> list[Callable[[], Atoms]]:
+    units = next(
+        (
+            lines[k + 1].strip()
+            for k, line in enumerate(lines[:-1])
+            if line.startswith("ITEM: UNITS")
+        ),
+        "",
+    )
     starts = [k for k, line in enumerate(lines) if line.startswith("ITEM: TIMESTEP")]
     parts = pairwise([*starts, len(lines)])
-    return [partial(_dump_frame, path, lines[first:last], first, units, atom_types) for first, last in parts]
+    return [
+        partial(_dump_frame, path, lines[first:last], first, units, atom_types)
+        for first, last in parts
+    ]
 
 
 def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types) -> Atoms:
     """The frame in the lines after line number `first`."""
-    at = {" ".join(line.split()[1:3]): k for k, line in enumerate(lines) if line.startswith("ITEM: ")}
+    at = {
+        " ".join(line.split()[1:3]): k for k, line in enumerate(lines) if line.startswith("ITEM: ")
+    }
     atoms = next((k for k, line in enumerate(lines) if line.startswith("ITEM: ATOMS")), None)
-    if "NUMBER OF" not in at or "BOX BOUNDS" not in at or atoms is None or max(at.values()) + 1 >= len(lines):
+    if (
+        "NUMBER OF" not in at
+        or "BOX BOUNDS" not in at
+        or atoms is None
+        or max(at.values()) + 1 >= len(lines)
+    ):
         missing = "expected ITEM: NUMBER OF ATOMS, BOX BOUNDS and ATOMS after it: truncated?"
         raise structure_error(path, f"line {first + 1}: {missing}")
     line = at["NUMBER OF"] + 1
@@ -221,7 +311,9 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
     rows = [(first + k + 1, lines[k].split()) for k in range(atoms + 1, atoms + 1 + count)]
     if short := [row for row in rows if len(row[1]) < len(columns)]:
         line, words = short[0]
-        raise unexpected(path, line, f"{len(columns)} columns ({' '.join(columns)})", " ".join(words))
+        raise unexpected(
+            path, line, f"{len(columns)} columns ({' '.join(columns)})", " ".join(words)
+        )
 
     def of(*names: str) -> np.ndarray:
         values = [(number, [words[columns[name]] for name in names]) for number, words in rows]
@@ -237,7 +329,9 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
     low, cell = dump_box(path, lines[begin].split()[3:], bounds)
     there = next((names for names in COORDINATES if set(names) <= set(columns)), None)
     if there is None:
-        raise structure_error(path, f"line {first + atoms + 1}: has no columns of coordinates, x y z or xs ys zs")
+        raise structure_error(
+            path, f"line {first + atoms + 1}: has no columns of coordinates, x y z or xs ys zs"
+        )
     position = of(*there)
     if there[0].startswith("xs"):
         position = low + position @ cell
@@ -247,20 +341,35 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
         notes = [f"its cell is periodic along {axes} only and is not used"] if axes else []
         cell = None
     masses = of("mass")[:, 0] if "mass" in columns else None
-    columns_of_names = {name: texts(name) for name in ("type", "element", *LABELS) if name in columns}
+    columns_of_names = {
+        name: texts(name) for name in ("type", "element", *LABELS) if name in columns
+    }
     names, elements = _dump_names(path, first + atoms + 1, columns_of_names, masses, atom_types)
     found = Atoms(
-        names, elements, _residues(texts("mol") if "mol" in columns else []) or [()] * count, position, None, cell,
-        masses, notes,
-    )  # fmt: skip
+        names,
+        elements,
+        _residues(texts("mol") if "mol" in columns else []) or [()] * count,
+        position,
+        None,
+        cell,
+        masses,
+        notes,
+    )
     velocity = of("vx", "vy", "vz") if {"vx", "vy", "vz"} <= set(columns) else None
-    return _in_our_units(found, velocity, f"units {units}", "it does not name its units (dump_modify units yes)")
+    return _in_our_units(
+        found, velocity, f"units {units}", "it does not name its units (dump_modify units yes)"
+    )
 
 
 def _dump_names(
-    path: Path, line: int, columns: dict[str, list[str]], masses: np.ndarray | None, atom_types: dict[str, str] | None
+    path: Path,
+    line: int,
+    columns: dict[str, list[str]],
+    masses: np.ndarray | None,
+    atom_types: dict[str, str] | None,
 ) -> tuple[list[str], list[str]]:
-    """Names and elements of the atoms of a dump, from its columns of types, labels and elements, named in a line."""
+    """Names and elements of the atoms of a dump, from its columns of types, labels and elements,
+    named in a line."""
     named = columns.get("element", [])
     labelled = next((columns[name] for name in LABELS if name in columns), named)
     types = columns.get("type", labelled)
@@ -268,7 +377,9 @@ def _dump_names(
         wanted = f"type, {', '.join(LABELS)}, element or mass"
         raise structure_error(path, f"line {line}: has no column that names its atoms: {wanted}")
     if atom_types is not None:
-        return names_of_types(path, types, [], dict(zip(types, labelled, strict=False)), atom_types), [""] * len(types)
+        return names_of_types(
+            path, types, [], dict(zip(types, labelled, strict=False)), atom_types
+        ), [""] * len(types)
     elements = [e if is_element(e) or e in HEAVY_HYDROGEN else "" for e in named]
     if not elements and masses is not None:
         element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}
@@ -280,8 +391,11 @@ def _dump_names(
     return names, elements or [""] * len(names)
 
 
-def dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -> tuple[np.ndarray, np.ndarray]:
-    """Origin (3,) and cell (3, 3) of a dump, whose bounds enclose the cell. kinds : the words after BOX BOUNDS"""
+def dump_box(
+    path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Origin (3,) and cell (3, 3) of a dump, whose bounds enclose the cell. kinds : the words after
+    BOX BOUNDS"""
     bounds, general = table(path, rows, "the bounds of the box"), kinds[:1] == ["abc"]
     if bounds.shape not in ([(3, 4)] if general else [(3, 2), (3, 3)]):
         raise unexpected(path, rows[0][0], "the bounds of the box along x", " ".join(rows[0][1]))
@@ -295,11 +409,21 @@ def dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) ->
     return low, cell
 
 
-register(Format(
-    (".data", ".lmp", ".lammps"), "data files of LAMMPS (.data)", read=read_data, has_types=True,
-    content=re.compile(r"^[ \t]*\d+[ \t]+atoms[ \t]*(#.*)?$", re.MULTILINE),
-))  # fmt: skip
-register(Format(
-    (), "dumps of LAMMPS", read=read_dump, has_types=True,
-    content=re.compile(r"\A\s*ITEM: (TIMESTEP|UNITS|TIME)\b"),
-))  # fmt: skip
+register(
+    Format(
+        (".data", ".lmp", ".lammps"),
+        "data files of LAMMPS (.data)",
+        read=read_data,
+        has_types=True,
+        content=re.compile(r"^[ \t]*\d+[ \t]+atoms[ \t]*(#.*)?$", re.MULTILINE),
+    )
+)
+register(
+    Format(
+        (),
+        "dumps of LAMMPS",
+        read=read_dump,
+        has_types=True,
+        content=re.compile(r"\A\s*ITEM: (TIMESTEP|UNITS|TIME)\b"),
+    )
+)

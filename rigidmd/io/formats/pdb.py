@@ -10,14 +10,23 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.io.formats import Encode, Format, System, register
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, Frame, is_element, numbers, structure_error, unexpected
+from rigidmd.io.formats.atoms import (
+    HEAVY_HYDROGEN,
+    Atoms,
+    Frame,
+    is_element,
+    numbers,
+    structure_error,
+    unexpected,
+)
 from rigidmd.io.formats.cells import cell_of
 from rigidmd.io.formats.through_mdanalysis import FrameFiles, dimensions
 
 #: Columns of the edges and angles in CRYST1.
 CRYST1 = (6, 15, 24, 33, 40, 47, 54)
 SPACE_GROUP = slice(55, 66)
-#: A coordinate in its columns, and three coordinates beyond them, which may follow the last digits of a residue number.
+#: A coordinate in its columns, and three coordinates beyond them, which may follow the last digits
+#: of a residue number.
 IN_COLUMNS = re.compile(r" *-?\d+\.\d{3}")
 BEYOND = re.compile(r"\w{0,3}\s" + 3 * r"\s*(-?\d+\.\d{3})")
 FREE = re.compile(r"\w{0,3}" + 3 * r"\s+([-+]?\d*\.\d*(?:[eEdD][-+]?\d+)?)" + r"(?=\s|$)")
@@ -27,20 +36,29 @@ def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The models of a .pdb, each with the last CRYST1 before it."""
     models, body, cell, notes = [], [], None, []
     ends = next((line for line in reversed(lines) if line.strip()), "")
-    cut = ["it ends with an atom, without END: is it truncated?"] if ends.startswith(("ATOM", "HETATM")) else []
+    cut = (
+        ["it ends with an atom, without END: is it truncated?"]
+        if ends.startswith(("ATOM", "HETATM"))
+        else []
+    )
     for number, line in enumerate([*lines, "END"], 1):
         if line.startswith("CRYST1"):
             cell, notes = _cryst1(number, line)
         elif line.startswith(("ATOM", "HETATM")):
             body.append((number, line))
         elif line.startswith("END") and body:
-            models.append(partial(_pdb_model, path, body, cell, [*notes, *(cut if number > len(lines) else [])]))
+            models.append(
+                partial(
+                    _pdb_model, path, body, cell, [*notes, *(cut if number > len(lines) else [])]
+                )
+            )
             body = []
     return models
 
 
 def _cryst1(line: int, text: str) -> tuple[np.ndarray | None, list[str]]:
-    """The cell of a CRYST1, separated by spaces or in columns. None and a note if it stands for no cell (zeros)."""
+    """The cell of a CRYST1, separated by spaces or in columns. None and a note if it stands for no
+    cell (zeros)."""
     for words in (text[6:].split()[:6], [text[a:b] for a, b in pairwise(CRYST1)]):
         with contextlib.suppress(ValueError):
             values = [float(word) for word in words]
@@ -50,18 +68,26 @@ def _cryst1(line: int, text: str) -> tuple[np.ndarray | None, list[str]]:
                 if cell is None:
                     return None, [f"line {line}: CRYST1 of {edges} defines no cell"]
                 return cell, _space_group_note(line, text)
-    return None, [f"line {line}: CRYST1 needs three edges and three angles, found {text[6:].strip()!r}"]
+    return None, [
+        f"line {line}: CRYST1 needs three edges and three angles, found {text[6:].strip()!r}"
+    ]
 
 
 def _space_group_note(line: int, text: str) -> list[str]:
-    """A note if CRYST1 names a space group with further symmetry operations, which are not applied."""
+    """A note if CRYST1 names a space group with further symmetry operations, which are not
+    applied."""
     name = text[SPACE_GROUP].strip()
     if not name or name.replace(" ", "") in ("P1", "1"):
         return []
-    return [f"line {line}: the space group {name} is not applied: its atoms were taken as all atoms of the cell"]
+    return [
+        f"line {line}: the space group {name} is not applied: its atoms were taken as all atoms of"
+        " the cell"
+    ]
 
 
-def _pdb_model(path: Path, body: list[tuple[int, str]], cell: np.ndarray | None, notes: list[str]) -> Atoms:
+def _pdb_model(
+    path: Path, body: list[tuple[int, str]], cell: np.ndarray | None, notes: list[str]
+) -> Atoms:
     """One model. Residues are renumbered, because their numbers may wrap or be missing."""
     names, elements, residue, position, locations = [], [], [], [], set()
     count, last = 0, None
@@ -77,15 +103,17 @@ def _pdb_model(path: Path, body: list[tuple[int, str]], cell: np.ndarray | None,
         digits = re.match(r" *(\d+)", line[22:30])
         residue.append((int(digits[1]) if digits else None, line[17:21].strip(), count))
     if len(locations := locations - {""}) > 1:
-        raise structure_error(path, f"has alternate locations {', '.join(sorted(locations))}; keep one of them")
+        raise structure_error(
+            path, f"has alternate locations {', '.join(sorted(locations))}; keep one of them"
+        )
     if count == 1 and not residue[0][1]:
         residue = [()] * len(names)
     return Atoms(names, elements, residue, np.array(position), cell=cell, notes=notes)
 
 
 def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[float]]:
-    """A line of an atom with names in the columns of the format, the end of the coordinates in the given line, and the
-    coordinates. Numbers wider than their columns shift the rest."""
+    """A line of an atom with names in the columns of the format, the end of the coordinates in the
+    given line, and the coordinates. Numbers wider than their columns shift the rest."""
     fields = [line[a : a + 8] for a in (30, 38, 46)]
     if all(map(IN_COLUMNS.fullmatch, fields)):
         return line, 54, [float(field) for field in fields]
@@ -93,12 +121,16 @@ def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[flo
     moved = max(0, len(serial[1]) - 5) if serial else 0
     straight = line[:11] + line[11 + moved :]
     found = BEYOND.match(line, 26 + moved)
-    joined = any(not line[a - 1 : a].isspace() and line[a : a + 1].isalnum() for a in (30, 38, 46, 54))
+    joined = any(
+        not line[a - 1 : a].isspace() and line[a : a + 1].isalnum() for a in (30, 38, 46, 54)
+    )
     if not found and not joined:
         with contextlib.suppress(ValueError):
             return line, 54, [float(field) for field in fields]
     if not (found := found or FREE.match(line, 26 + moved)):
-        raise unexpected(path, number, "an atom of a .pdb with coordinates in columns 31 to 54", line[26:60])
+        raise unexpected(
+            path, number, "an atom of a .pdb with coordinates in columns 31 to 54", line[26:60]
+        )
     return straight, found.end(), numbers(path, number, list(found.groups()), "three coordinates")
 
 
@@ -114,7 +146,9 @@ def encoder(system: System, interval: float, velocities: bool) -> Encode:
                 writer.CRYST1(box)
 
         # without END, which readers count as a further frame
-        lines = files.content(frame, write, start=k).removesuffix(b"END\n").splitlines(keepends=True)
+        lines = (
+            files.content(frame, write, start=k).removesuffix(b"END\n").splitlines(keepends=True)
+        )
         model = next(i for i, line in enumerate(lines) if line.startswith(b"MODEL "))
         box = [line for line in lines[-1:] if line.startswith(b"CRYST1")]
         head = [line for line in lines[: 1 if k else model] if not line.startswith(b"CRYST1")]
@@ -123,9 +157,14 @@ def encoder(system: System, interval: float, velocities: bool) -> Encode:
     return encode
 
 
-register(Format(
-    (".pdb", ".ent"), read=read_pdb, encoder=encoder, times=re.compile(rb"^REMARK +()TIME +(\S+) PS"),
-    content=re.compile(r"^(ATOM  |HETATM).{24}( *-?\d+\.\d{3}){3}", re.MULTILINE),
-    write_topology=lambda path, sites: sites.write(str(path), bonds="all"),
-    limits=(-999.99, 9999.99),  # columns of eight
-))  # fmt: skip
+register(
+    Format(
+        (".pdb", ".ent"),
+        read=read_pdb,
+        encoder=encoder,
+        times=re.compile(rb"^REMARK +()TIME +(\S+) PS"),
+        content=re.compile(r"^(ATOM  |HETATM).{24}( *-?\d+\.\d{3}){3}", re.MULTILINE),
+        write_topology=lambda path, sites: sites.write(str(path), bonds="all"),
+        limits=(-999.99, 9999.99),  # columns of eight
+    )
+)

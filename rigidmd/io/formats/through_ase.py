@@ -1,8 +1,8 @@
-"""Structures from and for ASE: files that it reads, `ase.Atoms` with the sites that have mass, in ASE's units, and its
-trajectories (.traj).
+"""Structures from and for ASE: files that it reads, `ase.Atoms` with the sites that have mass, in
+ASE's units, and its trajectories (.traj).
 
-In a trajectory, additional arrays, which ASE ignores, hold massless sites and the indices of the atoms among the sites.
-It is read item by item, and sizes are checked before arrays are allocated.
+In a trajectory, additional arrays, which ASE ignores, hold massless sites and the indices of the
+atoms among the sites. It is read item by item, and sizes are checked before arrays are allocated.
 """
 
 import contextlib
@@ -20,7 +20,14 @@ from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NOW, State
 from rigidmd.errors import StructureError
 from rigidmd.io.formats import Format, System, extensions, register
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, MASSLESS_NAME, Atoms, Frame, is_element, structure_error
+from rigidmd.io.formats.atoms import (
+    HEAVY_HYDROGEN,
+    MASSLESS_NAME,
+    Atoms,
+    Frame,
+    is_element,
+    structure_error,
+)
 from rigidmd.io.formats.frame_file import FrameFile
 from rigidmd.units import ENERGY_UNITS
 
@@ -36,7 +43,8 @@ ASE_VELOCITY = 98.22694788464063
 NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS = "atomtypes", "residuenames", "residuenumbers"
 #: ASE's array of what follows its symbols in the names of DL_POLY's files.
 DL_POLY_NAMES = "dlp4_labels"
-#: Columns of velocities in extended XYZ that ASE does not convert, because programs use different units.
+#: Columns of velocities in extended XYZ that ASE does not convert, because programs use different
+#: units.
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
 
 
@@ -61,14 +69,17 @@ def _reason(error: Exception) -> str:
     symbol = re.search(r"['\"](\w{1,8})['\"]", reason)
     if symbol and ("symbol" in reason or isinstance(error, KeyError)) and not is_element(symbol[1]):
         named = f"names an atom {symbol[1]}, but ASE, which reads this format, knows elements only"
-        return f"{named}. Use elements (X for sites without mass), or a .gro, .pdb or .xyz, which may have any names"
+        return (
+            f"{named}. Use elements (X for sites without mass), or a .gro, .pdb or .xyz, which may"
+            " have any names"
+        )
     hint = "Is the file complete and named by its format? A .xyz, .pdb or .gro made of it may help"
     return f"ASE, which reads this format, ends with {type(error).__name__}: {reason}. {hint}"
 
 
 def read_text_by_ase(path: Path, text: str, name: str) -> "list[AseAtoms]":
-    """The structures in the text of a file of this name. Massless sites become X and, where ASE needs it, heavy
-    hydrogen becomes H. Raises StructureError."""
+    """The structures in the text of a file of this name. Massless sites become X and, where ASE
+    needs it, heavy hydrogen becomes H. Raises StructureError."""
     faults = []
     plain = without_massless_names(text)
     with tempfile.TemporaryDirectory() as folder:
@@ -83,7 +94,8 @@ def read_text_by_ase(path: Path, text: str, name: str) -> "list[AseAtoms]":
 
 
 def without_massless_names(text: str) -> str:
-    """A text in which names of massless sites are X, the only such name that ASE knows, with columns unchanged."""
+    """A text in which names of massless sites are X, the only such name that ASE knows, with
+    columns unchanged."""
 
     def renamed(match: re.Match) -> str:
         return match[0] if is_element(match[0].capitalize()) else "X".ljust(len(match[0]))
@@ -97,33 +109,52 @@ def without_isotopes(text: str) -> str:
 
 
 def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atoms:
-    """Atoms in Å, ps and u from ASE's, with its masses unless they are its standard ones. By default, names and
-    residues are those in the arrays that ASE and rigidmd store, or else names are ASE's symbols."""
+    """Atoms in Å, ps and u from ASE's, with its masses unless they are its standard ones. By
+    default, names and residues are those in the arrays that ASE and rigidmd store, or else names
+    are ASE's symbols."""
     symbols, notes = atoms.get_chemical_symbols(), []
     if names is None and (stored := atoms.arrays.get(NAMES)) is not None:
         names = [str(name) for name in stored]
-        symbols = ["" if symbol == "X" else symbol for symbol in symbols]  # united atoms have names only
+        symbols = [
+            "" if symbol == "X" else symbol for symbol in symbols
+        ]  # united atoms have names only
     elif names is None and DL_POLY_NAMES in atoms.arrays:
-        names = [symbol + str(rest) for symbol, rest in zip(symbols, atoms.arrays[DL_POLY_NAMES], strict=True)]
+        names = [
+            symbol + str(rest)
+            for symbol, rest in zip(symbols, atoms.arrays[DL_POLY_NAMES], strict=True)
+        ]
         symbols = [""] * len(atoms)  # ASE takes the first letters, N for NA
     if residue is None:
         residue = _residues(atoms)
     if names is not None and len(names) != len(atoms):
         raise structure_error(path, f"has {len(names)} atoms, of which ASE reads {len(atoms)}")
-    occupied = {(e, x) for site in (atoms.info.get("occupancy") or {}).values() for e, x in site.items()}
-    if invalid := sorted({str(x) for _, x in occupied if not (isinstance(x, int | float) and x >= 0)}):
+    occupied = {
+        (e, x) for site in (atoms.info.get("occupancy") or {}).values() for e, x in site.items()
+    }
+    if invalid := sorted(
+        {str(x) for _, x in occupied if not (isinstance(x, int | float) and x >= 0)}
+    ):
         raise structure_error(path, f"some of its sites have the occupancy {', '.join(invalid)}")
     if partial_sites := sorted(f"{e} {x:g}" for e, x in occupied if x < 1):
-        found = f"some of its sites are occupied only partly ({', '.join(partial_sites)}): the crystal is disordered"
-        hint = "in which every site is occupied or left out (for ices, GenIce makes proton-disordered ones)"
-        raise structure_error(path, f"{found}, so that molecules are unknown. Give one arrangement of it, {hint}")
+        found = (
+            f"some of its sites are occupied only partly ({', '.join(partial_sites)}): the crystal"
+            " is disordered"
+        )
+        hint = (
+            "in which every site is occupied or left out (for ices, GenIce makes proton-disordered"
+            " ones)"
+        )
+        raise structure_error(
+            path, f"{found}, so that molecules are unknown. Give one arrangement of it, {hint}"
+        )
     velocity = atoms.get_velocities() * ASE_VELOCITY if atoms.has("momenta") else None
     if velocity is not None and not np.isfinite(velocity).all():
         bad = int(np.argmin(np.isfinite(velocity).all(axis=1)))
         raise structure_error(path, f"atom {bad + 1} has a velocity that is not a finite number")
     if unitless := [key for key in UNITLESS_VELOCITIES if key in atoms.arrays]:
         notes.append(
-            f"its velocities in the column {unitless[0]} have no units and are not used (ASE writes momenta instead)"
+            f"its velocities in the column {unitless[0]} have no units and are not used (ASE writes"
+            " momenta instead)"
         )
     cell = None
     if atoms.pbc.all():
@@ -133,9 +164,15 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
         notes.append(f"its cell is periodic along {axes} only and is not used")
     masses = atoms.get_masses() if atoms.has("masses") else None
     return Atoms(
-        symbols if names is None else names, symbols if elements is None else elements,
-        [()] * len(atoms) if residue is None else residue, atoms.get_positions(), velocity, cell, masses, notes,
-    )  # fmt: skip
+        symbols if names is None else names,
+        symbols if elements is None else elements,
+        [()] * len(atoms) if residue is None else residue,
+        atoms.get_positions(),
+        velocity,
+        cell,
+        masses,
+        notes,
+    )
 
 
 def _residues(atoms) -> list[tuple] | None:
@@ -149,25 +186,40 @@ def _residues(atoms) -> list[tuple] | None:
 def atoms_of_system(system: System, state: State, wrapped: bool = False) -> "ase.Atoms":
     """A state of a system as an `ase.Atoms`, see `atoms_of_sites`."""
     return atoms_of_sites(
-        system, system.site_positions(state, wrapped), system.site_velocities(state), state.cell, float(state.time[NOW])
+        system,
+        system.site_positions(state, wrapped),
+        system.site_velocities(state),
+        state.cell,
+        float(state.time[NOW]),
     )
 
 
 def atoms_of_sites(
-    system: System, positions: np.ndarray, velocities: np.ndarray | None, cell: np.ndarray | None, time: float
+    system: System,
+    positions: np.ndarray,
+    velocities: np.ndarray | None,
+    cell: np.ndarray | None,
+    time: float,
 ) -> "ase.Atoms":
-    """The sites with mass as an `ase.Atoms`, with masses, names and residues of the models, and `info["time_ps"]`, from
-    positions and velocities (s, 3) of all sites, Å and Å/ps, and a cell (3, 3), None or infinite without a box."""
+    """The sites with mass as an `ase.Atoms`, with masses, names and residues of the models, and
+    `info["time_ps"]`, from positions and velocities (s, 3) of all sites, Å and Å/ps, and a cell (3,
+    3), None or infinite without a box."""
     import ase
 
     sites = system.sites
     atom = np.flatnonzero(sites.mass > 0)
-    symbols = ["H" if e in HEAVY_HYDROGEN else e if is_element(e) else "X" for e in sites.element[atom]]
+    symbols = [
+        "H" if e in HEAVY_HYDROGEN else e if is_element(e) else "X" for e in sites.element[atom]
+    ]
     boxed = cell is not None and bool(np.isfinite(cell).all())
     found = ase.Atoms(
-        symbols, positions=np.asarray(positions, float)[atom], masses=sites.mass[atom], cell=cell if boxed else None,
-        pbc=boxed, info={"time_ps": time},
-    )  # fmt: skip
+        symbols,
+        positions=np.asarray(positions, float)[atom],
+        masses=sites.mass[atom],
+        cell=cell if boxed else None,
+        pbc=boxed,
+        info={"time_ps": time},
+    )
     if velocities is not None:
         found.set_velocities(np.asarray(velocities, float)[atom] / ASE_VELOCITY)
     of_atom = sites.molecule[atom]
@@ -178,8 +230,13 @@ def atoms_of_sites(
 
 
 TAG = "ASE-Trajectory"
-#: Additional arrays: indices of the atoms among the sites (first frame), positions and velocities of the other sites.
-ATOMS, MASSLESS, MASSLESS_VELOCITY = "rigidmd_atoms", "rigidmd_massless", "rigidmd_massless_velocity"
+#: Additional arrays: indices of the atoms among the sites (first frame), positions and velocities
+#: of the other sites.
+ATOMS, MASSLESS, MASSLESS_VELOCITY = (
+    "rigidmd_atoms",
+    "rigidmd_massless",
+    "rigidmd_massless_velocity",
+)
 #: Bytes of the head of a file: magic number, tag, version, number of items, offset of their table.
 HEAD = 48
 #: What the library raises for damaged files.
@@ -217,12 +274,22 @@ class TrajReader:
             if self._file.get_tag() != TAG:
                 raise ValueError("not a trajectory of ASE")
             self.count = len(self._file)
-            self._atoms = self._array(self._file, ATOMS, (-1,), np.int64) if self.count else np.zeros(0, np.int64)
-            self._mass = self._array(self._file, "masses", (len(self._atoms),)) if self.count else np.zeros(0)
+            self._atoms = (
+                self._array(self._file, ATOMS, (-1,), np.int64)
+                if self.count
+                else np.zeros(0, np.int64)
+            )
+            self._mass = (
+                self._array(self._file, "masses", (len(self._atoms),))
+                if self.count
+                else np.zeros(0)
+            )
             self.sites = len(self._atoms)
             if self.count and MASSLESS in self._file:
                 self.sites += len(self._array(self._file, MASSLESS, (-1, 3)))
-            is_inside = not len(self._atoms) or (self._atoms[0] >= 0 and self._atoms[-1] < self.sites)
+            is_inside = not len(self._atoms) or (
+                self._atoms[0] >= 0 and self._atoms[-1] < self.sites
+            )
             if not np.array_equal(np.unique(self._atoms), self._atoms) or not is_inside:
                 raise ValueError("it is damaged: its indices of atoms are invalid")
         except Exception:  # no file stays open
@@ -242,8 +309,13 @@ class TrajReader:
             n, m = len(self._atoms), self.sites - len(self._atoms)
             wanted = {"positions": n, "momenta": n, MASSLESS: m, MASSLESS_VELOCITY: m}
             there = {name for name in wanted if name == "positions" or name in item}
-            arrays = [self._array(item, name, (size, 3)) if name in there else None for name, size in wanted.items()]
-            return Stored._make([*arrays, cell if cell.any() else None, float(info["time_ps"]), int(info["step"])])
+            arrays = [
+                self._array(item, name, (size, 3)) if name in there else None
+                for name, size in wanted.items()
+            ]
+            return Stored._make(
+                [*arrays, cell if cell.any() else None, float(info["time_ps"]), int(info["step"])]
+            )
         except DAMAGE as error:
             raise ValueError(f"frame {k + 1} is damaged: {error}") from None
 
@@ -251,7 +323,9 @@ class TrajReader:
         found = self.read(k)
         positions, velocities = self._joined(found.positions, found.massless), None
         if found.momenta is not None:
-            velocities = self._joined(found.momenta / self._mass[:, None] * ASE_VELOCITY, found.massless_velocity)
+            velocities = self._joined(
+                found.momenta / self._mass[:, None] * ASE_VELOCITY, found.massless_velocity
+            )
         return Frame(found.time, positions, found.cell, velocities, step=found.step)
 
     def _joined(self, of_atoms: np.ndarray, others: np.ndarray | None) -> np.ndarray:
@@ -261,29 +335,50 @@ class TrajReader:
             found[np.setdiff1d(np.arange(self.sites), self._atoms)] = others
         return found
 
-    def _array(self, item: Any, name: str, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
+    def _array(
+        self, item: Any, name: str, shape: tuple[int, ...], kind: type = np.float64
+    ) -> np.ndarray:
         """An array of an item with this type and shape (-1: any length)."""
         try:
             there = item.proxy(name)
-            fits = len(shape) == there.ndim and all(n in (-1, m) for n, m in zip(shape, there.shape, strict=False))
-            if there.dtype != kind or not fits or there.offset < 0 or there.offset + there.nbytes > self._size:
+            fits = len(shape) == there.ndim and all(
+                n in (-1, m) for n, m in zip(shape, there.shape, strict=False)
+            )
+            if (
+                there.dtype != kind
+                or not fits
+                or there.offset < 0
+                or there.offset + there.nbytes > self._size
+            ):
                 raise ValueError(f"it is damaged: {name} has the wrong type, shape or offset")
             found = np.array(there.read())
         except (AssertionError, *DAMAGE):
-            raise ValueError(f"it is damaged, or not a trajectory of rigidmd: it has no {name}") from None
+            raise ValueError(
+                f"it is damaged, or not a trajectory of rigidmd: it has no {name}"
+            ) from None
         if kind is np.float64 and not np.isfinite(found).all():
             raise ValueError(f"it is damaged: {name} has values that are not finite")
         return found
 
 
 class TrajFile(FrameFile):
-    """Writes ASE's .traj files of molecules, in double precision, for `ase gui` and `ase.io.read`."""
+    """Writes ASE's .traj files of molecules, in double precision, for `ase gui` and
+    `ase.io.read`."""
 
-    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
+    def __init__(
+        self,
+        path: Path,
+        system: System,
+        velocities: bool,
+        wrapped: bool,
+        kept: Sequence[int] | None = None,
+    ):
         self._massive = np.flatnonzero(system.sites.mass > 0)
         self._massless = np.flatnonzero(system.sites.mass == 0)
         # its symbols, masses and periodicity are the same in every frame
-        self._template = atoms_of_sites(system, system.site_positions(system.state), None, system.state.cell, 0.0)
+        self._template = atoms_of_sites(
+            system, system.site_positions(system.state), None, system.state.cell, 0.0
+        )
         super().__init__(path, system, velocities, wrapped, kept)
 
     @property
@@ -304,7 +399,9 @@ class TrajFile(FrameFile):
         massless = position[self._massless]
         if not len(massless):
             massless = of_massless = None
-        return Stored(position[self._massive], momenta, massless, of_massless, cell, float(time), int(step))
+        return Stored(
+            position[self._massive], momenta, massless, of_massless, cell, float(time), int(step)
+        )
 
     def _append(self, file: Any, frame: Stored) -> None:
         atoms = self._template
@@ -317,7 +414,9 @@ class TrajFile(FrameFile):
         additional = {MASSLESS: frame.massless, MASSLESS_VELOCITY: frame.massless_velocity}
         if len(file.backend) == 0:
             additional[ATOMS] = self._massive.astype(np.int64)
-        file.backend.write(**{name: array for name, array in additional.items() if array is not None})
+        file.backend.write(
+            **{name: array for name, array in additional.items() if array is not None}
+        )
         file.write(atoms)
 
     def _stored_frames(self, count: int) -> Iterator[Stored]:
@@ -329,7 +428,10 @@ class TrajFile(FrameFile):
                 yield old.read(k)
 
     def _arrays(self, frame: Stored) -> list[np.ndarray]:
-        return [*(part for part in frame[:5] if part is not None), np.array([frame.time, float(frame.step)])]
+        return [
+            *(part for part in frame[:5] if part is not None),
+            np.array([frame.time, float(frame.step)]),
+        ]
 
     def _open(self, path: Path, mode: str) -> Any:
         from ase.io.trajectory import TrajectoryWriter  # slow to import
@@ -337,7 +439,13 @@ class TrajFile(FrameFile):
         return TrajectoryWriter(path, mode)
 
 
-register(Format(
-    (".traj",), writer=TrajFile, reader=TrajReader, velocities=True, double=True,
-    viewer="ase gui {trajectory}",
-))  # fmt: skip
+register(
+    Format(
+        (".traj",),
+        writer=TrajFile,
+        reader=TrajReader,
+        velocities=True,
+        double=True,
+        viewer="ase gui {trajectory}",
+    )
+)

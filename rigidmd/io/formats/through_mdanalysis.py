@@ -1,7 +1,9 @@
-"""Frames in the formats of MDAnalysis: the file of one frame by its writers, and reading in another process.
+"""Frames in the formats of MDAnalysis: the file of one frame by its writers, and reading in another
+process.
 
-Its binary trajectories have no names of atoms: XTC and TRR of GROMACS, DCD of CHARMM and NAMD, NetCDF of AMBER. XTC has
-positions to 0.001 nm, TRR and NetCDF velocities too. DCD stores one time between all frames.
+Its binary trajectories have no names of atoms: XTC and TRR of GROMACS, DCD of CHARMM and NAMD,
+NetCDF of AMBER. XTC has positions to 0.001 nm, TRR and NetCDF velocities too. DCD stores one time
+between all frames.
 """
 
 import contextlib
@@ -37,10 +39,21 @@ def universe_of(system: System, velocities: bool = False) -> Any:
 
     sites, names = system.sites, system.residue_names
     u = mda.Universe.empty(
-        len(sites.molecule), n_residues=len(names), atom_resindex=sites.molecule, trajectory=True, velocities=velocities
+        len(sites.molecule),
+        n_residues=len(names),
+        atom_resindex=sites.molecule,
+        trajectory=True,
+        velocities=velocities,
     )
-    attributes = {"names": sites.name, "types": sites.element, "elements": sites.element, "masses": sites.mass}
-    for name, values in (attributes | {"resnames": names, "resids": np.arange(1, len(names) + 1)}).items():
+    attributes = {
+        "names": sites.name,
+        "types": sites.element,
+        "elements": sites.element,
+        "masses": sites.mass,
+    }
+    for name, values in (
+        attributes | {"resnames": names, "resids": np.arange(1, len(names) + 1)}
+    ).items():
         u.add_TopologyAttr(name, values)
     return u
 
@@ -54,21 +67,34 @@ def set_frame(timestep: Any, frame: Frame) -> None:
 
 
 class FrameFiles:
-    """Makes the content of a file with one frame, which MDAnalysis writes in memory, with `options` of its writer."""
+    """Makes the content of a file with one frame, which MDAnalysis writes in memory, with `options`
+    of its writer."""
 
-    def __init__(self, system: System, velocities: bool, name: str, options: dict[str, Any] | None = None):
-        self._universe, self._name, self._options = universe_of(system, velocities), name, options or {}
+    def __init__(
+        self, system: System, velocities: bool, name: str, options: dict[str, Any] | None = None
+    ):
+        self._universe, self._name, self._options = (
+            universe_of(system, velocities),
+            name,
+            options or {},
+        )
         self.sites: int = len(system.sites.name)
 
-    def content(self, frame: Frame, write: Callable[[Any, Any], object] | None = None, **options: Any) -> bytes:
+    def content(
+        self, frame: Frame, write: Callable[[Any, Any], object] | None = None, **options: Any
+    ) -> bytes:
         """`write(writer, atoms)` is called in place of `writer.write(atoms)`."""
         import MDAnalysis as mda
 
         set_frame(self._universe.trajectory.ts, frame)
         with scratch_file() as path, ignore_warnings():
-            writer: Any = mda.Writer(path, n_atoms=self.sites, format=self._name, **self._options, **options)
+            writer: Any = mda.Writer(
+                path, n_atoms=self.sites, format=self._name, **self._options, **options
+            )
             with writer:
-                writer.write(self._universe.atoms) if write is None else write(writer, self._universe.atoms)
+                writer.write(self._universe.atoms) if write is None else write(
+                    writer, self._universe.atoms
+                )
             return Path(path).read_bytes()
 
 
@@ -93,15 +119,23 @@ PROGRAM = ("-c", f"from {__name__} import main; main()")
 def read_in_process(
     read: Callable[[str, int, int], dict[str, np.ndarray]], path: Path, frame: int, atoms: int
 ) -> dict[str, np.ndarray]:
-    """The arrays that `read(path, frame, atoms)` returns, which can be pickled. Raises StructureError."""
+    """The arrays that `read(path, frame, atoms)` returns, which can be pickled. Raises
+    StructureError."""
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "frame.npz"
         arguments = [pickle.dumps(read).hex(), str(path), str(frame), str(atoms), str(target)]
         ended = subprocess.run(
-            **python_process(*PROGRAM, *arguments), stdin=subprocess.DEVNULL, capture_output=True, check=False
+            **python_process(*PROGRAM, *arguments),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            check=False,
         )
         if ended.returncode < 0 or not target.is_file():
-            reason = "its reader crashed" if ended.returncode < 0 else ended.stderr.decode(errors="replace")[-300:]
+            reason = (
+                "its reader crashed"
+                if ended.returncode < 0
+                else ended.stderr.decode(errors="replace")[-300:]
+            )
             raise structure_error(path, f"cannot be read as a trajectory: {reason}. Is it damaged?")
         with np.load(target, allow_pickle=False) as data:
             found = dict(data)
@@ -111,7 +145,8 @@ def read_in_process(
 
 
 def main() -> None:
-    """The program of the process: a pickled function, its arguments, the file for the arrays or the message `error`."""
+    """The program of the process: a pickled function, its arguments, the file for the arrays or the
+    message `error`."""
     read, path, frame, atoms, target = sys.argv[1:]
     warnings.simplefilter("ignore")
     try:
@@ -125,7 +160,9 @@ def main() -> None:
 def index_of(count: int, frame: int) -> int:
     """The index of a frame of `count`: 1 is the first and -1 the last. Raises ValueError."""
     if not 1 <= abs(frame) <= count:
-        raise ValueError(f"structure.frame is {frame}: it holds {count}, 1 is the first and -1 the last")
+        raise ValueError(
+            f"structure.frame is {frame}: it holds {count}, 1 is the first and -1 the last"
+        )
     return frame - 1 if frame > 0 else count + frame
 
 
@@ -147,7 +184,13 @@ def xtc_encoder(system: System, interval: float, velocities: bool) -> Encode:
         box = np.zeros((3, 3)) if frame.cell is None else NM_PER_A * frame.cell
         with scratch_file() as path:
             with XTCFile(path, "w") as file:
-                file.write(positions, box.astype(np.float32), step_in_32_bits(frame.step), frame.time, PER_NM)
+                file.write(
+                    positions,
+                    box.astype(np.float32),
+                    step_in_32_bits(frame.step),
+                    frame.time,
+                    PER_NM,
+                )
             return Path(path).read_bytes()
 
     return encode
@@ -167,7 +210,9 @@ def dcd_encoder(system: System, interval: float, velocities: bool) -> Encode:
 def netcdf_encoder(system: System, interval: float, velocities: bool) -> Encode:
     files = FrameFiles(system, velocities, "NCDF", {"velocities": velocities})
     size = 4 + 12 * files.sites * (1 + velocities)
-    return lambda frame, k: files.content(frame)[0 if k == 0 else -size - 48 * (frame.cell is not None) :]
+    return lambda frame, k: files.content(frame)[
+        0 if k == 0 else -size - 48 * (frame.cell is not None) :
+    ]
 
 
 def read_through(path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
@@ -181,7 +226,8 @@ def read_through(path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
 
 
 def arrays_of_xdr(name: str, path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
-    """A frame of .xtc or .trr, by the library of MDAnalysis' readers, which themselves write files with offsets."""
+    """A frame of .xtc or .trr, by the library of MDAnalysis' readers, which themselves write files
+    with offsets."""
     library = import_module("MDAnalysis.lib.formats.libmdaxdr")
     with getattr(library, name)(path) as file:
         _check(file.n_atoms, atoms)
@@ -218,15 +264,39 @@ def _check(there: int, wanted: int) -> None:
         raise ValueError(f"it has {there} atoms, the file with their names {wanted}")
 
 
-register(Format(
-    (".xtc",), read_arrays=partial(arrays_of_xdr, "XTCFile"), encoder=xtc_encoder, check=read_through,
-    limits=(-2e7, 2e7),  # coordinates are 32-bit integers
-))  # fmt: skip
-register(Format((".trr",), read_arrays=partial(arrays_of_xdr, "TRRFile"), encoder=trr_encoder, velocities=True))
-register(Format(
-    (".dcd",), read_arrays=partial(arrays_of_reader, "DCD"), encoder=dcd_encoder, counter=(8, "<i"), even=True,
-))  # fmt: skip
-register(Format(
-    (".nc", ".ncdf"), read_arrays=partial(arrays_of_reader, "NCDF"), mdanalysis="NCDF", encoder=netcdf_encoder,
-    counter=(4, ">i"), velocities=True,
-))  # fmt: skip
+register(
+    Format(
+        (".xtc",),
+        read_arrays=partial(arrays_of_xdr, "XTCFile"),
+        encoder=xtc_encoder,
+        check=read_through,
+        limits=(-2e7, 2e7),  # coordinates are 32-bit integers
+    )
+)
+register(
+    Format(
+        (".trr",),
+        read_arrays=partial(arrays_of_xdr, "TRRFile"),
+        encoder=trr_encoder,
+        velocities=True,
+    )
+)
+register(
+    Format(
+        (".dcd",),
+        read_arrays=partial(arrays_of_reader, "DCD"),
+        encoder=dcd_encoder,
+        counter=(8, "<i"),
+        even=True,
+    )
+)
+register(
+    Format(
+        (".nc", ".ncdf"),
+        read_arrays=partial(arrays_of_reader, "NCDF"),
+        mdanalysis="NCDF",
+        encoder=netcdf_encoder,
+        counter=(4, ">i"),
+        velocities=True,
+    )
+)

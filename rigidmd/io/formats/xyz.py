@@ -1,6 +1,5 @@
 """XYZ, plain and extended. ASE reads it, with corrections before and after."""
 
-# isort: skip_file
 import io
 import re
 from collections.abc import Callable
@@ -10,15 +9,24 @@ from pathlib import Path
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Encode, Format, System, register
 from rigidmd.io.formats.atoms import (
-    HEAVY_HYDROGEN, Atoms, Frame, atom_count, is_element, numbers, unexpected, without_fortran,
-)  # fmt: skip
+    HEAVY_HYDROGEN,
+    Atoms,
+    Frame,
+    atom_count,
+    is_element,
+    numbers,
+    unexpected,
+    without_fortran,
+)
 from rigidmd.io.formats.through_ase import NAMES, from_ase, read_by_ase
 from rigidmd.io.formats.through_mdanalysis import FrameFiles
 
 
-def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = None) -> list[Callable[[], Atoms]]:
-    """The frames of a plain or extended .xyz through ASE, which needs elements, while many files have names.
-    `atom_types`: name in the file, such as a type of LAMMPS -> name of the atom."""
+def read_xyz(
+    path: Path, lines: list[str], atom_types: dict[str, str] | None = None
+) -> list[Callable[[], Atoms]]:
+    """The frames of a plain or extended .xyz through ASE, which needs elements, while many files
+    have names. `atom_types`: name in the file, such as a type of LAMMPS -> name of the atom."""
     labels, clean, at = [], [], 0
     while at < len(lines):
         if not lines[at].strip():
@@ -28,9 +36,16 @@ def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = N
         clean += [lines[at], re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", lines[at + 1])]
         properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
         column, place, width = _columns(properties[1]) if properties else (0, 1, 4)
-        what = f"{width} columns, {properties[1]}" if properties else "an atom of an .xyz: name, x, y, z"
+        what = (
+            f"{width} columns, {properties[1]}"
+            if properties
+            else "an atom of an .xyz: name, x, y, z"
+        )
         lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
-        if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (3, 9):
+        if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (
+            3,
+            9,
+        ):
             raise unexpected(path, at + 2, "nine numbers of Lattice", lattice[1])
         for k in range(at + 2, at + 2 + count):
             words = lines[k].split()
@@ -47,7 +62,9 @@ def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = N
             clean.append(" ".join(words))
         at += 2 + count
     frames, first = [], 0
-    for atoms in read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), format="extxyz") if clean else []:
+    for atoms in (
+        read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), format="extxyz") if clean else []
+    ):
         of_frame = labels[first : first + len(atoms)]
         first += len(atoms)
         named = len(of_frame) == len(atoms) and None not in of_frame
@@ -59,7 +76,8 @@ def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = N
 
 
 def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
-    """Name and element of an atom. The name in the file may be that of a type, or an atomic number."""
+    """Name and element of an atom. The name in the file may be that of a type, or an atomic
+    number."""
     from ase.data import chemical_symbols
 
     name = (atom_types or {}).get(name, name)
@@ -70,7 +88,8 @@ def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
 
 
 def _columns(properties: str) -> tuple[int | None, int | None, int]:
-    """Columns of species and positions, or None, and their number: 0, 1 and 4 for `species:S:1:pos:R:3`."""
+    """Columns of species and positions, or None, and their number: 0, 1 and 4 for
+    `species:S:1:pos:R:3`."""
     words, column, found = properties.split(":"), 0, {}
     for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
         found["species" if name.lower() == "symbols" else name.lower()] = column
@@ -104,8 +123,13 @@ def encoder(system: System, interval: float, velocities: bool) -> Encode:
     return encode
 
 
-register(Format(
-    (".xyz", ".extxyz"), read=read_xyz, has_types=True, encoder=encoder,
-    content=re.compile(r"\A\s*\d+[ \t]*\n.*\n[ \t]*[A-Za-z]\w*([ \t]+-?\d*\.?\d+){3}"),
-    times=re.compile(rb'(?:Lattice="([^"]*)" )?pbc=.* Time=(\S+)'),
-))  # fmt: skip
+register(
+    Format(
+        (".xyz", ".extxyz"),
+        read=read_xyz,
+        has_types=True,
+        encoder=encoder,
+        content=re.compile(r"\A\s*\d+[ \t]*\n.*\n[ \t]*[A-Za-z]\w*([ \t]+-?\d*\.?\d+){3}"),
+        times=re.compile(rb'(?:Lattice="([^"]*)" )?pbc=.* Time=(\S+)'),
+    )
+)

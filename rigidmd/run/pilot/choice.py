@@ -1,8 +1,10 @@
-"""The choice of `integrator = "auto"` for an error of energy or trajectory: the cheapest integrator and step.
+"""The choice of `integrator = "auto"` for an error of energy or trajectory: the cheapest integrator
+and step.
 
-Cost is counted in force evaluations, not seconds, so a scene leads to the same choice on every machine. An error of the
-energy has to hold over the whole run: short pilot runs measure the regular error of each step, `measure_energy_walk`
-the random walk of the energy by truncated forces, and a longer pilot run of the best step its slow regular error.
+Cost is counted in force evaluations, not seconds, so a scene leads to the same choice on every
+machine. An error of the energy has to hold over the whole run: short pilot runs measure the regular
+error of each step, `measure_energy_walk` the random walk of the energy by truncated forces, and a
+longer pilot run of the best step its slow regular error.
 """
 
 from dataclasses import replace
@@ -16,22 +18,30 @@ from rigidmd.core.integrators import DRIFT, KICK, SCHEMES, Scheme
 from rigidmd.core.state import State
 from rigidmd.core.statistics import ENERGY_ERROR
 from rigidmd.errors import SimulationError
-from rigidmd.run.pilot.trials import Trial, TrialSystem, final_state, measure_errors, state_difference
+from rigidmd.run.pilot.trials import (
+    Trial,
+    TrialSystem,
+    final_state,
+    measure_errors,
+    state_difference,
+)
 from rigidmd.scene.validation import not_none
 
 #: The integrator of the pilot runs: its regular error is small compared with the walk.
 PILOT_INTEGRATOR = "srkn_6"
 #: Steps of the first pilot run; the second takes twice as many of half the length.
 STEPS = 32
-#: Steps between energies that are compared. Short lags have most values, but include a regular error.
+#: Steps between energies that are compared. Short lags have most values, but include a regular
+#: error.
 LAGS = (1, 2, 4, 8)
 JUMPS = (-1.0, -0.5, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 
 
 class EnergyWalk(NamedTuple):
-    """The random walk of the energy that truncated forces cause, for any integrator and step. See "Energy drift and its
-    error" in the theory chapter `errors`: D = scale w dt^(2k+2), with a scale of the scene that no integrator changes.
-    D is in squares of the energy unit of a `TrialSystem` per unit of time of its span."""
+    """The random walk of the energy that truncated forces cause, for any integrator and step. See
+    "Energy drift and its error" in the theory chapter `errors`: D = scale w dt^(2k+2), with a scale
+    of the scene that no integrator changes. D is in squares of the energy unit of a `TrialSystem`
+    per unit of time of its span."""
 
     scale: float
     jump: float  # the derivative of the force that jumps
@@ -41,14 +51,16 @@ class EnergyWalk(NamedTuple):
         return self.scale * weight(scheme, self.jump) * dt ** (2 * self.jump + 2)
 
     def square(self, scheme: Scheme, dt: float, time: float) -> float:
-        """Expected mean square of the walk over a run: D t/2 from its scatter, and the square of its mean."""
+        """Expected mean square of the walk over a run: D t/2 from its scatter, and the square of
+        its mean."""
         half = self.rate(scheme, dt) * time / 2
         return half + (self.freedom * half) ** 2 / 3
 
 
 @cache
 def weight(scheme: Scheme, jump: float) -> float:
-    """w of an integrator; the sum of b² for a jump below 0, where the errors of kicks are independent."""
+    """w of an integrator; the sum of b² for a jump below 0, where the errors of kicks are
+    independent."""
     at, kicks, n = 0.0, [], np.arange(1.0, 1000.0)
     for flow in scheme.flows:
         at += flow.fraction if flow.kind == DRIFT else 0.0
@@ -60,7 +72,8 @@ def weight(scheme: Scheme, jump: float) -> float:
 
 
 def measure_energy_walk(system: TrialSystem, timestep: float) -> EnergyWalk:
-    """The walk, from two pilot runs at about this step (in the unit of the system) and at half of it."""
+    """The walk, from two pilot runs at about this step (in the unit of the system) and at half of
+    it."""
     scheme, rates = cast(Scheme, system.methods[PILOT_INTEGRATOR].scheme), []
     for _ in range(3):
         rates = [_rate(system, timestep / part, part * STEPS) for part in (1, 2)]
@@ -73,11 +86,14 @@ def measure_energy_walk(system: TrialSystem, timestep: float) -> EnergyWalk:
     jump = min(JUMPS, key=lambda k: abs(log(fast / slow) - (2 * k + 2) * log(2)))
     dt = timestep * system.time_size
     unit = EnergyWalk(1.0, jump, system.freedom)
-    return unit._replace(scale=(fast / unit.rate(scheme, dt) + slow / unit.rate(scheme, dt / 2)) / 2)
+    return unit._replace(
+        scale=(fast / unit.rate(scheme, dt) + slow / unit.rate(scheme, dt / 2)) / 2
+    )
 
 
 def _rate(system: TrialSystem, timestep: float, steps: int) -> float | None:
-    """D in a run: the least of all lags, as a regular error adds to short ones; None if the run diverges."""
+    """D in a run: the least of all lags, as a regular error adds to short ones; None if the run
+    diverges."""
     trial = Trial(PILOT_INTEGRATOR, timestep, steps, 0)
     measure_errors(system, trial, None, STEPS)
     if trial.diverged:
@@ -87,18 +103,26 @@ def _rate(system: TrialSystem, timestep: float, steps: int) -> float | None:
 
 
 #: Tried in this order. A later one is abandoned at a step that is too long and costs more.
-CANDIDATES = sorted((name for name, scheme in SCHEMES.items() if scheme.auto), key=lambda name: SCHEMES[name].auto)
-#: Most trials of each, how much its longest step is shortened at most, and the least gain for another trial.
+CANDIDATES = sorted(
+    (name for name, scheme in SCHEMES.items() if scheme.auto), key=lambda name: SCHEMES[name].auto
+)
+#: Most trials of each, how much its longest step is shortened at most, and the least gain for
+#: another trial.
 MAX_TRIALS, MAX_SHORTENING, MIN_GAIN = 16, 4096, 1.1
 #: Most halvings of the reference's step.
 HALVINGS = 12
 #: An interpolated step is shortened by this factor, so that its error falls below the target.
 MARGIN = 0.95
-#: Expected error over a run longer than its pilot runs, in the target: one random walk in ten is 1.5 times as large.
+#: Expected error over a run longer than its pilot runs, in the target: one random walk in ten is
+#: 1.5 times as large.
 SAFETY = 0.65
-#: Length of the pilot run of the best step: part of the run; least and most, in short pilot runs; its repetitions.
+#: Length of the pilot run of the best step: part of the run; least and most, in short pilot runs;
+#: its repetitions.
 LONG_PILOT_PART, LONG_PILOT_MIN, LONG_PILOT_MAX, CORRECTIONS = 0.05, 10.0, 100.0, 3
-REMEDIES = "truncation = 'smooth_switch', a longer cutoff_A or a shorter stage make the walk of the energy smaller"
+REMEDIES = (
+    "truncation = 'smooth_switch', a longer cutoff_A or a shorter stage make the walk of the energy"
+    " smaller"
+)
 
 
 class Choice(NamedTuple):
@@ -111,14 +135,24 @@ class Choice(NamedTuple):
 
 
 class _Search:
-    """The longest steps of the candidates within a target for an error (an attribute of `Trial`) over a time."""
+    """The longest steps of the candidates within a target for an error (an attribute of `Trial`)
+    over a time."""
 
-    def __init__(self, system: TrialSystem, target: float, error: str, longest: dict[str, float], exact: State | None):
+    def __init__(
+        self,
+        system: TrialSystem,
+        target: float,
+        error: str,
+        longest: dict[str, float],
+        exact: State | None,
+    ):
         self.system, self.longest, self.exact = system, longest, exact
         self.target, self.error = target, error
         self.energy_walk: EnergyWalk | None = None
         self.time = system.span
-        self.slow_factor: dict[str, float] = {}  # regular error in a longer pilot run over that in the short one
+        self.slow_factor: dict[
+            str, float
+        ] = {}  # regular error in a longer pilot run over that in the short one
         self.measured: dict[str, Trial] = {}  # the last one of each integrator that has an error
         self._tried: dict[tuple[str, float, float | None], Trial] = {}
 
@@ -134,7 +168,9 @@ class _Search:
     def cost(self, trial: Trial) -> float:
         """Forces per unit of time of the span."""
         system = self.system
-        return system.methods[trial.integrator].force_evaluations / (trial.timestep * system.time_size)
+        return system.methods[trial.integrator].force_evaluations / (
+            trial.timestep * system.time_size
+        )
 
     def walk_square(self, name: str, timestep: float, time: float) -> float:
         scheme = self.system.methods[name].scheme
@@ -146,11 +182,16 @@ class _Search:
         """Error over the time; at another step by the order of the integrator."""
         name, step = trial.integrator, timestep or trial.timestep
         order = self.system.methods[name].order
-        regular = self.slow_factor.get(name, 1.0) * getattr(trial, self.error) * (step / trial.timestep) ** order
+        regular = (
+            self.slow_factor.get(name, 1.0)
+            * getattr(trial, self.error)
+            * (step / trial.timestep) ** order
+        )
         return sqrt(regular**2 + self.walk_square(name, step, self.time))
 
     def trial(self, name: str, timestep: float, span: float | None = None) -> Trial:
-        """A trial of an integrator at a step; it ends exactly at the span if trajectories are compared."""
+        """A trial of an integrator at a step; it ends exactly at the span if trajectories are
+        compared."""
         system = self.system if span is None else replace(self.system, span=span)
         n = max(1, ceil(system.span / (timestep * system.time_size) * (1 - 1e-12)))
         if self.exact is not None:
@@ -166,11 +207,14 @@ class _Search:
         low, high = 1e-6 * trial.timestep, 1e3 * trial.timestep
         while high > 1.01 * low:
             middle = sqrt(low * high)
-            low, high = (middle, high) if self.expected(trial, middle) <= self.target else (low, middle)
+            low, high = (
+                (middle, high) if self.expected(trial, middle) <= self.target else (low, middle)
+            )
         return low
 
     def _longest_step(self, name: str, cheapest: float) -> Trial | None:
-        """The trial with the longest step within the target. None without one, or if all cost more than `cheapest`."""
+        """The trial with the longest step within the target. None without one, or if all cost more
+        than `cheapest`."""
         longest = step = self.longest[name]
         good, bad = None, inf
         for _ in range(MAX_TRIALS):
@@ -184,7 +228,11 @@ class _Search:
             else:
                 bad = trial.timestep
             if good is None:
-                step = step / 2 if trial.diverged else max(round_down(MARGIN * self.step_for(trial)), step / 4)
+                step = (
+                    step / 2
+                    if trial.diverged
+                    else max(round_down(MARGIN * self.step_for(trial)), step / 4)
+                )
                 continue
             step = min(MARGIN * self.step_for(good), longest)
             step = round_down(step if step < bad else sqrt(good.timestep * bad))
@@ -194,14 +242,17 @@ class _Search:
 
 
 def choose(
-    system: TrialSystem, longest: dict[str, float], energy: float | None, trajectory: float | None = None,
+    system: TrialSystem,
+    longest: dict[str, float],
+    energy: float | None,
+    trajectory: float | None = None,
     duration: float | None = None,
-) -> Choice:  # fmt: skip
-    """The integrator and step with the fewest forces that keep the error of the energy, or else of the trajectory,
-    below a target.
+) -> Choice:
+    """The integrator and step with the fewest forces that keep the error of the energy, or else of
+    the trajectory, below a target.
 
-    longest : the longest step to try of each integrator, in the unit of the system; duration : of the run over which an
-    error of the energy has to hold, if not the span. Raises SimulationError.
+    longest : the longest step to try of each integrator, in the unit of the system; duration : of
+    the run over which an error of the energy has to hold, if not the span. Raises SimulationError.
     """
     if energy is not None:
         target, error, exact = energy, "energy_rms", None
@@ -212,10 +263,17 @@ def choose(
     first = search.best()
     if first is None:
         least = min(search.measured.values(), key=lambda trial: getattr(trial, error), default=None)
-        reached = "" if least is None else (
-            f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g} {system.time_unit}"
-        )  # fmt: skip
-        raise SimulationError(f"no integrator keeps its error below {target:g} with any step tried{reached}")
+        reached = (
+            ""
+            if least is None
+            else (
+                f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g}"
+                f" {system.time_unit}"
+            )
+        )
+        raise SimulationError(
+            f"no integrator keeps its error below {target:g} with any step tried{reached}"
+        )
     best, per = first, "ps" if system.time_unit == "fs" else "s"
     value, over, words = getattr(best, error), f"over {system.span:.3g} {per}", ""
     if duration is not None and duration > system.span:
@@ -223,7 +281,9 @@ def choose(
         over = f"over {duration:.4g} {per}"
     cost, before = search.cost(best), search.cost(first)
     kind = ENERGY_ERROR if error == "energy_rms" else "error of the trajectory"
-    reason = f"{kind} {value:.1e} {over} for a target of {target:g}{words}; {cost:.4g} forces per {per}"
+    reason = (
+        f"{kind} {value:.1e} {over} for a target of {target:g}{words}; {cost:.4g} forces per {per}"
+    )
     common = search.measured.get("velocity_verlet")
     if common is not None and best.integrator != "velocity_verlet":
         step = min(search.step_for(common), longest["velocity_verlet"])
@@ -231,17 +291,25 @@ def choose(
         reason += f", {fewer:.1f} times fewer than velocity_verlet at {step:.2g} {system.time_unit}"
     if value > target:
         reason += f"; no step tried keeps the target over that time: {REMEDIES}"
-    elif cost > 1.5 * before and search.walk_square(best.integrator, best.timestep, search.time) > 0.1 * value**2:
-        reason += f"; {cost / before:.1f} times as many as for {system.span:.3g} {per} only: {REMEDIES}"
+    elif (
+        cost > 1.5 * before
+        and search.walk_square(best.integrator, best.timestep, search.time) > 0.1 * value**2
+    ):
+        reason += (
+            f"; {cost / before:.1f} times as many as for {system.span:.3g} {per} only: {REMEDIES}"
+        )
     return Choice(best.integrator, best.timestep, value, reason)
 
 
 def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[Trial, float, str]:
-    """The best trial for a run that is longer than its pilots, its expected error, and a phrase about the pilot run."""
+    """The best trial for a run that is longer than its pilots, its expected error, and a phrase
+    about the pilot run."""
     span, target = search.system.span, search.target
     search.energy_walk, search.time = measure_energy_walk(search.system, first.timestep), duration
     search.target = SAFETY * target
-    length = min(duration, LONG_PILOT_MAX * span, max(LONG_PILOT_MIN * span, LONG_PILOT_PART * duration))
+    length = min(
+        duration, LONG_PILOT_MAX * span, max(LONG_PILOT_MIN * span, LONG_PILOT_PART * duration)
+    )
     best, value, seen = first, search.expected(first), first
     for _ in range(CORRECTIONS):
         if (found := search.best()) is None:
@@ -252,7 +320,9 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
             search.longest[name] = step / 2
             continue
         of_pilot = search.walk_square(name, step, length)
-        square = max(seen.energy_rms**2, 2 * float(np.var(seen.energies)))  # the error may not be 0 at the start
+        square = max(
+            seen.energy_rms**2, 2 * float(np.var(seen.energies))
+        )  # the error may not be 0 at the start
         value = sqrt(square + search.walk_square(name, step, duration) - of_pilot)
         if value <= (1 + SAFETY) / 2 * target:
             break

@@ -1,4 +1,5 @@
-"""The longest stable time step, estimated before the first step from the stiffest motion of a state."""
+"""The longest stable time step, estimated before the first step from the stiffest motion of a
+state."""
 
 from math import inf, sqrt
 from typing import NamedTuple
@@ -19,7 +20,8 @@ from rigidmd.mechanics.rotation import from_vector
 DIRECTIONS = 16
 #: Displacement for a difference of forces, in smallest diameters.
 DISPLACEMENT = 1e-5
-#: Most molecules that are displaced: the stiffest motion is local, and each direction takes 48 B per molecule.
+#: Most molecules that are displaced: the stiffest motion is local, and each direction takes 48 B
+#: per molecule.
 MOST_DISPLACED = 50_000
 #: Molecules above which the estimate is made only if it costs less than 1 % of the stage.
 SMALL_SYSTEM = 1000
@@ -32,26 +34,34 @@ class StiffestMode(NamedTuple):
     molecule: int  # with the largest part in it
 
 
-def stiffest_mode(system: System, state: State, engine: Engine | None = None) -> StiffestMode | None:
+def stiffest_mode(
+    system: System, state: State, engine: Engine | None = None
+) -> StiffestMode | None:
     """The fastest small motion of all molecules together; None if no restoring force acts.
 
-    The largest eigenvalue of the mass-weighted matrix of force differences, in the Krylov space of one random vector
-    (Arnoldi). The state is unchanged. Each of `DIRECTIONS` directions takes one force evaluation. In large systems only
-    a slab of `MOST_DISPLACED` molecules moves.
+    The largest eigenvalue of the mass-weighted matrix of force differences, in the Krylov space of
+    one random vector (Arnoldi). The state is unchanged. Each of `DIRECTIONS` directions takes one
+    force evaluation. In large systems only a slab of `MOST_DISPLACED` molecules moves.
 
     engine : of this system; a new one if not given
     """
     model, engine = system.model, engine or system.engine()
     moving = np.arange(len(state.position))
     if len(moving) > MOST_DISPLACED:
-        moving = np.sort(np.argpartition(system.centres(state, wrapped=True)[:, 0], MOST_DISPLACED)[:MOST_DISPLACED])
+        moving = np.sort(
+            np.argpartition(system.centres(state, wrapped=True)[:, 0], MOST_DISPLACED)[
+                :MOST_DISPLACED
+            ]
+        )
     rotating = moving[: len(state.rotation)]
     mass = np.sqrt(model.inverse_mass[model.species[moving]])[:, None]
     inertia = np.sqrt(model.inverse_inertia[model.species[rotating]])
     radius = np.array([m.radius for m in system.species])[model.species[rotating], None]
 
     def weighted(load: Load) -> np.ndarray:
-        return np.concatenate([(mass * load.force[moving]).ravel(), (inertia * load.torque_body[rotating]).ravel()])
+        return np.concatenate(
+            [(mass * load.force[moving]).ravel(), (inertia * load.torque_body[rotating]).ravel()]
+        )
 
     here, moved = weighted(engine.evaluate(state)[0]), state.copy()
     vector = np.random.default_rng(0).standard_normal(here.size)
@@ -87,7 +97,8 @@ def stiffest_mode(system: System, state: State, engine: Engine | None = None) ->
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> float:
-    """Scalar product of long vectors. `a @ b` would start threads that then spin on cores that a run needs."""
+    """Scalar product of long vectors. `a @ b` would start threads that then spin on cores that a
+    run needs."""
     return float(np.einsum("i,i", a, b))
 
 
@@ -95,24 +106,33 @@ def body_step_warnings(system: BodySystem) -> list[str]:
     """Warnings of a step that is unstable or inaccurate for the motion of a body at its start."""
     run, method = system.scene.run, system.method
     rate, angle = fastest_body_rate(system), stable_angle(method)
-    if not system.scene.watch.stable_step or rate == 0 or angle == inf:  # some solvers choose their own steps
+    if (
+        not system.scene.watch.stable_step or rate == 0 or angle == inf
+    ):  # some solvers choose their own steps
         return []
     moves = f"at its start the body swings or spins at {rate:.3g} rad/s"
     if run.timestep_s > angle / rate:
         follows = f"which {run.integrator} can follow up to {angle / rate:.3g} s"
-        return [f"timestep_s = {run.timestep_s:g} is longer than what is stable: {moves}, {follows}"]
+        return [
+            f"timestep_s = {run.timestep_s:g} is longer than what is stable: {moves}, {follows}"
+        ]
     error = step_error(method, rate * run.timestep_s) if isinstance(method, Scheme) else 0.0
     if error > INACCURATE:
         what = f"as if its torques were wrong by {error:.0%}"
-        return [f"timestep_s = {run.timestep_s:g} is inaccurate: {moves}, which {run.integrator} follows {what}"]
+        return [
+            f"timestep_s = {run.timestep_s:g} is inaccurate: {moves}, which {run.integrator}"
+            f" follows {what}"
+        ]
     return []
 
 
 def fastest_body_rate(system: BodySystem) -> float:
-    """The fastest rate (rad/s) that a body's steps have to resolve at its start: swing under its weight, or spin.
+    """The fastest rate (rad/s) that a body's steps have to resolve at its start: swing under its
+    weight, or spin.
 
-    The exact rotor is exact for a free body at any spin, the split rotor only for a symmetric body. With a weight on
-    the axis of symmetry only the nutation has to be resolved; with general solvers, the whole spin.
+    The exact rotor is exact for a free body at any spin, the split rotor only for a symmetric body.
+    With a weight on the axis of symmetry only the nutation has to be resolved; with general
+    solvers, the whole spin.
     """
     if not system.rotates:
         return 0.0
@@ -121,7 +141,9 @@ def fastest_body_rate(system: BodySystem) -> float:
     stiffness, spins = np.zeros(3), np.divide(momentum, inertia, out=np.zeros(3), where=inertia > 0)
     for term in weights:
         arms = np.sqrt(np.maximum(term.point @ term.point - term.point**2, 0.0))
-        stiffness += np.linalg.norm(term.force) * np.divide(arms, inertia, out=np.zeros(3), where=inertia > 0)
+        stiffness += np.linalg.norm(term.force) * np.divide(
+            arms, inertia, out=np.zeros(3), where=inertia > 0
+        )
     method = system.method
     flows = isinstance(method, Scheme)
     followed = not flows or isinstance(system.engine().model_for(method).rotor, SplitRotor)

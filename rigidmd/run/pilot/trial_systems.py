@@ -1,4 +1,5 @@
-"""Systems for pilot runs and for `rigidmd accuracy`: the start of a scene with every method that can move it.
+"""Systems for pilot runs and for `rigidmd accuracy`: the start of a scene with every method that
+can move it.
 
 The functions `choose_for_...` apply `choice` to them for `integrator = "auto"`.
 """
@@ -30,29 +31,36 @@ from rigidmd.scene.body import SAMPLES
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
-#: General ODE solvers for the textbook equations of a body, for comparison with the engine's schemes.
+#: General ODE solvers for the textbook equations of a body, for comparison with the engine's
+#: schemes.
 COMPARATORS = {
-    solver if form == "matrix" else f"{solver}_{form}": (solver, form) for solver in SOLVERS for form in FORMULATIONS
+    solver if form == "matrix" else f"{solver}_{form}": (solver, form)
+    for solver in SOLVERS
+    for form in FORMULATIONS
 }
 SPAN_PS = 0.1
 #: Step of velocity Verlet and span of a pilot run, in radians of the mean vibration or libration.
 PILOT_STEP, PILOT_SPAN = 0.15, 10.0
-#: For an error of the energy over a stage a pilot run takes this part of the stage, at least these radians.
+#: For an error of the energy over a stage a pilot run takes this part of the stage, at least these
+#: radians.
 PILOT_PART, LEAST_SPAN = 0.01, 3.0
 #: Samples and steps of the first run of a body, which only measures how fast it moves.
 COARSE_SAMPLES, COARSE_STEPS = 200, 20_000
 
 
 def natural_time(system: System, state: State) -> float | None:
-    """Time (ps) of one radian of the faster of vibration and libration; None at rest. Its inverse squared is <F²/m> /
-    <m v²>, the mean square frequency of harmonic motion; likewise for torques."""
+    """Time (ps) of one radian of the faster of vibration and libration; None at rest. Its inverse
+    squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion; likewise for
+    torques."""
     sums = sums_of_state(system.model, state, system.engine().evaluate(state)[0])
     pairs = (sums.force, sums.translation), (sums.torque, sums.rotation)
     fastest = max(force / motion if motion > 0 else 0.0 for force, motion in pairs)
     return 1 / sqrt(fastest) if fastest > 0 else None
 
 
-def molecular_trial_system(system: System, start: State, rotor: str | None, span: float) -> TrialSystem:
+def molecular_trial_system(
+    system: System, start: State, rotor: str | None, span: float
+) -> TrialSystem:
     """Molecules that start at a state and run for `span` ps."""
     state = start.copy()
     state.step[:] = 0
@@ -72,34 +80,51 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
         return system.engine_of(system.terms, precision_for(error))
 
     def conserved_errors(now: State) -> dict[str, float]:
-        """Errors of the conserved components of the total momentum and, with neither box nor fields, of the angular
-        momentum, relative to the sums of their sizes."""
+        """Errors of the conserved components of the total momentum and, with neither box nor
+        fields, of the angular momentum, relative to the sums of their sizes."""
         errors = {}
         if conserved.any():
-            before, after = (mass[:, None] * velocity[:, conserved] for velocity in (state.velocity, now.velocity))
+            before, after = (
+                mass[:, None] * velocity[:, conserved]
+                for velocity in (state.velocity, now.velocity)
+            )
             errors["momentum"] = _change(before, after)
         if conserved.all() and not (boxed or system.external):
             errors["L"] = _change(_angular_momenta(state, mass), _angular_momenta(now, mass))
         return errors
 
     return TrialSystem(
-        name=system.scene.name, state=state,
+        name=system.scene.name,
+        state=state,
         methods={
-            name: Method(partial(engine, scheme), scheme if scheme.exact_rotor else scheme.with_rotor(rotor))
+            name: Method(
+                partial(engine, scheme), scheme if scheme.exact_rotor else scheme.with_rotor(rotor)
+            )
             for name, scheme in system.scene.schemes.items()
         },
         energy=lambda engine, now: observe(system, engine, now, energy_unit=1.0).conserved,
-        energy_unit="kT per degree of freedom", energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
-        energy_size=freedom * thermal or 1.0, kinetic=kinetic or 1.0, span=span, time_unit="fs", time_size=FEMTOSECOND,
-        length_unit="Å", reference="srkn_6", conserved_errors=conserved_errors, can_continue=True,
+        energy_unit="kT per degree of freedom",
+        energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
+        energy_size=freedom * thermal or 1.0,
+        kinetic=kinetic or 1.0,
+        span=span,
+        time_unit="fs",
+        time_size=FEMTOSECOND,
+        length_unit="Å",
+        reference="srkn_6",
+        conserved_errors=conserved_errors,
+        can_continue=True,
         refused={name: "it is for single bodies" for name in COMPARATORS},
-        freedom=freedom, chooses_precision=bool(system.precision_reason),
-    )  # fmt: skip
+        freedom=freedom,
+        chooses_precision=bool(system.precision_reason),
+    )
 
 
 def _change(before: np.ndarray, after: np.ndarray) -> float:
     """Change of the sum over molecules of vectors (n, 3), relative to the sum of their lengths."""
-    return float(np.linalg.norm((after - before).sum(axis=0)) / (np.linalg.norm(before, axis=1).sum() or 1.0))
+    return float(
+        np.linalg.norm((after - before).sum(axis=0)) / (np.linalg.norm(before, axis=1).sum() or 1.0)
+    )
 
 
 def _angular_momenta(state: State, mass: np.ndarray) -> np.ndarray:
@@ -111,21 +136,35 @@ def _angular_momenta(state: State, mass: np.ndarray) -> np.ndarray:
 
 
 def body_trial_system(
-    scene: BodyScene, span: float | None = None, applied: dict[str, Callable[[Pose], tuple]] | None = None
+    scene: BodyScene,
+    span: float | None = None,
+    applied: dict[str, Callable[[Pose], tuple]] | None = None,
 ) -> tuple[TrialSystem, float]:
-    """A body for `span` s (default: its run, up to the first break), and its fastest rate of rotation (rad/s)."""
+    """A body for `span` s (default: its run, up to the first break), and its fastest rate of
+    rotation (rad/s)."""
     run = scene.run
-    keys = ("rotor", "formulation", "relative_tolerance", "absolute_tolerance", "energy_error", "trajectory_error")
+    keys = (
+        "rotor",
+        "formulation",
+        "relative_tolerance",
+        "absolute_tolerance",
+        "energy_error",
+        "trajectory_error",
+    )
     plain = dict.fromkeys(keys)
     fits, refused = {}, {}
     for name in (*scene.schemes, *COMPARATORS):
         solver, form = COMPARATORS.get(name, (name, "matrix"))
         formulation = None if form == "matrix" else form
         try:
-            changed = run.model_copy(update=plain | {"integrator": solver, "formulation": formulation})
+            changed = run.model_copy(
+                update=plain | {"integrator": solver, "formulation": formulation}
+            )
             fits[name] = build_body(scene.model_copy(update={"run": changed}), applied)
         except SceneError as error:
-            reasons = (re.split("[:;] use ", text.removeprefix("run: "))[0] for text in error.errors)  # without advice
+            reasons = (
+                re.split("[:;] use ", text.removeprefix("run: "))[0] for text in error.errors
+            )  # without advice
             refused[name] = "; ".join(reasons).replace(solver, "it")
     if not fits:
         build_body(scene, applied)  # raises the error
@@ -134,7 +173,9 @@ def body_trial_system(
     engine, snapshots = system.engine(), [Snapshot(0.0, system.state)]
     state = engine.begin(system.state, system.method)
     for step in range(0, COARSE_STEPS, COARSE_STEPS // COARSE_SAMPLES):
-        engine.advance(state, system.method, whole / COARSE_STEPS, step + COARSE_STEPS // COARSE_SAMPLES)
+        engine.advance(
+            state, system.method, whole / COARSE_STEPS, step + COARSE_STEPS // COARSE_SAMPLES
+        )
         snapshots.append(Snapshot(float(state.time[0]), state.copy()))
     seen = motion(system, snapshots)
     kinetic = float(np.abs(seen["kinetic"]).max()) or 1.0
@@ -145,12 +186,20 @@ def body_trial_system(
 
     def conserved_errors(state) -> dict[str, float]:
         seen = motion(system, [snapshots[0], Snapshot(float(state.time[0]), state)])
-        return {name: float(seen[f"{name}_error"][-1]) for name in seen.invariants if name != "energy"}
+        return {
+            name: float(seen[f"{name}_error"][-1]) for name in seen.invariants if name != "energy"
+        }
 
     methods = {}
     for name, fit in fits.items():
-        scheme = scene.schemes[name] if name in scene.schemes else fit.method._replace(duration=whole)
-        scheme = scheme if isinstance(scheme, Solver) or scheme.exact_rotor else scheme.with_rotor(run.rotor)
+        scheme = (
+            scene.schemes[name] if name in scene.schemes else fit.method._replace(duration=whole)
+        )
+        scheme = (
+            scheme
+            if isinstance(scheme, Solver) or scheme.exact_rotor
+            else scheme.with_rotor(run.rotor)
+        )
         methods[name] = Method(lambda _, fit=fit: fit.engine(), scheme)
     at_a_pole = system.rotates and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
     reference = max(
@@ -158,12 +207,26 @@ def body_trial_system(
         key=lambda name: (SCHEMES[name].order, -SCHEMES[name].force_evaluations),
     )
     trial_system = TrialSystem(
-        name=scene.name, state=system.state, methods=methods, energy=energy,
-        energy_unit="times the largest kinetic energy", energy_note="", energy_size=kinetic, kinetic=kinetic,
-        span=whole, time_unit="s", time_size=1.0, length_unit="m", reference=reference,
-        conserved_errors=conserved_errors, can_continue=False, refused=refused,
-        singular=tuple(name for name, (_, form) in COMPARATORS.items() if form == "euler_angles" and at_a_pole),
-    )  # fmt: skip
+        name=scene.name,
+        state=system.state,
+        methods=methods,
+        energy=energy,
+        energy_unit="times the largest kinetic energy",
+        energy_note="",
+        energy_size=kinetic,
+        kinetic=kinetic,
+        span=whole,
+        time_unit="s",
+        time_size=1.0,
+        length_unit="m",
+        reference=reference,
+        conserved_errors=conserved_errors,
+        can_continue=False,
+        refused=refused,
+        singular=tuple(
+            name for name, (_, form) in COMPARATORS.items() if form == "euler_angles" and at_a_pole
+        ),
+    )
     speed = 0.0
     if system.rotates:  # of the body, and of the nutation by its wheels
         inertia, carried = system.moments(np.zeros(1))
@@ -173,7 +236,8 @@ def body_trial_system(
 
 
 def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, str]:
-    """Stage k with the integrator and step that are best from this state, and the reason. Raises SimulationError."""
+    """Stage k with the integrator and step that are best from this state, and the reason. Raises
+    SimulationError."""
     stage = system.scene.stages[k]
     natural = natural_time(system, state)
     step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.timestep_fs
@@ -184,9 +248,12 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
     longest = {
         name: float(f"{4 * step * scheme.force_evaluations:.3g}")
         for name, scheme in SCHEMES.items()
-        if scheme.exact_rotor or scheme.order == 2  # the others need more forces, and are for bodies without that rotor
+        if scheme.exact_rotor
+        or scheme.order == 2  # the others need more forces, and are for bodies without that rotor
     }
-    found = choose(trial_system, longest, stage.energy_error_kT, stage.trajectory_error, stage.duration)
+    found = choose(
+        trial_system, longest, stage.energy_error_kT, stage.trajectory_error, stage.duration
+    )
     return stage.with_integrator(found.integrator, found.timestep), found.reason
 
 
@@ -194,14 +261,21 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
 MIN_STEP_FRACTION = 0.25
 
 
-def choose_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None) -> tuple[BodyScene, str]:
+def choose_for_body(
+    scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None
+) -> tuple[BodyScene, str]:
     """A scene with the best integrator and step, and the reason. Raises SimulationError."""
     run = scene.run
     trial_system, _ = body_trial_system(scene, applied=applied)
     longest = {name: run.timestep_s for name in trial_system.methods if name in SCHEMES}
     found = choose(trial_system, longest, run.energy_error, run.trajectory_error)
-    chosen, timestep = found.timestep, _fit_step(found.timestep, run.duration_s, scene.output.interval_s)
-    fitted = "" if timestep == chosen else f", shortened to {timestep:g} s to fit duration and samples"
+    chosen, timestep = (
+        found.timestep,
+        _fit_step(found.timestep, run.duration_s, scene.output.interval_s),
+    )
+    fitted = (
+        "" if timestep == chosen else f", shortened to {timestep:g} s to fit duration and samples"
+    )
     none = {"energy_error": None, "trajectory_error": None}
     changed = run.model_copy(update={"integrator": found.integrator, "timestep_s": timestep} | none)
     reason = f"{found.integrator} at {chosen:g} s chosen{fitted}: {found.reason}"
@@ -209,8 +283,9 @@ def choose_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]
 
 
 def _fit_step(timestep: float, duration: float, interval: float | None) -> float:
-    """The longest step up to this one that divides the duration and the interval of samples; or the duration alone, if
-    the interval or their common divisor would make it much shorter. Each step is then a sample."""
+    """The longest step up to this one that divides the duration and the interval of samples; or the
+    duration alone, if the interval or their common divisor would make it much shorter. Each step is
+    then a sample."""
     if interval is not None and interval < MIN_STEP_FRACTION * timestep:
         interval = duration
     if interval is None:

@@ -1,7 +1,8 @@
-"""Trials of integrators: runs from the same start at several time steps, for pilot runs and `rigidmd accuracy`.
+"""Trials of integrators: runs from the same start at several time steps, for pilot runs and
+`rigidmd accuracy`.
 
-The cost is seconds of computing and force evaluations for a span of time. Errors of the trajectory are measured at the
-end, of conserved quantities on the way.
+The cost is seconds of computing and force evaluations for a span of time. Errors of the trajectory
+are measured at the end, of conserved quantities on the way.
 """
 
 import time as clock
@@ -28,7 +29,8 @@ DIVERGED = 0.5
 STABLE_FRACTION = 0.8
 #: Least steps in a span of a trial that extends the steps of an integrator.
 MIN_STEPS = 4
-#: Steps that warm up an engine (lists, buffers, memory): the first 25 steps of 216 waters took 40 ms, the next 20 ms.
+#: Steps that warm up an engine (lists, buffers, memory): the first 25 steps of 216 waters took 40
+#: ms, the next 20 ms.
 WARM_UP = 10
 #: Least seconds of computing in the timing of a span.
 TIMING_SECONDS = 0.2
@@ -57,12 +59,15 @@ class Method(NamedTuple):
 class TrialSystem:
     """A start, and how to measure errors on it. Functions have the arguments engine and state.
 
-    energy : the conserved energy; energy_unit, energy_note : the unit of its reported error, as text
-    energy_size : that unit in the units of `energy`; kinetic : kinetic energy that sets the limit of divergence
+    energy : the conserved energy; energy_unit, energy_note : the unit of its reported error, as
+        text
+    energy_size : that unit in the units of `energy`; kinetic : kinetic energy that sets the limit
+        of divergence
     reference : name of the method of the reference
     conserved_errors : relative errors of other conserved quantities, of a state
     can_continue : whether timing may continue beyond the span instead of starting again
-    refused : name -> reason, of methods that cannot move this system; singular : names of those singular at the start
+    refused : name -> reason, of methods that cannot move this system; singular : names of those
+        singular at the start
     rounding : relative rms errors of forces and torques in mixed precision; None in double
     chooses_precision : whether each trial has the precision that suits the error of its step
     """
@@ -104,7 +109,9 @@ class Trial:
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
     orthogonality_error: float = np.nan
-    conserved_errors: dict[str, float] = field(default_factory=dict)  # largest relative ones, of other quantities
+    conserved_errors: dict[str, float] = field(
+        default_factory=dict
+    )  # largest relative ones, of other quantities
     tolerance: float | None = None  # of a method that chooses its steps
     failure: str = ""  # why it failed or diverged
     energies: list[float] = field(default_factory=list, repr=False)  # errors, from 0 at the start
@@ -121,11 +128,14 @@ class Trial:
     @property
     def spread(self) -> float | None:
         """Range of the seconds over their median; None if timed once."""
-        return (max(self.seconds) - min(self.seconds)) / self.time if len(self.seconds) > 1 else None
+        return (
+            (max(self.seconds) - min(self.seconds)) / self.time if len(self.seconds) > 1 else None
+        )
 
     @property
     def conservation_error(self) -> float:
-        """The error of the energy, or a larger relative one of QᵀQ or of another conserved quantity."""
+        """The error of the energy, or a larger relative one of QᵀQ or of another conserved
+        quantity."""
         others = [self.orthogonality_error, *self.conserved_errors.values()]
         return max(self.energy_rms, *(error for error in others if not np.isnan(error)), 0.0)
 
@@ -143,17 +153,24 @@ class IntegratorAccuracy:
     trials: list[Trial]
     reference_steps: int
     reference_error: float  # of the reference, from a run with half as many steps
-    left_out: dict[str, str] = field(default_factory=dict)  # usual methods that were not tried -> reason
+    left_out: dict[str, str] = field(
+        default_factory=dict
+    )  # usual methods that were not tried -> reason
 
     def __repr__(self) -> str:
         return f"<Precision of {self.trial_system.name}: {len(self.trials)} trials>"
 
     def stable_step(self, integrator: str) -> float | None:
-        steps = [trial.timestep for trial in self.trials if trial.integrator == integrator and not trial.diverged]
+        steps = [
+            trial.timestep
+            for trial in self.trials
+            if trial.integrator == integrator and not trial.diverged
+        ]
         return max(steps, default=None)
 
     def front(self, error: str) -> list[Trial]:
-        """Trials that no other beats in both time and error (an attribute of `Trial`), fastest first."""
+        """Trials that no other beats in both time and error (an attribute of `Trial`), fastest
+        first."""
         found: list[Trial] = []
         for trial in sorted((t for t in self.trials if not t.diverged), key=lambda t: t.time):
             if not found or getattr(trial, error) < getattr(found[-1], error):
@@ -161,9 +178,14 @@ class IntegratorAccuracy:
         return found
 
     def time_for(self, integrator: str, error: str, target: float) -> "ReachedError | None":
-        """Where an integrator reaches an error, between its trials; None if its shortest step is not exact enough. At
-        most its longest step, or `STABLE_FRACTION` of it where a longer one diverges."""
-        tried = [t for t in self.trials if t.integrator == integrator and not t.diverged and getattr(t, error) > 0]
+        """Where an integrator reaches an error, between its trials; None if its shortest step is
+        not exact enough. At most its longest step, or `STABLE_FRACTION` of it where a longer one
+        diverges."""
+        tried = [
+            t
+            for t in self.trials
+            if t.integrator == integrator and not t.diverged and getattr(t, error) > 0
+        ]
         tried.sort(key=lambda t: -t.timestep)
         if not tried:
             return None
@@ -176,10 +198,20 @@ class IntegratorAccuracy:
                 step = coarse.timestep * (fine.timestep / coarse.timestep) ** fraction
         if step is None:
             return None
-        longest = max((STABLE_FRACTION if unstable else 1.0) * tried[0].timestep, tried[-1].timestep)
-        limit = "" if step < longest else "kept from its longest stable step" if unstable else "its longest step tried"
+        longest = max(
+            (STABLE_FRACTION if unstable else 1.0) * tried[0].timestep, tried[-1].timestep
+        )
+        limit = (
+            ""
+            if step < longest
+            else "kept from its longest stable step"
+            if unstable
+            else "its longest step tried"
+        )
         step, up = float(min(step, longest)), tried[::-1]
-        seconds = np.exp(np.interp(np.log(step), np.log([t.timestep for t in up]), np.log([t.time for t in up])))
+        seconds = np.exp(
+            np.interp(np.log(step), np.log([t.timestep for t in up]), np.log([t.time for t in up]))
+        )
         near = min(tried, key=lambda t: abs(np.log(t.timestep / step)))
         return ReachedError(float(seconds), step, near.spread or 0.0, limit)
 
@@ -194,19 +226,25 @@ class ReachedError(NamedTuple):
 
 
 def measure(
-    system: TrialSystem, trials: list[Trial], repeats: int,
-    progress: Callable[[float], object] = lambda fraction: None, extend: bool = False,
-) -> IntegratorAccuracy:  # fmt: skip
+    system: TrialSystem,
+    trials: list[Trial],
+    repeats: int,
+    progress: Callable[[float], object] = lambda fraction: None,
+    extend: bool = False,
+) -> IntegratorAccuracy:
     """Run all trials and the reference; time the trials alternately `repeats` times.
 
     progress : called with the fraction done
-    extend : whether longer steps than the longest one of each integrator are tried, doubled until one fails
+    extend : whether longer steps than the longest one of each integrator are tried, doubled until
+        one fails
     """
     most = max((trial.forces for trial in trials), default=0) or OBSERVATIONS * OBSERVATIONS
     steps = 2 * -(-2 * most // system.methods[system.reference].force_evaluations)
     exact = final_state(system, steps)
     differences = state_difference(exact, final_state(system, steps // 2))
-    result = IntegratorAccuracy(system, trials, steps, max(x for x in differences if not np.isnan(x)))
+    result = IntegratorAccuracy(
+        system, trials, steps, max(x for x in differences if not np.isnan(x))
+    )
     for trial in trials:  # compile and measure errors
         measure_errors(system, trial, exact)
     if extend:
@@ -222,7 +260,8 @@ def measure(
 
 
 def _extended(system: TrialSystem, trials: list[Trial], exact: State) -> list[Trial]:
-    """The trials, and before those of each integrator trials with longer steps, doubled until one fails."""
+    """The trials, and before those of each integrator trials with longer steps, doubled until one
+    fails."""
     found = []
     for name, group in groupby(trials, key=lambda trial: trial.integrator):
         ladder = list(group)
@@ -276,15 +315,17 @@ def time_span(system: TrialSystem, trial: Trial) -> float:
 
 
 def plan(system: TrialSystem, steps: dict[str, list[float]]) -> list[Trial]:
-    """Trials of integrators at time steps (in the unit of the system), adjusted to a whole number in the span. Methods
-    that choose their steps get tolerances instead."""
+    """Trials of integrators at time steps (in the unit of the system), adjusted to a whole number
+    in the span. Methods that choose their steps get tolerances instead."""
     trials = {}
     for integrator, timesteps in steps.items():
         scheme = system.methods[integrator].scheme
         if isinstance(scheme, Solver) and scheme.name != RK4:
             step = system.span / OBSERVATIONS / system.time_size
             for tolerance in TOLERANCES:
-                trials[integrator, tolerance] = Trial(integrator, step, OBSERVATIONS, 0, tolerance=tolerance)
+                trials[integrator, tolerance] = Trial(
+                    integrator, step, OBSERVATIONS, 0, tolerance=tolerance
+                )
             continue
         for timestep in timesteps:
             n = max(1, round(system.span / (timestep * system.time_size)))
@@ -299,11 +340,18 @@ def trial_of(system: TrialSystem, integrator: str, steps: int) -> Trial:
 
 
 def _begin_trial(system: TrialSystem, trial: Trial) -> tuple[Engine, State, Callable[[int], None]]:
-    """A new engine, a state at the start, and a function that advances it to a number of steps since the start."""
+    """A new engine, a state at the start, and a function that advances it to a number of steps
+    since the start."""
     method = system.methods[trial.integrator]
-    engine, scheme, dt = method.engine(trial.timestep), method.scheme, trial.timestep * system.time_size
+    engine, scheme, dt = (
+        method.engine(trial.timestep),
+        method.scheme,
+        trial.timestep * system.time_size,
+    )
     if trial.tolerance is not None:
-        scheme = scheme._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
+        scheme = scheme._replace(
+            relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance
+        )
         dt = system.span / trial.steps
     state = engine.begin(system.state, scheme)
     return engine, state, lambda steps: engine.advance(state, scheme, dt, steps)
@@ -324,7 +372,9 @@ def state_difference(a: State, b: State) -> tuple[float, float]:
     return (float(np.abs(a.rotation - b.rotation).max()) if len(a.rotation) else np.nan), position
 
 
-def measure_errors(system: TrialSystem, trial: Trial, exact: State | None, observations: int = OBSERVATIONS) -> None:
+def measure_errors(
+    system: TrialSystem, trial: Trial, exact: State | None, observations: int = OBSERVATIONS
+) -> None:
     """Run a trial and measure all its errors. Its end is compared with `exact`."""
     engine, state, advance_to = _begin_trial(system, trial)
     first = system.energy(engine, state)

@@ -1,5 +1,5 @@
-"""`rigidmd accuracy`: the errors and run times of integrators at several time steps, from the start of a scene; as a
-table, recommendations, accuracy.csv, .png and a self-contained page."""
+"""`rigidmd accuracy`: the errors and run times of integrators at several time steps, from the start
+of a scene; as a table, recommendations, accuracy.csv, .png and a self-contained page."""
 
 from collections.abc import Callable
 from math import inf
@@ -9,17 +9,31 @@ import numpy as np
 
 from rigidmd.core.integrators import RADAU, SCHEMES, SOLVERS
 from rigidmd.errors import SceneError, option
-from rigidmd.figures.style import FAINT, INK, curve_style, label_minor_ticks, new_figure, open_axis, write_figure
+from rigidmd.figures.style import (
+    FAINT,
+    INK,
+    curve_style,
+    label_minor_ticks,
+    new_figure,
+    open_axis,
+    write_figure,
+)
 from rigidmd.io.write import Column, Table
 from rigidmd.run.force_errors import single_precision_errors
-from rigidmd.run.pilot.trial_systems import COMPARATORS, SPAN_PS, body_trial_system, molecular_trial_system
+from rigidmd.run.pilot.trial_systems import (
+    COMPARATORS,
+    SPAN_PS,
+    body_trial_system,
+    molecular_trial_system,
+)
 from rigidmd.run.pilot.trials import IntegratorAccuracy, Trial, measure, plan
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
 from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
 
-#: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body also solvers.
+#: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body
+#: also solvers.
 DEFAULT_INTEGRATORS = (
     *(name for name, scheme in SCHEMES.items() if scheme.is_default),
     *(name for name, (solver, _) in COMPARATORS.items() if solver != RADAU),
@@ -27,36 +41,50 @@ DEFAULT_INTEGRATORS = (
 #: Time steps per force evaluation, relative to the scene's; longer ones follow until one fails.
 LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
 RADIANS = 0.1  # rotation of a spinning body per force evaluation in the middle of the ladder, rad
-AT_REST = 8.0  # step of a body that does not rotate, in the step of its scene, which is assumed to be suitable
+#: step of a body that does not rotate, in the step of its scene, which is assumed to be suitable
+AT_REST = 8.0
 AT_A_POLE = "the start has theta = 0 or 180 degrees, where Euler angles are singular"
 
 
 def measure_accuracy(
-    scene: MolecularScene | BodyScene, integrators: list[str] | None = None, timesteps: list[float] | None = None,
-    span: float | None = None, repeats: int = 3,
+    scene: MolecularScene | BodyScene,
+    integrators: list[str] | None = None,
+    timesteps: list[float] | None = None,
+    span: float | None = None,
+    repeats: int = 3,
     progress: Callable[[float], object] = lambda fraction: None,
-) -> IntegratorAccuracy:  # fmt: skip
-    """Error against run time of integrators at time steps, on the start of a scene. Raises SceneError.
+) -> IntegratorAccuracy:
+    """Error against run time of integrators at time steps, on the start of a scene. Raises
+    SceneError.
 
-    integrators : names; default: the scene's and those that suit it; the others are in `left_out`. rk4, dop853 and
-        radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion or _euler_angles sets another
-    timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost around the scene's
+    integrators : names; default: the scene's and those that suit it; the others are in `left_out`.
+        rk4, dop853 and radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion
+        or _euler_angles sets another
+    timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost
+        around the scene's
     span : ps or s
     progress : called with the fraction that is done; at 0, after all arguments have been checked
 
-    Molecules start where the last stage starts, after the earlier stages have run; no thermostat acts.
+    Molecules start where the last stage starts, after the earlier stages have run; no thermostat
+    acts.
     """
     check_engine_is_rigidmd(scene)
     known = (*scene.schemes, *COMPARATORS)
     integrators = list(dict.fromkeys(_method_name(name, scene) for name in integrators or []))
     if unknown := [name for name in integrators if name not in known]:
         of_all = f"(known: {', '.join(known)})"
-        errors = [f"unknown integrator {name}{did_you_mean(name, known)} {of_all}" for name in unknown]
+        errors = [
+            f"unknown integrator {name}{did_you_mean(name, known)} {of_all}" for name in unknown
+        ]
         raise SceneError(option("integrators"), errors)
     lengths = [*(timesteps or []), *([] if span is None else [span])]
     if not all(0 < length < inf for length in lengths) or repeats < 1:
-        raise SceneError("accuracy", ["time steps, span and repeats must be finite and greater than 0"])
-    if isinstance(scene, MolecularScene) and (refused := [name for name in integrators if name in COMPARATORS]):
+        raise SceneError(
+            "accuracy", ["time steps, span and repeats must be finite and greater than 0"]
+        )
+    if isinstance(scene, MolecularScene) and (
+        refused := [name for name in integrators if name in COMPARATORS]
+    ):
         reasons = [f"{name} does not suit this scene: it is for single bodies" for name in refused]
         raise SceneError(scene.source, reasons)
     progress(0.0)
@@ -75,7 +103,9 @@ def measure_accuracy(
         trial_system.rounding = single_precision_errors(simulation.system, state)
         base = last.timestep_fs / (last.row.force_evaluations if last.has_scheme else 1)
     if refused := [name for name in integrators if name not in trial_system.methods]:
-        reasons = [f"{name} does not suit this scene: {trial_system.refused[name]}" for name in refused]
+        reasons = [
+            f"{name} does not suit this scene: {trial_system.refused[name]}" for name in refused
+        ]
         raise SceneError(scene.source, reasons)
     left_out = {}
     if not integrators:
@@ -83,20 +113,30 @@ def measure_accuracy(
         defaults += [row.name for row in scene.integrators]
         left_out = {name: why for name, why in trial_system.refused.items() if name in defaults}
         left_out |= {name: AT_A_POLE for name in trial_system.singular if name in defaults}
-        of_scene = _method_name(scene.run.integrator if is_body else scene.stages[-1].integrator, scene)
+        of_scene = _method_name(
+            scene.run.integrator if is_body else scene.stages[-1].integrator, scene
+        )
         candidates = dict.fromkeys((*defaults, of_scene))
-        integrators = [name for name in candidates if name in trial_system.methods and name not in left_out]
+        integrators = [
+            name for name in candidates if name in trial_system.methods and name not in left_out
+        ]
     steps = {
-        name: timesteps or [base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
+        name: (
+            timesteps
+            or [base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
+        )
         for name in integrators
     }
-    found = measure(trial_system, plan(trial_system, steps), repeats, progress=progress, extend=not timesteps)
+    found = measure(
+        trial_system, plan(trial_system, steps), repeats, progress=progress, extend=not timesteps
+    )
     found.left_out = left_out
     return found
 
 
 def _method_name(name: str, scene: MolecularScene | BodyScene) -> str:
-    """The full name of a method: for solvers with the formulation of the scene, unless it is the matrix."""
+    """The full name of a method: for solvers with the formulation of the scene, unless it is the
+    matrix."""
     solver, _, form = name.partition("_")
     if solver in SOLVERS and isinstance(scene, BodyScene):
         form = form or scene.run.formulation
@@ -121,20 +161,32 @@ def trial_table(found: IntegratorAccuracy) -> Table:
         return Column(header, known, short)
 
     others = dict.fromkeys(name for trial in found.trials for name in trial.conserved_errors)
-    return Table([
-        Column("integrator", lambda t: t.integrator),
-        Column(f"step ({s.time_unit})", lambda t: t.timestep),
-        Column(f"forces per {per}", lambda t: t.forces / s.span, f"forces/{per}"),
-        Column(f"seconds per {per}", lambda t: "fails" if t.diverged else t.time / s.span, f"s/{per}"),
-        column("spread (%)", lambda t: t.spread and 100 * t.spread, "± %"),
-        column("error of Q", lambda t: t.rotation_error, "Q"),
-        column(f"error of X ({s.length_unit})", lambda t: t.position_error, f"X ({s.length_unit})"),
-        column("energy rms", lambda t: t.energy_rms, "energy"),
-        column("energy drift in the span", lambda t: t.energy_drift, "drift"),
-        column("±", lambda t: t.energy_drift_error),
-        *(column(f"error of {name}", lambda t, name=name: t.conserved_errors.get(name), name) for name in others),
-        column("orthogonality error", lambda t: t.orthogonality_error, "QᵀQ"),
-    ], found.trials)  # fmt: skip
+    return Table(
+        [
+            Column("integrator", lambda t: t.integrator),
+            Column(f"step ({s.time_unit})", lambda t: t.timestep),
+            Column(f"forces per {per}", lambda t: t.forces / s.span, f"forces/{per}"),
+            Column(
+                f"seconds per {per}",
+                lambda t: "fails" if t.diverged else t.time / s.span,
+                f"s/{per}",
+            ),
+            column("spread (%)", lambda t: t.spread and 100 * t.spread, "± %"),
+            column("error of Q", lambda t: t.rotation_error, "Q"),
+            column(
+                f"error of X ({s.length_unit})", lambda t: t.position_error, f"X ({s.length_unit})"
+            ),
+            column("energy rms", lambda t: t.energy_rms, "energy"),
+            column("energy drift in the span", lambda t: t.energy_drift, "drift"),
+            column("±", lambda t: t.energy_drift_error),
+            *(
+                column(f"error of {name}", lambda t, name=name: t.conserved_errors.get(name), name)
+                for name in others
+            ),
+            column("orthogonality error", lambda t: t.orthogonality_error, "QᵀQ"),
+        ],
+        found.trials,
+    )
 
 
 def table_text(found: IntegratorAccuracy) -> str:
@@ -151,8 +203,8 @@ def recommendations(found: IntegratorAccuracy) -> list[str]:
         lines.append(f"for {error} over {_span(found)} the cheapest is {best}{faster}{rivals}")
     if lines and s.time_unit == "fs":
         lines.append(
-            f"energy errors grow over longer runs, by a random walk where forces are truncated: --span measures them "
-            f"over more than {s.span:g} ps"
+            "energy errors grow over longer runs, by a random walk where forces are truncated:"
+            f" --span measures them over more than {s.span:g} ps"
         )
     return [*lines, *remarks(found)]
 
@@ -162,27 +214,44 @@ def _span(found: IntegratorAccuracy) -> str:
 
 
 def remarks(found: IntegratorAccuracy) -> list[str]:
-    """Sentences on the reference, the longest stable steps, what failed or was left out, and the timings."""
+    """Sentences on the reference, the longest stable steps, what failed or was left out, and the
+    timings."""
     s = found.trial_system
     lines = [
         f"unit of energy errors: {s.energy_unit}{s.energy_note}",
-        f"reference: {s.reference} in {found.reference_steps} steps, error about {found.reference_error:.0e}",
+        (
+            f"reference: {s.reference} in {found.reference_steps} steps, error about"
+            f" {found.reference_error:.0e}"
+        ),
     ]
     if s.rounding is not None:
         force, torque = s.rounding
         torques = f", torques by {torque:.1e}" if torque else ""
         which = "the reference is in mixed precision too"
         if s.chooses_precision:
-            which = "trials with long steps have it, others and the reference are in double precision"
-        lines.append(f"mixed precision: forces differ from double ones by {force:.1e} of their rms{torques}; {which}")
+            which = (
+                "trials with long steps have it, others and the reference are in double precision"
+            )
+        lines.append(
+            f"mixed precision: forces differ from double ones by {force:.1e} of their rms{torques};"
+            f" {which}"
+        )
     for name in dict.fromkeys(t.integrator for t in found.trials):
         failures = [t.failure for t in found.trials if t.integrator == name and t.failure]
         if "diverges" in failures:
             step = found.stable_step(name)
-            lines.append(f"{name} diverges" + (f" beyond {step:.3g} {s.time_unit}" if step else " at every step tried"))
-        lines += [f"{name}: {failure}" for failure in dict.fromkeys(failures) if failure != "diverges"][:1]
+            lines.append(
+                f"{name} diverges"
+                + (f" beyond {step:.3g} {s.time_unit}" if step else " at every step tried")
+            )
+        lines += [
+            f"{name}: {failure}" for failure in dict.fromkeys(failures) if failure != "diverges"
+        ][:1]
     for why in dict.fromkeys(found.left_out.values()):
-        lines.append(f"left out: {', '.join(name for name in found.left_out if found.left_out[name] == why)}: {why}")
+        lines.append(
+            "left out:"
+            f" {', '.join(name for name in found.left_out if found.left_out[name] == why)}: {why}"
+        )
     return lines + _describe_timings(found)
 
 
@@ -190,15 +259,19 @@ def _describe_timings(found: IntegratorAccuracy) -> list[str]:
     timed = [trial for trial in found.trials if not trial.diverged]
     if timed and timed[0].spread is None:
         return ["timed once: the spread of the seconds is unknown; see --repeats"]
-    doubtful = [(spread, trial) for trial in timed if (spread := trial.spread) is not None and spread > DOUBTFUL]
+    doubtful = [
+        (spread, trial)
+        for trial in timed
+        if (spread := trial.spread) is not None and spread > DOUBTFUL
+    ]
     if not doubtful:
         return []
     spread, worst = max(doubtful, key=lambda pair: pair[0])
     which = f"{worst.integrator} at {worst.timestep:.3g} {found.trial_system.time_unit}"
     return [
-        f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than {DOUBTFUL:.0%}, "
-        f"those of {which} by {spread:.0%} (± % in the table): was another program running? An idle machine or "
-        "more --repeats help"
+        f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than"
+        f" {DOUBTFUL:.0%}, those of {which} by {spread:.0%} (± % in the table): was another program"
+        " running? An idle machine or more --repeats help"
     ]
 
 
@@ -206,8 +279,8 @@ COMMON = "velocity_verlet"  # integrator to compare with
 
 
 def cheapest(found: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
-    """For each error of the energy, and of Q or X: the cheapest integrator, how much faster than `COMMON` it is, others
-    that are as fast. Errors with the same answer are one row."""
+    """For each error of the energy, and of Q or X: the cheapest integrator, how much faster than
+    `COMMON` it is, others that are as fast. Errors with the same answer are one row."""
     s, rows, unit = found.trial_system, [], found.trial_system.time_unit
     rotates = any(not np.isnan(t.rotation_error) for t in found.trials)
     # A motion of a body with the right energy is not advised if QᵀQ or another invariant is worse.
@@ -228,14 +301,24 @@ def cheapest(found: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
             best = min(reached, key=lambda name: reached[name].seconds)
             at, common = reached.pop(best), reached.get(COMMON)
             slow = at.seconds * (1 + at.spread / 2)
-            rivals = {name: r.step for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow}
-            chosen, faster = f"{best} at {at.step:.2g} {unit}{f' ({at.limit})' if at.limit else ''}", ""
+            rivals = {
+                name: r.step for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow
+            }
+            chosen, faster = (
+                f"{best} at {at.step:.2g} {unit}{f' ({at.limit})' if at.limit else ''}",
+                "",
+            )
             if common and COMMON not in rivals:
-                faster = f"{common.seconds / at.seconds:.1f} times faster than {COMMON} at {common.step:.2g} {unit}"
+                faster = (
+                    f"{common.seconds / at.seconds:.1f} times faster than {COMMON} at"
+                    f" {common.step:.2g} {unit}"
+                )
             others = ", ".join(f"{name} at {step:.2g} {unit}" for name, step in rivals.items())
             answers.setdefault((chosen, faster, others), []).append(target)
         for answer, targets in answers.items():
-            span = " to ".join(f"{target:.0e}" for target in dict.fromkeys((targets[0], targets[-1])))
+            span = " to ".join(
+                f"{target:.0e}" for target in dict.fromkeys((targets[0], targets[-1]))
+            )
             rows.append((f"{what} of {span} {of}".rstrip(), *answer))
     return rows
 
@@ -249,41 +332,69 @@ def write_accuracy(folder: Path, found: IntegratorAccuracy, command: str) -> lis
 
 
 def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
-    """Label points (time, error, step) in this order, each that is far enough from the one labelled before."""
+    """Label points (time, error, step) in this order, each that is far enough from the one labelled
+    before."""
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
     size = np.array([np.log(right / left), np.log(high / low)])
     before = np.full(2, np.inf)
     for time, error, step in points:
         at = np.log([time, error]) / size
         if (np.abs(at - before) > [0.06, 0.04]).any():
-            axis.annotate(f"{step:.2g}", (time, error), xytext=(-6, -6), textcoords="offset points", fontsize=7,
-                          color=INK, ha="right", va="top")  # fmt: skip
+            axis.annotate(
+                f"{step:.2g}",
+                (time, error),
+                xytext=(-6, -6),
+                textcoords="offset points",
+                fontsize=7,
+                color=INK,
+                ha="right",
+                va="top",
+            )
             before = at
 
 
 def accuracy_figure(found: IntegratorAccuracy):
-    """Log error against log run time, a curve for each integrator; rings mark the best trials, bars the time spread."""
+    """Log error against log run time, a curve for each integrator; rings mark the best trials, bars
+    the time spread."""
     s = found.trial_system
     per = "ps" if s.time_unit == "fs" else "s"
     figure = new_figure(10, 4.8)
     left, right = figure.subplots(1, 2)
     rotates = any(not np.isnan(t.rotation_error) for t in found.trials)
     titles = {
-        "trajectory_error": f"error of {'Q' if rotates else f'X ({s.length_unit})'} after {s.span:g} {per}",
+        "trajectory_error": (
+            f"error of {'Q' if rotates else f'X ({s.length_unit})'} after {s.span:g} {per}"
+        ),
         "energy_rms": f"rms error of the energy, {s.energy_unit}",
     }
     names = list(dict.fromkeys(t.integrator for t in found.trials))
     for axis, (error, title) in zip((left, right), titles.items(), strict=True):
         for k, name in enumerate(names):
-            trials = [t for t in found.trials if t.integrator == name and not t.diverged and getattr(t, error) > 0]
+            trials = [
+                t
+                for t in found.trials
+                if t.integrator == name and not t.diverged and getattr(t, error) > 0
+            ]
             times, errors = [t.time / s.span for t in trials], [getattr(t, error) for t in trials]
             style = curve_style(k)
             axis.loglog(times, errors, ms=3.5, lw=1.2, label=name, **style)
-            low, high = ([abs(end(t.seconds) - t.time) / s.span for t in trials] for end in (min, max))
-            axis.errorbar(times, errors, xerr=[low, high], fmt="none", ecolor=style["color"], elinewidth=0.7)
+            low, high = (
+                [abs(end(t.seconds) - t.time) / s.span for t in trials] for end in (min, max)
+            )
+            axis.errorbar(
+                times, errors, xerr=[low, high], fmt="none", ecolor=style["color"], elinewidth=0.7
+            )
         front = [t for t in found.front(error) if getattr(t, error) > 0]
-        ring = {"ms": 9, "mfc": "none", "mec": INK, "mew": 0.8, "label": f"best, with its step ({s.time_unit})"}
-        axis.loglog([t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring)
+        ring = {
+            "ms": 9,
+            "mfc": "none",
+            "mec": INK,
+            "mew": 0.8,
+            "label": f"best, with its step ({s.time_unit})",
+        }
+        axis.loglog(
+            [t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring
+        )
         _label_steps(axis, [(t.time / s.span, getattr(t, error), t.timestep) for t in front])
         axis.set_title(title, loc="left", fontsize=9, color=INK)
         open_axis(axis, which="both")
@@ -291,19 +402,42 @@ def accuracy_figure(found: IntegratorAccuracy):
         label_minor_ticks(axis.yaxis)
     figure.supxlabel(f"computing time (s) per {per} of motion", color=INK, fontsize=10)
     left.axhline(found.reference_error, color=FAINT, lw=0.8, ls=":")
-    left.annotate("error of the reference", (1, found.reference_error), xycoords=("axes fraction", "data"), fontsize=8,
-                  color=FAINT, ha="right", va="bottom")  # fmt: skip
-    right.legend(frameon=False, fontsize=8, handlelength=2.8, loc="center left", bbox_to_anchor=(1.0, 0.5),
-                 labelcolor=INK)  # fmt: skip
+    left.annotate(
+        "error of the reference",
+        (1, found.reference_error),
+        xycoords=("axes fraction", "data"),
+        fontsize=8,
+        color=FAINT,
+        ha="right",
+        va="bottom",
+    )
+    right.legend(
+        frameon=False,
+        fontsize=8,
+        handlelength=2.8,
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        labelcolor=INK,
+    )
     return figure
 
 
 def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
     colored = chips(list(dict.fromkeys(t.integrator for t in found.trials)))
-    titles = [f"for, over {_span(found)}", "the cheapest is", "gain", "as fast within the spread of the timings"]
+    titles = [
+        f"for, over {_span(found)}",
+        "the cheapest is",
+        "gain",
+        "as fast within the spread of the timings",
+    ]
     parts = [
-        section("Recommendations", table(titles, cheapest(found), words=True), items(remarks(found))),
-        section("Error against run time", wide(accuracy_figure(found), "accuracy", "log error over log run time")),
+        section(
+            "Recommendations", table(titles, cheapest(found), words=True), items(remarks(found))
+        ),
+        section(
+            "Error against run time",
+            wide(accuracy_figure(found), "accuracy", "log error over log run time"),
+        ),
         section("All trials", table(*trial_table(found).shown(), marked=colored)),
         section("How to repeat it", code(command)),
     ]

@@ -1,4 +1,5 @@
-"""`rigidmd accuracy --averages`: samples the last stage of a scene by several methods and steps, for their biases."""
+"""`rigidmd accuracy --averages`: samples the last stage of a scene by several methods and steps,
+for their biases."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -32,12 +33,15 @@ UNSEEN = 2.0  # a slope of at most this many standard errors counts as not seen
 class AveragedQuantity(NamedTuple):
     name: str
     unit: str
-    scale: float  # of which the bias limit is a fraction; NaN: the limit of the quantity at a step of zero
+    # of which the bias limit is a fraction; NaN: the limit of the quantity at a step of zero
+    scale: float
     exact: float | None = None  # the limit where it is known
     bias_unit: str = ""  # of reported biases, `unit` when empty
     bias_size: float = 1.0  # of one such unit, in `unit`
     only: str = ""  # the integrator that has it, where not all do
-    is_main: bool = True  # whether it is printed and drawn; all are in accuracy.csv and accuracy.json
+    is_main: bool = (
+        True  # whether it is printed and drawn; all are in accuracy.csv and accuracy.json
+    )
     of: str = "its value"  # name of the scale
 
     @property
@@ -52,8 +56,12 @@ class AverageRun:
     timestep: float  # fs
     forces_per_ps: float
     seconds_per_ns: float | None = None
-    averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
-    short: list[str] = field(default_factory=list)  # names of averages whose sampling is too short for an error
+    averages: dict[str, tuple[float, float]] = field(
+        default_factory=dict
+    )  # name -> mean, standard error
+    short: list[str] = field(
+        default_factory=list
+    )  # names of averages whose sampling is too short for an error
     failure: str = ""  # why there are none
 
     @property
@@ -110,14 +118,17 @@ class Averages:
     def bias_limit(self, quantity: AveragedQuantity) -> float:
         """The bias whose step is reported, in the quantity's unit of biases."""
         fit = self.fit(quantity)
-        scale = quantity.scale if quantity.scale == quantity.scale or fit is None else abs(fit.limit)
+        scale = (
+            quantity.scale if quantity.scale == quantity.scale or fit is None else abs(fit.limit)
+        )
         return BIAS_LIMIT * scale / quantity.bias_size
 
     def step_at_limit(self, method: str, quantity: AveragedQuantity) -> tuple[float, bool] | None:
-        """The step (fs) at which the bias of a method reaches the limit, and whether a bias was seen.
+        """The step (fs) at which the bias of a method reaches the limit, and whether a bias was
+        seen.
 
-        A bias is not seen if its slope is within `UNSEEN` errors of 0; it is then smaller up to that step. None if the
-        fit has no slope of the method.
+        A bias is not seen if its slope is within `UNSEEN` errors of 0; it is then smaller up to
+        that step. None if the fit has no slope of the method.
         """
         fit = self.fit(quantity)
         if fit is None or method not in fit.slopes:
@@ -125,35 +136,51 @@ class Averages:
         slope, error = fit.slopes[method]
         seen = abs(slope) > UNSEEN * error
         steepest = abs(slope) if seen else abs(slope) + UNSEEN * error
-        return (sqrt(self.bias_limit(quantity) * quantity.bias_size / steepest), seen) if steepest > 0 else None
+        return (
+            (sqrt(self.bias_limit(quantity) * quantity.bias_size / steepest), seen)
+            if steepest > 0
+            else None
+        )
 
 
 #: Measured besides the method of the stage when no methods are given.
-DEFAULT_METHODS = ("baoab+langevin", "velocity_verlet+velocity_rescaling", "velocity_verlet+nose_hoover")
+DEFAULT_METHODS = (
+    "baoab+langevin",
+    "velocity_verlet+velocity_rescaling",
+    "velocity_verlet+nose_hoover",
+)
 LADDER = (0.15, 0.3, 0.45, 0.6, 0.75)  # time steps, in units of the longest stable step
 #: Time steps, in units of the scene's, where the longest stable step is unknown.
 LADDER_AROUND_SCENE = (0.5, 1.0, 2.0, 4.0)
 SAMPLE_PS = 20.0
-#: Time before sampling, as a fraction of the time sampled: the start has the distribution of another step.
+#: Time before sampling, as a fraction of the time sampled: the start has the distribution of
+#: another step.
 EQUILIBRATION = 0.2
-#: Interval of the samples that are averaged, ps, and their largest number; longer runs have longer intervals.
+#: Interval of the samples that are averaged, ps, and their largest number; longer runs have longer
+#: intervals.
 SAMPLING_INTERVAL_PS, MOST_SAMPLES = 0.02, 4000
 
 
 def check_engine_is_rigidmd(scene: MolecularScene | BodyScene) -> None:
-    """Raise SceneError if a scene names another engine: only the integrators of rigidmd are measured."""
+    """Raise SceneError if a scene names another engine: only the integrators of rigidmd are
+    measured."""
     if isinstance(scene, MolecularScene) and scene.engine.is_external:
         error = f"engine.name = {scene.engine.name!r}: accuracy measures rigidmd; leave it out"
         raise SceneError(scene.source, [error])
 
 
 def measure_averages(
-    scene: MolecularScene | BodyScene, methods: list[str] | None = None, timesteps: list[float] | None = None,
-    sample: float = SAMPLE_PS, progress: Callable[[float], object] = lambda fraction: None,
-) -> Averages:  # fmt: skip
-    """Means of U, temperatures, and pressure or density in the last stage, by methods at time steps. Raises SceneError.
+    scene: MolecularScene | BodyScene,
+    methods: list[str] | None = None,
+    timesteps: list[float] | None = None,
+    sample: float = SAMPLE_PS,
+    progress: Callable[[float], object] = lambda fraction: None,
+) -> Averages:
+    """Means of U, temperatures, and pressure or density in the last stage, by methods at time
+    steps. Raises SceneError.
 
-    methods : "integrator" or "integrator+thermostat"; default: the method of the stage and `DEFAULT_METHODS`
+    methods : "integrator" or "integrator+thermostat"; default: the method of the stage and
+        `DEFAULT_METHODS`
     timesteps : fs, the same for all; default: fractions of the longest stable step of each method
     sample : ps that each is sampled, after a fifth of that
     progress : called with the fraction that is done; at 0, after all arguments have been checked
@@ -161,7 +188,10 @@ def measure_averages(
     The earlier stages of the scene run before, once.
     """
     if isinstance(scene, BodyScene):
-        raise SceneError(scene.source, [f"{option('averages')} is for molecules; a single body has no thermostat"])
+        raise SceneError(
+            scene.source,
+            [f"{option('averages')} is for molecules; a single body has no thermostat"],
+        )
     check_engine_is_rigidmd(scene)
     stage = _with_thermostat(scene)
     schemes = scene.schemes | WITH_THERMOSTAT
@@ -170,7 +200,9 @@ def measure_averages(
         of_stage = [] if stage.is_auto else [(stage.integrator, stage.thermostat_kind)]
         pairs = list(dict.fromkeys([*of_stage, *pairs]))
     if not all(0 < length < inf for length in (sample, *(timesteps or []))):
-        raise SceneError("accuracy", [f"time steps and {option('sample_ps')} must be finite and greater than 0"])
+        raise SceneError(
+            "accuracy", [f"time steps and {option('sample_ps')} must be finite and greater than 0"]
+        )
     if timesteps and max(timesteps) * FEMTOSECOND > sample:
         error = f"{max(timesteps):g} fs is longer than the {sample:g} ps sampled with it"
         raise SceneError(option("timesteps"), [error])
@@ -184,9 +216,13 @@ def measure_averages(
         steps = timesteps or [ratio * stage.timestep_fs for ratio in LADDER_AROUND_SCENE]
         if found is not None and not timesteps:
             exact = [ratio * stable_angle(scheme) / found.rate / FEMTOSECOND for ratio in LADDER]
-            steps = [round(step, 1 - floor(log10(step))) for step in exact]  # two digits, for tables and legends
+            steps = [
+                round(step, 1 - floor(log10(step))) for step in exact
+            ]  # two digits, for tables and legends
         for step in sorted(set(steps)):
-            run = AverageRun(integrator, thermostat, step, scheme.force_evaluations / (step * FEMTOSECOND))
+            run = AverageRun(
+                integrator, thermostat, step, scheme.force_evaluations / (step * FEMTOSECOND)
+            )
             plan.append((_with_method(stage, integrator, thermostat, step, sample), run))
     whole = sum(run.forces_per_ps for _, run in plan)
     done = 0.0
@@ -208,28 +244,46 @@ def measure_averages(
     exact = stage.temperatures[0]
     for name, n in (("T_trans", freedom.translation), ("T_rot", freedom.rotation)):
         if n:
-            unbiased = AveragedQuantity(f"{name} unbiased", "K", exact, exact, only="velocity_verlet")
+            unbiased = AveragedQuantity(
+                f"{name} unbiased", "K", exact, exact, only="velocity_verlet"
+            )
             quantities += [AveragedQuantity(name, "K", exact, exact), unbiased]
     if stage.ensemble == "npt":
         quantities.append(AveragedQuantity("density", "g/cm³", nan))
     elif state.volume < np.inf:
-        quantities.append(AveragedQuantity("pressure", "bar", count * thermal / state.volume / BAR, of="N kT/V"))
+        quantities.append(
+            AveragedQuantity("pressure", "bar", count * thermal / state.volume / BAR, of="N kT/V")
+        )
     runs = [run for _, run in plan]
     for column in COLUMNS.values():  # where it varies
         if any(run.averages.get(column.header, (0.0, 0.0))[1] > 0 for run in runs):
             quantities.append(AveragedQuantity(column.header, column.unit, nan, is_main=False))
-    return Averages(scene.name, stage.label, stage.temperatures[0], count, freedom.total, sample, quantities, runs)
+    return Averages(
+        scene.name,
+        stage.label,
+        stage.temperatures[0],
+        count,
+        freedom.total,
+        sample,
+        quantities,
+        runs,
+    )
 
 
 def start_of_last_stage(scene: MolecularScene) -> tuple[Simulation, State]:
-    """A simulation of a scene, and the state in which its last stage begins. Earlier stages run without files."""
+    """A simulation of a scene, and the state in which its last stage begins. Earlier stages run
+    without files."""
     simulation = Simulation(scene)
     if len(scene.stages) > 1:
         interval = scene.output.log_interval_ps if scene.stages[-1].volume else 1e9
         quiet = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": interval})
         resolved = simulation.scene
-        results = Simulation(resolved.model_copy(update={"stages": resolved.stages[:-1], "output": quiet})).run()
-        scale_to_mean_box(simulation.system, results.state, cast(Samples, results.samples), len(scene.stages) - 1)
+        results = Simulation(
+            resolved.model_copy(update={"stages": resolved.stages[:-1], "output": quiet})
+        ).run()
+        scale_to_mean_box(
+            simulation.system, results.state, cast(Samples, results.samples), len(scene.stages) - 1
+        )
         return simulation, results.state
     simulation.start()
     return simulation, simulation.state.copy()
@@ -240,28 +294,49 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
     stage = scene.stages[-1]
     if not stage.has_thermostat:
         advice = "give it ensemble = 'nvt' or 'npt'"
-        error = f"{option('averages')} samples the last stage, and {stage.ensemble} has no thermostat: {advice}"
+        error = (
+            f"{option('averages')} samples the last stage, and {stage.ensemble} has no thermostat:"
+            f" {advice}"
+        )
         raise SceneError(scene.source, [error])
-    if len(set(stage.temperatures)) > 1 or (stage.has_barostat and stage.pressures[0] != stage.pressures[1]):
-        error = f"{option('averages')} needs one temperature and one pressure in the last stage; here they change"
+    if len(set(stage.temperatures)) > 1 or (
+        stage.has_barostat and stage.pressures[0] != stage.pressures[1]
+    ):
+        error = (
+            f"{option('averages')} needs one temperature and one pressure in the last stage; here"
+            " they change"
+        )
         raise SceneError(scene.source, [error])
     return stage
 
 
 def _parse_method(text: str, stage: Stage, known: Iterable[str]) -> tuple[str, str]:
-    """Integrator and thermostat of "integrator+thermostat"; default: Langevin for baoab, else the stage's."""
+    """Integrator and thermostat of "integrator+thermostat"; default: Langevin for baoab, else the
+    stage's."""
     integrator, _, thermostat = (part.strip() for part in text.partition("+"))
-    thermostat = thermostat or ("langevin" if integrator in WITH_THERMOSTAT else stage.thermostat_kind)
-    for what, name, names in (("integrator", integrator, known), ("thermostat", thermostat, THERMOSTATS)):
+    thermostat = thermostat or (
+        "langevin" if integrator in WITH_THERMOSTAT else stage.thermostat_kind
+    )
+    for what, name, names in (
+        ("integrator", integrator, known),
+        ("thermostat", thermostat, THERMOSTATS),
+    ):
         if name not in names:
             error = f"unknown {what} {name}{did_you_mean(name, names)} (known: {', '.join(names)})"
             raise SceneError(option("integrators"), [error])
     return integrator, thermostat
 
 
-def _with_method(stage: Stage, integrator: str, thermostat: str, step: float, sample: float) -> Stage:
-    """The stage by another method at another step; its settings of a thermostat or rotor are kept only for the same."""
-    changes = dict.fromkeys(ERROR_TARGETS) | {"integrator": integrator, "thermostat": thermostat, "timestep_fs": step}
+def _with_method(
+    stage: Stage, integrator: str, thermostat: str, step: float, sample: float
+) -> Stage:
+    """The stage by another method at another step; its settings of a thermostat or rotor are kept
+    only for the same."""
+    changes = dict.fromkeys(ERROR_TARGETS) | {
+        "integrator": integrator,
+        "thermostat": thermostat,
+        "timestep_fs": step,
+    }
     changes["duration_ps"] = (1 + EQUILIBRATION) * sample
     if thermostat != stage.thermostat_kind:
         changes["thermostat_time_ps"] = None
@@ -270,7 +345,14 @@ def _with_method(stage: Stage, integrator: str, thermostat: str, step: float, sa
     return stage.model_copy(update=changes)
 
 
-def _sample(scene: MolecularScene, stage: Stage, state: State, run: AverageRun, sample: float, progress: Every) -> None:
+def _sample(
+    scene: MolecularScene,
+    stage: Stage,
+    state: State,
+    run: AverageRun,
+    sample: float,
+    progress: Every,
+) -> None:
     """Run a stage from a state, and store means and cost in `run`."""
     interval = max(SAMPLING_INTERVAL_PS, sample / MOST_SAMPLES)
     output = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": interval})
@@ -290,12 +372,16 @@ def _sample(scene: MolecularScene, stage: Stage, state: State, run: AverageRun, 
     count = len(simulation.system.model.species)
     series = {
         "U": results["potential"] / count,
-        "T_trans": results["temperature_translation"], "T_rot": results["temperature_rotation"],
+        "T_trans": results["temperature_translation"],
+        "T_rot": results["temperature_rotation"],
         "T_trans unbiased": results["temperature_translation_unbiased"],
         "T_rot unbiased": results["temperature_rotation_unbiased"],
-        "pressure": results["pressure_bar"], "density": results["density"],
-    }  # fmt: skip
-    series |= {column.header: results[name] for name, column in COLUMNS.items() if name not in NOT_AVERAGED}
+        "pressure": results["pressure_bar"],
+        "density": results["density"],
+    }
+    series |= {
+        column.header: results[name] for name, column in COLUMNS.items() if name not in NOT_AVERAGED
+    }
     for name, values in series.items():
         average, error = mean_and_error(values[late])
         if average is not None and error is not None:

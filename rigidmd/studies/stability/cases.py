@@ -1,4 +1,5 @@
-"""Stability cases: their registry, the scenes that they make in code and run, the outcomes and the verdicts on them."""
+"""Stability cases: their registry, the scenes that they make in code and run, the outcomes and the
+verdicts on them."""
 
 import time as clock
 from collections.abc import Callable
@@ -25,7 +26,8 @@ VERDICTS = {
     UNDETECTED: "the answer is wrong and nothing shows it",
     CRASH: "an exception that is not an error of rigidmd",
 }
-#: A run is bounded while the errors of conserved quantities stay below this fraction of the kinetic energy.
+#: A run is bounded while the errors of conserved quantities stay below this fraction of the kinetic
+#: energy.
 BOUND = 0.1
 #: Most doublings of a step that is bounded; ratio at which bisection ends.
 DOUBLINGS, RATIO = 10, 1.1
@@ -33,7 +35,9 @@ DOUBLINGS, RATIO = 10, 1.1
 
 class Outcome(NamedTuple):
     error: float = nan  # with respect to the known answer, in the unit of the case
-    reported_error: float = nan  # largest error of conserved quantities that the run itself reports, relative
+    reported_error: float = (
+        nan  # largest error of conserved quantities that the run itself reports, relative
+    )
     message: str = ""  # of the rigidmd error that refused or stopped it
     crash: str = ""
     seconds: float = 0.0
@@ -74,7 +78,8 @@ class StepLimit(NamedTuple):
     tried: float  # the longest step that was tried
 
 
-#: run(result, quick) adds runs and step limits to the result; quick : fewer settings and integrators.
+#: run(result, quick) adds runs and step limits to the result; quick : fewer settings and
+#: integrators.
 CaseFunction = Callable[["CaseResult", bool], None]
 
 
@@ -93,23 +98,35 @@ class CaseResult:
     notes: list[str] = field(default_factory=list)
 
     def add(
-        self, setting: str, outcome: Outcome, allowed: float = nan, family: str = "", step: float = nan,
+        self,
+        setting: str,
+        outcome: Outcome,
+        allowed: float = nan,
+        family: str = "",
+        step: float = nan,
         expected: tuple[str, ...] = (RIGHT,),
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.runs.append(CaseRun(setting, family, step, allowed, expected, outcome))
 
     @property
     def families(self) -> list[str]:
-        return list(dict.fromkeys([t.family for t in self.runs] + [limit.family for limit in self.limits]))
+        return list(
+            dict.fromkeys([t.family for t in self.runs] + [limit.family for limit in self.limits])
+        )
 
     @property
     def failures(self) -> list[str]:
         """Undetected errors and crashes, a sentence each."""
         runs = [t for t in self.runs if t.verdict in (UNDETECTED, CRASH)]
-        found = [f"{self.name}, {t.setting} {t.family}".strip() + f": {t.outcome.crash or UNDETECTED}" for t in runs]
+        found = [
+            f"{self.name}, {t.setting} {t.family}".strip() + f": {t.outcome.crash or UNDETECTED}"
+            for t in runs
+        ]
         for limit in self.limits:
             if limit.beyond in (UNDETECTED, CRASH):
-                where = f"{self.name}, {limit.setting} {limit.family}, steps beyond {limit.longest:.3g}"
+                where = (
+                    f"{self.name}, {limit.setting} {limit.family}, steps beyond {limit.longest:.3g}"
+                )
                 found.append(f"{where}: {limit.message or UNDETECTED}")
         return found
 
@@ -131,12 +148,16 @@ def failure(outcome: Outcome) -> str:
 
 
 def longest_step(
-    run: Callable[[float], Outcome], start: float, setting: str = "", family: str = "", bound: float = BOUND
+    run: Callable[[float], Outcome],
+    start: float,
+    setting: str = "",
+    family: str = "",
+    bound: float = BOUND,
 ) -> StepLimit:
     """The longest step that is bounded: doubled or halved from `start`, then bisected.
 
-    Runs just beyond the limit and at two and four times it show how it fails. The worst outcome is reported, because a
-    step that is far too long can seem stable again.
+    Runs just beyond the limit and at two and four times it show how it fails. The worst outcome is
+    reported, because a step that is far too long can seem stable again.
     """
     seen: dict[float, Outcome] = {}
 
@@ -158,16 +179,22 @@ def longest_step(
         is_bounded(2 * bad)
         is_bounded(4 * bad)
         ways = {failure(outcome): outcome for step, outcome in seen.items() if step >= bad}
-        beyond = next(way for way in (CRASH, UNDETECTED, "blow-up", "drift", "detected") if way in ways)
+        beyond = next(
+            way for way in (CRASH, UNDETECTED, "blow-up", "drift", "detected") if way in ways
+        )
         message = ways[beyond].crash or ways[beyond].message
     seconds = sum(outcome.seconds for outcome in seen.values())
-    return StepLimit(setting, family, inf if bad == inf else good, beyond, message, seconds, max(seen))
+    return StepLimit(
+        setting, family, inf if bad == inf else good, beyond, message, seconds, max(seen)
+    )
 
 
 CASES: dict[str, CaseResult] = {}  # without results
 
 
-def register(group: int, error: str = "", step: str = "s") -> Callable[[CaseFunction], CaseFunction]:
+def register(
+    group: int, error: str = "", step: str = "s"
+) -> Callable[[CaseFunction], CaseFunction]:
     """Register a function as a case under its own name, with the first line of its docstring."""
 
     def add(run: CaseFunction) -> CaseFunction:
@@ -178,7 +205,8 @@ def register(group: int, error: str = "", step: str = "s") -> Callable[[CaseFunc
     return add
 
 
-#: Integrator families: velocity Verlet with both rotors, a symplectic Nystrom scheme, compositions with split rotors.
+#: Integrator families: velocity Verlet with both rotors, a symplectic Nystrom scheme, compositions
+#: with split rotors.
 FAMILIES = {
     "velocity_verlet": {"integrator": "velocity_verlet", "rotor": "split"},
     "velocity_verlet, exact rotor": {"integrator": "velocity_verlet", "rotor": "exact"},
@@ -201,7 +229,8 @@ def families(quick: bool) -> tuple[str, ...]:
 
 
 def attempt(run: Callable[..., Outcome]) -> Callable[..., Outcome]:
-    """A run whose errors are outcomes: one of rigidmd becomes a message, any other exception a crash."""
+    """A run whose errors are outcomes: one of rigidmd becomes a message, any other exception a
+    crash."""
 
     @wraps(run)
     def attempted(*arguments: Any, **options: Any) -> Outcome:
@@ -223,31 +252,59 @@ def body_scene(data: dict, step: float, duration: float, family: str, samples: i
     known = FAMILIES | TEXTBOOK | {POINT: {"integrator": "velocity_verlet"}}
     run = {"duration_s": float(duration), "timestep_s": float(step)} | known[family]
     interval = min(max(float(step), duration / samples), float(duration))
-    return data | {"run": run, "output": {"trajectory": False, "figures": False, "interval_s": interval}}
+    return data | {
+        "run": run,
+        "output": {"trajectory": False, "figures": False, "interval_s": interval},
+    }
 
 
 @attempt
 def run_body(
-    data: dict, step: float, duration: float, family: str, error: Callable[[Results], float], samples: int = 50
+    data: dict,
+    step: float,
+    duration: float,
+    family: str,
+    error: Callable[[Results], float],
+    samples: int = 50,
 ) -> Outcome:
-    """The outcome of a run of a body for a duration (s); error(results) compares with the known answer."""
+    """The outcome of a run of a body for a duration (s); error(results) compares with the known
+    answer."""
     results = Simulation(Scene.from_dict(body_scene(data, step, duration, family, samples))).run()
     wrong = list(results.summary["largest_relative_error"].values())
-    reported_error = max([*wrong, results.summary["largest_orthogonality_error"] or 0.0], default=0.0)
+    reported_error = max(
+        [*wrong, results.summary["largest_orthogonality_error"] or 0.0], default=0.0
+    )
     return Outcome(float(error(results)), float(reported_error))
 
 
 def molecules_scene(
-    molecules: list[dict], box: dict, step: float, steps: int, family: str = SPLIT, temperature: float | None = 298.0,
-    thermostat: dict | None = None, forces: dict | None = None, samples: int = 25,
-) -> dict:  # fmt: skip
-    """The tables of a scene of molecules: one stage of `steps` steps (fs), sampled `samples` times, no files."""
+    molecules: list[dict],
+    box: dict,
+    step: float,
+    steps: int,
+    family: str = SPLIT,
+    temperature: float | None = 298.0,
+    thermostat: dict | None = None,
+    forces: dict | None = None,
+    samples: int = 25,
+) -> dict:
+    """The tables of a scene of molecules: one stage of `steps` steps (fs), sampled `samples` times,
+    no files."""
     stage = {"duration_ps": step * steps / 1000, "timestep_fs": float(step)} | FAMILIES[family]
     if thermostat is not None:
         stage |= {"ensemble": "nvt"} | thermostat
     start = {} if temperature is None else {"temperature_K": float(temperature)}
-    output = {"trajectory": False, "log_interval_ps": min(1e9, step * max(1, steps // samples) / 1000)}
-    scene = {"box": box, "molecules": molecules, "forces": forces or {}, "start": start, "stages": [stage]}
+    output = {
+        "trajectory": False,
+        "log_interval_ps": min(1e9, step * max(1, steps // samples) / 1000),
+    }
+    scene = {
+        "box": box,
+        "molecules": molecules,
+        "forces": forces or {},
+        "start": start,
+        "stages": [stage],
+    }
     return scene | {"output": output}
 
 
@@ -259,7 +316,8 @@ def simulate(data: dict, state: State | None = None, folder: str = ".") -> Resul
 
 
 def energy_error(results: Results, scale: float = 0.0) -> float:
-    """Largest change of the conserved energy, relative to the initial kinetic energy (or a scale, kJ/mol)."""
+    """Largest change of the conserved energy, relative to the initial kinetic energy (or a scale,
+    kJ/mol)."""
     wrong = np.abs(results["drift"])
     size = scale or results["kinetic"][0]
     return float(wrong.max() / size) if np.isfinite(wrong).all() and size > 0 else inf
@@ -267,10 +325,14 @@ def energy_error(results: Results, scale: float = 0.0) -> float:
 
 @attempt
 def run_molecules(
-    data: dict, state: State | None = None, error: Callable[[Results], float] | None = None, scale: float = 0.0,
+    data: dict,
+    state: State | None = None,
+    error: Callable[[Results], float] | None = None,
+    scale: float = 0.0,
     folder: str = ".",
-) -> Outcome:  # fmt: skip
-    """The outcome of a run of molecules; its error is the energy error unless error(results) computes another."""
+) -> Outcome:
+    """The outcome of a run of molecules; its error is the energy error unless error(results)
+    computes another."""
     results = simulate(data, state, folder)
     reported_error = energy_error(results, scale)
     return Outcome(reported_error if error is None else float(error(results)), reported_error)
@@ -278,6 +340,7 @@ def run_molecules(
 
 @attempt
 def run_invalid(data: dict) -> Outcome:
-    """The outcome of a scene that must be refused before it runs; one that runs has no right answer."""
+    """The outcome of a scene that must be refused before it runs; one that runs has no right
+    answer."""
     Simulation(Scene.from_dict(data)).run()
     return Outcome(nan, 0.0)

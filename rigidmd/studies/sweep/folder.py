@@ -1,4 +1,5 @@
-"""The folder of a sweep: its manifest sweep.json, and a folder for each point, which is the folder of a run."""
+"""The folder of a sweep: its manifest sweep.json, and a folder for each point, which is the folder
+of a run."""
 
 import contextlib
 import hashlib
@@ -13,7 +14,15 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rigidmd.core.files import writing
 from rigidmd.errors import OutputError, option
-from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, check_inside, offsets_of, written_by_runs
+from rigidmd.io.folder import (
+    LOCK,
+    MARKER,
+    SUMMARY,
+    SWEEP,
+    check_inside,
+    offsets_of,
+    written_by_runs,
+)
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json
 from rigidmd.scene.validation import not_none
@@ -61,10 +70,13 @@ class Manifest:
 
     def overrides(self, point: SweepPoint) -> dict[str, Any]:
         """Dotted key -> value of a point, for `Scene.read`."""
-        return self.fixed | {key: value for first, value in point.values.items() for key in self.keys[first]}
+        return self.fixed | {
+            key: value for first, value in point.values.items() for key in self.keys[first]
+        }
 
     def combinations(self) -> list[tuple[dict[str, Any], list[SweepPoint]]]:
-        """The values of all keys but `seed`, each with its points: its replicas, if the seed is swept."""
+        """The values of all keys but `seed`, each with its points: its replicas, if the seed is
+        swept."""
         found: dict[str, tuple[dict[str, Any], list[SweepPoint]]] = {}
         for point in self.points:
             values = {key: value for key, value in point.values.items() if key != SEED}
@@ -88,7 +100,9 @@ def read_manifest(folder: Path) -> Manifest:
     found = not_none(read_json(path, Manifest, remedy))
     names = [point.folder for point in found.points]
     problem = ""
-    if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len({*names}) < len(names):
+    if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len(
+        {*names}
+    ) < len(names):
         problem = "points with invalid names of folders"
     if any(point.values.keys() != found.keys.keys() for point in found.points):
         problem = "points without values of all keys"
@@ -107,7 +121,8 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def clear_sweep(folder: Path, names: Iterable[str]) -> None:
-    """Remove the files of a sweep, and the files of runs in folders of these names. Raises OutputError."""
+    """Remove the files of a sweep, and the files of runs in folders of these names. Raises
+    OutputError."""
     for inner in [*(folder / name for name in names if Path(name).name == name), folder]:
         if not inner.is_dir() or (inner.is_symlink() and inner != folder):
             continue
@@ -123,7 +138,8 @@ def clear_sweep(folder: Path, names: Iterable[str]) -> None:
 
 
 def state_on_disk(folder: Path, point: SweepPoint) -> State:
-    """The state that the folder of a point shows: finished, interrupted, or waiting if nothing has run there."""
+    """The state that the folder of a point shows: finished, interrupted, or waiting if nothing has
+    run there."""
     inner = folder / point.folder
     with contextlib.suppress(OutputError):
         summary = read_json(inner / SUMMARY, Summary) or Summary(interrupted=True)
@@ -139,13 +155,18 @@ def short_keys(keys: Iterable[str]) -> dict[str, str]:
     for key in keys:
         parts = key.split(".")
         ends = (".".join(parts[-n:]) for n in range(1, len(parts) + 1))
-        alone = (end for end in ends if not any(other != key and f".{other}".endswith(f".{end}") for other in keys))
+        alone = (
+            end
+            for end in ends
+            if not any(other != key and f".{other}".endswith(f".{end}") for other in keys)
+        )
         found[key] = re.sub(r"[^\w.+\-]", "-", next(alone, key))
     return found
 
 
 def value_name(value: Any) -> str:
-    """A value in the name of a folder: letters, digits and . + - only; equal values have equal names."""
+    """A value in the name of a folder: letters, digits and . + - only; equal values have equal
+    names."""
     match value:
         case bool():
             return str(value).lower()
@@ -164,7 +185,11 @@ def value_name(value: Any) -> str:
 def point_name(values: Mapping[str, Any], short: Mapping[str, str]) -> str:
     """The name of a point's folder: temperature_K=280_seed=1."""
     name = "_".join(f"{short[key]}={value_name(value)}" for key, value in values.items())
-    return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return (
+        name
+        if len(name) <= LONGEST
+        else f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    )
 
 
 def combination_folder(folder: Path, values: Mapping[str, Any], short: Mapping[str, str]) -> Path:

@@ -1,4 +1,5 @@
-"""Averages of a sweep over a time step, extrapolated to a step of 0: extrapolation.csv, .png and .html."""
+"""Averages of a sweep over a time step, extrapolated to a step of 0: extrapolation.csv, .png and
+.html."""
 
 import csv
 from dataclasses import dataclass, field
@@ -27,7 +28,8 @@ MOST_PANELS, ACROSS = 12, 3
 
 
 class Limit(NamedTuple):
-    """A quantity at a step of 0, for a combination of values of the keys other than the step and the seed."""
+    """A quantity at a step of 0, for a combination of values of the keys other than the step and
+    the seed."""
 
     values: dict[str, Any]
     method: str  # integrator
@@ -54,7 +56,9 @@ class Limits(NamedTuple):
     @property
     def title(self) -> str:
         raised = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-        powers = dict.fromkeys(f"dt{str(limit.fit.order).translate(raised)} ({limit.method})" for limit in self.limits)
+        powers = dict.fromkeys(
+            f"dt{str(limit.fit.order).translate(raised)} ({limit.method})" for limit in self.limits
+        )
         return f"averages at a step of 0, from errors of order {', '.join(powers)} in {self.key}"
 
     def columns(self) -> list[Column]:
@@ -62,36 +66,55 @@ class Limits(NamedTuple):
         return key_columns(self.limits[0].values) if self.limits else []
 
     def as_text(self) -> Table:
-        """For readers: limits, chi² over its degrees of freedom, the longest step of the fit, and biases."""
+        """For readers: limits, chi² over its degrees of freedom, the longest step of the fit, and
+        biases."""
         short = short_keys(self.limits[0].values) if self.limits else {}
         found = [column._replace(header=short[column.header]) for column in self.columns()]
         found += [
             Column("average", lambda limit: SHORT.get(limit.quantity, limit.quantity)),
             Column("limit", lambda limit: limit.fit.describe_limit()),
             Column(
-                "chi²/dof", lambda limit: f"{limit.fit.chi2:.2g}/{limit.fit.freedom}" if limit.fit.freedom else None
+                "chi²/dof",
+                lambda limit: (
+                    f"{limit.fit.chi2:.2g}/{limit.fit.freedom}" if limit.fit.freedom else None
+                ),
             ),
             Column("to (fs)", lambda limit: f"{limit.fit.longest:g}"),
         ]
         for step in self.steps:
-            bias = lambda limit, step=step: (at := limit.bias(step)) and format_signed(*at)  # noqa: E731
+
+            def bias(limit, step=step):
+                return (at := limit.bias(step)) and format_signed(*at)
+
             found.append(Column(f"bias at {step:g} fs", bias))
         return Table(found, self.limits)
 
     def as_columns(self) -> Table:
         """The table of extrapolation.csv."""
-        digits = lambda pair: pair and list(map(nine_digits, pair))  # noqa: E731
+
+        def digits(pair):
+            return pair and list(map(nine_digits, pair))
+
         found = [*self.columns(), Column("average", lambda limit: limit.quantity)]
-        found += [Column("integrator", lambda limit: limit.method), Column("order", lambda limit: limit.fit.order)]
-        found += with_error("limit", lambda limit: digits((limit.fit.limit, limit.fit.limit_error)), "limit error")
         found += [
-            Column("chi2", lambda limit: nine_digits(limit.fit.chi2) if limit.fit.freedom else None),
+            Column("integrator", lambda limit: limit.method),
+            Column("order", lambda limit: limit.fit.order),
+        ]
+        found += with_error(
+            "limit", lambda limit: digits((limit.fit.limit, limit.fit.limit_error)), "limit error"
+        )
+        found += [
+            Column(
+                "chi2", lambda limit: nine_digits(limit.fit.chi2) if limit.fit.freedom else None
+            ),
             Column("degrees of freedom", lambda limit: limit.fit.freedom),
             Column("longest step in fit (fs)", lambda limit: limit.fit.longest),
         ]
         for step in self.steps:
             name = f"bias at {step:g} fs"
-            found += with_error(name, lambda limit, step=step: digits(limit.bias(step)), f"{name} error")
+            found += with_error(
+                name, lambda limit, step=step: digits(limit.bias(step)), f"{name} error"
+            )
         return Table(found, self.limits)
 
 
@@ -103,17 +126,27 @@ def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
     first = next((first for first, together in manifest.keys.items() if key in together), None)
     parts = key.split(".")
     stages = scene.stages if isinstance(scene, MolecularScene) else ()
-    named = [k for k, stage in enumerate(stages) if len(parts) == 3 and parts[1] in (str(k), stage.label)]
+    named = [
+        k for k, stage in enumerate(stages) if len(parts) == 3 and parts[1] in (str(k), stage.label)
+    ]
     last = max((k for k, stage in enumerate(stages) if not stage.is_minimisation), default=None)
     problem = ""
     if first is None:
-        problem = f"is not varied; this sweep varies {', '.join(k for keys in manifest.keys.values() for k in keys)}"
+        problem = (
+            "is not varied; this sweep varies"
+            f" {', '.join(k for keys in manifest.keys.values() for k in keys)}"
+        )
     elif parts[0] != "stages" or parts[-1] != "timestep_fs" or not named:
         problem = "is not the time step of a stage of molecules"
     elif last not in named:
-        problem = f"is not the step of the stage whose averages are taken, the last one, {stages[last or 0].label}"
+        problem = (
+            "is not the step of the stage whose averages are taken, the last one,"
+            f" {stages[last or 0].label}"
+        )
     if problem or first is None:
-        advice = f"--set stages.{last or 0}.timestep_fs=1,2,4 {OPTION} stages.{last or 0}.timestep_fs"
+        advice = (
+            f"--set stages.{last or 0}.timestep_fs=1,2,4 {OPTION} stages.{last or 0}.timestep_fs"
+        )
         raise SceneError(OPTION, [f"{key} {problem}; give it a key such as {advice}"])
     return first, named[-1]
 
@@ -148,8 +181,8 @@ class _Group:
 def extrapolate_sweep(folder: Path, manifest: Manifest, key: str) -> Limits:
     """Extrapolate all averages of the logs of a sweep, and the values of analyses, to a step of 0.
 
-    Values of analyses are those of replicas together, where they have been analysed together, else of single runs.
-    Raises SceneError if the key is not a swept time step, OutputError.
+    Values of analyses are those of replicas together, where they have been analysed together, else
+    of single runs. Raises SceneError if the key is not a swept time step, OutputError.
     """
     for point in manifest.points:
         update_state(folder, point)
@@ -170,9 +203,12 @@ def extrapolate_sweep(folder: Path, manifest: Manifest, key: str) -> Limits:
 
 
 def _groups(folder: Path, manifest: Manifest, key: str) -> dict[str, _Group]:
-    """The averages of a sweep by a description of the values of the keys other than the step and the seed."""
+    """The averages of a sweep by a description of the values of the keys other than the step and
+    the seed."""
     short, groups = short_keys(manifest.keys), {}
-    for row, (_, points) in zip(table_of(folder, manifest, True).rows, manifest.combinations(), strict=True):
+    for row, (_, points) in zip(
+        table_of(folder, manifest, True).rows, manifest.combinations(), strict=True
+    ):
         if not row.runs:
             continue
         point = next(point for point in points if point.state == "finished")
@@ -194,7 +230,8 @@ def _groups(folder: Path, manifest: Manifest, key: str) -> dict[str, _Group]:
 
 
 def _values_together(folder: Path) -> dict[str, Together]:
-    """The values of analyses of several runs together that have an error, by their headers. Raises OutputError."""
+    """The values of analyses of several runs together that have an error, by their headers. Raises
+    OutputError."""
     return {
         value.header: Together(value.value, value.error, entry.frames_used.runs)
         for entry in read_table(folder).values()
@@ -217,18 +254,27 @@ def write_limits(folder: Path, found: Limits, command: str) -> list[str]:
 def _page(found: Limits, command: str) -> str:
     note = "mean = limit + slope · dt^order, up to the longest step that chi² allows (column `to`)"
     drawn = "means over the time step, and their limits"
-    return page(f"{found.name}: averages at a step of 0", [
-        f'<p class="faint">{plain(found.title)}</p>',
-        section("Limits and biases", table(*found.as_text().shown()), items([note, *found.missing])),
-        section("Means against the time step", wide(_figure(found), "extrapolation", drawn)),
-        section("How to repeat it", code(command)),
-    ])  # fmt: skip
+    return page(
+        f"{found.name}: averages at a step of 0",
+        [
+            f'<p class="faint">{plain(found.title)}</p>',
+            section(
+                "Limits and biases", table(*found.as_text().shown()), items([note, *found.missing])
+            ),
+            section("Means against the time step", wide(_figure(found), "extrapolation", drawn)),
+            section("How to repeat it", code(command)),
+        ],
+    )
 
 
 def _figure(found: Limits):
-    """A panel for each of the main averages: means with error bars, the fit, and the limit with its error at 0."""
+    """A panel for each of the main averages: means with error bars, the fit, and the limit with its
+    error at 0."""
     of_log = {column.header for column in COLUMNS.values()}
-    rank = lambda name: MAIN.index(name) if name in MAIN else len(MAIN) + (name in of_log)  # noqa: E731
+
+    def rank(name):
+        return MAIN.index(name) if name in MAIN else len(MAIN) + (name in of_log)
+
     shown = sorted(dict.fromkeys(limit.quantity for limit in found.limits), key=rank)[:MOST_PANELS]
     figure, axes = panel_grid(len(shown), ACROSS, 3.7, 2.8, 0.5)
     short = short_keys(found.limits[0].values)
@@ -237,7 +283,12 @@ def _figure(found: Limits):
     for axis, name in zip(axes, shown, strict=True):
         for limit in (limit for limit in found.limits if limit.quantity == name):
             label, fit = describe_values(limit.values, short), limit.fit
-            style = curve_style(labels.index(label)) | {"ls": "none", "ms": 4, "capsize": 2.5, "elinewidth": 0.9}
+            style = curve_style(labels.index(label)) | {
+                "ls": "none",
+                "ms": 4,
+                "capsize": 2.5,
+                "elinewidth": 0.9,
+            }
             steps, means, errors = zip(*(point[1:] for point in limit.points), strict=True)
             handles[label] = axis.errorbar(steps, means, errors, **style)
             axis.errorbar([0], [fit.limit], [fit.limit_error], mfc="none", clip_on=False, **style)
@@ -251,6 +302,13 @@ def _figure(found: Limits):
     for axis in axes[-ACROSS:]:
         axis.set_xlabel("time step, fs", fontsize=9, color=INK)
     if len(labels) > 1:
-        figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, loc="outside lower left", ncols=3,
-                      labelcolor=INK)  # fmt: skip
+        figure.legend(
+            handles.values(),
+            handles.keys(),
+            frameon=False,
+            fontsize=8,
+            loc="outside lower left",
+            ncols=3,
+            labelcolor=INK,
+        )
     return figure

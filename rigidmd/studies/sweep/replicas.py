@@ -1,7 +1,9 @@
-"""Analyses of all runs of a sweep: of each run, and of replicas together with errors from their scatter."""
+"""Analyses of all runs of a sweep: of each run, and of replicas together with errors from their
+scatter."""
 
 import csv
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,13 +57,18 @@ def analyse_sweep(
 ) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 
-    Results of replicas together are written into the folder of the sweep, or into a folder for each combination of
-    the other keys, and all values into analysis.csv. names, start, viscosity, progress, figures : see `analyse_folder`
+    Results of replicas together are written into the folder of the sweep, or into a folder for each
+    combination of the other keys, and all values into analysis.csv. names, start, viscosity,
+    progress, figures : see `analyse_folder`
     """
     manifest = read_manifest(folder)
-    ready = {point.folder for point in manifest.points if state_on_disk(folder, point) == "finished"}
+    ready = {
+        point.folder for point in manifest.points if state_on_disk(folder, point) == "finished"
+    }
     if not ready:
-        raise OutputError(f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` continues it")
+        raise OutputError(
+            f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` continues it"
+        )
     wants_mean_force = MEAN_FORCE in names or (not names and is_of_windows(manifest))
     if names == [MEAN_FORCE]:
         return [_mean_force(folder, manifest, ready, figures)]
@@ -75,15 +82,22 @@ def analyse_sweep(
         where = combination_folder(folder, values, short)
         title = describe_values(values, short)
         request = _Request(names, start, viscosity, figures)
-        show = lambda part, name, seen=seen: progress((seen + part) / len(ready), name)  # noqa: E731
+
+        def show(part, name, seen=seen):
+            return progress((seen + part) / len(ready), name)
+
         found.append(_combine(folder, where, title, values, finished, request, show))
         seen += len(finished)
     if wants_mean_force:
         found.append(_mean_force(folder, manifest, ready, figures))
     if not any(combination.results for combination in found):
-        reasons = dict.fromkeys(reason for combination in found for reason in combination.failed.values())
+        reasons = dict.fromkeys(
+            reason for combination in found for reason in combination.failed.values()
+        )
         raise OutputError(f"{folder}: no point can be analysed: {'; '.join(reasons)}")
-    _write_table(folder, manifest, [combination for combination in found if combination.title != WINDOWS])
+    _write_table(
+        folder, manifest, [combination for combination in found if combination.title != WINDOWS]
+    )
     return found
 
 
@@ -116,27 +130,36 @@ def _combine(
     request: _Request,
     progress: Callable[[float, str], object],
 ) -> Combination:
-    """Analyses of each run of a combination, written into its folder; and of all of them together, written into the
-    folder `where` if there are several. What fails of one run or of one analysis does not end the others."""
+    """Analyses of each run of a combination, written into its folder; and of all of them together,
+    written into the folder `where` if there are several. What fails of one run or of one analysis
+    does not end the others."""
     members: list[RigidFrames] = []
     outputs: list[AnalysisOutput] = []
     failed: dict[str, str] = {}
     names, start, viscosity, figures = request
+
+    def show_part(k: int, of: str, part: float, name: str) -> None:
+        progress((k + part) / (len(points) + 1), f"{of}{name}")
+
     for k, point in enumerate(points):
-        show = lambda part, name, k=k, point=point: progress((k + part) / (len(points) + 1), f"{point} {name}")  # noqa: E731
+        show = partial(show_part, k, f"{point} ")
         try:
             frames = frames_of_folder(read_record(folder / point), start)
-            outputs.append(analyse_frames(folder / point, as_runs(frames), names, viscosity, show, figures))
+            outputs.append(
+                analyse_frames(folder / point, as_runs(frames), names, viscosity, show, figures)
+            )
         except RigidMDError as error:
             failed[point] = str(error)
             continue
         members.append(_thinned(frames, MOST_NUMBERS // len(points)))
     if len(members) < 2:
         (done,) = outputs or [AnalysisOutput({}, [], {}, [])]
-        return Combination(title, values, len(members), done.results, failed | done.failed, done.files)
+        return Combination(
+            title, values, len(members), done.results, failed | done.failed, done.files
+        )
     with writing(where, "made"):
         where.mkdir(exist_ok=True)
-    show = lambda part, name: progress((len(points) + part) / (len(points) + 1), f"all runs: {name}")  # noqa: E731
+    show = partial(show_part, len(points), "all runs: ")
     done = analyse_frames(where, Runs(tuple(members)), names, viscosity, show, figures)
     return Combination(title, values, len(members), done.results, failed | done.failed, done.files)
 
@@ -148,13 +171,18 @@ def _thinned(frames: RigidFrames, most: int) -> RigidFrames:
 
 
 def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> None:
-    """analysis.csv: a line for each combination, its values with their errors; analysis.png: values against a key."""
+    """analysis.csv: a line for each combination, its values with their errors; analysis.png: values
+    against a key."""
     values = {
-        combination.title: {(result.name, v.header): v for result in combination.results for v in result.values}
+        combination.title: {
+            (result.name, v.header): v for result in combination.results for v in result.values
+        }
         for combination in found
     }
     columns = [*key_columns(found[0].values), Column("runs", lambda combination: combination.runs)]
-    for title in dict.fromkeys(title for of_combination in values.values() for title in of_combination):
+    for title in dict.fromkeys(
+        title for of_combination in values.values() for title in of_combination
+    ):
 
         def measured(combination: Combination, title: tuple = title) -> list[float | None] | None:
             value = values[combination.title].get(title)
@@ -166,7 +194,13 @@ def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> 
     rows = [
         SweepRow(
             combination.values,
-            {None: {header: (v.value, v.error) for (_, header), v in of.items() if v.value is not None}},
+            {
+                None: {
+                    header: (v.value, v.error)
+                    for (_, header), v in of.items()
+                    if v.value is not None
+                }
+            },
         )
         for combination, of in zip(found, values.values(), strict=True)
     ]

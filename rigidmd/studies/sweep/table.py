@@ -1,4 +1,5 @@
-"""The table of a sweep, a line for each combination of values with means and errors over its replicas; its figure."""
+"""The table of a sweep, a line for each combination of values with means and errors over its
+replicas; its figure."""
 
 import csv
 from collections.abc import Iterable
@@ -21,7 +22,15 @@ from rigidmd.io.write import Column, nine_digits, with_error
 from rigidmd.io.write import Table as ReportTable
 from rigidmd.run.record import Record, read_record
 from rigidmd.scene.stage import Stage
-from rigidmd.studies.sweep.folder import FIGURE, SEED, TABLE, Manifest, describe_values, short_keys, value_name
+from rigidmd.studies.sweep.folder import (
+    FIGURE,
+    SEED,
+    TABLE,
+    Manifest,
+    describe_values,
+    short_keys,
+    value_name,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -30,9 +39,16 @@ POTENTIAL, DRIFT = "Potential Energy per molecule (kJ/mole)", "Drift (kT/ns per 
 #: Columns of the printed table and the figure: for molecules, for a body.
 MAIN = ("Temperature (K)", POTENTIAL, "Pressure (bar)", "Density (g/mL)", DRIFT)
 MAIN_OF_BODY = (
-    "theta lowest (rad)", "theta highest (rad)", "energy end (J)", "energy_error largest", "L_size_error largest",
-)  # fmt: skip
-SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/d.o.f.)"}  # short titles for the printed table
+    "theta lowest (rad)",
+    "theta highest (rad)",
+    "energy end (J)",
+    "energy_error largest",
+    "L_size_error largest",
+)
+SHORT = {
+    POTENTIAL: "U per molecule (kJ/mol)",
+    DRIFT: "drift (kT/ns/d.o.f.)",
+}  # short titles for the printed table
 #: Columns of a body that are not in the table; nor are the entries of Q and of the quaternion.
 NOT_OF_BODY = ("time", "orthogonality_error")
 
@@ -49,7 +65,8 @@ class SweepRow:
     runs: dict[Any, dict[str, Measured]] = field(default_factory=dict)
 
     def __getitem__(self, column: str) -> Measured:
-        """Mean over the runs and its standard error; for one run its value and error. NaN without a value."""
+        """Mean over the runs and its standard error; for one run its value and error. NaN without a
+        value."""
         found = [run[column] for run in self.runs.values() if column in run]
         if len(found) < 2:
             return found[0] if found else (nan, None)
@@ -63,9 +80,9 @@ class SweepRow:
 class Table(Displayed):
     """Results of a sweep: a row for each combination of values, columns of means and errors.
 
-    table["Temperature (K)"] is a column of means as an array (rows,), table.error("Temperature (K)") of their errors,
-    table["seed"] of the values of a key. failed : point -> why it has no results. runs : point that has finished ->
-    folder of its run, for `rigidmd.read_run`
+    table["Temperature (K)"] is a column of means as an array (rows,), table.error("Temperature
+    (K)") of their errors, table["seed"] of the values of a key. failed : point -> why it has no
+    results. runs : point that has finished -> folder of its run, for `rigidmd.read_run`
     """
 
     folder: Path
@@ -81,7 +98,10 @@ class Table(Displayed):
         return len(self.rows)
 
     def __repr__(self) -> str:
-        return f"<Table of {len(self)} combinations of {', '.join(self.keys) or 'no keys'} in {self.folder}>"
+        return (
+            f"<Table of {len(self)} combinations of {', '.join(self.keys) or 'no keys'} in"
+            f" {self.folder}>"
+        )
 
     def __getitem__(self, column: str) -> np.ndarray:
         """A column of means, or of the values of a key. Raises KeyError with all names."""
@@ -91,7 +111,8 @@ class Table(Displayed):
         return np.array([row[column][0] for row in self.rows])
 
     def error(self, column: str) -> np.ndarray:
-        """Standard errors of a column of means: over the runs of a row, or of its single run; NaN without one."""
+        """Standard errors of a column of means: over the runs of a row, or of its single run; NaN
+        without one."""
         self._check(column)
         return np.array([nan if (error := row[column][1]) is None else error for row in self.rows])
 
@@ -106,27 +127,35 @@ class Table(Displayed):
         return pandas.DataFrame(rows, columns=[column.header for column in table.columns])
 
     def as_columns(self) -> ReportTable:
-        """Values of keys, number of runs, and each column with its error: the table of sweep.csv."""
+        """Values of keys, number of runs, and each column with its error: the table of
+        sweep.csv."""
         columns = [*key_columns(self.keys), Column("runs", lambda row: len(row.runs))]
         for name in self.columns:
-            pair = with_error(name, lambda row, name=name: list(map(nine_digits, row[name])), f"{name} error")
+            pair = with_error(
+                name, lambda row, name=name: list(map(nine_digits, row[name])), f"{name} error"
+            )
             columns += pair if any(row[name][1] is not None for row in self.rows) else pair[:1]
         return ReportTable(columns, self.rows)
 
     def _check(self, column: str) -> None:
         if column not in self.columns:
-            raise KeyError(f"no column {column!r}; there are {', '.join([*self.keys, *self.columns])}")
+            raise KeyError(
+                f"no column {column!r}; there are {', '.join([*self.keys, *self.columns])}"
+            )
 
 
 def key_columns(keys: Iterable[str]) -> list[Column]:
     """The columns of the values of the keys of a combination."""
 
-    cell = lambda value: value if type(value) in (int, float, str) else value_name(value)  # noqa: E731
+    def cell(value):
+        return value if type(value) in (int, float, str) else value_name(value)
+
     return [Column(key, lambda row, key=key: cell(row.values[key])) for key in keys]
 
 
 def table_of(folder: Path, manifest: Manifest, with_analyses: bool = False) -> Table:
-    """The table of the points that have finished. with_analyses : also of the values of analyses in their folders"""
+    """The table of the points that have finished. with_analyses : also of the values of analyses in
+    their folders"""
     rows, columns, failed, runs = [], {}, {}, {}
     for values, points in manifest.combinations():
         row = SweepRow(values)
@@ -136,7 +165,11 @@ def table_of(folder: Path, manifest: Manifest, with_analyses: bool = False) -> T
             try:
                 found = summarise_run(read_record(folder / point.folder))
                 if with_analyses:
-                    values = [v for entry in read_table(folder / point.folder).values() for v in entry.values]
+                    values = [
+                        v
+                        for entry in read_table(folder / point.folder).values()
+                        for v in entry.values
+                    ]
                     found |= {v.header: (v.value, v.error) for v in values if v.value is not None}
             except RigidMDError as error:
                 failed[point.folder] = str(error)
@@ -145,18 +178,29 @@ def table_of(folder: Path, manifest: Manifest, with_analyses: bool = False) -> T
             runs[point.folder] = folder / point.folder
             columns |= dict.fromkeys(found)
         rows.append(row)
-    return Table(folder, list(rows[0].values) if rows else [], rows, list(columns), failed, runs, manifest.keys)
+    return Table(
+        folder,
+        list(rows[0].values) if rows else [],
+        rows,
+        list(columns),
+        failed,
+        runs,
+        manifest.keys,
+    )
 
 
 def summarise_run(record: Record) -> dict[str, Measured]:
-    """Results of a run: means over the production of molecules, figures of the motion of a body. Raises OutputError."""
+    """Results of a run: means over the production of molecules, figures of the motion of a body.
+    Raises OutputError."""
     if record.is_body:
         return _summarise_motion(record)
     _, production = production_samples(record)
     found = _means_of(record, production)
     for stage, samples in earlier_production(record):
         means = _means_of(record, samples)
-        found |= {f"{stage.label}: {header}": means[header] for header in _of_interest(means, stage)}
+        found |= {
+            f"{stage.label}: {header}": means[header] for header in _of_interest(means, stage)
+        }
     stages = (record.summary or {}).get("stages") or [{}]
     if (drift := stages[-1].get("drift_kT_ns_per_degree_of_freedom")) is not None:
         found[DRIFT] = drift, stages[-1].get("drift_error_kT_ns_per_degree_of_freedom")
@@ -186,7 +230,9 @@ def _of_interest(means: dict[str, Measured], stage: Stage) -> list[str]:
     """Columns of an earlier stage: its main averages, and the box if it changes."""
     of_box = [IN_LOGS[name].header for name in ("volume", "a", "b", "c", "alpha", "beta", "gamma")]
     wanted = [*MAIN, *(of_box if stage.changes_box else [])]
-    return [header for header in wanted if header in means and (header != DENSITY or stage.changes_box)]
+    return [
+        header for header in wanted if header in means and (header != DENSITY or stage.changes_box)
+    ]
 
 
 def _summarise_motion(record: Record) -> dict[str, Measured]:
@@ -199,8 +245,15 @@ def _summarise_motion(record: Record) -> dict[str, Measured]:
         if name.endswith("_error"):
             found[f"{name} largest"] = float(np.abs(values).max()), None
             continue
-        figures = {"mean": values.mean(), "lowest": values.min(), "highest": values.max(), "end": values[-1]}
-        found |= {f"{name} {word} ({unit})": (float(value), None) for word, value in figures.items()}
+        figures = {
+            "mean": values.mean(),
+            "lowest": values.min(),
+            "highest": values.max(),
+            "end": values[-1],
+        }
+        found |= {
+            f"{name} {word} ({unit})": (float(value), None) for word, value in figures.items()
+        }
     return found
 
 
@@ -219,27 +272,37 @@ def table_text(table: Table) -> str:
 
 
 def main_columns(table: Table) -> ReportTable:
-    """The table that is printed and displayed: keys, number of runs, and the main columns with their errors."""
+    """The table that is printed and displayed: keys, number of runs, and the main columns with
+    their errors."""
 
     def text(value: float, error: float | None) -> str:
         return format_with_error(value, error) if np.isfinite(value) else "-"
 
     short = short_keys(table.keys)
-    shown = [name for name in (*MAIN, *MAIN_OF_BODY) if name in table.columns] + _earlier_densities(table)
-    keys = [Column(short[key], lambda row, key=key: value_name(row.values[key])) for key in table.keys]
-    means = [Column(SHORT.get(name, name), lambda row, name=name: text(*row[name])) for name in shown]
+    shown = [name for name in (*MAIN, *MAIN_OF_BODY) if name in table.columns] + _earlier_densities(
+        table
+    )
+    keys = [
+        Column(short[key], lambda row, key=key: value_name(row.values[key])) for key in table.keys
+    ]
+    means = [
+        Column(SHORT.get(name, name), lambda row, name=name: text(*row[name])) for name in shown
+    ]
     return ReportTable([*keys, Column("runs", lambda row: str(len(row.runs))), *means], table.rows)
 
 
 DENSITY, PRESSURE = "Density (g/mL)", "Pressure (bar)"
-#: Relative error of the density from which on the volume is taken to change: the density is drawn, not the pressure.
+#: Relative error of the density from which on the volume is taken to change: the density is drawn,
+#: not the pressure.
 CHANGES = 1e-9
 MOST_PANELS = 4
 #: Inches of a panel; panels in a row; curves in the legend.
 WIDTH, HEIGHT, ACROSS, MOST_NAMED = 4.4, 3.0, 2, 20
-#: Fraction of the distance between values of the axis over which curves are spread, so that no error bar hides another.
+#: Fraction of the distance between values of the axis over which curves are spread, so that no
+#: error bar hides another.
 SPREAD = 0.06
-#: Ratio of the largest to the smallest value from which on the axis is logarithmic; values that need a power of ten.
+#: Ratio of the largest to the smallest value from which on the axis is logarithmic; values that
+#: need a power of ten.
 DECADES, TINY = 100.0, 1e-3
 
 
@@ -263,8 +326,8 @@ MOST_VALUES = 12  # panels of the figure of analyses
 
 
 def write_analyses_figure(folder: Path, manifest: Manifest, rows: list[SweepRow]) -> None:
-    """Write analysis.png: what analyses measured against the first numerical key. Nothing is written for values that
-    only one combination has. Raises OutputError.
+    """Write analysis.png: what analyses measured against the first numerical key. Nothing is
+    written for values that only one combination has. Raises OutputError.
 
     rows : of the values of each combination, as results of a single run
     """
@@ -289,24 +352,42 @@ def _earlier_densities(table: Table) -> list[str]:
 
 #: Last parts of keys -> units on axes.
 UNITS = {
-    "K": "K", "fs": "fs", "ps": "ps", "A": "Å", "bar": "bar", "g_cm3": "g/cm³", "nm": "nm", "s": "s", "kg": "kg",
-    "m": "m", "kJ_mol": "kJ/mol", "V_per_nm": "V/nm", "per_ps": "1/ps", "deg": "°", "u": "u", "rad": "rad",
-}  # fmt: skip
+    "K": "K",
+    "fs": "fs",
+    "ps": "ps",
+    "A": "Å",
+    "bar": "bar",
+    "g_cm3": "g/cm³",
+    "nm": "nm",
+    "s": "s",
+    "kg": "kg",
+    "m": "m",
+    "kJ_mol": "kJ/mol",
+    "V_per_nm": "V/nm",
+    "per_ps": "1/ps",
+    "deg": "°",
+    "u": "u",
+    "rad": "rad",
+}
 
 
 def axis_label(key: str, together: Iterable[str]) -> str:
-    """A swept key as the label of an axis: with its unit, and with the keys that vary together with it."""
+    """A swept key as the label of an axis: with its unit, and with the keys that vary together with
+    it."""
     *place, name = key.split(".")
     ends = [end for end in UNITS if name.endswith(f"_{end}")]
     end = max(ends, key=len, default="")
     words = name.removesuffix(f"_{end}").replace("_", " ")
-    label = " ".join([words, *(["of", ".".join(place)] if place else []), *([f"({UNITS[end]})"] if end else [])])
+    label = " ".join(
+        [words, *(["of", ".".join(place)] if place else []), *([f"({UNITS[end]})"] if end else [])]
+    )
     others = [other for other in together if other != key]
     return f"{label}\ntogether with {', '.join(others)}" if others else label
 
 
 def _shown_columns(table: Table) -> list[str]:
-    """Columns that are drawn: the density instead of the pressure where a barostat moves the box."""
+    """Columns that are drawn: the density instead of the pressure where a barostat moves the
+    box."""
     there = [column for column in (*MAIN, *MAIN_OF_BODY) if column in table.columns]
     if DENSITY in there:
         runs = [run[DENSITY] for row in table.rows for run in row.runs.values()]
@@ -319,9 +400,14 @@ def _shown_columns(table: Table) -> list[str]:
 
 
 def _figure(table: Table, rows: list[SweepRow], shown: list[str], title: str):
-    """A panel for each column against the first key with numbers, else the first key; without keys against the seed."""
+    """A panel for each column against the first key with numbers, else the first key; without keys
+    against the seed."""
     columns = {key: [row.values[key] for row in table.rows] for key in table.keys}
-    numbers = [key for key, values in columns.items() if all(type(value) in (int, float) for value in values)]
+    numbers = [
+        key
+        for key, values in columns.items()
+        if all(type(value) in (int, float) for value in values)
+    ]
     key = [*numbers, *table.keys, SEED][0]
     # the values at x = 0, 1, ... if they are not numbers
     words = list(dict.fromkeys(map(value_name, columns[key]))) if table.keys and not numbers else []
@@ -340,13 +426,24 @@ def _figure(table: Table, rows: list[SweepRow], shown: list[str], title: str):
             axis.locator_params(axis="x", integer=True)
     handles, labels = axes[0].get_legend_handles_labels()
     if 1 < len(labels) <= MOST_NAMED:
-        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8, labelcolor=INK)
+        figure.legend(
+            handles,
+            labels,
+            loc="outside lower center",
+            ncols=4,
+            frameon=False,
+            fontsize=8,
+            labelcolor=INK,
+        )
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, color=INK)
     return figure
 
 
-def _curves(table: Table, rows: list[SweepRow], key: str, words: list[str], column: str) -> dict[str, np.ndarray]:
-    """Positions, means and errors (3, p), NaN where there are none, for each combination of the other keys."""
+def _curves(
+    table: Table, rows: list[SweepRow], key: str, words: list[str], column: str
+) -> dict[str, np.ndarray]:
+    """Positions, means and errors (3, p), NaN where there are none, for each combination of the
+    other keys."""
     points: dict[str, list] = {}
     if table.keys:
         others = short_keys(other for other in table.keys if other != key)
@@ -355,8 +452,12 @@ def _curves(table: Table, rows: list[SweepRow], key: str, words: list[str], colu
             label = describe_values({other: row.values[other] for other in others}, others)
             points.setdefault(label, []).append((x, *row[column]))
     else:
-        points[""] = [(float(seed or 0), *run[column]) for seed, run in rows[0].runs.items() if column in run]
-    return {label: np.array(sorted(found), float).reshape(-1, 3).T for label, found in points.items()}
+        points[""] = [
+            (float(seed or 0), *run[column]) for seed, run in rows[0].runs.items() if column in run
+        ]
+    return {
+        label: np.array(sorted(found), float).reshape(-1, 3).T for label, found in points.items()
+    }
 
 
 def _draw(axis, curves: dict[str, np.ndarray], band: tuple[float, float | None] | None) -> None:

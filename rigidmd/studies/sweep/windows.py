@@ -56,12 +56,18 @@ def mean_force_of_points(
     of = [(key, KEY.fullmatch(key)) for key in manifest.keys]
     if not is_of_windows(manifest):
         key = "fields.restraints.0.distance_A"
-        raise OutputError(f"{folder}: pmf needs a sweep over the distance of a restraint, such as {key}")
+        raise OutputError(
+            f"{folder}: pmf needs a sweep over the distance of a restraint, such as {key}"
+        )
     if other := [key for key, found in of if found is None and key != SEED]:
-        raise OutputError(f"{folder}: pmf needs windows that differ by their restraint alone, not by {other[0]}")
+        raise OutputError(
+            f"{folder}: pmf needs windows that differ by their restraint alone, not by {other[0]}"
+        )
     numbers = {int(found[1]) for _, found in of if found is not None}
     if len(numbers) > 1:
-        raise OutputError(f"{folder}: pmf needs windows of one restraint; the sweep varies {len(numbers)}")
+        raise OutputError(
+            f"{folder}: pmf needs windows of one restraint; the sweep varies {len(numbers)}"
+        )
     k = numbers.pop()
     windows, temperatures, used = [], set(), {"frames": 0}
     for point in points:
@@ -82,12 +88,25 @@ def _window(folder: Path, k: int) -> tuple[Window, float, dict[str, Any]]:
     stage, production = production_samples(record)
     name, column = distance_column(k)
     if name not in record.columns:
-        raise OutputError(f"{folder}: its log has no column {column.header!r}: fields.restraints.{k} has no `between`")
+        raise OutputError(
+            f"{folder}: its log has no column {column.header!r}: fields.restraints.{k} has no"
+            " `between`"
+        )
     if stage.temperature_K is None or stage.ramps or stage.changes_box:
-        raise OutputError(f"{folder}: the windows need a last stage at constant temperature and volume (nvt)")
+        raise OutputError(
+            f"{folder}: the windows need a last stage at constant temperature and volume (nvt)"
+        )
     entry, time = record.scene.fields.restraints[k], record.time[production]
-    used = {"stage": stage.label, "from_ps": float(time[0]), "to_ps": float(time[-1]), "frames": len(time), "notes": []}
-    window = Window(not_none(entry.distance_A), entry.stiffness[0], record.columns[name][production])
+    used = {
+        "stage": stage.label,
+        "from_ps": float(time[0]),
+        "to_ps": float(time[-1]),
+        "frames": len(time),
+        "notes": [],
+    }
+    window = Window(
+        not_none(entry.distance_A), entry.stiffness[0], record.columns[name][production]
+    )
     return window, float(stage.temperatures[1]), used
 
 
