@@ -41,10 +41,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
-from support import read_checkpoint, write_checkpoint
 
 from rigidmd.commands import cli
 from rigidmd.errors import CheckpointError
+from rigidmd.io.checkpoint import read_checkpoint, write_checkpoint
 
 try:
     from _testcapi import remove_mem_hooks, set_nomemory

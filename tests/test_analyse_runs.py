@@ -14,21 +14,17 @@ import numpy as np
 import pytest
 from MDAnalysis.analysis.msd import EinsteinMSD
 from MDAnalysis.analysis.rdf import InterRDF
-from support import (
-    ROOT,
-    build,
-    frames_of_folder,
-    gmx,
-    read_record,
-    registry,
-    small_scene,
-    total_dipole,
-)
+from support import ROOT, gmx, small_scene
 
 import rigidmd
 from rigidmd import Scene, Simulation
+from rigidmd.analysis import registry
+from rigidmd.analysis.built_in.rotation import total_dipole
+from rigidmd.analysis.rigid_frames import frames_of_folder
+from rigidmd.assemble.build import build
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.run.record import read_record
 from rigidmd.units import DEBYE
 
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))

@@ -10,7 +10,9 @@ import tomllib
 from fnmatch import fnmatch
 
 import pytest
-from support import BY_EXTENSION, ROOT
+from support import ROOT
+
+from rigidmd.io.formats import BY_EXTENSION
 
 PACKAGE = ROOT / "rigidmd"
 
@@ -128,14 +130,14 @@ def test_every_kind_of_upward_import_is_found():
     source = """
 from typing import TYPE_CHECKING
 import numpy
-from PACKAGE.core.state import State
+from rigidmd.core.state import State
 if TYPE_CHECKING:
-    from PACKAGE.view.plots import plot
+    from rigidmd.view.plots import plot
 def build():
-    from PACKAGE import run
-    import PACKAGE.assemble.build
-    from PACKAGE import Scene
-""".replace("PACKAGE", "rigidmd")  # test_support.py would take these imports for ours
+    from rigidmd import run
+    import rigidmd.assemble.build
+    from rigidmd import Scene
+"""
     assert [message.split(":")[0] for message in upward("scene", imports_in(source))] == [
         "6",
         "8",
@@ -154,12 +156,8 @@ def build():
 
 
 def test_a_part_of_a_package_can_be_below_it():
-    light = imports_in(
-        "from PACKAGE.engines.lammps.options import PROGRAM".replace("PACKAGE", "rigidmd")
-    )
-    heavy = imports_in(
-        "from PACKAGE.engines.lammps.files import fixes".replace("PACKAGE", "rigidmd")
-    )
+    light = imports_in("from rigidmd.engines.lammps.options import PROGRAM")
+    heavy = imports_in("from rigidmd.engines.lammps.files import fixes")
     assert not list(upward("scene", light)) and len(list(upward("scene", heavy))) == 1
     assert len(list(upward("engines.*.options", heavy))) == 1
 

@@ -8,25 +8,17 @@ import random
 import shutil
 
 import pytest
-from support import (
-    ANALYSIS,
-    ROOT,
-    Manifest,
-    Summary,
-    SweepPoint,
-    compare,
-    describe_run_comparison,
-    read_json,
-    read_manifest,
-    read_record,
-    read_results,
-    write_manifest,
-    write_report,
-)
+from support import ROOT
 
 from rigidmd import Scene, Simulation
+from rigidmd.analysis.files import ANALYSIS, read_results
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, RigidMDError
+from rigidmd.io.run_files import Summary, read_json
+from rigidmd.run.record import read_record
+from rigidmd.studies.compare import compare, describe_run_comparison
+from rigidmd.studies.sweep.folder import Manifest, SweepPoint, read_manifest, write_manifest
+from rigidmd.view.run_page import write_report
 
 DEEP = "[" * 5000 + "]" * 5000
 #: What a value of a file of JSON becomes, as text.

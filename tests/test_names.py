@@ -9,18 +9,15 @@ import subprocess
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from support import (
-    Manifest,
-    SweepPoint,
-    build,
-    force_field_of,
-    gromacs_files,
-    lammps_files,
-    write_slurm_script,
-)
 
+from rigidmd.assemble.build import build
+from rigidmd.engines.force_field import force_field_of
+from rigidmd.engines.gromacs import files as gromacs_files
+from rigidmd.engines.lammps import files as lammps_files
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.scene import Scene
+from rigidmd.studies.sweep.folder import Manifest, SweepPoint
+from rigidmd.studies.sweep.sweeping import write_slurm_script
 
 PLAIN = ("one", "two", "first", "AR", "RES")
 #: What some language obeys, at the ends of names and within them.
@@ -164,7 +161,7 @@ def test_names_change_no_setting_of_gromacs(usual, tmp_path, names):
 @example((EVIL[0], EVIL[1], "{stages}{title}{system}{kick}", '"""', "&"))
 def test_names_change_no_statement_of_the_script_for_openmm(usual, tmp_path, names):
     pytest.importorskip("openmm")
-    from support import write_openmm
+    from rigidmd.engines.openmm.files import write_openmm
 
     texts = []
     for drawn in (usual[1], force_field_of(build(named(names)))):

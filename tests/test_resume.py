@@ -22,31 +22,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import FORTY_WATERS, MINIMISE, NPH, NPT, NVE, NVT, forty_waters
-from support import (
-    CHECKPOINT,
-    PREVIOUS,
-    ROOT,
-    AppendedFile,
-    Arrays,
-    BodyRecord,
-    BodyRun,
-    Checkpoint,
-    FolderLock,
-    MolecularRecord,
-    MolecularRun,
-    checkpoint,
-    contents,
-    provenance,
-    read_checkpoint,
-    same_after_stops,
-    small_scene,
-    stopped_at,
-    write_checkpoint,
-)
+from support import ROOT, contents, same_after_stops, small_scene, stopped_at
 
 from rigidmd.commands import cli
+from rigidmd.core.files import AppendedFile
 from rigidmd.errors import CheckpointError, OutputError, RigidMDWarning, SimulationError
+from rigidmd.io import checkpoint
+from rigidmd.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from rigidmd.io.folder import CHECKPOINT, PREVIOUS, FolderLock
 from rigidmd.run import Every, Simulation, run_together
+from rigidmd.run import resume as provenance
+from rigidmd.run.body import BodyRecord, BodyRun
+from rigidmd.run.molecular import MolecularRecord, MolecularRun
+from rigidmd.run.resume import Arrays
 from rigidmd.scene import Scene
 
 TOP = {

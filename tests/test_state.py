@@ -3,26 +3,14 @@ else."""
 
 import numpy as np
 import pytest
-from support import (
-    HEAT,
-    NOW,
-    ORIGIN,
-    ROOT,
-    SCHEMES,
-    THERMOSTAT,
-    Solver,
-    VelocityRescaling,
-    build_body,
-    built,
-    constant_ramp,
-    key_of,
-    move,
-    read_state,
-    small_scene,
-    state_of,
-    write_state,
-)
+from support import ROOT, built, move, small_scene
 
+from rigidmd.assemble.body import build_body
+from rigidmd.core.integrators import SCHEMES, Solver
+from rigidmd.core.state import HEAT, NOW, ORIGIN, state_of
+from rigidmd.core.state_file import read_state, write_state
+from rigidmd.dynamics.noise import THERMOSTAT, key_of
+from rigidmd.dynamics.thermostats import VelocityRescaling, constant_ramp
 from rigidmd.errors import StructureError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

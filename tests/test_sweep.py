@@ -16,38 +16,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import (
-    ROOT,
-    Axis,
-    FolderLock,
-    Pool,
-    SweepRow,
-    Waiting,
-    axis_label,
-    code_kind,
-    extrapolate,
-    format_ranges,
-    format_walltime,
-    limits,
-    parse_axis,
-    point_name,
-    read_manifest,
-    read_record,
-    registry,
-    run_points,
-    short_keys,
-    summarise_run,
-    sweeping,
-    value_name,
-    worker,
-)
-from support import axis_settings as settings
+from support import ROOT
 
 import rigidmd
+from rigidmd.analysis import registry
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.io.folder import FolderLock
 from rigidmd.run import Simulation
+from rigidmd.run.record import read_record
 from rigidmd.scene import Scene
+from rigidmd.studies.extrapolation import extrapolate
+from rigidmd.studies.sweep import backends, limits, sweeping
+from rigidmd.studies.sweep.backends import Pool
+from rigidmd.studies.sweep.folder import point_name, read_manifest, short_keys, value_name
+from rigidmd.studies.sweep.plan import Axis, parse_axis, settings
+from rigidmd.studies.sweep.sweeping import (
+    Waiting,
+    code_kind,
+    format_ranges,
+    format_walltime,
+    run_points,
+)
+from rigidmd.studies.sweep.table import SweepRow, axis_label, summarise_run
 
 ARGON = """
 [box]
@@ -718,7 +709,7 @@ def whole(argon, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "sweep"
     manifest = long_sweep(argon, folder)
     for point in manifest.points:
-        assert worker.run_task(sweeping.task_of(folder, manifest, point))["state"] == "finished"
+        assert backends.run_task(sweeping.task_of(folder, manifest, point))["state"] == "finished"
     return folder
 
 
@@ -807,16 +798,16 @@ def test_a_point_waits_for_a_run_that_is_about_to_stop(tmp_path):
     lock = FolderLock(tmp_path)
     lock.take()
     with pytest.raises(OutputError, match="did not end within"):
-        worker.wait_for_folder(tmp_path, 0.1)
+        backends.wait_for_folder(tmp_path, 0.1)
     lock.release()
-    worker.wait_for_folder(tmp_path, 0.1)
+    backends.wait_for_folder(tmp_path, 0.1)
 
 
 def test_a_scene_that_changes_meanwhile_is_not_run(argon, tmp_path):
     manifest = long_sweep(argon, tmp_path / "sweep")
     point = manifest.points[0]
     point.scene_sha256 = "other"
-    ended = worker.run_task(sweeping.task_of(tmp_path / "sweep", manifest, point))
+    ended = backends.run_task(sweeping.task_of(tmp_path / "sweep", manifest, point))
     assert ended["state"] == "failed"
     assert "has changed since the sweep began" in ended["message"]
 
@@ -906,7 +897,7 @@ def test_points_run_on_a_cluster_of_dask(argon, finished, tmp_path, capsys):
 @pytest.mark.soak
 def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
     pytest.importorskip("distributed")
-    from support import Cluster
+    from rigidmd.studies.sweep.backends import Cluster
 
     folder = tmp_path / "sweep"
 
@@ -923,7 +914,7 @@ def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
 
 
 def test_without_a_cluster(argon, tmp_path, monkeypatch, capsys):
-    from support import cluster
+    from rigidmd.studies.sweep import backends as cluster
 
     monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.5)
     arguments = ["sweep", str(argon), *GRID, "-o", str(tmp_path / "sweep"), "--scheduler"]

@@ -1,7 +1,11 @@
 """What thermostats evolve besides momenta: it outlives a stop."""
 
 import numpy as np
-from support import STORED_NAMES, build, same_after_stops, small_scene, state_from
+from support import same_after_stops, small_scene
+
+from rigidmd.assemble.build import build
+from rigidmd.core.state import STORED_NAMES
+from rigidmd.run.resume import state_from
 
 WATER = {
     "box": {"density_g_cm3": 0.9},
