@@ -3,6 +3,7 @@ no effect on it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -94,9 +95,8 @@ def build_body(
     if added_mass.any() and not scene.body.pinned:
         translation = FluidTranslation(mass, mass + added_mass)
     body = Body(translation, rotor, frame_of(scene), resistance_of(scene))
-    terms = terms_of(scene, mass, axes, centre, displaced) | {
-        name: PythonForce() for name in applied
-    }
+    terms: dict[str, NamedTuple] = terms_of(scene, mass, axes, centre, displaced)
+    terms |= {name: PythonForce() for name in applied}
     system = BodySystem(
         scene=scene,
         body=body,

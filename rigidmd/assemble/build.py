@@ -327,9 +327,8 @@ def thermostat_of(system: System, k: int) -> NamedTuple:
 def barostat_of(system: System, k: int) -> NamedTuple:
     stage, key = system.scene.stages[k], key_of(system.scene.seed, BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
-    pressure = Pressure(
-        *(tuple(x * BAR for x in ends) for ends in stage.pressures), float(stage.steps)
-    )
+    first, last = (tuple(x * BAR for x in ends) for ends in stage.pressures)
+    pressure = Pressure(first, last, float(stage.steps))  # pyright: ignore[reportArgumentType]
     x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
     given = Confinement(
         _thermal(stage),

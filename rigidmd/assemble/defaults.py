@@ -134,10 +134,8 @@ def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> 
     components."""
     if scene.run.remove_momentum_interval_ps is not None:
         return scene
-    conserved = (
-        ELECTROSTATICS[scene.forces.electrostatics].conserves_momentum
-        and scene.forces.dispersion != "pme"
-    )
+    electrostatics = ELECTROSTATICS[scene.forces.electrostatics or "none"]
+    conserved = electrostatics.conserves_momentum and scene.forces.dispersion != "pme"
     removed = not conserved and keeps_momentum.any()
     run = {"remove_momentum_interval_ps": REMOVE_MOMENTUM_INTERVAL if removed else False}
     return scene.model_copy(update={"run": scene.run.model_copy(update=run)})

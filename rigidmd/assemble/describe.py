@@ -186,7 +186,7 @@ def _describe_molecules(system: System) -> str:
     return "\n".join(lines)
 
 
-def _words(part: NamedTuple) -> str:
+def _words(part: object) -> str:
     """The name of a class as words: "split rotor"."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()
 

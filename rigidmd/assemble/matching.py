@@ -313,11 +313,8 @@ class _Matcher:
         if not count:
             return
         orders = self._orders_of(group.candidate.species, group.candidate.classes[-1])
-        others = [
-            other
-            for other, fits in zip(names, np.isfinite(rms[:, rows]).any(axis=1), strict=True)
-            if fits
-        ]
+        fits_one = np.isfinite(rms[:, rows]).any(axis=1)
+        others = [names[k] for k in np.flatnonzero(fits_one)]
         if len(others) > 1:
             best = " and not ".join([name, *(other for other in others if other != name)])
             notes[f"{COUNT} taken for {best}, which fits less well"] += count

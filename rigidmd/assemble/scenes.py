@@ -68,7 +68,9 @@ def scene_from_atoms(
     if faults := atoms_errors(atoms):
         raise SceneError(SOURCE, faults)
     data = with_absolute_paths(settings)
-    filled = {key: data.setdefault(key, {}) for key in ("structure", "start", "box")}
+    filled: dict[str, dict[str, Any]] = {
+        key: data.setdefault(key, {}) for key in ("structure", "start", "box")
+    }
     faults = ["molecules is given by the atoms and models"] if "molecules" in data else []
     for key, table in filled.items():
         if not isinstance(table, Mapping):

@@ -260,6 +260,7 @@ def _parts(symbols: list[str], position: np.ndarray, cell: np.ndarray | None) ->
     from scipy.sparse.csgraph import connected_components
 
     atoms = AseAtoms(symbols, position, cell=cell, pbc=cell is not None)
-    first, second = neighbor_list("ij", atoms, natural_cutoffs(atoms, SLACK))
+    bonding_distances = [SLACK * distance for distance in natural_cutoffs(atoms)]
+    first, second = neighbor_list("ij", atoms, bonding_distances)
     links = coo_array((np.ones(len(first)), (first, second)), shape=(len(symbols), len(symbols)))
     return connected_components(links)[1]

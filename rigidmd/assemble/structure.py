@@ -278,16 +278,17 @@ def _notes(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> 
         what = f"{expected - there} sites without mass are missing in the file ({names})"
         yield f"{what}: built from the rigid template"
     others = {}
-    for k, molecule in enumerate(species if atoms.masses is not None else ()):
+    masses = atoms.masses
+    for k, molecule in enumerate(species if masses is not None else ()):
+        assert masses is not None
         for s, site in enumerate(massive_sites(molecule)):
             members = np.array(
                 [matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int
             )
             mass = float(molecule.masses[site])
-            for i in members[np.abs(atoms.masses[members] - mass) > SAME_MASS * mass]:
+            for i in members[np.abs(masses[members] - mass) > SAME_MASS * mass]:
                 others[
-                    f"{atoms.names[i]} {atoms.masses[i]:g} and {molecule.site_names[site]}"
-                    f" {mass:g} u"
+                    f"{atoms.names[i]} {masses[i]:g} and {molecule.site_names[site]} {mass:g} u"
                 ] = None
     if listed := "; ".join(others):
         yield (

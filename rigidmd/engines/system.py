@@ -211,9 +211,8 @@ class System:
         if np.isfinite(cell).all() != np.isfinite(self.state.cell).all():
             return ["one of scene and state has a periodic box, and the other has none"]
         half = min(space_of(cell).edges) / 2
-        reach = [
-            term.potential.cutoff for term in self.terms.values() if isinstance(term, PairForces)
-        ]  # type: ignore[attr-defined]
+        pair_terms = [term for term in self.terms.values() if isinstance(term, PairForces)]
+        reach = [term.potential.cutoff for term in pair_terms]  # type: ignore[attr-defined]
         return [
             f"half the shortest edge of its box, {half:.4g} Å, is below the cutoff of {r:g} Å"
             for r in reach

@@ -98,7 +98,10 @@ def worse_status(status, other):
 @chosen_by_type
 def power(term, state, velocity, omega):
     """Power of a term whose class has `time_dependent = True`; 0 for any other, since its energy
-    includes its work. velocity (lab axes) and omega (body axes) : tuples, relative to the frame"""
+    includes its work.
+
+    velocity, omega : tuples, along the axes of the lab and of the body, relative to the frame
+    """
     if not getattr(term.instance_class, "time_dependent", False):
         return lambda term, state, velocity, omega: 0.0
 

@@ -182,8 +182,11 @@ def ase_results(
 def gradient_forces(
     system: System, state: State, force: np.ndarray, torque: np.ndarray, atoms: np.ndarray | None
 ) -> np.ndarray:
-    """Forces (a, 3) on the sites with mass, u Å/ps²: the first form of this file. force, torque (n,
-    3) : of the molecules, lab frame; atoms : as in `ase_results`"""
+    """Forces (a, 3) on the sites with mass, u Å/ps²: the first form of this file.
+
+    force, torque : (n, 3) of the molecules, lab frame
+    atoms : as in `ase_results`
+    """
     atom = system.sites.mass > 0
     of_atom, mass = system.sites.molecule[atom], system.sites.mass[atom, None]
     found = mass * (force / system.model.mass[system.model.species][:, None])[of_atom]

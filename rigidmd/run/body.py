@@ -15,7 +15,7 @@ from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
 from rigidmd.engines.body_motion import Motion, Snapshot, energies, is_balanced, motion
 from rigidmd.engines.body_system import BodySystem, Pose
-from rigidmd.engines.protocol import Engine, NotFiniteError
+from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import MATRIX
 from rigidmd.errors import SimulationError
 from rigidmd.figures.body import FIGURES
@@ -239,16 +239,12 @@ class BodyRecord(RunRecord):
     stable: PositiveFloat | None = None  # the longest stable step, s
 
 
-class BodyRun(RunPart):
+class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
     """The part of a simulation of a single body."""
 
     time_unit = "s"
     record_type = BodyRecord
     summary_text = staticmethod(body_summary_text)
-
-    system: BodySystem
-    engine: Engine
-    record: BodyRecord
 
     def __init__(
         self,

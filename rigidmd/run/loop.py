@@ -28,6 +28,7 @@ from rigidmd.io.progress import progress_of
 from rigidmd.io.write import write_json
 from rigidmd.run import resume
 from rigidmd.run.observers import GrowingFile, Moment, Observer
+from rigidmd.run.part import RunPart
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import (
     SEGMENT_SECONDS,
@@ -71,7 +72,8 @@ class RunLoop:
     def __init__(
         self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None
     ):
-        self._simulation, self._folder, self._part = simulation, simulation.folder, simulation.part
+        self._simulation, self._folder = simulation, simulation.folder
+        self._part: RunPart[Any, Any, Any] = simulation.part
         self._force, self._resumes = force, resumes
         self.checkpoints = CheckpointSchedule(
             simulation.folder, simulation.scene.output.checkpoint_minutes, deadline

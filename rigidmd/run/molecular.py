@@ -76,16 +76,12 @@ class MolecularRecord(RunRecord):
 REPLAYED = 20
 
 
-class MolecularRun(RunPart):
+class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     """The part of a simulation of molecules."""
 
     time_unit = "ps"
     record_type = MolecularRecord
     summary_text = staticmethod(summary_text)
-
-    system: System
-    engine: Engine
-    record: MolecularRecord
 
     def __init__(
         self, simulation: "Simulation", scene: MolecularScene, forces: Any, thermostat: Any

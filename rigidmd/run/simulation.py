@@ -12,9 +12,18 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from math import inf
-from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Generic,
+    NamedTuple,
+    TypedDict,
+    TypeVar,
+    Unpack,
+    cast,
+    overload,
+)
 
 import numpy as np
 
@@ -29,19 +38,39 @@ from rigidmd.run.loop import RunLoop
 from rigidmd.run.observers import as_observer
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import checked_walltime, signal_handler, stop_signals
-from rigidmd.scene import BodyScene, Scene
+from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 if TYPE_CHECKING:
     import ase
 
     from rigidmd.assemble.user_code.force import Force, HasStage, HasTerm
     from rigidmd.assemble.user_code.pair_potential import PairLaw
-    from rigidmd.engines.body_system import Pose
+    from rigidmd.engines.body_system import BodySystem, Pose
+    from rigidmd.engines.observables import Observation
+    from rigidmd.engines.protocol import Engine
+    from rigidmd.engines.system import System
+    from rigidmd.run.body import BodyRun
     from rigidmd.run.minimise import OverlapRemoval
     from rigidmd.run.molecular import MolecularRun
+    from rigidmd.run.schedule import Segment
 
     UserForce = Force | PairLaw | HasTerm | NamedTuple
 
+    class Options(TypedDict, total=False):
+        """The keyword arguments of `Simulation`, which are described there."""
+
+        observers: Any
+        say: Callable[[str], object] | None
+        warn: Callable[[str], object]
+        resume: bool
+        walltime: float | None
+        forces: UserForce | Sequence[UserForce] | None
+        thermostat: NamedTuple | HasStage | None
+        applied: Mapping[str, Callable[[Pose], tuple]] | None
+
+
+SystemT = TypeVar("SystemT")
+SceneT = TypeVar("SceneT")
 
 #: Simulations that have begun and not ended, which are closed when the interpreter exits.
 _BEGUN: "weakref.WeakSet[Simulation]" = weakref.WeakSet()
@@ -55,7 +84,7 @@ def _as_warning(sentence: str) -> None:
     warnings.warn(sentence, RigidMDWarning, stacklevel=level)
 
 
-class Simulation(Displayed):
+class Simulation(Displayed, Generic[SystemT, SceneT]):
     """A scene, ready to run: `run()` runs it to its end, `step(n)` advances it by n steps; both can
     be mixed.
 
@@ -83,6 +112,37 @@ class Simulation(Displayed):
         called once for each position of the body. Forces that depend on the velocity are constant
         within a step, which reduces its order to 1
     """
+
+    part: "MolecularRun | BodyRun"
+
+    if TYPE_CHECKING:
+
+        @overload
+        def __init__(
+            self: "Simulation[System, MolecularScene]",
+            scene: MolecularScene,
+            folder: str | Path | None = None,
+            force: bool = False,
+            **options: Unpack[Options],
+        ) -> None: ...
+
+        @overload
+        def __init__(
+            self: "Simulation[BodySystem, BodyScene]",
+            scene: BodyScene,
+            folder: str | Path | None = None,
+            force: bool = False,
+            **options: Unpack[Options],
+        ) -> None: ...
+
+        @overload
+        def __init__(
+            self: "Simulation[Any, Any]",
+            scene: Scene,
+            folder: str | Path | None = None,
+            force: bool = False,
+            **options: Unpack[Options],
+        ) -> None: ...
 
     def __init__(
         self,
@@ -120,7 +180,6 @@ class Simulation(Displayed):
             None  # of the last run by this object in the folder
         )
         of_molecules = {"forces": forces, "thermostat": thermostat}
-        self.part: Any  # a `RunPart`
         if isinstance(scene, BodyScene):
             from rigidmd.run.body import BodyRun
 
@@ -158,15 +217,30 @@ class Simulation(Displayed):
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    scene = property(
-        attrgetter("part.scene"), doc="The scene as it runs, with defaults and choices."
-    )
-    system = property(attrgetter("part.system"), doc="The `System` or `BodySystem`.")
-    engine = property(attrgetter("part.engine"), doc="The present engine.")
-    segment = property(
-        attrgetter("part.segment"), doc="The present segment: its method, step and number of steps."
-    )
-    threads = property(attrgetter("part.threads"), doc="Number of threads.")
+    @property
+    def scene(self) -> SceneT:
+        """The scene as it runs, with defaults and choices."""
+        return cast(SceneT, self.part.scene)
+
+    @property
+    def system(self) -> SystemT:
+        """The system that the scene describes."""
+        return cast(SystemT, self.part.system)
+
+    @property
+    def engine(self) -> "Engine":
+        """The present engine."""
+        return self.part.engine
+
+    @property
+    def segment(self) -> "Segment":
+        """The present segment: its method, step and number of steps."""
+        return self.part.segment
+
+    @property
+    def threads(self) -> int:
+        """Number of threads."""
+        return self.part.threads
 
     @property
     def state(self) -> State:
@@ -178,7 +252,7 @@ class Simulation(Displayed):
         return self.part.state.read_only
 
     @property
-    def observation(self) -> Any:
+    def observation(self) -> "Observation | Pose":
         """Observables of the present state, before, within and after a run; each use evaluates the
         forces.
 
@@ -217,20 +291,20 @@ class Simulation(Displayed):
 
     def introduction(self) -> str:
         """A few lines for the start of a run."""
-        return "\n".join([self.part.headline, *(f"  {note}" for note in self.system.notes)])
+        return "\n".join([self.part.headline, *(f"  {note}" for note in self.part.system.notes)])
 
     def conclusion(self, results: Results) -> str:
         """The summary as text, without the notes of the introduction and the warnings that were
         issued."""
-        return self.part.summary_text(results.summary, [*self.system.notes, *self._issued])
+        return self.part.summary_text(results.summary, [*self.part.system.notes, *self._issued])
 
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it runs, with copies of the files that it reads."""
-        write_scene(folder, self.scene)
+        write_scene(folder, self.part.scene)
 
     # Before a run.
 
-    def _before_run(self) -> Any:
+    def _before_run(self) -> "MolecularRun | BodyRun":
         """The part, which is changed before a run. Raises RuntimeError within a run."""
         if self._loop is not None:
             raise RuntimeError("the run has begun; close() ends it")
@@ -240,9 +314,9 @@ class Simulation(Displayed):
         """The part of molecules. Raises TypeError for a body, RuntimeError within a run unless it
         may have `begun`."""
         part = self.part if begun else self._before_run()
-        if isinstance(self.scene, BodyScene):
-            raise TypeError(f"{self.scene.name} is a single body; this method is for molecules")
-        return part
+        if isinstance(part.scene, BodyScene):
+            raise TypeError(f"{part.scene.name} is a single body; this method is for molecules")
+        return cast("MolecularRun", part)
 
     def start_from(self, state: State) -> None:
         """Let runs of molecules begin at the given positions and momenta, without removal of

@@ -305,7 +305,10 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
 
 def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list[str]:
     """A note if few trajectories of hybrid Monte Carlo were accepted, in the second half of enough
-    samples, or if none was. acceptance (t,) : between samples, NaN where no trajectory ended"""
+    samples, or if none was.
+
+    acceptance : (t,) between samples, NaN where no trajectory ended
+    """
     known = acceptance[np.isfinite(acceptance)]
     enough = len(acceptance) - len(acceptance) // 2 >= MIN_SAMPLES
     judged, where = (known[len(known) // 2 :], "in its second half ") if enough else (known, "")

@@ -54,12 +54,18 @@ EXACT_RETURN = 0.02
 class BodyAnimation:
     """Lengths are in units of the picture's half width, about its centre; (t,) samples.
 
-    position (t, 3) : of the pivot or the centre of mass; centre (3,) : centre of mass in the body's
-    axes quaternion (t, 4) : w, x, y, z, without jumps of sign; angles (t, 3) : phi, theta, psi,
-    degrees; empty for a point path (p, 3) and when (p,) : the body axis on the sphere, or the
-    centre of mass; sphere : its radius, 0 without one
-    vectors : name -> (t, 3), and largest : name -> largest size with its unit; gravity (3,) or None
-    unit : of the picture, m; azimuth : of the eye, rad; notes : on thinning and enlargement
+    position : (t, 3) of the pivot or the centre of mass
+    centre : (3,) centre of mass in the body's axes
+    quaternion : (t, 4) w, x, y, z, without jumps of sign
+    angles : (t, 3) phi, theta, psi, degrees; empty for a point
+    path, when : (p, 3) and (p,) the body axis on the sphere, or the centre of mass
+    sphere : its radius, 0 without one
+    vectors : name -> (t, 3)
+    largest : name -> largest size with its unit
+    gravity : (3,) or None
+    unit : of the picture, m
+    azimuth : of the eye, rad
+    notes : on thinning and enlargement
     """
 
     def __init__(self, record: Record):

@@ -293,8 +293,10 @@ def fastest_cutoff(
     charges: Charges, cell: np.ndarray, longest: float, error: float, filled: float
 ) -> float | None:
     """The real-space cutoff (Å), at most `longest`, with which PME is fastest if real and
-    reciprocal space each have this error; None if no cutoff reaches it. filled : see
-    `filled_fraction`"""
+    reciprocal space each have this error; None if no cutoff reaches it.
+
+    filled : see `filled_fraction`
+    """
     volume, cutoffs = abs(float(np.linalg.det(cell))), np.arange(SHORTEST_CUTOFF, longest, 0.5)
 
     @cache

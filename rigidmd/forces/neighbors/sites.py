@@ -108,7 +108,9 @@ def sites_of(
 
 def exclusion_groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
     """Exclusion group of each site (s,): the molecule, or one group for all frozen molecules. Sites
-    of a group do not interact. frozen (n,) : whether each molecule is frozen
+    of a group do not interact.
+
+    frozen (n,) : whether each molecule is frozen
     """
     if not frozen.any():
         return sites.molecule
