@@ -658,7 +658,7 @@ def test_the_name_of_a_trajectory_fits_into_a_folder():
 
 #: Packages that rigidmd, or what it needs, imports.
 PACKAGES = (
-    "MDAnalysis ase dask distributed filelock gemmi gsd llvmlite matplotlib numba numpy pandas platformdirs pydantic "
+    "MDAnalysis ase dask distributed filelock gemmi gsd lazy_loader llvmlite matplotlib numba numpy pandas platformdirs pydantic "
     "pymbar rigidmd rocket_fft scipy sympy tomli_w tqdm yaml"
 )
 
