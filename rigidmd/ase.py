@@ -69,18 +69,26 @@ class RigidMD(Calculator):
 
     Parameters
     ----------
-    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a
-        scene file; or a scene, whose species, [forces], [fields], precision and forces from Python
+    models
+        Names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene
+        file; or a scene, whose species, [forces], [fields], precision and forces from Python
         (`with_user_code`) are used
-    atom_forces : "gradient" of the energy of the fitted molecules, or of "sites": each atom has the
-        forces of its site
-    bend, tolerance : largest distance of an atom from its rigid position without a warning, and
-        without an error, over the molecule's radius
-    precision : "double", the default, or "mixed"
-    fields, forces : the table [fields] of a scene file, and keys of its table [forces]: cutoff_A,
+    atom_forces
+        "gradient" of the energy of the fitted molecules, or of "sites": each atom has the forces of
+        its site
+    bend, tolerance
+        Largest distance of an atom from its rigid position without a warning, and without an error,
+        over the molecule's radius
+    precision
+        "double", the default, or "mixed"
+    fields, forces
+        The table [fields] of a scene file, and keys of its table [forces]: cutoff_A,
         electrostatics, ...
 
-    Raises SceneError or StructureError if atoms and models do not match.
+    Raises
+    ------
+    SceneError, StructureError
+        If atoms and models do not match.
     """
 
     # ASE has it so
@@ -170,12 +178,17 @@ class RigidMD(Calculator):
         """Move rigid molecules to a near minimum of the energy, or of the enthalpy with
         pressure_bar.
 
-        stage_keys : keys of a stage with ensemble = "minimise": force_limit_kJ_mol_A, pressure_bar,
-            ...
-
         Sets positions, and the cell with pressure_bar. Constraints of the atoms are ignored; models
-        set what is frozen. Returns the values of the minimum, as in summary.json. Raises
-        SceneError, SimulationError.
+        set what is frozen. Returns the values of the minimum, as in summary.json.
+
+        Parameters
+        ----------
+        stage_keys
+            Keys of a stage with ensemble = "minimise": force_limit_kJ_mol_A, pressure_bar, ...
+
+        Raises
+        ------
+        SceneError, SimulationError
         """
         assembly = self._assemble(atoms, stage_keys)
         fitted = assembly.fit(atoms)
@@ -351,17 +364,25 @@ class CalculatorForce(Force):
 
     Parameters
     ----------
-    calculator : with energies (eV) and forces (eV/Å) of periodic or free atoms, as the scene has
-        them, and for a barostat or the pressure with a stress (eV/Å³)
-    name : in logs and messages; default: the name of the calculator's class
-    energy_noise_eV : random error of its energies, as of self-consistent iterations or of single
-        precision; larger differences between forces and differences of the energy are refused at
-        the start of a run
-    changes_momentum : which components of the total momentum it may change: True for external
-        fields and restraints
+    calculator
+        With energies (eV) and forces (eV/Å) of periodic or free atoms, as the scene has them, and
+        for a barostat or the pressure with a stress (eV/Å³)
+    name
+        In logs and messages; default: the name of the calculator's class
+    energy_noise_eV
+        Random error of its energies, as of self-consistent iterations or of single precision;
+        larger differences between forces and differences of the energy are refused at the start of
+        a run
+    changes_momentum
+        Which components of the total momentum it may change: True for external fields and
+        restraints
 
-    Raises SceneError where a calculator without stress is used with a barostat, and SimulationError
-    with the step and the closest atoms if the calculator fails.
+    Raises
+    ------
+    SceneError
+        If a calculator without stress is used with a barostat.
+    SimulationError
+        If the calculator fails; it names the step and the closest atoms.
     """
 
     def __init__(

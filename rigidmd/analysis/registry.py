@@ -76,7 +76,12 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
     The function gets a `rigidmd.analysis.rigid_frames.RigidFrames` (time, positions, Q, L,
     velocities, cell, ...) and returns one number for each frame (f,), or a dictionary of such
     arrays, of which means, errors, a CSV file and a figure are made. The first line of its
-    docstring is the title. Raises OutputError if the name is not free.
+    docstring is the title.
+
+    Raises
+    ------
+    OutputError
+        If the name is not free.
     """
     name = getattr(function, "__name__", "")
     if is_built_in(name):

@@ -34,8 +34,15 @@ SHAPES = {"FixLinearTriatomic", "FixInternals"}
 
 def resolve(scene: AnyScene) -> AnyScene:
     """The same scene with all defaults, which runs to the same bits. The integrator "auto" stays
-    until a run has chosen one. Raises SceneError, and for molecules StructureError and
-    MoleculeError."""
+    until a run has chosen one.
+
+    Raises
+    ------
+    SceneError
+        If the scene has errors.
+    StructureError, MoleculeError
+        For molecules, if a file of a structure or of a model has errors.
+    """
     return build_body(scene).scene if isinstance(scene, BodyScene) else build(scene).scene
 
 
@@ -57,13 +64,21 @@ def scene_from_atoms(
     TIP4P, need not be among the atoms. The scene contains the atoms; a run in a folder writes them
     there.
 
-    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a
-        scene file
-    settings : the other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}],
-        seed=3. start={"temperature_K": 300} draws momenta instead of using the atoms' momenta.
-        Default of stages: 1 ps of nve, or a minimisation if neither atoms nor settings give momenta
+    Atoms that do not match the models are found when the system is built.
 
-    Raises SceneError. Atoms that do not match the models are found when the system is built.
+    Parameters
+    ----------
+    models
+        Names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene
+        file
+    settings
+        The other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}], seed=3.
+        start={"temperature_K": 300} draws momenta instead of using the atoms' momenta. Default of
+        stages: 1 ps of nve, or a minimisation if neither atoms nor settings give momenta
+
+    Raises
+    ------
+    SceneError
     """
     if faults := atoms_errors(atoms):
         raise SceneError(SOURCE, faults)

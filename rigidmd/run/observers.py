@@ -33,9 +33,17 @@ class Moment:
     """The argument of observers: position in the run, state and observation. Its values do not
     change later.
 
-    step : steps since the start; time : ps, or s for a single body; stage : index of the stage
-    state : for molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body
-        in SI units
+    Parameters
+    ----------
+    step
+        Steps since the start
+    time
+        In ps, or s for a single body
+    stage
+        Index of the stage
+    state
+        For molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in
+        SI units
     """
 
     def __init__(self, run: "Simulation", step: int, time: float, stage: int):
@@ -77,9 +85,12 @@ def above_zero(interval: float, name: str) -> float:
 class Observer:
     """Base class; its methods do nothing.
 
-    remembers : name -> type of each attribute that a checkpoint has and a resumed run gets back: an
-        array (`np.ndarray`), arrays by name (`dict[str, np.ndarray]`), or what JSON can hold, which
-        is checked
+    Parameters
+    ----------
+    remembers
+        Name -> type of each attribute that a checkpoint has and a resumed run gets back: an array
+        (`np.ndarray`), arrays by name (`dict[str, np.ndarray]`), or what JSON can hold, which is
+        checked
     """
 
     remembers: ClassVar[dict[str, Any]] = {}
@@ -102,7 +113,13 @@ class Observer:
         """Called before the first step; the folder exists."""
 
     def see(self, moment: Moment) -> None:
-        """Observe a moment. Raises SimulationError to stop the run."""
+        """Observe a moment.
+
+        Raises
+        ------
+        SimulationError
+            To stop the run.
+        """
 
     def memory(self) -> Checkpoint:
         """The data that `resume` needs, for a checkpoint. Its files must be on the disk when it

@@ -33,10 +33,16 @@ class Results(Displayed):
     whole system, K, bar, Å, ps) or, for a body, in SI units. `units` lists all columns with their
     units.
 
-    summary : values with units in their keys, as in summary.json
-    files : paths of the files written
-    interrupted : whether the run ended early, by a signal or at its walltime (`out_of_time`)
-    signal : number of the signal, 2 for Ctrl-C, 15 for SIGTERM
+    Parameters
+    ----------
+    summary
+        Values with units in their keys, as in summary.json
+    files
+        Paths of the files written
+    interrupted
+        Whether the run ended early, by a signal or at its walltime (`out_of_time`)
+    signal
+        Number of the signal, 2 for Ctrl-C, 15 for SIGTERM
     """
 
     system: "System | BodySystem"
@@ -69,8 +75,13 @@ class Results(Displayed):
 
     @property
     def state(self) -> State:
-        """The final state, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units. Raises
-        OutputError if a run that was read from a folder has none."""
+        """The final state, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units.
+
+        Raises
+        ------
+        OutputError
+            If a run that was read from a folder has none.
+        """
         if self._state is None:
             raise OutputError(self._no_state)
         return self._state
@@ -96,8 +107,13 @@ class Results(Displayed):
         return {name: column.unit for name, column in self.samples.described.items()}
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """The samples under the headers of log.csv (motion.csv of a body). Raises ImportError
-        without pandas."""
+        """The samples under the headers of log.csv (motion.csv of a body).
+
+        Raises
+        ------
+        ImportError
+            Without pandas.
+        """
         try:
             import pandas
         except ImportError:
@@ -115,7 +131,11 @@ class Results(Displayed):
 
         Lengths in Å, times in ps; for a body a second becomes a picosecond. Every frame has its
         time in the run, also where the file format has none. Warns if frames are not evenly spaced.
-        Raises ValueError without a trajectory.
+
+        Raises
+        ------
+        ValueError
+            Without a trajectory.
         """
         from rigidmd.io import trajectory
 
@@ -151,7 +171,13 @@ class Results(Displayed):
         frame at its time, is exact, with energy, forces and stress; other frames have the digits of
         the trajectory (single precision but for .traj), and the energy where the log has a line at
         their time. So has the final state of a run that was read from a folder, without forces.
-        Raises ValueError for a body or without frames, IndexError.
+
+        Raises
+        ------
+        ValueError
+            For a body, or without frames.
+        IndexError
+            If there are fewer frames.
         """
         from rigidmd.run.atom_forces import atoms_of_results
 
@@ -164,7 +190,12 @@ class Results(Displayed):
         For molecules Q rotates the principal axes of `rigidmd models NAME`, for a body the body's
         axes, at all samples. A trajectory.gsd stores Q. With other files it is fitted to the
         positions of sites, as exact as these, with an arbitrary rotation of linear molecules about
-        their axes. Raises ValueError if nothing rotates.
+        their axes.
+
+        Raises
+        ------
+        ValueError
+            If nothing rotates.
         """
         if "Q" in self.samples.described:
             return self["Q"][:, None]

@@ -88,29 +88,41 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     """A scene, ready to run: `run()` runs it to its end, `step(n)` advances it by n steps; both can
     be mixed.
 
-    scene : the scene
-    folder : folder for the files; None writes nothing and keeps the frames in memory
-    force : replace an earlier run in that folder
-    observers : user-defined, called between steps: `Every`, `LivePlot`, any object with `interval`
-        and `see(moment)`
-    `say` : called with a sentence before something slow (compiling, pilot runs). Default: printed
-        with the progress
-    warn : called with each warning; the summary repeats them. Default: a `RigidMDWarning` of
-        Python's `warnings`
-    resume : continue from the last checkpoint in the folder, to the same bits; begin if the folder
-        is empty or absent
-    walltime : seconds from now until the run has to have ended; it stops shortly before, with a
-        checkpoint
-    forces : for molecules, user-defined forces, besides the forces of the scene: `rigidmd.Force`,
+    Parameters
+    ----------
+    scene
+        The scene
+    folder
+        Folder for the files; None writes nothing and keeps the frames in memory
+    force
+        Replace an earlier run in that folder
+    observers
+        user-defined, called between steps: `Every`, `LivePlot`, any object with `interval` and
+        `see(moment)`
+    say
+        Called with a sentence before something slow (compiling, pilot runs). Default: printed with
+        the progress
+    warn
+        Called with each warning; the summary repeats them. Default: a `RigidMDWarning` of Python's
+        `warnings`
+    resume
+        Continue from the last checkpoint in the folder, to the same bits; begin if the folder is
+        empty or absent
+    walltime
+        Seconds from now until the run has to have ended; it stops shortly before, with a checkpoint
+    forces
+        For molecules, user-defined forces, besides the forces of the scene: `rigidmd.Force`,
         `rigidmd.pair_law`, terms of classes with `rigidmd.compiled_force`, or objects whose method
         term(system) makes such a term. At the start forces and torques are compared with
         differences of the energy, and the virial with the effect of a strain of the box
-    thermostat : for molecules, a user-defined thermostat for every stage: a NamedTuple of a class
-        with `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
-    applied : for a single body, name -> function of a `Pose` that gives a force (3,) in N along the
-        lab's axes, at the centre of mass, and a torque (3,) in N m along the body's axes. It is
-        called once for each position of the body. Forces that depend on the velocity are constant
-        within a step, which reduces its order to 1
+    thermostat
+        For molecules, a user-defined thermostat for every stage: a NamedTuple of a class with
+        `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
+    applied
+        For a single body, name -> function of a `Pose` that gives a force (3,) in N along the lab's
+        axes, at the centre of mass, and a torque (3,) in N m along the body's axes. It is called
+        once for each position of the body. Forces that depend on the velocity are constant within a
+        step, which reduces its order to 1
     """
 
     part: "MolecularRun | BodyRun"
@@ -257,7 +269,12 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         forces.
 
         An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log; the `Pose` of a body,
-        in SI units. Raises SimulationError if the forces cannot be evaluated.
+        in SI units.
+
+        Raises
+        ------
+        SimulationError
+            If the forces cannot be evaluated.
         """
         return self.part.observe_now()
 
@@ -279,7 +296,13 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         return list(self.part.record.notes)
 
     def path(self, file: str) -> Path:
-        """Path of a file in the folder of the run. Raises ValueError without a folder."""
+        """Path of a file in the folder of the run.
+
+        Raises
+        ------
+        ValueError
+            Without a folder.
+        """
         if self.folder is None:
             raise ValueError(f"this run has no folder for {file}")
         return self.folder / file
@@ -322,7 +345,10 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """Let runs of molecules begin at the given positions and momenta, without removal of
         overlaps.
 
-        state : of as many molecules in the same order, in the units of `state`, such as
+        Parameters
+        ----------
+        state
+            Of as many molecules in the same order, in the units of `state`, such as
             `results.state`. Time and step begin at 0. Raises StructureError for a state that this
             scene cannot have, TypeError for anything else.
         """
@@ -372,10 +398,20 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         run in a folder that was interrupted is continued from its last checkpoint. Without a folder
         there is none, and it begins anew.
 
-        Raises OutputError (before computing), SimulationError if it fails, CheckpointError.
+        Parameters
+        ----------
+        progress
+            Whether to show progress, by a bar or, if not on a terminal, lines every 30 s; default:
+            in notebooks
 
-        progress : whether to show progress, by a bar or, if not on a terminal, lines every 30 s;
-            default: in notebooks
+        Raises
+        ------
+        OutputError
+            Before computing, if the folder cannot be used.
+        CheckpointError
+            If the run cannot be resumed.
+        SimulationError
+            If the run fails.
         """
         return cast(Results, self._drive(inf, progress).results)
 
@@ -385,7 +421,12 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         The first call begins the run: it compiles and writes the first files. A minimisation is
         done with the next step after it. `run` or `close` completes the run. A signal such as
-        Ctrl-C ends the run with all files, and is raised then. Raises ValueError, and as `run`.
+        Ctrl-C ends the run with all files, and is raised then.
+
+        Raises
+        ------
+        ValueError
+            For a count below 1. Errors of `run` occur here too.
         """
         if count < 1:
             raise ValueError(f"step({count}): at least one step")
@@ -407,7 +448,10 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """End the run at its next observation, with all files. Observers and other threads may call
         it.
 
-        number : of the signal that requests it
+        Parameters
+        ----------
+        number
+            Of the signal that requests it
         """
         if self._loop is not None:
             self._loop.stop(number)
@@ -487,12 +531,15 @@ def run_together(
     For many small systems this is faster than one run after another on all cores: no thread waits
     for another, and the steps of one run continue while the observers of another are called.
 
-    jobs : runs at a time; default: the number of cores
-
     Ctrl-C and SIGTERM stop all runs at their next observations; a run that had not begun is None in
     the list. A second Ctrl-C then raises KeyboardInterrupt. If a run fails, the others continue,
     and the first error is raised at the end, with a note on the runs that failed. Summaries and
     scenes of the simulations have one thread.
+
+    Parameters
+    ----------
+    jobs
+        Runs at a time; default: the number of cores
     """
     simulations = list(simulations)
     if wrong := [value for value in simulations if not isinstance(value, Simulation)]:

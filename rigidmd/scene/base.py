@@ -128,8 +128,13 @@ class Scene(Section, Displayed):
         return self._source
 
     def with_end(self, time: float) -> "Scene":
-        """The same scene with its end at a time of the run, ps. Raises SceneError if the end cannot
-        be set."""
+        """The same scene with its end at a time of the run, ps.
+
+        Raises
+        ------
+        SceneError
+            If the end cannot be set.
+        """
         raise SceneError(
             self.source,
             [f"{option('until')} is for molecules; set run.duration_s of a single body"],
@@ -173,11 +178,14 @@ class Scene(Section, Displayed):
         cls, path: PathName, overrides: dict[str, Any] | None = None
     ) -> "MolecularScene | BodyScene":
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}.
-        Raises SceneError.
 
         An override of None removes the key. Files named in the scene must lie in its folder or
         below; files named in `overrides` may be anywhere, and are taken relative to the working
         directory.
+
+        Raises
+        ------
+        SceneError
         """
         path = Path(path)
         data, text = read_tables(path)
@@ -216,15 +224,22 @@ class Scene(Section, Displayed):
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
     ) -> "MolecularScene | BodyScene":
-        """The scene in a nested dictionary like the one of a TOML file. Raises SceneError with all
-        errors.
+        """The scene in a nested dictionary like the one of a TOML file.
 
         Numbers and arrays of NumPy and paths are accepted as numbers, lists and texts. The
         dictionary is not changed.
 
-        source, text : path of the TOML file, for messages, and its text, for the numbers of lines
-            in them
-        embedded_files : see `embedded_files`; with them, files may be outside `folder`
+        Parameters
+        ----------
+        source, text
+            Path of the TOML file, for messages, and its text, for the numbers of lines in them
+        embedded_files
+            See `embedded_files`; with them, files may be outside `folder`
+
+        Raises
+        ------
+        SceneError
+            With all errors.
         """
         folder, data = Path(folder), plain_values(data)
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}

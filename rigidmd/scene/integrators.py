@@ -105,13 +105,22 @@ def integrator(
     rigidmd.integrator("ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth
     1990")
 
-    steps : lengths of successive velocity Verlet steps, as fractions of the time step; or
-    kicks, drifts : fractions of kick, drift, ..., drift, kick; gradients : of each kick, see
-        `core.integrators.Flow`
-
     Fractions sum to 1 and read the same from both ends. A scene that names the row keeps its
     coefficients in its table [[integrators]], so that its file and the folder of its run are
-    complete. Raises SceneError.
+    complete.
+
+    Parameters
+    ----------
+    steps
+        Lengths of successive velocity Verlet steps, as fractions of the time step; or
+    kicks, drifts
+        Fractions of kick, drift, ..., drift, kick
+    gradients
+        Of each kick, see `core.integrators.Flow`
+
+    Raises
+    ------
+    SceneError
     """
     given = {
         "name": name,

@@ -203,8 +203,12 @@ class MolecularScene(Scene):
     def with_user_code(
         self, forces: Sequence[Any] = (), thermostat: Any = None
     ) -> "MolecularScene":
-        """The same scene with forces and a thermostat from Python, see `Simulation`. Raises
-        SceneError."""
+        """The same scene with forces and a thermostat from Python, see `Simulation`.
+
+        Raises
+        ------
+        SceneError
+        """
         thermostat = self._user_code.thermostat if thermostat is None else thermostat
         user_code = UserCode((*self._user_code.forces, *forces), thermostat)
         if self.from_python not in ((), user_code.names):
@@ -214,8 +218,12 @@ class MolecularScene(Scene):
         return scene
 
     def with_end(self, time: float) -> "MolecularScene":
-        """The same scene with a last stage that ends at a time of the run, ps. Raises
-        SceneError."""
+        """The same scene with a last stage that ends at a time of the run, ps.
+
+        Raises
+        ------
+        SceneError
+        """
         before = sum(stage.duration for stage in self.stages[:-1])
         last = self.stages[-1]
         if last.is_minimisation or last.ramps:

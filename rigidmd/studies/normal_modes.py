@@ -220,15 +220,27 @@ def normal_modes(
 
     A minimisation comes first, to the rounding of forces and torques and at constant cell.
 
-    minimise : False requires that the start is a minimum
-    count : of the lowest and of the highest modes, by Lanczos; default: all, or 20 if there are
-        more than 6000
-    gamma : only modes with the period of the unit cell that `structure.repeat` repeats (k = 0)
-    required : number of a mode that has to be computed, which is checked before computing
-    progress : called with the fraction done
+    Parameters
+    ----------
+    minimise
+        False requires that the start is a minimum
+    count
+        Of the lowest and of the highest modes, by Lanczos; default: all, or 20 if there are more
+        than 6000
+    gamma
+        Only modes with the period of the unit cell that `structure.repeat` repeats (k = 0)
+    required
+        Number of a mode that has to be computed, which is checked before computing
+    progress
+        Called with the fraction done
 
-    Raises SceneError for a single body, for a required mode that does not exist, and at the Gamma
-    point without a unit cell; SimulationError where a minimum is required and not found.
+    Raises
+    ------
+    SceneError
+        For a single body, for a required mode that does not exist, and at the Gamma point without a
+        unit cell.
+    SimulationError
+        If a minimum is required and not found.
     """
     simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
     if isinstance(simulation.scene, BodyScene):

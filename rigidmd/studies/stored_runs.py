@@ -35,7 +35,10 @@ def read_run(folder: str | Path) -> Results | Table:
     `notes` and an empty `stages`, its state is the one of the last checkpoint. A sweep gives the
     `Table` that `rigidmd.sweep` returned, with the points that have finished.
 
-    Raises OutputError if the folder has no run, or a damaged one.
+    Raises
+    ------
+    OutputError
+        If the folder has no run, or a damaged one.
     """
     folder = Path(folder)
     if (folder / SWEEP).is_file():

@@ -286,8 +286,15 @@ class AnimationPage:
 
 
 def show(results: Results) -> "StructureWidget | AnimationPage":
-    """The animation of a run in a notebook: molecules by chemiscope, a body on a small page. Raises
-    ImportError without chemiscope, ValueError without a trajectory."""
+    """The animation of a run in a notebook: molecules by chemiscope, a body on a small page.
+
+    Raises
+    ------
+    ImportError
+        Without chemiscope.
+    ValueError
+        Without a trajectory.
+    """
     if isinstance(results.system, BodySystem):
         record = record_of(results.system, results.samples, results.summary)
         return AnimationPage(

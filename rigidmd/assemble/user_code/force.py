@@ -51,13 +51,18 @@ class Force:
     It is called once for every new set of positions, between steps of the compiled loop; a
     `compiled_force` is faster.
 
-    name : in logs and messages; default: the name of the class
-    changes_momentum : which components of the total momentum it may change; False for forces
-        between molecules
-    tied_to_places : whether its energy depends on absolute positions, which excludes a barostat. If
-        False, its virial must be the last of the returned values
-    energy_noise : random error of its energies, kJ/mol, for the comparison with its forces at the
-        start of a run
+    Parameters
+    ----------
+    name
+        In logs and messages; default: the name of the class
+    changes_momentum
+        Which components of the total momentum it may change; False for forces between molecules
+    tied_to_places
+        Whether its energy depends on absolute positions, which excludes a barostat. If False, its
+        virial must be the last of the returned values
+    energy_noise
+        Random error of its energies, kJ/mol, for the comparison with its forces at the start of a
+        run
     """
 
     name: ClassVar[str | None] = None

@@ -77,7 +77,12 @@ class PairLaw:
     formula_of_function: Formula | None = field(default=None, repr=False)
 
     def formula(self, cutoff: float) -> Formula:
-        """The formula that is compiled. Raises PairPotentialError."""
+        """The formula that is compiled.
+
+        Raises
+        ------
+        PairPotentialError
+        """
         try:
             if self.table is not None:
                 r, energy, force, name = self.table
@@ -93,8 +98,13 @@ class PairLaw:
         return not_none(self.formula_of_function)
 
     def bind(self, system: System) -> BoundPotential:
-        """The potential between the sites of a system. Raises PairPotentialError with all
-        errors."""
+        """The potential between the sites of a system.
+
+        Raises
+        ------
+        PairPotentialError
+            With all errors.
+        """
         forces = system.scene.forces
         cutoff = self.cutoff_A or system.cutoff
         check_cutoff(cutoff, system)
@@ -353,25 +363,37 @@ def pair_law(
 
     rigidmd.pair_law("A*exp(-B*r) - C/r**6", {"Ar": {"A": 1.6e6, "B": 4.4, "C": 6.2e3}})
 
-    energy : the energy in kJ/mol of the distance r in Å and of named parameters, as a text: + - * /
-        ** and exp, log, sqrt, sin, cos; its force is its derivative. Or a function f(p, r) that
-        gives (energy, -dE/dr), where p has the parameters; it may also have the arguments r2 (r²)
-        and inverse (1/r), and is compiled for vectors
-    parameters : site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a
+    Parameters
+    ----------
+    energy
+        The energy in kJ/mol of the distance r in Å and of named parameters, as a text: + - * / **
+        and exp, log, sqrt, sin, cos; its force is its derivative. Or a function f(p, r) that gives
+        (energy, -dE/dr), where p has the parameters; it may also have the arguments r2 (r²) and
+        inverse (1/r), and is compiled for vectors
+    parameters
+        Site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a
         dictionary, or the NamedTuple that a function expects. Or plain numbers, the same for all
         sites. Default: `parameters` of the sites in the models' files
-    table : instead of an energy, distances in Å, energies in kJ/mol and perhaps forces -dE/dr in
+    table
+        Instead of an energy, distances in Å, energies in kJ/mol and perhaps forces -dE/dr in
         kJ/mol/Å, which a spline interpolates; or a file with these columns. Nearer than the first
         distance the energy rises as r⁻¹²
-    sites : the only sites that it acts on
-    pairs : (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it
-        acts on them only
-    mixing : parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites;
-        default: arithmetic for names that begin with sig, else geometric
-    truncation, switch_start_A, cutoff_A : as in [forces] of the scene, which are the defaults
-    name : in the log and in messages
+    sites
+        The only sites that it acts on
+    pairs
+        (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it acts
+        on them only
+    mixing
+        Parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites; default:
+        arithmetic for names that begin with sig, else geometric
+    truncation, switch_start_A, cutoff_A
+        As in [forces] of the scene, which are the defaults
+    name
+        In the log and in messages
 
-    Raises ValueError.
+    Raises
+    ------
+    ValueError
     """
     if (energy is None) == (table is None):
         raise ValueError("needs an energy or a table")

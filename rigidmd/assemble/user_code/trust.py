@@ -16,9 +16,13 @@ _TRUSTED: set[str] = set()
 
 
 def trust(path: str | Path) -> None:
-    """Allow scenes to run a Python file with these contents, at any path. Raises SceneError. The
-    code can do anything that you can do: read it before. On the command line, --trust FILE does the
-    same."""
+    """Allow scenes to run a Python file with these contents, at any path. The code can do anything
+    that you can do: read it before. On the command line, --trust FILE does the same.
+
+    Raises
+    ------
+    SceneError
+    """
     _TRUSTED.add(digest_of(_source(Path(path), option("trust"))))
 
 

@@ -201,15 +201,28 @@ def sweep(
     table = rigidmd.sweep("water.toml", {"stages.equilibration.temperature_K": [280, 290], "seed":
     range(1, 9)}, jobs=2) print(table["Temperature (K)"], table.error("Temperature (K)"))
 
-    sets : dotted key -> list, tuple or range of values, or one value for all points; all
-        combinations run
-    folder : default: runs/NAME-sweep. Points that have finished there are not run again
-    jobs, threads : points at a time, threads of each; default: so that all cores have work
-    progress : whether to show progress, as `Simulation.run` does; default: in notebooks
+    The same call continues a sweep.
 
-    Raises SceneError and OutputError before anything runs, SimulationError if points failed
-    (`sweep.json` has
-    the reasons), KeyboardInterrupt after Ctrl-C. The same call continues a sweep.
+    Parameters
+    ----------
+    sets
+        Dotted key -> list, tuple or range of values, or one value for all points; all combinations
+        run
+    folder
+        default: runs/NAME-sweep. Points that have finished there are not run again
+    jobs, threads
+        Points at a time, threads of each; default: so that all cores have work
+    progress
+        Whether to show progress, as `Simulation.run` does; default: in notebooks
+
+    Raises
+    ------
+    SceneError, OutputError
+        Before anything runs.
+    SimulationError
+        If points failed; `sweep.json` has the reasons.
+    KeyboardInterrupt
+        After Ctrl-C.
     """
     with ExitStack() as stack:
         where = None if folder is None else Path(folder)

@@ -28,9 +28,16 @@ def is_of_windows(manifest: Manifest) -> bool:
 def pmf(sweep: Table | str | Path) -> AnalysisResult:
     """The potential of mean force along the restrained distance of a sweep, by all its windows.
 
-    sweep : what `rigidmd.sweep` or `rigidmd.read_run` returned, or the folder of a sweep
+    Points that have not finished are left out. Nothing is written.
 
-    Points that have not finished are left out. Nothing is written. Raises OutputError.
+    Parameters
+    ----------
+    sweep
+        What `rigidmd.sweep` or `rigidmd.read_run` returned, or the folder of a sweep
+
+    Raises
+    ------
+    OutputError
     """
     folder = sweep.folder if isinstance(sweep, Table) else Path(sweep)
     manifest = read_manifest(folder)
