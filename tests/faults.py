@@ -85,7 +85,7 @@ FAILING = ("write", "open", "replace", "fsync", "truncate", "mkdir")
 #: Arrays that nothing else in a checkpoint decides: with other values the run is another one, which
 #: must end by itself.
 FREE = re.compile(
-    r"state/(velocity|angular_momentum_body|books|bath|position|rotation)|Sampler/|engine/load|engine/\w+.times"
+    r"state/(velocity|angular_momentum_body|energy_ledger|extra_variables|position|rotation)|Sampler/|engine/load|engine/\w+.times"
 )
 
 # Scenes

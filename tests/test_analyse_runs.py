@@ -148,7 +148,7 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     assert {name: (copy / name).read_bytes() for name in kept} == kept
     assert cli.main(["analyse", str(copy), "--only", "rdf", "--from", "100fs"]) == 0
     again = json.loads((copy / "analysis.json").read_text())["analyses"]
-    assert again["rdf"]["stretch"]["from_ps"] == pytest.approx(0.1, abs=0.003)
+    assert again["rdf"]["frames_used"]["from_ps"] == pytest.approx(0.1, abs=0.003)
     assert again["rdf"] != found["rdf"] and again["spectrum"] == found["spectrum"]
     capsys.readouterr()
 
@@ -505,7 +505,7 @@ def test_a_run_that_was_killed_is_analysed_as_far_as_it_came(copy, capsys):
         "This run has not ended" in text
         and "trajectory.trr ends within a frame, which is left out" in text
     )
-    found = json.loads((copy / "analysis.json").read_text())["analyses"]["msd"]["stretch"]
+    found = json.loads((copy / "analysis.json").read_text())["analyses"]["msd"]["frames_used"]
     assert found["to_ps"] < 0.16 and found["frames"] == 34
 
 

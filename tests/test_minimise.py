@@ -711,12 +711,12 @@ def test_a_minimisation_and_its_overlap_removal_end_in_their_time(tmp_path, monk
     assert results.out_of_time
     (found,) = [stage["minimum"] for stage in results.summary["stages"]]
     assert (found["converged"], found["ended_by"], found["iterations"]) == (False, "interrupted", 0)
-    assert found["relief_steps"] <= 2
+    assert found["overlap_removal_steps"] <= 2
     monkeypatch.undo()
     results = Simulation(scene, tmp_path / "out", resume=True, warn=lambda warning: None).run()
     assert not results.interrupted
     assert results.summary["stages"][0]["minimum"]["converged"]
-    assert results.summary["stages"][0]["minimum"]["relief_steps"] > 2
+    assert results.summary["stages"][0]["minimum"]["overlap_removal_steps"] > 2
 
 
 def test_a_minimum_alone_has_one_frame(tmp_path):

@@ -439,7 +439,7 @@ def test_the_topology_is_the_first_frame_relief_included(tmp_path):
     results = Simulation(
         Scene.read(ROOT / "systems" / "water_nitrogen.toml", short), tmp_path / "out"
     ).run()
-    assert results.summary["relief_steps"] > 0
+    assert results.summary["overlap_removal_steps"] > 0
     universe = results.universe()
     first = mda.Universe(str(tmp_path / "out" / "topology.gro")).atoms.positions
     assert first == pytest.approx(universe.trajectory[0].positions, abs=0.011)

@@ -111,7 +111,7 @@ DAMAGES = {
         r"written by a later rigidmd \(version 99 of the format",
     ),
     "shape": (lambda s: s.update(position=s["position"][:3]), "position: damaged"),
-    "nan": (lambda s: s.update(books=np.full(3, np.nan)), "books: damaged"),
+    "nan": (lambda s: s.update(energy_ledger=np.full(3, np.nan)), "energy_ledger: damaged"),
     "species": (lambda s: s.update(species=s["species"] + 5), "species: damaged"),
     "rotation": (lambda s: s.update(rotation=1.1 * s["rotation"]), "rotation: damaged"),
     "mirror": (lambda s: s.update(rotation=-s["rotation"]), "rotation: damaged"),

@@ -745,7 +745,7 @@ def test_a_force_in_python_conserves_energy_and_is_in_the_log(tmp_path):
     header = (tmp_path / "run" / "log.csv").read_text().splitlines()[0]
     assert header.endswith('"spring (kJ/mole)"')
     assert results.units["spring"] == "kJ/mol"
-    assert results.summary["own_forces"] == {"spring": "Spring, computed by Python"}
+    assert results.summary["user_forces"] == {"spring": "Spring, computed by Python"}
 
 
 def test_a_run_with_forces_from_python_is_repeated_by_python_only(tmp_path, capsys):

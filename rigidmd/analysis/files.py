@@ -9,7 +9,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from rigidmd.analysis.curve_figure import curve_figure
 from rigidmd.analysis.registry import analysis_order, is_built_in, selected
@@ -64,9 +64,7 @@ def write_results(
     add_to_folder(folder, [ANALYSIS, *new])
     entries, curves = {}, [curve for result in results for curve in result.curves]
     for name, entry in known.items():
-        entries[name] = entry.model_dump(by_alias=True) | {
-            "values": [value._asdict() for value in entry.values]
-        }
+        entries[name] = entry.model_dump() | {"values": [value._asdict() for value in entry.values]}
     for result in [
         *results,
         *(AnalysisResult(name, name, notes=[reason]) for name, reason in failed.items()),
@@ -79,7 +77,7 @@ def write_results(
                 {key: getattr(curve, key) for key in _Curve.model_fields} for curve in result.curves
             ],
             "files": files.get(result.name, []),
-            "stretch": frames_used,
+            "frames_used": frames_used,
         }
     entries = dict(sorted(entries.items(), key=lambda entry: analysis_order(entry[0])))
     for curve in curves:
@@ -123,7 +121,8 @@ class _Entry(BaseModel):
     notes: list[str]
     curves: list[_Curve]
     files: list[str]
-    frames_used: _FramesUsed = Field(alias="stretch")
+    # "stretch" in files of rigidmd 0.2
+    frames_used: _FramesUsed = Field(validation_alias=AliasChoices("frames_used", "stretch"))
 
 
 class _Analyses(BaseModel):

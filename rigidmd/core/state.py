@@ -96,9 +96,6 @@ class State(NamedTuple):
         self.step[ORIGIN] = self.step[NOW]
 
 
-#: Names of a state's arrays in files, in the order of `State`; two differ, so that older files can
-#: be read.
-STORED_NAMES = (*State._fields[:7], "books", "bath")
 #: The cell of a scene without a box.
 NO_CELL = np.diag([inf, inf, inf])
 

@@ -14,11 +14,13 @@ from rigidmd.errors import CheckpointError, option
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 
 #: Version of the format. Version 1 (rigidmd 0.1) named observers by their number; 2 had no record
-#: of the run.
-SCHEMA = 3
+#: of the run; 3 had other names.
+SCHEMA = 4
 #: Members besides the arrays of the run: all other values as JSON, and names, lengths and CRC-32 of
 #: all other members.
-JSON, CONTENTS = "told", "contents"
+JSON, CONTENTS = "values", "contents"
+#: The name of JSON in version 3.
+FORMER_JSON = "told"
 
 
 class Checkpoint(NamedTuple):
@@ -73,7 +75,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
                 raise ValueError("its contents differ from those that were written")
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files if name != CONTENTS}
-        values = json.loads(arrays.pop(JSON).tobytes())
+        name = JSON if JSON in arrays else FORMER_JSON
+        values = json.loads(arrays.pop(name).tobytes())
         schema = int(values.pop("schema"))
     except (
         Exception

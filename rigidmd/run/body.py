@@ -12,7 +12,7 @@ from pydantic import PositiveFloat
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.time_step import stable_angle
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
+from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines.body_motion import Motion, Snapshot, energies, is_balanced, motion
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.protocol import NotFiniteError
@@ -60,14 +60,14 @@ class Sampler(Observer):
         """The arrays of all snapshots, by name."""
         found = {
             name: np.array([seen.state[k] for seen in self.snapshots])
-            for k, name in enumerate(STORED_NAMES)
+            for k, name in enumerate(State._fields)
         }
         return found | {"t": np.array([seen.time for seen in self.snapshots])}
 
     @stacked.setter
     def stacked(self, stacked: dict[str, np.ndarray]) -> None:
         times = stacked.pop("t")
-        states = [State(*(stacked[name][k] for name in STORED_NAMES)) for k in range(len(times))]
+        states = [State(*(stacked[name][k] for name in State._fields)) for k in range(len(times))]
         self.snapshots = [
             Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)
         ]
@@ -83,7 +83,7 @@ class Sampler(Observer):
             raise ValueError("the times of its samples cannot be of a run")
         for seen in self.snapshots:
             state_from(
-                dict(zip(STORED_NAMES, seen.state, strict=True)), run.part.state, exact=False
+                dict(zip(State._fields, seen.state, strict=True)), run.part.state, exact=False
             )
 
     def see(self, moment: Moment) -> None:

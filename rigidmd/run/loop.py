@@ -18,7 +18,7 @@ import numpy as np
 from rigidmd.compile.cache import compiling_announced, describe_cache
 from rigidmd.core.files import LostFileError, writing
 from rigidmd.core.process import PROCESS_LOCK
-from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES
+from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines.protocol import Halted, NotFiniteError
 from rigidmd.errors import OutputError, RigidMDError, SimulationError, resume_command
 from rigidmd.io import folder as run_folder
@@ -345,7 +345,7 @@ class RunLoop:
         parts |= {
             RECORD: resume.stored(record, record.types()),
             "engine": Checkpoint({}, memory),
-            "state": Checkpoint({}, dict(zip(STORED_NAMES, part.state, strict=True))),
+            "state": Checkpoint({}, dict(zip(State._fields, part.state, strict=True))),
         }
         arrays = {
             f"{owner}/{name}": array

@@ -604,7 +604,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         found = {
             "unit": unit,
             "molecules": n,
-            "relief_steps": removal.steps if removal else 0,
+            "overlap_removal_steps": removal.steps if removal else 0,
             "notes": [*self.system.notes, *self.system.warnings],
             "components": {name: energy / size for name, energy in seen.components.items()},
             "potential": seen.potential / size,

@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
-from rigidmd.core.state import STORED_NAMES, State
+from rigidmd.core.state import State
 from rigidmd.engines import samples
 from rigidmd.engines.body_motion import Snapshot, motion
 from rigidmd.engines.body_system import BodySystem
@@ -180,7 +180,7 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
     for owner in kept.values.get("of", {}):
         part = kept.of(owner).arrays
         if "stacked/t" in part:  # of `run.body.Sampler`
-            states = zip(*(part[f"stacked/{name}"] for name in STORED_NAMES), strict=True)
+            states = zip(*(part[f"stacked/{name}"] for name in State._fields), strict=True)
             times = part["stacked/t"].tolist()
             snapshots = [Snapshot(t, State(*state)) for t, state in zip(times, states, strict=True)]
             missing.append(

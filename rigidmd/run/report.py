@@ -135,9 +135,8 @@ def stage_title(stage: dict) -> str:
     """Steps and speed of a stage, or how its minimisation ended."""
     if found := stage["minimum"]:
         ended = "converged" if found["converged"] else f"not converged ({found['ended_by']}),"
-        removal = (
-            f" and {found['relief_steps']} of overlap removal" if found["relief_steps"] else ""
-        )
+        steps = found["overlap_removal_steps"]
+        removal = f" and {steps} of overlap removal" if steps else ""
         return (
             f"{stage['name']}: {ended} after {found['iterations']} iterations{removal};"
             f" {stage['computing_s']:.1f} s"

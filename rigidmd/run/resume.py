@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigidmd.compile.machine import CODE_SETTINGS, PROCESSOR, PROCESSOR_FEATURES, SIMD_BITS
 from rigidmd.core.integrators import Scheme
-from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
+from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.core.state_file import array_errors
 from rigidmd.errors import CheckpointError, SceneError, option
 from rigidmd.io.checkpoint import Checkpoint
@@ -194,13 +194,13 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True
 
     exact : whether the method of the run keeps rotation matrices orthogonal to rounding
     """
-    found = State(*(np.array(arrays[name], order="C") for name in STORED_NAMES))
-    shapes = {name: expected.shape for name, expected in zip(STORED_NAMES, like, strict=True)}
+    found = State(*(np.array(arrays[name], order="C") for name in State._fields))
+    shapes = {name: expected.shape for name, expected in zip(State._fields, like, strict=True)}
     for name, problem in array_errors(
-        dict(zip(STORED_NAMES, found, strict=True)), shapes, exact
+        dict(zip(State._fields, found, strict=True)), shapes, exact
     ).items():
         raise ValueError(f"{name} of its state {problem}")
-    for name, array, expected in zip(STORED_NAMES, found, like, strict=True):
+    for name, array, expected in zip(State._fields, found, like, strict=True):
         if array.dtype != expected.dtype:
             raise ValueError(
                 f"{name} of its state is of the type {array.dtype}, not {expected.dtype}"

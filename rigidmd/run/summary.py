@@ -126,7 +126,7 @@ def summarise(
         "precision_reason": (
             f"{system.precision}: {system.precision_reason}" if system.precision_reason else None
         ),
-        "relief_steps": record.removal.steps if record.removal else 0,
+        "overlap_removal_steps": record.removal.steps if record.removal else 0,
         "preparing_s": preparing,
         "wall_s": wall,
         "largest_orthogonality_error": float(samples["orthogonality_error"].max()),
@@ -135,7 +135,7 @@ def summarise(
         "momentum_conserved": [
             axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept
         ],
-        "own_forces": dict(system.user_terms),
+        "user_forces": dict(system.user_terms),
         "forces_by_python": {
             name: [f.calls, f.seconds] for name, f in system.python_forces.items()
         },
@@ -468,7 +468,7 @@ def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
         "ended_by": found.ended_by or None,
         "iterations": found.iterations,
         "precision": found.precision,
-        "relief_steps": found.overlap_steps,
+        "overlap_removal_steps": found.overlap_steps,
         "energy_before_kJ_mol_per_molecule": found.energy_before / KJ_PER_MOL / molecules,
         "energy_after_kJ_mol_per_molecule": found.energy_after / KJ_PER_MOL / molecules,
         "largest_force_kJ_mol_A": found.force / KJ_PER_MOL,

@@ -90,7 +90,9 @@ def _state_of(record: Record) -> tuple[State | None, str]:
                 )
             return found, ""
         arrays = latest(record.folder)[0].of("state").arrays
-        return state_from(arrays, start._replace(extra_variables=arrays["bath"]), exact=False), ""
+        return state_from(
+            arrays, start._replace(extra_variables=arrays["extra_variables"]), exact=False
+        ), ""
     except (CheckpointError, StructureError, ValueError, KeyError) as error:
         return None, f"the final state is not available: {error}"
 
