@@ -33,9 +33,9 @@ from rigidmd.core.state import NOW, State, state_of
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError, describe_error
-from rigidmd.io.formats import STRUCTURE
-from rigidmd.io.formats.cells import basis_of, least_skewed_cell, standard_rotation
-from rigidmd.io.formats.through_ase import EV, atoms_of_sites
+from rigidmd.formats import STRUCTURE
+from rigidmd.formats.cells import basis_of, least_skewed_cell, standard_rotation
+from rigidmd.formats.through_ase import EV, atoms_of_sites
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.io.trajectory import read_frames
 from rigidmd.run.atom_forces import Form, ase_results

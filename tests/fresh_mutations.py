@@ -205,7 +205,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F25",
         "GSD: the tilt yz over the edge b",
-        "io/formats/gsd.py",
+        "formats/gsd.py",
         "bx / ly, cx / lz, cy / lz]",
         "bx / ly, cx / lz, cy / ly]",
         ("test_gsd.py::test_frames_come_back",),

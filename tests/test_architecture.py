@@ -12,7 +12,7 @@ from fnmatch import fnmatch
 import pytest
 from support import ROOT
 
-from rigidmd.io.formats import BY_EXTENSION
+from rigidmd.formats import BY_EXTENSION
 
 PACKAGE = ROOT / "rigidmd"
 
@@ -28,7 +28,7 @@ LAYERS = (
     "mechanics",
     "forces",
     "dynamics",
-    "io.formats",
+    "formats",
     "scene",
     "engines",
     "io",
@@ -50,7 +50,7 @@ LIBRARIES = {
     "ase": {"io", "assemble", "run", "ase.py"},
     "chemiscope": {"view"},
     "distributed": {"studies/sweep"},
-    "gsd": {"io/formats"},
+    "gsd": {"formats"},
     "IPython": {"io/progress.py"},
     "llvmlite": {"compile"},
     "MDAnalysis": {"io", "run/results.py"},
@@ -146,8 +146,8 @@ def build():
     ]
     assert not list(upward("__init__", imports_in(source)))
     inner = [
-        (1, "rigidmd.io.formats.gro"),
-        (2, "rigidmd.io.formats"),
+        (1, "rigidmd.formats.gro"),
+        (2, "rigidmd.formats"),
         (3, "rigidmd.io.trajectory"),
         (4, "rigidmd.io"),
     ]
@@ -208,7 +208,7 @@ NAMED_EXTENSIONS = {
 
 
 def test_only_a_format_names_its_extensions():
-    """In texts except docstrings; `io.formats` also has the default names of files."""
+    """In texts except docstrings; `formats` also has the default names of files."""
     extension = re.compile(rf"[.]({'|'.join(name[1:] for name in BY_EXTENSION)})\b")
     naming = {}
     for path in FILES:
@@ -221,7 +221,7 @@ def test_only_a_format_names_its_extensions():
         ]
         if found := [text for text in texts if isinstance(text, str) and extension.search(text)]:
             naming[name_of(path)] = found
-    strange = {name: texts for name, texts in naming.items() if not name.startswith("io/formats/")}
+    strange = {name: texts for name, texts in naming.items() if not name.startswith("formats/")}
     assert set(strange) == set(NAMED_EXTENSIONS), strange
     assert len(naming) >= len(strange) + 8  # the registry and seven modules
 
@@ -254,7 +254,7 @@ def test_ase_loads_little_of_rigidmd():
         f"from importlib.metadata import EntryPoint\nEntryPoint(*{point}, 'ase.ioformats').load()"
     )
     assert "rigidmd.io.ase_plugin" in found
-    assert not {"numba", "MDAnalysis", "matplotlib", "rigidmd.io.formats"} & found
+    assert not {"numba", "MDAnalysis", "matplotlib", "rigidmd.formats"} & found
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from rigidmd.ase import RigidMD
 from rigidmd.assemble.build import build
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SceneError, StructureError
-from rigidmd.io.formats.through_ase import EV, TrajFile, TrajReader
+from rigidmd.formats.through_ase import EV, TrajFile, TrajReader
 from rigidmd.io.trajectory import read_frames
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.run import Every

@@ -47,7 +47,7 @@ from rigidmd.commands.arguments import read_scene
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.core.shipped import CHAPTERS, DOCS, find_example
 from rigidmd.errors import SceneError
-from rigidmd.io.formats import BY_EXTENSION
+from rigidmd.formats import BY_EXTENSION
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.scene.models import read_parameters
 

@@ -10,7 +10,7 @@ from support import same_after_stops, small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.errors import OutputError, SceneError
-from rigidmd.io.formats.gsd import GsdFile, GsdReader
+from rigidmd.formats.gsd import GsdFile, GsdReader
 from rigidmd.io.trajectory import read_frames
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run import Every, Simulation

@@ -11,7 +11,7 @@ from support import small_scene
 from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
 from rigidmd.errors import MoleculeError, SceneError
-from rigidmd.io.formats.bonds import bonds
+from rigidmd.formats.bonds import bonds
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

@@ -25,8 +25,8 @@ from rigidmd.assemble.start import close_pairs, every_site
 from rigidmd.assemble.structure import read_structure
 from rigidmd.core.state_file import write_state
 from rigidmd.errors import SceneError, StructureError
-from rigidmd.io.formats.atoms import element_of, element_of_mass
-from rigidmd.io.formats.cells import (
+from rigidmd.formats.atoms import element_of, element_of_mass
+from rigidmd.formats.cells import (
     basis_of,
     describe_basis,
     least_skewed_cell,

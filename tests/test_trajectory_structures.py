@@ -13,14 +13,14 @@ from MDAnalysis.analysis.dielectric import DielectricConstant
 from scenes import FORTY_WATERS, NVT, forty_waters
 from support import small_scene
 
+from rigidmd import formats
 from rigidmd.analysis.rigid_frames import without_rounding
 from rigidmd.assemble.build import build
 from rigidmd.assemble.structure import read_structure
 from rigidmd.commands import cli
 from rigidmd.errors import SceneError, SimulationError, StructureError
-from rigidmd.io import formats
-from rigidmd.io.formats import through_mdanalysis
-from rigidmd.io.formats.atoms import Frame
+from rigidmd.formats import through_mdanalysis
+from rigidmd.formats.atoms import Frame
 from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.io.trajectory import (
     from_files,
@@ -518,7 +518,7 @@ from functools import partial
 
 import numpy as np
 
-from PACKAGE.io.formats import Atoms, Format, Frame, register
+from PACKAGE.formats import Atoms, Format, Frame, register
 
 
 def encoder(system, interval, velocities):
@@ -586,7 +586,7 @@ def test_adding_a_format_takes_one_file(tmp_path, monkeypatch):
         )
     finally:
         formats.BY_EXTENSION.pop(".toy", None)
-        sys.modules.pop("rigidmd.io.formats.toy", None)
+        sys.modules.pop("rigidmd.formats.toy", None)
     with pytest.raises(
         SceneError, match=r"must end in one of \.dcd \.gsd \.nc \.pdb \.traj \.trr \.xtc \.xyz"
     ):

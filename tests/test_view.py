@@ -19,7 +19,7 @@ from support import ROOT
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.body import build_body
 from rigidmd.commands import cli
-from rigidmd.io.formats.bonds import connections
+from rigidmd.formats.bonds import connections
 from rigidmd.mechanics.inertia import SOLIDS, shifted_inertia, solid
 from rigidmd.run.record import read_record
 from rigidmd.view import molecule_animation

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.io.formats.bonds import shortest_links
+from rigidmd.formats.bonds import shortest_links
 from rigidmd.mechanics.rotation import align
 from rigidmd.scene.models import Molecule
 

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats.atoms import (
     CHARMM_IONS,
     CHARMM_WATER,
     SAME_MASS,

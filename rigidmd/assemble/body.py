@@ -18,7 +18,7 @@ from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.errors import SceneError
 from rigidmd.forces.body.applied import PythonForce, SteadyForce, TimeDependentForce
 from rigidmd.forces.body.resistance import NoResistance, Resistance
-from rigidmd.io.formats import format_of
+from rigidmd.formats import format_of
 from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor, split_rotor
 from rigidmd.mechanics.inertia import (
     Assembly,

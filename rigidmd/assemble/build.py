@@ -32,7 +32,7 @@ from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of
 from rigidmd.forces.parts import Composition, Interactions, SystemParts, sum_of_tails
-from rigidmd.io.formats.cells import describe_basis, describe_cell
+from rigidmd.formats.cells import describe_basis, describe_cell
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene, couplings
 from rigidmd.scene.fields import FIELDS, field_notes

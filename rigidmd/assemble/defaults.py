@@ -20,7 +20,7 @@ from rigidmd.core.integrators import RK4, SOLVERS
 from rigidmd.forces.neighbors.space import Triclinic, longest_gaps
 from rigidmd.forces.parts import Composition, Grid, Settings
 from rigidmd.forces.potentials.truncation import default_switch_start
-from rigidmd.io.formats import BODY_TOPOLOGY, TOPOLOGY
+from rigidmd.formats import BODY_TOPOLOGY, TOPOLOGY
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.forces import ELECTROSTATICS, OPEN, PERIODIC, Forces

@@ -21,7 +21,7 @@ from rigidmd.errors import SceneError
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.potentials.coulomb import ReactionField
-from rigidmd.io.formats.cells import right_angled
+from rigidmd.formats.cells import right_angled
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.scene import BodyScene, MolecularScene

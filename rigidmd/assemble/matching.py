@@ -20,8 +20,8 @@ from rigidmd.assemble.assignment import (
 )
 from rigidmd.assemble.atom_kinds import kinds_of, labels_of
 from rigidmd.assemble.bonded_atoms import bonded_atoms
-from rigidmd.io.formats.atoms import Atoms
-from rigidmd.io.formats.cells import make_whole
+from rigidmd.formats.atoms import Atoms
+from rigidmd.formats.cells import make_whole
 from rigidmd.scene.models import Molecule
 
 #: Up to this multiple of the tolerance the best order of atoms is searched, for messages on

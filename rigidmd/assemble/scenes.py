@@ -15,9 +15,9 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.core.toml import plain_values
 from rigidmd.errors import RigidMDWarning, SceneError
-from rigidmd.io.formats import STRUCTURE
-from rigidmd.io.formats.cells import cell_error
-from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, atoms_of_system
+from rigidmd.formats import STRUCTURE
+from rigidmd.formats.cells import cell_error
+from rigidmd.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, atoms_of_system
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.base import AnyScene, with_absolute_paths
 from rigidmd.scene.molecules import Settings

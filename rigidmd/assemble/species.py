@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidmd.errors import InputError, MoleculeError, SceneError, StructureError
 from rigidmd.forces.parts import select_by_number
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms
+from rigidmd.formats.atoms import HEAVY_HYDROGEN, Atoms
 from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import (

@@ -16,8 +16,8 @@ from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.fields.walls import range_of_centres
 from rigidmd.forces.parts import gather_per_molecule
-from rigidmd.io.formats import format_of
-from rigidmd.io.formats.cells import cell_error, pairs_within
+from rigidmd.formats import format_of
+from rigidmd.formats.cells import cell_error, pairs_within
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import AXES

@@ -16,9 +16,9 @@ from rigidmd.core.state import edges_and_angles
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
-from rigidmd.io.formats import has_types
-from rigidmd.io.formats.atoms import SAME_MASS, Atoms
-from rigidmd.io.formats.cells import (
+from rigidmd.formats import has_types
+from rigidmd.formats.atoms import SAME_MASS, Atoms
+from rigidmd.formats.cells import (
     basis_of,
     cell_error,
     describe_basis,

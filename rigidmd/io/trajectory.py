@@ -25,11 +25,11 @@ from rigidmd.core.state import State
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError, SimulationError, StructureError
-from rigidmd.io.formats import BY_EXTENSION, written
-from rigidmd.io.formats.atoms import Frame
-from rigidmd.io.formats.bonds import charges, connections
-from rigidmd.io.formats.frame_file import FrameFile
-from rigidmd.io.formats.through_mdanalysis import (
+from rigidmd.formats import BY_EXTENSION, written
+from rigidmd.formats.atoms import Frame
+from rigidmd.formats.bonds import charges, connections
+from rigidmd.formats.frame_file import FrameFile
+from rigidmd.formats.through_mdanalysis import (
     dimensions,
     read_in_process,
     set_frame,

@@ -22,8 +22,8 @@ from rigidmd.engines.observables import observe
 from rigidmd.engines.system import System
 from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
-from rigidmd.io.formats import format_of
-from rigidmd.io.formats.through_ase import EV, atoms_of_sites, atoms_of_system
+from rigidmd.formats import format_of
+from rigidmd.formats.through_ase import EV, atoms_of_sites, atoms_of_system
 from rigidmd.mechanics.rotation import hat
 from rigidmd.run.force_errors import forces_inside
 from rigidmd.run.rigid_fit import kinds_of

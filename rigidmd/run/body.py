@@ -20,9 +20,9 @@ from rigidmd.engines.samples import MATRIX
 from rigidmd.errors import SimulationError
 from rigidmd.figures.body import FIGURES
 from rigidmd.forces.body.applied import SteadyForce
+from rigidmd.formats import format_of
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import MOTION, MOTION_NPZ
-from rigidmd.io.formats import format_of
 from rigidmd.io.write import write_columns, write_npz
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run.checks import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck

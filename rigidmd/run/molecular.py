@@ -23,9 +23,9 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.engines.samples import OF_TRAJECTORIES, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError, SimulationError, StructureError
+from rigidmd.formats import format_of
+from rigidmd.formats.through_ase import atoms_of_system
 from rigidmd.io.checkpoint import Checkpoint
-from rigidmd.io.formats import format_of
-from rigidmd.io.formats.through_ase import atoms_of_system
 from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks

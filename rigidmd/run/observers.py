@@ -18,9 +18,9 @@ from pydantic import Field
 from rigidmd.core.state import NOW, State
 from rigidmd.figures.run import run_figures
 from rigidmd.figures.style import save_files
+from rigidmd.formats.atoms import Frame
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import SCENE
-from rigidmd.io.formats.atoms import Frame
 from rigidmd.run.resume import restored, stored
 
 if TYPE_CHECKING:

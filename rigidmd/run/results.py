@@ -11,7 +11,7 @@ import numpy as np
 from rigidmd.core.display import Displayed
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
-from rigidmd.io.formats import BY_EXTENSION
+from rigidmd.formats import BY_EXTENSION
 
 if TYPE_CHECKING:
     import ase
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rigidmd.engines.body_system import BodySystem
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
-    from rigidmd.io.formats.atoms import Frame
+    from rigidmd.formats.atoms import Frame
 
 
 @dataclass(repr=False)

@@ -34,7 +34,7 @@ from rigidmd.core.toml import (
     values_in,
 )
 from rigidmd.errors import SceneError, option
-from rigidmd.io.formats import Format, format_of, written
+from rigidmd.formats import Format, format_of, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
     MOST_TABLES,

@@ -18,7 +18,7 @@ from rigidmd.core.integrators import (
     Rotor,
     auto_errors,
 )
-from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY
+from rigidmd.formats import BODY_TOPOLOGY, TRAJECTORY
 from rigidmd.mechanics.inertia import (
     COMPONENTS_PER_DIMENSION,
     SOLIDS,

@@ -9,7 +9,7 @@ from pydantic import Field, PrivateAttr, Strict
 
 from rigidmd.core.plain_text import distinct
 from rigidmd.errors import SceneError, option
-from rigidmd.io.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
+from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, Strict, field_validator
 
-from rigidmd.io.formats import extensions
-from rigidmd.io.formats.cells import cell_of
+from rigidmd.formats import extensions
+from rigidmd.formats.cells import cell_of
 from rigidmd.scene.models import Site, SiteName, available_models, model_error
 from rigidmd.scene.validation import (
     Count,

@@ -10,9 +10,9 @@ from rigidmd.core.state import State
 from rigidmd.core.state_file import read_state
 from rigidmd.engines.body_motion import Motion
 from rigidmd.errors import CheckpointError, StructureError
+from rigidmd.formats.atoms import Frame
 from rigidmd.io.checkpoint import latest
 from rigidmd.io.folder import FINAL, SWEEP, written_by_runs
-from rigidmd.io.formats.atoms import Frame
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.results import Results
 from rigidmd.run.resume import state_from

@@ -24,7 +24,7 @@ from rigidmd.analysis.result import (
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs
 from rigidmd.errors import OutputError
-from rigidmd.io.formats import written
+from rigidmd.formats import written
 from rigidmd.mechanics.inertia import rotational_freedom
 from rigidmd.run.rigid_fit import Kind
 from rigidmd.units import COULOMB, DEBYE

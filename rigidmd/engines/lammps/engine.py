@@ -31,7 +31,7 @@ from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError, StructureError
 from rigidmd.forces.ewald.corrections import background, self_energy
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.io.formats.lammps import dump_box
+from rigidmd.formats.lammps import dump_box
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, SplitRotor
 
 #: Begins a line with numbers, which also ends the output of a command.

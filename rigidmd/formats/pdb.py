@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.io.formats import Encode, Format, System, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Encode, Format, System, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
     Frame,
@@ -19,8 +19,8 @@ from rigidmd.io.formats.atoms import (
     structure_error,
     unexpected,
 )
-from rigidmd.io.formats.cells import cell_of
-from rigidmd.io.formats.through_mdanalysis import FrameFiles, dimensions
+from rigidmd.formats.cells import cell_of
+from rigidmd.formats.through_mdanalysis import FrameFiles, dimensions
 
 #: Columns of the edges and angles in CRYST1.
 CRYST1 = (6, 15, 24, 33, 40, 47, 54)

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Format, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Format, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
     atom_count,
@@ -24,7 +24,7 @@ from rigidmd.io.formats.atoms import (
     table,
     unexpected,
 )
-from rigidmd.io.formats.through_ase import ASE_VELOCITY
+from rigidmd.formats.through_ase import ASE_VELOCITY
 
 #: Columns of the section Atoms by atom style. Three image numbers may follow. a, b, c are columns
 #: that are not used.

@@ -19,8 +19,8 @@ import numpy as np
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NOW, State
 from rigidmd.errors import StructureError
-from rigidmd.io.formats import Format, System, extensions, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Format, System, extensions, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     MASSLESS_NAME,
     Atoms,
@@ -28,7 +28,7 @@ from rigidmd.io.formats.atoms import (
     is_element,
     structure_error,
 )
-from rigidmd.io.formats.frame_file import FrameFile
+from rigidmd.formats.frame_file import FrameFile
 from rigidmd.units import ENERGY_UNITS
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ import numpy as np
 
 from rigidmd.core.process import ignore_warnings, python_process
 from rigidmd.core.state import edges_and_angles
-from rigidmd.io.formats import Encode, Format, System, register
-from rigidmd.io.formats.atoms import Frame, structure_error
+from rigidmd.formats import Encode, Format, System, register
+from rigidmd.formats.atoms import Frame, structure_error
 
 
 def dimensions(cell: np.ndarray | None) -> list[float] | None:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.io.formats.atoms import Atoms, Frame
+from rigidmd.formats.atoms import Atoms, Frame
 
 #: The system of a run, of a package above. All have `state`, `sites` with arrays `name`, `element`,
 #: `mass`, `molecule`, `residue_names`, `site_positions(state, wrapped)`, `site_velocities(state)`.

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Format, register
-from rigidmd.io.formats.atoms import Atoms, numbers, structure_error, unexpected
+from rigidmd.formats import Format, register
+from rigidmd.formats.atoms import Atoms, numbers, structure_error, unexpected
 
 #: Columns before the coordinates: number and name of the residue, name and number of the atom.
 HEAD = 24

@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Encode, Format, System, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Encode, Format, System, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
     Frame,
@@ -18,8 +18,8 @@ from rigidmd.io.formats.atoms import (
     unexpected,
     without_fortran,
 )
-from rigidmd.io.formats.through_ase import NAMES, from_ase, read_by_ase
-from rigidmd.io.formats.through_mdanalysis import FrameFiles
+from rigidmd.formats.through_ase import NAMES, from_ase, read_by_ase
+from rigidmd.formats.through_mdanalysis import FrameFiles
 
 
 def read_xyz(

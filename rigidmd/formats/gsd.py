@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.io.formats import Format, System, register
-from rigidmd.io.formats.atoms import SAME_MASS, Atoms, Frame, names_of_types, structure_error
-from rigidmd.io.formats.bonds import charges, connections
-from rigidmd.io.formats.cells import make_whole
-from rigidmd.io.formats.frame_file import FrameFile
-from rigidmd.io.formats.through_mdanalysis import index_of
+from rigidmd.formats import Format, System, register
+from rigidmd.formats.atoms import SAME_MASS, Atoms, Frame, names_of_types, structure_error
+from rigidmd.formats.bonds import charges, connections
+from rigidmd.formats.cells import make_whole
+from rigidmd.formats.frame_file import FrameFile
+from rigidmd.formats.through_mdanalysis import index_of
 from rigidmd.mechanics.rotation import from_quaternion, to_quaternion
 
 #: Distance, Å, between particles at one position.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rigidmd.io.formats.cells import pairs_within
+from rigidmd.formats.cells import pairs_within
 
 if TYPE_CHECKING:
     import gemmi

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Format, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Format, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     MASSLESS_NAME,
     Atoms,
@@ -19,8 +19,8 @@ from rigidmd.io.formats.atoms import (
     is_element,
     structure_error,
 )
-from rigidmd.io.formats.cells import cell_of, describe_cell
-from rigidmd.io.formats.crystal import (
+from rigidmd.formats.cells import cell_of, describe_cell
+from rigidmd.formats.crystal import (
     IDENTITY,
     NoSymmetry,
     Setting,

@@ -12,7 +12,7 @@ import numpy as np
 from rigidmd.core.files import LostFileError, atomic_file, create_empty_file, unreadable_reason
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
-from rigidmd.io.formats import System
+from rigidmd.formats import System
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
