@@ -47,13 +47,13 @@ RANK = {name: rank for rank, name in enumerate((*LAYERS, *ABOVE_ALL))}
 
 #: Library -> the packages and files that import it.
 LIBRARIES = {
-    "ase": {"io", "assemble", "run", "ase.py"},
+    "ase": {"formats", "io", "assemble", "run", "ase.py"},
     "chemiscope": {"view"},
     "distributed": {"studies/sweep"},
     "gsd": {"formats"},
     "IPython": {"io/progress.py"},
     "llvmlite": {"compile"},
-    "MDAnalysis": {"io", "run/results.py"},
+    "MDAnalysis": {"formats", "io", "run/results.py"},
     "matplotlib": {"figures", "analysis/files.py", "view", "studies"},
     "numba": {"compile", "forces"},
     "numba.core": {"compile"},

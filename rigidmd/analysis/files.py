@@ -121,7 +121,7 @@ class _Entry(BaseModel):
     notes: list[str]
     curves: list[_Curve]
     files: list[str]
-    # "stretch" in files of rigidmd 0.2
+    # `stretch` in files of rigidmd 0.2
     frames_used: _FramesUsed = Field(validation_alias=AliasChoices("frames_used", "stretch"))
 
 

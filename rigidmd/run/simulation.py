@@ -99,7 +99,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     observers
         user-defined, called between steps: `Every`, `LivePlot`, any object with `interval` and
         `see(moment)`
-    say
+    `say`
         Called with a sentence before something slow (compiling, pilot runs). Default: printed with
         the progress
     warn
@@ -348,7 +348,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         Parameters
         ----------
         state
-            Of as many molecules in the same order, in the units of `state`, such as
+            A state of as many molecules in the same order, in the units of `state`, such as
             `results.state`. Time and step begin at 0. Raises StructureError for a state that this
             scene cannot have, TypeError for anything else.
         """
