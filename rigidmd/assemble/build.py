@@ -32,6 +32,7 @@ from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of
 from rigidmd.forces.parts import Composition, Interactions, SystemParts, sum_of_tails
+from rigidmd.forces.terms import trait
 from rigidmd.formats.cells import describe_basis, describe_cell
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene, couplings
@@ -149,9 +150,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         ]
         if faults:
             raise SceneError(scene.source, faults)
-    driven = [
-        name for name, term in system.terms.items() if getattr(type(term), "time_dependent", False)
-    ]
+    driven = [name for name, term in system.terms.items() if trait(type(term), "time_dependent")]
     if faults := [
         f"stages.{k}" for k, stage in enumerate(scene.stages) if stage.is_hybrid and driven
     ]:
@@ -261,7 +260,7 @@ def left_out(
     direct = has_sums and forces.electrostatics == "ewald" and forces.dispersion != "pme"
     method, has_charges = (
         forces.electrostatics,
-        any(getattr(term, "acts_on_charges", False) for term in terms.values()),
+        any(trait(term, "acts_on_charges") for term in terms.values()),
     )
     reasons = {
         f"{title}: {'no site has it' if getattr(forces, key) else without}": key not in terms

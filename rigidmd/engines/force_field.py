@@ -29,6 +29,7 @@ from rigidmd.forces.potentials.truncation import (
     Truncation,
     Unmodified,
 )
+from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.validation import not_none
 
@@ -160,7 +161,8 @@ def unknown_terms(system: System, title: str) -> Iterator[str]:
         kind = type(term.potential if isinstance(term, PairForces) else term)
         what = "a user-defined force"
         if name not in system.user_terms:
-            what = "a field" if hasattr(term, "changes_momentum") else f"the term {kind.__name__}"
+            is_field = trait(term, "changes_momentum") is not None
+            what = "a field" if is_field else f"the term {kind.__name__}"
             what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
             what = (
                 "forces.ewald_slab or ewald_surface_permittivity"

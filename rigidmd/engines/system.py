@@ -17,6 +17,7 @@ from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.parts import Tail, gather_per_molecule
+from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
@@ -115,13 +116,14 @@ class System:
     @property
     def external(self) -> list[str]:
         """Names of the terms of external fields, which may change the total momentum."""
-        return [name for name, term in self.terms.items() if hasattr(term, "changes_momentum")]
+        terms = self.terms.items()
+        return [name for name, term in terms if trait(term, "changes_momentum") is not None]
 
     @property
     def position_dependent(self) -> list[str]:
         """Names of the terms whose energy depends on positions in the lab, which exclude a
         barostat. A field is among them only if a molecule has a net charge."""
-        return [name for name, term in self.terms.items() if getattr(term, "tied_to_places", False)]
+        return [name for name, term in self.terms.items() if trait(term, "tied_to_places")]
 
     @property
     def distances(self) -> dict[str, DistanceRestraint]:

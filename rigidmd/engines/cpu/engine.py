@@ -47,14 +47,10 @@ from rigidmd.forces.terms import (
     NoForce,
     Setup,
     TermDispatcher,
-    checkpoint_arrays,
     compute_load_with_energies,
-    passes_of,
     restored,
-    with_capacity,
-    with_code,
+    trait,
     with_common_scratch,
-    workspace_of,
 )
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
@@ -319,7 +315,7 @@ class CpuEngine(Engine):
     def memory(self) -> dict[str, np.ndarray] | None:
         """Neighbour lists as last built, forces at the present positions, and the memory of the
         barostat."""
-        owners = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
+        owners = self._checkpoint_arrays()
         if self.load is not None and self._last.is_current:
             owners[LOAD] = self.load._asdict()
         if (box := self._couplings.box) is not None:
@@ -331,6 +327,11 @@ class CpuEngine(Engine):
             for owner, arrays in owners.items()
             for key, array in arrays.items()
         }
+
+    def _checkpoint_arrays(self) -> dict[str, dict[str, np.ndarray]]:
+        """Name of a term -> the arrays on which its next forces depend."""
+        workspaces = self.workspaces.items()
+        return {name: trait(workspace, "checkpoint_arrays")() for name, workspace in workspaces}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         self._prepare(state)
@@ -366,10 +367,7 @@ class CpuEngine(Engine):
 
     def _recall_lists(self, state: State, kept: dict[str, dict[str, np.ndarray]]) -> None:
         """Make new workspaces, with the neighbour lists that were kept: all of them or none."""
-        spaces, now = (
-            tuple(with_code(workspace) for workspace in self.new_workspaces(state)),
-            float(state.time[NOW]),
-        )
+        spaces, now = _with_code(self.new_workspaces(state)), float(state.time[NOW])
         if kept.keys() & set(self.names):
             pairs = zip(self.names, spaces, strict=False)
             spaces = tuple(
@@ -389,7 +387,7 @@ class CpuEngine(Engine):
         for name, found, there in zip(Load._fields, load, self.load or (), strict=True):
             if np.abs(found - there).max(initial=0.0) > rounding * np.abs(found).max(initial=0.0):
                 raise ValueError(f"its state has another {name} than was kept with it")
-        lists = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
+        lists = self._checkpoint_arrays()
         same = all(
             np.array_equal(array, kept[name][key])
             for name, of in lists.items()
@@ -435,14 +433,14 @@ class CpuEngine(Engine):
         load, status = no_load(state), np.zeros(1, np.int64)
         into = Evaluation(state, load, np.zeros(TALLY_SIZE), status)
         workspaces = zip(self.names, self.new_workspaces(state), strict=False)
-        return {name: passes_of(workspace, into) for name, workspace in workspaces}
+        return {name: trait(workspace, "passes")(into) for name, workspace in workspaces}
 
     def new_workspaces(self, state: State) -> tuple[NamedTuple, ...]:
         """New workspaces for the cell of a state, without machine code. Their arrays show the
         memory needed."""
         setup = self._setup._replace(cell=state.cell)
         return with_common_scratch(
-            tuple(workspace_of(term, setup) for term in self.terms.values())
+            tuple(trait(term, "workspace")(setup) for term in self.terms.values())
         ) or (NoForce(),)
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
@@ -461,10 +459,8 @@ class CpuEngine(Engine):
             set_threads(usable_threads(self.threads))
         if self._workspaces is None:
             spaces = self.new_workspaces(state)
-            self._compile(
-                lambda: TermDispatcher(tuple(map(with_code, spaces)), USES["observations"])
-            )
-            self._workspaces = tuple(map(with_code, spaces))
+            self._compile(lambda: TermDispatcher(_with_code(spaces), USES["observations"]))
+            self._workspaces = _with_code(spaces)
         return self._workspaces
 
     def _compile(self, make: Callable[[], object]) -> None:
@@ -478,7 +474,7 @@ class CpuEngine(Engine):
         again."""
         workspaces = self._prepare(state)
         if status in (LIST_FULL, CELL_CHANGED):
-            enlarged = tuple(with_capacity(workspace, state.cell) for workspace in workspaces)
+            enlarged = tuple(trait(space, "with_capacity")(state.cell) for space in workspaces)
             workspaces = self._workspaces = with_common_scratch(enlarged)
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
@@ -494,6 +490,10 @@ class CpuEngine(Engine):
                 if name in self._python_forces:
                     workspace.update(self._python_forces[name], state)  # type: ignore[attr-defined]  # of such terms
         return workspaces
+
+
+def _with_code(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple, ...]:
+    return tuple(trait(workspace, "with_code")() for workspace in workspaces)
 
 
 def _as_scheme(integrator: Scheme | Solver) -> Scheme:

@@ -61,6 +61,7 @@ from rigidmd.forces.terms import (
     WITH_VIRIALS,
     Evaluation,
     Setup,
+    trait,
 )
 
 
@@ -91,7 +92,7 @@ class PairForces(NamedTuple):
     @property
     def acts_on_charges(self) -> bool:
         """Whether its potential is an interaction of charges."""
-        return getattr(self.potential, "acts_on_charges", False)
+        return trait(self.potential, "acts_on_charges")
 
     def workspace(self, setup: Setup) -> "PairWorkspace":
         potential, sites = self.potential, self.sites
