@@ -42,8 +42,8 @@ class Setup(NamedTuple):
 class Term:
     """What a force term and its workspace may have, besides an implementation of `add_forces`.
 
-    A term has what is given here unless it defines it. A named tuple cannot inherit: `trait` looks
-    an attribute up.
+    A term has what is given here unless it defines it. A named tuple cannot inherit: `trait` finds
+    an attribute of either.
     """
 
     # of a term
