@@ -103,7 +103,7 @@ def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
     """
     bands, span = spectral_bands(runs, interval), interval * min(map(len, runs))
     longest = longest_time(len(runs), span)
-    found = None
+    limit = None
     for part in PARTS:
         highest = part / (2 * interval)
         some = Bands(*(values[: np.searchsorted(bands.frequency, highest)] for values in bands))
@@ -118,10 +118,10 @@ def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
         )
         value = float(np.average(limits, weights=weights))
         error = float(np.sqrt(np.average(errors**2 + (limits - value) ** 2, weights=weights)))
-        found = Limit(value, ERROR_FACTOR * error, best, highest)
+        limit = Limit(value, ERROR_FACTOR * error, best, highest)
         if best.chi2 <= GROUPS + 2 * np.sqrt(2 * GROUPS):
             break
-    return found
+    return limit
 
 
 def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
@@ -140,15 +140,19 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
 
     def model(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Density (b,) and its relative slopes with all parameters (b, p)."""
-        parts, times, rest = (
+        parts, times, plateau = (
             np.exp(parameters[:count]),
             np.exp(parameters[count:-1]),
             np.exp(parameters[-1]),
         )
         below = 1 + squares[:, None] * times**2
-        density = (parts / below).sum(axis=1) + rest
+        density = (parts / below).sum(axis=1) + plateau
         slopes = np.column_stack(
-            [parts / below, -2 * parts * squares[:, None] * times**2 / below**2, 0 * squares + rest]
+            [
+                parts / below,
+                -2 * parts * squares[:, None] * times**2 / below**2,
+                0 * squares + plateau,
+            ]
         )
         return density, slopes / density[:, None]
 
@@ -184,17 +188,17 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
         if gain < CLOSE:
             break
     weighted = slopes * bands.freedom[:, None]
-    parts, times, rest = (
+    parts, times, plateau = (
         np.exp(parameters[:count]),
         np.exp(parameters[count:-1]),
         float(np.exp(parameters[-1])),
     )
-    of_limit = np.concatenate([parts, np.zeros(count), [rest]])
+    of_limit = np.concatenate([parts, np.zeros(count), [plateau]])
     variance = float(of_limit @ np.linalg.pinv(weighted.T @ slopes, hermitian=True) @ of_limit)
     residual = bands.freedom * (bands.density / density - 1)
     groups = np.array_split(np.arange(len(residual)), GROUPS)
     chi2 = sum(float(residual[group].sum() ** 2 / bands.freedom[group].sum()) for group in groups)
     score = 2 * before + 2 * (2 * count + 1)
     return Relaxations(
-        0.5 * rest, 0.5 * parts, times, 0.5 * np.sqrt(max(0.0, variance)), score, chi2
+        0.5 * plateau, 0.5 * parts, times, 0.5 * np.sqrt(max(0.0, variance)), score, chi2
     )

@@ -313,8 +313,8 @@ def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) ->
     return [
         f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be"
         f" of order 2; use one of {', '.join(split)} with rotor = 'split'"
-        for what, there in why.items()
-        if there and scheme.exact_rotor
+        for what, is_present in why.items()
+        if is_present and scheme.exact_rotor
     ]
 
 
@@ -507,8 +507,8 @@ def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray
         )
     for k, entry in enumerate(scene.applied):
         force, torque = (
-            constant_function(np.zeros(3)) if given is None else _time_function(entry, given)
-            for given in (entry.force_N, entry.torque_N_m)
+            constant_function(np.zeros(3)) if vector is None else _time_function(entry, vector)
+            for vector in (entry.force_N, entry.torque_N_m)
         )
         if entry.axes == "body":
             force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)

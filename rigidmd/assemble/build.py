@@ -204,14 +204,16 @@ def interactions(parts: SystemParts) -> Interactions:
         names.append(ELECTROSTATICS[forces.electrostatics].module)
     if forces.dispersion != "cutoff":
         names.append("ewald.dispersion")
-    found = [import_module(f"rigidmd.forces.{name}").interactions(parts) for name in names if name]
+    contributions = [
+        import_module(f"rigidmd.forces.{name}").interactions(parts) for name in names if name
+    ]
     return Interactions(
-        {name: term for part in found for name, term in part.terms.items()},
-        {name: value for part in found for name, value in part.constants.items()},
-        sum(part.pressure for part in found),
-        sum_of_tails([part.tail for part in found if part.tail is not None]),
-        next((part.force_error for part in found if part.force_error is not None), None),
-        tuple(note for part in found for note in part.notes),
+        {name: term for part in contributions for name, term in part.terms.items()},
+        {name: value for part in contributions for name, value in part.constants.items()},
+        sum(part.pressure for part in contributions),
+        sum_of_tails([part.tail for part in contributions if part.tail is not None]),
+        next((part.force_error for part in contributions if part.force_error is not None), None),
+        tuple(note for part in contributions for note in part.notes),
     )
 
 
@@ -294,28 +296,28 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total
     momentum."""
     stage = system.scene.stages[k]
-    found, thermostat = stage.scheme, system.thermostat
+    scheme, thermostat = stage.scheme, system.thermostat
     if thermostat is not None and hasattr(thermostat, "for_stage"):
         thermostat = thermostat.for_stage(system, k)
     elif thermostat is None and stage.has_thermostat:
         thermostat = thermostat_of(system, k)
     if stage.is_hybrid and system.thermostat is None:
-        found = found.with_trajectories(thermostat_of(system, k), stage.steps_together)
+        scheme = scheme.with_trajectories(thermostat_of(system, k), stage.steps_together)
     elif thermostat is not None:
-        found = found.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
+        scheme = scheme.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
     if stage.has_barostat:
         barostat = barostat_of(system, k)
         in_steps = couplings.BAROSTATS[stage.barostat_kind].in_verlet_steps
-        found = (
-            found.with_piston(barostat)
+        scheme = (
+            scheme.with_piston(barostat)
             if in_steps
-            else found.with_barostat(barostat, stage.moves_every)
+            else scheme.with_barostat(barostat, stage.moves_every)
         )
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
-        found = found.with_momentum_removal(
+        scheme = scheme.with_momentum_removal(
             max(1, round(interval / (stage.timestep_fs * FEMTOSECOND)))
         )
-    return found
+    return scheme
 
 
 def thermostat_of(system: System, k: int) -> NamedTuple:
@@ -330,7 +332,7 @@ def barostat_of(system: System, k: int) -> NamedTuple:
     first, last = (tuple(x * BAR for x in ends) for ends in stage.pressures)
     pressure = Pressure(first, last, float(stage.steps))  # pyright: ignore[reportArgumentType]
     x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
-    given = Confinement(
+    confinement = Confinement(
         _thermal(stage),
         pressure,
         stage.compressibility / BAR,
@@ -340,7 +342,7 @@ def barostat_of(system: System, k: int) -> NamedTuple:
         (0.0, 0.0) if system.tail is None else system.tail[:2],
         key,
     )
-    return BAROSTATS[stage.barostat_kind](stage, given)
+    return BAROSTATS[stage.barostat_kind](stage, confinement)
 
 
 def _thermal(stage: Stage) -> Ramp:

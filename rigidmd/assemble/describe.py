@@ -161,14 +161,15 @@ def _describe_molecules(system: System) -> str:
         lines += [f"  {what}: {kind.replace('_', ' ')}" for kind in kinds if kind]
     if any(stage.ensemble == "nph" for stage in scene.stages):
         lines.append("  barostat: piston, in the nph stages only")
-    kept = [axis for axis, keeps in zip("xyz", system.model.keeps_momentum, strict=True) if keeps]
+    conserved = [
+        axis for axis, keeps in zip("xyz", system.model.keeps_momentum, strict=True) if keeps
+    ]
     if (interval := system.removes_momentum_every) is not None:
-        part = "" if len(kept) == 3 else f" along {' and '.join(kept)}"
+        part = "" if len(conserved) == 3 else f" along {' and '.join(conserved)}"
         lines.append(f"  total momentum: removed{part} every {interval:g} ps")
-    if (system.external or system.user_terms) and len(kept) < 3:
-        lines.append(
-            f"  total momentum: conserved {'along ' + ' and '.join(kept) if kept else 'nowhere'}"
-        )
+    if (system.external or system.user_terms) and len(conserved) < 3:
+        where = f"along {' and '.join(conserved)}" if conserved else "nowhere"
+        lines.append(f"  total momentum: conserved {where}")
     lines += ["left out:", *(f"  {reason}" for reason in system.left_out), "\nstages:"]
     for k, stage in enumerate(scene.stages):
         steps, sampled = describe_stage(stage)

@@ -105,14 +105,14 @@ class RigidBodies:
         """Rotations (n, 3, 3) that bring the body-frame offsets nearest to the offsets (s, 3) in
         the lab."""
         products = np.einsum("si,sj->sij", arm, self._body).reshape(-1, 9)
-        found = nearest_rotation(self._sum(products).reshape(-1, 3, 3))
+        rotation = nearest_rotation(self._sum(products).reshape(-1, 3, 3))
         if (line := self._linear).any():
             axis_body = (self._inertia[line] == 0).astype(float)
-            found[line] = _tilted(
+            rotation[line] = _tilted(
                 before[line],
-                *(np.einsum("nij,nj->ni", q[line], axis_body) for q in (before, found)),
+                *(np.einsum("nij,nj->ni", q[line], axis_body) for q in (before, rotation)),
             )
-        return found
+        return rotation
 
 
 def _tilted(rotation: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -178,14 +178,18 @@ class MassPoints(NamedTuple):
     @property
     def distances(self) -> list[tuple[int, int, float]]:
         """All pairs of points and their distances, Å."""
-        found: list[tuple[int, int, float]] = []
+        distances: list[tuple[int, int, float]] = []
         for i in range(len(self.mass)):
             for j in range(i):
                 d = float(np.linalg.norm(self.position_body[i] - self.position_body[j]))
-                found.append(
-                    (j, i, next((other for *_, other in found if abs(d - other) <= SAME * d), d))
+                distances.append(
+                    (
+                        j,
+                        i,
+                        next((other for *_, other in distances if abs(d - other) <= SAME * d), d),
+                    )
                 )
-        return found
+        return distances
 
 
 def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:

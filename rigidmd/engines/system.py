@@ -204,9 +204,9 @@ class System:
         names = State._fields[:5]
         arrays = {name: np.asarray(getattr(state, name)) for name in names}
         shapes = {name: getattr(self.state, name).shape for name in names}
-        if found := array_errors(arrays, shapes):
+        if problems := array_errors(arrays, shapes):
             about = f"the scene has {len(self.state.position)} molecules"
-            return [f"{name} of the state {problem}; {about}" for name, problem in found.items()]
+            return [f"{name} of the state {problem}; {about}" for name, problem in problems.items()]
         cell = arrays["cell"]
         if np.isfinite(cell).all() != np.isfinite(self.state.cell).all():
             return ["one of scene and state has a periodic box, and the other has none"]
@@ -243,8 +243,8 @@ class System:
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of
         mass inside the box."""
-        whole = state._replace(position=self.centres(state, wrapped))
-        return self.positions_of(whole, self.sites.molecule, self.sites.offset_body)
+        placed = state._replace(position=self.centres(state, wrapped))
+        return self.positions_of(placed, self.sites.molecule, self.sites.offset_body)
 
     def positions_of(
         self, state: State, molecule: np.ndarray, offset_body: np.ndarray

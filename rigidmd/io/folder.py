@@ -201,10 +201,10 @@ class RunMark:
 
     def _last_written(self) -> tuple[int, int] | None:
         try:
-            found = (self._folder / SCENE).stat()
+            status = (self._folder / SCENE).stat()
         except OSError:
             return None
-        return found.st_ino, found.st_mtime_ns
+        return status.st_ino, status.st_mtime_ns
 
     @property
     def is_there(self) -> bool:

@@ -166,10 +166,10 @@ def _read(function: Callable[..., T], path: Path, sites: int, *arguments: Any) -
     raise OutputError(f"{path} cannot be read as a trajectory: {reason}")
 
 
-def _frames(path: Path, sites: int, most: int) -> Frames:
+def _frames(path: Path, sites: int, frame_limit: int) -> Frames:
     with contextlib.closing(_opened(path, sites)) as reader:
         count = reader.n_frames
-        stride = max(1, -(-count // most))
+        stride = max(1, -(-count // frame_limit))
         selected = range(0, count, stride)
         times, boxes = [], []
         positions = np.empty((len(selected), sites, 3), np.float32)
@@ -234,11 +234,11 @@ def _times_and_cells_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]
     with path.open("rb") as file:
         for line in file:
             if (b"Time=" in line or line.startswith(b"REMARK")) and (
-                found := re.search(pattern, line)
+                match := re.search(pattern, line)
             ):
-                times.append(float(found[2]))
-                if found[1]:
-                    cells.append(np.array(found[1].split(), float).reshape(3, 3))
+                times.append(float(match[2]))
+                if match[1]:
+                    cells.append(np.array(match[1].split(), float).reshape(3, 3))
     return times, cells
 
 
@@ -291,11 +291,11 @@ class SiteReader(ReaderBase):
     def _read_frame(self, i):
         if not 0 <= i < self.n_frames:
             raise OSError(f"frame {i} does not exist")
-        found = self._file.frame(i)
-        if len(found.positions) != self.n_atoms:
+        stored = self._file.frame(i)
+        if len(stored.positions) != self.n_atoms:
             raise ValueError(f"frame {i + 1} has another number of sites")
         self._frame = self.ts.frame = i
-        set_frame(self.ts, found)
+        set_frame(self.ts, stored)
         return self.ts
 
     def _read_next_timestep(self, ts=None):

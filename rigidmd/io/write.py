@@ -128,12 +128,13 @@ class Table(NamedTuple):
         """The table for a terminal, without columns that have no values. left : indices of columns
         aligned left"""
         _, cells = self.shown()
-        kept = [
+        shown_columns = [
             k for k in range(len(self.columns)) if any(line[k] not in ("", "-") for line in cells)
         ]
         lines = [[column.short or column.header for column in self.columns], *cells]
         return columns_text(
-            [[line[k] for k in kept] for line in lines], [kept.index(k) for k in left if k in kept]
+            [[line[k] for k in shown_columns] for line in lines],
+            [shown_columns.index(k) for k in left if k in shown_columns],
         )
 
     def write(self, path: Path, quoting: Any = csv.QUOTE_MINIMAL) -> None:

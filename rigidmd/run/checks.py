@@ -110,13 +110,13 @@ class StepCheck:
             if not np.isfinite(values).all():
                 m = int((~np.isfinite(values).all(axis=1)).argmax())
                 return FailedCheck(f"the {what} on {molecule_label(system, m)} is not finite", m)
-        found: list[
+        measures: list[
             tuple[np.ndarray, float, str]
         ] = []  # a measure (n,), its limit, a message about its largest value
         if limits.kick and self.thermal > 0:
             size = kicks(model, load, self.thermal, dt * max(map(abs, scheme.kicks)))
             times = f"by {size.max():.3g} times its thermal size (watch.kick = {limits.kick:g})"
-            found.append((size, limits.kick, f"one kick changes a momentum of {{}} {times}"))
+            measures.append((size, limits.kick, f"one kick changes a momentum of {{}} {times}"))
         stride, between = dt * max(map(abs, scheme.drifts)), "between two force evaluations"
         if limits.move:
             way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
@@ -124,7 +124,7 @@ class StepCheck:
                 f"{way.max() / self._diameter:.3g} of the smallest diameter (watch.move ="
                 f" {limits.move:g})"
             )
-            found.append(
+            measures.append(
                 (
                     way / self._diameter,
                     limits.move,
@@ -138,8 +138,8 @@ class StepCheck:
                 f"{{}} rotates by {angle.max():.3g} rad {between} (watch.turn_rad ="
                 f" {limits.turn_rad:g})"
             )
-            found.append((angle, limits.turn_rad, message))
-        for size, limit, message in found:
+            measures.append((angle, limits.turn_rad, message))
+        for size, limit, message in measures:
             if size.max() > limit:
                 m = int(size.argmax())
                 return FailedCheck(
@@ -263,18 +263,18 @@ def most_overlapping_pair(
     )
     acts = any(name.startswith("coulomb") for name in system.terms)
     charge = system.of_sites(lambda m: m.charges) if acts else np.zeros(len(sigma))
-    found = []
+    pairs = []
     reach = max(OVERLAP * sigma.max(), near.max() * system.smallest_diameter)
     for i, j, distance in close_pairs(system, state, (reach, every_site)):
         repel = sigma[i] > 0 and sigma[j] > 0
         size = (sigma[i] + sigma[j]) / 2 if repel else system.smallest_diameter
         attract = not repel and charge[i] * charge[j] < 0
         if (repel or attract) and distance <= (OVERLAP if repel else max(near[i], near[j])) * size:
-            found.append(OverlappingPair(i, j, distance, distance / size, attract))
+            pairs.append(OverlappingPair(i, j, distance, distance / size, attract))
     of_molecule = [
-        pair for pair in found if molecule in system.sites.molecule[[pair.first, pair.second]]
+        pair for pair in pairs if molecule in system.sites.molecule[[pair.first, pair.second]]
     ]
-    return min(of_molecule or found, key=lambda pair: pair.fraction, default=None)
+    return min(of_molecule or pairs, key=lambda pair: pair.fraction, default=None)
 
 
 def _first_overlap(
@@ -409,7 +409,7 @@ def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:
     liquid. The measure is relative to the masses, temperature and time step of the scene.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = (
+        largest = (
             np.abs(load.force).max(axis=1)
             * dt
             * np.sqrt(model.inverse_mass[model.species] / thermal)
@@ -420,5 +420,5 @@ def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:
             / np.sqrt(model.inertia[model.species] * thermal)[: len(load.torque_body)]
         )
     turn = np.where((model.inertia[model.species] > 0)[: len(turn)], turn, 0.0)
-    found[: len(turn)] = np.maximum(found[: len(turn)], turn.max(axis=1, initial=0.0))
-    return found
+    largest[: len(turn)] = np.maximum(largest[: len(turn)], turn.max(axis=1, initial=0.0))
+    return largest

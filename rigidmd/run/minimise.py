@@ -198,17 +198,17 @@ class Enthalpy:
     def moved(self, state: State, move: np.ndarray) -> State:
         """A copy of a state after a move (k,)."""
         shift, rotation, strain = self._parts(move)
-        found = state.copy()
+        moved_state = state.copy()
         if strain.any():
             matrix = np.diag(np.exp(strain[:3]))
             for k in range(3, 6):
                 matrix[COMPONENTS[k]] = strain[k]
-            found.position[:] = state.position @ matrix
-            found.cell[:] = state.cell @ matrix
-        found.position[:] += shift
+            moved_state.position[:] = state.position @ matrix
+            moved_state.cell[:] = state.cell @ matrix
+        moved_state.position[:] += shift
         if len(rotation):
-            found.rotation[:] = state.rotation @ from_vector(rotation / self.arm)
-        return found
+            moved_state.rotation[:] = state.rotation @ from_vector(rotation / self.arm)
+        return moved_state
 
     def gain(self, point: EnthalpyPoint, other: EnthalpyPoint, move: np.ndarray) -> float:
         """Change of the enthalpy by a move from a point to another, u Å²/ps².
@@ -420,14 +420,14 @@ class _Descent:
 
     def step(self, point: EnthalpyPoint) -> EnthalpyPoint | None:
         """The next point, lower than this one; None if there is none. Raises SimulationError."""
-        found = self._along(point, self._direction(point.gradient))
-        if found is None and self._memory:
+        move_and_point = self._along(point, self._direction(point.gradient))
+        if move_and_point is None and self._memory:
             self._memory.clear()
             self._fraction = FIRST_MOVE
             return self.step(point)
-        if found is None:
+        if move_and_point is None:
             return None
-        move, other = found
+        move, other = move_and_point
         change = other.gradient - point.gradient
         if move @ change > 1e-8 * np.linalg.norm(move) * np.linalg.norm(change):
             self._memory.append((move, change))
@@ -438,17 +438,17 @@ class _Descent:
     def _direction(self, gradient: np.ndarray) -> np.ndarray:
         """The quasi-Newton move, or one along the negative gradient; no longer than allowed."""
         if self._memory:
-            found = gradient.copy()
+            direction = gradient.copy()
             weights = []
             for move, change in reversed(self._memory):
-                weights.append(move @ found / (move @ change))
-                found -= weights[-1] * change
+                weights.append(move @ direction / (move @ change))
+                direction -= weights[-1] * change
             move, change = self._memory[-1]
-            found *= move @ change / (change @ change)
+            direction *= move @ change / (change @ change)
             for (move, change), weight in zip(self._memory, reversed(weights), strict=True):
-                found += (weight - change @ found / (move @ change)) * move
-            if found @ gradient > 1e-6 * np.linalg.norm(found) * np.linalg.norm(gradient):
-                return -found * min(1.0, self._enthalpy.bound(found))
+                direction += (weight - change @ direction / (move @ change)) * move
+            if direction @ gradient > 1e-6 * np.linalg.norm(direction) * np.linalg.norm(gradient):
+                return -direction * min(1.0, self._enthalpy.bound(direction))
             self._memory.clear()
             self._fraction = FIRST_MOVE
         return -gradient * self._fraction * self._enthalpy.bound(gradient)

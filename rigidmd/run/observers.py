@@ -166,12 +166,12 @@ def as_observer(value: Any) -> Observer:
     observer = type(
         type(value).__name__, (Observer,), {}
     )()  # its name is in messages and checkpoints
-    given = {
+    attributes = {
         name: getattr(value, name)
         for name in dir(Observer)
         if name[0] != "_" and hasattr(value, name)
     }
-    vars(observer).update(given)
+    vars(observer).update(attributes)
     return observer
 
 

@@ -91,10 +91,10 @@ class Kind(NamedTuple):
 def kinds_of(system: System) -> list[Kind]:
     """The species of a system that have molecules, frozen and mobile ones separately."""
     first = np.flatnonzero(np.diff(system.sites.molecule, prepend=-1))
-    found = []
+    kinds = []
     for k, molecule in enumerate(system.species):
         index = np.flatnonzero(system.model.species == k)
         if len(index):
             sites = first[index][:, None] + np.arange(len(molecule.masses))
-            found.append(Kind(molecule, index, sites, bool(system.model.inverse_mass[k] > 0)))
-    return found
+            kinds.append(Kind(molecule, index, sites, bool(system.model.inverse_mass[k] > 0)))
+    return kinds

@@ -195,9 +195,9 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         if isinstance(scene, BodyScene):
             from rigidmd.run.body import BodyRun
 
-            if given := [key for key, value in of_molecules.items() if value is not None]:
+            if set_keys := [key for key, value in of_molecules.items() if value is not None]:
                 problem = (
-                    f"{' and '.join(given)}: for molecules; a single body takes applied={{name:"
+                    f"{' and '.join(set_keys)}: for molecules; a single body takes applied={{name:"
                     " function}"
                 )
                 raise SceneError(scene.source, [problem])

@@ -133,7 +133,7 @@ def summarise(
         "momentum_u_A_ps": last.momentum,
         "momentum_relative": last.momentum / size if size else 0.0,
         "momentum_conserved": [
-            axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept
+            axis for axis, keeps in zip("xyz", system.model.keeps_momentum, strict=True) if keeps
         ],
         "own_forces": dict(system.user_terms),
         "forces_by_python": {
@@ -222,12 +222,12 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     half = len(of_stage) // 2
     if len(of_stage) - half < MIN_SAMPLES:
         return []
-    time, drift, whole = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
-    found, stage, freedom, level = (
+    time, drift, temperature = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
+    notes, stage, freedom, level = (
         [],
         system.scene.stages[k],
         system.freedom_in(k),
-        float(whole.mean()),
+        float(temperature.mean()),
     )
     line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
     if (
@@ -246,14 +246,14 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
             if stage.has_thermostat
             else ""
         )
-        found.append(
+        notes.append(
             f"stages.{k}: in its second half the conserved energy drifts by {rate:+.2g} ±"
             f" {error:.1g} kT/ns per degree of freedom, as from a step that is too long or forces"
             f" that jump at the cutoff{hides}. Try a shorter timestep_fs than"
             f" {stage.timestep_fs:g}{smooth}"
         )
     if not stage.has_thermostat:
-        return found
+        return notes
     moving, rotating = pair = [of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS]
     unbiased, corrected = (
         [of_stage[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS],
@@ -263,10 +263,10 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         (moving, rotating), corrected = unbiased, " without the error of the step"
         both = zip(unbiased, (freedom.translation, freedom.rotation), strict=True)
         right = (
-            sum((values * count for values, count in both if count), np.zeros(len(whole)))
+            sum((values * count for values, count in both if count), np.zeros(len(temperature)))
             / freedom.total
         )
-        heat, error = mean_and_error(right - whole)
+        heat, error = mean_and_error(right - temperature)
         if (
             heat is not None
             and error is not None
@@ -278,7 +278,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
                 if v[0] > 0
             ]
             shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heat))
-            found.append(
+            notes.append(
                 f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules"
                 f" {abs(heat):.2g} K too {'hot' if heat > 0 else 'cold'}: their"
                 f" temperature{corrected} is"
@@ -293,14 +293,14 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         and error is not None
         and abs(gap) > max(DIFFERENCE_LIMIT * level, STANDARD_ERRORS * error)
     ):
-        found.append(
+        notes.append(
             f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot"
             f" {rotating.mean():.4g} K{corrected}, a difference of {abs(gap):.2g} ± {error:.1g} K"
             " that sampling does not explain: timestep_fs is too long, or translation and rotation"
             " exchange energy too slowly in this stage. Try a shorter step, or run longer before"
             " means are taken"
         )
-    return found
+    return notes
 
 
 def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list[str]:
@@ -425,9 +425,14 @@ def stage_summary(
     return values
 
 
-def _minimised(system: System, samples: Samples, k: int, computing: float, found: Minimum) -> dict:
+def _minimised(
+    system: System, samples: Samples, k: int, computing: float, minimum: Minimum
+) -> dict:
     """Values of a minimisation, at its end; None for those that only a stage of motion has."""
-    stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
+    stage, minimum_values = (
+        system.scene.stages[k],
+        minimum_figures(minimum, len(system.model.species)),
+    )
     end = Samples(samples.stages, samples.user_terms, samples.of_stage(k).table()[-1:])
     return dict.fromkeys(stage_summary(system, samples, k, computing, (0, 0))) | {
         "name": stage.label,
@@ -435,24 +440,24 @@ def _minimised(system: System, samples: Samples, k: int, computing: float, found
         "steps": 0,
         "duration_ps": 0.0,
         "computing_s": computing,
-        "potential_kJ_mol_per_molecule": figures["energy_after_kJ_mol_per_molecule"],
-        "pressure_bar": figures["pressure_bar"],
+        "potential_kJ_mol_per_molecule": minimum_values["energy_after_kJ_mol_per_molecule"],
+        "pressure_bar": minimum_values["pressure_bar"],
         **(_means(end, BOX) if stage.changes_box else {}),
         "moves_tried": 0,
         "moves_accepted": 0,
-        "minimum": figures,
+        "minimum": minimum_values,
     }
 
 
 def _means(samples: Samples, columns: Mapping[str, str]) -> dict[str, float | None]:
     """Means of columns, and their errors; the columns have the units of their keys."""
-    found = {}
+    means = {}
     for name, unit in columns.items():
         values = samples[name]  # no trajectory has ended at the first sample
-        found[f"{name}_{unit}"], found[f"{name}_error_{unit}"] = mean_and_error(
+        means[f"{name}_{unit}"], means[f"{name}_error_{unit}"] = mean_and_error(
             values[np.isfinite(values)]
         )
-    return found
+    return means
 
 
 def _finite_or_none(value: float) -> float | None:

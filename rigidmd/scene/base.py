@@ -282,10 +282,10 @@ class Scene(Section, Displayed):
                 )
             elif fault := unreadable_reason(path):
                 faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
-        whole, rows = with_registered_rows(exact_names(data, kind))
+        complete, rows = with_registered_rows(exact_names(data, kind))
         scene = None
         try:
-            scene = kind.model_validate(whole, context=rows)
+            scene = kind.model_validate(complete, context=rows)
         except ValidationError as error:
             faults += validation_messages(error, kind, text, overridden)
         if scene is None or faults:
@@ -407,11 +407,15 @@ def _similar_files(path: Path, suffix: str = "") -> str:
     """'; did you mean ...?' for files of similar names in the folder of a path; empty if there are
     none."""
     try:
-        there = [other for other in sorted(path.parent.iterdir()) if other.name.endswith(suffix)]
+        neighbours = [
+            other for other in sorted(path.parent.iterdir()) if other.name.endswith(suffix)
+        ]
     except (OSError, ValueError):
         return ""
-    stems = similar_names(path.stem, {other.stem for other in there if other.name != path.name})
-    return suggestion([other.name for other in there if other.stem in stems])
+    stems = similar_names(
+        path.stem, {other.stem for other in neighbours if other.name != path.name}
+    )
+    return suggestion([other.name for other in neighbours if other.stem in stems])
 
 
 def file_name(wanted: Callable[[Format], Any]) -> AfterValidator:
@@ -462,8 +466,10 @@ def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
         else ()
     )
     keys = [table + name for table in tables for name in names]
-    there = [key for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)]
-    return "".join(f"; {setting(key)} removes it" for key in there)
+    removable = [
+        key for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)
+    ]
+    return "".join(f"; {setting(key)} removes it" for key in removable)
 
 
 def _has_key(data: Any, key: str) -> bool:
@@ -496,7 +502,7 @@ def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
                 [e[k] for k in ("name", "ensemble", "model") if isinstance(e, dict) and k in e]
                 for e in target
             ]
-            names = [found[0] if found else "" for found in named]
+            names = [labels[0] if labels else "" for labels in named]
             if number is None and names.count(part) == 1:
                 number = names.index(part)
             if number is None or number >= len(target):
@@ -511,8 +517,8 @@ def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
         elif not table:
             return key, [f"{where}: {here} is not a table"]
         elif value is None and part not in target:
-            there = did_you_mean(part, target) or f"; there are {', '.join(target)}"
-            return key, [f"{setting(key)}: {here or 'the scene'} has no {part} to remove{there}"]
+            hint = did_you_mean(part, target) or f"; there are {', '.join(target)}"
+            return key, [f"{setting(key)}: {here or 'the scene'} has no {part} to remove{hint}"]
         index: Any = number if listed else part
         indices.append(index)
         if depth == len(parents) and value is None:

@@ -47,10 +47,10 @@ class Walls(Section):
 
     def _errors(self):
         for kind, keys in KEYS_OF_WALLS.items():
-            given = [key for key in keys if getattr(self, key) is not None]
-            if kind != self.kind and given:
-                yield f"{', '.join(given)} would do nothing with kind = {self.kind!r}"
-            missing = [key for key, needed in keys.items() if needed and key not in given]
+            set_keys = [key for key in keys if getattr(self, key) is not None]
+            if kind != self.kind and set_keys:
+                yield f"{', '.join(set_keys)} would do nothing with kind = {self.kind!r}"
+            missing = [key for key, needed in keys.items() if needed and key not in set_keys]
             if kind == self.kind and missing:
                 yield f"kind = {kind!r} needs {' and '.join(missing)}"
         lower, upper = self.positions_A
@@ -107,19 +107,19 @@ class Restraint(Section):
             yield "between needs distance_A, at which the spring has no energy"
         if isinstance(self.stiffness_kJ_mol_A2, tuple):
             yield "stiffness_kJ_mol_A2 has one number for a distance"
-        if given := [
+        if set_keys := [
             key for key in ("species", "molecules", "position_A") if getattr(self, key) is not None
         ]:
-            yield f"{', '.join(given)} would do nothing with between, which names the molecules"
+            yield f"{', '.join(set_keys)} would do nothing with between, which names the molecules"
 
     @property
     def groups(self) -> tuple[list[int], ...]:
         """The numbers of the molecules of both groups; empty without `between`."""
-        found = []
+        groups = []
         for group in self.between or ():
             ranges = [(group, group)] if isinstance(group, int) else spans(group)
-            found.append([number for first, last in ranges for number in range(first, last + 1)])
-        return tuple(found)
+            groups.append([number for first, last in ranges for number in range(first, last + 1)])
+        return tuple(groups)
 
     @property
     def spans(self) -> list[tuple[int, int]]:
@@ -160,21 +160,21 @@ class Fields(Section):
     def entries(self) -> dict[str, tuple["FieldKind", Section, str]]:
         """Name of each term -> its kind, the table with its keys, and the path of that table or key
         in the scene."""
-        found: dict[str, tuple[FieldKind, Section, str]] = {}
+        entries: dict[str, tuple[FieldKind, Section, str]] = {}
         for name, kind in FIELDS.items():
             value = getattr(self, kind.key)
             if isinstance(value, tuple) and all(isinstance(entry, Section) for entry in value):
-                found |= {
+                entries |= {
                     f"{name}_{k}": (kind, entry, f"fields.{kind.key}.{k}")
                     for k, entry in enumerate(value)
                 }
             elif value is not None:
-                found[name] = (
+                entries[name] = (
                     kind,
                     value if isinstance(value, Section) else self,
                     f"fields.{kind.key}",
                 )
-        return found
+        return entries
 
     def bounds(self, axis: int) -> tuple[float, float] | None:
         """Range of positions between the walls perpendicular to an axis, Å; None without walls."""

@@ -98,10 +98,11 @@ class Site(Section):
     """Parameters of custom pair potentials, by name"""
 
     def _errors(self):
-        given = [key for key in DEPTHS if getattr(self, key) is not None]
-        if len(given) > 1:
-            yield f"give one of {', '.join(given)}, not {'both' if len(given) == 2 else 'all'}"
-        if bool(given) != (self.sigma_A is not None):
+        set_keys = [key for key in DEPTHS if getattr(self, key) is not None]
+        if len(set_keys) > 1:
+            number = "both" if len(set_keys) == 2 else "all"
+            yield f"give one of {', '.join(set_keys)}, not {number}"
+        if bool(set_keys) != (self.sigma_A is not None):
             yield f"a Lennard-Jones site needs both sigma_A and one of {', '.join(DEPTHS)}"
 
     @property
@@ -352,8 +353,8 @@ def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
         Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])})
         for i, entry in enumerate(found.sites())
     ]
-    kept = ("name", "residue_names", "title", "source", "group", "note", "mixing")
-    return molecule(sites=tuple(sites), **{key: getattr(found, key) for key in kept})
+    copied_keys = ("name", "residue_names", "title", "source", "group", "note", "mixing")
+    return molecule(sites=tuple(sites), **{key: getattr(found, key) for key in copied_keys})
 
 
 def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[Site, ...]:

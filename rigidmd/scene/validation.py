@@ -246,12 +246,12 @@ KEY_WITH_UNIT = re.compile(rf"(?:.*_)?[a-z]{{4,}}_({'|'.join(OTHER_UNITS)})")
 def _as_number(text: str, keys: list) -> str:
     """Advice on a text where a number is expected: the number in the unit of the key; empty for
     other texts."""
-    found = WITH_UNIT.fullmatch(text)
-    if not found:
+    match = WITH_UNIT.fullmatch(text)
+    if not match:
         return ""
-    number, unit = float(found[1]), found[2]
+    number, unit = float(match[1]), match[2]
     if not unit:
-        return f"{ADVICE}{found[1]} without quotes"
+        return f"{ADVICE}{match[1]} without quotes"
     key = KEY_WITH_UNIT.fullmatch(
         str(next((key for key in reversed(keys) if isinstance(key, str)), ""))
     )
@@ -282,9 +282,9 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
         case "literal_error":
-            wanted = context["expected"].replace("False", "false").replace("True", "true")
-            return f"is {shown}, must be {wanted}" + did_you_mean(
-                str(value), re.findall(r"'([^']*)'", wanted)
+            expected = context["expected"].replace("False", "false").replace("True", "true")
+            return f"is {shown}, must be {expected}" + did_you_mean(
+                str(value), re.findall(r"'([^']*)'", expected)
             )
         case "tuple_type" | "list_type" if isinstance(value, dict):
             return f"is a table, must be a list of tables: write [[{'.'.join(map(str, keys))}]]"

@@ -66,10 +66,10 @@ def _thermostats(system: System) -> Iterator[tuple[str, Any, float]]:
     for k, stage in enumerate(system.scene.stages):
         if stage.is_minimisation or stage.is_auto:
             continue
-        given = system.thermostat
-        thermostat = given.for_stage(system, k) if hasattr(given, "for_stage") else given
+        outer = system.thermostat
+        thermostat = outer.for_stage(system, k) if hasattr(outer, "for_stage") else outer
         if type(thermostat) in THERMOSTATS:
-            yield f"thermostat {name_of(given)}", thermostat, float(stage.timestep_fs * FEMTOSECOND)
+            yield f"thermostat {name_of(outer)}", thermostat, float(stage.timestep_fs * FEMTOSECOND)
 
 
 def _faults(name: str, function: Callable, arguments: tuple) -> list[str]:

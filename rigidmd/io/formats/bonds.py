@@ -133,9 +133,9 @@ def bonds(m: Any) -> list[tuple[int, int]]:
     bonded = cdist(x[atoms], x[atoms]) <= radius[:, None] + radius
     bonded[tuple(shortest_links(x[atoms]).T)] = True
     pairs = atoms[np.argwhere(np.triu(bonded | bonded.T, 1))].tolist()
-    found = sorted((i, j) if m.masses[i] >= m.masses[j] else (j, i) for i, j in pairs)
+    links = sorted((i, j) if m.masses[i] >= m.masses[j] else (j, i) for i, j in pairs)
     nearest = atoms[cdist(x[massless], x[atoms]).round(9).argmin(axis=1)]
-    return [*found, *zip(nearest.tolist(), massless.tolist(), strict=True)]
+    return [*links, *zip(nearest.tolist(), massless.tolist(), strict=True)]
 
 
 def distance(m: Any, i: int, j: int) -> float:

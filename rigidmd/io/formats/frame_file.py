@@ -18,10 +18,10 @@ from rigidmd.io.formats import System
 def _identity(path: Path) -> tuple[int, int] | None:
     """Device and number of a file; None without a file."""
     try:
-        found = path.lstat()
+        status = path.lstat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 class FrameFile:

@@ -310,18 +310,21 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
     length = min(
         duration, LONG_PILOT_MAX * span, max(LONG_PILOT_MIN * span, LONG_PILOT_PART * duration)
     )
-    best, value, seen = first, search.expected(first), first
+    best, value, pilot_trial = first, search.expected(first), first
     for _ in range(CORRECTIONS):
-        if (found := search.best()) is None:
+        if (candidate := search.best()) is None:
             break
-        best, seen = found, search.trial(found.integrator, found.timestep, length)
+        best, pilot_trial = (
+            candidate,
+            search.trial(candidate.integrator, candidate.timestep, length),
+        )
         name, step = best.integrator, best.timestep
-        if seen.diverged:
+        if pilot_trial.diverged:
             search.longest[name] = step / 2
             continue
         of_pilot = search.walk_square(name, step, length)
         square = max(
-            seen.energy_rms**2, 2 * float(np.var(seen.energies))
+            pilot_trial.energy_rms**2, 2 * float(np.var(pilot_trial.energies))
         )  # the error may not be 0 at the start
         value = sqrt(square + search.walk_square(name, step, duration) - of_pilot)
         if value <= (1 + SAFETY) / 2 * target:
@@ -329,8 +332,12 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
         regular = sqrt(max(square - of_pilot, best.energy_rms**2))
         slow = regular / (best.energy_rms or regular or 1.0)
         search.slow_factor[name] = max(1.2 * search.slow_factor.get(name, 1.0), slow)
-    pilot = seen.steps * seen.timestep * search.system.time_size
-    return best, value, f" (expected, from {seen.energy_rms:.1e} in a pilot of {pilot:.3g} ps)"
+    pilot = pilot_trial.steps * pilot_trial.timestep * search.system.time_size
+    return (
+        best,
+        value,
+        f" (expected, from {pilot_trial.energy_rms:.1e} in a pilot of {pilot:.3g} ps)",
+    )
 
 
 def round_down(step: float) -> float:

@@ -171,11 +171,11 @@ class IntegratorAccuracy:
     def front(self, error: str) -> list[Trial]:
         """Trials that no other beats in both time and error (an attribute of `Trial`), fastest
         first."""
-        found: list[Trial] = []
+        fastest: list[Trial] = []
         for trial in sorted((t for t in self.trials if not t.diverged), key=lambda t: t.time):
-            if not found or getattr(trial, error) < getattr(found[-1], error):
-                found.append(trial)
-        return found
+            if not fastest or getattr(trial, error) < getattr(fastest[-1], error):
+                fastest.append(trial)
+        return fastest
 
     def time_for(self, integrator: str, error: str, target: float) -> "ReachedError | None":
         """Where an integrator reaches an error, between its trials; None if its shortest step is
@@ -238,8 +238,8 @@ def measure(
     extend : whether longer steps than the longest one of each integrator are tried, doubled until
         one fails
     """
-    most = max((trial.forces for trial in trials), default=0) or OBSERVATIONS * OBSERVATIONS
-    steps = 2 * -(-2 * most // system.methods[system.reference].force_evaluations)
+    most_forces = max((trial.forces for trial in trials), default=0) or OBSERVATIONS * OBSERVATIONS
+    steps = 2 * -(-2 * most_forces // system.methods[system.reference].force_evaluations)
     exact = final_state(system, steps)
     differences = state_difference(exact, final_state(system, steps // 2))
     result = IntegratorAccuracy(
@@ -250,19 +250,19 @@ def measure(
     if extend:
         result.trials = trials = _extended(system, trials, exact)
     good = [trial for trial in trials if not trial.diverged]
-    done, whole = 0.0, len(good) * repeats
+    done, total = 0.0, len(good) * repeats
     for _ in range(repeats):
         for trial in good:
             trial.seconds.append(time_span(system, trial))
             done += 1
-            progress(done / whole)
+            progress(done / total)
     return result
 
 
 def _extended(system: TrialSystem, trials: list[Trial], exact: State) -> list[Trial]:
     """The trials, and before those of each integrator trials with longer steps, doubled until one
     fails."""
-    found = []
+    extended = []
     for name, group in groupby(trials, key=lambda trial: trial.integrator):
         ladder = list(group)
         longest = max(ladder, key=lambda trial: trial.timestep)
@@ -270,8 +270,8 @@ def _extended(system: TrialSystem, trials: list[Trial], exact: State) -> list[Tr
             longest = trial_of(system, name, longest.steps // 2)
             measure_errors(system, longest, exact)
             ladder.insert(0, longest)
-        found += ladder
-    return found
+        extended += ladder
+    return extended
 
 
 def time_span(system: TrialSystem, trial: Trial) -> float:
