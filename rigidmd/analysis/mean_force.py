@@ -76,9 +76,8 @@ def potential_of_mean_force(
         drawn = [rng.choice(some, len(some)) for some in samples]
         again, _ = _free_energies(windows, drawn, thermal_energy, free)
         profiles.append(_profile(windows, drawn, thermal_energy, again, edges, filled))
-    profiles = [
-        profile for profile in profiles if np.isfinite(profile).all()
-    ]  # in some a bin is empty
+    # in some a bin is empty
+    profiles = [profile for profile in profiles if np.isfinite(profile).all()]
     if len(profiles) < RESAMPLED // 2 or filled.sum() < 2:
         raise OutputError(
             "the windows have too few samples for a potential of mean force: run longer"

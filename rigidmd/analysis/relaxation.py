@@ -36,9 +36,8 @@ class Bands(NamedTuple):
 
     frequency: np.ndarray  # mean of each band
     density: np.ndarray  # mean of each band: twice the integral of the correlation at frequency 0
-    freedom: (
-        np.ndarray
-    )  # half the number of degrees of freedom of the chi² distribution of each mean
+    #: Half the number of degrees of freedom of the chi² distribution of each mean
+    freedom: np.ndarray
 
 
 class Relaxations(NamedTuple):
@@ -128,10 +127,8 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
     """The most likely model with a number of relaxations, by Fisher's scoring in the logarithms of
     its parameters, with the damping of Levenberg and Marquardt."""
     squares = (2 * np.pi * bands.frequency) ** 2
-    top, low = (
-        float(np.average(bands.density[:6], weights=bands.freedom[:6])),
-        float(bands.density[-1]),
-    )
+    top = float(np.average(bands.density[:6], weights=bands.freedom[:6]))
+    low = float(bands.density[-1])
     shortest = 0.5 / (2 * np.pi * float(bands.frequency[-1]))
     times = np.geomspace(4 * shortest, max(8 * shortest, longest / 3), count + 2)[1:-1]
     bottom = np.log([*[1e-4 * top] * count, *[shortest] * count, 1e-5 * top])
@@ -140,11 +137,9 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
 
     def model(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Density (b,) and its relative slopes with all parameters (b, p)."""
-        parts, times, plateau = (
-            np.exp(parameters[:count]),
-            np.exp(parameters[count:-1]),
-            np.exp(parameters[-1]),
-        )
+        parts = np.exp(parameters[:count])
+        times = np.exp(parameters[count:-1])
+        plateau = np.exp(parameters[-1])
         below = 1 + squares[:, None] * times**2
         density = (parts / below).sum(axis=1) + plateau
         slopes = np.column_stack(

@@ -78,9 +78,8 @@ class RigidFrames:
     def interval(self) -> float | None:
         """Time between frames, ps; None if they are not evenly spaced."""
         gaps = np.diff(self.time)
-        rounding = 2 * float(
-            np.spacing(np.float32(np.abs(self.time).max()))
-        )  # files hold times in single precision
+        # files hold times in single precision
+        rounding = 2 * float(np.spacing(np.float32(np.abs(self.time).max())))
         if len(gaps) == 0 or gaps.min() <= 0 or np.ptp(gaps) > EVEN * gaps.max() + rounding:
             return None
         return self.span / len(gaps)

@@ -110,10 +110,8 @@ class Runs:
 
         conclude : function of the mean of `values`, which may be nonlinear
         """
-        parts, weights = (
-            np.asarray(values, float),
-            np.array([len(run) for run in self.members], float),
-        )
+        parts = np.asarray(values, float)
+        weights = np.array([len(run) for run in self.members], float)
         value = np.asarray(conclude(np.average(parts, axis=0, weights=weights)), float)
         others = [np.arange(len(parts)) != k for k in range(len(parts))]
         without = [

@@ -47,9 +47,8 @@ class Assignment(NamedTuple):
 
     order: np.ndarray  # (m, s) atom of each site
     fit: TemplateFit
-    rival: (
-        np.ndarray
-    )  # (m,) rms of the best order in which an atom is a site with other parameters, Å; inf if none
+    #: (m,) rms of the best order in which an atom is a site with other parameters, Å; inf if none
+    rival: np.ndarray
 
     def of(self, rows: np.ndarray) -> "Assignment":
         """That of some of the molecules."""
@@ -256,9 +255,8 @@ class Orders:
         ]
         if len(fits) == 1:
             return Assignment(order, fits[0], np.full(len(points), np.inf))
-        rms = np.array(
-            [np.where(fit.deviation <= self.limit, fit.rms, np.inf) for fit in fits]
-        )  # (k, m)
+        # (k, m)
+        rms = np.array([np.where(fit.deviation <= self.limit, fit.rms, np.inf) for fit in fits])
         of_variant = np.full((self._variants.max() + 1, len(points)), np.inf)
         np.minimum.at(of_variant, self._variants, rms)
         given_fits = of_variant[0] <= self.equal_to(of_variant.min(axis=0))
@@ -305,9 +303,8 @@ class Orders:
         size = np.bincount(self.classes)[self.classes]
         far = distance >= WIDE * distance.max()
         axis = self._centred / np.where(distance > 0, distance, 1.0)[:, None]
-        off_axis = np.linalg.norm(
-            np.cross(axis[:, None], self._centred), axis=2
-        )  # (s, s) of the second from the first
+        # (s, s) of the second from the first
+        off_axis = np.linalg.norm(np.cross(axis[:, None], self._centred), axis=2)
         off_axis[~far] = 0.0
         if off_axis.max() <= LINEAR * distance.max():
             return [int(np.where(far, size, np.inf).argmin())]

@@ -71,10 +71,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     velocity = (
         start.velocity if scene.structure is not None and scene.structure.velocities else None
     )
-    mass, inertia = (
-        np.array([m.mass for m in species]),
-        np.where(frozen[:, None], 0.0, [m.inertia for m in species]),
-    )
+    mass = np.array([m.mass for m in species])
+    inertia = np.where(frozen[:, None], 0.0, [m.inertia for m in species])
     rotor = split_rotor(inertia)
     model = Model(
         index.astype(np.int32),
@@ -181,10 +179,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     if scene.structure is None:
         system.notes.extend(f"box: {note}" for note in start.notes)
         return system
-    file, off = (
-        scene.structure.file,
-        f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å",
-    )
+    file = scene.structure.file
+    off = f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å"
     system.notes.append(
         f"{len(index)} molecules read from {file}; distances of atoms from rigid templates: {off}"
     )
@@ -261,10 +257,8 @@ def left_out(
     forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
     has_sums = any(name.endswith("_reciprocal") for name in terms)
     direct = has_sums and forces.electrostatics == "ewald" and forces.dispersion != "pme"
-    method, has_charges = (
-        forces.electrostatics,
-        any(getattr(term, "acts_on_charges", False) for term in terms.values()),
-    )
+    method = forces.electrostatics
+    has_charges = any(getattr(term, "acts_on_charges", False) for term in terms.values())
     reasons = {
         f"{title}: {'no site has it' if getattr(forces, key) else without}": key not in terms
         for key, (title, without) in POTENTIALS.items()

@@ -80,10 +80,8 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
     scene, faults = _with_electrostatics(scene, composition)
     numbers, cutoff_errors = _cutoff_and_switch(scene.forces, composition)
     faults += cutoff_errors
-    settings, of_method = (
-        Settings({}, faults),
-        getattr(electrostatics_module(scene.forces), "settings", None),
-    )
+    settings = Settings({}, faults)
+    of_method = getattr(electrostatics_module(scene.forces), "settings", None)
     if not faults and of_method is not None:
         settings = of_method(
             scene.forces, composition, numbers["cutoff_A"], scene.engine.is_external

@@ -105,9 +105,8 @@ class _Candidate(NamedTuple):
 
     species: int
     order: list[int]  # atoms of the group, in the order of the sites with mass
-    classes: list[
-        np.ndarray
-    ]  # (s,) atoms of one class may be exchanged: by names, then by elements
+    #: (s,) atoms of one class may be exchanged: by names, then by elements
+    classes: list[np.ndarray]
     nameless: bool
 
 
@@ -249,9 +248,8 @@ class _Matcher:
         """Write the species of molecules `members`, of which `groups` are the possible ones, into
         `found`. Returns error messages by molecule; `known` is the number of those found before."""
         faults = {}
-        rms = np.array(
-            [np.where(g.fits, g.assigned.fit.rms, np.inf) for g in groups]
-        )  # (groups, m)
+        # (groups, m)
+        rms = np.array([np.where(g.fits, g.assigned.fit.rms, np.inf) for g in groups])
         chosen, fitting = rms.argmin(axis=0), np.asarray(np.isfinite(rms))
         clear = np.where(np.eye(len(groups), dtype=bool)[chosen].T, np.inf, rms).min(axis=0)
         least = rms.min(axis=0) + EQUAL_OF_RADIUS * max(g.limit for g in groups) / self._tolerance

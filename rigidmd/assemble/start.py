@@ -85,10 +85,8 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
         if faults:
             raise StructureError(scene.structure_source, faults)
         return configuration
-    n, sites = (
-        sum(counts),
-        sum(count * len(m.masses) for count, m in zip(counts, species, strict=True)),
-    )
+    n = sum(counts)
+    sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
     check_memory_of_molecules(scene.source, n, sites)
     cell, rng = not_none(cell), np.random.default_rng([scene.seed, LATTICE])
     configuration = Configuration(
@@ -249,11 +247,9 @@ def close_pairs(
     Å. `wanted` are radii, and functions for the indices of the sites of a molecule to which they
     apply."""
     cell = state.cell if state.volume < inf else None
-    position, owner, free = (
-        system.site_positions(state),
-        system.sites.molecule,
-        mobile(system.model),
-    )
+    position = system.site_positions(state)
+    owner = system.sites.molecule
+    free = mobile(system.model)
     near: dict[tuple[int, int], float] = {}
     for radius, sites_of in wanted:
         chosen = system.of_sites(

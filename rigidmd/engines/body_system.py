@@ -141,10 +141,8 @@ class BodySystem:
 
     def breaks(self) -> list[float]:
         """Times within the run at which a prescribed function of time has a jump or a kink."""
-        end, parts = (
-            self.scene.run.steps * self.scene.run.timestep_s,
-            (*self.body, *self.terms.values()),
-        )
+        end = self.scene.run.steps * self.scene.run.timestep_s
+        parts = (*self.body, *self.terms.values())
         functions = [value for part in parts for value in part if isinstance(value, TimeFunction)]
         return sorted({float(t) for function in functions for t in function.times if 0 < t < end})
 
@@ -195,9 +193,8 @@ class BodySystem:
                     f"t = {time:g} s: an applied function gave {returned!r}, must give force and"
                     " torque of 3 numbers each"
                 ) from None
-            if (
-                not self.translates
-            ):  # the force acts at the centre of mass, the torque is about the pivot
+            # the force acts at the centre of mass, the torque is about the pivot
+            if not self.translates:
                 torque = torque + np.cross(self.centre, self.pose(time, state).rotation.T @ force)
             if not (np.isfinite(force).all() and np.isfinite(torque).all()):
                 raise SimulationError(

@@ -268,11 +268,9 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
     )
     size = max(size, virial / STEEPEST)
     plain = PLAIN + there.force_tolerance
-    force_error, sites, alpha = (
-        system.force_error or 0.0,
-        system.site_count,
-        system.scene.forces.ewald_alpha_per_A,
-    )
+    force_error = system.force_error or 0.0
+    sites = system.site_count
+    alpha = system.scene.forces.ewald_alpha_per_A
     ewald = (
         force_error * (1 / alpha if alpha else 0.0) * (PER_SITE * sites + ERRORS * np.sqrt(sites))
     )

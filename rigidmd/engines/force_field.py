@@ -195,10 +195,8 @@ def _lennard_jones_kinds(system: System) -> list[list[int]]:
         return kinds
     sites = term.sites
     for k, member in zip(*np.unique(system.model.species, return_index=True), strict=True):
-        of_member, positions = (
-            slice(sites.first[member], sites.first[member + 1]),
-            system.species[k].positions_body,
-        )
+        of_member = slice(sites.first[member], sites.first[member + 1])
+        positions = system.species[k].positions_body
         for kind, offset in zip(law.kind[of_member], sites.offsets()[of_member], strict=True):
             kinds[k][int(np.linalg.norm(positions - offset, axis=1).argmin())] = int(kind)
     return kinds

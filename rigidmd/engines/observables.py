@@ -32,9 +32,8 @@ class Observation(NamedTuple):
     components: dict[str, float]  # potential energy by term and constant
     kinetic_translation: float
     kinetic_rotation: float
-    pressure_tensor_bar: (
-        np.ndarray
-    )  # (3, 3) molecular, tail correction included, symmetric; NaN without a box
+    #: (3, 3) molecular, tail correction included, symmetric; NaN without a box
+    pressure_tensor_bar: np.ndarray
     virial: np.ndarray  # (3, 3) molecular, without the tail correction; an energy
     momentum: np.ndarray  # (3,) u Å/ps
     load: Load  # u Å/ps² and u Å²/ps²

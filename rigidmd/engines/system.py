@@ -54,9 +54,8 @@ class System:
     constants: dict[str, float]  # constant energies, u Å²/ps²
     constant_pressure: float  # a constant part of the pressure, u/(Å ps²)
     tail: Tail | None  # the tail correction, where the scene requests it
-    residue_number: (
-        np.ndarray
-    )  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
+    #: (n,) numbers by which a scene may select molecules: see Molecules.frozen
+    residue_number: np.ndarray
     from_lattice: bool
     left_out: list[str]
     precision_reason: str = ""  # where the scene has precision = "auto"
@@ -65,13 +64,11 @@ class System:
     )
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)  # of what is allowed and probably not meant
-    python_forces: dict[str, Callable] = field(
-        default_factory=dict
-    )  # name of a term that Python computes -> function
+    #: Name of a term that Python computes -> function
+    python_forces: dict[str, Callable] = field(default_factory=dict)
     thermostat: Any = None  # user-defined, in place of the thermostat of every stage
-    user_terms: dict[str, str] = field(
-        default_factory=dict
-    )  # name of a user-defined term -> description
+    #: Name of a user-defined term -> description
+    user_terms: dict[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<System of {self.scene.in_short}>"

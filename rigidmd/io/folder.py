@@ -146,9 +146,8 @@ class FolderLock:
 
     def __init__(self, folder: Path):
         self._folder = folder
-        self._lock = FileLock(
-            folder / LOCK, timeout=0, thread_local=False
-        )  # any thread may end a run
+        # any thread may end a run
+        self._lock = FileLock(folder / LOCK, timeout=0, thread_local=False)
 
     @property
     def is_taken(self) -> bool:
@@ -185,9 +184,8 @@ def never_began(folder: Path) -> bool:
         return False
     log = folder / LOG
     with writing(log, "read"):
-        is_short = (
-            not unreadable_reason(log, 1e5) and len(log.read_bytes().splitlines()) <= 2
-        )  # its header, its start
+        # its header, its start
+        is_short = not unreadable_reason(log, 1e5) and len(log.read_bytes().splitlines()) <= 2
     return is_short or not log.exists()
 
 

@@ -68,10 +68,8 @@ def in_memory(system: System | BodySystem, frames: Sequence[Frame]) -> mda.Unive
     """A Universe of frames in memory, each with its time and box."""
     u = universe(system, system.state)
     _connect(u, system)
-    times, positions = (
-        _checked([frame.time for frame in frames]),
-        np.array([frame.positions for frame in frames]),
-    )
+    times = _checked([frame.time for frame in frames])
+    positions = np.array([frame.positions for frame in frames])
     boxes = None if u.dimensions is None else np.array([dimensions(frame.cell) for frame in frames])
     velocities = np.array([frame.velocities for frame in frames])
     u.trajectory = timed(MemoryReader)(
@@ -309,9 +307,8 @@ class _WithTimes(ProtoReader):
     def __init__(self, *source, times: list[float], **options):
         self._times = times
         self._dt = float(times[1] - times[0]) if len(times) > 1 else 0.0
-        super().__init__(
-            *source, **options | {"times": times}
-        )  # a reader passes its options to its copies
+        # a reader passes its options to its copies
+        super().__init__(*source, **options | {"times": times})
         self._set_time(self.ts)
 
     @property

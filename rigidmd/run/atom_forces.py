@@ -62,9 +62,8 @@ def atoms_of_results(
     def with_logged_energy(atoms: "ase.Atoms", time: float) -> "ase.Atoms":
         """Atoms with the energy of the log, if it has a line at their time."""
         if len(same := np.flatnonzero(_same(results["time"], time))):
-            energy = (
-                results["potential"][same[-1]] * KJ_PER_MOL / EV
-            )  # after a minimisation that begins then
+            # after a minimisation that begins then
+            energy = results["potential"][same[-1]] * KJ_PER_MOL / EV
             atoms.calc = SinglePointCalculator(atoms, energy=float(energy))
         return atoms
 
@@ -200,9 +199,8 @@ def gradient_forces(
         moments = _sum_per_molecule(
             of_atom, mass[..., None] * y[:, :, None] * r[:, None, :], len(force)
         )
-        moments = 0.5 * (
-            moments + moments.swapaxes(1, 2)
-        )  # it is symmetric where the fit is the best
+        # it is symmetric where the fit is the best
+        moments = 0.5 * (moments + moments.swapaxes(1, 2))
         tensor = moments.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments
         turn = np.einsum(
             "nij,nj->ni", np.linalg.pinv(tensor, rcond=MIN_MOMENT, hermitian=True), torque
@@ -234,10 +232,8 @@ def site_forces(
         of_term = np.array(cast(Any, workspace).site_force)
         at = _site_indices(system, sites)
         if name.endswith("reciprocal"):
-            term, position = (
-                cast(EwaldSum, system.terms[name]),
-                (state.position[system.sites.molecule] + arm)[at],
-            )
+            term = cast(EwaldSum, system.terms[name])
+            position = (state.position[system.sites.molecule] + arm)[at]
             of_term = of_term + forces_inside(term.charge, position, sites.first, term.smooth)
         np.add.at(on_sites, at, of_term)
     atom = system.sites.mass > 0
@@ -250,10 +246,8 @@ def site_forces(
 
 def _arms(system: System, state: State, atoms: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Positions from the centres of mass, lab frame: (s, 3) of the sites, (a, 3) of the atoms."""
-    arm, atom = (
-        system.site_positions(state) - state.position[system.sites.molecule],
-        system.sites.mass > 0,
-    )
+    arm = system.site_positions(state) - state.position[system.sites.molecule]
+    atom = system.sites.mass > 0
     return arm, arm[atom] if atoms is None else atoms - state.position[system.sites.molecule[atom]]
 
 
@@ -291,9 +285,8 @@ def _massless_forces_on_atoms(system: System, state: State, force: np.ndarray) -
             if len(state.rotation)
             else np.tile(np.eye(3), (len(kind.index), 1, 1))
         )
-        matrices = np.array(
-            [_transfer_matrices(m, int(site)) for site in bare]
-        )  # (bare, heavy, 3, 3)
+        # (bare, heavy, 3, 3)
+        matrices = np.array([_transfer_matrices(m, int(site)) for site in bare])
         body = np.einsum("nij,nbi->nbj", Q, force[kind.sites[:, bare]])
         on_atoms[kind.sites[:, heavy]] = np.einsum("nij,bhjk,nbk->nhi", Q, matrices, body)
     return on_atoms

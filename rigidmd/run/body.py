@@ -107,13 +107,10 @@ class BodyWatch(Observer):
 
     def __init__(self, run: "Simulation"):
         self._run, self._system, self._limits = run, run.system, run.scene.watch
-        system, every = (
-            run.system,
-            max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s)),
-        )
-        step_limit = EVALUATIONS_PER_CHECK // getattr(
-            system.method, "force_evaluations", 1
-        )  # half a second of computing
+        system = run.system
+        every = max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
+        # half a second of computing
+        step_limit = EVALUATIONS_PER_CHECK // getattr(system.method, "force_evaluations", 1)
         self.steps = min(step_limit, SAMPLES_PER_CHECK * every)
         self._start = energies_of(system, system.state)
         weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
@@ -282,9 +279,8 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
                 " order 2; otherwise integrator = 'dop853'"
             )
         rate, angle = fastest_body_rate(system), stable_angle(system.method)
-        if (
-            not self.scene.watch.stable_step or rate == 0 or angle == inf
-        ):  # some solvers choose their own steps
+        # some solvers choose their own steps
+        if not self.scene.watch.stable_step or rate == 0 or angle == inf:
             return
         self.record.stable = angle / rate
         for sentence in body_step_warnings(system):
@@ -300,11 +296,9 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         return self._segments[k]
 
     def restore(self, kept: Checkpoint) -> None:
-        arrays, method, k = (
-            kept.of("state").arrays,
-            self.system.method,
-            self.record.position.segment,
-        )
+        arrays = kept.of("state").arrays
+        method = self.system.method
+        k = self.record.position.segment
         check_same_scene(self.scene, self.record.scene, {}, int(arrays["step"][NOW]))
         self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
         if k > 0:

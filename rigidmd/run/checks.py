@@ -78,9 +78,8 @@ class StepCheck:
         self._per_momentum = model.inverse_inertia * np.array(arms)  # (species, 3)
         self._most_per_momentum = float(self._per_momentum.max())
         self._diameter = system.smallest_diameter
-        self._mass_root = sqrt(
-            model.inverse_mass.max()
-        )  # of the lightest, inverse; 0 if all are frozen
+        # of the lightest, inverse; 0 if all are frozen
+        self._mass_root = sqrt(model.inverse_mass.max())
         self._inertia_root = sqrt(model.inertia[model.inertia > 0].min(initial=inf))
         self._deepest_well = max((m.epsilon.max() for m in system.species), default=0.0)
 

@@ -68,10 +68,8 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> dict[str,
     coulomb, energy = _coulomb(system, state)
     exact, exact_energy = _coulomb(reference, state)
     error = np.linalg.norm((coulomb - exact)[moves], axis=1)
-    measured, force = (
-        float(np.sqrt((error**2).mean())),
-        float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean())),
-    )
+    measured = float(np.sqrt((error**2).mean()))
+    force = float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean()))
     return {
         "reference": next(note for note in reference.notes if note.startswith("ewald")),
         "rms_force_per_A": force / size,
@@ -89,10 +87,8 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     a system."""
     term, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
     counts = np.bincount(system.model.species, minlength=len(system.species))
-    charges, cutoff = (
-        charges_in(system.species, counts),
-        not_none(system.scene.forces.ewald_cutoff_A),
-    )
+    charges = charges_in(system.species, counts)
+    cutoff = not_none(system.scene.forces.ewald_cutoff_A)
     if isinstance(term, EwaldSum):
         reciprocal = k_space_error(
             charges, term.smooth.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume

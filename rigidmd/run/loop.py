@@ -87,10 +87,11 @@ class RunLoop:
         self._failed_before: list[Observer] = []
         self._bar, self._progress = progress_of(0.0, "", False), False
         self._until = 0.0  # the step at which the run pauses
+        # seconds before, and the time since which it runs
         self._wall, self._since = (
             0.0,
             clock.perf_counter(),
-        )  # seconds before, and the time since which it runs
+        )
         self._observers: dict[str, Observer] = {}
         self._course = self._run()
 
@@ -387,10 +388,8 @@ class RunLoop:
             shown, pace = None, inf
             self._bar.unpause()
             while done < segment.steps and not self.interrupted:
-                to, together = (
-                    min(schedule.next_observation(done), self._until - position.first),
-                    segment.together,
-                )
+                to = min(schedule.next_observation(done), self._until - position.first)
+                together = segment.together
                 if pace > 0:  # the first step alone, as it may be slow
                     to = min(to, done + max(1, int(SEGMENT_SECONDS / pace)))
                 to = done + -int((done - to) // together) * together
@@ -420,9 +419,8 @@ class RunLoop:
                     yield
             if not (segment.action is not None and self.interrupted):
                 self._checkpoint()
-            if (
-                done < segment.steps and shown is not None
-            ):  # only a run that stops here calls these observers
+            # only a run that stops here calls these observers
+            if done < segment.steps and shown is not None:
                 due = [
                     observer.ends and not is_shown
                     for observer, is_shown in zip(observers, shown, strict=True)
@@ -457,10 +455,8 @@ class RunLoop:
             if isinstance(error, RigidMDError) and method == observer.see:
                 raise
             self._failed_before.append(observer)
-            reason, name = (
-                f"{type(error).__name__}: {' '.join(str(error).split())}",
-                type(observer).__name__,
-            )
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            name = type(observer).__name__
             if observer.draws:
                 self._simulation.note(
                     f"{', '.join(observer.files()) or name} cannot be drawn: {reason}"

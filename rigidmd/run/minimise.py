@@ -74,9 +74,8 @@ def remove_overlaps(
         # Each molecule moves along its own force by at most `length`, so overlaps do not slow down
         # the others.
         shift, rotation = load.force * free[:, None], load.torque_body * rotates / arm
-        largest = (
-            np.abs(shift).max() or np.abs(rotation).max()
-        )  # in a uniform field there are torques alone
+        # in a uniform field there are torques alone
+        largest = np.abs(shift).max() or np.abs(rotation).max()
         shift, rotation = shift / largest, rotation / largest
         reach = np.linalg.norm(shift, axis=1)
         reach[: len(rotation)] = np.maximum(
@@ -109,10 +108,8 @@ def remove_overlaps(
 
 def _rotations(system: System, state: State) -> tuple[np.ndarray, np.ndarray]:
     """Which principal axes (n, 3) rotate; radii (n, 1) of molecules, Å, 1 for points."""
-    species, radius = (
-        system.model.species[: len(state.rotation)],
-        np.array([m.radius for m in system.species]),
-    )
+    species = system.model.species[: len(state.rotation)]
+    radius = np.array([m.radius for m in system.species])
     return (system.model.inertia > 0)[species], np.where(radius > 0, radius, 1.0)[species, None]
 
 
@@ -123,9 +120,8 @@ class EnthalpyPoint(NamedTuple):
     energy: float  # potential energy with constants and tail correction, u Å²/ps²
     scale: float  # sum of the absolute values of its parts, to which rounding is relative
     load: Load
-    pressure: (
-        np.ndarray
-    )  # (6,) by `barostats.COMPONENTS`, without the kinetic part, u/(Å ps²); NaN without a box
+    #: (6,) by `barostats.COMPONENTS`, without the kinetic part, u/(Å ps²); NaN without a box
+    pressure: np.ndarray
     gradient: np.ndarray  # (k,) of the enthalpy in the coordinates of `Enthalpy.moved`, u Å/ps²
 
     @property
@@ -188,10 +184,8 @@ class Enthalpy:
         used = self.coordinate >= 0
         slopes = np.zeros(len(self._lengths))
         np.add.at(slopes, self.coordinate[used], volume * (self.target - pressure)[used])
-        shifts, rotations = (
-            -load.force * self.free[:, None],
-            -load.torque_body * self.rotates / self.arm,
-        )
+        shifts = -load.force * self.free[:, None]
+        rotations = -load.torque_body * self.rotates / self.arm
         gradient = np.concatenate([shifts.ravel(), rotations.ravel(), slopes / self._lengths])
         return EnthalpyPoint(state, sum(parts), sum(map(abs, parts)), load, pressure, gradient)
 
@@ -458,11 +452,9 @@ class _Descent:
     ) -> tuple[np.ndarray, EnthalpyPoint] | None:
         """An accepted move along a direction, and the point it leads to; None without one. Raises
         SimulationError."""
-        slope, length, noise = (
-            float(direction @ point.gradient),
-            1.0,
-            self._enthalpy.rounding * point.scale,
-        )
+        slope = float(direction @ point.gradient)
+        length = 1.0
+        noise = self._enthalpy.rounding * point.scale
         for _ in range(TRIALS):
             move = length * direction
             try:

@@ -62,13 +62,11 @@ class MolecularRecord(RunRecord):
 
     stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
     removal: OverlapRemoval | None = None
-    choices: dict[Count, str] = field(
-        default_factory=dict
-    )  # of integrator and step, with the reasons
+    #: Of integrator and step, with the reasons
+    choices: dict[Count, str] = field(default_factory=dict)
     stable: dict[Count, PositiveFloat] = field(default_factory=dict)  # the longest stable step, ps
-    moves: dict[Count, tuple[Count, Count]] = field(
-        default_factory=dict
-    )  # of the box, tried and accepted
+    #: Of the box, tried and accepted
+    moves: dict[Count, tuple[Count, Count]] = field(default_factory=dict)
     minima: dict[Count, Minimum] = field(default_factory=dict)
 
 
@@ -156,9 +154,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         if self.scene.engine.is_external:
             from rigidmd.engines.external import compare_at, describe_comparison, external_engine
 
-            other = external_engine(
-                self.system
-            )  # first: the error of a missing program comes before compilation
+            # first: the error of a missing program comes before compilation
+            other = external_engine(self.system)
             try:
                 self._remove_overlaps()
                 lines = compare_at(

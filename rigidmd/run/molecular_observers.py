@@ -182,9 +182,8 @@ class StepWatch(Observer):
             for stage in moving
         ]
         every = checks.check_interval(run.system)
-        self.steps = (
-            every if max(of_samples, default=0.0) > every else None
-        )  # samples come at least as often
+        # samples come at least as often
+        self.steps = every if max(of_samples, default=0.0) > every else None
 
     def see(self, moment: Moment) -> None:
         if (load := self._run.engine.load) is not None:  # forces have been evaluated

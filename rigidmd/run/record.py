@@ -150,6 +150,7 @@ def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> n
 def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
     """Columns of motion.csv, or, of a run that has not written it, of its last checkpoint."""
     if (columns := read_motion(folder / MOTION)) is not None:
+        # that every motion has
         families = [
             "time",
             "position",
@@ -157,7 +158,7 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
             "potential",
             "energy",
             "work",
-        ]  # that every motion has
+        ]
         if system.rotates:
             families += [
                 "rotation",

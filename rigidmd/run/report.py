@@ -152,10 +152,8 @@ def stage_title(stage: dict) -> str:
 
 
 def _minimum_rows(stage: dict, minimum: dict) -> list[tuple[str, str]]:
-    before, after = (
-        minimum["energy_before_kJ_mol_per_molecule"],
-        minimum["energy_after_kJ_mol_per_molecule"],
-    )
+    before = minimum["energy_before_kJ_mol_per_molecule"]
+    after = minimum["energy_after_kJ_mol_per_molecule"]
     force, torque = minimum["largest_force_kJ_mol_A"], minimum["largest_torque_kJ_mol"]
     rows = [
         ("potential", f"{before:.6g} before, {after:.6f} kJ/mol per molecule after"),
@@ -181,10 +179,8 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
     rows.append(("means", f"over {stage['means_over']}"))
     if stage.get("volume_nm3") is not None:
-        mean, end = (
-            format_with_error(stage["volume_nm3"], stage["volume_error_nm3"]),
-            stage["volume_before_nm3"],
-        )
+        mean = format_with_error(stage["volume_nm3"], stage["volume_error_nm3"])
+        end = stage["volume_before_nm3"]
         rows.append(
             (
                 "volume",
@@ -199,10 +195,8 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         if parts := _temperatures(stage, "_unbiased"):
             rows.append(("", f"{parts} corrected for the time step"))
         if (scatter := stage.get("temperature_scatter_K")) is not None:
-            off, before = (
-                stage["temperature_K"] - stage["temperature_before_K"],
-                stage["temperature_before_K"],
-            )
+            off = stage["temperature_K"] - stage["temperature_before_K"]
+            before = stage["temperature_before_K"]
             moment = "this stage keeps the energy of one moment; such temperatures scatter by"
             hint = "" if abs(off) < 3 * scatter else ", less than this: equilibrate longer"
             rows.append(
@@ -242,19 +236,15 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         )
     elif stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
-        value, error = (
-            stage["drift_kJ_mol_ns_per_molecule"],
-            stage["drift_error_kJ_mol_ns_per_molecule"],
-        )
+        value = stage["drift_kJ_mol_ns_per_molecule"]
+        error = stage["drift_error_kJ_mol_ns_per_molecule"]
         verdict = f": {stage['drift_verdict']}" if stage["drift_verdict"] else ""
         rows.append(
             ("drift", f"{format_signed(value, error)} kJ/mol/ns per molecule ({what}){verdict}")
         )
         if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
-            value, error = (
-                stage["drift_kT_ns_per_degree_of_freedom"],
-                stage["drift_error_kT_ns_per_degree_of_freedom"],
-            )
+            value = stage["drift_kT_ns_per_degree_of_freedom"]
+            error = stage["drift_error_kT_ns_per_degree_of_freedom"]
             rows.append(("", f"{format_signed(value, error)} kT/ns per degree of freedom"))
             total = f"in total {value * stage['duration_ps'] / 1000:+.2g} kT per degree of freedom"
             if stage["drift_over_kinetic_std"] is not None:

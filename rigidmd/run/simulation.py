@@ -171,9 +171,8 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         thermostat: "NamedTuple | HasStage | None" = None,
         applied: "Mapping[str, Callable[[Pose], tuple]] | None" = None,
     ):
-        self.folder = (
-            None if folder is None else Path(folder).absolute()
-        )  # a callback may change the directory
+        # a callback may change the directory
+        self.folder = None if folder is None else Path(folder).absolute()
         if resume and folder is None:
             raise ValueError("a run without a folder has no checkpoint to resume from")
         self._force, self._resume, self._user_say, self.warn = force, resume, say, warn

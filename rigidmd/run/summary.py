@@ -63,12 +63,10 @@ class Minimum(NamedTuple):
     energy_after: float  # at the end
     force: float  # largest force on a molecule that is not frozen
     torque: float  # largest torque about a principal axis
-    pressure: (
-        tuple[float, ...] | None
-    )  # six, by `barostats.COMPONENTS`, without the kinetic part; None without a box
-    deviation: (
-        float | None
-    )  # largest deviation from the requested pressure; None if the cell does not relax
+    #: Six, by `barostats.COMPONENTS`, without the kinetic part; None without a box
+    pressure: tuple[float, ...] | None
+    #: Largest deviation from the requested pressure; None if the cell does not relax
+    deviation: float | None
     precision: str = "double"  # of the last forces
 
 
@@ -83,15 +81,12 @@ def summarise(
 ) -> dict:
     """The summary of a run of molecules, without its `provenance`; seconds as in
     `RunPart.summary`."""
-    scene, minima, computing, last = (
-        system.scene,
-        record.minima,
-        record.position.computing,
-        samples.row(-1),
-    )
-    size = float(
-        system.model.mass[system.model.species] @ np.linalg.norm(state.velocity, axis=1)
-    )  # sum of |m v|
+    scene = system.scene
+    minima = record.minima
+    computing = record.position.computing
+    last = samples.row(-1)
+    # sum of |m v|
+    size = float(system.model.mass[system.model.species] @ np.linalg.norm(state.velocity, axis=1))
     moving = [k for k in range(len(computing)) if k not in minima]
     stages = []
     for k in np.unique(samples["stage"]).tolist():
@@ -223,12 +218,10 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     if len(of_stage) - half < MIN_SAMPLES:
         return []
     time, drift, temperature = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
-    notes, stage, freedom, level = (
-        [],
-        system.scene.stages[k],
-        system.freedom_in(k),
-        float(temperature.mean()),
-    )
+    notes = []
+    stage = system.scene.stages[k]
+    freedom = system.freedom_in(k)
+    level = float(temperature.mean())
     line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
     if (
         thermal > 0
@@ -255,10 +248,8 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     if not stage.has_thermostat:
         return notes
     moving, rotating = pair = [of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS]
-    unbiased, corrected = (
-        [of_stage[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS],
-        "",
-    )
+    unbiased = [of_stage[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS]
+    corrected = ""
     if any(np.isfinite(values).all() for values in unbiased):
         (moving, rotating), corrected = unbiased, " without the error of the step"
         both = zip(unbiased, (freedom.translation, freedom.rotation), strict=True)
@@ -361,10 +352,8 @@ def stage_summary(
         else slope(time, drift)
     )
     temperatures = _means(steady, TEMPERATURES)
-    potential, pressure = (
-        mean_and_error(steady["potential"] / n),
-        mean_and_error(steady["pressure_bar"]),
-    )
+    potential = mean_and_error(steady["potential"] / n)
+    pressure = mean_and_error(steady["pressure_bar"])
     spread, duration = float(of_stage["kinetic"].std()), steps * stage.timestep_fs * FEMTOSECOND
     thermal = (
         BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total
@@ -429,10 +418,8 @@ def _minimised(
     system: System, samples: Samples, k: int, computing: float, minimum: Minimum
 ) -> dict:
     """Values of a minimisation, at its end; None for those that only a stage of motion has."""
-    stage, minimum_values = (
-        system.scene.stages[k],
-        minimum_figures(minimum, len(system.model.species)),
-    )
+    stage = system.scene.stages[k]
+    minimum_values = minimum_figures(minimum, len(system.model.species))
     end = Samples(samples.stages, samples.user_terms, samples.of_stage(k).table()[-1:])
     return dict.fromkeys(stage_summary(system, samples, k, computing, (0, 0))) | {
         "name": stage.label,

@@ -87,9 +87,8 @@ class Scene(Section, Displayed):
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
-    _read_in: Path = PrivateAttr(
-        default_factory=lambda: _working_directory()
-    )  # from which `_folder` begins
+    #: From which `_folder` begins
+    _read_in: Path = PrivateAttr(default_factory=lambda: _working_directory())
     _embedded_files: dict[str, bytes] = PrivateAttr(default_factory=dict)
 
     @field_validator("integrators")

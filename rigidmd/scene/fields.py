@@ -192,9 +192,8 @@ class FieldKind(NamedTuple):
     module: str  # in `forces.fields`, with the function `term`
     key: str  # of `Fields`: a value, a table or a list of tables, each of which is one term
     title: str  # in the list of unused interactions of a scene
-    sentence: Callable[
-        [Any, Any], str
-    ]  # of the table with its keys and of its term, for `rigidmd check`
+    #: Of the table with its keys and of its term, for `rigidmd check`
+    sentence: Callable[[Any, Any], str]
 
 
 def _electric_sentence(fields: Fields, term: Any) -> str:

@@ -229,10 +229,8 @@ class Molecule:
     def description(self) -> str:
         """Kind of body, number of sites, mass, charge and dipole, for reports."""
         shape = f"{self.kind}, planar" if self.planar else self.kind
-        charge, count = (
-            f"net charge {self.charge:+g} e" if self.charge else "neutral",
-            len(self.masses),
-        )
+        charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
+        count = len(self.masses)
         dipole = ""
         if self.charges.any() and self.radius > 0:
             dipole = f", dipole {self.dipole_debye:.3f} D" if self.has_dipole else ", no dipole"
@@ -296,10 +294,8 @@ def molecule(
         for i, j in sorted(near[:, ::-1].tolist())
     ]
     if frame.kind == "linear" or (frame.kind == "point" and not faults):
-        off, limit = (
-            np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1),
-            OFF_AXIS * size,
-        )
+        off = np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1)
+        limit = OFF_AXIS * size
         where = "from the centre of mass, but all the mass is there: nothing resists its torque"
         if frame.kind == "linear":
             where = "off the axis of a linear body: nothing resists its torque about that axis"

@@ -338,10 +338,8 @@ class MolecularScene(Scene):
             yield (
                 "box.vacuum_A and fields.walls across the same axis contradict each other: omit one"
             )
-        first, from_file = (
-            self.first_moving,
-            self.structure is not None and self.structure.velocities,
-        )
+        first = self.first_moving
+        from_file = self.structure is not None and self.structure.velocities
         if (
             self.start.temperature_K is None
             and first is not None

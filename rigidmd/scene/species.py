@@ -184,9 +184,8 @@ class Box(Section):
         if self.vacuum_A is not None and not self.periodic:
             yield "vacuum_A would do nothing: periodic is false"
         angles = [radians(angle) for angle in self.angles_deg or (90, 90, 90)]
-        if (
-            not 2 * max(angles) < sum(angles) < 2 * pi
-        ):  # the edges would be in one plane, or could not meet
+        # the edges would be in one plane, or could not meet
+        if not 2 * max(angles) < sum(angles) < 2 * pi:
             yield "angles_deg: three edges cannot form these angles"
 
     @property

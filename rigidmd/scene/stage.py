@@ -299,10 +299,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             return
         step = self.timestep_fs * FEMTOSECOND
         least = pi * step
-        thermostat, barostat = (
-            THERMOSTATS.get(self.thermostat_kind),
-            BAROSTATS.get(self.barostat_kind),
-        )
+        thermostat = THERMOSTATS.get(self.thermostat_kind)
+        barostat = BAROSTATS.get(self.barostat_kind)
         if thermostat and thermostat.oscillates and self.thermostat_time < least:
             yield (
                 f"thermostat_time_ps = {self.thermostat_time:g} is a period shorter than pi steps,"

@@ -69,10 +69,8 @@ def slab_of(frames: RigidFrames, axis: str) -> Slab:
     def centred(fraction: np.ndarray) -> np.ndarray:
         return ((fraction - middle + 0.5) % 1.0 - 0.5) * height[:, None]
 
-    area, centre = (
-        float(np.mean(frames.volume / height)),
-        frames.positions[:, :, k] / height[:, None],
-    )
+    area = float(np.mean(frames.volume / height))
+    centre = frames.positions[:, :, k] / height[:, None]
     return Slab(k, area, float(height.mean()), centred(at), centred(centre), mass)
 
 

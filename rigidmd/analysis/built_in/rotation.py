@@ -318,14 +318,11 @@ def dielectric(runs: Runs) -> AnalysisResult:
     cause = _broken_symmetry(runs)
     centre, lost = np.zeros(3), 0.0
     if cause:
-        centre, lost = (
-            runs.mean([M.mean(axis=0) for M in dipoles]),
-            min(0.5, 2 * correlation / runs.span),
-        )
+        centre = runs.mean([M.mean(axis=0) for M in dipoles])
+        lost = min(0.5, 2 * correlation / runs.span)
     squares = [np.sum((M - centre) ** 2, axis=1) / (1 - lost) for M in dipoles]
-    per_square = (
-        4 * np.pi * COULOMB / (3 * runs.volume * runs.thermal_energy)
-    )  # y = <M²>/(3 eps0 V kT)
+    # y = <M²>/(3 eps0 V kT)
+    per_square = 4 * np.pi * COULOMB / (3 * runs.volume * runs.thermal_energy)
     size, error = mean_of_series(runs, squares)
     y = per_square * size
     result = AnalysisResult("dielectric", "dielectric constant")

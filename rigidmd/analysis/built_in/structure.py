@@ -85,9 +85,8 @@ def rdf(
         mean, error = _mean_of_frames(thinned, g)
         curve.columns[title] = mean
         within = mean * shells * density
-        curve.columns[f"n {a}-{b}"] = (
-            np.cumsum(within) - 0.5 * within
-        )  # up to the middle of each bin
+        # up to the middle of each bin
+        curve.columns[f"n {a}-{b}"] = np.cumsum(within) - 0.5 * within
         if error is not None:
             curve.errors[title] = error
         result.values += _peaks(f"{a}-{b}", r, thinned, g, shells * density)
@@ -208,9 +207,8 @@ def _peaks(
         )
         of_blocks, left_out = _errors_over_blocks(frames[0], peak_near, samples)
         errors = np.maximum(of_blocks, left_out).tolist()
-        errors[2] = float(
-            np.hypot(of_blocks[2], left_out[2]) / np.sqrt(2)
-        )  # jumps of the minimum count once
+        # jumps of the minimum count once
+        errors[2] = float(np.hypot(of_blocks[2], left_out[2]) / np.sqrt(2))
     titles = (
         ("first peak", "Å"),
         ("height of that peak", "1"),
@@ -391,10 +389,11 @@ def hydrogen_bonds(
         raise OutputError(f"{why}: there are no hydrogen bonds")
     thinned, notes = _thinned(runs, ENOUGH_MOLECULES)
     number = len(runs.system.model.species)
+    # (f, n) each
     bonds = [
         np.array([_bonds(run, k, distance, angle) for k in range(len(run))])
         for run in thinned.members
-    ]  # (f, n) each
+    ]
     each = [of_run.mean(axis=1) for of_run in bonds]
     value, error = mean_of_series(thinned, each)
     size = int(max(of_run.max() for of_run in bonds)) + 1
@@ -429,11 +428,12 @@ def _donors(molecule: Molecule) -> list[tuple[int, int]]:
 
 def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float) -> np.ndarray:
     """Hydrogen bonds of each molecule (n,) in a frame."""
+    # arms (sites, 3) to the first hydrogen of each, the second, ...; NaN without one
     heavy, owner, arms = (
         [],
         [],
         [],
-    )  # arms (sites, 3) to the first hydrogen of each, the second, ...; NaN without one
+    )
     arm_count = len(max((_donors(kind.molecule) for kind in frames.kinds), key=len))
     for kind in frames.kinds:
         centre = frames.positions[frame, kind.index]

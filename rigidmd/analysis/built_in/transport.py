@@ -133,9 +133,8 @@ def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResul
         f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps"
     )
     edge = None  # of a cubic box
-    distance = (
-        runs.system.smallest_diameter
-    )  # over which a molecule has to move to change its surroundings
+    # over which a molecule has to move to change its surroundings
+    distance = runs.system.smallest_diameter
     if runs.has_box:
         distance = float((runs.volume / len(runs.system.model.species)) ** (1 / 3))
         cell = runs.mean_cell

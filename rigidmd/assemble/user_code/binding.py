@@ -175,10 +175,8 @@ def _term(made: Any, name: str, system: System, target: System, tails: list[Tail
         target.notes.extend(f"{name}: {note}" for note in notes)
         target.warnings.extend(f"{name} {warning}" for warning in warnings)
         tails += [] if tail is None else [tail]
-        cutoff, truncation = (
-            made.cutoff_A or system.cutoff,
-            made.truncation or system.scene.forces.truncation,
-        )
+        cutoff = made.cutoff_A or system.cutoff
+        truncation = made.truncation or system.scene.forces.truncation
         reach = f"cutoff {cutoff:g} Å, {truncation}" if cutoff < inf else "no cutoff"
         target.user_terms[name] = f"{formula.text}, {len(term.group)} sites, {reach}"
         return term

@@ -458,9 +458,8 @@ def pair_law(
         ):
             raise ValueError(f"{key} is {value!r}, must be a number above 0")
     usual = "table" if table is not None else getattr(energy, "__name__", "pair_law")
-    kinds = [
-        type(value) for value in parameter_sets if hasattr(value, "_asdict")
-    ]  # a NamedTuple that a function expects
+    # a NamedTuple that a function expects
+    kinds = [type(value) for value in parameter_sets if hasattr(value, "_asdict")]
     kind = kinds[-1] if kinds else None
     formula = (
         formula_of_function(energy, kind)

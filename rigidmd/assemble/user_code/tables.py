@@ -52,10 +52,8 @@ def read_columns(path: Path) -> Columns:
             )
     for number, words in lines:
         values = [float(word) if _is_number(word) else inf for word in words]
-        row, expected = (
-            dict(zip(names, values, strict=False)),
-            (len(names),) if names is not COLUMNS else (2, 3),
-        )
+        row = dict(zip(names, values, strict=False))
+        expected = (len(names),) if names is not COLUMNS else (2, 3)
         if len(words) not in ((len(rows[0]),) if rows else expected):
             must = f"must have the same columns in all lines: {', '.join(names)}"
             faults.append(f"line {number}: has {len(words)} numbers, {must}")

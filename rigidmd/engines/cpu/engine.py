@@ -174,9 +174,8 @@ class CpuEngine(Engine):
         workspaces = self._prepare(state)
         keep_time(state, dt)
         last = self._last
-        if (
-            state is not last.state and "steps" in self._dispatchers
-        ):  # its energies belong to another state
+        # its energies belong to another state
+        if state is not last.state and "steps" in self._dispatchers:
             self._dispatchers["steps"].table.tallies_valid[0] = 0
         if self.load is None:
             self.load = no_load(state)
@@ -227,9 +226,8 @@ class CpuEngine(Engine):
             model, state, load, workspaces, flows, gradient, dt, until, progress
         ):
             workspaces = self._handle_status(status, state)
-        return (
-            progress[LOADED] != 0
-        )  # also False after no step, because then no forces were evaluated
+        # also False after no step, because then no forces were evaluated
+        return progress[LOADED] != 0
 
     def _bind(self, objects: tuple, make: Callable[[], Any]) -> Any:
         """What `make` returns, which is kept while it is bound to the same objects."""
@@ -366,10 +364,8 @@ class CpuEngine(Engine):
 
     def _recall_lists(self, state: State, arrays_of: dict[str, dict[str, np.ndarray]]) -> None:
         """Make new workspaces, with the neighbour lists that were kept: all of them or none."""
-        spaces, now = (
-            tuple(with_code(workspace) for workspace in self.new_workspaces(state)),
-            float(state.time[NOW]),
-        )
+        spaces = tuple(with_code(workspace) for workspace in self.new_workspaces(state))
+        now = float(state.time[NOW])
         if arrays_of.keys() & set(self.names):
             pairs = zip(self.names, spaces, strict=False)
             spaces = tuple(
@@ -409,9 +405,8 @@ class CpuEngine(Engine):
                 evaluated_total = terms.sum(0)[first : first + len(values)]
                 if (np.abs(evaluated_total - values) > rounding * np.abs(terms).sum(0).max()).any():
                     raise ValueError("its state has another energy or virial than was kept with it")
-            if (
-                not same
-            ):  # they were built for a trial box or the end of a trajectory that was rejected
+            # they were built for a trial box or the end of a trajectory that was rejected
+            if not same:
                 self._recall_lists(state, arrays_of)
         elif not same:
             raise ValueError("its neighbour lists are not those of its state")

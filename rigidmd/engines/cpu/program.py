@@ -83,9 +83,8 @@ class Profile(NamedTuple):
     """Median times of a step and its rows, without energies."""
 
     step: float  # s
-    rows: list[
-        tuple[str, float]
-    ]  # text and s of each row of the forces; the last one is the rest of the step
+    #: Text and s of each row of the forces; the last one is the rest of the step
+    rows: list[tuple[str, float]]
 
 
 def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Profile:

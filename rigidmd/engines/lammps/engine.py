@@ -177,9 +177,8 @@ class LammpsEngine(ExternalEngine):
         for mine, its in zip(state[:5], received[:5], strict=True):
             mine[:] = its
         n, force, virial = len(energies), rows[:, 10:13] * files.KCAL, np.zeros((3, 3))
-        if (
-            view.is_periodic
-        ):  # the symmetric part of the molecular virial, from the atomic virial as a pressure
+        # the symmetric part of the molecular virial, from the atomic virial as a pressure
+        if view.is_periodic:
             xx, yy, zz, xy, xz, yz = np.array(printed[n : n + 6]) * files.ATMOSPHERE * state.volume
             intramolecular = self._bodies.intramolecular_virial(position, force)
             virial = (
@@ -201,10 +200,8 @@ class LammpsEngine(ExternalEngine):
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
         view = self._view
         charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # with LAMMPS' constant
-        names, law = (
-            ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None)),
-            view.coulomb,
-        )
+        names = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None))
+        law = view.coulomb
         names += (
             ["coulomb_real", "coulomb_reciprocal"]
             if view.has_ewald_sum

@@ -331,9 +331,8 @@ def fixes(view: ForceFieldView, k: int) -> list[str]:
         langevin = [f"fix {POINTS}_bath {POINTS} langevin {damping} {seed + 1} tally yes"]
     else:
         of_bodies, of_points = f"rigid/{kind}/small molecule", kind
-        if (
-            stage.has_thermostat
-        ):  # LAMMPS has the inverse of an angular frequency, a scene its period
+        # LAMMPS has the inverse of an angular frequency, a scene its period
+        if stage.has_thermostat:
             chain = f" temp {at} {_num(1e3 * stage.thermostat_time / (2 * pi))}"
             of_bodies, of_points = of_bodies + chain, of_points + chain
         if stage.has_barostat:

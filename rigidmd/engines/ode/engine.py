@@ -54,10 +54,11 @@ class OdeEngine(CpuEngine):
     _dense_output: Callable[[float], np.ndarray] | None = None
     _restart = False  # whether forces have changed, so that earlier steps are useless
     _steps = 0  # steps that DOP853 or Radau has taken
+    #: Consecutive steps at the limit of stability and not, as Hairer counts them
     _stiff_steps, _other_steps = (
         0,
         0,
-    )  # consecutive steps at the limit of stability and not, as Hairer counts them
+    )
     is_stiff = False
 
     @property
@@ -193,9 +194,8 @@ class OdeEngine(CpuEngine):
                 problem = f"{solver.name} finds no step that keeps its tolerances ({limits})"
                 raise SimulationError(f"at t = {running.t:.6g}: {problem}")
             self._dense_output = running.dense_output()
-            if (
-                self.stop_requested()
-            ):  # restore the last observation: the rates have changed the state
+            # restore the last observation: the rates have changed the state
+            if self.stop_requested():
                 state.extra_variables[:] = variables_before
                 read(
                     form,

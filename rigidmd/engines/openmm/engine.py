@@ -194,9 +194,8 @@ class OpenmmEngine(ExternalEngine):
             else state.cell
         )
         received = self._particles.bodies.state(state, position, velocity, cell)
-        if (
-            self._stage.has_barostat
-        ):  # OpenMM wraps molecules into the box whenever it changes the box
+        # OpenMM wraps molecules into the box whenever it changes the box
+        if self._stage.has_barostat:
             moved = received.position @ np.linalg.inv(cell) - state.position @ np.linalg.inv(
                 state.cell
             )

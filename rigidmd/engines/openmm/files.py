@@ -74,9 +74,10 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     ):
         from openmm import Vec3, app
 
+        # Å
         app.PDBFile.writeFile(
             _topology(particles), [Vec3(*row) for row in (position / NM).tolist()], file
-        )  # Å
+        )
     return [*text, TOPOLOGY]
 
 

@@ -183,9 +183,8 @@ class Layout(NamedTuple):
     point: np.ndarray  # (p,) particle of each mass point
     of_species: list[MassPoints]
     first: np.ndarray  # (n,) first particle of each molecule
-    local: list[
-        np.ndarray
-    ]  # for each species the particles of its mass points, counted from `first`
+    #: For each species the particles of its mass points, counted from `first`
+    local: list[np.ndarray]
 
     def positions(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Positions, Å, and velocities, Å/ps, of all particles (q, 3) at a state."""
@@ -220,10 +219,8 @@ def layout(view: ForceFieldView) -> Layout:
         at, of_particles = body.particles(len(m.masses))
         local.append(at)
         mass.append(np.zeros_like(of_particles) if is_frozen else of_particles)
-    count, sites = (
-        np.array([len(of_species) for of_species in mass])[species],
-        system.sites_per_molecule,
-    )
+    count = np.array([len(of_species) for of_species in mass])[species]
+    sites = system.sites_per_molecule
     first, molecule = np.cumsum(count) - count, np.repeat(np.arange(len(species)), count)
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
     points = Points(
@@ -329,10 +326,8 @@ def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
             forces.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     if (tail := view.system.tail) is not None:
-        energy, constant = (
-            float(tail.energy_volume) / KJ_PER_MOL * NM**3,
-            float(tail.constant) / KJ_PER_MOL,
-        )
+        energy = float(tail.energy_volume) / KJ_PER_MOL * NM**3
+        constant = float(tail.constant) / KJ_PER_MOL
         forces.append((library().CustomVolumeForce(f"{energy!r}/v+({constant!r})"), Group.TAIL))
     return forces
 

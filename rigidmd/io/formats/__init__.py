@@ -28,9 +28,8 @@ Encode = Callable[[Frame, int], bytes]
 class Format(NamedTuple):
     """A file format. What it cannot do is None or False."""
 
-    extensions: tuple[
-        str, ...
-    ]  # in lower case; the first is written. None if it is known by its content only
+    #: In lower case; the first is written. None if it is known by its content only
+    extensions: tuple[str, ...]
     name: str = ""  # in messages; default: its extensions
 
     # As a structure. For each structure in a text `read` returns a function that returns its atoms;

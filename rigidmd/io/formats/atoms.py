@@ -12,10 +12,11 @@ from rigidmd.core.toml import parse_whole_number
 from rigidmd.errors import StructureError
 
 SAME_MASS = 0.01  # relative difference of the masses of one element
+# u, AME2020; ASE has no symbols for them
 HEAVY_HYDROGEN = {
     "D": 2.014101777844,
     "T": 3.01604928132,
-}  # u, AME2020; ASE has no symbols for them
+}
 #: Names of ions in CHARMM's force fields that do not begin with their elements.
 CHARMM_IONS = {
     "SOD": "Na",
@@ -39,12 +40,10 @@ class Atoms(NamedTuple):
     """The n atoms of a file, in Å, ps and u."""
 
     names: list[str]
-    elements: list[
-        str
-    ]  # "" if the format has only names; X for massless sites, D and T for heavy hydrogen
-    residue: list[
-        tuple
-    ]  # (number or None, name, ...), differs between neighbours; () without residues
+    #: "" if the format has only names; X for massless sites, D and T for heavy hydrogen
+    elements: list[str]
+    #: (number or None, name, ...), differs between neighbours; () without residues
+    residue: list[tuple]
     position: np.ndarray  # (n, 3) Å
     velocity: np.ndarray | None = None  # (n, 3) Å/ps; rows of NaN for atoms without one
     cell: np.ndarray | None = None  # (3, 3), rows a, b, c, Å

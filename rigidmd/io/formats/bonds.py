@@ -124,11 +124,9 @@ def bonds(m: Any) -> list[tuple[int, int]]:
     nearest atoms."""
     from scipy.spatial.distance import cdist
 
-    x, atoms, massless = (
-        m.positions_body,
-        np.flatnonzero(m.masses > 0),
-        np.flatnonzero(m.masses == 0),
-    )
+    x = m.positions_body
+    atoms = np.flatnonzero(m.masses > 0)
+    massless = np.flatnonzero(m.masses == 0)
     radius = SLACK * np.array([COVALENT.get(m.elements[i], 0.0) for i in atoms])
     bonded = cdist(x[atoms], x[atoms]) <= radius[:, None] + radius
     bonded[tuple(shortest_links(x[atoms]).T)] = True

@@ -88,10 +88,8 @@ def same_lattice(cell: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
 def describe_cell(cell: np.ndarray) -> str:
     """Lengths and angles of a cell (3, 3)."""
     parameters = edges_and_angles(cell)
-    lengths, angles = (
-        ", ".join(f"{x:.4f}" for x in parameters[:3]),
-        ", ".join(f"{x:.4g}" for x in parameters[3:]),
-    )
+    lengths = ", ".join(f"{x:.4f}" for x in parameters[:3])
+    angles = ", ".join(f"{x:.4g}" for x in parameters[3:])
     return f"edges {lengths} Å, angles {angles}°"
 
 
@@ -140,9 +138,8 @@ def _short_bases(cell: np.ndarray) -> np.ndarray:
     from ase.geometry import minkowski_reduce
 
     edges, reduced = minkowski_reduce(cell)
-    factors = np.array(
-        [v for v in product((-2, -1, 0, 1, 2), repeat=3) if v > (0, 0, 0)]
-    )  # without -v
+    # without -v
+    factors = np.array([v for v in product((-2, -1, 0, 1, 2), repeat=3) if v > (0, 0, 0)])
     vectors = factors @ np.asarray(reduced)
     longest = np.linalg.norm(edges, axis=1).max()
     vectors = vectors[np.linalg.norm(vectors @ cell, axis=1) <= (1 + SAME_HEIGHT) * longest]

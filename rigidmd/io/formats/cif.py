@@ -162,9 +162,8 @@ def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
     position = _coordinates(path, sites, names, "fract" if is_fractional else "cartn")
     if cell is None and is_fractional:
         raise structure_error(path, f"has no cell: {CELL[0]} to {CELL[-1]} are missing")
-    if cell is None or (
-        not is_fractional and np.allclose(cell, np.eye(3))
-    ):  # the placeholder of the PDB
+    # the placeholder of the PDB
+    if cell is None or (not is_fractional and np.allclose(cell, np.eye(3))):
         return Atoms(names, elements, residue, position, cell=cell)
     if not is_fractional:
         position = _to_fractional(block, position, cell)

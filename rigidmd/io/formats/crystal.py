@@ -181,9 +181,8 @@ def settings_of_name(name: str) -> list[Setting]:
             ]:
                 return settings
     symbol, code = attempts[0]
-    group = gemmi.find_spacegroup_by_name(
-        symbol
-    )  # other symbols of the same setting: H 3, F d 3 m, C m c e
+    # other symbols of the same setting: H 3, F d 3 m, C m c e
+    group = gemmi.find_spacegroup_by_name(symbol)
     if group is None:
         return []
     return settings_where(

@@ -40,9 +40,8 @@ class Particles(NamedTuple):
     cell: np.ndarray | None  # (3, 3) rows a, b, c
     label: list[str]  # (N,) names of types
     body: np.ndarray  # (N,) number of the body; of the particle itself without a body
-    owner: (
-        np.ndarray
-    )  # (N,) index of the central particle of the body; of the particle itself without one
+    #: (N,) index of the central particle of the body; of the particle itself without one
+    owner: np.ndarray
     position: np.ndarray  # (N, 3) lab frame, molecules whole
     orientation: np.ndarray  # (N, 4) wxyz, normalised
     velocity: np.ndarray | None  # (N, 3)
@@ -346,9 +345,8 @@ class GsdFile(FrameFile):
         image = np.zeros(position.shape)
         if np.isfinite(state.cell).all():
             image = np.floor(np.linalg.solve(state.cell.T, position.T).T)
-            position = (
-                position - (image + 0.5) @ state.cell
-            )  # in the box that is centred at the origin
+            # in the box that is centred at the origin
+            position = position - (image + 0.5) @ state.cell
         properties = {
             "position": position,
             "image": image,

@@ -202,10 +202,8 @@ def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[s
 
 def _fits(columns: list[str], rows: list[Row], known: set[str]) -> bool:
     """Whether all rows can have these columns, and three image numbers or nothing after them."""
-    kind, whole_columns = (
-        columns.index("type"),
-        [k for k, name in enumerate(columns) if name in ("id", "mol")],
-    )
+    kind = columns.index("type")
+    whole_columns = [k for k, name in enumerate(columns) if name in ("id", "mol")]
     for row in rows:
         words, images = row.words, [word.lstrip("+-") for word in row.words[len(columns) :]]
         if len(words) < len(columns) or len(images) not in (0, 3):

@@ -115,9 +115,8 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
     symbols, notes = atoms.get_chemical_symbols(), []
     if names is None and (stored := atoms.arrays.get(NAMES)) is not None:
         names = [str(name) for name in stored]
-        symbols = [
-            "" if symbol == "X" else symbol for symbol in symbols
-        ]  # united atoms have names only
+        # united atoms have names only
+        symbols = ["" if symbol == "X" else symbol for symbol in symbols]
     elif names is None and DL_POLY_NAMES in atoms.arrays:
         names = [
             symbol + str(number)

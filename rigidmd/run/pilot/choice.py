@@ -314,18 +314,15 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
     for _ in range(CORRECTIONS):
         if (candidate := search.best()) is None:
             break
-        best, pilot_trial = (
-            candidate,
-            search.trial(candidate.integrator, candidate.timestep, length),
-        )
+        best = candidate
+        pilot_trial = search.trial(candidate.integrator, candidate.timestep, length)
         name, step = best.integrator, best.timestep
         if pilot_trial.diverged:
             search.longest[name] = step / 2
             continue
         of_pilot = search.walk_square(name, step, length)
-        square = max(
-            pilot_trial.energy_rms**2, 2 * float(np.var(pilot_trial.energies))
-        )  # the error may not be 0 at the start
+        # the error may not be 0 at the start
+        square = max(pilot_trial.energy_rms**2, 2 * float(np.var(pilot_trial.energies)))
         value = sqrt(square + search.walk_square(name, step, duration) - of_pilot)
         if value <= (1 + SAFETY) / 2 * target:
             break

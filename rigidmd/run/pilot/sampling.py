@@ -170,11 +170,9 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
         update={"trajectory_steps": WARMING_STEPS}
     )
     now, _ = _acceptance(system, state, k, first)
-    stiffest, rate, best = (
-        stiffest_mode(system, now),
-        mean_square_rate(system, now, k),
-        (0.0, stage, 0.0),
-    )
+    stiffest = stiffest_mode(system, now)
+    rate = mean_square_rate(system, now, k)
+    best = (0.0, stage, 0.0)
     if stiffest is None or rate == 0:
         raise SimulationError(
             f"stages.{k}: nothing sets a step for integrator = 'auto'; name an integrator and a"

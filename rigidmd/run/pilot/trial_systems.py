@@ -162,9 +162,10 @@ def body_trial_system(
             )
             fits[name] = build_body(scene.model_copy(update={"run": changed}), applied)
         except SceneError as error:
+            # without advice
             reasons = (
                 re.split("[:;] use ", text.removeprefix("run: "))[0] for text in error.errors
-            )  # without advice
+            )
             refused[name] = "; ".join(reasons).replace(solver, "it")
     if not fits:
         build_body(scene, applied)  # raises the error
@@ -271,10 +272,8 @@ def choose_for_body(
     trial_system, _ = body_trial_system(scene, applied=applied)
     longest = {name: run.timestep_s for name in trial_system.methods if name in SCHEMES}
     choice = choose(trial_system, longest, run.energy_error, run.trajectory_error)
-    chosen, timestep = (
-        choice.timestep,
-        _fit_step(choice.timestep, run.duration_s, scene.output.interval_s),
-    )
+    chosen = choice.timestep
+    timestep = _fit_step(choice.timestep, run.duration_s, scene.output.interval_s)
     fitted = (
         "" if timestep == chosen else f", shortened to {timestep:g} s to fit duration and samples"
     )

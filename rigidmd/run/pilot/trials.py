@@ -109,9 +109,8 @@ class Trial:
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
     orthogonality_error: float = np.nan
-    conserved_errors: dict[str, float] = field(
-        default_factory=dict
-    )  # largest relative ones, of other quantities
+    #: Largest relative ones, of other quantities
+    conserved_errors: dict[str, float] = field(default_factory=dict)
     tolerance: float | None = None  # of a method that chooses its steps
     failure: str = ""  # why it failed or diverged
     energies: list[float] = field(default_factory=list, repr=False)  # errors, from 0 at the start
@@ -153,9 +152,8 @@ class IntegratorAccuracy:
     trials: list[Trial]
     reference_steps: int
     reference_error: float  # of the reference, from a run with half as many steps
-    left_out: dict[str, str] = field(
-        default_factory=dict
-    )  # usual methods that were not tried -> reason
+    #: Usual methods that were not tried -> reason
+    left_out: dict[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<Precision of {self.trial_system.name}: {len(self.trials)} trials>"
