@@ -141,11 +141,10 @@ def has_finite_energy(system: BodySystem) -> bool:
 def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
     """The state at the start; spin (3,) along the principal axes, relative to the frame."""
     start, time = scene.start, np.zeros(1)
-    frame = (
-        np.zeros(3)
-        if isinstance(body.frame, InertialFrame)
-        else values_at(body.frame.angular_velocity, time)[0]
-    )
+    if isinstance(body.frame, InertialFrame):
+        frame = np.zeros(3)
+    else:
+        frame = values_at(body.frame.angular_velocity, time)[0]
     position = velocity = np.zeros((0, 3))
     rotation, momentum = np.zeros((0, 3, 3)), np.zeros((0, 3))
     principal_rotation = attitude @ axes
@@ -281,11 +280,9 @@ def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) ->
             f"dry friction is discontinuous where a body stops, which {run.integrator} cannot"
             " resolve"
         )
-        return (
-            [f"run: {what}: use velocity_verlet"]
-            if resisted and resistance.rotation_dry.any()
-            else []
-        )
+        if resisted and resistance.rotation_dry.any():
+            return [f"run: {what}: use velocity_verlet"]
+        return []
     scheme = run.scheme
     if resisted and min(scheme.kicks) < 0:
         forward = ", ".join(name for name, other in SCHEMES.items() if min(other.kicks) >= 0)

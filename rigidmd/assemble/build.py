@@ -56,11 +56,10 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     warnings = scene_warnings(scene, species)
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
-    cell = (
-        ""
-        if start.cell is None
-        else f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
-    )
+    if start.cell is None:
+        cell = ""
+    else:
+        cell = f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
     if implausible := scene_errors(scene, species, counts, space):
         raise SceneError(scene.source, implausible)
     composition = Composition(species, counts, space, start.basis, cell, start.position)
@@ -92,21 +91,19 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     acting.terms.update(field_terms(parts))
     model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
-    thermal = (
-        0.0
-        if velocity is None
-        else float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
-    )
+    if velocity is None:
+        thermal = 0.0
+    else:
+        thermal = float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
     free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
     scene, precision_reason = with_precision(scene, free, thermal / BOLTZMANN, acting.force_error)
     without_tail = ""
     if scene.forces.dispersion == "cutoff" and not scene.forces.tail_correction:
         is_choice = written.forces.tail_correction is False
-        without_tail = (
-            "forces.tail_correction is false"
-            if is_choice
-            else without_tail_reason(written, composition)
-        )
+        if is_choice:
+            without_tail = "forces.tail_correction is false"
+        else:
+            without_tail = without_tail_reason(written, composition)
     system = System(
         scene=scene,
         species=species,
@@ -302,11 +299,10 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     if stage.has_barostat:
         barostat = barostat_of(system, k)
         in_steps = couplings.BAROSTATS[stage.barostat_kind].in_verlet_steps
-        scheme = (
-            scheme.with_piston(barostat)
-            if in_steps
-            else scheme.with_barostat(barostat, stage.moves_every)
-        )
+        if in_steps:
+            scheme = scheme.with_piston(barostat)
+        else:
+            scheme = scheme.with_barostat(barostat, stage.moves_every)
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
         scheme = scheme.with_momentum_removal(
             max(1, round(interval / (stage.timestep_fs * FEMTOSECOND)))

@@ -198,11 +198,10 @@ def _mass_warnings(m: Molecule) -> list[str]:
 
     messages = {}
     for name, element, mass in zip(m.site_names, m.elements, m.masses.tolist(), strict=True):
-        usual = (
-            float(atomic_masses[atomic_numbers[element]])
-            if atomic_numbers.get(element, 0) > 0
-            else 0.0
-        )
+        if atomic_numbers.get(element, 0) > 0:
+            usual = float(atomic_masses[atomic_numbers[element]])
+        else:
+            usual = 0.0
         if mass > 0 and usual and not LIGHTEST * usual <= mass <= HEAVIEST * usual + HYDROGENS:
             messages[element] = (
                 f"{m.name}: mass_u of {name} is {mass:g} u, and {element} has {usual:.4g} u"
@@ -221,11 +220,10 @@ def gravity_warnings(key: str, acceleration: tuple[float, float, float]) -> list
 
 def body_warnings(scene: BodyScene) -> list[str]:
     """Warnings of numbers of a single body that are probably in another unit."""
-    warnings = (
-        []
-        if scene.gravity is None
-        else gravity_warnings("gravity.acceleration_m_s2", scene.gravity.acceleration_m_s2)
-    )
+    if scene.gravity is None:
+        warnings = []
+    else:
+        warnings = gravity_warnings("gravity.acceleration_m_s2", scene.gravity.acceleration_m_s2)
     for key in ("euler_angles_deg", "yaw_pitch_roll_deg"):
         angles: Any = getattr(scene.start, key)
         if angles is not None and any(map(in_radians, angles)) and max(map(abs, angles)) <= 2 * pi:

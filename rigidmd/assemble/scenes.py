@@ -150,11 +150,10 @@ def atoms_errors(atoms: Any) -> list[str]:
         faults.append(f"they are periodic along {axes} only: {advice}")
     elif atoms.pbc.all():
         cell = atoms.cell.array
-        why = (
-            cell_error(cell)
-            if np.isfinite(cell).all()
-            else "it has an edge that is not a finite number"
-        )
+        if np.isfinite(cell).all():
+            why = cell_error(cell)
+        else:
+            why = "it has an edge that is not a finite number"
         if why:
             faults.append(
                 f"they are periodic, but their cell is invalid: {why}. Set atoms.cell, or atoms.pbc"

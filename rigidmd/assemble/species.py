@@ -194,11 +194,10 @@ def model_from_geometry(
     nearest = round(model.charge)
     off = abs(model.charge - nearest)
     if off > EXACTLY:
-        nearly = (
-            f"nearly but not exactly {f'{nearest:+d}' if nearest else 0}"
-            if off < NEARLY
-            else "not a whole number"
-        )
+        if off < NEARLY:
+            nearly = f"nearly but not exactly {f'{nearest:+d}' if nearest else 0}"
+        else:
+            nearly = "not a whole number"
         notes.append(f"the charges sum to {model.charge:+.6g} e, {nearly}")
     return file, model, notes
 

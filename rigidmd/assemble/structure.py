@@ -265,11 +265,11 @@ def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
     ]
     expected = f"the scene's molecules ({', '.join(f'{mass:g}' for mass in masses)} u)"
     advice = "set structure.atom_types, or these masses by masses_u"
-    return (
-        [f"its atom types {', '.join(unknown)} have masses of no site of {expected}: {advice}"]
-        if unknown
-        else []
-    )
+    if unknown:
+        return [
+            f"its atom types {', '.join(unknown)} have masses of no site of {expected}: {advice}"
+        ]
+    return []
 
 
 def _notes(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> Iterator[str]:

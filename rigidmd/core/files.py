@@ -29,11 +29,9 @@ def unreadable_reason(path: Path, largest: float = inf) -> str:
     try:
         status = path.stat()
     except OSError as error:
-        return (
-            "there is no such file"
-            if error.errno == errno.ENOENT
-            else f"cannot be read: {error.strerror}"
-        )
+        if error.errno == errno.ENOENT:
+            return "there is no such file"
+        return f"cannot be read: {error.strerror}"
     except ValueError:
         return "there is no such file: its name contains a zero byte"
     if stat.S_ISDIR(status.st_mode):

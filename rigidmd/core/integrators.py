@@ -244,16 +244,15 @@ def auto_errors(
     decide."""
     set_keys = [key for key, value in requested.items() if value is not None]
     if integrator != AUTO:
-        return (
-            [f"{', '.join(set_keys)} would do nothing without integrator = 'auto'"]
-            if set_keys
-            else []
-        )
-    errors = (
-        [f"{', '.join(unused)} would do nothing with integrator = 'auto', which chooses it"]
-        if unused
-        else []
-    )
+        if set_keys:
+            return [f"{', '.join(set_keys)} would do nothing without integrator = 'auto'"]
+        return []
+    if unused:
+        errors = [
+            f"{', '.join(unused)} would do nothing with integrator = 'auto', which chooses it"
+        ]
+    else:
+        errors = []
     if len(set_keys) != 1:
         errors.append(f"integrator = 'auto' needs one of {', '.join(requested)}")
     return errors

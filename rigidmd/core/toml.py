@@ -141,11 +141,10 @@ def describe_toml_error(error: TOMLDecodeError, text: str) -> str:
         ),
         "",
     )
-    keys = (
-        [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1:]
-        if bare
-        else []
-    )
+    keys = []
+    if bare:
+        before = [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number]
+        keys = before[-1:]
     if not keys or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # a table header after an unclosed list
         return f"is not TOML: {error}"
     where = f"line {number}: {'.'.join(map(str, keys[0]))}: "

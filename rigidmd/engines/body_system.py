@@ -161,11 +161,10 @@ class BodySystem:
         velocity = (
             1.3 * start.velocity + rate * reach * along if self.translates else start.velocity
         )
-        spin = (
-            1.3 * start.angular_velocity_body + rate * along[::-1]
-            if self.rotates
-            else start.angular_velocity_body
-        )
+        if self.rotates:
+            spin = 1.3 * start.angular_velocity_body + rate * along[::-1]
+        else:
+            spin = start.angular_velocity_body
         other = start._replace(velocity=velocity, angular_velocity_body=spin)
         names = []
         for name, function in self.applied.items():

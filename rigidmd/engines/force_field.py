@@ -162,11 +162,8 @@ def unknown_terms(system: System, title: str) -> Iterator[str]:
         if name not in system.user_terms:
             what = "a field" if hasattr(term, "changes_momentum") else f"the term {kind.__name__}"
             what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
-            what = (
-                "forces.ewald_slab or ewald_surface_permittivity"
-                if isinstance(term, SurfaceDipole)
-                else what
-            )
+            if isinstance(term, SurfaceDipole):
+                what = "forces.ewald_slab or ewald_surface_permittivity"
         if name in system.user_terms or kind not in DESCRIBED:
             yield f"{name.replace('_', ' ')}: {what} has no translation for {title}"
     if system.thermostat is not None:
@@ -179,11 +176,9 @@ Potential = TypeVar("Potential")
 def _potential(system: System, name: str, kind: type[Potential]) -> Potential | None:
     """The pair potential of a term if it is of a class, else None."""
     term = system.terms.get(name)
-    return (
-        term.potential
-        if isinstance(term, PairForces) and isinstance(term.potential, kind)
-        else None
-    )
+    if isinstance(term, PairForces) and isinstance(term.potential, kind):
+        return term.potential
+    return None
 
 
 def _lennard_jones_kinds(system: System) -> list[list[int]]:

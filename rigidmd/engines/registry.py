@@ -31,7 +31,7 @@ class Program(NamedTuple):
     installed: str = ""  # a function that describes what is installed here
     options: Mapping[str, Option] = {}
     describe: Callable[..., str] = lambda **options: ""  # name and options for reports
-    #: a message on options that contradict each other
+    #: A message on options that contradict each other
     option_errors: Callable[..., str] = lambda **options: ""
     precise: Mapping[
         str, Any

@@ -392,11 +392,10 @@ def describe_equilibrated(
         return f"{all_of_stage}, in which the set point changes"
     if len(time) < LEAST_SAMPLES:
         return f"{all_of_stage}, too short to detect equilibration"
-    part = (
-        f"the last {time[-1] - time[start]:.4g} of {time[-1] - begin:.4g} ps"
-        if start
-        else all_of_stage
-    )
+    if start:
+        part = f"the last {time[-1] - time[start]:.4g} of {time[-1] - begin:.4g} ps"
+    else:
+        part = all_of_stage
     drifts = any(
         least_error_from(values) == len(time) // 2 for values in _slow_series(of_stage, stage)
     )

@@ -142,11 +142,9 @@ class System:
         """Time between removals of the total momentum, ps; None for never, also where every
         thermostat changes it."""
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
-        return (
-            (self.scene.run.remove_momentum_interval_ps or None)
-            if any(map(self.keeps_momentum_in, moving))
-            else None
-        )
+        if any(map(self.keeps_momentum_in, moving)):
+            return self.scene.run.remove_momentum_interval_ps or None
+        return None
 
     def keeps_momentum_in(self, k: int) -> bool:
         """Whether the thermostat of stage k leaves the total momentum as it is."""

@@ -103,11 +103,10 @@ def latest(folder: Path) -> tuple[Checkpoint, list[str]]:
                 return read_checkpoint(path), errors
             except CheckpointError as error:
                 errors.append(str(error))
-    file_names = (
-        sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-        if folder.is_dir()
-        else []
-    )
+    if folder.is_dir():
+        file_names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    else:
+        file_names = []
     if errors:
         raise CheckpointError("; ".join(errors) + f". The run cannot be resumed from {folder}")
     listed = f"it holds {', '.join(file_names)}" if file_names else "it is empty"

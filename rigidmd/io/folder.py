@@ -51,11 +51,10 @@ def check_folder(
         if not (folder / marker).is_file():
             raise OutputError(f"{folder} is not empty and holds no earlier {what}; {elsewhere()}")
         if not force:
-            resume = (
-                f"{resume_command(folder)} continues it, "
-                if (folder / CHECKPOINT).is_file()
-                else ""
-            )
+            if (folder / CHECKPOINT).is_file():
+                resume = f"{resume_command(folder)} continues it, "
+            else:
+                resume = ""
             advice = f"{resume}{option('force')} replaces it, {elsewhere()}"
             raise OutputError(f"{folder} holds an earlier {what}; {advice}")
         replaced = {(folder / name).resolve() for name in written_by_runs(folder, marker)}

@@ -195,11 +195,9 @@ def columns(tensor: bool = True, user_terms: Sequence[str] = ()) -> dict[str, st
     `Samples`"""
     described = samples.COLUMNS | samples.more_columns(user_terms)
     written = {name: column.header for name, column in described.items() if column.header}
-    return (
-        written
-        if tensor
-        else {name: header for name, header in written.items() if name not in TENSOR}
-    )
+    if tensor:
+        return written
+    return {name: header for name, header in written.items() if name not in TENSOR}
 
 
 class Log(AppendedFile):

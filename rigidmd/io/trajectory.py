@@ -342,11 +342,10 @@ class _WithoutOffsetsFile:
 def reader_of(extension: str) -> Any:
     """MDAnalysis' class of readers of a format."""
     form = BY_EXTENSION[extension]
-    reader = (
-        SiteReader
-        if form.reader
-        else get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
-    )
+    if form.reader:
+        reader = SiteReader
+    else:
+        reader = get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
     return _subclass(_WithoutOffsetsFile, reader) if issubclass(reader, XDRBaseReader) else reader
 
 

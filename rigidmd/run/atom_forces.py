@@ -280,11 +280,10 @@ def _massless_forces_on_atoms(system: System, state: State, force: np.ndarray) -
         bare, heavy = np.flatnonzero(m.masses == 0), np.flatnonzero(m.masses > 0)
         if len(bare) == 0:
             continue
-        Q = (
-            state.rotation[kind.index]
-            if len(state.rotation)
-            else np.tile(np.eye(3), (len(kind.index), 1, 1))
-        )
+        if len(state.rotation):
+            Q = state.rotation[kind.index]
+        else:
+            Q = np.tile(np.eye(3), (len(kind.index), 1, 1))
         # (bare, heavy, 3, 3)
         matrices = np.array([_transfer_matrices(m, int(site)) for site in bare])
         body = np.einsum("nij,nbi->nbj", Q, force[kind.sites[:, bare]])

@@ -204,11 +204,10 @@ def check_sample(system: System, limits: Watch, since: Sample, now: Sample) -> F
         kinetic = max(
             kinetic, per_kelvin * max(stage.temperatures) * system.freedom_in(now.stage).total
         )
-        fraction = (
-            min(1.0, stage.thermostat_time / (now.time - since.time))
-            if now.time > since.time
-            else 1.0
-        )
+        if now.time > since.time:
+            fraction = min(1.0, stage.thermostat_time / (now.time - since.time))
+        else:
+            fraction = 1.0
     drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
     if np.isnan(drift):  # another engine, which does not count the heat of its thermostat
         return None
@@ -338,11 +337,10 @@ def _user_code(system: System) -> str:
     rows = {row.name for row in system.scene.integrators} & {
         stage.integrator for stage in system.scene.stages
     }
-    named = (
-        []
-        if system.thermostat is None
-        else [f"the thermostat {name_of(system.thermostat)}, from Python"]
-    )
+    if system.thermostat is None:
+        named = []
+    else:
+        named = [f"the thermostat {name_of(system.thermostat)}, from Python"]
     named += [f"the integrator {name}, from the scene" for name in sorted(rows)]
     return f"{' or '.join(named)} (the run without it shows whether), or " if named else ""
 

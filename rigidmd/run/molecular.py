@@ -547,11 +547,10 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     @property
     def headline(self) -> str:
         system, asked = self.system, self.scene.threads or 0
-        hint = (
-            f" (the scene requests {asked}; this machine has no more)"
-            if asked > self.threads
-            else ""
-        )
+        if asked > self.threads:
+            hint = f" (the scene requests {asked}; this machine has no more)"
+        else:
+            hint = ""
         return (
             f"{self.scene.name}: {len(system.model.species)} molecules, {system.site_count} sites, "
             f"{system.last_freedom.total} degrees of freedom; {self.threads} threads{hint}"

@@ -229,16 +229,14 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         > _drift_limit(time[-1] - time[0]) * thermal + STANDARD_ERRORS * line.error
     ):
         rate, error = (value * 1000 / thermal for value in (line.value, line.error))
-        smooth = (
-            ""
-            if system.scene.forces.truncation == "smooth_switch"
-            else " or truncation = 'smooth_switch'"
-        )
-        hides = (
-            "; the thermostat hides this and leaves temperatures wrong"
-            if stage.has_thermostat
-            else ""
-        )
+        if system.scene.forces.truncation == "smooth_switch":
+            smooth = ""
+        else:
+            smooth = " or truncation = 'smooth_switch'"
+        if stage.has_thermostat:
+            hides = "; the thermostat hides this and leaves temperatures wrong"
+        else:
+            hides = ""
         notes.append(
             f"stages.{k}: in its second half the conserved energy drifts by {rate:+.2g} ±"
             f" {error:.1g} kT/ns per degree of freedom, as from a step that is too long or forces"
@@ -346,11 +344,10 @@ def stage_summary(
     n, steps = len(system.model.species), of_stage.row(-1).step - first.step
     speed = steps / computing if computing > 0 else None
     time, drift = of_stage["time"], of_stage["drift"]
-    line = (
-        slope(np.append(first.time, time), np.append(0.0, drift))
-        if len(before)
-        else slope(time, drift)
-    )
+    if len(before):
+        line = slope(np.append(first.time, time), np.append(0.0, drift))
+    else:
+        line = slope(time, drift)
     temperatures = _means(steady, TEMPERATURES)
     potential = mean_and_error(steady["potential"] / n)
     pressure = mean_and_error(steady["pressure_bar"])

@@ -244,11 +244,10 @@ class Scene(Section, Displayed):
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
         from rigidmd.scene import BodyScene, MolecularScene
 
-        kind = (
-            cls
-            if issubclass(cls, (BodyScene, MolecularScene))
-            else _kind_of_scene(data, BodyScene, MolecularScene)
-        )
+        if issubclass(cls, (BodyScene, MolecularScene)):
+            kind = cls
+        else:
+            kind = _kind_of_scene(data, BodyScene, MolecularScene)
         if kind is None:
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults, overridden = [], []
@@ -301,11 +300,10 @@ def read_tables(path: Path) -> tuple[dict[str, Any], str]:
     fault = unreadable_reason(path)
     if fault.startswith("there is no such file"):
         shipped = similar_names(path.stem, [example.name for example in examples()])
-        new = (
-            f"; `rigidmd new {shipped[0]}` copies a shipped scene"
-            if shipped
-            else "; `rigidmd examples` lists scenes"
-        )
+        if shipped:
+            new = f"; `rigidmd new {shipped[0]}` copies a shipped scene"
+        else:
+            new = "; `rigidmd examples` lists scenes"
         raise SceneError(str(path), [fault + (_similar_files(path, ".toml") or new)])
     if path.is_dir():
         raise SceneError(str(path), [fault + _scenes_in(path)])
@@ -459,11 +457,10 @@ def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
     if not re.search("not both|omit one|contradict", fault):
         return ""
     names = re.findall(r"[a-z]\w*(?:\.\w+)*", fault)
-    tables = (
-        dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)])
-        if overridden
-        else ()
-    )
+    if overridden:
+        tables = dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)])
+    else:
+        tables = ()
     keys = [table + name for table in tables for name in names]
     removable = [
         key for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)
@@ -505,11 +502,10 @@ def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
             if number is None and names.count(part) == 1:
                 number = names.index(part)
             if number is None or number >= len(target):
-                called = (
-                    f" ({', '.join(map(shorten_repr, names))})"
-                    if number is None and any(names)
-                    else ""
-                )
+                if number is None and any(names):
+                    called = f" ({', '.join(map(shorten_repr, names))})"
+                else:
+                    called = ""
                 return key, [
                     f"{where}: {here} has entries 0 to {len(target) - 1}{called}, not {part!r}"
                 ]

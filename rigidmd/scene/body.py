@@ -320,11 +320,10 @@ class BodyStart(Section):
                 )
                 yield f"the matrix is not a rotation with rounded digits: {what}"
             elif not self.project and (error > LARGEST_ORTHOGONALITY_ERROR or sense < 0):
-                what = (
-                    "a reflection"
-                    if error <= LARGEST_ORTHOGONALITY_ERROR
-                    else f"|Q^T Q - 1| is {error:.2g}"
-                )
+                if error <= LARGEST_ORTHOGONALITY_ERROR:
+                    what = "a reflection"
+                else:
+                    what = f"|Q^T Q - 1| is {error:.2g}"
                 limit = (
                     f"must be below {LARGEST_ORTHOGONALITY_ERROR:g}; project = true uses the"
                     " nearest rotation"

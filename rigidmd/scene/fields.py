@@ -179,11 +179,9 @@ class Fields(Section):
     def bounds(self, axis: int) -> tuple[float, float] | None:
         """Range of positions between the walls perpendicular to an axis, Å; None without walls."""
         ranges = [walls.positions_A for walls in self.walls if walls.direction == axis]
-        return (
-            (max(lower for lower, _ in ranges), min(upper for _, upper in ranges))
-            if ranges
-            else None
-        )
+        if ranges:
+            return max(lower for lower, _ in ranges), min(upper for _, upper in ranges)
+        return None
 
 
 class FieldKind(NamedTuple):
@@ -225,21 +223,18 @@ def _restraint_sentence(entry: Restraint, term: Any) -> str:
         spring = f"restrained to {entry.distance_A:g} Å, {entry.stiffness[0]:g} kJ/mol/Å²"
         return f"distance of {one} and {other} {spring}"
     size = f"{entry.stiffness[0]:g}" if len(set(entry.stiffness)) == 1 else _vector(entry.stiffness)
-    where = (
-        "to their starting positions"
-        if entry.position_A is None
-        else f"to {_vector(entry.position_A)} Å"
-    )
+    if entry.position_A is None:
+        where = "to their starting positions"
+    else:
+        where = f"to {_vector(entry.position_A)} Å"
     return f"{len(term.molecule)} molecules restrained {where}, {size} kJ/mol/Å²"
 
 
 def _numbers(group: list[int]) -> str:
     """A group of molecules, for messages."""
-    return (
-        f"molecule {group[0]}"
-        if len(group) == 1
-        else f"the centre of {len(group)} molecules ({group[0]}, ...)"
-    )
+    if len(group) == 1:
+        return f"molecule {group[0]}"
+    return f"the centre of {len(group)} molecules ({group[0]}, ...)"
 
 
 def _vector(values: Any) -> str:

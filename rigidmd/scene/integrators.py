@@ -161,11 +161,10 @@ def with_registered_rows(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str
         if isinstance(table, dict) and isinstance(name := table.get("name"), str)
     ]
     rows = [row for name, row in _REGISTERED.items() if name in names and name not in taken]
-    changed = (
-        {"integrators": [*tables, *(row.model_dump(exclude_none=True) for row in rows)]}
-        if rows
-        else {}
-    )
+    if rows:
+        changed = {"integrators": [*tables, *(row.model_dump(exclude_none=True) for row in rows)]}
+    else:
+        changed = {}
     return data | changed, dict.fromkeys(taken, SCHEMES["velocity_verlet"])
 
 

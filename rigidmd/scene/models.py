@@ -336,11 +336,10 @@ def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
         heavy = [i for i in sites if found.masses[i] > 0]
         if not heavy:
             known = ", ".join(dict.fromkeys([*found.elements, *found.site_names]))
-            why = (
-                "is massless, and stays so"
-                if sites
-                else f"is not a site or element of it; there are {known}"
-            )
+            if sites:
+                why = "is massless, and stays so"
+            else:
+                why = f"is not a site or element of it; there are {known}"
             faults.append(f"masses_u.{key} {why}")
         changed |= {i: mass for i in heavy if i not in changed or found.site_names[i] == key}
     if faults:

@@ -227,11 +227,10 @@ class MolecularScene(Scene):
         before = sum(stage.duration for stage in self.stages[:-1])
         last = self.stages[-1]
         if last.is_minimisation or last.ramps:
-            what = (
-                "is a minimisation"
-                if last.is_minimisation
-                else "changes temperature or pressure over its duration"
-            )
+            if last.is_minimisation:
+                what = "is a minimisation"
+            else:
+                what = "changes temperature or pressure over its duration"
             raise SceneError(
                 self.source, [f"the last stage {what}: {option('until')} cannot set its end"]
             )
@@ -282,11 +281,9 @@ class MolecularScene(Scene):
         """Path of the structure file, or "atoms", for messages; empty without a structure."""
         if self.structure is None:
             return ""
-        return (
-            "atoms"
-            if "structure.file" in self.embedded_files
-            else str(self.path(self.structure.file))
-        )
+        if "structure.file" in self.embedded_files:
+            return "atoms"
+        return str(self.path(self.structure.file))
 
     @property
     def topology(self) -> str | None:
@@ -346,11 +343,10 @@ class MolecularScene(Scene):
             and first.temperature_K is None
             and not from_file
         ):
-            which = (
-                "the first stage"
-                if first is self.stages[0]
-                else "the first stage that is not a minimisation"
-            )
+            if first is self.stages[0]:
+                which = "the first stage"
+            else:
+                which = "the first stage that is not a minimisation"
             yield (
                 f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are"
                 " read"
@@ -405,11 +401,10 @@ class MolecularScene(Scene):
             before = self.stages[k - 1] if k else None
             if stage.volume and (before is None or not before.has_barostat or before.ramps):
                 changes = ", and its set point changes" if before and before.ramps else ""
-                preceding = (
-                    f"stages.{k - 1} is {before.ensemble}{changes}"
-                    if before
-                    else "it is the first stage"
-                )
+                if before:
+                    preceding = f"stages.{k - 1} is {before.ensemble}{changes}"
+                else:
+                    preceding = "it is the first stage"
                 why = (
                     "needs an npt or nph stage just before it, at constant temperature and pressure"
                 )

@@ -363,11 +363,9 @@ def _choices(annotation: Any) -> list[str]:
     if isinstance(annotation, str):
         return [annotation]
     parts = (*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ()))
-    return (
-        [*annotation.names]
-        if isinstance(annotation, NameIn)
-        else [n for part in parts for n in _choices(part)]
-    )
+    if isinstance(annotation, NameIn):
+        return [*annotation.names]
+    return [n for part in parts for n in _choices(part)]
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

@@ -289,11 +289,9 @@ class _SiteTypes:
             bool(self._named[name][k][i]) for pair in self._potential.pairs for name in pair
         )
         acts = parameters is not None or any(sides)
-        return (
-            (None if parameters is None else tuple(sorted(parameters.items())), sides)
-            if acts
-            else None
-        )
+        if acts:
+            return None if parameters is None else tuple(sorted(parameters.items())), sides
+        return None
 
     def _parameters(self, k: int, m: Molecule, i: int) -> Parameters | None:
         potential = self._potential
@@ -301,11 +299,9 @@ class _SiteTypes:
             return None
         if potential.of_sites is None and not self._formula.shared:
             parameters = m.parameters[i]
-            return (
-                {name: parameters[name] for name in self._needed}
-                if all(name in parameters for name in self._needed)
-                else None
-            )
+            if all(name in parameters for name in self._needed):
+                return {name: parameters[name] for name in self._needed}
+            return None
         if not potential.of_sites:
             return None if potential.pairs else {"scale": 1.0} if potential.of_sites is None else {}
         named = [name for name in potential.of_sites if self._named[name][k][i]]
@@ -441,11 +437,10 @@ def pair_law(
             )
             raise ValueError(f"{either}; {flat[0]} is a number, and {others} is not")
         constants = _numbers("parameters", parameters) if flat else {}
-        of_sites = (
-            {}
-            if flat
-            else {key: _numbers(f"parameters of {key}", x) for key, x in parameters.items()}
-        )
+        if flat:
+            of_sites = {}
+        else:
+            of_sites = {key: _numbers(f"parameters of {key}", x) for key, x in parameters.items()}
     for key, value in (pairs or {}).items():
         if not (
             isinstance(key, tuple) and len(key) == 2 and all(isinstance(one, str) for one in key)
@@ -461,11 +456,10 @@ def pair_law(
     # a NamedTuple that a function expects
     kinds = [type(value) for value in parameter_sets if hasattr(value, "_asdict")]
     kind = kinds[-1] if kinds else None
-    formula = (
-        formula_of_function(energy, kind)
-        if energy is not None and not isinstance(energy, str)
-        else None
-    )
+    if energy is not None and not isinstance(energy, str):
+        formula = formula_of_function(energy, kind)
+    else:
+        formula = None
     return PairLaw(
         energy,
         columns,

@@ -67,11 +67,10 @@ def read_columns(path: Path) -> Columns:
                 f"line {number}: {' '.join(words):.60} has {largest}: begin it at larger distances"
             )
         elif not row["r_A"] > (rows[-1]["r_A"] if rows else 0.0):
-            least = (
-                f"{rows[-1]['r_A']:g} Å of the row before; sort the rows by distance"
-                if rows
-                else "0"
-            )
+            if rows:
+                least = f"{rows[-1]['r_A']:g} Å of the row before; sort the rows by distance"
+            else:
+                least = "0"
             faults.append(f"line {number}: r_A = {row['r_A']:g} must be above {least}")
         else:
             rows.append(row)

@@ -413,11 +413,9 @@ class CpuEngine(Engine):
 
     @property
     def moves(self) -> tuple[int, int]:
-        return (
-            (0, 0)
-            if (box := self._couplings.box) is None
-            else (int(box.counts[0]), int(box.counts[1]))
-        )
+        if (box := self._couplings.box) is None:
+            return 0, 0
+        return int(box.counts[0]), int(box.counts[1])
 
     @property
     def trajectories(self) -> np.ndarray | None:

@@ -269,11 +269,10 @@ class Process:
         messages = [line for line in output if "ERROR" in line] or [
             line for line in output if line
         ][-3:]
-        kind = (
-            SimulationError
-            if any(line.startswith("run ") and line != "run 0" for line in lines)
-            else EngineError
-        )
+        if any(line.startswith("run ") and line != "run 0" for line in lines):
+            kind = SimulationError
+        else:
+            kind = EngineError
         raise kind(f"LAMMPS stopped: {'; '.join(messages) or f'exit code {self._process.wait()}'}")
 
     def close(self) -> None:

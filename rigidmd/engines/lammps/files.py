@@ -257,11 +257,10 @@ def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
     coefficients = {
         (i, j): f"{_num(view.epsilon[i, j] / KCAL)} {_num(view.sigma[i, j])}" for i, j in pairs
     }
-    shifts = (
-        f"pair_modify pair {name} shift yes"
-        if view.truncation == "shift" and law.cutoff < inf
-        else ""
-    )
+    if view.truncation == "shift" and law.cutoff < inf:
+        shifts = f"pair_modify pair {name} shift yes"
+    else:
+        shifts = ""
     return PairStyle(name, arguments, coefficients, modify=shifts)
 
 

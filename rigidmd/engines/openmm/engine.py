@@ -188,11 +188,10 @@ class OpenmmEngine(ExternalEngine):
         velocity = had.getVelocities(asNumpy=True)._value[point] * ANGSTROM
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
-        cell = (
-            had.getPeriodicBoxVectors(asNumpy=True)._value * ANGSTROM
-            if self._stage.has_barostat
-            else state.cell
-        )
+        if self._stage.has_barostat:
+            cell = had.getPeriodicBoxVectors(asNumpy=True)._value * ANGSTROM
+        else:
+            cell = state.cell
         received = self._particles.bodies.state(state, position, velocity, cell)
         # OpenMM wraps molecules into the box whenever it changes the box
         if self._stage.has_barostat:
@@ -220,11 +219,10 @@ class OpenmmEngine(ExternalEngine):
         def energy(group: int) -> float:
             return _energy_of(self._evaluating_context, {group})
 
-        energies = (
-            {"lennard_jones": energy(Group.LENNARD_JONES)}
-            if Group.LENNARD_JONES in self._groups
-            else {}
-        )
+        if Group.LENNARD_JONES in self._groups:
+            energies = {"lennard_jones": energy(Group.LENNARD_JONES)}
+        else:
+            energies = {}
         view, law = self._view, self._view.coulomb
         if isinstance(law, ScreenedCoulomb):
             alpha, charge = law.alpha, view.charge * COULOMB_CHARGE

@@ -49,11 +49,9 @@ def connections(system: Any, massless: bool = False) -> np.ndarray:
 
 def charges(system: Any) -> np.ndarray:
     """Charges (s,) of all sites, e; 0 for a single body."""
-    return (
-        system.of_sites(lambda m: m.charges)
-        if hasattr(system, "species")
-        else np.zeros(len(system.points))
-    )
+    if hasattr(system, "species"):
+        return system.of_sites(lambda m: m.charges)
+    return np.zeros(len(system.points))
 
 
 def shortest_links(points: np.ndarray) -> np.ndarray:

@@ -331,11 +331,10 @@ class GsdFile(FrameFile):
 
         system, sites = self._system, self._constituent
         owner, n = system.sites.molecule[sites], len(state.position)
-        orientation = (
-            to_quaternion(state.rotation)
-            if len(state.rotation)
-            else np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-        )
+        if len(state.rotation):
+            orientation = to_quaternion(state.rotation)
+        else:
+            orientation = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
         position = np.vstack(
             [
                 system.centres(state, self._wrapped),

@@ -93,11 +93,13 @@ def read_data(
         raise structure_error(
             path, f"line {counts[0].line} promises {count} atoms, the section Atoms has {len(rows)}"
         )
-    return (
-        [partial(_data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types)]
-        if rows
-        else []
-    )
+    if rows:
+        return [
+            partial(
+                _data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types
+            )
+        ]
+    return []
 
 
 def _data_atoms(

@@ -36,11 +36,10 @@ def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The models of a .pdb, each with the last CRYST1 before it."""
     models, body, cell, notes = [], [], None, []
     ends = next((line for line in reversed(lines) if line.strip()), "")
-    cut = (
-        ["it ends with an atom, without END: is it truncated?"]
-        if ends.startswith(("ATOM", "HETATM"))
-        else []
-    )
+    if ends.startswith(("ATOM", "HETATM")):
+        cut = ["it ends with an atom, without END: is it truncated?"]
+    else:
+        cut = []
     for number, line in enumerate([*lines, "END"], 1):
         if line.startswith("CRYST1"):
             cell, notes = _cryst1(number, line)

@@ -273,16 +273,11 @@ class TrajReader:
             if self._file.get_tag() != TAG:
                 raise ValueError("not a trajectory of ASE")
             self.count = len(self._file)
-            self._atoms = (
-                self._array(self._file, ATOMS, (-1,), np.int64)
-                if self.count
-                else np.zeros(0, np.int64)
-            )
-            self._mass = (
-                self._array(self._file, "masses", (len(self._atoms),))
-                if self.count
-                else np.zeros(0)
-            )
+            self._atoms = np.zeros(0, np.int64)
+            self._mass = np.zeros(0)
+            if self.count:
+                self._atoms = self._array(self._file, ATOMS, (-1,), np.int64)
+                self._mass = self._array(self._file, "masses", (len(self._atoms),))
             self.sites = len(self._atoms)
             if self.count and MASSLESS in self._file:
                 self.sites += len(self._array(self._file, MASSLESS, (-1, 3)))

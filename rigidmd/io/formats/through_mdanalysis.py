@@ -131,11 +131,10 @@ def read_in_process(
             check=False,
         )
         if ended.returncode < 0 or not target.is_file():
-            reason = (
-                "its reader crashed"
-                if ended.returncode < 0
-                else ended.stderr.decode(errors="replace")[-300:]
-            )
+            if ended.returncode < 0:
+                reason = "its reader crashed"
+            else:
+                reason = ended.stderr.decode(errors="replace")[-300:]
             raise structure_error(path, f"cannot be read as a trajectory: {reason}. Is it damaged?")
         with np.load(target, allow_pickle=False) as data:
             arrays = dict(data)

@@ -36,11 +36,10 @@ def read_xyz(
         clean += [lines[at], re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", lines[at + 1])]
         properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
         column, place, width = _columns(properties[1]) if properties else (0, 1, 4)
-        what = (
-            f"{width} columns, {properties[1]}"
-            if properties
-            else "an atom of an .xyz: name, x, y, z"
-        )
+        if properties:
+            what = f"{width} columns, {properties[1]}"
+        else:
+            what = "an atom of an .xyz: name, x, y, z"
         lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
         if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (
             3,

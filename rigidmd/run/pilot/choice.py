@@ -228,11 +228,10 @@ class _Search:
             else:
                 bad = trial.timestep
             if good is None:
-                step = (
-                    step / 2
-                    if trial.diverged
-                    else max(round_down(MARGIN * self.step_for(trial)), step / 4)
-                )
+                if trial.diverged:
+                    step = step / 2
+                else:
+                    step = max(round_down(MARGIN * self.step_for(trial)), step / 4)
                 continue
             step = min(MARGIN * self.step_for(good), longest)
             step = round_down(step if step < bad else sqrt(good.timestep * bad))
@@ -263,14 +262,13 @@ def choose(
     first = search.best()
     if first is None:
         least = min(search.measured.values(), key=lambda trial: getattr(trial, error), default=None)
-        reached = (
-            ""
-            if least is None
-            else (
+        if least is None:
+            reached = ""
+        else:
+            reached = (
                 f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g}"
                 f" {system.time_unit}"
             )
-        )
         raise SimulationError(
             f"no integrator keeps its error below {target:g} with any step tried{reached}"
         )

@@ -198,11 +198,8 @@ def body_trial_system(
         scheme = (
             scene.schemes[name] if name in scene.schemes else fit.method._replace(duration=duration)
         )
-        scheme = (
-            scheme
-            if isinstance(scheme, Solver) or scheme.exact_rotor
-            else scheme.with_rotor(run.rotor)
-        )
+        if not (isinstance(scheme, Solver) or scheme.exact_rotor):
+            scheme = scheme.with_rotor(run.rotor)
         methods[name] = Method(lambda _, fit=fit: fit.engine(), scheme)
     at_a_pole = system.rotates and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
     reference = max(
