@@ -62,10 +62,10 @@ class MolecularRecord(RunRecord):
 
     stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
     removal: OverlapRemoval | None = None
-    #: Of integrator and step, with the reasons
+    #: Integrators and steps that were chosen, with the reasons
     choices: dict[Count, str] = field(default_factory=dict)
     stable: dict[Count, PositiveFloat] = field(default_factory=dict)  # the longest stable step, ps
-    #: Of the box, tried and accepted
+    #: Moves of the box, tried and accepted
     moves: dict[Count, tuple[Count, Count]] = field(default_factory=dict)
     minima: dict[Count, Minimum] = field(default_factory=dict)
 

@@ -113,8 +113,8 @@ def with_user_code(system: System) -> System:
     with all errors."""
     scene, (added, thermostat) = system.scene, system.scene.user_code
     forces = [*custom_forces(scene), *added]
-    own_names = [*(entry.name for entry in scene.forces.custom), *map(name_of, added)]
-    names = distinct(own_names, [*system.terms, *system.constants])
+    force_names = [*(entry.name for entry in scene.forces.custom), *map(name_of, added)]
+    names = distinct(force_names, [*system.terms, *system.constants])
     bound = replace(
         system, python_forces={}, thermostat=thermostat, user_terms={}, notes=[*system.notes]
     )
