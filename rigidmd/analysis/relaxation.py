@@ -174,20 +174,14 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
                 break
             continue
         gain, before = before - after, after
-        parameters, density, slopes, damping = (
-            tried,
-            density_there,
-            slopes_there,
-            max(0.2 * damping, 1e-7),
-        )
+        parameters, density, slopes = tried, density_there, slopes_there
+        damping = max(0.2 * damping, 1e-7)
         if gain < CLOSE:
             break
     weighted = slopes * bands.freedom[:, None]
-    parts, times, plateau = (
-        np.exp(parameters[:count]),
-        np.exp(parameters[count:-1]),
-        float(np.exp(parameters[-1])),
-    )
+    parts = np.exp(parameters[:count])
+    times = np.exp(parameters[count:-1])
+    plateau = float(np.exp(parameters[-1]))
     of_limit = np.concatenate([parts, np.zeros(count), [plateau]])
     variance = float(of_limit @ np.linalg.pinv(weighted.T @ slopes, hermitian=True) @ of_limit)
     residual = bands.freedom * (bands.density / density - 1)

@@ -135,11 +135,9 @@ class ExternalEngine(Engine, ABC):
     whole virial."""
 
     def __init__(self, system: System, stage: int):
-        self._system, self._view, self._stage = (
-            system,
-            force_field_of(system),
-            system.scene.stages[stage],
-        )
+        self._system = system
+        self._view = force_field_of(system)
+        self._stage = system.scene.stages[stage]
         self.conserves_energy = not (self._stage.has_thermostat or self._stage.has_barostat)
         self._known_state: State | None = None  # the present state of the program
         self._heat_offset = (

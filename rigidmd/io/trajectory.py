@@ -382,10 +382,8 @@ def write_topology(path: Path, system: System | BodySystem, state: State, wrappe
     positions = system.site_positions(state, wrapped)
     others = written(lambda form: form.write_topology and form.exceeded(positions) is None)
     _check_fits(path, positions, "output.topology", others)
-    with (
-        atomic_file(path) as temporary,
-        ignore_warnings(),
-    ):  # of missing attributes (occupancies, ...)
+    # warnings of missing attributes (occupancies, ...)
+    with atomic_file(path) as temporary, ignore_warnings():
         write = not_none(BY_EXTENSION[path.suffix].write_topology)
         write(temporary, universe(system, state, wrapped).select_atoms("all"))
 

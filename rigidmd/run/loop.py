@@ -87,11 +87,8 @@ class RunLoop:
         self._failed_before: list[Observer] = []
         self._bar, self._progress = progress_of(0.0, "", False), False
         self._until = 0.0  # the step at which the run pauses
-        # seconds before, and the time since which it runs
-        self._wall, self._since = (
-            0.0,
-            clock.perf_counter(),
-        )
+        self._wall = 0.0  # seconds before the time since which it runs
+        self._since = clock.perf_counter()
         self._observers: dict[str, Observer] = {}
         self._course = self._run()
 
@@ -251,11 +248,9 @@ class RunLoop:
         simulation, part, notes = self._simulation, self._part, self._part.record.notes
         self._note_lost_files()
         results = Results(part.system, part.state, part.samples())
-        results.interrupted, results.signal, results.out_of_time = (
-            self.interrupted,
-            self.signal,
-            self.out_of_time,
-        )
+        results.interrupted = self.interrupted
+        results.signal = self.signal
+        results.out_of_time = self.out_of_time
         made_by = resume.provenance(
             simulation.scene, part.threads, part.record.inputs, part.engine_version
         )
@@ -369,11 +364,9 @@ class RunLoop:
                 part.segment = segment = part.reenter_segment(k)
             else:
                 part.segment = segment = part.enter_segment(k)
-                position.segment, position.first, position.seconds = (
-                    k,
-                    int(part.state.step[NOW]),
-                    0.0,
-                )
+                position.segment = k
+                position.first = int(part.state.step[NOW])
+                position.seconds = 0.0
                 if k == 0:
                     self._notify(0, [observer.interval is not None for observer in observers])
                     self._checkpoint()

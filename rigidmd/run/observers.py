@@ -244,10 +244,8 @@ class Figures(Observer):
     draws = True
 
     def __init__(self, stems: Sequence[str], suffixes: Sequence[str]):
-        self._suffixes, self._names = (
-            suffixes,
-            [f"{stem}.{suffix}" for stem in stems for suffix in suffixes],
-        )
+        self._suffixes = suffixes
+        self._names = [f"{stem}.{suffix}" for stem in stems for suffix in suffixes]
 
     def end(self, run: "Simulation", results: "Results") -> None:
         failed = None

@@ -27,10 +27,8 @@ def schema() -> dict[str, Any]:
     ]
     _, document = models_json_schema(kinds, schema_generator=_TomlSchema)
     document["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
-    for kind, section in (
-        ("MolecularScene", "Stage"),
-        ("BodyScene", "Run"),
-    ):  # other names need [[integrators]]
+    # other names need [[integrators]]
+    for kind, section in (("MolecularScene", "Stage"), ("BodyScene", "Run")):
         enum = document["$defs"][section]["properties"]["integrator"].pop("enum")
         known = {"properties": {"integrator": {"enum": enum}}}
         sections = {"run": known} if section == "Run" else {"stages": {"items": known}}

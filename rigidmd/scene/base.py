@@ -392,11 +392,8 @@ def is_inside(path: Path, folder: Path) -> bool:
     missing."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
-    except (
-        OSError,
-        RuntimeError,
-        ValueError,
-    ):  # a name that is too long, a loop of links, a zero byte
+    # a name that is too long, a loop of links, a zero byte
+    except (OSError, RuntimeError, ValueError):
         return True
 
 

@@ -263,13 +263,12 @@ def _as_number(text: str, keys: list) -> str:
 
 def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     value = detail["input"]
-    shown = (
-        "a table"
-        if isinstance(value, dict)
-        else "a list"
-        if isinstance(value, list)
-        else shorten_repr(value)
-    )
+    if isinstance(value, dict):
+        shown = "a table"
+    elif isinstance(value, list):
+        shown = "a list"
+    else:
+        shown = shorten_repr(value)
     context = detail.get("ctx", {})
     match detail["type"]:
         case "extra_forbidden":
@@ -311,13 +310,12 @@ def _foreign(name: str, model: type[BaseModel]) -> str:
             if table == "none" and "stages" in model.model_fields:
                 return f"; not needed: {note}"
             if (section or not path) and key in _known_keys(model, path):
-                place = (
-                    f" in [[{table}]]"
-                    if "tuple" in str(section)
-                    else f" in [{table}]"
-                    if path
-                    else ""
-                )
+                if "tuple" in str(section):
+                    place = f" in [[{table}]]"
+                elif path:
+                    place = f" in [{table}]"
+                else:
+                    place = ""
                 return f"; in rigidmd this is {key}{place}{note and f' ({note})'}"
     return ""
 

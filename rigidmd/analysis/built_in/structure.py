@@ -428,12 +428,8 @@ def _donors(molecule: Molecule) -> list[tuple[int, int]]:
 
 def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float) -> np.ndarray:
     """Hydrogen bonds of each molecule (n,) in a frame."""
-    # arms (sites, 3) to the first hydrogen of each, the second, ...; NaN without one
-    heavy, owner, arms = (
-        [],
-        [],
-        [],
-    )
+    heavy, owner = [], []
+    arms = []  # (sites, 3) to the first hydrogen of each, the second, ...; NaN without one
     arm_count = len(max((_donors(kind.molecule) for kind in frames.kinds), key=len))
     for kind in frames.kinds:
         centre = frames.positions[frame, kind.index]

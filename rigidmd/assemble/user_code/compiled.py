@@ -37,10 +37,8 @@ def check_compiled_code(system: System, state: State) -> list[str]:
         after, function = state.copy(), THERMOSTATS[type(thermostat)]
         if wrong := _faults(name, function, (thermostat, system.model, after, h, 0)):
             faults += wrong
-        elif (
-            _kinetic_energy(system, state) == 0
-        ):  # at rest, a factor of the momenta may be infinite
-            continue
+        elif _kinetic_energy(system, state) == 0:
+            continue  # at rest, a factor of the momenta may be infinite
         elif not after.is_finite:
             faults.append(
                 f"{name}: {_place(function)} makes momenta that are not finite, in a time of"

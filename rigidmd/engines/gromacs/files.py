@@ -276,10 +276,8 @@ def _settings(view: ForceFieldView, k: int) -> str:
     def every(interval: float) -> int:
         return max(1, round(interval * 1e3 / stage.timestep_fs))
 
-    keeps, interval = (
-        system.freedom_in(k).translation < 3 * len(system.model.species),
-        system.removes_momentum_every,
-    )
+    keeps = system.freedom_in(k).translation < 3 * len(system.model.species)
+    interval = system.removes_momentum_every
     integrator, _ = TRANSLATIONS.of("thermostat")[stage.thermostat]
     settings: dict[str, object] = {
         "integrator": integrator,

@@ -245,10 +245,8 @@ class Process:
             raise EngineError(
                 f"LAMMPS cannot be started as {' '.join(arguments)}: {error.strerror}"
             ) from None
-        self._in, self._out = (
-            cast(IO[str], self._process.stdin),
-            cast(IO[str], self._process.stdout),
-        )
+        self._in = cast(IO[str], self._process.stdin)
+        self._out = cast(IO[str], self._process.stdout)
         self._end = weakref.finalize(
             self, _ended, self._process, [self._in, self._out], self._folder_handle
         )

@@ -55,10 +55,7 @@ class OdeEngine(CpuEngine):
     _restart = False  # whether forces have changed, so that earlier steps are useless
     _steps = 0  # steps that DOP853 or Radau has taken
     #: Consecutive steps at the limit of stability and not, as Hairer counts them
-    _stiff_steps, _other_steps = (
-        0,
-        0,
-    )
+    _stiff_steps, _other_steps = 0, 0
     is_stiff = False
 
     @property

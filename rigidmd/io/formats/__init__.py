@@ -93,12 +93,10 @@ BY_EXTENSION: dict[str, Format] = {}
 BY_CONTENT: list[Format] = []
 #: Default names of files of a run, of the topology of a body, with bonds, and of the `ase.Atoms` of
 #: a scene.
-TRAJECTORY, TOPOLOGY, BODY_TOPOLOGY, STRUCTURE = (
-    "trajectory.xtc",
-    "topology.gro",
-    "topology.pdb",
-    "atoms.xyz",
-)
+TRAJECTORY = "trajectory.xtc"
+TOPOLOGY = "topology.gro"
+BODY_TOPOLOGY = "topology.pdb"
+STRUCTURE = "atoms.xyz"
 
 
 def register(form: Format) -> None:

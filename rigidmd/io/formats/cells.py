@@ -170,9 +170,8 @@ def cell_of(parameters: list[float]) -> np.ndarray | None:
         and (angles > 0).all()
         and (angles < 180).all()
     ):
-        with contextlib.suppress(
-            AssertionError
-        ):  # raised by ASE if three edges cannot form the angles
+        # raised by ASE if three edges cannot form the angles
+        with contextlib.suppress(AssertionError):
             return cellpar_to_cell([*edges, *angles])
     return None
 

@@ -231,11 +231,9 @@ def atoms_of_sites(
 TAG = "ASE-Trajectory"
 #: Additional arrays: indices of the atoms among the sites (first frame), positions and velocities
 #: of the other sites.
-ATOMS, MASSLESS, MASSLESS_VELOCITY = (
-    "rigidmd_atoms",
-    "rigidmd_massless",
-    "rigidmd_massless_velocity",
-)
+ATOMS = "rigidmd_atoms"
+MASSLESS = "rigidmd_massless"
+MASSLESS_VELOCITY = "rigidmd_massless_velocity"
 #: Bytes of the head of a file: magic number, tag, version, number of items, offset of their table.
 HEAD = 48
 #: What the library raises for damaged files.

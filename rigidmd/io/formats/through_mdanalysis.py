@@ -73,11 +73,9 @@ class FrameFiles:
     def __init__(
         self, system: System, velocities: bool, name: str, options: dict[str, Any] | None = None
     ):
-        self._universe, self._name, self._options = (
-            universe_of(system, velocities),
-            name,
-            options or {},
-        )
+        self._universe = universe_of(system, velocities)
+        self._name = name
+        self._options = options or {}
         self.sites: int = len(system.sites.name)
 
     def content(

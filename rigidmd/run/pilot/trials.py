@@ -199,13 +199,12 @@ class IntegratorAccuracy:
         longest = max(
             (STABLE_FRACTION if unstable else 1.0) * tried[0].timestep, tried[-1].timestep
         )
-        limit = (
-            ""
-            if step < longest
-            else "kept from its longest stable step"
-            if unstable
-            else "its longest step tried"
-        )
+        if step < longest:
+            limit = ""
+        elif unstable:
+            limit = "kept from its longest stable step"
+        else:
+            limit = "its longest step tried"
         step, up = float(min(step, longest)), tried[::-1]
         seconds = np.exp(
             np.interp(np.log(step), np.log([t.timestep for t in up]), np.log([t.time for t in up]))
@@ -341,11 +340,9 @@ def _begin_trial(system: TrialSystem, trial: Trial) -> tuple[Engine, State, Call
     """A new engine, a state at the start, and a function that advances it to a number of steps
     since the start."""
     method = system.methods[trial.integrator]
-    engine, scheme, dt = (
-        method.engine(trial.timestep),
-        method.scheme,
-        trial.timestep * system.time_size,
-    )
+    engine = method.engine(trial.timestep)
+    scheme = method.scheme
+    dt = trial.timestep * system.time_size
     if trial.tolerance is not None:
         scheme = scheme._replace(
             relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance
