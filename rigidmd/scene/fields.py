@@ -271,9 +271,8 @@ def field_notes(scene: "MolecularScene") -> list[str]:
 def field_errors(scene: "MolecularScene") -> Iterator[str]:
     """Messages on fields of a scene that contradict its other tables."""
     fields, boxed = scene.fields, scene.box.periodic
-    held = any(entry.between is None for entry in fields.restraints) or any(
-        species.frozen for species in scene.molecules
-    )
+    has_anchors = any(entry.between is None for entry in fields.restraints)
+    held = has_anchors or any(species.frozen for species in scene.molecules)
     for k, walls in enumerate(fields.walls):
         if boxed and inf in map(abs, walls.positions_A):
             why = "or molecules would cross the periodic boundary to the other side"

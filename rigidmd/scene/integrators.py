@@ -155,16 +155,13 @@ def with_registered_rows(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str
     names = [
         table.get("integrator") for table in (*stages, data.get("run")) if isinstance(table, dict)
     ]
-    taken = [
-        name
-        for table in tables
-        if isinstance(table, dict) and isinstance(name := table.get("name"), str)
-    ]
+    given_names = [table.get("name") for table in tables if isinstance(table, dict)]
+    taken = [name for name in given_names if isinstance(name, str)]
     rows = [row for name, row in _REGISTERED.items() if name in names and name not in taken]
+    changed = {}
     if rows:
-        changed = {"integrators": [*tables, *(row.model_dump(exclude_none=True) for row in rows)]}
-    else:
-        changed = {}
+        new_tables = [row.model_dump(exclude_none=True) for row in rows]
+        changed = {"integrators": [*tables, *new_tables]}
     return data | changed, dict.fromkeys(taken, SCHEMES["velocity_verlet"])
 
 

@@ -368,9 +368,8 @@ def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[S
 
 def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
     """The entry of this name, or else of the element."""
-    return next((s for s in sites if s.name == name), None) or next(
-        (s for s in sites if s.name == element), None
-    )
+    by_name = {site.name: site for site in reversed(sites)}  # the first of several
+    return by_name.get(name) or by_name.get(element)
 
 
 @cache

@@ -423,8 +423,10 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def temperatures(self) -> tuple[float, float]:
         """Temperature of the thermostat at begin and end, K."""
-        both = self.temperature_K
-        return both if isinstance(both, tuple) else (both or 0.0, both or 0.0)
+        temperature = self.temperature_K
+        if isinstance(temperature, tuple):
+            return temperature
+        return temperature or 0.0, temperature or 0.0
 
     @property
     def thermostat_time(self) -> float:

@@ -520,7 +520,9 @@ def _contents(
 def _formula(text: str) -> dict[str, float]:
     """Numbers of atoms in a formula such as C6 H6; empty if it is unreadable."""
     words = [re.fullmatch(r"([A-Z][a-z]?)(\d*\.?\d*)", word) for word in text.split()]
-    return {word[1]: float(word[2] or 1) for word in words if word} if all(words) else {}
+    if not all(words):
+        return {}
+    return {word[1]: float(word[2] or 1) for word in words if word}
 
 
 register(

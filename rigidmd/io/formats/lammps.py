@@ -383,9 +383,8 @@ def _dump_names(
         expected = f"type, {', '.join(LABELS)}, element or mass"
         raise structure_error(path, f"line {line}: has no column that names its atoms: {expected}")
     if atom_types is not None:
-        return names_of_types(
-            path, types, [], dict(zip(types, labelled, strict=False)), atom_types
-        ), [""] * len(types)
+        labels = dict(zip(types, labelled, strict=False))
+        return names_of_types(path, types, [], labels, atom_types), [""] * len(types)
     elements = [e if is_element(e) or e in HEAVY_HYDROGEN else "" for e in named]
     if not elements and masses is not None:
         element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}
