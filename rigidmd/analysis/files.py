@@ -133,14 +133,14 @@ class _Analyses(BaseModel):
 
 def read_table(folder: Path) -> dict[str, _Entry]:
     """The entries of analysis.json by analysis, if there are any. Raises OutputError."""
-    found = read_json(folder / ANALYSIS, _Analyses, "; remove it, and analyse again")
-    return {} if found is None else found.analyses
+    analyses = read_json(folder / ANALYSIS, _Analyses, "; remove it, and analyse again")
+    return {} if analyses is None else analyses.analyses
 
 
 def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
     """The results of analyses in the folder of a run, each with a phrase on the frames used. Raises
     OutputError."""
-    found = []
+    results = []
     for name, entry in read_table(folder).items():
         curves, used = [], entry.frames_used
         for described in entry.curves:
@@ -148,12 +148,12 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
             read = read_columns(path)
             if read is None or not read.cells:
                 raise OutputError(f"{path} cannot be read: it has no curve; analyse again")
-            head, *rest = read.cells
+            head, *titles = read.cells
             table = {title: read.numbers(title) for title in read.cells}
             columns = {
-                t: table[t] for t in rest if t.removesuffix(" error") not in table.keys() - {t}
+                t: table[t] for t in titles if t.removesuffix(" error") not in table.keys() - {t}
             }
-            errors = {t.removesuffix(" error"): table[t] for t in rest if t not in columns}
+            errors = {t.removesuffix(" error"): table[t] for t in titles if t not in columns}
             curves.append(
                 Curve(
                     **described.model_dump(),
@@ -163,8 +163,10 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
                 )
             )
         phrase = f"{used.frames} frames from {used.from_ps:g} to {used.to_ps:g} ps"
-        found.append((AnalysisResult(name, entry.about, entry.values, curves, entry.notes), phrase))
-    return found
+        results.append(
+            (AnalysisResult(name, entry.about, entry.values, curves, entry.notes), phrase)
+        )
+    return results
 
 
 READING = 0.25  # fraction of the progress for reading frames

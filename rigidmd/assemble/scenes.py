@@ -94,12 +94,12 @@ def scene_from_atoms(
                 f"{key} is a {kind}, must be a dictionary like the table [{key}] of a scene file"
             )
     structure, start, box = filled.values()
-    given = [
+    taken = [
         key
         for key in ("file", "frame", "topology")
         if isinstance(structure, Mapping) and key in structure
     ]
-    if faults := faults + [f"structure.{key} is given by the atoms" for key in given]:
+    if faults := faults + [f"structure.{key} is given by the atoms" for key in taken]:
         raise SceneError(SOURCE, faults)
     draws = start.get("temperature_K") is not None
     structure["file"] = STRUCTURE
@@ -133,8 +133,8 @@ def atoms_errors(atoms: Any) -> list[str]:
     import ase
 
     if not isinstance(atoms, ase.Atoms):
-        more = "; ase.io.read returns a list of them for ':'" if isinstance(atoms, list) else ""
-        return [f"are of the type {type(atoms).__name__}, must be one ase.Atoms{more}"]
+        hint = "; ase.io.read returns a list of them for ':'" if isinstance(atoms, list) else ""
+        return [f"are of the type {type(atoms).__name__}, must be one ase.Atoms{hint}"]
     if len(atoms) == 0:
         return ["there are no atoms"]
     values = [("position", atoms.positions)]
@@ -150,11 +150,10 @@ def atoms_errors(atoms: Any) -> list[str]:
         faults.append(f"they are periodic along {axes} only: {advice}")
     elif atoms.pbc.all():
         cell = atoms.cell.array
-        why = (
-            cell_error(cell)
-            if np.isfinite(cell).all()
-            else "it has an edge that is not a finite number"
-        )
+        if np.isfinite(cell).all():
+            why = cell_error(cell)
+        else:
+            why = "it has an edge that is not a finite number"
         if why:
             faults.append(
                 f"they are periodic, but their cell is invalid: {why}. Set atoms.cell, or atoms.pbc"
@@ -199,7 +198,7 @@ def models_with_absolute_paths(
 ) -> list[dict[str, Any]]:
     """Tables [[molecules]] of models, with absolute paths, so that they do not depend on the
     working directory."""
-    found = []
+    entries = []
     models = plain_values(models)
     for entry in models if isinstance(models, list) else [models]:
         if isinstance(entry, dict):
@@ -208,9 +207,9 @@ def models_with_absolute_paths(
                 for key in SPECIES_FILES
                 if isinstance(entry.get(key), str)
             }
-            found.append(entry | paths)
+            entries.append(entry | paths)
         elif isinstance(entry, str) and entry.endswith(".toml"):
-            found.append({"file": os.path.abspath(entry)})
+            entries.append({"file": os.path.abspath(entry)})
         else:
-            found.append({"model": entry})
-    return found
+            entries.append({"model": entry})
+    return entries

@@ -34,8 +34,8 @@ class SavedState(NamedTuple):
 
 def write_state(path: Path, saved: SavedState) -> None:
     """Write a state of molecules, without pickle. Raises OutputError."""
-    more = {"residue_number": saved.residue_number, "models": saved.models}
-    more = {name: array for name, array in more.items() if array is not None}
+    optional = {"residue_number": saved.residue_number, "models": saved.models}
+    optional = {name: array for name, array in optional.items() if array is not None}
     with atomic_file(path) as temporary:
         arrays: dict[str, Any] = dict(zip(State._fields, saved.state, strict=True))
         np.savez(
@@ -43,7 +43,7 @@ def write_state(path: Path, saved: SavedState) -> None:
             schema=SCHEMA,
             species_names=np.array(saved.names),
             species=saved.species,
-            **more,
+            **optional,
             **arrays,
         )
 
@@ -132,22 +132,22 @@ def array_errors(
 
     exact : whether matrices must be rotations, not only numbers
     """
-    found = {}
+    errors = {}
     for name, shape in shapes.items():
         array = arrays[name]
         if array.shape != shape:
-            found[name] = f"has the shape {array.shape}, not {shape}"
+            errors[name] = f"has the shape {array.shape}, not {shape}"
         elif array.dtype.kind not in "fi":
-            found[name] = f"is of the type {array.dtype}, not of real numbers"
+            errors[name] = f"is of the type {array.dtype}, not of real numbers"
         elif name == "cell" and not is_cell(array):
-            found[name] = (
+            errors[name] = (
                 "is not a cell with a along x, b in the xy plane and positive a_x, b_y, c_z"
             )
         elif name != "cell" and not (np.abs(array) <= LARGEST).all():  # NaN is not
-            found[name] = "is not finite"
+            errors[name] = "is not finite"
         elif name == "rotation" and exact and not are_rotations(array):
-            found[name] = "has matrices Q that are not rotations, with QᵀQ = 1 and determinant 1"
-    return found
+            errors[name] = "has matrices Q that are not rotations, with QᵀQ = 1 and determinant 1"
+    return errors
 
 
 def are_rotations(matrices: np.ndarray) -> bool:

@@ -31,9 +31,8 @@ class Program(NamedTuple):
     installed: str = ""  # a function that describes what is installed here
     options: Mapping[str, Option] = {}
     describe: Callable[..., str] = lambda **options: ""  # name and options for reports
-    option_errors: Callable[..., str] = lambda **options: (
-        ""
-    )  # a message on options that contradict each other
+    #: A message on options that contradict each other
+    option_errors: Callable[..., str] = lambda **options: ""
     precise: Mapping[
         str, Any
     ] = {}  # the options with which `rigidmd verify` compares, unless others are given

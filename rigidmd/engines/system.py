@@ -55,9 +55,8 @@ class System:
     constants: dict[str, float]  # constant energies, u Å²/ps²
     constant_pressure: float  # a constant part of the pressure, u/(Å ps²)
     tail: Tail | None  # the tail correction, where the scene requests it
-    residue_number: (
-        np.ndarray
-    )  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
+    #: (n,) numbers by which a scene may select molecules: see Molecules.frozen
+    residue_number: np.ndarray
     from_lattice: bool
     left_out: list[str]
     precision_reason: str = ""  # where the scene has precision = "auto"
@@ -66,13 +65,11 @@ class System:
     )
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)  # of what is allowed and probably not meant
-    python_forces: dict[str, Callable] = field(
-        default_factory=dict
-    )  # name of a term that Python computes -> function
+    #: Name of a term that Python computes -> function
+    python_forces: dict[str, Callable] = field(default_factory=dict)
     thermostat: Any = None  # user-defined, in place of the thermostat of every stage
-    user_terms: dict[str, str] = field(
-        default_factory=dict
-    )  # name of a user-defined term -> description
+    #: Name of a user-defined term -> description
+    user_terms: dict[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<System of {self.scene.in_short}>"
@@ -147,11 +144,9 @@ class System:
         """Time between removals of the total momentum, ps; None for never, also where every
         thermostat changes it."""
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
-        return (
-            (self.scene.run.remove_momentum_interval_ps or None)
-            if any(map(self.keeps_momentum_in, moving))
-            else None
-        )
+        if any(map(self.keeps_momentum_in, moving)):
+            return self.scene.run.remove_momentum_interval_ps or None
+        return None
 
     def keeps_momentum_in(self, k: int) -> bool:
         """Whether the thermostat of stage k leaves the total momentum as it is."""
@@ -206,9 +201,9 @@ class System:
         names = State._fields[:5]
         arrays = {name: np.asarray(getattr(state, name)) for name in names}
         shapes = {name: getattr(self.state, name).shape for name in names}
-        if found := array_errors(arrays, shapes):
+        if problems := array_errors(arrays, shapes):
             about = f"the scene has {len(self.state.position)} molecules"
-            return [f"{name} of the state {problem}; {about}" for name, problem in found.items()]
+            return [f"{name} of the state {problem}; {about}" for name, problem in problems.items()]
         cell = arrays["cell"]
         if np.isfinite(cell).all() != np.isfinite(self.state.cell).all():
             return ["one of scene and state has a periodic box, and the other has none"]
@@ -245,8 +240,8 @@ class System:
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of
         mass inside the box."""
-        whole = state._replace(position=self.centres(state, wrapped))
-        return self.positions_of(whole, self.sites.molecule, self.sites.offset_body)
+        placed = state._replace(position=self.centres(state, wrapped))
+        return self.positions_of(placed, self.sites.molecule, self.sites.offset_body)
 
     def positions_of(
         self, state: State, molecule: np.ndarray, offset_body: np.ndarray

@@ -30,12 +30,12 @@ class Checkpoint(NamedTuple):
     def of(self, owner: str) -> "Checkpoint":
         """The part of one owner, whose arrays have names of the form owner/name."""
         start = f"{owner}/"
-        found = {
+        arrays = {
             name.removeprefix(start): array
             for name, array in self.arrays.items()
             if name.startswith(start)
         }
-        return Checkpoint(dict(self.values["of"].get(owner, {})), found)
+        return Checkpoint(dict(self.values["of"].get(owner, {})), arrays)
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
@@ -106,14 +106,13 @@ def latest(folder: Path) -> tuple[Checkpoint, list[str]]:
                 return read_checkpoint(path), errors
             except CheckpointError as error:
                 errors.append(str(error))
-    there = (
-        sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-        if folder.is_dir()
-        else []
-    )
+    if folder.is_dir():
+        file_names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    else:
+        file_names = []
     if errors:
         raise CheckpointError("; ".join(errors) + f". The run cannot be resumed from {folder}")
-    listed = f"it holds {', '.join(there)}" if there else "it is empty"
+    listed = f"it holds {', '.join(file_names)}" if file_names else "it is empty"
     raise CheckpointError(
         f"{folder} holds no checkpoint ({listed}); {option('force')} begins the run again"
     )

@@ -113,9 +113,9 @@ def _read_trajectory(
             path, f"holds no names of atoms, and {missing}: name a file by structure.topology"
         )
     atoms = read_atoms(topology, None, atom_types)
-    found = read_in_process(form.read_arrays, path, frame, len(atoms.names))
+    arrays = read_in_process(form.read_arrays, path, frame, len(atoms.names))
     return atoms._replace(
-        position=found["position"], velocity=found.get("velocity"), cell=found.get("cell")
+        position=arrays["position"], velocity=arrays.get("velocity"), cell=arrays.get("cell")
     )
 
 

@@ -166,12 +166,12 @@ def as_observer(value: Any) -> Observer:
     observer = type(
         type(value).__name__, (Observer,), {}
     )()  # its name is in messages and checkpoints
-    given = {
+    attributes = {
         name: getattr(value, name)
         for name in dir(Observer)
         if name[0] != "_" and hasattr(value, name)
     }
-    vars(observer).update(given)
+    vars(observer).update(attributes)
     return observer
 
 
@@ -244,10 +244,8 @@ class Figures(Observer):
     draws = True
 
     def __init__(self, stems: Sequence[str], suffixes: Sequence[str]):
-        self._suffixes, self._names = (
-            suffixes,
-            [f"{stem}.{suffix}" for stem in stems for suffix in suffixes],
-        )
+        self._suffixes = suffixes
+        self._names = [f"{stem}.{suffix}" for stem in stems for suffix in suffixes]
 
     def end(self, run: "Simulation", results: "Results") -> None:
         failed = None

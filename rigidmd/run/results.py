@@ -55,9 +55,8 @@ class Results(Displayed):
     out_of_time: bool = False
     _frames: "Sequence[Frame]" = field(default_factory=list)
     _tensor: np.ndarray | None = None  # (n, 7) rows of the pressure tensor of a run without files
-    _analysis_frames: dict[float | None, Any] = field(
-        default_factory=dict
-    )  # kept by rigidmd.analysis, by their start
+    #: Kept by rigidmd.analysis, by their start
+    _analysis_frames: dict[float | None, Any] = field(default_factory=dict)
     _is_stored: bool = False  # read from a folder, without user-defined forces
     _no_state: str = ""  # why a stored run has no final state
 

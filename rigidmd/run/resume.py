@@ -163,8 +163,10 @@ def check_same_scene(
             )
     unlike = differences(keys_of(plain(scene), excluded), keys_of(before, excluded))
     changes = [f"{key} is {now}, there {then}" for key, (now, then) in unlike.items()]
-    found = input_digests(scene)
-    changes += [f"the file of {key} has changed" for key in found if found[key] != inputs.get(key)]
+    digests = input_digests(scene)
+    changes += [
+        f"the file of {key} has changed" for key in digests if digests[key] != inputs.get(key)
+    ]
     if changes:
         raise CheckpointError(
             f"{scene.source}: is not the scene of the run in the folder: {'; '.join(changes[:8])}. "
@@ -194,24 +196,24 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True
 
     exact : whether the method of the run keeps rotation matrices orthogonal to rounding
     """
-    found = State(*(np.array(arrays[name], order="C") for name in State._fields))
+    state = State(*(np.array(arrays[name], order="C") for name in State._fields))
     shapes = {name: expected.shape for name, expected in zip(State._fields, like, strict=True)}
     for name, problem in array_errors(
-        dict(zip(State._fields, found, strict=True)), shapes, exact
+        dict(zip(State._fields, state, strict=True)), shapes, exact
     ).items():
         raise ValueError(f"{name} of its state {problem}")
-    for name, array, expected in zip(State._fields, found, like, strict=True):
+    for name, array, expected in zip(State._fields, state, like, strict=True):
         if array.dtype != expected.dtype:
             raise ValueError(
                 f"{name} of its state is of the type {array.dtype}, not {expected.dtype}"
             )
-    if (np.isfinite(found.cell) != np.isfinite(like.cell)).any():
+    if (np.isfinite(state.cell) != np.isfinite(like.cell)).any():
         raise ValueError("its state has another kind of box")
     if not (
-        0 <= found.step[ORIGIN] <= found.step[NOW] and 0 <= found.time[ORIGIN] <= found.time[NOW]
+        0 <= state.step[ORIGIN] <= state.step[NOW] and 0 <= state.time[ORIGIN] <= state.time[NOW]
     ):
         raise ValueError("its step or time is before the start")
-    return found
+    return state
 
 
 def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
@@ -226,10 +228,10 @@ def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
         else:
             plain_types[name] = kind
     values = {name: getattr(owner, name) for name in plain_types}
-    found = (
+    dumped = (
         _model_of(plain_types).model_construct(**values).model_dump(mode="json", exclude_none=True)
     )
-    return Checkpoint({name: found.get(name) for name in plain_types}, arrays)
+    return Checkpoint({name: dumped.get(name) for name in plain_types}, arrays)
 
 
 def restored(
@@ -249,11 +251,11 @@ def restored(
         }
     try:
         model = _model_of({name: types[name] for name in types if name not in arrays})
-        found = model.model_validate(kept.values, context=rows)
+        values = model.model_validate(kept.values, context=rows)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-    return {name: getattr(found, name) for name in types if name not in arrays} | arrays
+    return {name: getattr(values, name) for name in types if name not in arrays} | arrays
 
 
 def _model_of(types: Mapping[str, Any]) -> type[BaseModel]:

@@ -68,10 +68,12 @@ class ObservationSchedule:
 
     def due(self, done: int) -> list[bool]:
         """Which observers are called after `done` steps."""
-        return [
-            (observer.ends and done == self._last) or (every > 0 and (before + done) % every == 0)
-            for observer, (every, before) in zip(self._observers, self._regular, strict=True)
-        ]
+        is_last = done == self._last
+        is_due = []
+        for observer, (every, before) in zip(self._observers, self._regular, strict=True):
+            is_regular = every > 0 and (before + done) % every == 0
+            is_due.append((observer.ends and is_last) or is_regular)
+        return is_due
 
 
 #: Seconds of computing after which the clock and signals are checked.

@@ -171,9 +171,8 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         thermostat: "NamedTuple | HasStage | None" = None,
         applied: "Mapping[str, Callable[[Pose], tuple]] | None" = None,
     ):
-        self.folder = (
-            None if folder is None else Path(folder).absolute()
-        )  # a callback may change the directory
+        # a callback may change the directory
+        self.folder = None if folder is None else Path(folder).absolute()
         if resume and folder is None:
             raise ValueError("a run without a folder has no checkpoint to resume from")
         self._force, self._resume, self._user_say, self.warn = force, resume, say, warn
@@ -195,9 +194,9 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         if isinstance(scene, BodyScene):
             from rigidmd.run.body import BodyRun
 
-            if given := [key for key, value in of_molecules.items() if value is not None]:
+            if set_keys := [key for key, value in of_molecules.items() if value is not None]:
                 problem = (
-                    f"{' and '.join(given)}: for molecules; a single body takes applied={{name:"
+                    f"{' and '.join(set_keys)}: for molecules; a single body takes applied={{name:"
                     " function}"
                 )
                 raise SceneError(scene.source, [problem])
