@@ -164,7 +164,7 @@ def with_user_code(system: System) -> System:
 
 def _term(made: Any, name: str, system: System, target: System, tails: list[Tail]) -> NamedTuple:
     """The term of one object for a system. Its function, description and notes are added to
-    `found`, its tail correction to `tails`. Raises PairPotentialError, ValueError,
+    `target`, its tail correction to `tails`. Raises PairPotentialError, ValueError,
     UserForceError."""
     if isinstance(made, PairLaw):
         term, formula, tail, notes, warnings = made.bind(system)
