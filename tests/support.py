@@ -312,7 +312,7 @@ HOMES = {
     "scene.species": "Box",
     "assemble.start": "close_pairs every_site",
     "studies.sweep.plan": "Axis parse_axis",
-    "studies.sweep.sweeping": "Waiting code_kind format_ranges format_walltime run_points write_slurm_script",
+    "studies.sweep.sweeping": "format_ranges write_slurm_script",
     "view.animation": "write_film",
     "view.body_animation": "BodyAnimation",
     "core.shipped": "CHAPTERS DOCS NOTEBOOKS find_example",
@@ -426,7 +426,7 @@ HOMES = {
     "run.report": "summary_text",
     "io.run_files": "Summary TENSOR columns read_json",
     "io.scene_file": "write_scene",
-    "studies.sweep.folder": "Manifest SweepPoint point_name read_manifest short_keys value_name write_manifest",
+    "studies.sweep.folder": "Manifest SweepPoint point_name read_manifest short_keys value_name",
     "io.trajectory": "TrajectoryFile from_files in_memory open_trajectory read_frames reader_of write_topology",
     "engines.rigid_bodies": "RigidBodies mass_points",
     "engines.external": "compare_at describe_comparison external_engine",
@@ -451,8 +451,11 @@ HOMES = {
     "studies.stability.cases": (
         "CASES CRASH CaseResult Outcome REFUSED REPORTED RIGHT UNDETECTED failure longest_step"
     ),
-    "studies.sweep.backends": "Cluster Pool",
-    "studies.sweep.table": "SweepRow axis_label summarise_run",
+    "studies.sweep.points": "format_walltime run_points wait_for_folder",
+    "io.progress": "progress_of",
+    "scene.base": "format_override",
+    "studies.sweep.figure": "axis_label",
+    "studies.sweep.table": "SweepRow summarise_run",
     "studies.other_engines": "export verify",
 }
 
@@ -485,7 +488,6 @@ MODULES = {
     "checkpoint": "io.checkpoint",
     "choice": "run.pilot.choice",
     "choosing": "studies.accuracy.accuracy",
-    "cluster": "studies.sweep.backends",
     "distances": "forces.fields.distances",
     "couplings": "scene.couplings",
     "integrator_rows": "scene.integrators",
@@ -521,7 +523,7 @@ MODULES = {
     "reading_process": "io.formats.through_mdanalysis",
     "watch": "run.checks",
     "wave_vectors": "forces.ewald.direct_sum",
-    "worker": "studies.sweep.backends",
+    "sweep_points": "studies.sweep.points",
 }
 
 

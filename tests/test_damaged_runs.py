@@ -20,7 +20,6 @@ from support import (
     read_manifest,
     read_record,
     read_results,
-    write_manifest,
     write_report,
 )
 
@@ -193,10 +192,10 @@ def test_any_value_of_an_analysis(argon, tmp_path):
 
 def test_any_value_of_a_manifest(tmp_path):
     points = [SweepPoint(f"p{k}", {"seed": k}, "0" * 64) for k in range(2)]
-    write_manifest(
-        tmp_path,
-        Manifest("s", "s.toml", {"seed": ["seed"]}, {"a.b": 1}, {"c": [1]}, {"file": "0"}, points),
-    )
+    keys = {"seed": ["seed"]}
+    manifest = Manifest("s", "s.toml", keys, {"a.b": 1}, {"c": [1]}, {"file": "0"}, points)
+    manifest.folder = tmp_path
+    manifest.write()
     data = json.loads((tmp_path / "sweep.json").read_text())
     assert read_manifest(tmp_path).points == points
     found = [0, 0]

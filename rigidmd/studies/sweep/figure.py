@@ -1,0 +1,193 @@
+"""Figures of sweeps: means with errors against a key, a panel for each quantity."""
+
+import csv
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, panel_grid, write_figure
+from rigidmd.io.folder import add_to_folder
+from rigidmd.studies.sweep.folder import (
+    FIGURE,
+    SEED,
+    TABLE,
+    Manifest,
+    describe_values,
+    short_keys,
+    value_name,
+)
+from rigidmd.studies.sweep.table import DENSITY, DRIFT, PRESSURE, SweepRow, Table, table_of
+
+#: Relative error of the density from which on the volume is taken to change: the density is drawn,
+#: not the pressure.
+CHANGES = 1e-9
+MOST_PANELS = 4
+ANALYSES_FIGURE, MOST_VALUES = "analysis.png", 12  # its number of panels
+ACROSS, MOST_NAMED = 2, 20  # panels in a row; curves in the legend
+SPREAD = 1 / 36  # inches between neighbouring curves with errors, so that none hides another
+LONG_WORD = 12  # letters of a value from which on the values are written at an angle
+#: Ratio of the largest to the smallest value from which on the axis is logarithmic; values that
+#: need a power of ten.
+DECADES, TINY = 100.0, 1e-3
+#: Last parts of keys -> units on axes.
+UNITS = {
+    "K": "K",
+    "fs": "fs",
+    "ps": "ps",
+    "A": "Å",
+    "bar": "bar",
+    "g_cm3": "g/cm³",
+    "nm": "nm",
+    "s": "s",
+    "kg": "kg",
+    "m": "m",
+    "kJ_mol": "kJ/mol",
+    "V_per_nm": "V/nm",
+    "per_ps": "1/ps",
+    "deg": "°",
+    "u": "u",
+    "rad": "rad",
+}
+
+
+def collect(manifest: Manifest) -> tuple[Table, list[Path]]:
+    """The table of the finished points, and the files with table and figure. Raises OutputError."""
+    table = table_of(manifest)
+    if not table.runs:
+        return table, []
+    table.as_columns().write(table.folder / TABLE, csv.QUOTE_NONNUMERIC)
+    write_sweep_figure(table, manifest.name)
+    files = [table.folder / TABLE, table.folder / FIGURE]
+    return table, [path for path in files if path.is_file()]
+
+
+def write_sweep_figure(table: Table, name: str) -> None:
+    """Write sweep.png, if there is anything to draw. Raises OutputError."""
+    counts = [row.count for row in table.rows if row.runs]
+    columns = _drawn_columns(table)
+    if not columns or not counts:
+        return
+    title = name
+    if any(map(table.has_error, columns)):
+        runs = f"{min(counts)}" if len({*counts}) == 1 else f"{min(counts)} to {max(counts)}"
+        over = f"means over {runs} runs, with" if max(counts) > 1 else "with"
+        title = f"{name}: {'' if table.keys else 'each run, and '}{over} one standard error"
+    write_figure(table.folder / FIGURE, lambda: _figure(table, columns), title)
+
+
+def write_analyses_figure(table: Table, name: str) -> None:
+    """Write analysis.png: what analyses measured against the first numerical key. Nothing is
+    written for values that only one combination has. Raises OutputError."""
+    columns = [name for name in table.columns if np.isfinite(table[name]).sum() > 1][:MOST_VALUES]
+    if columns:
+        add_to_folder(table.folder, [ANALYSES_FIGURE])
+        title = f"{name}: measured by analyses, with one standard error"
+        write_figure(table.folder / ANALYSES_FIGURE, lambda: _figure(table, columns), title)
+
+
+def axis_label(key: str, together: Iterable[str]) -> str:
+    """A swept key as the label of an axis: with its unit, and with the keys that vary together with
+    it."""
+    *table, name = key.split(".")
+    end = max((end for end in UNITS if name.endswith(f"_{end}")), key=len, default="")
+    label = name.removesuffix(f"_{end}").replace("_", " ")
+    label += f" of {'.'.join(table)}" if table else ""
+    label += f" ({UNITS[end]})" if end else ""
+    others = [other for other in together if other != key]
+    return f"{label}\ntogether with {', '.join(others)}" if others else label
+
+
+def _drawn_columns(table: Table) -> list[str]:
+    """Columns that are drawn: the density instead of the pressure where a barostat moves the
+    box."""
+    columns = table.shown()
+    if DENSITY in columns:
+        changes = table.error(DENSITY) > CHANGES * table[DENSITY]
+        refused = PRESSURE if changes.any() else DENSITY
+        columns = [column for column in columns if column != refused]
+    columns += table.earlier_densities()
+    if len(columns) > MOST_PANELS:
+        columns = [column for column in columns if column != DRIFT]
+    return columns[:MOST_PANELS]
+
+
+def panels(titles: Sequence[str], across: int = ACROSS, width: float = 4.4, height: float = 3.0):
+    """A figure, and its panels with these titles."""
+    figure, axes = panel_grid(len(titles), across, width, height, 0.4)
+    for axis, title in zip(axes, titles, strict=True):
+        axis.set_title(title, loc="left", fontsize=9, color=INK)
+        open_axis(axis, labelsize=8)
+    return figure, axes
+
+
+def add_legend(figure: Any, axes: Sequence[Any]) -> None:
+    """Name the curves of all panels once, if there are several and not too many."""
+    handles = {}
+    for axis in axes:
+        curves, labels = axis.get_legend_handles_labels()
+        handles |= dict(zip(labels, curves, strict=True))
+    if 1 < len(handles) <= MOST_NAMED:
+        style = {"ncols": 4, "frameon": False, "fontsize": 8, "labelcolor": INK}
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", **style)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float)
+
+
+def _figure(table: Table, columns: list[str]):
+    """A panel for each column against the first key with numbers, else the first key; without keys
+    against the seed."""
+    rows = [row for row in table.rows if row.runs]
+    numbers = [key for key in table.keys if all(_is_number(row.values[key]) for row in rows)]
+    key = [*numbers, *table.keys, SEED][0]
+    figure, axes = panels(columns)
+    if key == SEED:  # each run, and the mean over all
+        for axis, column in zip(axes, columns, strict=True):
+            mean, error = rows[0][column]
+            axis.axhline(mean, color=FAINT, lw=0.9, zorder=0)
+            low, high = mean - (error or 0), mean + (error or 0)
+            axis.axhspan(low, high, color=FAINT, alpha=0.25, lw=0, zorder=0)
+        rows = [SweepRow({SEED: seed}, {seed: run}) for seed, run in rows[0].runs.items()]
+    others = short_keys(other for other in table.keys if other != key)
+    curves: dict[str, list[SweepRow]] = {}
+    for row in sorted(rows, key=lambda row: row.values[key]) if key in [*numbers, SEED] else rows:
+        label = describe_values({other: row.values[other] for other in others}, others)
+        curves.setdefault(label, []).append(row)
+    words = [] if key in [*numbers, SEED] else [value_name(row.values[key]) for row in rows]
+    for axis, column in zip(axes, columns, strict=True):
+        _draw(axis, curves, key, column, lines=key != SEED)
+        axis.set_xlabel(axis_label(key, table.together.get(key, ())), fontsize=9, color=INK)
+        if max(map(len, words), default=0) > LONG_WORD:
+            axis.tick_params(axis="x", rotation=30)
+        if not words and all(float(row.values[key]).is_integer() for row in rows):
+            axis.locator_params(axis="x", integer=True)
+    add_legend(figure, axes)
+    return figure
+
+
+def _draw(axis: Any, curves: dict[str, list[SweepRow]], key: str, column: str, lines: bool) -> None:
+    """Draw a column against a key, a curve for each label."""
+    from matplotlib.transforms import ScaledTranslation  # slow to import
+
+    drawn = []
+    for k, (label, rows) in enumerate(curves.items()):
+        rows = [row for row in rows if np.isfinite(row[column][0])]
+        values = [row.values[key] for row in rows]
+        x = [value if _is_number(value) else value_name(value) for value in values]
+        means, errors = np.array([row[column] for row in rows], float).reshape(-1, 2).T
+        has_bars = np.isfinite(errors).any()
+        shift = has_bars * SPREAD * (k - (len(curves) - 1) / 2)
+        offset = ScaledTranslation(shift, 0, axis.figure.dpi_scale_trans)
+        style = curve_style(k) | ({} if lines else {"ls": "none"})
+        bars = {"capsize": 2.5, "elinewidth": 0.9, "label": label, "lw": 0.9, "ms": 3.5}
+        displaced = {"transform": axis.transData + offset}
+        axis.errorbar(x, means, np.nan_to_num(errors), **displaced, **bars, **style)
+        drawn += [*means]
+    sizes = np.abs(drawn)
+    if drawn and min(drawn) > 0 and max(drawn) > DECADES * min(drawn):
+        axis.set_yscale("log")
+    elif not 0 < sizes.max(initial=0.0) < TINY:
+        axis.ticklabel_format(axis="y", useOffset=False)
