@@ -312,7 +312,7 @@ HOMES = {
     "scene.species": "Box",
     "assemble.start": "close_pairs every_site",
     "studies.sweep.plan": "Axis parse_axis",
-    "studies.sweep.sweeping": "format_ranges write_slurm_script",
+    "studies.sweep.sweeping": "write_slurm_script",
     "view.animation": "write_film",
     "view.body_animation": "BodyAnimation",
     "core.shipped": "CHAPTERS DOCS NOTEBOOKS find_example",
@@ -451,7 +451,7 @@ HOMES = {
     "studies.stability.cases": (
         "CASES CRASH CaseResult Outcome REFUSED REPORTED RIGHT UNDETECTED failure longest_step"
     ),
-    "studies.sweep.points": "format_walltime run_points wait_for_folder",
+    "studies.sweep.points": "format_walltime wait_for_folder",
     "io.progress": "progress_of",
     "scene.base": "format_override",
     "studies.sweep.figure": "axis_label",

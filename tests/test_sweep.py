@@ -26,7 +26,6 @@ from support import (
     axis_label,
     extrapolate,
     format_override,
-    format_ranges,
     format_walltime,
     limits,
     parse_axis,
@@ -1026,7 +1025,7 @@ def test_a_script_for_slurm(argon, finished, slurm, capsys):
         )
         == 0
     )
-    assert "#SBATCH --array=1-2\n" in script.read_text()
+    assert "#SBATCH --array=1,2\n" in script.read_text()
 
 
 def test_commands_for_any_scheduler(argon, finished, slurm, capsys):
@@ -1086,7 +1085,6 @@ def test_slurm_jobs_submit_themselves_again(argon, slurm):
 
 
 def test_words_for_slurm():
-    assert format_ranges([0, 1, 2, 5, 7, 8]) == "0-2,5,7-8"
     assert format_walltime(3661.9) == "1:01:01"
     assert format_walltime(100 * 3600) == "100:00:00"
 

@@ -240,7 +240,7 @@ def _print_results(manifest: "Manifest", step: str | None) -> None:
     folder = manifest.folder
     table, files = collect(manifest)
     if files:
-        print(table.main_columns().text(left=()))
+        print(table.brief().text(left=()))
     for name, reason in table.failed.items():
         print(f"  {name} is not in the table: {reason}")
     names = ["sweep.json", *(path.name for path in files)]

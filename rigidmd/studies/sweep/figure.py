@@ -18,7 +18,15 @@ from rigidmd.studies.sweep.folder import (
     short_keys,
     value_name,
 )
-from rigidmd.studies.sweep.table import DENSITY, DRIFT, PRESSURE, SweepRow, Table, table_of
+from rigidmd.studies.sweep.table import (
+    DENSITY,
+    DRIFT,
+    PRESSURE,
+    SweepRow,
+    Table,
+    report_of,
+    table_of,
+)
 
 #: Relative error of the density from which on the volume is taken to change: the density is drawn,
 #: not the pressure.
@@ -57,7 +65,7 @@ def collect(manifest: Manifest) -> tuple[Table, list[Path]]:
     table = table_of(manifest)
     if not table.runs:
         return table, []
-    table.as_columns().write(table.folder / TABLE, csv.QUOTE_NONNUMERIC)
+    report_of(table.lines()).write(table.folder / TABLE, csv.QUOTE_NONNUMERIC)
     write_sweep_figure(table, manifest.name)
     files = [table.folder / TABLE, table.folder / FIGURE]
     return table, [path for path in files if path.is_file()]
@@ -144,50 +152,57 @@ def _figure(table: Table, columns: list[str]):
     numbers = [key for key in table.keys if all(_is_number(row.values[key]) for row in rows)]
     key = [*numbers, *table.keys, SEED][0]
     figure, axes = panels(columns)
-    if key == SEED:  # each run, and the mean over all
+    if key == SEED:
         for axis, column in zip(axes, columns, strict=True):
-            mean, error = rows[0][column]
-            axis.axhline(mean, color=FAINT, lw=0.9, zorder=0)
-            low, high = mean - (error or 0), mean + (error or 0)
-            axis.axhspan(low, high, color=FAINT, alpha=0.25, lw=0, zorder=0)
+            _draw_band(axis, *rows[0][column])
         rows = [SweepRow({SEED: seed}, {seed: run}) for seed, run in rows[0].runs.items()]
+        numbers = [SEED]
+    if numbers:
+        rows.sort(key=lambda row: row.values[key])
     others = short_keys(other for other in table.keys if other != key)
     curves: dict[str, list[SweepRow]] = {}
-    for row in sorted(rows, key=lambda row: row.values[key]) if key in [*numbers, SEED] else rows:
+    for row in rows:
         label = describe_values({other: row.values[other] for other in others}, others)
         curves.setdefault(label, []).append(row)
-    words = [] if key in [*numbers, SEED] else [value_name(row.values[key]) for row in rows]
+    values = [row.values[key] for row in rows]
     for axis, column in zip(axes, columns, strict=True):
-        _draw(axis, curves, key, column, lines=key != SEED)
+        _draw(axis, curves, key, column)
         axis.set_xlabel(axis_label(key, table.together.get(key, ())), fontsize=9, color=INK)
-        if max(map(len, words), default=0) > LONG_WORD:
-            axis.tick_params(axis="x", rotation=30)
-        if not words and all(float(row.values[key]).is_integer() for row in rows):
+        if numbers and all(float(value).is_integer() for value in values):
             axis.locator_params(axis="x", integer=True)
+        elif not numbers and max(len(value_name(value)) for value in values) > LONG_WORD:
+            axis.tick_params(axis="x", rotation=30)
     add_legend(figure, axes)
     return figure
 
 
-def _draw(axis: Any, curves: dict[str, list[SweepRow]], key: str, column: str, lines: bool) -> None:
+def _draw_band(axis: Any, mean: float, error: float | None) -> None:
+    """Draw the mean over all runs, and its error."""
+    error = error or 0.0
+    axis.axhline(mean, color=FAINT, lw=0.9, zorder=0)
+    axis.axhspan(mean - error, mean + error, color=FAINT, alpha=0.25, lw=0, zorder=0)
+
+
+def _draw(axis: Any, curves: dict[str, list[SweepRow]], key: str, column: str) -> None:
     """Draw a column against a key, a curve for each label."""
     from matplotlib.transforms import ScaledTranslation  # slow to import
 
     drawn = []
     for k, (label, rows) in enumerate(curves.items()):
-        rows = [row for row in rows if np.isfinite(row[column][0])]
-        values = [row.values[key] for row in rows]
-        x = [value if _is_number(value) else value_name(value) for value in values]
-        means, errors = np.array([row[column] for row in rows], float).reshape(-1, 2).T
-        has_bars = np.isfinite(errors).any()
-        shift = has_bars * SPREAD * (k - (len(curves) - 1) / 2)
+        x = [row.values[key] for row in rows]
+        if not all(map(_is_number, x)):
+            x = list(map(value_name, x))
+        means, errors = np.array([row[column] for row in rows], float).T
+        shift = SPREAD * (k - (len(curves) - 1) / 2)
         offset = ScaledTranslation(shift, 0, axis.figure.dpi_scale_trans)
-        style = curve_style(k) | ({} if lines else {"ls": "none"})
-        bars = {"capsize": 2.5, "elinewidth": 0.9, "label": label, "lw": 0.9, "ms": 3.5}
-        displaced = {"transform": axis.transData + offset}
-        axis.errorbar(x, means, np.nan_to_num(errors), **displaced, **bars, **style)
-        drawn += [*means]
-    sizes = np.abs(drawn)
+        style = curve_style(k) | {"lw": 0.9, "ms": 3.5, "capsize": 2.5, "elinewidth": 0.9}
+        if key == SEED:
+            style["ls"] = "none"
+        if np.isfinite(errors).any():
+            style["transform"] = axis.transData + offset
+        axis.errorbar(x, means, np.nan_to_num(errors), label=label, **style)
+        drawn += [*means[np.isfinite(means)]]
     if drawn and min(drawn) > 0 and max(drawn) > DECADES * min(drawn):
         axis.set_yscale("log")
-    elif not 0 < sizes.max(initial=0.0) < TINY:
+    elif not 0 < np.abs(drawn).max(initial=0.0) < TINY:
         axis.ticklabel_format(axis="y", useOffset=False)

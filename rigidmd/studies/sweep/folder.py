@@ -5,6 +5,7 @@ import contextlib
 import hashlib
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -164,13 +165,14 @@ def clear_sweep(folder: Path, names: Iterable[str]) -> None:
 
 def short_keys(keys: Iterable[str]) -> dict[str, str]:
     """Key -> the shortest end that no other key has: temperature_K of stages.0.temperature_K."""
-    dotted = {key: f".{key}" for key in keys}
-    short = {}
-    for key in dotted:
+    ends: dict[str, list[str]] = {}
+    for key in keys:
         parts = key.split(".")
-        ends = [".".join(parts[k:]) for k in range(len(parts) - 1, -1, -1)]
-        count = {end: sum(name.endswith(f".{end}") for name in dotted.values()) for end in ends}
-        unique = next((end for end in ends if count[end] == 1), key)
+        ends[key] = [".".join(parts[k:]) for k in reversed(range(len(parts)))]
+    count = Counter(end for ends_of_key in ends.values() for end in ends_of_key)
+    short = {}
+    for key, ends_of_key in ends.items():
+        unique = next((end for end in ends_of_key if count[end] == 1), key)
         short[key] = re.sub(r"[^\w.+\-]", "-", unique)
     return short
 

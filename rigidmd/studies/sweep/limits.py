@@ -15,12 +15,12 @@ from rigidmd.engines.samples import COLUMNS
 from rigidmd.errors import SceneError
 from rigidmd.figures.style import INK, curve_style, write_figure
 from rigidmd.io.folder import SCENE, add_to_folder
-from rigidmd.io.write import Column, Table, nine_digits, with_error
+from rigidmd.io.write import Table, nine_digits
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, Together, extrapolate, means_of_runs
 from rigidmd.studies.sweep.figure import add_legend, panels
 from rigidmd.studies.sweep.folder import Manifest, describe_values, point_name, short_keys
-from rigidmd.studies.sweep.table import DRIFT, MAIN, SHORT, Measured, key_columns, table_of
+from rigidmd.studies.sweep.table import DRIFT, MAIN, SHORT, Measured, key_cells, report_of, table_of
 from rigidmd.view.page import code, items, page, plain, section, table, wide, write_page
 
 OPTION = "--extrapolate"
@@ -75,53 +75,42 @@ class Limits(NamedTuple):
     def as_text(self) -> Table:
         """For readers: limits, chi² over its degrees of freedom, the longest step of the fit, and
         biases."""
-
-        def chi2(limit: Limit) -> str | None:
-            fit = limit.fit
-            return f"{fit.chi2:.2g}/{fit.freedom}" if fit.freedom else None
-
         short = short_keys(self.keys)
-        columns = [column._replace(header=short[column.header]) for column in key_columns(short)]
-        columns += [
-            Column("average", lambda limit: limit.title),
-            Column("limit", lambda limit: limit.fit.describe_limit()),
-            Column("chi²/dof", chi2),
-            Column("to (fs)", lambda limit: f"{limit.fit.longest:g}"),
-        ]
-        for step in self.steps:
+        lines = []
+        for limit in self.limits:
+            fit = limit.fit
+            line = {short[key]: cell for key, cell in key_cells(limit.values).items()}
+            line["average"] = limit.title
+            line["limit"] = fit.describe_limit()
+            line["chi²/dof"] = f"{fit.chi2:.2g}/{fit.freedom}" if fit.freedom else None
+            line["to (fs)"] = f"{fit.longest:g}"
+            for step in self.steps:
+                bias = limit.bias(step)
+                line[f"bias at {step:g} fs"] = None if bias is None else format_signed(*bias)
+            lines.append(line)
+        return report_of(lines)
 
-            def bias(limit: Limit, step: float = step) -> str | None:
-                return format_signed(*at) if (at := limit.bias(step)) else None
-
-            columns.append(Column(f"bias at {step:g} fs", bias))
-        return Table(columns, self.limits)
-
-    def as_columns(self) -> Table:
-        """The table of extrapolation.csv."""
-
-        def limit_and_error(limit: Limit) -> list[float | None]:
-            return [nine_digits(limit.fit.limit), nine_digits(limit.fit.limit_error)]
-
-        def chi2(limit: Limit) -> float | None:
-            return nine_digits(limit.fit.chi2) if limit.fit.freedom else None
-
-        columns = [
-            *key_columns(self.keys),
-            Column("average", lambda limit: limit.quantity),
-            Column("integrator", lambda limit: limit.method),
-            Column("order", lambda limit: limit.fit.order),
-            *with_error("limit", limit_and_error, "limit error"),
-            Column("chi2", chi2),
-            Column("degrees of freedom", lambda limit: limit.fit.freedom),
-            Column("longest step in fit (fs)", lambda limit: limit.fit.longest),
-        ]
-        for step in self.steps:
-
-            def bias(limit: Limit, step: float = step) -> list[float | None]:
-                return list(map(nine_digits, limit.bias(step) or ()))
-
-            columns += with_error(f"bias at {step:g} fs", bias, f"bias at {step:g} fs error")
-        return Table(columns, self.limits)
+    def lines(self) -> list[dict[str, Any]]:
+        """The lines of extrapolation.csv."""
+        lines = []
+        for limit in self.limits:
+            fit = limit.fit
+            line = key_cells(limit.values)
+            line["average"] = limit.quantity
+            line["integrator"] = limit.method
+            line["order"] = fit.order
+            line["limit"] = nine_digits(fit.limit)
+            line["limit error"] = nine_digits(fit.limit_error)
+            line["chi2"] = nine_digits(fit.chi2) if fit.freedom else None
+            line["degrees of freedom"] = fit.freedom
+            line["longest step in fit (fs)"] = fit.longest
+            for step in self.steps:
+                name = f"bias at {step:g} fs"
+                bias, error = limit.bias(step) or (None, None)
+                line[name] = nine_digits(bias)
+                line[f"{name} error"] = nine_digits(error)
+            lines.append(line)
+        return lines
 
 
 def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
@@ -234,7 +223,7 @@ def write_limits(folder: Path, limits: Limits, command: str) -> list[str]:
     if not limits.limits:
         return []
     add_to_folder(folder, FILES)
-    limits.as_columns().write(folder / FILES[0], csv.QUOTE_NONNUMERIC)
+    report_of(limits.lines()).write(folder / FILES[0], csv.QUOTE_NONNUMERIC)
     write_figure(folder / FILES[1], lambda: _figure(limits), f"{limits.name}: {limits.title}")
     write_page(folder / FILES[2], lambda: _page(limits, command))
     return [name for name in FILES if (folder / name).is_file()]

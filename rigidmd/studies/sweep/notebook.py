@@ -8,7 +8,7 @@ from rigidmd.view.page import notes, table
 
 @html_of.register
 def sweep_html(sweep: Table) -> str:
-    titles, rows = sweep.main_columns().shown()
+    titles, rows = sweep.brief().shown()
     about = f"a sweep over {', '.join(sweep.keys) or 'no keys'}, in {sweep.folder}"
     failed = [f"{point}: {why}" for point, why in sweep.failed.items()]
     return framed("sweep", about, table(titles, rows) + notes(failed))

@@ -30,6 +30,7 @@ from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError, op
 from rigidmd.io.folder import elsewhere
 from rigidmd.run.resume import (
     NOT_COMPARED,
+    describe_differences,
     differences,
     file_digest,
     input_digests,
@@ -311,18 +312,12 @@ def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> None:
 def _differences_between(earlier: Manifest, now: Manifest) -> list[str]:
     """Differences that make another sweep: the keys that vary, values of other keys, files."""
     if earlier.keys != now.keys:
-        before, after = (
-            " and ".join(map(", ".join, manifest.keys.values())) for manifest in (earlier, now)
-        )
+        before = " and ".join(map(", ".join, earlier.keys.values()))
+        after = " and ".join(map(", ".join, now.keys.values()))
         return [f"it varies {before}, not {after}"]
-    problems = []
-    for key, values in differences(earlier.common, now.common).items():
-        before, after = (value if value == "left out" else shorten_repr(value) for value in values)
-        problems.append(f"{key} is {after}, there {before}")
-    changed = differences(earlier.inputs, now.inputs)
-    problems += [f"the file of {key} has changed" for key in changed]
+    values = differences(now.common, earlier.common)
     digests = {point.folder: point.scene_sha256 for point in earlier.points}
-    return problems or [
+    return describe_differences(values, differences(now.inputs, earlier.inputs)) or [
         f"a file that {point.folder} reads has changed"
         for point in now.points
         if digests.get(point.folder, point.scene_sha256) != point.scene_sha256

@@ -1,8 +1,8 @@
 """The running of points. A point is a process of `rigidmd run --resume` in its folder.
 
-Threads wait for these processes: those of an executor of this process, or those of the workers of
-a cluster of dask.distributed with a common file system. Processes write their messages to files,
-which this module reads; a file tells them to stop.
+The threads of an executor wait for these processes, in this process or in the workers of a cluster
+of dask.distributed with a common file system. Messages of points are in files, which this module
+reads; another file requests that points stop.
 """
 
 import re
@@ -12,6 +12,7 @@ import time as clock
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, wait
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -46,54 +47,53 @@ THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 PROGRESS = re.compile(r"  (\S+) of (\S+) \S+, ")
 
 
-def run_words(manifest: Manifest, point: SweepPoint, trust: Sequence[str]) -> list[str]:
+class Circumstances(NamedTuple):
+    """What all points of a sweep have in common, on any machine with its file system."""
+
+    sweep: Manifest  # without points
+    trust: Sequence[str]
+    threads: int
+    working_directory: str
+    outputs: Path  # folder for messages, and of the file STOP
+    ends_at: float | None  # `time.time()` at which all has to have ended
+
+
+def run_words(sweep: Manifest, point: SweepPoint, trust: Sequence[str]) -> list[str]:
     """The command that runs a point, or continues it."""
-    resume = "--resume" if manifest.has_checkpoints else "--force"
-    folder = str((manifest.folder / point.folder).absolute())
-    words = ["rigidmd", "run", manifest.scene, "-o", folder, resume]
-    for key, value in manifest.overrides(point.values).items():
+    resume = "--resume" if sweep.has_checkpoints else "--force"
+    words = ["rigidmd", "run", sweep.scene, "-o"]
+    words += [str((sweep.folder / point.folder).absolute()), resume]
+    for key, value in sweep.overrides(point.values).items():
         words += ["--set", format_override(key, value)]
     for path in trust:
         words += ["--trust", str(Path(path).absolute())]
     return words
 
 
-class PointTask(NamedTuple):
-    """A point to run, on any machine with the file system of the sweep."""
-
-    folder: Path
-    scene: str
-    overrides: dict[str, Any]
-    sha256: str  # digest of its scene
-    command: list[str]
-    threads: int
-    working_directory: str
-    outputs: Path  # folder for messages, and of the file STOP
-    ends_at: float | None  # `time.time()` at which it has to have ended
-
-
-def run_point(task: PointTask) -> tuple[int, float]:
+def run_point(point: SweepPoint, common: Circumstances) -> tuple[int, float]:
     """Run a point. Returns its exit code and the seconds that it took. Raises RigidMDError."""
-    began, command = clock.monotonic(), task.command
-    if _requested_signal(task):
+    began, sweep, outputs = clock.monotonic(), common.sweep, common.outputs
+    words = run_words(sweep, point, common.trust)
+    if _requested_signal(outputs):
         return BY_SIGNAL + signal.SIGTERM, 0.0
-    if task.ends_at is not None:
-        seconds_left = task.ends_at - clock.time()
+    if common.ends_at is not None:
+        seconds_left = common.ends_at - clock.time()
         if seconds_left <= 0:
             return OUT_OF_TIME, 0.0
-        command = [*command, "--walltime", format_walltime(seconds_left)]
-    if digest_of(Scene.read(task.scene, task.overrides)) != task.sha256:
+        words += ["--walltime", format_walltime(seconds_left)]
+    scene = Scene.read(sweep.scene, sweep.overrides(point.values))
+    if digest_of(scene) != point.scene_sha256:
         raise RigidMDError(
-            f"{task.scene} or a file that it reads has changed since the sweep began"
+            f"{sweep.scene} or a file that it reads has changed since the sweep began"
         )
-    wait_for_folder(task.folder)
-    python = python_process("-m", "rigidmd.core.bound_process", *command)
-    with (task.outputs / task.folder.name).open("wb") as output:
+    wait_for_folder(sweep.folder / point.folder)
+    python = python_process("-m", "rigidmd.core.bound_process", *words)
+    with (outputs / point.folder).open("wb") as output:
         # In a separate session: Ctrl-C goes only to its parent, which stops it with a checkpoint
         process = subprocess.Popen(
             python["args"],
-            env=python["env"] | dict.fromkeys(THREADS, str(task.threads)),
-            cwd=task.working_directory,
+            env=python["env"] | dict.fromkeys(THREADS, str(common.threads)),
+            cwd=common.working_directory,
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=output,
@@ -102,7 +102,7 @@ def run_point(task: PointTask) -> tuple[int, float]:
     sent = 0
     with process:
         while process.poll() is None:
-            requested = _requested_signal(task)
+            requested = _requested_signal(outputs)
             if requested != sent:
                 process.send_signal(requested)
                 sent = requested
@@ -111,13 +111,12 @@ def run_point(task: PointTask) -> tuple[int, float]:
     return process.returncode, clock.monotonic() - began
 
 
-def _requested_signal(task: PointTask) -> int:
-    """The signal that a point has to get; 0 for none. Without the folder of messages its sweep has
-    ended."""
-    if not task.outputs.is_dir():
-        return signal.SIGTERM
-    stop = task.outputs / STOP
-    return int(stop.read_text()) if stop.exists() else 0
+def _requested_signal(outputs: Path) -> int:
+    """The signal that points have to get; 0 for none. Without the folder their sweep has ended."""
+    stop = outputs / STOP
+    if stop.exists():
+        return int(stop.read_text())
+    return 0 if outputs.is_dir() else signal.SIGTERM
 
 
 def wait_for_folder(folder: Path, timeout: float = LOCK_TIMEOUT) -> None:
@@ -182,47 +181,30 @@ def run_points(
         for_table = min(FOR_TABLE, FOR_TABLE_FRACTION * walltime)
         ends_at = clock.time() + checked_walltime(walltime) - for_table
     signals: list[int] = []
-    with _hidden_folder(manifest.folder.absolute()) as outputs:
+    folder = manifest.folder.absolute()
+    # Files in use may stay when the temporary folder is removed
+    with TemporaryDirectory(prefix=".points-", dir=folder, ignore_cleanup_errors=True) as name:
+        outputs = Path(name)
 
         def stop(number: int) -> None:
             signals.append(number)
             at_once = signals.count(signal.SIGINT) > 1
             write_text(outputs / STOP, str(int(signal.SIGKILL if at_once else signal.SIGTERM)))
 
-        def submit(point: SweepPoint) -> Future:
-            task = PointTask(
-                manifest.folder.absolute() / point.folder,
-                manifest.scene,
-                manifest.overrides(point.values),
-                point.scene_sha256,
-                run_words(manifest, point, trust),
-                threads,
-                str(Path.cwd()),
-                outputs,
-                ends_at,
-            )
-            return executor.submit(run_point, task)
-
+        alone = replace(manifest, points=[])
+        alone.folder = folder
+        common = Circumstances(alone, trust, threads, str(Path.cwd()), outputs, ends_at)
+        messages = _Messages(outputs, bar, receive)
         with signal_handler(stop, signal.SIGINT, signal.SIGTERM):
-            running = {submit(point): point for point in manifest.unfinished}
-            messages = _Messages(outputs, bar, receive)
+            running = {executor.submit(run_point, p, common): p for p in manifest.unfinished}
             while running:
                 manifest.write()
                 done, _ = wait(running, max(TICK, len(manifest.points) / POINTS_PER_SECOND))
                 messages.read(running.values())
                 for future in done:
-                    _record_end(manifest.folder, running.pop(future), future, messages, signals)
+                    _record_end(folder, running.pop(future), future, messages, signals)
     manifest.write()
     return signals[0] if signals else None
-
-
-@contextmanager
-def _hidden_folder(parent: Path) -> Iterator[Path]:
-    """A folder for the messages of points, whose files may be in use when it is removed."""
-    with writing(parent):
-        folder = TemporaryDirectory(prefix=".points-", dir=parent, ignore_cleanup_errors=True)
-    with folder as name:
-        yield Path(name)
 
 
 class _Messages:

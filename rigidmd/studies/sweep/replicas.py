@@ -20,13 +20,12 @@ from rigidmd.run.record import read_record
 from rigidmd.studies.sweep.figure import write_analyses_figure
 from rigidmd.studies.sweep.folder import (
     Manifest,
-    SweepPoint,
     describe_values,
     point_name,
     read_manifest,
     short_keys,
 )
-from rigidmd.studies.sweep.table import Measured, SweepRow, Table
+from rigidmd.studies.sweep.table import Measured, SweepRow, Table, report_of
 from rigidmd.studies.sweep.windows import is_of_windows, write_mean_force
 
 ANALYSES = "analysis.csv"
@@ -93,21 +92,18 @@ def _analyse_combinations(
     short = short_keys(manifest.keys)
     combinations = []
     table = Table(manifest.folder, [], [], [], together=manifest.keys)
-    count = len(manifest.points_in("finished"))
-    done = 0
+    begun, count = 0, len(manifest.points)
     for values, points in manifest.combinations():
-        finished = [point for point in points if point.state == "finished"]
-        if not finished:
+        folders = [manifest.folder / point.folder for point in points if point.state == "finished"]
+        if not folders:
             continue
+        together = manifest.folder / point_name(values, short)
 
-        def show(part: float, name: str, done: int = done, weight: int = len(finished)) -> None:
-            progress((done + weight * part) / count, name)
+        def show(part: float, name: str, begun: int = begun) -> None:
+            progress((begun + part) / count, name)
 
-        runs, output = _analyse_replicas(
-            manifest.folder, point_name(values, short), finished, start, analyse, show
-        )
-        title = describe_values(values, short)
-        combinations.append(Combination(title, runs, *output[1:]))
+        runs, output = _analyse_replicas(folders, together, start, analyse, show)
+        combinations.append(Combination(describe_values(values, short), runs, *output[1:]))
         measured: dict[str, Measured] = {
             value.header: (value.value, value.error)
             for result in output.results
@@ -115,50 +111,43 @@ def _analyse_combinations(
             if value.value is not None
         }
         table.rows.append(SweepRow(values, {None: measured}, runs))
-        done += len(finished)
+        table.columns += [header for header in measured if header not in table.columns]
+        begun += len(points)
     table.keys[:] = table.rows[0].values
-    table.columns[:] = dict.fromkeys(name for row in table.rows for name in row.runs[None])
     if table.columns:
         add_to_folder(manifest.folder, [ANALYSES])
-        table.as_columns().write(manifest.folder / ANALYSES, csv.QUOTE_NONNUMERIC)
+        report_of(table.lines()).write(manifest.folder / ANALYSES, csv.QUOTE_NONNUMERIC)
     if table.keys and len(table) > 1:
         write_analyses_figure(table, manifest.name)
     return combinations
 
 
 def _analyse_replicas(
-    sweep: Path,
-    name: str,
-    points: list[SweepPoint],
-    start: float | None,
-    analyse: Analyse,
-    progress: Progress,
+    folders: list[Path], together: Path, start: float | None, analyse: Analyse, progress: Progress
 ) -> tuple[int, AnalysisOutput]:
     """Analyses of each run of a combination, written into its folder; and of all of them together,
-    written into a folder of this name if there are several. What fails of one run or of one
-    analysis does not end the others. Returns the number of runs too."""
+    written into another folder if there are several. What fails of one run or of one analysis does
+    not end the others. Returns the number of runs too."""
     members: list[RigidFrames] = []
     failed: dict[str, str] = {}
     output = AnalysisOutput({}, [], {}, [])
 
     def show(part: float, of: str, k: int, label: str) -> None:
-        progress((k + part) / (len(points) + 1), f"{label} {of}")
+        progress(k + part, f"{label} {of}")
 
-    for k, point in enumerate(points):
-        folder = sweep / point.folder
+    for k, folder in enumerate(folders):
         try:
             frames = frames_of_folder(read_record(folder), start)
-            shown = partial(show, k=k, label=point.folder)
+            shown = partial(show, k=k, label=folder.name)
             output = analyse(folder, as_runs(frames), progress=shown)
         except RigidMDError as error:
-            failed[point.folder] = str(error)
+            failed[folder.name] = str(error)
             continue
-        every = -(-frames.size * len(points) // MOST_NUMBERS)
+        every = -(-frames.size * len(folders) // MOST_NUMBERS)
         members.append(frames if every == 1 else frames[::every].copied())
     if len(members) > 1:
-        folder = sweep / name
-        with writing(folder, "made"):
-            folder.mkdir(exist_ok=True)
-        shown = partial(show, k=len(points), label="all runs:")
-        output = analyse(folder, Runs(tuple(members)), progress=shown)
+        with writing(together, "made"):
+            together.mkdir(exist_ok=True)
+        shown = partial(show, k=len(folders) - 1, label="all runs:")
+        output = analyse(together, Runs(tuple(members)), progress=shown)
     return len(members), output._replace(failed=failed | output.failed)

@@ -5,7 +5,6 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -203,7 +202,7 @@ def write_slurm_script(
         count=len(lines),
         name=in_comment(manifest.name),
         job=f"{as_word(manifest.name)}-sweep",
-        array=format_ranges(list(lines)),
+        array=",".join(map(str, lines)),
         threads=threads,
         time=format_walltime(walltime),
         folder=folder.replace("%", "%%"),  # Slurm replaces %j and others
@@ -216,10 +215,3 @@ def write_slurm_script(
     )
     write_text(Path(script), text)
     return Path(script), len(lines)
-
-
-def format_ranges(numbers: Sequence[int]) -> str:
-    """Ascending numbers as Slurm's --array has them: 0-3,7."""
-    runs = groupby(enumerate(numbers), key=lambda pair: pair[1] - pair[0])
-    ends = [[pair[1] for pair in run] for _, run in runs]
-    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in ends)

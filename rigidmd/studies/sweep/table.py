@@ -1,9 +1,10 @@
 """The table of a sweep: a line for each combination of values with means and errors over its
 replicas."""
 
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite, nan
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from rigidmd.core.display import Displayed
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
 from rigidmd.errors import RigidMDError
-from rigidmd.io.write import Column, nine_digits, with_error
+from rigidmd.io.write import Column, nine_digits
 from rigidmd.io.write import Table as ReportTable
 from rigidmd.run.record import Record, read_record
 from rigidmd.studies.sweep.folder import SEED, Manifest, short_keys, value_name
@@ -123,37 +124,37 @@ class Table(Displayed):
             import pandas
         except ImportError:
             raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
-        table = self.as_columns()
-        rows = list(map(table.values, table.rows))
-        return pandas.DataFrame(rows, columns=[column.header for column in table.columns])
+        return pandas.DataFrame(self.lines())
 
-    def as_columns(self) -> ReportTable:
-        """Values of keys, number of runs, and each column with its error: the table of
-        sweep.csv."""
-        columns = [*key_columns(self.keys), Column("runs", lambda row: row.count)]
-        for name in self.columns:
+    def lines(self) -> list[dict[str, Any]]:
+        """The lines of sweep.csv: values of keys, number of runs, and each column with its
+        error."""
+        with_error = {name for name in self.columns if self.has_error(name)}
+        lines = []
+        for row in self.rows:
+            line = key_cells(row.values) | {"runs": row.count}
+            for name in self.columns:
+                mean, error = row[name]
+                line[name] = nine_digits(mean)
+                if name in with_error:
+                    line[f"{name} error"] = nine_digits(error)
+            lines.append(line)
+        return lines
 
-            def digits(row: SweepRow, name: str = name) -> list[float | None]:
-                return list(map(nine_digits, row[name]))
-
-            pair = with_error(name, digits, f"{name} error")
-            columns += pair if self.has_error(name) else pair[:1]
-        return ReportTable(columns, self.rows)
-
-    def main_columns(self) -> ReportTable:
+    def brief(self) -> ReportTable:
         """The table that is printed and displayed: keys, number of runs, and the main columns with
         their errors."""
-        columns = []
-        for key, short in short_keys(self.keys).items():
-            columns.append(Column(short, lambda row, key=key: value_name(row.values[key])))
-        columns.append(Column("runs", lambda row: str(row.count)))
-        for name in [*self.shown(), *self.earlier_densities()]:
-
-            def text(row: SweepRow, name: str = name) -> str:
-                return format_with_error(*row[name]) if isfinite(row[name][0]) else "-"
-
-            columns.append(Column(SHORT.get(name, name), text))
-        return ReportTable(columns, self.rows)
+        short = short_keys(self.keys)
+        lines = []
+        for row in self.rows:
+            line = {short[key]: value_name(value) for key, value in row.values.items()}
+            line["runs"] = str(row.count)
+            for name in [*self.shown(), *self.earlier_densities()]:
+                mean, error = row[name]
+                text = format_with_error(mean, error) if isfinite(mean) else "-"
+                line[SHORT.get(name, name)] = text
+            lines.append(line)
+        return report_of(lines)
 
     def shown(self) -> list[str]:
         """The main columns that it has."""
@@ -164,14 +165,18 @@ class Table(Displayed):
         return [column for column in self.columns if column.endswith(f": {DENSITY}")]
 
 
-def key_columns(keys: Iterable[str]) -> list[Column]:
-    """The columns of the values of the keys of a combination."""
+def report_of(lines: Sequence[dict[str, Any]]) -> ReportTable:
+    """A table of lines with the same headers."""
+    headers = lines[0] if lines else ()
+    return ReportTable([Column(header, itemgetter(header)) for header in headers], lines)
 
-    def cell(row: Any, key: str) -> Any:
-        value = row.values[key]
-        return value if type(value) in (int, float, str) else value_name(value)
 
-    return [Column(key, lambda row, key=key: cell(row, key)) for key in keys]
+def key_cells(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of the keys of a combination, as cells of a file."""
+    return {
+        key: value if type(value) in (int, float, str) else value_name(value)
+        for key, value in values.items()
+    }
 
 
 def table_of(manifest: Manifest, with_analyses: bool = False) -> Table:
