@@ -476,6 +476,7 @@ RENAMED = {
     "accuracy_table": "studies.accuracy.accuracy:table_text",
     "stability_table": "studies.stability.report:table_text",
     "stability_conclusions": "studies.stability.report:conclusions",
+    "SweepTable": "studies.sweep.table:Table",
     "tree_ahead": "forces.neighbors.tree:ahead",
 }
 
@@ -523,6 +524,7 @@ MODULES = {
     "reading_process": "io.formats.through_mdanalysis",
     "watch": "run.checks",
     "wave_vectors": "forces.ewald.direct_sum",
+    "sweep_figure": "studies.sweep.figure",
     "sweep_points": "studies.sweep.points",
 }
 

@@ -23,6 +23,7 @@ from support import (
     Axis,
     FolderLock,
     SweepRow,
+    SweepTable,
     axis_label,
     extrapolate,
     format_override,
@@ -36,6 +37,7 @@ from support import (
     registry,
     short_keys,
     summarise_run,
+    sweep_figure,
     sweep_points,
     sweeping,
     value_name,
@@ -600,6 +602,22 @@ timestep_fs = 5
 )
 def test_axes_have_units_and_name_the_keys_that_vary_together(key, together, label):
     assert axis_label(key, together) == label
+
+
+@pytest.mark.parametrize("errors", [0.5, None])
+def test_a_figure_shows_all_points_of_all_curves(errors, tmp_path):
+    """Curves with errors are displaced, which must not move them out of the panel."""
+    rows = [
+        SweepRow({"a.b_K": x, "word": word}, {None: {"x": (x + shift, errors)}})
+        for x in (300.0, 280.0, 290.0)
+        for word, shift in (("one", 0.0), ("two", 40.0))
+    ]
+    drawn = sweep_figure.draw_table(SweepTable(tmp_path, ["a.b_K", "word"], rows, ["x"]), ["x"])
+    (axis,) = drawn.axes
+    assert axis.get_xlim()[0] <= 280 < 300 <= axis.get_xlim()[1] < 310
+    assert axis.get_ylim()[0] <= 280 < 340 <= axis.get_ylim()[1] < 350
+    assert axis.lines[0].get_xdata().tolist() == [280, 290, 300]
+    assert [text.get_text() for text in drawn.legends[0].texts] == ["word = one", "word = two"]
 
 
 def test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run():

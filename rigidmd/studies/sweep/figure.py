@@ -82,7 +82,7 @@ def write_sweep_figure(table: Table, name: str) -> None:
         runs = f"{min(counts)}" if len({*counts}) == 1 else f"{min(counts)} to {max(counts)}"
         over = f"means over {runs} runs, with" if max(counts) > 1 else "with"
         title = f"{name}: {'' if table.keys else 'each run, and '}{over} one standard error"
-    write_figure(table.folder / FIGURE, lambda: _figure(table, columns), title)
+    write_figure(table.folder / FIGURE, lambda: draw_table(table, columns), title)
 
 
 def write_analyses_figure(table: Table, name: str) -> None:
@@ -92,7 +92,7 @@ def write_analyses_figure(table: Table, name: str) -> None:
     if columns:
         add_to_folder(table.folder, [ANALYSES_FIGURE])
         title = f"{name}: measured by analyses, with one standard error"
-        write_figure(table.folder / ANALYSES_FIGURE, lambda: _figure(table, columns), title)
+        write_figure(table.folder / ANALYSES_FIGURE, lambda: draw_table(table, columns), title)
 
 
 def axis_label(key: str, together: Iterable[str]) -> str:
@@ -145,7 +145,7 @@ def _is_number(value: Any) -> bool:
     return type(value) in (int, float)
 
 
-def _figure(table: Table, columns: list[str]):
+def draw_table(table: Table, columns: list[str]):
     """A panel for each column against the first key with numbers, else the first key; without keys
     against the seed."""
     rows = [row for row in table.rows if row.runs]
@@ -171,7 +171,7 @@ def _figure(table: Table, columns: list[str]):
         if numbers and all(float(value).is_integer() for value in values):
             axis.locator_params(axis="x", integer=True)
         elif not numbers and max(len(value_name(value)) for value in values) > LONG_WORD:
-            axis.tick_params(axis="x", rotation=30)
+            axis.tick_params(axis="x", rotation=20)
     add_legend(figure, axes)
     return figure
 
@@ -198,9 +198,10 @@ def _draw(axis: Any, curves: dict[str, list[SweepRow]], key: str, column: str) -
         style = curve_style(k) | {"lw": 0.9, "ms": 3.5, "capsize": 2.5, "elinewidth": 0.9}
         if key == SEED:
             style["ls"] = "none"
+        curve = axis.errorbar(x, means, np.nan_to_num(errors), label=label, **style)
         if np.isfinite(errors).any():
-            style["transform"] = axis.transData + offset
-        axis.errorbar(x, means, np.nan_to_num(errors), label=label, **style)
+            for artist in curve.get_children():
+                artist.set_transform(artist.get_transform() + offset)
         drawn += [*means[np.isfinite(means)]]
     if drawn and min(drawn) > 0 and max(drawn) > DECADES * min(drawn):
         axis.set_yscale("log")

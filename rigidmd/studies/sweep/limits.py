@@ -119,23 +119,19 @@ def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
     key : that key, or one that varies together with it; scene : of one of the points
     """
     first = next((first for first, together in manifest.keys.items() if key in together), None)
-    table, *name, end = key.split(".") if key.count(".") == 2 else ("", "", "")
     stages = scene.stages if isinstance(scene, MolecularScene) else ()
-    named = [k for k, stage in enumerate(stages) if name[0] in (str(k), stage.label)]
     last = max((k for k, stage in enumerate(stages) if not stage.is_minimisation), default=0)
-    if first is not None and (table, end) == ("stages", "timestep_fs") and last in named:
+    label = stages[last].label if stages else ""
+    usual = f"stages.{last}.timestep_fs"
+    if first is not None and key in (usual, f"stages.{label}.timestep_fs"):
         return first, last
     if first is None:
         varied = ", ".join(key for keys in manifest.keys.values() for key in keys)
         problem = f"is not varied; this sweep varies {varied}"
-    elif (table, end) != ("stages", "timestep_fs") or not named:
-        problem = "is not the time step of a stage of molecules"
+    elif key.startswith("stages.") and key.endswith(".timestep_fs"):
+        problem = f"is not the step of the stage whose averages are taken, the last one, {label}"
     else:
-        problem = (
-            "is not the step of the stage whose averages are taken, the last one,"
-            f" {stages[last].label}"
-        )
-    usual = f"stages.{last}.timestep_fs"
+        problem = "is not the time step of a stage of molecules"
     advice = f"give it a key such as --set {usual}=1,2,4 {OPTION} {usual}"
     raise SceneError(OPTION, [f"{key} {problem}; {advice}"])
 

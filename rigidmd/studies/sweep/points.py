@@ -81,8 +81,7 @@ def run_point(point: SweepPoint, common: Circumstances) -> tuple[int, float]:
         if seconds_left <= 0:
             return OUT_OF_TIME, 0.0
         words += ["--walltime", format_walltime(seconds_left)]
-    scene = Scene.read(sweep.scene, sweep.overrides(point.values))
-    if digest_of(scene) != point.scene_sha256:
+    if not _is_unchanged(point, common):
         raise RigidMDError(
             f"{sweep.scene} or a file that it reads has changed since the sweep began"
         )
@@ -109,6 +108,17 @@ def run_point(point: SweepPoint, common: Circumstances) -> tuple[int, float]:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(POLL_INTERVAL)
     return process.returncode, clock.monotonic() - began
+
+
+def _is_unchanged(point: SweepPoint, common: Circumstances) -> bool:
+    """Whether the scene of a point is the one that was checked. A worker in another directory would
+    not find its files, and does not check it."""
+    if str(Path.cwd()) != common.working_directory:
+        return True
+    with suppress(RigidMDError):
+        scene = Scene.read(common.sweep.scene, common.sweep.overrides(point.values))
+        return digest_of(scene) == point.scene_sha256
+    return False
 
 
 def _requested_signal(outputs: Path) -> int:
@@ -188,12 +198,15 @@ def run_points(
 
         def stop(number: int) -> None:
             signals.append(number)
+            if signals.count(signal.SIGINT) > 2:  # a cluster may not answer
+                raise KeyboardInterrupt
             at_once = signals.count(signal.SIGINT) > 1
             write_text(outputs / STOP, str(int(signal.SIGKILL if at_once else signal.SIGTERM)))
 
         alone = replace(manifest, points=[])
         alone.folder = folder
-        common = Circumstances(alone, trust, threads, str(Path.cwd()), outputs, ends_at)
+        trusted = [str(Path(path).absolute()) for path in trust]
+        common = Circumstances(alone, trusted, threads, str(Path.cwd()), outputs, ends_at)
         messages = _Messages(outputs, bar, receive)
         with signal_handler(stop, signal.SIGINT, signal.SIGTERM):
             running = {executor.submit(run_point, p, common): p for p in manifest.unfinished}

@@ -25,7 +25,7 @@ from rigidmd.studies.sweep.folder import (
     read_manifest,
     short_keys,
 )
-from rigidmd.studies.sweep.table import Measured, SweepRow, Table, report_of
+from rigidmd.studies.sweep.table import SweepRow, Table, measured_values, report_of
 from rigidmd.studies.sweep.windows import is_of_windows, write_mean_force
 
 ANALYSES = "analysis.csv"
@@ -104,12 +104,7 @@ def _analyse_combinations(
 
         runs, output = _analyse_replicas(folders, together, start, analyse, show)
         combinations.append(Combination(describe_values(values, short), runs, *output[1:]))
-        measured: dict[str, Measured] = {
-            value.header: (value.value, value.error)
-            for result in output.results
-            for value in result.values
-            if value.value is not None
-        }
+        measured = measured_values(output.results)
         table.rows.append(SweepRow(values, {None: measured}, runs))
         table.columns += [header for header in measured if header not in table.columns]
         begun += len(points)

@@ -1,7 +1,7 @@
 """The table of a sweep: a line for each combination of values with means and errors over its
 replicas."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite, nan
 from operator import itemgetter
@@ -194,7 +194,7 @@ def table_of(manifest: Manifest, with_analyses: bool = False) -> Table:
             try:
                 results = summarise_run(read_record(folder))
                 if with_analyses:
-                    results |= _values_of_analyses(folder)
+                    results |= measured_values(read_table(folder).values())
             except RigidMDError as error:
                 table.failed[point.folder] = str(error)
                 continue
@@ -205,9 +205,14 @@ def table_of(manifest: Manifest, with_analyses: bool = False) -> Table:
     return table
 
 
-def _values_of_analyses(folder: Path) -> dict[str, Measured]:
-    values = [value for entry in read_table(folder).values() for value in entry.values]
-    return {value.header: (value.value, value.error) for value in values if value.value is not None}
+def measured_values(results: Iterable[Any]) -> dict[str, Measured]:
+    """The values of results of analyses by their headers."""
+    return {
+        value.header: (value.value, value.error)
+        for result in results
+        for value in result.values
+        if value.value is not None
+    }
 
 
 def summarise_run(record: Record) -> dict[str, Measured]:
@@ -256,8 +261,7 @@ def _summarise_motion(record: Record) -> dict[str, Measured]:
             results[f"{name} largest"] = float(np.abs(values).max()), None
             continue
         unit = BODY_COLUMNS[name].unit if name in BODY_COLUMNS else "1"
-        results[f"{name} mean ({unit})"] = float(values.mean()), None
-        results[f"{name} lowest ({unit})"] = float(values.min()), None
-        results[f"{name} highest ({unit})"] = float(values.max()), None
-        results[f"{name} end ({unit})"] = float(values[-1]), None
+        numbers = values.mean(), values.min(), values.max(), values[-1]
+        for word, number in zip(("mean", "lowest", "highest", "end"), numbers, strict=True):
+            results[f"{name} {word} ({unit})"] = float(number), None
     return results

@@ -48,20 +48,19 @@ def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, dict[str, Any]]:
     folder, points = manifest.folder, manifest.points_in("finished")
     if not points:
         raise OutputError(f"{folder}: no point of the sweep has finished")
+    keys = manifest.keys.keys() - {SEED}
+    restraints = {match[1] for key in keys if (match := KEY.fullmatch(key))}
+    others = [key for key in keys if not KEY.fullmatch(key)]
+    problem = ""
     if not is_of_windows(manifest):
         problem = f"a sweep over the distance of a restraint, such as {DISTANCE}"
-        raise OutputError(f"{folder}: pmf needs {problem}")
-    restraints = set()
-    for key in manifest.keys.keys() - {SEED}:
-        restraint = KEY.fullmatch(key)
-        if restraint is None:
-            problem = f"windows that differ by their restraint alone, not by {key}"
-            raise OutputError(f"{folder}: pmf needs {problem}")
-        restraints.add(int(restraint[1]))
-    if len(restraints) > 1:
+    elif others:
+        problem = f"windows that differ by their restraint alone, not by {others[0]}"
+    elif len(restraints) > 1:
         problem = f"windows of one restraint; the sweep varies {len(restraints)}"
+    if problem:
         raise OutputError(f"{folder}: pmf needs {problem}")
-    (k,) = restraints
+    k = int(restraints.pop())
     windows, temperatures, uses = zip(
         *(_window(folder / point.folder, k) for point in points), strict=True
     )
