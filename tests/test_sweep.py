@@ -233,7 +233,7 @@ def test_all_combinations_with_keys_that_go_together():
 
 
 def test_cores_are_full(monkeypatch):
-    monkeypatch.setattr(sweeping, "cores", lambda: 8)
+    monkeypatch.setattr(sweeping, "MOST_THREADS", 8)
     assert sweeping.jobs_and_threads(24, None, None) == (8, 1)
     assert sweeping.jobs_and_threads(3, None, None) == (3, 2)
     assert sweeping.jobs_and_threads(24, 2, None) == (2, 4)

@@ -110,15 +110,14 @@ def axis_label(key: str, together: Iterable[str]) -> str:
 def _drawn_columns(table: Table) -> list[str]:
     """Columns that are drawn: the density instead of the pressure where a barostat moves the
     box."""
-    columns = table.shown()
+    columns = table.main_columns()
+    omitted = []
     if DENSITY in columns:
         changes = table.error(DENSITY) > CHANGES * table[DENSITY]
-        refused = PRESSURE if changes.any() else DENSITY
-        columns = [column for column in columns if column != refused]
-    columns += table.earlier_densities()
-    if len(columns) > MOST_PANELS:
-        columns = [column for column in columns if column != DRIFT]
-    return columns[:MOST_PANELS]
+        omitted.append(PRESSURE if changes.any() else DENSITY)
+    if len(columns) - len(omitted) > MOST_PANELS:
+        omitted.append(DRIFT)
+    return [column for column in columns if column not in omitted][:MOST_PANELS]
 
 
 def panels(titles: Sequence[str], across: int = ACROSS, width: float = 4.4, height: float = 3.0):

@@ -93,7 +93,8 @@ def parse_axis(text: str) -> Axis:
 def _words_and_ranges(listed: str, text: str) -> list[Any]:
     """The values of a list that is not TOML. Raises SceneError."""
     if re.search(r"[\[\]{}\"']", listed):
-        raise _error(text, ": brackets or quotation marks do not match")
+        advice = "put texts that contain them into quotation marks"
+        raise _error(text, f": brackets or quotation marks do not match; {advice}")
     values: list[Any] = []
     for piece in map(str.strip, listed.split(",")):
         if not piece:

@@ -1,6 +1,5 @@
 """`rigidmd sweep`: its folder is opened, its points run here, or commands for them are written."""
 
-import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rigidmd.assemble.user_code.trust import trust as trust_file
+from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import UNSAFE, as_word, in_comment
 from rigidmd.core.process import OUT_OF_TIME
@@ -56,11 +56,6 @@ code=$?
 [ $code -eq {again} ] && exec sbatch --array="$SLURM_ARRAY_TASK_ID" {script}
 exit $code
 """
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
@@ -122,10 +117,9 @@ def open_existing_sweep(folder: Path) -> Iterator[Manifest]:
 def jobs_and_threads(count: int, jobs: int | None, threads: int | None) -> tuple[int, int]:
     """Points at a time, and threads of each, so that all cores have work. Given numbers are
     kept."""
-    most = cores()
     if jobs is None:
-        jobs = max(1, min(most // (threads or 1), count))
-    return jobs, threads or max(1, most // jobs)
+        jobs = max(1, min(MOST_THREADS // (threads or 1), count))
+    return jobs, threads or max(1, MOST_THREADS // jobs)
 
 
 def sweep(

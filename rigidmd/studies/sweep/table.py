@@ -149,20 +149,18 @@ class Table(Displayed):
         for row in self.rows:
             line = {short[key]: value_name(value) for key, value in row.values.items()}
             line["runs"] = str(row.count)
-            for name in [*self.shown(), *self.earlier_densities()]:
+            for name in self.main_columns():
                 mean, error = row[name]
                 text = format_with_error(mean, error) if isfinite(mean) else "-"
                 line[SHORT.get(name, name)] = text
             lines.append(line)
         return report_of(lines)
 
-    def shown(self) -> list[str]:
-        """The main columns that it has."""
-        return [name for name in (*MAIN, *MAIN_OF_BODY) if name in self.columns]
-
-    def earlier_densities(self) -> list[str]:
-        """Columns of densities of stages before the last one."""
-        return [column for column in self.columns if column.endswith(f": {DENSITY}")]
+    def main_columns(self) -> list[str]:
+        """The columns that are printed and drawn: the main ones, and the densities of stages before
+        the last one."""
+        earlier = [column for column in self.columns if column.endswith(f": {DENSITY}")]
+        return [name for name in (*MAIN, *MAIN_OF_BODY) if name in self.columns] + earlier
 
 
 def report_of(lines: Sequence[dict[str, Any]]) -> ReportTable:
