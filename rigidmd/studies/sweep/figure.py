@@ -22,6 +22,7 @@ from rigidmd.studies.sweep.table import (
     DENSITY,
     DRIFT,
     PRESSURE,
+    SHORT,
     SweepRow,
     Table,
     report_of,
@@ -33,7 +34,7 @@ from rigidmd.studies.sweep.table import (
 CHANGES = 1e-9
 MOST_PANELS = 4
 ANALYSES_FIGURE, MOST_VALUES = "analysis.png", 12  # its number of panels
-ACROSS, MOST_NAMED = 2, 20  # panels in a row; curves in the legend
+MOST_NAMED = 20  # curves in the legend
 SPREAD = 1 / 36  # inches between neighbouring curves with errors, so that none hides another
 LONG_WORD = 12  # letters of a value from which on the values are written at an angle
 #: Ratio of the largest to the smallest value from which on the axis is logarithmic; values that
@@ -120,40 +121,38 @@ def _drawn_columns(table: Table) -> list[str]:
     return [column for column in columns if column not in omitted][:MOST_PANELS]
 
 
-def panels(titles: Sequence[str], across: int = ACROSS, width: float = 4.4, height: float = 3.0):
+def _panels(titles: Sequence[str]):
     """A figure, and its panels with these titles."""
-    figure, axes = panel_grid(len(titles), across, width, height, 0.4)
+    figure, axes = panel_grid(len(titles), 2 if len(titles) <= MOST_PANELS else 3, 4.4, 3.0, 0.4)
     for axis, title in zip(axes, titles, strict=True):
         axis.set_title(title, loc="left", fontsize=9, color=INK)
         open_axis(axis, labelsize=8)
     return figure, axes
 
 
-def add_legend(figure: Any, axes: Sequence[Any]) -> None:
-    """Name the curves of all panels once, if there are several and not too many."""
-    handles = {}
-    for axis in axes:
-        curves, labels = axis.get_legend_handles_labels()
-        handles |= dict(zip(labels, curves, strict=True))
-    if 1 < len(handles) <= MOST_NAMED:
+def _add_legend(figure: Any, axis: Any) -> None:
+    """Name the curves of one panel, which all have, if there are several and not too many."""
+    handles, labels = axis.get_legend_handles_labels()
+    if 1 < len(labels) <= MOST_NAMED:
         style = {"ncols": 4, "frameon": False, "fontsize": 8, "labelcolor": INK}
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", **style)
+        figure.legend(handles, labels, loc="outside lower center", **style)
 
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float)
 
 
-def draw_table(table: Table, columns: list[str]):
+def draw_table(table: Table, columns: list[str], connected: bool = True):
     """A panel for each column against the first key with numbers, else the first key; without keys
     against the seed."""
     rows = [row for row in table.rows if row.runs]
     numbers = [key for key in table.keys if all(_is_number(row.values[key]) for row in rows)]
     key = [*numbers, *table.keys, SEED][0]
-    figure, axes = panels(columns)
+    figure, axes = _panels([SHORT.get(column, column) for column in columns])
     if key == SEED:
         for axis, column in zip(axes, columns, strict=True):
             _draw_band(axis, *rows[0][column])
+        connected = False
         rows = [SweepRow({SEED: seed}, {seed: run}) for seed, run in rows[0].runs.items()]
         numbers = [SEED]
     if numbers:
@@ -165,13 +164,13 @@ def draw_table(table: Table, columns: list[str]):
         curves.setdefault(label, []).append(row)
     values = [row.values[key] for row in rows]
     for axis, column in zip(axes, columns, strict=True):
-        _draw(axis, curves, key, column)
+        _draw(axis, curves, key, column, {} if connected else {"ls": "none"})
         axis.set_xlabel(axis_label(key, table.together.get(key, ())), fontsize=9, color=INK)
         if numbers and all(float(value).is_integer() for value in values):
             axis.locator_params(axis="x", integer=True)
         elif not numbers and max(len(value_name(value)) for value in values) > LONG_WORD:
             axis.tick_params(axis="x", rotation=20)
-    add_legend(figure, axes)
+    _add_legend(figure, axes[0])
     return figure
 
 
@@ -182,7 +181,9 @@ def _draw_band(axis: Any, mean: float, error: float | None) -> None:
     axis.axhspan(mean - error, mean + error, color=FAINT, alpha=0.25, lw=0, zorder=0)
 
 
-def _draw(axis: Any, curves: dict[str, list[SweepRow]], key: str, column: str) -> None:
+def _draw(
+    axis: Any, curves: dict[str, list[SweepRow]], key: str, column: str, line: dict[str, Any]
+) -> None:
     """Draw a column against a key, a curve for each label."""
     from matplotlib.transforms import ScaledTranslation  # slow to import
 
@@ -195,9 +196,7 @@ def _draw(axis: Any, curves: dict[str, list[SweepRow]], key: str, column: str) -
         shift = SPREAD * (k - (len(curves) - 1) / 2)
         offset = ScaledTranslation(shift, 0, axis.figure.dpi_scale_trans)
         style = curve_style(k) | {"lw": 0.9, "ms": 3.5, "capsize": 2.5, "elinewidth": 0.9}
-        if key == SEED:
-            style["ls"] = "none"
-        curve = axis.errorbar(x, means, np.nan_to_num(errors), label=label, **style)
+        curve = axis.errorbar(x, means, np.nan_to_num(errors), label=label, **style | line)
         if np.isfinite(errors).any():
             for artist in curve.get_children():
                 artist.set_transform(artist.get_transform() + offset)

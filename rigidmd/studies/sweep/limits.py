@@ -13,14 +13,24 @@ from rigidmd.analysis.files import read_table
 from rigidmd.core.statistics import format_signed
 from rigidmd.engines.samples import COLUMNS
 from rigidmd.errors import SceneError
-from rigidmd.figures.style import INK, curve_style, write_figure
+from rigidmd.figures.style import curve_style, write_figure
 from rigidmd.io.folder import SCENE, add_to_folder
 from rigidmd.io.write import Table, nine_digits
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, Together, extrapolate, means_of_runs
-from rigidmd.studies.sweep.figure import add_legend, panels
+from rigidmd.studies.sweep.figure import draw_table
 from rigidmd.studies.sweep.folder import Manifest, describe_values, point_name, short_keys
-from rigidmd.studies.sweep.table import DRIFT, MAIN, SHORT, Measured, key_cells, report_of, table_of
+from rigidmd.studies.sweep.table import (
+    DRIFT,
+    MAIN,
+    SHORT,
+    Measured,
+    SweepRow,
+    key_cells,
+    report_of,
+    table_of,
+)
+from rigidmd.studies.sweep.table import Table as SweepTable
 from rigidmd.view.page import code, items, page, plain, section, table, wide, write_page
 
 OPTION = "--extrapolate"
@@ -242,31 +252,32 @@ def _figure(limits: Limits):
     """A panel for each of the main averages: means with error bars, the fit, and the limit with its
     error at 0."""
     of_log = [column.header for column in COLUMNS.values()]
+
+    def rank(name: str) -> int:
+        return MAIN.index(name) if name in MAIN else len(MAIN) + (name in of_log)
+
     quantities = dict.fromkeys(limit.quantity for limit in limits.limits)
-    of_analyses = [name for name in quantities if name not in of_log and name not in MAIN]
-    ordered = [name for name in MAIN if name in quantities]
-    shown = [*dict.fromkeys([*ordered, *of_analyses, *quantities])][:MOST_PANELS]
-    figure, axes = panels([SHORT.get(name, name) for name in shown], 3, 3.7, 2.8)
+    shown = sorted(quantities, key=rank)[:MOST_PANELS]
+    rows: dict[tuple[str, float], SweepRow] = {}
+    for limit in limits.limits:
+        for point in limit.points:
+            row = SweepRow({limits.key: point.timestep} | limit.values, {None: {}})
+            row = rows.setdefault((limit.label, point.timestep), row)
+            row.runs[None][limit.quantity] = point.mean, point.error
+    means = SweepTable(Path(), [limits.key, *limits.keys], list(rows.values()), shown)
+    figure = draw_table(means, shown, connected=False)
     labels = list(dict.fromkeys(limit.label for limit in limits.limits))
     for limit in limits.limits:
         if limit.quantity in shown:
-            style = curve_style(labels.index(limit.label))
-            _draw(axes[shown.index(limit.quantity)], limit, style)
-    for axis in axes:
-        axis.set_xlim(left=0)
-        axis.ticklabel_format(axis="y", useOffset=False)
-    for axis in axes[-3:]:
-        axis.set_xlabel("time step, fs", fontsize=9, color=INK)
-    add_legend(figure, axes)
+            axis = figure.axes[shown.index(limit.quantity)]
+            _draw_limit(axis, limit.fit, curve_style(labels.index(limit.label)))
     return figure
 
 
-def _draw(axis: Any, limit: Limit, style: dict[str, Any]) -> None:
-    fit = limit.fit
-    style = style | {"ls": "none", "ms": 4, "capsize": 2.5, "elinewidth": 0.9}
-    _, steps, means, errors = zip(*limit.points, strict=True)
-    axis.errorbar(steps, means, errors, label=limit.label, **style)
-    axis.errorbar([0], [fit.limit], [fit.limit_error], mfc="none", clip_on=False, **style)
-    x = np.linspace(0, fit.longest, 60)
+def _draw_limit(axis: Any, fit: BiasFit, style: dict[str, Any]) -> None:
+    bars = {"ls": "none", "ms": 4, "capsize": 2.5, "mfc": "none", "clip_on": False}
+    axis.errorbar([0], [fit.limit], [fit.limit_error], **style | bars)
+    step = np.linspace(0, fit.longest, 60)
     slope = fit.slopes[""][0] if fit.slopes else 0.0
-    axis.plot(x, fit.limit + slope * x**fit.order, color=style["color"], lw=0.9)
+    axis.plot(step, fit.limit + slope * step**fit.order, color=style["color"], lw=0.9)
+    axis.set_xlim(left=0)
