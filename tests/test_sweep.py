@@ -830,6 +830,9 @@ def test_points_end_with_their_sweep(argon, tmp_path):
     sweep.wait()
     wait_for_folder(folder / "seed=1", 60.0)
     assert (folder / "seed=1" / "checkpoint.npz").is_file()
+    assert len(list(folder.glob(".points-*"))) == 1
+    assert cli.main([*command[3:], "--walltime", "0:00:01"]) == 75
+    assert not list(folder.glob(".points-*"))
 
 
 def test_points_that_fail_are_told_and_repeated(argon, tmp_path, capsys):

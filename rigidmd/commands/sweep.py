@@ -187,7 +187,7 @@ def _run(options: Options, manifest: "Manifest") -> int:
             where = f"on the cluster {options.scheduler}"
         with progress_of(left, "points", True) as bar, executor as pool:
             print(f"  {where}, {threads} thread{'s' if threads > 1 else ''} each", flush=True)
-            settings = options.walltime, options.trust, _shown()
+            settings = options.walltime, options.trust, _message_printer()
             stopped = run_points(manifest, pool, bar, threads, *settings)
     _print_results(manifest, options.extrapolate)
     finished, failed = manifest.points_in("finished"), manifest.points_in("failed")
@@ -208,7 +208,7 @@ def _run(options: Options, manifest: "Manifest") -> int:
     return FAILED if manifest.unfinished else 0
 
 
-def _shown() -> Callable[[str, str], None]:
+def _message_printer() -> Callable[[str, str], None]:
     """A function that shows messages of points: warnings and compilations once each, errors
     at once."""
     from tqdm import tqdm

@@ -298,15 +298,13 @@ def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> None:
     elif is_sweep(folder):
         earlier = read_manifest(folder)
         if problems := _differences_between(earlier, fresh):
-            more = len(problems) - MOST_SHOWN
-            shown = [*problems[:MOST_SHOWN], *([f"and {more} more"] if more > 0 else [])]
             raise OutputError(
-                f"{folder} holds a sweep of another scene: {'; '.join(shown)}. {option('force')}"
-                f" begins it anew, {elsewhere()}"
+                f"{folder} holds a sweep of another scene: {'; '.join(problems[:MOST_SHOWN])}."
+                f" {option('force')} begins it anew, {elsewhere()}"
             )
-        points = {point.folder: point for point in (*fresh.points, *earlier.points)}
-        old = [point.folder for point in earlier.points]
-        fresh.points = [points[name] for name in dict.fromkeys([*old, *points])]
+        names = {point.folder for point in earlier.points}
+        new = [point for point in fresh.points if point.folder not in names]
+        fresh.points = earlier.points + new
     fresh.update_states()
 
 

@@ -6,6 +6,7 @@ reads; another file requests that points stop.
 """
 
 import re
+import shutil
 import signal
 import subprocess
 import time as clock
@@ -40,6 +41,7 @@ POINTS_PER_SECOND = 1000  # of a large sweep, in the manifest
 #: Time that is left for table and figure at the end of a wall time: seconds, and at most this
 #: fraction.
 FOR_TABLE, FOR_TABLE_FRACTION = 15.0, 0.1
+OUTPUTS = ".points-"  # start of the name of the folder of messages
 STOP = "stop"  # the file that requests a signal, by its number
 #: Exit codes of runs that finished, or were stopped.
 UNEVENTFUL = (0, OUT_OF_TIME, BY_SIGNAL + signal.SIGINT, BY_SIGNAL + signal.SIGTERM)
@@ -47,7 +49,7 @@ THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 PROGRESS = re.compile(r"  (\S+) of (\S+) \S+, ")
 
 
-class Circumstances(NamedTuple):
+class CommonSettings(NamedTuple):
     """What all points of a sweep have in common, on any machine with its file system."""
 
     sweep: Manifest  # without points
@@ -70,7 +72,7 @@ def run_words(sweep: Manifest, point: SweepPoint, trust: Sequence[str]) -> list[
     return words
 
 
-def run_point(point: SweepPoint, common: Circumstances) -> tuple[int, float]:
+def run_point(point: SweepPoint, common: CommonSettings) -> tuple[int, float]:
     """Run a point. Returns its exit code and the seconds that it took. Raises RigidMDError."""
     began, sweep, outputs = clock.monotonic(), common.sweep, common.outputs
     words = run_words(sweep, point, common.trust)
@@ -110,7 +112,7 @@ def run_point(point: SweepPoint, common: Circumstances) -> tuple[int, float]:
     return process.returncode, clock.monotonic() - began
 
 
-def _is_unchanged(point: SweepPoint, common: Circumstances) -> bool:
+def _is_unchanged(point: SweepPoint, common: CommonSettings) -> bool:
     """Whether the scene of a point is the one that was checked. A worker in another directory would
     not find its files, and does not check it."""
     if str(Path.cwd()) != common.working_directory:
@@ -192,8 +194,9 @@ def run_points(
         ends_at = clock.time() + checked_walltime(walltime) - for_table
     signals: list[int] = []
     folder = manifest.folder.absolute()
-    # Files in use may stay when the temporary folder is removed
-    with TemporaryDirectory(prefix=".points-", dir=folder, ignore_cleanup_errors=True) as name:
+    for abandoned in folder.glob(f"{OUTPUTS}*"):  # of a sweep that was killed
+        shutil.rmtree(abandoned, ignore_errors=True)
+    with TemporaryDirectory(prefix=OUTPUTS, dir=folder, ignore_cleanup_errors=True) as name:
         outputs = Path(name)
 
         def stop(number: int) -> None:
@@ -206,7 +209,7 @@ def run_points(
         alone = replace(manifest, points=[])
         alone.folder = folder
         trusted = [str(Path(path).absolute()) for path in trust]
-        common = Circumstances(alone, trusted, threads, str(Path.cwd()), outputs, ends_at)
+        common = CommonSettings(alone, trusted, threads, str(Path.cwd()), outputs, ends_at)
         messages = _Messages(outputs, bar, receive)
         with signal_handler(stop, signal.SIGINT, signal.SIGTERM):
             running = {executor.submit(run_point, p, common): p for p in manifest.unfinished}
