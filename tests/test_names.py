@@ -5,6 +5,7 @@ import ast
 import re
 import shlex
 import subprocess
+from unittest.mock import patch
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
@@ -183,7 +184,8 @@ def script(folder, name, scene, trust):
     folder.mkdir(parents=True, exist_ok=True)
     manifest = Manifest(name, scene, {}, {}, {}, {}, points)
     manifest.folder = folder
-    path, _ = write_slurm_script(manifest, 3600.0, 1, trust)
+    with patch("rigidmd.studies.sweep.sweeping.trusted_by", lambda sweep, point, trust: trust):
+        path, _ = write_slurm_script(manifest, 3600.0, 1, trust)
     return path.read_text()
 
 

@@ -5,6 +5,7 @@ import csv
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -1061,6 +1062,44 @@ def test_commands_for_any_scheduler(argon, finished, slurm, capsys):
     assert capsys.readouterr().out.splitlines() == lines[1:]
     ours, theirs = Path("my sweep") / "seed=1", finished / "temperature_K=120_seed=1"
     assert (ours / "log.csv").read_bytes() == (theirs / "log.csv").read_bytes()
+
+
+SPRING = """
+from typing import NamedTuple
+
+import rigidmd
+
+
+class Spring(NamedTuple):
+    stiffness: float
+    tied_to_places = True
+
+
+@rigidmd.compiled_force(Spring)
+def add_spring(term, state, load, tally):
+    load.force[0, 0] -= term.stiffness * state.position[0, 0]
+
+
+def spring():
+    return Spring({size})
+"""
+
+
+def test_each_point_trusts_the_file_that_it_runs(argon, tmp_path, capsys):
+    """A sweep over modules, each of which has to be trusted."""
+    text = argon.read_text() + '[[forces.custom]]\nmodule = "one.py"\nname = "spring"\n'
+    (scene := tmp_path / "argon.toml").write_text(text)
+    for name, size in (("one.py", 1.0), ("two.py", 2.0), ("three.py", 3.0)):
+        (tmp_path / name).write_text(SPRING.format(size=size))
+    names = [str(tmp_path / name) for name in ("one.py", "two.py", "three.py")]
+    arguments = ["sweep", str(scene), "--set", f"forces.custom.0.module={names[0]},{names[1]}"]
+    arguments += ["--to", "commands", "-o", str(tmp_path / "s")]
+    trusted = ["--trust", names[0], "--trust", names[1]]
+    assert cli.main([*arguments, *trusted, "--trust", names[2]]) == 2
+    assert "three.py is not a file that [[forces.custom]]" in capsys.readouterr().err
+    assert cli.main([*arguments, *trusted]) == 0
+    for line, name in zip(capsys.readouterr().out.splitlines(), names, strict=False):
+        assert shlex.split(line)[-2:] == ["--trust", name]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rigidmd.assemble.scenes import resolve
-from rigidmd.assemble.user_code.trust import check_trusted
+from rigidmd.assemble.user_code.trust import check_trusted, unused_files
 from rigidmd.core.toml import (
     TOMLDecodeError,
     parse_toml,
@@ -210,11 +210,12 @@ def read_points(path: Path, axes: Sequence[Axis], trusted: Sequence[str] = ()) -
     digest = cache(file_digest)  # each file is read once
     points_of: dict[str, list[str]] = defaultdict(list)  # error -> descriptions of its points
     build_errors: dict[str, RigidMDError | None] = {}  # values without the seed -> error
+    scene, unused = None, list(trusted)
     for values in all_values:
         try:
             scene = Scene.read(path, manifest.overrides(values))
+            unused = unused_files(scene, unused)
             if not manifest.points:
-                check_trusted(scene, trusted)
                 _describe_scene(manifest, scene, digest)
             sha256 = digest_of(scene, digest)
             manifest.points.append(SweepPoint(point_name(values, short), values, sha256))
@@ -231,8 +232,9 @@ def read_points(path: Path, axes: Sequence[Axis], trusted: Sequence[str] = ()) -
         more = f" and {len(points) - 1} more points" if len(points) > 1 else ""
         is_everywhere = 1 < len(points) == len(all_values)
         errors.append(message if is_everywhere else f"at {points[0]}{more}: {message}")
-    if errors:
+    if errors or scene is None:
         raise SceneError(str(path), errors)
+    check_trusted(scene, unused)
     return manifest
 
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 from filelock import FileLock, Timeout
 
+from rigidmd.assemble.user_code.trust import unused_files
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.process import BY_SIGNAL, OUT_OF_TIME, python_process
 from rigidmd.errors import OutputError, RigidMDError, SettingError, describe_error, option
@@ -72,23 +73,32 @@ def run_words(sweep: Manifest, point: SweepPoint, trust: Sequence[str]) -> list[
     return words
 
 
+def trusted_by(sweep: Manifest, point: SweepPoint, trust: Sequence[str]) -> list[str]:
+    """The trusted files that the scene of a point runs."""
+    if not trust:
+        return []
+    unused = unused_files(Scene.read(sweep.scene, sweep.overrides(point.values)), trust)
+    return [path for path in trust if path not in unused]
+
+
 def run_point(point: SweepPoint, common: CommonSettings) -> tuple[int, float]:
     """Run a point. Returns its exit code and the seconds that it took. Raises RigidMDError."""
     began, sweep, outputs = clock.monotonic(), common.sweep, common.outputs
-    words = run_words(sweep, point, common.trust)
+    words, walltime = ["-m", "rigidmd.core.bound_process"], []
     if _requested_signal(outputs):
         return BY_SIGNAL + signal.SIGTERM, 0.0
     if common.ends_at is not None:
         seconds_left = common.ends_at - clock.time()
         if seconds_left <= 0:
             return OUT_OF_TIME, 0.0
-        words += ["--walltime", format_walltime(seconds_left)]
+        walltime = ["--walltime", format_walltime(seconds_left)]
     if not _is_unchanged(point, common):
         raise RigidMDError(
             f"{sweep.scene} or a file that it reads has changed since the sweep began"
         )
     wait_for_folder(sweep.folder / point.folder)
-    python = python_process("-m", "rigidmd.core.bound_process", *words)
+    words += run_words(sweep, point, trusted_by(sweep, point, common.trust))
+    python = python_process(*words, *walltime)
     with (outputs / point.folder).open("wb") as output:
         # In a separate session: Ctrl-C goes only to its parent, which stops it with a checkpoint
         process = subprocess.Popen(

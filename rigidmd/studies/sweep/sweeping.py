@@ -28,7 +28,7 @@ from rigidmd.studies.sweep.plan import (
     read_points,
     with_seeds,
 )
-from rigidmd.studies.sweep.points import THREADS, format_walltime, run_points, run_words
+from rigidmd.studies.sweep.points import THREADS, format_walltime, run_points, run_words, trusted_by
 from rigidmd.studies.sweep.table import Table
 
 #: Time that a run leaves unused at the end of the wall time of its job: seconds, and at most this
@@ -169,7 +169,7 @@ def sweep(
 def commands(manifest: Manifest, trust: Sequence[str]) -> dict[int, str]:
     """The commands of the points that have not finished, for a shell, by their numbers."""
     return {
-        k: shlex.join(run_words(manifest, point, trust))
+        k: shlex.join(run_words(manifest, point, trusted_by(manifest, point, trust)))
         for k, point in enumerate(manifest.points)
         if point.state != "finished"
     }
