@@ -747,7 +747,7 @@ def when_running(folder, act):
                     act(log.parent.name)
                     return
 
-    thread = threading.Thread(target=watch)
+    thread = threading.Thread(target=watch, daemon=True)
     thread.start()
 
     def end():
