@@ -752,7 +752,7 @@ def test_a_trusted_file_that_nothing_names_is_refused(capsys, tmp_path):
         capsys, tmp_path, GOOD, "--trust", own
     )
     assert main(["sweep", str(tmp_path / "bad.toml"), "--set", "seed=1,2", "--trust", own]) == 2
-    assert "names no Python file by module in [[forces.custom]]" in capsys.readouterr().err
+    assert "own.py is not a file that [[forces.custom]]" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

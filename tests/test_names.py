@@ -5,6 +5,7 @@ import ast
 import re
 import shlex
 import subprocess
+from unittest.mock import patch
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
@@ -178,9 +179,10 @@ def test_names_change_no_statement_of_the_script_for_openmm(usual, tmp_path, nam
 def script(folder, name, scene, trust):
     points = [SweepPoint(f"p{k}", {}, "") for k in range(3)]
     folder.mkdir(parents=True, exist_ok=True)
-    path, _ = write_slurm_script(
-        folder, Manifest(name, scene, {}, {}, {}, {}, points), 3600.0, 1, trust, 75
-    )
+    manifest = Manifest(name, scene, {}, {}, {}, {}, points)
+    manifest.folder = folder
+    with patch("rigidmd.studies.sweep.sweeping.trusted_by", lambda sweep, point, trust: trust):
+        path, _ = write_slurm_script(manifest, 3600.0, 1, trust)
     return path.read_text()
 
 
@@ -211,13 +213,15 @@ def test_paths_change_no_word_of_the_script_of_a_job(tmp_path, name, folder, sce
     assert [line.split("=")[0] for line in options[0]] == [
         line.split("=")[0] for line in options[1]
     ]
-    run = next(shlex.split(line) for line in text.splitlines() if line.startswith("rigidmd "))
-    assert run[:7] == [
+    run = next(shlex.split(line) for line in text.splitlines() if line.startswith("1) "))
+    assert run[:9] == [
+        "1)",
         "rigidmd",
-        "sweep",
+        "run",
         scene,
         "-o",
-        str(tmp_path / folder),
+        str(tmp_path / folder / "p1"),
+        "--resume",
         "--trust",
         str(tmp_path.cwd() / trust),
     ]

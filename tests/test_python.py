@@ -693,7 +693,7 @@ def test_messages_name_arguments_of_python_not_options(tmp_path):
         "call rigidmd.trust(": lambda: rigidmd.resolve(
             Scene.read(path, {"forces.custom": [entry]})
         ),
-        "no Python file by module": lambda: rigidmd.sweep(
+        "names by module: it names none": lambda: rigidmd.sweep(
             path, {"seed": [1, 2]}, trust=[tmp_path / "spring.py"]
         ),
         "there is no such file": lambda: rigidmd.trust(tmp_path / "other.py"),

@@ -19,6 +19,7 @@ from rigidmd.compile.machine import CODE_SETTINGS, PROCESSOR, PROCESSOR_FEATURES
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.core.state_file import array_errors
+from rigidmd.core.toml import shorten_text
 from rigidmd.errors import CheckpointError, SceneError, option
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import elsewhere
@@ -128,6 +129,14 @@ def differences(
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
+def describe_differences(values: Mapping[str, tuple[Any, Any]], files: Iterable[str]) -> list[str]:
+    """Phrases: keys with their values now and before, and keys of files that have changed."""
+    changes = []
+    for key, (now, before) in values.items():
+        changes.append(f"{key} is {shorten_text(str(now))}, there {shorten_text(str(before))}")
+    return changes + [f"the file of {key} has changed" for key in files]
+
+
 def _flat(data: Any, name: str = "") -> dict[str, Any]:
     """Dotted key -> value of nested tables, without None."""
     if isinstance(data, list) and any(isinstance(value, Mapping) for value in data):
@@ -162,12 +171,9 @@ def check_same_scene(
                 f"{scene.source}: the run in the folder is already longer, {steps} steps"
             )
     unlike = differences(keys_of(plain(scene), excluded), keys_of(before, excluded))
-    changes = [f"{key} is {now}, there {then}" for key, (now, then) in unlike.items()]
     digests = input_digests(scene)
-    changes += [
-        f"the file of {key} has changed" for key in digests if digests[key] != inputs.get(key)
-    ]
-    if changes:
+    changed = [key for key in digests if digests[key] != inputs.get(key)]
+    if changes := describe_differences(unlike, changed):
         raise CheckpointError(
             f"{scene.source}: is not the scene of the run in the folder: {'; '.join(changes[:8])}. "
             f"{option('force')} begins a new run, {elsewhere()}"

@@ -1,6 +1,7 @@
 """The base class of scenes: reading one from a TOML file or a dictionary, and setting single keys
 of it."""
 
+import json
 import os
 import re
 import shlex
@@ -538,3 +539,25 @@ def parse_override(text: str) -> tuple[str, Any]:
         return key.strip(), parse_toml(f"value = {value}")["value"]
     except TOMLDecodeError:
         return key.strip(), value.strip()
+
+
+def format_override(key: str, value: Any) -> str:
+    """KEY=VALUE of the command line, which `parse_override` reads as this value."""
+    return f"{key}={_format_toml(value)}"
+
+
+def _format_toml(value: Any) -> str:
+    """A value in one line of TOML; empty for None."""
+    match value:
+        case None:
+            return ""
+        case bool():
+            return str(value).lower()
+        case str():
+            return json.dumps(value, ensure_ascii=False)
+        case list() | tuple():
+            return f"[{', '.join(map(_format_toml, value))}]"
+        case Mapping():
+            pairs = (f"{json.dumps(key)} = {_format_toml(part)}" for key, part in value.items())
+            return f"{{{', '.join(pairs)}}}"
+    return repr(value)

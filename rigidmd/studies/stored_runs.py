@@ -16,7 +16,7 @@ from rigidmd.io.folder import FINAL, SWEEP, written_by_runs
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.results import Results
 from rigidmd.run.resume import state_from
-from rigidmd.studies.sweep.folder import read_manifest, state_on_disk
+from rigidmd.studies.sweep.folder import read_manifest
 from rigidmd.studies.sweep.table import Table, table_of
 
 
@@ -42,16 +42,8 @@ def read_run(folder: str | Path) -> Results | Table:
     """
     folder = Path(folder)
     if (folder / SWEEP).is_file():
-        return _read_sweep(folder)
+        return table_of(read_manifest(folder))
     return _results_of(read_record(folder))
-
-
-def _read_sweep(folder: Path) -> Table:
-    """The table of a sweep; the states of its points are read from their folders."""
-    manifest = read_manifest(folder)
-    for point in manifest.points:
-        point.state = state_on_disk(folder, point)
-    return table_of(folder, manifest)
 
 
 def _results_of(record: Record) -> Results:
