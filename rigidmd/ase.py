@@ -308,9 +308,8 @@ class _Assembly(NamedTuple):
     numbers: np.ndarray
     pbc: np.ndarray
     cell: np.ndarray  # (3, 3) for which numbers such as the grid of PME were chosen
-    basis: (
-        np.ndarray
-    )  # (3, 3) integers: edges of the engine's cell in terms of the edges of the atoms' cell
+    # (3, 3) integers: edges of the engine's cell in terms of the edges of the atoms' cell
+    basis: np.ndarray
 
     @property
     def order(self) -> np.ndarray:

@@ -1181,7 +1181,7 @@ def test_every_example_of_an_extension_runs_and_is_short(path, monkeypatch):
     from rigidmd.analysis import registry
 
     monkeypatch.setattr(registry, "KNOWN", dict(registry.KNOWN))
-    assert len(path.read_text().splitlines()) < 40
+    assert len(path.read_text().splitlines()) <= 50
     assert path.read_text().startswith("# ")
     runpy.run_path(str(path), run_name="__main__")
 

@@ -58,7 +58,9 @@ def read_state(path: Path) -> SavedState:
         if reason := memory_shortage(2 * size, f"reading its {format_gigabytes(size)}"):
             raise ValueError(f"not enough memory: {reason}")
         with np.load(path, allow_pickle=False) as data:
-            arrays = {FORMER_NAMES.get(key, key): data[key] for key in data.files}
+            arrays: dict[str, np.ndarray] = {
+                FORMER_NAMES.get(key, key): data[key] for key in data.files
+            }
         schema = int(arrays.pop("schema", 1))
         names = [str(name) for name in arrays.pop("species_names")]
         species = arrays["species"]

@@ -21,9 +21,8 @@ class Model(NamedTuple):
     inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 about an axis without inertia
     inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
     rotor: SplitRotor | ExactRotor | NoRotor
-    keeps_momentum: np.ndarray = np.ones(
-        3, bool
-    )  # (3,) whether each component of the total momentum is conserved
+    # (3,) whether each component of the total momentum is conserved
+    keeps_momentum: np.ndarray = np.ones(3, bool)
 
 
 #: A total momentum below this fraction of the sum of |m v| is rounding.

@@ -33,9 +33,8 @@ class Program(NamedTuple):
     describe: Callable[..., str] = lambda **options: ""  # name and options for reports
     #: A message on options that contradict each other
     option_errors: Callable[..., str] = lambda **options: ""
-    precise: Mapping[
-        str, Any
-    ] = {}  # the options with which `rigidmd verify` compares, unless others are given
+    # the options with which `rigidmd verify` compares, unless others are given
+    precise: Mapping[str, Any] = {}
     thermostat: str | None = None  # its default thermostat in place of rigidmd's
     barostat: str | None = None  # likewise of npt; None if its barostat has no name in a scene
     writer: str = (

@@ -97,9 +97,8 @@ class Sample(NamedTuple):
         float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")
     ]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
-    user_energies: tuple[
-        float, ...
-    ] = ()  # of user-defined forces, kJ/mol; then distances, Å, and OF_TRAJECTORIES
+    # of user-defined forces, kJ/mol; then distances, Å, and OF_TRAJECTORIES
+    user_energies: tuple[float, ...] = ()
 
 
 _HINTS = get_type_hints(Sample, include_extras=True)

@@ -109,9 +109,8 @@ class StepCheck:
             if not np.isfinite(values).all():
                 m = int((~np.isfinite(values).all(axis=1)).argmax())
                 return FailedCheck(f"the {what} on {molecule_label(system, m)} is not finite", m)
-        measures: list[
-            tuple[np.ndarray, float, str]
-        ] = []  # a measure (n,), its limit, a message about its largest value
+        # a measure (n,), its limit, a message about its largest value
+        measures: list[tuple[np.ndarray, float, str]] = []
         if limits.kick and self.thermal > 0:
             size = kicks(model, load, self.thermal, dt * max(map(abs, scheme.kicks)))
             times = f"by {size.max():.3g} times its thermal size (watch.kick = {limits.kick:g})"

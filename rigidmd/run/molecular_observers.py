@@ -95,9 +95,8 @@ class Sampler(Observer):
         self.trajectories = np.zeros(5)  # see `Engine.trajectories`, at the last sample
         if any(stage.is_hybrid for stage in run.scene.stages):
             self.remembers = self.remembers | {"trajectories": np.ndarray}
-        self._begins: dict[
-            int, int
-        ] = {}  # stage -> row of the last sample before it, or of the first
+        # stage -> row of the last sample before it, or of the first
+        self._begins: dict[int, int] = {}
 
     def origin(self, stage: int) -> float | None:
         """Conserved energy (kJ/mol) at the start of a stage: of the last sample before it, or else

@@ -163,9 +163,8 @@ def as_observer(value: Any) -> Observer:
             f"{value!r:.60} is not an observer: it needs an interval and a method see(moment); "
             "rigidmd.Every(interval, function) makes one of a function"
         )
-    observer = type(
-        type(value).__name__, (Observer,), {}
-    )()  # its name is in messages and checkpoints
+    # its name is in messages and checkpoints
+    observer = type(type(value).__name__, (Observer,), {})()
     attributes = {
         name: getattr(value, name)
         for name in dir(Observer)

@@ -40,9 +40,8 @@ class ObservationSchedule:
 
     def __init__(self, observers: Collection[Observer], segment: Segment):
         self._observers, self._last, together = observers, segment.steps, segment.together
-        self._regular: list[
-            tuple[int, int]
-        ] = []  # steps between two calls of each, or 0; steps before the segment
+        # steps between two calls of each, or 0; steps before the segment
+        self._regular: list[tuple[int, int]] = []
         for observer in observers:
             if observer.interval is None:
                 self._regular.append((-(-(observer.steps or 0) // together) * together, 0))

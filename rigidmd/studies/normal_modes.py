@@ -137,19 +137,15 @@ class NormalModes:
     number: np.ndarray  # (k,) of each mode among all d, from 1
     rate: np.ndarray  # (k,) w, rad/ps; 0 of zero modes, negative of unstable modes
     wavenumber: np.ndarray  # (k,) w/(2 pi c), cm⁻¹
-    error: (
-        np.ndarray
-    )  # (k,) cm⁻¹, by the asymmetry of the Hessian or the residual of the vector; NaN of zero modes
-    vector: (
-        np.ndarray
-    )  # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
-    translation: (
-        np.ndarray
-    )  # (k,) fraction of the kinetic energy that is of translation, not of libration
+    # (k,) cm⁻¹, by the asymmetry of the Hessian or the residual of the vector; NaN of zero modes
+    error: np.ndarray
+    # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
+    vector: np.ndarray
+    # (k,) fraction of the kinetic energy that is of translation, not of libration
+    translation: np.ndarray
     weight: np.ndarray  # (k, n) fraction of the kinetic energy in each molecule
-    intensity: (
-        np.ndarray
-    )  # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges
+    # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges
+    intensity: np.ndarray
     total: int  # number of all modes; at the Gamma point those of a unit cell
     cells: int = 0  # number of unit cells, if these are modes at the Gamma point
 
@@ -418,9 +414,8 @@ def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np
 
     high = largest(c.curvature)
     top = max(q @ c.curvature(q) for q in high)
-    low = largest(
-        lambda q: c.relative(top * q) - c.curvature(q)
-    )  # w² near 0 would converge to a fraction of itself
+    # w² near 0 would converge to a fraction of itself
+    low = largest(lambda q: c.relative(top * q) - c.curvature(q))
     vector = np.concatenate([c.translations, low, high])
     image = np.concatenate([0 * c.translations, [c.curvature(q) for q in (*low, *high)]])
     square = (vector * image).sum(axis=1)

@@ -219,9 +219,8 @@ class BodyAnimation:
     def _faces(self, axes, rotation: np.ndarray, origin: np.ndarray) -> None:
         from matplotlib.collections import PolyCollection
 
-        seen = (
-            self.mesh.vertices @ rotation.T + origin
-        ) @ self._view.T  # right, up, towards the eye
+        # right, up, towards the eye
+        seen = (self.mesh.vertices @ rotation.T + origin) @ self._view.T
         light = np.array([-0.5, 0.65, 0.55])
         shown = []
         for face, painted in zip(self.mesh.faces, self.mesh.painted, strict=True):
@@ -269,9 +268,8 @@ class BodyAnimation:
         back = np.flatnonzero((off < 1) & (np.arange(len(off)) > left[0])) if len(left) else left
         if len(back) == 0:
             return float(self.time[-1]), []
-        near = back[
-            np.searchsorted(back, back[-1] - 0.1 * len(off)) :
-        ]  # the best of the last returns
+        # the best of the last returns
+        near = back[np.searchsorted(back, back[-1] - 0.1 * len(off)) :]
         end = float(self.time[near[off[near].argmin()]])
         how = (
             "returns to its start"

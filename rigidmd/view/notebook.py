@@ -130,9 +130,8 @@ def _drawing(drawing: "Picture | None", salt: str, about: str) -> str:
     if drawing is None:
         return ""
     svg = figure(drawing, salt, about).replace("#000000", "var(--ink)")
-    svg = svg.replace(
-        "*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin"
-    )  # not of the rest of the notebook
+    # not of the rest of the notebook
+    svg = svg.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")
     return f'<div class="{"paper" if "<image" in svg else "figure"}">{svg}</div>'
 
 

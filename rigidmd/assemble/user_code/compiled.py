@@ -109,7 +109,7 @@ def _kinetic_energy(system: System, state: State) -> float:
 
 def describe_compile_error(error: CompileError) -> str:
     """Where in the user's code a function cannot be compiled, and why."""
-    text = str(error)
+    text = re.sub(r"\x1b\[[\d;]*m", "", str(error))  # Numba's colours, where colorama is installed
     files = re.findall(r'File "(?!<)([^"]+)", line (\d+)', text)
     of_user = [(file, int(line)) for file, line in files if _is_of_user(file)]
     where = f" ({_quoted(*of_user[0])})" if of_user else ""

@@ -150,9 +150,8 @@ class _Search:
         self.target, self.error = target, error
         self.energy_walk: EnergyWalk | None = None
         self.time = system.span
-        self.slow_factor: dict[
-            str, float
-        ] = {}  # regular error in a longer pilot run over that in the short one
+        # regular error in a longer pilot run over that in the short one
+        self.slow_factor: dict[str, float] = {}
         self.measured: dict[str, Trial] = {}  # the last one of each integrator that has an error
         self._tried: dict[tuple[str, float, float | None], Trial] = {}
 
