@@ -58,9 +58,8 @@ def read_state(path: Path) -> SavedState:
         if reason := memory_shortage(2 * size, f"reading its {format_gigabytes(size)}"):
             raise ValueError(f"not enough memory: {reason}")
         with np.load(path, allow_pickle=False) as data:
-            arrays: dict[str, np.ndarray] = {
-                FORMER_NAMES.get(key, key): data[key] for key in data.files
-            }
+            names_in_file = map(str, data.files)
+            arrays = {FORMER_NAMES.get(name, name): data[name] for name in names_in_file}
         schema = int(arrays.pop("schema", 1))
         names = [str(name) for name in arrays.pop("species_names")]
         species = arrays["species"]
