@@ -20,6 +20,7 @@ import rigidmd
 from rigidmd import Scene, Simulation
 from rigidmd.analysis import registry
 from rigidmd.analysis.built_in.rotation import total_dipole
+from rigidmd.analysis.files import read_table
 from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.assemble.build import build
 from rigidmd.commands import cli
@@ -150,6 +151,11 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     again = json.loads((copy / "analysis.json").read_text())["analyses"]
     assert again["rdf"]["frames_used"]["from_ps"] == pytest.approx(0.1, abs=0.003)
     assert again["rdf"] != found["rdf"] and again["spectrum"] == found["spectrum"]
+    # a file of rigidmd 0.2 has another name for the frames
+    written = (copy / "analysis.json").read_text()
+    (copy / "analysis.json").write_text(written.replace('"frames_used"', '"stretch"'))
+    assert {entry.frames_used.runs for entry in read_table(copy).values()} == {1}
+    (copy / "analysis.json").write_text(written)
     capsys.readouterr()
 
 

@@ -7,7 +7,7 @@ from functools import cache
 
 import mutations
 import pytest
-from mutations import MUTATIONS, ROOT, applied, chosen, main, mutated
+from mutations import MUTATIONS, ROOT, applied, chosen, find_once, main, mutated
 
 
 @cache
@@ -36,6 +36,15 @@ def test_mutations_apply_once_and_name_tests_that_exist():
             if function.partition("[")[0] not in functions_of(name):
                 errors.append(f"{mutation.name}: there is no test {test}")
     assert not errors, "\n".join(errors)
+
+
+def test_code_is_found_whatever_its_line_breaks_and_trailing_commas_are():
+    text = "x = f(\n    a,\n    b,\n) + g(a, b)\n"
+    assert find_once("f(a, b) + g", text).span() == (4, 26)
+    assert find_once("g(a, b)", text).group() == "g(a, b)"
+    for code in ("f(a, c)", "a, b"):
+        with pytest.raises(ValueError, match=r"occurs [02] times"):
+            find_once(code, text)
 
 
 def test_names_are_given_once():

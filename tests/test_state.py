@@ -133,7 +133,7 @@ def test_a_damaged_state_is_refused_in_words(tmp_path, damage):
 
 
 def test_a_state_of_the_first_version_is_read(tmp_path):
-    """It had neither a version nor books; time and work were of one number each."""
+    """It had neither a version nor an energy ledger; time and work were of one number each."""
     state = state_of(np.ones((2, 3)), cell=10 * np.eye(3))
     old = {
         key: getattr(state, key)
@@ -149,3 +149,16 @@ def test_a_state_of_the_first_version_is_read(tmp_path):
     )
     saved = read_state(tmp_path / "s.npz")
     assert same_bits(saved.state[:5], state[:5]) and saved.state.time[NOW] == 0
+
+
+def test_a_state_of_the_second_version_has_other_names(tmp_path):
+    system, _, state = built({"spce": 3}, 20.0, 1)
+    state.energy_ledger[:] = 1.5, -2.0, 0.25
+    write_state(tmp_path / "s.npz", system.saved(state._replace(extra_variables=np.arange(4.0))))
+    with np.load(tmp_path / "s.npz") as data:
+        arrays = {name: data[name] for name in data.files} | {"schema": 2}
+    arrays["books"], arrays["bath"] = arrays.pop("energy_ledger"), arrays.pop("extra_variables")
+    np.savez(tmp_path / "old.npz", **arrays)
+    read = read_state(tmp_path / "old.npz").state
+    assert read.energy_ledger.tolist() == [1.5, -2.0, 0.25]
+    assert read.extra_variables.tolist() == [0.0, 1.0, 2.0, 3.0]

@@ -23,10 +23,11 @@ from support import ROOT, built, same_after_stops, shaken, small_scene
 import rigidmd
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
-from rigidmd.assemble.user_code.compiled import check_compiled_code
+from rigidmd.assemble.user_code.compiled import check_compiled_code, describe_compile_error
 from rigidmd.commands.cli import main
 from rigidmd.compile import kernel, simd
 from rigidmd.compile.cache import CacheIndex
+from rigidmd.compile.kernels import CompileError
 from rigidmd.core import user_modules
 from rigidmd.dynamics.noise import THERMOSTAT, Key, key_of, normals
 from rigidmd.errors import SceneError, SimulationError
@@ -1118,6 +1119,11 @@ def test_an_error_in_a_thermostat_names_its_line_and_the_cause(line, message):
         rigidmd.Simulation(points(), thermostat=with_error(line)).run()
     assert message in str(error.value)
     assert "halving" not in str(error.value)
+
+
+def test_errors_of_numba_have_no_colours():
+    error = CompileError("Failed in nopython mode\n\x1b[1m\x1b[31mNameError: no ramp\x1b[0m")
+    assert describe_compile_error(error) == ": NameError: no ramp"
 
 
 def test_an_index_beyond_an_array_in_a_compiled_force_names_its_line():
