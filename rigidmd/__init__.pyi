@@ -6,8 +6,9 @@ from .assemble.scenes import atoms_of as atoms_of
 from .assemble.scenes import resolve as resolve
 from .assemble.scenes import scene_from_atoms as scene_from_atoms
 from .assemble.user_code.force import Force as Force
-from .assemble.user_code.pair_potential import PairLaw as PairLaw
+from .assemble.user_code.pair_potential import PairPotential as PairPotential
 from .assemble.user_code.pair_potential import pair_law as pair_law
+from .assemble.user_code.pair_potential import pair_potential as pair_potential
 from .assemble.user_code.trust import trust as trust
 from .dynamics.user_kernels import compiled_force as compiled_force
 from .dynamics.user_kernels import compiled_thermostat as compiled_thermostat

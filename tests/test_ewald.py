@@ -79,7 +79,7 @@ def charged_sites(system, state):
     return system.site_positions(state)[on], charge[on], system.sites.molecule[on]
 
 
-# --- the pair law ---------------------------------------------------------------------------------
+# --- the pair potential ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("alpha", "cutoff"), [(0.25, 9.0), (0.35, 9.0), (0.28, 10.0), (0.9, 6.0)])
@@ -738,10 +738,10 @@ def test_lennard_jones_and_real_space_end_apart(truncation, ewald):
     assert found.components["coulomb_self"] == pytest.approx(
         oracle.self - 0.5 * shift * net @ net, rel=1e-11
     )
-    # without its charges the oracle of laws that end is one of Lennard-Jones
-    laws = Oracle(system)
-    laws.charge = np.zeros_like(laws.charge)
-    lj = laws.energy(state.position, state.rotation)[0]
+    # without its charges the oracle of potentials that end is one of Lennard-Jones
+    potentials = Oracle(system)
+    potentials.charge = np.zeros_like(potentials.charge)
+    lj = potentials.energy(state.position, state.rotation)[0]
     assert found.components["lennard_jones"] == pytest.approx(lj, rel=1e-10)
 
 

@@ -733,18 +733,19 @@ def pair_forces_at(argon, charges, r2, found):
         found[k, 1] = radial(charges, r2[k])[1]
 
 
-def switched_laws(name, start):
+def switched_potentials(name, start):
     """Lennard-Jones of one and of two kinds, and charges, between the same sites."""
-    laws = [
+    potentials = [
         lennard_jones(
             np.zeros(1, np.int32), np.full(kinds, 3.4), np.full(kinds, 100.0), 9.0, name, start
         )
         for kinds in (1, 2)
     ]
-    laws = [
-        law._replace(c12=np.full_like(law.c12, 2e9), c6=np.full_like(law.c6, 3e6)) for law in laws
+    potentials = [
+        potential._replace(c12=np.full_like(potential.c12, 2e9), c6=np.full_like(potential.c6, 3e6))
+        for potential in potentials
     ]
-    return *laws, reaction_field(np.zeros(1), 9.0, 78.5, name, start)
+    return *potentials, reaction_field(np.zeros(1), 9.0, 78.5, name, start)
 
 
 def forces_of_products(argon, charges, r):
@@ -760,13 +761,15 @@ def forces_of_products(argon, charges, r):
 @pytest.mark.parametrize("start", [8.1, 5.0, 0.0])
 @pytest.mark.parametrize("name", ["switch", "smooth_switch"])
 def test_a_switched_force_is_that_of_the_product(name, start):
-    """The laws add a polynomial in r to the coefficients of their forces; it is exact."""
-    one, two, charges = switched_laws(name, start)
+    """The potentials add a polynomial in r to the coefficients of their forces; it is exact."""
+    one, two, charges = switched_potentials(name, start)
     r = np.linspace(max(start - 1, 3.0), 9.0, 2001)
     expected = forces_of_products(one, charges, r)
-    for law in (one, two):
+    for potential in (one, two):
         found = np.empty((len(r), 2))
-        pair_forces_at(law.for_slots(1, np.float64), charges.for_slots(1, np.float64), r**2, found)
+        pair_forces_at(
+            potential.for_slots(1, np.float64), charges.for_slots(1, np.float64), r**2, found
+        )
         limit = (
             1e-13 if name == "switch" else 2e-12
         )  # terms of the smooth one are up to 1e4 times their sum
@@ -777,9 +780,9 @@ def test_a_switched_force_is_that_of_the_product(name, start):
 def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
     """The polynomial in r² that mixed precision adds to the force: here in double precision, and
     how far its terms cancel, which single precision would show."""
-    one, _, charges = switched_laws("switch", start)
-    laws = one.for_slots(1, np.float32), charges.for_slots(1, np.float32)
-    corrections = laws[0].correction, laws[1].switched
+    one, _, charges = switched_potentials("switch", start)
+    potentials = one.for_slots(1, np.float32), charges.for_slots(1, np.float32)
+    corrections = potentials[0].correction, potentials[1].switched
     assert all(isinstance(correction, SwitchCorrection) for correction in corrections)
     shape = Unmodified(9.0)
     plain = (
@@ -788,7 +791,7 @@ def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
     )
     r = np.linspace(start - 1, 9.0, 2001)
     found, without = np.empty((2, len(r), 2))
-    pair_forces_at(*laws, r**2, found)
+    pair_forces_at(*potentials, r**2, found)
     pair_forces_at(*plain, r**2, without)
     expected = forces_of_products(one, charges, r)
     before = r < start
@@ -802,11 +805,11 @@ def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
 
 
 @pytest.mark.parametrize("name", TRUNCATIONS)
-def test_what_a_law_does_for_its_ending_is_decided_by_the_ending(name):
+def test_what_a_potential_does_for_its_ending_is_decided_by_the_ending(name):
     """A wide switch has an addend in mixed precision too; a smooth one multiplies the energy there;
     what is no switch has nothing to add."""
     for start, dtype in ((0.0, np.float32), (8.0, np.float64)):
-        one, two, charges = switched_laws(name, start)
+        one, two, charges = switched_potentials(name, start)
         one, two, charges = (
             one.for_slots(1, dtype),
             two.for_slots(1, dtype),

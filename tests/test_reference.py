@@ -21,14 +21,14 @@ from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN
 
 
-def points(positions, edge, **law):
+def points(positions, edge, **potential):
     """Engine and state of LJ points (sigma = epsilon = 1)."""
     n = len(positions)
     sites = CentralSites(
         np.arange(n + 1, dtype=np.int32), np.arange(n, dtype=np.int32)
     )  # as a scene has them
     kind = np.zeros(n, np.int32)
-    made = lennard_jones(kind, np.ones(1), np.ones(1), **law)
+    made = lennard_jones(kind, np.ones(1), np.ones(1), **potential)
     term = pair_forces(made, sites)
     model = Model(kind, np.ones(1), np.ones(1), np.zeros((1, 3)), np.zeros((1, 3)), NoRotor())
     return made, Engine(model, {"lj": term}, skin=0.3), state_of(positions, cell=edge * np.eye(3))
@@ -50,14 +50,14 @@ def test_nist_lennard_jones(reference, config):
     for row in table["rows"]:
         shifted = row["rc"] == "LFS3"
         cutoff = 3.0 if shifted else float(row["rc"])
-        law, engine, state = points(
+        potential, engine, state = points(
             positions, float(table["L"]), cutoff=cutoff, name="force_shift" if shifted else "plain"
         )
         tally = engine.evaluate(state)[1]["lj"]
         assert tally.energy == five_digits(row["U_pair"])
         assert tally.virial.trace() == five_digits(row["W_pair"])
         if not shifted:
-            assert tail(law).energy(table["L"] ** 3) == five_digits(row["U_LRC"])
+            assert tail(potential).energy(table["L"] ** 3) == five_digits(row["U_LRC"])
 
 
 def test_a_cutoff_that_reaches_hundreds_of_clusters():

@@ -1,4 +1,4 @@
-"""Doors: forces, pair laws and thermostats of users, from Python and from scenes; functions of
+"""Doors: forces, pair potentials and thermostats of users, from Python and from scenes; functions of
 vectors."""
 
 import functools
@@ -134,13 +134,13 @@ FORMULAS = {
 
 
 @numba.njit(error_model="numpy")
-def at_distance(law, formula, end, r2):
-    return energy_and_force(law, formula, end, r2)
+def at_distance(potential, formula, end, r2):
+    return energy_and_force(potential, formula, end, r2)
 
 
 @numba.njit(error_model="numpy")
-def in_numbers(law, r2):
-    return of_built_in(law, law.c12, law.c6, r2)
+def in_numbers(potential, r2):
+    return of_built_in(potential, potential.c12, potential.c6, r2)
 
 
 @pytest.mark.parametrize("energy", FORMULAS)
@@ -150,10 +150,10 @@ def test_the_code_of_a_formula_has_the_energy_and_its_derivative(energy):
     assert formula.parameters == tuple(sorted(given))
     own = formula.kind(*formula.numbers(given))
     end = (0.0, 0.0, 0.0, 0.0)
-    law, radial = CustomOneKind(20.0, Unmodified(20.0), own, (), end), formula.radial(given)
+    potential, radial = CustomOneKind(20.0, Unmodified(20.0), own, (), end), formula.radial(given)
     names = {"exp": math.exp, "log": math.log, "sin": math.sin, "cos": math.cos, "sqrt": math.sqrt}
     for r in (2.1, 3.7, 8.5):
-        u, w = at_distance(law, own, end, r * r)
+        u, w = at_distance(potential, own, end, r * r)
         assert u / KJ_PER_MOL == pytest.approx(eval(energy, names | given | {"r": r}), rel=1e-13)
         v, force, slope = radial(r)
         assert (v, force) == pytest.approx((u, w * r), rel=1e-12)
@@ -355,7 +355,7 @@ def test_a_function_needs_to_say_what_its_parameters_are():
 
 
 @pytest.mark.parametrize("name", TRUNCATIONS)
-def test_a_law_ends_as_the_built_in_one(name):
+def test_a_potential_ends_as_the_built_in_one(name):
     theirs = built_in(np.zeros(1, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, 7.5)
     formula, given = formula_of_text(LJ), {"eps": 1.0, "sig": 3.4}
     end = truncation_terms(name, theirs.truncation, formula.radial(given))
@@ -369,7 +369,7 @@ def test_a_law_ends_as_the_built_in_one(name):
 
 
 @pytest.mark.parametrize("name", TRUNCATIONS)
-def test_the_tail_of_a_law_is_that_of_the_built_in_one(name):
+def test_the_tail_of_a_potential_is_that_of_the_built_in_one(name):
     theirs = built_in(np.zeros(10, np.int32), np.array([3.4]), np.array([100.0]), 9.0, name, 7.5)
     radial = formula_of_text(LJ).radial({"eps": 1.0, "sig": 3.4})
     found = tail_of_pair(
@@ -380,11 +380,11 @@ def test_the_tail_of_a_law_is_that_of_the_built_in_one(name):
         tail_of_pair(formula_of_text("1/r**3").radial({}), np.zeros(4), theirs.truncation)
 
 
-# --- pair laws in a system ------------------------------------------------------------------------
+# --- pair potentials in a system ------------------------------------------------------------------------
 
 
-def same_as_built_in(counts, tolerance=1e-13, law=None, **forces):
-    """A law equals the built-in Lennard-Jones of the same models, with mixing and ending."""
+def same_as_built_in(counts, tolerance=1e-13, potential=None, **forces):
+    """A potential equals the built-in Lennard-Jones of the same models, with mixing and ending."""
     scene = small_scene(counts, 25.0, forces={"electrostatics": "none", **forces})
     system, engine, state = built(
         counts, 25.0, spread=0.0, forces={"electrostatics": "none", **forces}
@@ -396,7 +396,7 @@ def same_as_built_in(counts, tolerance=1e-13, law=None, **forces):
         for i, name in enumerate(m.site_names)
         if m.epsilon[i] > 0
     }
-    own = build(scene.with_user_code([(law or rigidmd.pair_law)(given)]))
+    own = build(scene.with_user_code([(potential or rigidmd.pair_potential)(given)]))
     load, tallies = own.engine_of(
         {name: own.terms[name] for name in own.user_terms}, "double"
     ).evaluate(state)
@@ -412,83 +412,95 @@ def same_as_built_in(counts, tolerance=1e-13, law=None, **forces):
 
 
 def from_text(given, **more):
-    return rigidmd.pair_law(LJ, given, **more)
+    return rigidmd.pair_potential(LJ, given, **more)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("truncation", TRUNCATIONS)
-def test_a_law_is_the_built_in_one_in_a_box(truncation):
-    same_as_built_in({"argon": 60}, 1e-12, law=from_text, truncation=truncation)
-    same_as_built_in({"argon": 40, "nitrogen": 30}, 1e-12, law=from_text, truncation=truncation)
+def test_a_potential_is_the_built_in_one_in_a_box(truncation):
+    same_as_built_in({"argon": 60}, 1e-12, potential=from_text, truncation=truncation)
+    same_as_built_in(
+        {"argon": 40, "nitrogen": 30}, 1e-12, potential=from_text, truncation=truncation
+    )
 
 
 @pytest.mark.soak
-def test_a_law_from_a_function_or_a_table_is_the_built_in_one():
+def test_a_potential_from_a_function_or_a_table_is_the_built_in_one():
     def from_function(given):
-        return rigidmd.pair_law(lennard_jones, {key: Pair(**own) for key, own in given.items()})
+        return rigidmd.pair_potential(
+            lennard_jones, {key: Pair(**own) for key, own in given.items()}
+        )
 
     def from_table(given):
         (own,) = given.values()
         r = np.linspace(2.4, 9.5, 2000)
-        return rigidmd.pair_law(
+        return rigidmd.pair_potential(
             table=(r, 4 * own["eps"] * ((own["sig"] / r) ** 12 - (own["sig"] / r) ** 6))
         )
 
-    same_as_built_in({"argon": 40, "nitrogen": 30}, 1e-12, law=from_function)
-    same_as_built_in({"argon": 60}, 1e-6, law=from_table)
+    same_as_built_in({"argon": 40, "nitrogen": 30}, 1e-12, potential=from_function)
+    same_as_built_in({"argon": 60}, 1e-6, potential=from_table)
 
 
 def test_who_interacts_with_which_parameters():
-    def numbers(law, counts={"argon": 3, "krypton": 3}, **forces):  # noqa: B006
-        law = (
-            build(small_scene(counts, 25.0, forces=forces).with_user_code([law]))
-            .terms["pair_law"]
+    def numbers(potential, counts={"argon": 3, "krypton": 3}, **forces):  # noqa: B006
+        potential = (
+            build(small_scene(counts, 25.0, forces=forces).with_user_code([potential]))
+            .terms["pair_potential"]
             .potential
         )
-        return law.parameters, law.interacts
+        return potential.parameters, potential.interacts
 
     both = {"Ar": {"k": 1.0}, "Kr": {"k": 4.0}}
-    parameters, interacts = numbers(rigidmd.pair_law("k/r**9", both))
+    parameters, interacts = numbers(rigidmd.pair_potential("k/r**9", both))
     assert parameters[0] == pytest.approx(100 * np.array([[1.0, 2.0], [2.0, 4.0]]))
     assert interacts.all()
-    parameters, _ = numbers(rigidmd.pair_law("k/r**9", both, mixing={"k": "arithmetic"}, pairs={}))
+    parameters, _ = numbers(
+        rigidmd.pair_potential("k/r**9", both, mixing={"k": "arithmetic"}, pairs={})
+    )
     assert parameters[0, 0, 1] == pytest.approx(250)
-    parameters, _ = numbers(rigidmd.pair_law("k/r**9", both, pairs={("Kr", "Ar"): {"k": 7.0}}))
+    parameters, _ = numbers(
+        rigidmd.pair_potential("k/r**9", both, pairs={("Kr", "Ar"): {"k": 7.0}})
+    )
     assert parameters[0, 0, 1] == parameters[0, 1, 0] == pytest.approx(700)
     parameters, interacts = numbers(
-        rigidmd.pair_law("k/r**9", pairs={("argon.Ar", "Kr"): {"k": 7.0}})
+        rigidmd.pair_potential("k/r**9", pairs={("argon.Ar", "Kr"): {"k": 7.0}})
     )
     assert np.array_equal(interacts, [[0, 1], [1, 0]])
     # as in [[forces.pairs]]: a name means sites of that name, and elements only if no site has it
     parameters, interacts = numbers(
-        rigidmd.pair_law("k/r**9", {"AR": {"k": 1.0}, "argon.AR": {"k": 2.0}})
+        rigidmd.pair_potential("k/r**9", {"AR": {"k": 1.0}, "argon.AR": {"k": 2.0}})
     )
     assert parameters[0] == pytest.approx(200)
     assert interacts.shape == (1, 1)
     one = build(
-        small_scene({"argon": 3}, 25.0).with_user_code([rigidmd.pair_law("k/r**9", {"k": 2.0})])
-    ).terms["pair_law"]
+        small_scene({"argon": 3}, 25.0).with_user_code(
+            [rigidmd.pair_potential("k/r**9", {"k": 2.0})]
+        )
+    ).terms["pair_potential"]
     assert one.potential.interacts.shape == (1, 1)
     with pytest.raises(SceneError, match=r"have no geometric mean"):
-        numbers(rigidmd.pair_law("k/r**9", {"Ar": {"k": 1.0}, "Kr": {"k": -4.0}}))
+        numbers(rigidmd.pair_potential("k/r**9", {"Ar": {"k": 1.0}, "Kr": {"k": -4.0}}))
     with pytest.raises(SceneError, match=r"no site is 'Xe'; there are AR, argon.AR"):
-        numbers(rigidmd.pair_law("k/r**9", {"Xe": {"k": 1.0}}))
+        numbers(rigidmd.pair_potential("k/r**9", {"Xe": {"k": 1.0}}))
     with pytest.raises(SceneError, match=r"(?s)Ar: there is no k.*Ar: l is not a parameter"):
-        numbers(rigidmd.pair_law("k/r**9", {"Ar": {"l": 1.0}}))
+        numbers(rigidmd.pair_potential("k/r**9", {"Ar": {"l": 1.0}}))
     with pytest.raises(SceneError, match="there is no k among its parameters"):
-        numbers(rigidmd.pair_law("k/r**9 + l/r", {"l": 1.0}))
+        numbers(rigidmd.pair_potential("k/r**9 + l/r", {"l": 1.0}))
     with pytest.raises(SceneError, match="mixing: q is not a parameter"):
-        numbers(rigidmd.pair_law("k/r**9", both, mixing={"q": "arithmetic"}))
+        numbers(rigidmd.pair_potential("k/r**9", both, mixing={"q": "arithmetic"}))
     with pytest.raises(SceneError, match="is given twice"):
         numbers(
-            rigidmd.pair_law("k/r**9", pairs={("AR", "KR"): {"k": 1.0}, ("KR", "AR"): {"k": 2.0}})
+            rigidmd.pair_potential(
+                "k/r**9", pairs={("AR", "KR"): {"k": 1.0}, ("KR", "AR"): {"k": 2.0}}
+            )
         )
     with pytest.raises(SceneError, match="switch_start_A would do nothing"):
-        numbers(rigidmd.pair_law("k/r**9", both, truncation="shift", switch_start_A=7.0))
+        numbers(rigidmd.pair_potential("k/r**9", both, truncation="shift", switch_start_A=7.0))
     with pytest.raises(SceneError, match=r"longer than half"):
-        numbers(rigidmd.pair_law("k/r**9", {"k": 1.0}, cutoff_A=13.0))
+        numbers(rigidmd.pair_potential("k/r**9", {"k": 1.0}, cutoff_A=13.0))
     with pytest.raises(SceneError, match="it has no cutoff, and the box is periodic"):
-        numbers(rigidmd.pair_law("k/r**9", {"k": 1.0}, cutoff_A=math.inf))
+        numbers(rigidmd.pair_potential("k/r**9", {"k": 1.0}, cutoff_A=math.inf))
 
 
 def test_parameters_may_come_from_the_model():
@@ -576,8 +588,8 @@ def test_a_table_ends_in_a_wall(tmp_path):
     """Nearer than the first row, value and slope are those of the first row, and the energy rises
     as r⁻¹²."""
     write_argon_table(tmp_path / "argon.csv", first=3.1)
-    law = rigidmd.pair_law(table=str(tmp_path / "argon.csv"))
-    radial = law.formula(9.0).radial({"scale": 1.0})
+    potential = rigidmd.pair_potential(table=str(tmp_path / "argon.csv"))
+    radial = potential.formula(9.0).radial({"scale": 1.0})
     energy, force = argon_energy(3.1)
     below, above = radial(3.1 - 1e-7), radial(3.1 + 1e-7)
     assert below[:2] == pytest.approx(above[:2], rel=1e-5)
@@ -687,9 +699,9 @@ def test_all_errors_of_a_table_are_told_and_its_file_is_in_the_folder(tmp_path):
         ({"table": [1.0]}, "must be a file, or lists"),
     ],
 )
-def test_a_law_that_makes_no_sense_is_told_at_once(arguments, word):
+def test_a_potential_that_makes_no_sense_is_told_at_once(arguments, word):
     with pytest.raises(ValueError, match=word):
-        rigidmd.pair_law(**arguments)
+        rigidmd.pair_potential(**arguments)
 
 
 # --- forces in Python -----------------------------------------------------------------------------
@@ -888,7 +900,7 @@ def test_forces_from_python_exclude_what_they_cannot_go_with():
     with pytest.raises(SceneError, match="forces: for molecules; a single body takes applied"):
         rigidmd.Simulation(top, forces=[Spring()])
     with pytest.raises(SceneError, match="energy is a column of the log"):
-        rigidmd.Simulation(points(), forces=[rigidmd.pair_law("1/r**9", name="energy")])
+        rigidmd.Simulation(points(), forces=[rigidmd.pair_potential("1/r**9", name="energy")])
     with pytest.raises(SceneError, match="thermostat: 3 is neither"):
         rigidmd.Simulation(points(), thermostat=3)
 
@@ -1020,11 +1032,13 @@ def of_strength(p: One, r):
     return STRENGTH * p.k / r, STRENGTH * p.k / r**2
 
 
-def test_a_law_of_a_function_sees_what_the_function_uses_when_the_law_is_made(monkeypatch):
+def test_a_potential_of_a_function_sees_what_the_function_uses_when_the_potential_is_made(
+    monkeypatch,
+):
     made, end = [], (0.0, 0.0, 0.0, 0.0)
     for strength in (1.0, 5.0):
         monkeypatch.setitem(globals(), "STRENGTH", strength)
-        own = rigidmd.pair_law(of_strength, {"D": One(2.0)}).formula(9.0).kind(2.0)
+        own = rigidmd.pair_potential(of_strength, {"D": One(2.0)}).formula(9.0).kind(2.0)
         made.append(
             at_distance(CustomOneKind(20.0, Unmodified(20.0), own, (), end), own, end, 4.0)[0]
         )
@@ -1240,8 +1254,8 @@ def test_langevin_function_of_dipoles_in_a_field_in_python():
 UMBRELLA = {"name": "umbrella", "energy": "0.5*k*(r - r0)**2", "sites": ["AR"]}
 
 
-def of_law(truncation="plain", cutoff=9.0, temperature=298.0, **law):
-    forces = {"cutoff_A": cutoff, "custom": [{"truncation": truncation} | law]}
+def with_potential(truncation="plain", cutoff=9.0, temperature=298.0, **potential):
+    forces = {"cutoff_A": cutoff, "custom": [{"truncation": truncation} | potential]}
     stages = [{"ensemble": "nvt", "temperature_K": temperature, "duration_ps": 0.004}]
     return small_scene({"argon": 4}, 20.0, forces=forces, stages=stages)
 
@@ -1250,35 +1264,37 @@ def of_law(truncation="plain", cutoff=9.0, temperature=298.0, **law):
     ("scene", "words"),
     [
         (
-            of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}),
+            with_potential(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}),
             "umbrella is 121 kJ/mol (49 kT at 298 K) at its cutoff",
         ),
         (
-            of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}, temperature=596.0),
+            with_potential(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}, temperature=596.0),
             "(24 kT at 596 K)",
         ),
         (
-            of_law("shift", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}),
+            with_potential("shift", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}),
             "its force is -44 kJ/mol/Å",
         ),
         (
-            of_law("smooth_switch", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}),
+            with_potential("smooth_switch", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}),
             "with truncation = smooth_switch",
         ),
         (
-            of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 9.0}),
+            with_potential(**UMBRELLA, parameters={"k": 8.0, "r0": 9.0}),
             "where it would change by 1.3e+02 kT",
         ),
         (
-            of_law(name="charge", energy="q*q*1389/r", sites=["AR"], parameters={"q": 0.4}),
+            with_potential(name="charge", energy="q*q*1389/r", sites=["AR"], parameters={"q": 0.4}),
             "charge is 24.7 kJ/mol",
         ),
         (
-            of_law(name="lj", energy="4*e*((s/r)**12 - (s/r)**6)", parameters={"e": 1.0, "s": 3.4}),
+            with_potential(
+                name="lj", energy="4*e*((s/r)**12 - (s/r)**6)", parameters={"e": 1.0, "s": 3.4}
+            ),
             None,
         ),
         (
-            of_law(
+            with_potential(
                 name="lj",
                 energy="4*e*((s/r)**12 - (s/r)**6)",
                 parameters={"e": 1.0, "s": 3.4},
@@ -1287,7 +1303,7 @@ def of_law(truncation="plain", cutoff=9.0, temperature=298.0, **law):
             ),
             "lj is -0.356 kJ/mol (-0.49 kT at 87 K)",
         ),
-        (of_law(name="wca", energy="e*(s/r)**12", parameters={"e": 1.0, "s": 3.4}), None),
+        (with_potential(name="wca", energy="e*(s/r)**12", parameters={"e": 1.0, "s": 3.4}), None),
     ],
 )
 def test_what_a_potential_has_at_its_cutoff_is_told(scene, words):
@@ -1309,7 +1325,7 @@ def test_a_gap_in_a_table_is_refused(gap, with_forces):
     with pytest.raises(
         ValueError, match=r"has a gap from 3\.|has a gap from 4 to 9|forces are not -dE/dr"
     ):
-        rigidmd.pair_law(table=rows).formula(9.0)
+        rigidmd.pair_potential(table=rows).formula(9.0)
 
 
 @pytest.mark.parametrize(
@@ -1318,9 +1334,9 @@ def test_a_gap_in_a_table_is_refused(gap, with_forces):
 def test_the_error_of_a_spline_is_what_it_says(step, with_forces):
     """Compared with the exact energy where it is below ten wells; the estimate is within a factor
     of 6."""
-    formula = rigidmd.pair_law(table=lennard_jones_rows(step)[: 3 if with_forces else 2]).formula(
-        9.0
-    )
+    formula = rigidmd.pair_potential(
+        table=lennard_jones_rows(step)[: 3 if with_forces else 2]
+    ).formula(9.0)
     radial, r = formula.radial({"scale": 1.0}), np.linspace(2.9, 8.99, 2001)
     r = r[argon_energy(r)[0] < 10 * ARGON["epsilon"]]
     off = (
@@ -1335,7 +1351,7 @@ def test_a_table_of_two_parts_or_of_growing_intervals_has_no_gap():
     two = [np.r_[a[fine[0] < 5.0], b[coarse[0] > 5.01]] for a, b in zip(fine, coarse, strict=True)]
     r = np.geomspace(2.6, 9.3, 200)
     for rows in (two, (r, *argon_energy(r))):
-        assert rigidmd.pair_law(table=tuple(rows)).formula(9.0).error < 1e-3
+        assert rigidmd.pair_potential(table=tuple(rows)).formula(9.0).error < 1e-3
 
 
 def test_a_spline_that_is_nonsense_is_refused_and_a_poor_one_told(tmp_path):
@@ -1346,7 +1362,7 @@ def test_a_spline_that_is_nonsense_is_refused_and_a_poor_one_told(tmp_path):
         ValueError,
         match=r"the error of its spline is .* of its deepest energy, .* must be below 0.1",
     ):
-        rigidmd.pair_law(table=(r, wild)).formula(9.0)
+        rigidmd.pair_potential(table=(r, wild)).formula(9.0)
     np.savetxt(tmp_path / "argon.csv", np.column_stack(lennard_jones_rows(0.12)[:2]))
     [told] = build(tabulated(tmp_path, sites=("AR",))).warnings
     assert re.match(
@@ -1359,7 +1375,7 @@ def test_a_huge_energy_in_a_table_is_told_with_its_line(value, tmp_path):
     lines = [f"{x:g} {y:g}" for x, y in zip(*lennard_jones_rows(0.1)[:2], strict=True)]
     (tmp_path / "t.csv").write_text("\n".join([lines[0], f"2.61 {value}", *lines[1:]]))
     with pytest.raises(ValueError, match=r"t.csv: line 2: 2.61 .* has a number above 1e\+30"):
-        rigidmd.pair_law(table=tmp_path / "t.csv")
+        rigidmd.pair_potential(table=tmp_path / "t.csv")
 
 
 @pytest.mark.parametrize("name", ["energy", "time", "tail", "load", "box", "trajectory"])

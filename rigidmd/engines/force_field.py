@@ -187,14 +187,17 @@ def _lennard_jones_kinds(system: System) -> list[list[int]]:
     """The Lennard-Jones kind of each site of each species; -1 for sites without Lennard-Jones
     forces."""
     kinds = [[-1] * len(m.masses) for m in system.species]
-    term, law = system.terms.get("lennard_jones"), _potential(system, "lennard_jones", LennardJones)
-    if law is None or not isinstance(term, PairForces):
+    term, potential = (
+        system.terms.get("lennard_jones"),
+        _potential(system, "lennard_jones", LennardJones),
+    )
+    if potential is None or not isinstance(term, PairForces):
         return kinds
     sites = term.sites
     for k, member in zip(*np.unique(system.model.species, return_index=True), strict=True):
         of_member = slice(sites.first[member], sites.first[member + 1])
         positions = system.species[k].positions_body
-        for kind, offset in zip(law.kind[of_member], sites.offsets()[of_member], strict=True):
+        for kind, offset in zip(potential.kind[of_member], sites.offsets()[of_member], strict=True):
             kinds[k][int(np.linalg.norm(positions - offset, axis=1).argmin())] = int(kind)
     return kinds
 
@@ -301,24 +304,30 @@ def _removed_by_truncation(
     import sympy  # slow to import
     from scipy.integrate import quad
 
-    law = not_none(view.lennard_jones)
+    potential = not_none(view.lennard_jones)
     powers = 4 * epsilon * sigma**12, 4 * epsilon * sigma**6
     nothing = (0.0,) * 4
-    unmodified = law._replace(truncation=Unmodified(inf), terms12=nothing, terms6=nothing)
+    unmodified = potential._replace(truncation=Unmodified(inf), terms12=nothing, terms6=nothing)
     r, energy = _symbolic(lennard_jones_formula(unmodified, *powers, 1.0))
     # expanded, so that 1/r¹² cancels where it is not truncated
     inside = sympy.lambdify(
-        r, sympy.expand(energy - _symbolic(lennard_jones_formula(law, *powers, 1.0))[1])
+        r, sympy.expand(energy - _symbolic(lennard_jones_formula(potential, *powers, 1.0))[1])
     )
     beyond = sympy.lambdify(r, energy)
 
     def removed(distance: float) -> float:
-        return float(inside(max(distance, CONTACT)) if distance <= law.cutoff else beyond(distance))
+        return float(
+            inside(max(distance, CONTACT)) if distance <= potential.cutoff else beyond(distance)
+        )
 
-    start = law.cutoff if isinstance(law.truncation, Unmodified) else law.truncation.start
-    ends = sorted({0.0, float(start), float(law.cutoff)})
+    start = (
+        potential.cutoff
+        if isinstance(potential.truncation, Unmodified)
+        else potential.truncation.start
+    )
+    ends = sorted({0.0, float(start), float(potential.cutoff)})
     parts = [quad(lambda x: x**2 * removed(x), a, b)[0] for a, b in pairwise(ends)]
-    return sum(parts) + quad(lambda x: x**2 * beyond(x), law.cutoff, inf)[0], removed
+    return sum(parts) + quad(lambda x: x**2 * beyond(x), potential.cutoff, inf)[0], removed
 
 
 def _distances_in_molecules(view: ForceFieldView, i: int, j: int) -> Iterator[tuple[float, int]]:

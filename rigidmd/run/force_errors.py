@@ -128,8 +128,10 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
         force = force + cast(Any, engine.workspaces[name]).site_force
     position = np.empty_like(force)
     compute_site_positions(real.sites, state, position)
-    law = cast(ScreenedCoulomb, real.potential)
-    force = force + forces_inside(law.charge, position, real.sites.first, InverseR(law.alpha))
+    potential = cast(ScreenedCoulomb, real.potential)
+    force = force + forces_inside(
+        potential.charge, position, real.sites.first, InverseR(potential.alpha)
+    )
     constants = sum(
         energy for name, energy in system.constants.items() if name.startswith("coulomb")
     )

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import ase
 
     from rigidmd.assemble.user_code.force import Force, HasStage, HasTerm
-    from rigidmd.assemble.user_code.pair_potential import PairLaw
+    from rigidmd.assemble.user_code.pair_potential import PairPotential
     from rigidmd.engines.body_system import BodySystem, Pose
     from rigidmd.engines.observables import Observation
     from rigidmd.engines.protocol import Engine
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from rigidmd.run.molecular import MolecularRun
     from rigidmd.run.schedule import Segment
 
-    UserForce = Force | PairLaw | HasTerm | NamedTuple
+    UserForce = Force | PairPotential | HasTerm | NamedTuple
 
     class Options(TypedDict, total=False):
         """The keyword arguments of `Simulation`, which are described there."""
@@ -112,8 +112,8 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         Seconds from now until the run has to have ended; it stops shortly before, with a checkpoint
     forces
         For molecules, user-defined forces, besides the forces of the scene: `rigidmd.Force`,
-        `rigidmd.pair_law`, terms of classes with `rigidmd.compiled_force`, or objects whose method
-        term(system) makes such a term. At the start forces and torques are compared with
+        `rigidmd.pair_potential`, terms of classes with `rigidmd.compiled_force`, or objects whose
+        method term(system) makes such a term. At the start forces and torques are compared with
         differences of the energy, and the virial with the effect of a strain of the box
     thermostat
         For molecules, a user-defined thermostat for every stage: a NamedTuple of a class with

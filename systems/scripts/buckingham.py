@@ -10,7 +10,7 @@ argon = {
     "B": alpha / distance,
     "C": well * alpha / (alpha - 6) * distance**6,
 }
-potential = rigidmd.pair_law(
+potential = rigidmd.pair_potential(
     "A*exp(-B*r) - C/r**6", {"Ar": argon}, name="buckingham", truncation="switch"
 )
 

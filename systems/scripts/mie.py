@@ -29,7 +29,7 @@ scene = rigidmd.Scene.from_dict(
     }
 )
 # between Ar and Kr: mean sigma, root of eps
-potential = rigidmd.pair_law(mie, {"Ar": Mie(1.0, 3.4), "Kr": Mie(1.4, 3.65)})
+potential = rigidmd.pair_potential(mie, {"Ar": Mie(1.0, 3.4), "Kr": Mie(1.4, 3.65)})
 results = rigidmd.Simulation(scene, forces=[potential]).run()
 print(results["mie"][-1], "kJ/mol; drift", results["drift"][-1])
 assert abs(results["drift"][-1]) < 2e-3 * results["kinetic"][-1]

@@ -4,16 +4,22 @@ become messages."""
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from math import inf
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.assemble.user_code.compiled import describe_compile_error
 from rigidmd.assemble.user_code.cutoffs import check_cutoff
-from rigidmd.assemble.user_code.force import BoundForce, Force, UserForceError, changes_momentum
-from rigidmd.assemble.user_code.pair_potential import PairLaw, pair_law
+from rigidmd.assemble.user_code.force import (
+    BoundTerm,
+    Force,
+    UserForceError,
+    bind_force,
+    changes_momentum,
+)
+from rigidmd.assemble.user_code.pair_potential import PairPotential, pair_potential
+from rigidmd.assemble.user_code.pair_terms import bind_pair_potential
 from rigidmd.assemble.user_code.trust import trusted_module
 from rigidmd.core.plain_text import did_you_mean, distinct
 from rigidmd.dynamics.model import count_degrees_of_freedom
@@ -23,7 +29,7 @@ from rigidmd.engines.samples import IN_LOGS
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
-from rigidmd.forces.parts import Tail, sum_of_tails
+from rigidmd.forces.parts import sum_of_tails
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.forces import CustomForce
 from rigidmd.scene.molecules import name_of
@@ -60,7 +66,7 @@ def _custom(scene: MolecularScene, entry: CustomForce, key: str) -> Any:
     if entry.module is None:
         pairs = {pair.sites: pair.parameters for pair in entry.pairs}
         table = None if entry.table is None else scene.path(entry.table)
-        return pair_law(
+        return pair_potential(
             entry.energy,
             entry.parameters or None,
             table=table,
@@ -115,76 +121,75 @@ def with_user_code(system: System) -> System:
     forces = [*custom_forces(scene), *added]
     force_names = [*(entry.name for entry in scene.forces.custom), *map(name_of, added)]
     names = distinct(force_names, [*system.terms, *system.constants])
-    bound = replace(
-        system, python_forces={}, thermostat=thermostat, user_terms={}, notes=[*system.notes]
-    )
-    bound = replace(bound, warnings=[*system.warnings])
-    terms, tails = {}, [] if system.tail is None else [system.tail]
-    faults = [
+    errors = [
         f"{name} is {RESERVED[name]}; name the force otherwise"
         for name in names
         if name in RESERVED
     ]
+    # a force may add notes in `begin`
+    target = replace(
+        system, thermostat=thermostat, notes=[*system.notes], warnings=[*system.warnings]
+    )
+    bound: dict[str, BoundTerm] = {}
     changed = np.zeros(3, bool)  # whether they may change components of the total momentum
-    for name, made in zip(names, forces, strict=True):
+    for name, force in zip(names, forces, strict=True):
         try:
-            term = _term(made, name, system, bound, tails)
-            if not isinstance(term, PairForces):
-                changed |= changes_momentum(term)
-            terms[name] = term
+            bound[name] = bind(force, target, name)
+            if not isinstance(bound[name].term, PairForces):
+                changed |= changes_momentum(bound[name].term)
         except (SceneError, UserForceError, ValueError) as error:
-            faults += [f"{name}: {fault}" for fault in getattr(error, "errors", [error])]
-    if thermostat is not None and not (
-        type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")
-    ):
+            errors += [f"{name}: {message}" for message in getattr(error, "errors", [error])]
+    if not (thermostat is None or is_thermostat(thermostat)):
         need = (
             "a NamedTuple of a class with rigidmd.compiled_thermostat nor has a method"
             " for_stage(system, k)"
         )
-        faults.append(f"thermostat: {thermostat!r:.60} is neither {need}")
-    if faults:
-        raise SceneError(scene.source, faults)
+        errors.append(f"thermostat: {thermostat!r:.60} is neither {need}")
+    if errors:
+        raise SceneError(scene.source, errors)
+    for name, term in bound.items():
+        target.notes.extend(f"{name}: {note}" for note in term.notes)
+        target.warnings.extend(f"{name} {warning}" for warning in term.warnings)
     if thermostat is not None:
-        bound.notes.append(
+        target.notes.append(
             f"thermostat: {name_of(thermostat)}, from Python, replaces the thermostats of all"
             " stages"
         )
     model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~changed)
-    # Forces computed by Python come first: as long as they are missing, no other need be computed.
-    terms = {name: terms[name] for name in bound.python_forces} | system.terms | terms
+    functions = {name: one.function for name, one in bound.items() if one.function is not None}
+    terms = {name: one.term for name, one in bound.items()}
+    tails = [tail for tail in (system.tail, *(one.tail for one in bound.values())) if tail]
     return replace(
-        bound,
+        target,
         scene=with_momentum_removal(scene, model.keeps_momentum),
-        terms=terms,
+        # Forces computed by Python come first: as long as they are missing, no other need be
+        # computed.
+        terms={name: terms[name] for name in functions} | system.terms | terms,
         model=model,
         freedom=count_degrees_of_freedom(model),
         tail=sum_of_tails(tails),
+        python_forces=functions,
+        user_terms={name: one.description for name, one in bound.items()},
     )
 
 
-def _term(made: Any, name: str, system: System, target: System, tails: list[Tail]) -> NamedTuple:
-    """The term of one object for a system. Its function, description and notes are added to
-    `target`, its tail correction to `tails`. Raises PairPotentialError, ValueError,
-    UserForceError."""
-    if isinstance(made, PairLaw):
-        term, formula, tail, notes, warnings = made.bind(system)
-        if formula.error:
-            target.notes.append(
-                f"{name}: the error of its spline is {formula.error:.1e} of its deepest energy"
-            )
-        target.notes.extend(f"{name}: {note}" for note in notes)
-        target.warnings.extend(f"{name} {warning}" for warning in warnings)
-        tails += [] if tail is None else [tail]
-        cutoff = made.cutoff_A or system.cutoff
-        truncation = made.truncation or system.scene.forces.truncation
-        reach = f"cutoff {cutoff:g} Å, {truncation}" if cutoff < inf else "no cutoff"
-        target.user_terms[name] = f"{formula.text}, {len(term.group)} sites, {reach}"
-        return term
-    if isinstance(made, Force):
-        bound = BoundForce(made, name, target)
-        target.python_forces[name] = bound
-        target.user_terms[name] = f"{type(made).__qualname__}, computed by Python"
-        return bound.term
+def is_thermostat(thermostat: Any) -> bool:
+    """Whether an object is a compiled thermostat of the user, or makes one for each stage."""
+    return type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")
+
+
+def bind(force: Any, system: System, name: str) -> BoundTerm:
+    """Any force of the user in a system. Raises PairPotentialError, ValueError, UserForceError,
+    SceneError."""
+    if isinstance(force, PairPotential):
+        return bind_pair_potential(force, system)
+    if isinstance(force, Force):
+        return bind_force(force, system, name)
+    return _bind_term(force, system)
+
+
+def _bind_term(made: Any, system: System) -> BoundTerm:
+    """A finished term, or an object whose method `term` makes it for a system."""
     if hasattr(made, "term"):
         try:
             made = made.term(system)
@@ -192,18 +197,19 @@ def _term(made: Any, name: str, system: System, target: System, tails: list[Tail
             raise
         except (Exception, SystemExit) as error:  # user code may raise anything
             raise ValueError(f"term(system) raised {describe_error(error)}") from error
-    if isinstance(made, PairForces):  # with a potential that is not a `PairLaw`
+    if isinstance(made, PairForces):  # with a potential that is not a `PairPotential`
         check_cutoff(made.potential.cutoff, system)  # type: ignore[attr-defined]  # every pair potential has a cutoff
-    if not (isinstance(made, PairForces) or type(made) in FORCES):
+    elif type(made) not in FORCES:
         compiled = (
             "a NamedTuple of a class with rigidmd.compiled_force, or an object whose term(system)"
             " makes one"
         )
         raise ValueError(
-            f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_law, {compiled}"
+            f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_potential,"
+            f" {compiled}"
         )
     numbers = ", ".join(
         f"{key} = {x:.6g}" for key, x in made._asdict().items() if isinstance(x, int | float)
     )
-    target.user_terms[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
-    return made
+    kind = type(made).__qualname__
+    return BoundTerm(made, f"{kind} with {numbers}" if numbers else kind)

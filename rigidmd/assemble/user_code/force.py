@@ -3,7 +3,7 @@
 import time as clock
 import traceback
 from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from rigidmd.core.state import State
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError, describe_error
 from rigidmd.forces.fields.python_forces import PythonForces, PythonForcesWorkspace
+from rigidmd.forces.parts import Tail
 from rigidmd.units import KJ_PER_MOL
 
 EVERY = (True, True, True)
@@ -30,6 +31,17 @@ class HasStage(Protocol):
     def for_stage(self, system: System, k: int) -> Any:
         """The thermostat of stage k, a NamedTuple of a class with `compiled_thermostat`."""
         ...
+
+
+class BoundTerm(NamedTuple):
+    """Any user-defined force in a system."""
+
+    term: Any  # a NamedTuple
+    description: str
+    function: "BoundForce | None" = None  # of a term that Python computes
+    tail: Tail | None = None  # of a pair potential, where the scene has forces.tail_correction
+    notes: Sequence[str] = ()
+    warnings: Sequence[str] = ()
 
 
 class UserForceError(SimulationError):
@@ -90,6 +102,12 @@ class Force:
         Torques may be left out. A fourth value is the molecular virial (3, 3), kJ/mol.
         """
         raise NotImplementedError
+
+
+def bind_force(force: Force, system: System, name: str) -> BoundTerm:
+    """The term of a force in a system. Raises UserForceError or ValueError."""
+    function = BoundForce(force, name, system)
+    return BoundTerm(function.term, f"{type(force).__qualname__}, computed by Python", function)
 
 
 class BoundForce:

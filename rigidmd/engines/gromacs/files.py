@@ -315,18 +315,18 @@ def _settings(view: ForceFieldView, k: int) -> str:
 
 
 def _coulomb(view: ForceFieldView) -> dict[str, object]:
-    law, mesh = view.coulomb, view.system.terms.get("coulomb_reciprocal")
+    potential, mesh = view.coulomb, view.system.terms.get("coulomb_reciprocal")
     settings: dict[str, object] = {
         "coulombtype": TRANSLATIONS.of("forces.electrostatics")[view.electrostatics]
     }
-    if isinstance(law, ScreenedCoulomb) and isinstance(mesh, Pme):
-        settings["coulomb-modifier"] = "Potential-shift" if law.shift else "None"
+    if isinstance(potential, ScreenedCoulomb) and isinstance(mesh, Pme):
+        settings["coulomb-modifier"] = "Potential-shift" if potential.shift else "None"
         # GROMACS needs one cutoff; rtol is that of alpha there
-        settings["ewald-rtol"] = f"{float(erfc(law.alpha * view.system.cutoff)):.12g}"
+        settings["ewald-rtol"] = f"{float(erfc(potential.alpha * view.system.cutoff)):.12g}"
         settings |= {f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)} | {
             "pme-order": mesh.order
         }
-    elif isinstance(law, ReactionField):
+    elif isinstance(potential, ReactionField):
         permittivity = view.system.scene.forces.reaction_field_permittivity
         settings["epsilon-rf"] = 0 if permittivity == inf else f"{permittivity:.12g}"
     return settings

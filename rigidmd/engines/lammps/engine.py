@@ -201,22 +201,22 @@ class LammpsEngine(ExternalEngine):
         view = self._view
         charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # with LAMMPS' constant
         names = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None))
-        law = view.coulomb
+        potential = view.coulomb
         names += (
             ["coulomb_real", "coulomb_reciprocal"]
             if view.has_ewald_sum
-            else ["coulomb"] * (law is not None)
+            else ["coulomb"] * (potential is not None)
         )
         energies = dict(zip(names, energy, strict=True))
-        if isinstance(law, ScreenedCoulomb):
-            even = background(float(charge.sum()) ** 2, law.alpha).strength / volume
-            energies["coulomb_reciprocal"] -= self_energy(charge, law.alpha) + even
+        if isinstance(potential, ScreenedCoulomb):
+            even = background(float(charge.sum()) ** 2, potential.alpha).strength / volume
+            energies["coulomb_reciprocal"] -= self_energy(charge, potential.alpha) + even
             if "coulomb_background" in view.system.terms:
                 energies["coulomb_background"] = even
-        elif isinstance(law, DampedShiftedForce):
-            energies["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(
-                charge @ charge
-            )
+        elif isinstance(potential, DampedShiftedForce):
+            energies["coulomb"] -= (
+                0.5 * potential.shift - potential.alpha / np.sqrt(np.pi)
+            ) * float(charge @ charge)
         return {
             name: Tally(float(u), np.zeros((3, 3)) if k else virial)
             for k, (name, u) in enumerate(energies.items())

@@ -238,26 +238,30 @@ def pair_styles(view: ForceFieldView) -> list[PairStyle]:
 
 
 def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
-    law = view.lennard_jones
-    if law is None or not view.epsilon.any():
+    potential = view.lennard_jones
+    if potential is None or not view.epsilon.any():
         return None
-    name = TRANSLATIONS.of("forces.truncation")[view.truncation] if law.cutoff < inf else "lj/cut"
+    name = (
+        TRANSLATIONS.of("forces.truncation")[view.truncation]
+        if potential.cutoff < inf
+        else "lj/cut"
+    )
     pairs = [(i, j) for i, j in np.argwhere(view.epsilon > 0) if i <= j]
-    cutoff = _num(_cutoff(law.cutoff))
+    cutoff = _num(_cutoff(potential.cutoff))
     if name == "table":
         formulas = {}
         for i, j in pairs:
             six = float(view.sigma[i, j]) ** 6
             c6 = 4 * float(view.epsilon[i, j]) * six
-            formulas[(i, j)] = lennard_jones_formula(law, c6 * six, c6, KCAL)
+            formulas[(i, j)] = lennard_jones_formula(potential, c6 * six, c6, KCAL)
         return _tables("lj", formulas, cutoff)
     arguments = cutoff
-    if name in ("lj/gromacs", "lj/mdf") and not isinstance(law.truncation, Unmodified):
-        arguments = f"{_num(law.truncation.start)} {cutoff}"
+    if name in ("lj/gromacs", "lj/mdf") and not isinstance(potential.truncation, Unmodified):
+        arguments = f"{_num(potential.truncation.start)} {cutoff}"
     coefficients = {
         (i, j): f"{_num(view.epsilon[i, j] / KCAL)} {_num(view.sigma[i, j])}" for i, j in pairs
     }
-    if view.truncation == "shift" and law.cutoff < inf:
+    if view.truncation == "shift" and potential.cutoff < inf:
         shifts = f"pair_modify pair {name} shift yes"
     else:
         shifts = ""
@@ -265,21 +269,21 @@ def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
 
 
 def _coulomb(view: ForceFieldView) -> PairStyle | None:
-    law = view.coulomb
-    if law is None:
+    potential = view.coulomb
+    if potential is None:
         return None
     charge = [kind.charge for kind in view.kinds]
     charged = [k for k, q in enumerate(charge) if q != 0]
     pairs = [(i, j) for i in charged for j in charged if i <= j]
-    cutoff, plain = _num(_cutoff(law.cutoff)), dict.fromkeys(pairs, "")
-    if isinstance(law, ScreenedCoulomb):
+    cutoff, plain = _num(_cutoff(potential.cutoff)), dict.fromkeys(pairs, "")
+    if isinstance(potential, ScreenedCoulomb):
         return PairStyle("coul/long", cutoff, plain, modify="pair_modify pair coul/long table 0")
-    if law.cutoff == inf:
+    if potential.cutoff == inf:
         return PairStyle("coul/cut", cutoff, plain)
-    if isinstance(law, DampedShiftedForce):
-        return PairStyle("coul/dsf", f"{_num(law.alpha)} {cutoff}", plain)
+    if isinstance(potential, DampedShiftedForce):
+        return PairStyle("coul/dsf", f"{_num(potential.alpha)} {cutoff}", plain)
     of_pairs = {
-        (i, j): coulomb_formula(law, COULOMB_REAL * charge[i] * charge[j]) for i, j in pairs
+        (i, j): coulomb_formula(potential, COULOMB_REAL * charge[i] * charge[j]) for i, j in pairs
     }
     return _tables("coulomb", of_pairs, cutoff)
 

@@ -223,21 +223,21 @@ class OpenmmEngine(ExternalEngine):
             energies = {"lennard_jones": energy(Group.LENNARD_JONES)}
         else:
             energies = {}
-        view, law = self._view, self._view.coulomb
-        if isinstance(law, ScreenedCoulomb):
-            alpha, charge = law.alpha, view.charge * COULOMB_CHARGE
+        view, potential = self._view, self._view.coulomb
+        if isinstance(potential, ScreenedCoulomb):
+            alpha, charge = potential.alpha, view.charge * COULOMB_CHARGE
             even = background(float(charge.sum()) ** 2, alpha).strength / state.volume
             energies["coulomb_real"] = energy(Group.COULOMB_PAIRS) - self._excluded_energy(
                 state, alpha
             )
-            if law.shift:
+            if potential.shift:
                 energies["coulomb_real"] += energy(Group.STEP_COULOMB)
             energies["coulomb_reciprocal"] = (
                 energy(Group.RECIPROCAL) - self_energy(charge, alpha) - even
             )
             if "coulomb_background" in view.system.terms:
                 energies["coulomb_background"] = even
-        elif law is not None:
+        elif potential is not None:
             energies["coulomb"] = energy(Group.COULOMB_PAIRS)
         return {
             name: Tally(float(u), np.zeros((3, 3)) if k else virial)

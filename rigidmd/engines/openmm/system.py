@@ -45,19 +45,19 @@ PME_ORDER = 5
 def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
     """A grid for splines of an order with the accuracy of the scene's Ewald sum: the grid of the
     scene if the order of its splines is not higher. None if no grid reaches the accuracy."""
-    system, law = view.system, view.coulomb
+    system, potential = view.system, view.coulomb
     pme = system.terms.get("coulomb_reciprocal")
     if isinstance(pme, Pme) and pme.order <= order:
         a, b, c = pme.grid
         return a, b, c
-    if not isinstance(law, ScreenedCoulomb) or system.space.volume == inf:
+    if not isinstance(potential, ScreenedCoulomb) or system.space.volume == inf:
         return None
     charges = charges_in(
         system.species, np.bincount(system.model.species, minlength=len(system.species))
     )
-    real_space = real_error(charges, law.alpha, law.cutoff, system.space.volume)
+    real_space = real_error(charges, potential.alpha, potential.cutoff, system.space.volume)
     error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - real_space**2, 0.0))
-    grid_and_error = pme_grid_for(charges, law.alpha, cell_of(system.space), error, order)
+    grid_and_error = pme_grid_for(charges, potential.alpha, cell_of(system.space), error, order)
     return None if grid_and_error is None else grid_and_error[0]
 
 
@@ -291,20 +291,20 @@ def _openmm_virtual_site(points: list[int], weight: list[float], cross: float) -
 def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
     """The forces of a system with their groups."""
     forces, view = [], particles.view
-    law, coulomb, plain = view.lennard_jones, view.coulomb, _builtin_lennard_jones(view)
+    potential, coulomb, plain = view.lennard_jones, view.coulomb, _builtin_lennard_jones(view)
     has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (
         coulomb is not None and coulomb.cutoff == inf
     )
     together = plain is not None and has_charge_force and not separate
-    if law is not None and view.epsilon.any():
+    if potential is not None and view.epsilon.any():
         if plain is None:
             forces.append((_custom_lennard_jones(particles), Group.LENNARD_JONES))
         elif not together:
-            force = _nonbonded(particles, law.cutoff, np.zeros_like(view.charge), plain)
+            force = _nonbonded(particles, potential.cutoff, np.zeros_like(view.charge), plain)
             forces.append((force, Group.LENNARD_JONES))
         if (
             view.is_periodic
-            and isinstance(law.truncation, Unmodified)
+            and isinstance(potential.truncation, Unmodified)
             and view.truncation == "plain"
         ):
             forces.append((_custom_lennard_jones(particles, step=True), Group.STEP_LENNARD_JONES))
@@ -335,8 +335,8 @@ def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
 def _builtin_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
     """sigma and epsilon of kinds if OpenMM has the Lennard-Jones potential of the scene built in,
     and those of all pairs follow by Lorentz-Berthelot rules, else None."""
-    law = view.lennard_jones
-    if law is None or not (law.cutoff == inf or view.truncation in ("plain", "switch")):
+    potential = view.lennard_jones
+    if potential is None or not (potential.cutoff == inf or view.truncation in ("plain", "switch")):
         return None
     sigma, epsilon = view.sigma.diagonal(), view.epsilon.diagonal()
     same = np.allclose(view.epsilon, np.sqrt(np.outer(epsilon, epsilon)), rtol=ROUNDING, atol=0)
@@ -360,9 +360,9 @@ def _nonbonded(
         sigma, epsilon = lennard_jones
         rows[particles.site, 1] = sigma[view.kind] * NM
         rows[particles.site, 2] = epsilon[view.kind] / KJ_PER_MOL
-        if (law := view.lennard_jones) and isinstance(law.truncation, Switched):
+        if (potential := view.lennard_jones) and isinstance(potential.truncation, Switched):
             force.setUseSwitchingFunction(True)
-            force.setSwitchingDistance(float(law.truncation.start) * NM)
+            force.setSwitchingDistance(float(potential.truncation.start) * NM)
     for row in rows.tolist():
         force.addParticle(*row)
     return force
@@ -394,17 +394,18 @@ def _custom_lennard_jones(particles: Layout, step: bool = False) -> Any:
     """The Lennard-Jones potential as a formula, or its step at the cutoff; linear in c12 and c6,
     from tables of kinds. Kind 0 is for mass points without a site."""
     view = particles.view
-    law = not_none(view.lennard_jones)
+    potential = not_none(view.lennard_jones)
     if step:
-        formula = f"c6*{law.cutoff**-6!r}-c12*{law.cutoff**-12!r}"
+        formula = f"c6*{potential.cutoff**-6!r}-c12*{potential.cutoff**-12!r}"
     else:
         of12, of6 = (
-            lennard_jones_formula(law, *c, 1.0).split(";", 1) for c in ((1.0, 0.0), (0.0, 1.0))
+            lennard_jones_formula(potential, *c, 1.0).split(";", 1)
+            for c in ((1.0, 0.0), (0.0, 1.0))
         )
         definitions = f";{of12[1]}" if len(of12) == 2 else ""
         formula = f"c12*({of12[0]})+c6*({of6[0]}){definitions}"
     formula += "; c12=table12(kind1,kind2); c6=table6(kind1,kind2)"
-    force = _custom(particles, law.cutoff, formula, "kind", view.kind + 1)
+    force = _custom(particles, potential.cutoff, formula, "kind", view.kind + 1)
     six = view.sigma**6
     c6 = 4 * view.epsilon * six / KJ_PER_MOL
     for name, table in (("table12", c6 * six), ("table6", c6)):

@@ -1,7 +1,7 @@
-"""What a pair law of one's own costs, compared with the built-in Lennard-Jones with the same
+"""What a custom pair potential costs, compared with the built-in Lennard-Jones with the same
 ending, in turns.
 
-python tests/benchmarks/own_law.py [molecules] [rounds]
+python tests/benchmarks/user_potential.py [molecules] [rounds]
 """
 
 import sys
@@ -33,27 +33,29 @@ def mie(p: Mie, r, inverse):
     return u * (six - 1), u * (12 * six - 6) * inverse
 
 
-def laws(epsilon: float, sigma: float) -> dict[str, rigidmd.PairLaw | None]:
-    """Name -> law; None is the built-in one."""
+def potentials(epsilon: float, sigma: float) -> dict[str, rigidmd.PairPotential | None]:
+    """Name -> potential; None is the built-in one."""
     given = {"epsilon": epsilon, "sigma": sigma}
     text = "4*epsilon*((sigma/r)**12 - (sigma/r)**6)"
     r = np.linspace(2.4, 9.5, 1000)
     power = (sigma / r) ** 6
     return {
         "built in": None,
-        "text": rigidmd.pair_law(text, {"AR": given}),
-        "function": rigidmd.pair_law(mie, {"AR": Mie(epsilon, sigma)}),
-        "exp-6": rigidmd.pair_law(
+        "text": rigidmd.pair_potential(text, {"AR": given}),
+        "function": rigidmd.pair_potential(mie, {"AR": Mie(epsilon, sigma)}),
+        "exp-6": rigidmd.pair_potential(
             "A*exp(-B*r) - C/r**6", {"AR": {"A": 1.5e6, "B": 3.7, "C": 6.2e3}}
         ),
-        "table": rigidmd.pair_law(table=(r, 4 * epsilon * (power * power - power))),
+        "table": rigidmd.pair_potential(table=(r, 4 * epsilon * (power * power - power))),
     }
 
 
 def main() -> None:
-    """Print the median of the ratios of each law."""
+    """Print the median of the ratios of each potential."""
     count, rounds = (int(x) for x in (*sys.argv[1:], 4000, 9)[:2])
-    print(f"{count} argon, cut-off 9 Å, steps of 4 fs; time of a step relative to the built-in law")
+    print(
+        f"{count} argon, cut-off 9 Å, steps of 4 fs; time of a step relative to the built-in potential"
+    )
     for precision in ("double", "mixed"):
         for truncation in ("plain", "switch"):
             scene = rigidmd.Scene.from_dict(
@@ -68,15 +70,15 @@ def main() -> None:
             )
             molecule = build(scene).species[0]
             runs = {}
-            for name, law in laws(
+            for name, potential in potentials(
                 float(molecule.epsilon[0]) / 100, float(molecule.sigma[0])
             ).items():
                 of = (
                     scene
-                    if law is None
+                    if potential is None
                     else scene.model_copy(
                         update={"forces": scene.forces.model_copy(update={"lennard_jones": False})}
-                    ).with_user_code([law])
+                    ).with_user_code([potential])
                 )
                 system = build(of)
                 engine = system.engine()
