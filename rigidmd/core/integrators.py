@@ -132,6 +132,11 @@ class Scheme(_SchemeFields):
         return self._replace(flows=(*self.flows, Flow(REMOVE_MOMENTUM, 0.0, every=every)))
 
     @property
+    def variables(self) -> int:
+        """How many numbers its thermostat and its barostat have in `state.extra_variables`."""
+        return sum(getattr(flow, "variables", 0) for flow in (self.thermostat, self.barostat))
+
+    @property
     def trajectory_steps(self) -> int:
         """Steps that are accepted or rejected together; 0 without hybrid Monte Carlo."""
         return max(flow.every if flow.kind == END_TRAJECTORY else 0 for flow in self.flows)

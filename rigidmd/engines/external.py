@@ -131,8 +131,8 @@ SPLIT = {None: "", "split": ""}
 
 
 class ExternalEngine(Engine, ABC):
-    """Base of engines that run another program for one stage. The first tally of `evaluate` has the
-    whole virial."""
+    """Base of engines that run another program for one stage, which keeps the variables of its
+    thermostat and barostat. The first tally of `evaluate` has the whole virial."""
 
     def __init__(self, system: System, stage: int):
         self._system = system
@@ -143,10 +143,6 @@ class ExternalEngine(Engine, ABC):
         self._heat_offset = (
             0.0  # heat in the ledger of a state that was sent, less the heat of the program by then
         )
-
-    def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
-        """None: the program itself keeps the variables of its thermostat and barostat."""
-        return np.zeros(0)
 
     def advance(
         self,

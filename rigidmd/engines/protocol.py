@@ -50,10 +50,10 @@ class Engine(Protocol):
     """Set by a run. An engine that chooses its steps calls it at each of them, and raises Halted if
     it is true"""
 
-    @abstractmethod
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
-        """The extra variables of an integrator (`state.extra_variables`) at the begin of a
-        segment."""
+        """The extra variables of an integrator (`state.extra_variables`) at the begin of a segment;
+        by default none."""
+        return np.zeros(0)
 
     def begin(self, state: State, integrator: Scheme | Solver) -> State:
         """A copy of a state with the variables of an integrator."""

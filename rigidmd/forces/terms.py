@@ -124,16 +124,6 @@ def with_common_scratch(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple,
     return tuple(trait(workspace, "with_scratch")(largest) for workspace in workspaces)
 
 
-def restored(
-    workspace: NamedTuple, arrays: dict[str, np.ndarray], skin: float, now: float
-) -> NamedTuple:
-    """The workspace with its checkpoint arrays, see `Term.restore`. Raises ValueError if these do
-    not fit."""
-    if not arrays and hasattr(workspace, "checkpoint_arrays"):
-        raise ValueError(f"{type(workspace).__name__} lacks checkpoint arrays")
-    return trait(workspace, "restore")(arrays, skin, now)
-
-
 def add_forces(term, state, load, tally):
     """Add the forces and torques of a term to `load`, its energy and virial to `tally` unless None;
     a status code."""

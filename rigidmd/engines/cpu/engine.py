@@ -48,7 +48,6 @@ from rigidmd.forces.terms import (
     Setup,
     TermDispatcher,
     compute_load_with_energies,
-    restored,
     trait,
     with_common_scratch,
 )
@@ -150,13 +149,7 @@ class CpuEngine(Engine):
 
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """The variables of the thermostat and the barostat of a scheme, at rest."""
-        integrator = _as_scheme(integrator)
-        return np.zeros(
-            sum(
-                getattr(flow, "variables", 0)
-                for flow in (integrator.thermostat, integrator.barostat)
-            )
-        )
+        return np.zeros(_as_scheme(integrator).variables)
 
     def advance(
         self,
@@ -370,7 +363,7 @@ class CpuEngine(Engine):
         if arrays_of.keys() & set(self.names):
             pairs = zip(self.names, spaces, strict=False)
             spaces = tuple(
-                restored(workspace, arrays_of.get(name, {}), self._setup.skin, now)
+                trait(workspace, "restore")(arrays_of.get(name, {}), self._setup.skin, now)
                 for name, workspace in pairs
             )
         self._workspaces = with_common_scratch(spaces)

@@ -209,7 +209,7 @@ def restored(
     like = {name: getattr(clusters, name) for name in (*CHECKPOINTED, "order")}
     like |= {"built": pairs.built, "times": pairs.times}
     if arrays.keys() not in ({"skin"}, {"skin", *like}):
-        raise ValueError(f"a neighbour list has {', '.join(arrays)}")
+        raise ValueError(f"a neighbour list has {', '.join(arrays) or 'no arrays'}")
     for name, array in ({"skin": np.array(pairs.skin)} | like).items():
         found = arrays.get(name, array)
         if (found.shape, found.dtype) != (array.shape, array.dtype):
