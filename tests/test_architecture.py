@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from fnmatch import fnmatch
 
 import pytest
 from support import ROOT
@@ -16,19 +15,17 @@ from rigidmd.formats import BY_EXTENSION
 
 PACKAGE = ROOT / "rigidmd"
 
-#: From the bottom up: a package imports from those before it and from itself. A subpackage may have
-#: a layer of its own.
+#: From the bottom up: a package imports from those before it and from itself.
 LAYERS = (
     "errors",
     "units",
     "core",
-    "engines.registry",
-    "engines.*.options",
     "compile",
     "mechanics",
     "forces",
     "dynamics",
     "formats",
+    "programs",
     "scene",
     "engines",
     "io",
@@ -75,9 +72,8 @@ def name_of(path):
 
 
 def layer_of(module):
-    """The most specific entry of LAYERS for a module; "" is `rigidmd` itself."""
-    fitting = (name for name in RANK if fnmatch(f"{module or '__init__'}.", f"{name}.*"))
-    return max(fitting, key=len, default=module.partition(".")[0])
+    """The package of a module; "" is `rigidmd` itself."""
+    return (module or "__init__").partition(".")[0]
 
 
 def package_of(path):
@@ -158,13 +154,6 @@ def build():
     assert [message.split(":")[0] for message in upward("dynamics", inner)] == ["1", "2", "3", "4"]
 
 
-def test_a_part_of_a_package_can_be_below_it():
-    light = imports_in("from rigidmd.engines.lammps.options import PROGRAM")
-    heavy = imports_in("from rigidmd.engines.lammps.files import fixes")
-    assert not list(upward("scene", light)) and len(list(upward("scene", heavy))) == 1
-    assert len(list(upward("engines.*.options", heavy))) == 1
-
-
 def test_each_library_has_its_packages():
     errors = [
         f"{name_of(path)}:{line}: imports {module}"
@@ -204,7 +193,7 @@ NAMED_EXTENSIONS = {
     "commands/models.py": "an example in --help",
     "engines/gromacs/files.py": "the files of an export and a command of GROMACS",
     "engines/lammps/files.py": "the files of an export, and commands of LAMMPS",
-    "engines/lammps/options.py": "the command that runs an export",
+    "programs/lammps.py": "the command that runs an export",
     "engines/openmm/files.py": "the files of an export, and its script",
     "io/ase_plugin.py": "names of files that ASE cannot read, which it matches without loading the formats",
 }

@@ -26,8 +26,8 @@ from rigidmd.engines.lammps import files
 from rigidmd.engines.openmm import engine
 from rigidmd.engines.openmm.files import write_openmm
 from rigidmd.engines.openmm.system import Group, integration_groups
-from rigidmd.engines.registry import programs
 from rigidmd.errors import SceneError
+from rigidmd.programs import programs
 
 COUNTS = {"spce": 6, "nitrogen": 4}
 NVT = {"ensemble": "nvt", "temperature_K": 310.0, "duration_ps": 0.4, "timestep_fs": 2.0}
@@ -472,7 +472,7 @@ def test_the_error_of_mixed_precision_is_the_one_in_the_manual():
 # a new engine
 
 OPTIONS = """
-from rigidmd.engines.registry import Option, Program
+from rigidmd.programs import Option, Program
 
 PROGRAM = Program(
     "Mirror", "it needs nothing", "mirror:TABLE", engine="mirror:MirrorEngine", installed="mirror:installed",
@@ -529,10 +529,10 @@ SCRIPT = """
 import sys
 
 import rigidmd.engines
-from rigidmd.engines import registry
+import rigidmd.programs
 
-rigidmd.engines.__path__.append(sys.argv[1])
-registry.NAMES.append("mirror")
+rigidmd.engines.__path__.append(sys.argv[1] + "/engines")
+rigidmd.programs.__path__.append(sys.argv[1] + "/programs")
 
 from rigidmd.commands import cli
 
@@ -545,11 +545,13 @@ sys.exit(cli.main(sys.argv[3:]))
 
 
 @pytest.mark.timeout(900)  # processes that compile
-def test_adding_an_engine_takes_a_folder_and_a_line(tmp_path):
-    folder = tmp_path / "engines" / "mirror"
+def test_adding_an_engine_takes_a_folder_and_a_file(tmp_path):
+    folder, programs = tmp_path / "engines" / "mirror", tmp_path / "programs"
     folder.mkdir(parents=True)
-    for name, text in (("__init__", ""), ("options", OPTIONS), ("mirror", MIRROR)):
-        (folder / f"{name}.py").write_text(text)
+    programs.mkdir()
+    (folder / "__init__.py").touch()
+    (folder / "mirror.py").write_text(MIRROR)
+    (programs / "mirror.py").write_text(OPTIONS)
     (tmp_path / "script.py").write_text(SCRIPT)
     scene = tmp_path / "argon.toml"
     scene.write_text(
@@ -558,7 +560,7 @@ def test_adding_an_engine_takes_a_folder_and_a_line(tmp_path):
     )
 
     def run(*arguments, error="right"):
-        command = [sys.executable, tmp_path / "script.py", folder.parent, error, *arguments]
+        command = [sys.executable, tmp_path / "script.py", tmp_path, error, *arguments]
         return subprocess.run(
             [*map(str, command)], capture_output=True, text=True, cwd=tmp_path, check=False
         )
@@ -592,4 +594,4 @@ def test_adding_an_engine_takes_a_folder_and_a_line(tmp_path):
     schema = run("schema").stdout
     assert '"mirror"' in schema and '"Angle of mirror; default: 2"' in schema
     text = run("run", "--help").stdout
-    assert "rigidmd, lammps, openmm or mirror" in text and "--tilt N" in text
+    assert "rigidmd, lammps, mirror or openmm" in text and "--tilt N" in text

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rigidmd.commands.streams import progress_bar
-from rigidmd.engines.registry import engine_options, runnable
+from rigidmd.programs import engine_options, runnable
 
 #: Adds an argument to the parser of a command.
 Argument = Callable[[argparse.ArgumentParser], object]

@@ -5,7 +5,7 @@ import json
 
 from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene
-from rigidmd.engines.registry import runnable
+from rigidmd.programs import runnable
 
 
 def _engine(parser: argparse.ArgumentParser) -> None:

@@ -22,9 +22,9 @@ from rigidmd.engines.force_field import (
 )
 from rigidmd.engines.observables import kinetic_energies, observe
 from rigidmd.engines.protocol import Engine, keep_time
-from rigidmd.engines.registry import Program
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError
+from rigidmd.programs import Program
 from rigidmd.scene.validation import not_none
 from rigidmd.units import KJ_PER_MOL
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, create_model
 
-from rigidmd.engines.registry import Program, engine_options, runnable
+from rigidmd.programs import Program, engine_options, runnable
 from rigidmd.scene.validation import Count, Section
 
 RIGIDMD = "rigidmd"

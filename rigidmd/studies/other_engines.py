@@ -24,11 +24,11 @@ from rigidmd.engines.external import (
     external_engine,
 )
 from rigidmd.engines.protocol import Engine
-from rigidmd.engines.registry import programs, runnable
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.io.folder import SCENE, check_folder, check_names, write_marker, written_by_runs
 from rigidmd.io.scene_file import input_names, write_scene
+from rigidmd.programs import programs, runnable
 from rigidmd.run import Simulation
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.engine import EngineChoice

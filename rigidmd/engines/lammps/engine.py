@@ -23,7 +23,6 @@ from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.model import Model
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.lammps import files
-from rigidmd.engines.lammps.options import PROGRAM
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.rigid_bodies import RigidBodies
@@ -33,6 +32,7 @@ from rigidmd.forces.ewald.corrections import background, self_energy
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.formats.lammps import dump_box
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, SplitRotor
+from rigidmd.programs.lammps import PROGRAM
 
 #: Begins a line with numbers, which also ends the output of a command.
 NUMBERS = "rigidmd:"

@@ -12,7 +12,6 @@ import numpy as np
 from rigidmd.core.state import HEAT, Load, State
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.observables import kinetic_energies
-from rigidmd.engines.openmm.options import FIXED_PRECISIONS, PLATFORMS, precision_of
 from rigidmd.engines.openmm.system import (
     NM,
     TOLERANCES,
@@ -30,6 +29,7 @@ from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.forces.ewald.corrections import background, intramolecular_energy, self_energy
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
+from rigidmd.programs.openmm import FIXED_PRECISIONS, PLATFORMS, precision_of
 from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL
 
 ANGSTROM = 1 / NM  # Å per nm

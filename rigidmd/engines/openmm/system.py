@@ -16,7 +16,6 @@ from scipy.special import erfc
 from rigidmd.core.state import State
 from rigidmd.engines.external import SPLIT, Key, Limit, Missing, Translations, moves
 from rigidmd.engines.force_field import ForceFieldView, coulomb_formula, lennard_jones_formula
-from rigidmd.engines.openmm.options import PROGRAM
 from rigidmd.engines.rigid_bodies import MassPoints, Points, RigidBodies, mass_points
 from rigidmd.errors import EngineError
 from rigidmd.forces.ewald.errors import charges_in, pme_grid_for, real_error
@@ -26,6 +25,7 @@ from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import TRUNCATIONS, Switched, Unmodified
+from rigidmd.programs.openmm import PROGRAM
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import COULOMB, KJ_PER_MOL

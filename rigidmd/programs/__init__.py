@@ -1,16 +1,14 @@
-"""The external engines: what scenes, commands and reports know of them without loading them.
+"""Other programs that can move the molecules: what scenes, commands and reports know of them
+without loading them.
 
-`engines/NAME/options.py` has a record PROGRAM for each. To add an engine, add its folder and its
-name in NAMES.
+`programs/NAME.py` has a record PROGRAM for each, and its engine is the folder `engines/NAME/`.
 """
 
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import import_module
+from pkgutil import iter_modules
 from typing import Any, NamedTuple
-
-#: Folders of external engines, and their names in scenes and commands.
-NAMES = ["lammps", "openmm", "gromacs"]
 
 
 class Option(NamedTuple):
@@ -22,7 +20,7 @@ class Option(NamedTuple):
 
 
 class Program(NamedTuple):
-    """An external engine. Objects of its folder are named as "module:object"."""
+    """A program. Objects of the folder of its engine are named as "module:object"."""
 
     title: str
     install: str  # how to install it
@@ -41,7 +39,7 @@ class Program(NamedTuple):
         ""  # its function (folder, view, state) -> names of files; empty without an export
     )
     command: str = ""  # that runs an exported folder
-    name: str = ""  # its folder, set by `programs`
+    name: str = ""  # in scenes and commands, and of its folder; set by `programs`
 
     def load(self, path: str) -> Any:
         """An object of its folder."""
@@ -51,15 +49,15 @@ class Program(NamedTuple):
 
 @cache
 def programs() -> dict[str, Program]:
-    """Name of an external engine -> its record."""
+    """Name of a program -> its record."""
     return {
-        name: import_module(f"rigidmd.engines.{name}.options").PROGRAM._replace(name=name)
-        for name in NAMES
+        module.name: import_module(f"{__name__}.{module.name}").PROGRAM._replace(name=module.name)
+        for module in iter_modules(__path__)
     }
 
 
 def runnable() -> dict[str, Program]:
-    """The engines that scenes can name."""
+    """The programs that scenes can name."""
     return {name: program for name, program in programs().items() if program.engine}
 
 

@@ -1,6 +1,6 @@
 """GROMACS for commands, which do not load its export."""
 
-from rigidmd.engines.registry import Program
+from rigidmd.programs import Program
 
 PROGRAM = Program(
     "GROMACS",

@@ -1,6 +1,6 @@
 """LAMMPS for scenes and commands, which do not load it."""
 
-from rigidmd.engines.registry import Option, Program
+from rigidmd.programs import Option, Program
 
 PROGRAM = Program(
     "LAMMPS",
