@@ -16,11 +16,10 @@ from rigidmd.core.integrators import FORMULATIONS, SCHEMES
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
-from rigidmd.run.pilot import trials as measuring
-from rigidmd.run.pilot.trial_systems import body_trial_system
-from rigidmd.run.pilot.trials import IntegratorAccuracy, Method, Trial, measure, time_span
+from rigidmd.run.trial_systems import body_trial_system
+from rigidmd.run.trials import Method, Trial
 from rigidmd.scene import Scene
-from rigidmd.studies.accuracy import accuracy, averages, averages_report
+from rigidmd.studies.accuracy import accuracy, averages, averages_report, measurement
 from rigidmd.studies.accuracy.accuracy import (
     measure_accuracy,
     recommendations,
@@ -35,6 +34,7 @@ from rigidmd.studies.accuracy.averages import (
     Averages,
     measure_averages,
 )
+from rigidmd.studies.accuracy.measurement import IntegratorAccuracy, measure, time_span
 from rigidmd.studies.extrapolation import MeanAtStep, Together, extrapolate, means_of_runs
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
@@ -44,7 +44,7 @@ TOP = ROOT / "systems" / "heavy_top_3.toml"
 def short_timings():
     """Seconds of computing are not what most of these tests are about."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measuring, "TIMING_SECONDS", 0.002)
+        patch.setattr(measurement, "TIMING_SECONDS", 0.002)
         yield
 
 
@@ -115,8 +115,8 @@ class Clockwork:
 @pytest.fixture
 def clockwork(monkeypatch):
     """(subject, engines made) of a subject moved by clockwork, for a given lifetime in steps."""
-    monkeypatch.setattr(measuring, "TIMING_SECONDS", 0.2)
-    monkeypatch.setattr(measuring.clock, "perf_counter", lambda: Clockwork.now)
+    monkeypatch.setattr(measurement, "TIMING_SECONDS", 0.2)
+    monkeypatch.setattr(measurement.clock, "perf_counter", lambda: Clockwork.now)
 
     def trial_system(can_continue, lasts=10**9):
         made = []
@@ -156,7 +156,7 @@ def test_a_step_that_is_good_for_the_span_only_is_timed_on_the_span(clockwork):
 def test_timings_alternate_between_trials(monkeypatch):
     order = []
     monkeypatch.setattr(
-        measuring,
+        measurement,
         "time_span",
         lambda trial_system, trial: order.append(trial.steps) or 1e-3 * len(order),
     )
@@ -312,11 +312,11 @@ def test_ladders_continue_to_longer_steps_until_one_fails_or_is_too_long_for_the
         trial.failure = "diverges" if trial.timestep > longest else ""
 
     trial_system, _ = body_trial_system(Scene.read(TOP), 1.0)
-    monkeypatch.setattr(measuring, "measure_errors", measure_errors)
-    monkeypatch.setattr(measuring, "final_state", lambda *_: trial_system.state)
-    monkeypatch.setattr(measuring, "time_span", lambda *_: 1.0)
+    monkeypatch.setattr(measurement, "measure_errors", measure_errors)
+    monkeypatch.setattr(measurement, "final_state", lambda *_: trial_system.state)
+    monkeypatch.setattr(measurement, "time_span", lambda *_: 1.0)
     for extend, expected in ((True, steps), (False, [50, 100])):
-        trials = measuring.plan(trial_system, {"velocity_verlet": [0.02, 0.01]})
+        trials = measurement.plan(trial_system, {"velocity_verlet": [0.02, 0.01]})
         found = measure(trial_system, trials, 1, extend=extend).trials
         assert [trial.steps for trial in found] == expected
         assert [trial.diverged for trial in found] == [trial.timestep > longest for trial in found]

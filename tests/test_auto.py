@@ -10,12 +10,12 @@ from support import ROOT, SPRING, small_scene, springs
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import DRIFT, KICK, SCHEMES
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.run import Simulation
-from rigidmd.run.pilot import choice
-from rigidmd.run.pilot.choice import EnergyWalk, choose, weight
+from rigidmd.run import Simulation, trials
+from rigidmd.run.pilot.choice import choose
+from rigidmd.run.pilot.energy_walk import EnergyWalk, weight
 from rigidmd.run.pilot.sampling import bias_of_potential, mean_square_rate
-from rigidmd.run.pilot.trial_systems import _fit_step
-from rigidmd.run.pilot.trials import Method, TrialSystem
+from rigidmd.run.pilot.stages import _fit_step
+from rigidmd.run.trials import Method, TrialSystem
 from rigidmd.scene import Scene
 from rigidmd.studies.accuracy.averages import measure_averages, start_of_last_stage
 
@@ -177,7 +177,7 @@ def known(monkeypatch):
             dt, scheme = 1e-3 * found.timestep, SCHEMES[found.integrator]
             return np.sqrt(regular(scheme, dt) ** 2 + true.square(scheme, dt, 20.0))
 
-        monkeypatch.setattr(choice, "measure_errors", measure_errors)
+        monkeypatch.setattr(trials, "measure_errors", measure_errors)
         methods = {name: Method(None, scheme) for name, scheme in SCHEMES.items()}
         trial_system = TrialSystem(
             "",

@@ -17,10 +17,9 @@ from rigidmd.core.integrators import KICK, SCHEMES
 from rigidmd.core.state import NOW
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.run import Simulation
+from rigidmd.run import Simulation, stable_step
 from rigidmd.run import checks as watch
-from rigidmd.run.pilot import stable_step
-from rigidmd.run.pilot.stable_step import DIRECTIONS, stiffest_mode
+from rigidmd.run.stable_step import DIRECTIONS, stiffest_mode
 from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"

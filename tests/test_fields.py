@@ -20,7 +20,7 @@ from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces.fields import distances
 from rigidmd.mechanics.rotation import from_vector, random_rotations
 from rigidmd.run import Simulation
-from rigidmd.run.pilot.trial_systems import molecular_trial_system
+from rigidmd.run.trial_systems import molecular_trial_system
 from rigidmd.studies.other_engines import export
 from rigidmd.units import AVOGADRO, BOLTZMANN, DEBYE, ELEMENTARY_CHARGE
 

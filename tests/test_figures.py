@@ -21,11 +21,12 @@ from rigidmd.engines.samples import NUMBERS, Sample, Samples
 from rigidmd.figures.picture import Picture
 from rigidmd.figures.run import energy_figure
 from rigidmd.figures.style import AT_ONCE, save_figure, shown_range
-from rigidmd.run.pilot.trial_systems import COMPARATORS, body_trial_system
-from rigidmd.run.pilot.trials import IntegratorAccuracy, Trial
+from rigidmd.run.trial_systems import COMPARATORS, body_trial_system
+from rigidmd.run.trials import Trial
 from rigidmd.scene import Scene
 from rigidmd.scene.models import load_model
 from rigidmd.studies.accuracy import accuracy
+from rigidmd.studies.accuracy.measurement import IntegratorAccuracy
 from rigidmd.view.molecule_figure import write_molecule_figure
 from rigidmd.view.plots import columns_figure, draw_panel, panels, record_of
 

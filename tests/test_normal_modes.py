@@ -17,8 +17,8 @@ from rigidmd.commands.cli import main
 from rigidmd.core.state import state_of
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.io.trajectory import read_frames
-from rigidmd.run.pilot.stable_step import stiffest_mode
 from rigidmd.run.record import read_record
+from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene.models import load_model
 from rigidmd.studies import normal_modes
 from rigidmd.studies.gamma_point import periodic_basis

@@ -34,7 +34,7 @@ def _check(options: Options) -> int:
     scene = read_scene(options)
     if isinstance(scene, BodyScene):
         from rigidmd.assemble.body import build_body
-        from rigidmd.run.pilot.stable_step import body_step_warnings
+        from rigidmd.run.stable_step import body_step_warnings
 
         if options.program or options.profile:
             option = "--program" if options.program else "--profile"

@@ -28,10 +28,10 @@ from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run.checks import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
 from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
-from rigidmd.run.pilot.stable_step import body_step_warnings, fastest_body_rate
 from rigidmd.run.report import body_summary_text
 from rigidmd.run.resume import Arrays, NotNegative, RunRecord, check_same_scene, state_from
 from rigidmd.run.schedule import Segment, interruptible
+from rigidmd.run.stable_step import body_step_warnings, fastest_body_rate
 from rigidmd.run.summary import summarise_body
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none
@@ -253,7 +253,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         self._choice = None
         applied = dict(applied or {})
         if scene.run.is_auto:
-            from rigidmd.run.pilot.trial_systems import choose_for_body
+            from rigidmd.run.pilot.stages import choose_for_body
 
             simulation.announce("choosing integrator and step by pilot runs")
             scene, self._choice = choose_for_body(scene, applied)

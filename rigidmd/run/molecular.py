@@ -41,10 +41,10 @@ from rigidmd.run.minimise import (
 from rigidmd.run.molecular_observers import FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
-from rigidmd.run.pilot.stable_step import DIRECTIONS, SMALL_SYSTEM, stiffest_mode
 from rigidmd.run.report import summary_text
 from rigidmd.run.resume import Count, RunRecord, check_same_scene, plain, state_from
 from rigidmd.run.schedule import Segment, interruptible
+from rigidmd.run.stable_step import DIRECTIONS, SMALL_SYSTEM, stiffest_mode
 from rigidmd.run.summary import Minimum, describe_minimum, summarise
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage
@@ -381,14 +381,10 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     def _choose(self, k: int) -> None:
         """Choose integrator and step of a stage by pilot runs from the present state, and set them
         in the scene."""
-        from rigidmd.run.pilot.sampling import choose_for_averages, choose_for_sampling
-        from rigidmd.run.pilot.trial_systems import choose_for_molecules
+        from rigidmd.run.pilot.stages import choose_for_stage
 
-        stage = self.scene.stages[k]
         self.simulation.announce("choosing integrator and step by pilot runs")
-        choose = choose_for_averages if stage.bias_kT else choose_for_molecules
-        choose = choose_for_sampling if stage.is_hybrid else choose
-        decided, reason = choose(self.system, self.state, k)
+        decided, reason = choose_for_stage(self.system, self.state, k)
         self.record.choices[k] = (
             f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
         )

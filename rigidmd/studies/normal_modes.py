@@ -26,7 +26,7 @@ from rigidmd.run import Simulation
 from rigidmd.run.checks import molecule_label
 from rigidmd.run.minimise import Enthalpy
 from rigidmd.run.minimise import minimise as find_minimum
-from rigidmd.run.pilot.stable_step import stiffest_mode
+from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.stage import Stage
 from rigidmd.studies.gamma_point import cells_of, periodic_basis

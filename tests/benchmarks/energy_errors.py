@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.errors import SimulationError
-from rigidmd.run.pilot import choice
+from rigidmd.run import trials
 
 WATER = {
     "box": {"lengths_A": 12.42},
@@ -47,18 +47,18 @@ TOP = Path(__file__).parents[2] / "systems" / "heavy_top_3.toml"
 
 def counted(made: Callable[[], Simulation]) -> tuple:
     """A simulation, its results, and the force evaluations of its pilots."""
-    forces, measure_errors = [0], choice.measure_errors
+    forces, measure_errors = [0], trials.measure_errors
 
     def counting(subject, trial, *more):
         forces[0] += trial.steps * subject.methods[trial.integrator].force_evaluations
         return measure_errors(subject, trial, *more)
 
-    choice.measure_errors = counting
+    trials.measure_errors = counting
     try:
         simulation = made()
         return simulation, simulation.run(), forces[0]
     finally:
-        choice.measure_errors = measure_errors
+        trials.measure_errors = measure_errors
 
 
 def of_molecules(name: str, target: float, duration: float) -> list[str]:

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis
-from rigidmd.run.pilot.trial_systems import body_trial_system, molecular_trial_system
+from rigidmd.run.trial_systems import body_trial_system, molecular_trial_system
 
 ROOT = Path(__file__).parents[2]
 DATA, IMAGE = (

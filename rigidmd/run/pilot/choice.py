@@ -8,99 +8,19 @@ longer pilot run of the best step its slow regular error.
 """
 
 from dataclasses import replace
-from functools import cache
-from math import ceil, floor, inf, log, log10, sqrt
-from typing import NamedTuple, cast
+from math import ceil, floor, inf, log10, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.integrators import DRIFT, KICK, SCHEMES, Scheme
+from rigidmd.core.integrators import SCHEMES, Scheme
 from rigidmd.core.state import State
 from rigidmd.core.statistics import ENERGY_ERROR
 from rigidmd.errors import SimulationError
-from rigidmd.run.pilot.trials import (
-    Trial,
-    TrialSystem,
-    final_state,
-    measure_errors,
-    state_difference,
-)
+from rigidmd.run import trials
+from rigidmd.run.pilot.energy_walk import EnergyWalk, measure_energy_walk
+from rigidmd.run.trials import Trial, TrialSystem, final_state, state_difference
 from rigidmd.scene.validation import not_none
-
-#: The integrator of the pilot runs: its regular error is small compared with the walk.
-PILOT_INTEGRATOR = "srkn_6"
-#: Steps of the first pilot run; the second takes twice as many of half the length.
-STEPS = 32
-#: Steps between energies that are compared. Short lags have most values, but include a regular
-#: error.
-LAGS = (1, 2, 4, 8)
-JUMPS = (-1.0, -0.5, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-
-
-class EnergyWalk(NamedTuple):
-    """The random walk of the energy that truncated forces cause, for any integrator and step. See
-    "Energy drift and its error" in the theory chapter `errors`: D = scale w dt^(2k+2), with a scale
-    of the scene that no integrator changes. D is in squares of the energy unit of a `TrialSystem`
-    per unit of time of its span."""
-
-    scale: float
-    jump: float  # the derivative of the force that jumps
-    freedom: int  # degrees of freedom; the energy unit is kT of one of them
-
-    def rate(self, scheme: Scheme, dt: float) -> float:
-        return self.scale * weight(scheme, self.jump) * dt ** (2 * self.jump + 2)
-
-    def square(self, scheme: Scheme, dt: float, time: float) -> float:
-        """Expected mean square of the walk over a run: D t/2 from its scatter, and the square of
-        its mean."""
-        half = self.rate(scheme, dt) * time / 2
-        return half + (self.freedom * half) ** 2 / 3
-
-
-@cache
-def weight(scheme: Scheme, jump: float) -> float:
-    """w of an integrator; the sum of b² for a jump below 0, where the errors of kicks are
-    independent."""
-    at, kicks, n = 0.0, [], np.arange(1.0, 1000.0)
-    for flow in scheme.flows:
-        at += flow.fraction if flow.kind == DRIFT else 0.0
-        kicks += [(flow.fraction, at)] if flow.kind == KICK else []
-    if jump < 0:
-        return 1.0 if jump == -1 else sum(b * b for b, _ in kicks)
-    total = sum(b * np.exp(2j * np.pi * n * c) for b, c in kicks)
-    return float(np.sum(np.abs(total) ** 2 / n ** (2 * jump + 2)))
-
-
-def measure_energy_walk(system: TrialSystem, timestep: float) -> EnergyWalk:
-    """The walk, from two pilot runs at about this step (in the unit of the system) and at half of
-    it."""
-    scheme, rates = cast(Scheme, system.methods[PILOT_INTEGRATOR].scheme), []
-    for _ in range(3):
-        rates = [_rate(system, timestep / part, part * STEPS) for part in (1, 2)]
-        if None not in rates:
-            break
-        timestep /= 2
-    fast, slow = rates
-    if not fast or not slow:
-        return EnergyWalk(0.0, JUMPS[-1], system.freedom)
-    jump = min(JUMPS, key=lambda k: abs(log(fast / slow) - (2 * k + 2) * log(2)))
-    dt = timestep * system.time_size
-    unit = EnergyWalk(1.0, jump, system.freedom)
-    return unit._replace(
-        scale=(fast / unit.rate(scheme, dt) + slow / unit.rate(scheme, dt / 2)) / 2
-    )
-
-
-def _rate(system: TrialSystem, timestep: float, steps: int) -> float | None:
-    """D in a run: the least of all lags, as a regular error adds to short ones; None if the run
-    diverges."""
-    trial = Trial(PILOT_INTEGRATOR, timestep, steps, 0)
-    measure_errors(system, trial, None, STEPS)
-    if trial.diverged:
-        return None
-    energy, spacing = np.array(trial.energies), steps / STEPS * timestep * system.time_size
-    return min(float(np.mean((energy[m:] - energy[:-m]) ** 2)) / (m * spacing) for m in LAGS)
-
 
 #: Tried in this order. A later one is abandoned at a step that is too long and costs more.
 CANDIDATES = sorted(
@@ -166,10 +86,8 @@ class _Search:
 
     def cost(self, trial: Trial) -> float:
         """Forces per unit of time of the span."""
-        system = self.system
-        return system.methods[trial.integrator].force_evaluations / (
-            trial.timestep * system.time_size
-        )
+        evaluations = self.system.methods[trial.integrator].force_evaluations
+        return evaluations / (trial.timestep * self.system.time_size)
 
     def walk_square(self, name: str, timestep: float, time: float) -> float:
         scheme = self.system.methods[name].scheme
@@ -180,12 +98,8 @@ class _Search:
     def expected(self, trial: Trial, timestep: float | None = None) -> float:
         """Error over the time; at another step by the order of the integrator."""
         name, step = trial.integrator, timestep or trial.timestep
-        order = self.system.methods[name].order
-        regular = (
-            self.slow_factor.get(name, 1.0)
-            * getattr(trial, self.error)
-            * (step / trial.timestep) ** order
-        )
+        regular = self.slow_factor.get(name, 1.0) * getattr(trial, self.error)
+        regular *= (step / trial.timestep) ** self.system.methods[name].order
         return sqrt(regular**2 + self.walk_square(name, step, self.time))
 
     def trial(self, name: str, timestep: float, span: float | None = None) -> Trial:
@@ -197,7 +111,7 @@ class _Search:
             timestep = system.span / n / system.time_size
         if (name, timestep, span) not in self._tried:
             trial = Trial(name, timestep, n, n * system.methods[name].force_evaluations)
-            measure_errors(system, trial, self.exact)
+            trials.measure_errors(system, trial, self.exact)
             self._tried[name, timestep, span] = trial
         return self._tried[name, timestep, span]
 
@@ -206,9 +120,10 @@ class _Search:
         low, high = 1e-6 * trial.timestep, 1e3 * trial.timestep
         while high > 1.01 * low:
             middle = sqrt(low * high)
-            low, high = (
-                (middle, high) if self.expected(trial, middle) <= self.target else (low, middle)
-            )
+            if self.expected(trial, middle) <= self.target:
+                low = middle
+            else:
+                high = middle
         return low
 
     def _longest_step(self, name: str, cheapest: float) -> Trial | None:
@@ -260,16 +175,14 @@ def choose(
     search = _Search(system, target, error, longest, exact)
     first = search.best()
     if first is None:
-        least = min(search.measured.values(), key=lambda trial: getattr(trial, error), default=None)
-        if least is None:
-            reached = ""
-        else:
-            reached = (
-                f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g}"
-                f" {system.time_unit}"
-            )
+        reached = [
+            f"; {trial.integrator} reaches {getattr(trial, error):.1e} at {trial.timestep:.3g}"
+            f" {system.time_unit}"
+            for trial in sorted(search.measured.values(), key=lambda trial: getattr(trial, error))
+        ]
         raise SimulationError(
-            f"no integrator keeps its error below {target:g} with any step tried{reached}"
+            f"no integrator keeps its error below {target:g} with any step tried"
+            + "".join(reached[:1])
         )
     best, per = first, "ps" if system.time_unit == "fs" else "s"
     value, over, words = getattr(best, error), f"over {system.span:.3g} {per}", ""
@@ -304,9 +217,8 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
     span, target = search.system.span, search.target
     search.energy_walk, search.time = measure_energy_walk(search.system, first.timestep), duration
     search.target = SAFETY * target
-    length = min(
-        duration, LONG_PILOT_MAX * span, max(LONG_PILOT_MIN * span, LONG_PILOT_PART * duration)
-    )
+    length = max(LONG_PILOT_MIN * span, LONG_PILOT_PART * duration)
+    length = min(duration, LONG_PILOT_MAX * span, length)
     best, value, pilot_trial = first, search.expected(first), first
     for _ in range(CORRECTIONS):
         if (candidate := search.best()) is None:
@@ -327,11 +239,8 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
         slow = regular / (best.energy_rms or regular or 1.0)
         search.slow_factor[name] = max(1.2 * search.slow_factor.get(name, 1.0), slow)
     pilot = pilot_trial.steps * pilot_trial.timestep * search.system.time_size
-    return (
-        best,
-        value,
-        f" (expected, from {pilot_trial.energy_rms:.1e} in a pilot of {pilot:.3g} ps)",
-    )
+    pilot_error = f"{pilot_trial.energy_rms:.1e} in a pilot of {pilot:.3g} ps"
+    return best, value, f" (expected, from {pilot_error})"
 
 
 def round_down(step: float) -> float:

@@ -4,6 +4,7 @@ Hamiltonian, see "The bias of averages" in the theory chapter `errors`."""
 
 from dataclasses import replace
 from math import inf, isfinite, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,20 +18,24 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
 from rigidmd.run.pilot.choice import round_down
-from rigidmd.run.pilot.stable_step import stiffest_mode
+from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
-#: Bias of U in kT per degree of freedom, in x.
-BIAS = {"velocity_verlet": 1 / 8, "baoab": 1 / 24}
-#: The heat capacity of water is twice that of harmonic motions, and then the bias of velocity
-#: Verlet may be too.
-ALLOWANCE = {"velocity_verlet": 2.0, "baoab": 1.0}
-#: Phrases for the reason of a choice.
-BASIS = {
-    "velocity_verlet": "as twice the bias of harmonic motions",
-    "baoab": "as one of two parts that cancel in harmonic motions",
+
+class Bias(NamedTuple):
+    """The bias of U of an integrator, in kT per degree of freedom and in (w dt)²."""
+
+    size: float
+    allowance: float  # factor by which it may be larger
+    basis: str  # for the reason of a choice
+
+
+BIAS = {
+    # the heat capacity of water is twice that of harmonic motions, and then the bias may be too
+    "velocity_verlet": Bias(1 / 8, 2.0, "as twice the bias of harmonic motions"),
+    "baoab": Bias(1 / 24, 1.0, "as one of two parts that cancel in harmonic motions"),
 }
 #: Step and length of the pilot run, in radians of the faster mean motion, translation or rotation;
 #: its samples.
@@ -39,20 +44,10 @@ PILOT_STEP, PILOT_RADIANS, PILOT_SAMPLES = 0.15, 50.0, 25
 MAX_STABLE_FRACTION = 0.5
 
 
-def sums_of_square_frequencies(
-    system: System, engine: Engine, state: State, thermal: float
-) -> tuple[float, float]:
-    """Sums of w² (1/ps²) over the degrees of freedom of translation and rotation, at kT = `thermal`
-    (u Å²/ps²). By equipartition <F²/m> = kT sum w², likewise for torques. Exact in the mean over
-    the canonical distribution."""
-    sums = sums_of_state(system.model, state, engine.evaluate(state)[0])
-    return sums.force / thermal, sums.torque / thermal
-
-
 def bias_of_potential(integrator: str, rate: float, timestep: float) -> float:
     """Estimated size of the bias of U, kT per degree of freedom; rate : mean w² of one, 1/ps²;
     timestep : ps."""
-    return BIAS[integrator] * rate * timestep**2
+    return BIAS[integrator].size * rate * timestep**2
 
 
 def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, str]:
@@ -64,50 +59,43 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     SimulationError.
     """
     stage = system.scene.stages[k]
-    target, steps = not_none(stage.bias_kT), {}
+    target, candidates = not_none(stage.bias_kT), {}
     stiffest, rate = stiffest_mode(system, state), mean_square_rate(system, state, k)
-    for integrator in BIAS:
-        if integrator == "baoab" and not (
-            stage.thermostat_is_open or stage.thermostat == "langevin"
-        ):
+    for integrator, bias in BIAS.items():
+        needs = {"thermostat": "langevin"} if integrator == "baoab" else {}
+        if needs and not (stage.thermostat_is_open or stage.thermostat == "langevin"):
             continue
-        decided = _decided(stage, integrator, stage.timestep_fs)
-        stable = (
-            MAX_STABLE_FRACTION * stable_angle(decided.scheme) / stiffest.rate if stiffest else inf
-        )
-        good = sqrt(target / (ALLOWANCE[integrator] * BIAS[integrator] * rate)) if rate > 0 else inf
-        step = min(good, stable, stage.duration)
-        steps[integrator] = round_down(step / FEMTOSECOND) if rate > 0 else stage.timestep_fs
-    best = max(steps, key=lambda name: (steps[name], -BIAS[name]))
-    step = steps[best] * FEMTOSECOND
-    bias = ALLOWANCE[best] * bias_of_potential(best, rate, step)
-    return (
-        _decided(stage, best, steps[best]),
-        (
-            f"bias of U below about {bias:.1e} kT per degree of freedom, where {target:g} was"
-            f" requested: estimated from {sqrt(rate):.3g} rad/ps, the rms frequency of the motions,"
-            f" {BASIS[best]}, not sampled; {1 / step:.4g} forces per ps"
-        ),
-    )
-
-
-def _decided(stage: Stage, integrator: str, timestep_fs: float) -> Stage:
-    thermostat = {"thermostat": "langevin"} if integrator == "baoab" else {}
-    return (
-        stage.with_integrator(integrator, timestep_fs).model_copy(update=thermostat).with_defaults
+        decided = stage.with_integrator(integrator, stage.timestep_fs).model_copy(update=needs)
+        if rate > 0:
+            stable = stable_angle(decided.scheme) / stiffest.rate if stiffest else inf
+            unbiased = sqrt(target / (bias.allowance * bias.size * rate))
+            step = min(unbiased, MAX_STABLE_FRACTION * stable, stage.duration)
+            decided = decided.with_integrator(integrator, round_down(step / FEMTOSECOND))
+        candidates[integrator] = decided.with_defaults
+    best = max(candidates, key=lambda name: (candidates[name].timestep_fs, -BIAS[name].size))
+    step = candidates[best].timestep_fs * FEMTOSECOND
+    error = BIAS[best].allowance * bias_of_potential(best, rate, step)
+    return candidates[best], (
+        f"bias of U below about {error:.1e} kT per degree of freedom, where {target:g} was"
+        f" requested: estimated from {sqrt(rate):.3g} rad/ps, the rms frequency of the motions,"
+        f" {BIAS[best].basis}, not sampled; {1 / step:.4g} forces per ps"
     )
 
 
 def mean_square_rate(system: System, state: State, k: int) -> float:
     """Mean w² of a degree of freedom (1/ps²) in stage k, over the second half of a pilot run from a
     state on."""
-    stage = system.scene.stages[k]
+    stage, freedom, engine = system.scene.stages[k], system.freedom_in(k), system.engine()
     thermal = BOLTZMANN * max(stage.temperatures)
-    engine, freedom = system.engine(), system.freedom_in(k)
-    first = sums_of_square_frequencies(system, engine, state, thermal)
-    fastest = (
-        max(sum_ / n for sum_, n in zip(first, freedom, strict=True) if n) if freedom.total else 0.0
-    )
+
+    def square_rates(now: State) -> np.ndarray:
+        """Sums of w² over translation and rotation. By equipartition <F²/m> = kT sum w², likewise
+        for torques; exact in the mean over the canonical distribution."""
+        sums = sums_of_state(system.model, now, engine.evaluate(now)[0])
+        return np.array([sums.force, sums.torque]) / thermal
+
+    pairs = zip(square_rates(state).tolist(), freedom, strict=True)
+    fastest = max((rates / n for rates, n in pairs if n), default=0.0)
     if fastest == 0 and (stiffest := stiffest_mode(system, state)) is not None:
         fastest = stiffest.rate**2  # the start is a minimum, where forces are 0
     if not isfinite(fastest) or fastest <= 0:
@@ -119,19 +107,17 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
         "thermostat": "langevin",
         "thermostat_time_ps": None,
         "friction_translation_per_ps": sqrt(fastest) / 5,
+        "friction_rotation_per_ps": None,
     }
-    heated = stage.with_integrator("baoab", dt / FEMTOSECOND)
-    scheme = _integrator(
-        system, k, heated.model_copy(update=heat | {"friction_rotation_per_ps": None})
-    )
-    now = engine.begin(state, scheme)
+    heated = stage.with_integrator("baoab", dt / FEMTOSECOND).model_copy(update=heat)
+    now, scheme = _begun(system, state, k, heated, engine)
     now.step[:] = 0
     now.begin_segment(0.0)
     every = round(PILOT_RADIANS / PILOT_STEP / PILOT_SAMPLES)
     sums = []
     for sample in range(1, PILOT_SAMPLES + 1):
         engine.advance(now, scheme, dt, sample * every)
-        sums.append(sum(sums_of_square_frequencies(system, engine, now, thermal)))
+        sums.append(square_rates(now).sum())
     rate = float(np.mean(sums[PILOT_SAMPLES // 2 :])) / freedom.total
     if not isfinite(rate):
         raise SimulationError(
@@ -140,17 +126,22 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
     return rate
 
 
-def _integrator(system: System, k: int, stage: Stage) -> Scheme:
-    """The integrator of a pilot run, with `stage` instead of stage k."""
+def _begun(
+    system: System, state: State, k: int, stage: Stage, engine: Engine
+) -> tuple[State, Scheme]:
+    """A state at the begin of a pilot run with `stage` instead of stage k, and its integrator."""
     stages = system.scene.stages
     scene = system.scene.model_copy(update={"stages": (*stages[:k], stage, *stages[k + 1 :])})
-    return integrator_of_stage(replace(system, scene=scene), k)
+    scheme = integrator_of_stage(replace(system, scene=scene), k)
+    return engine.begin(state, scheme), scheme
 
 
 #: Integrators that are tried for hybrid Monte Carlo, from the shortest step to the longest one.
 TRIED = ("velocity_verlet", "two_stage", "srkn_4")
 #: Steps that are tried, as fractions of the longest stable one, and trajectories with each.
 FRACTIONS, TRAJECTORIES = (0.2, 0.28, 0.4, 0.56, 0.8), 16
+#: Least acceptance with which longer steps are tried.
+LEAST_ACCEPTANCE = 0.2
 #: Steps of the first trajectories, which leave the lattice of a start, whose forces are not those
 #: of a liquid.
 WARMING_STEPS = 20
@@ -166,57 +157,51 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
     from a copy of a state on, so that they also approach equilibrium, first with the shortest step.
     Raises SimulationError."""
     stage = system.scene.stages[k]
-    first = stage.with_integrator(TRIED[0], stage.timestep_fs).model_copy(
-        update={"trajectory_steps": WARMING_STEPS}
-    )
-    now, _ = _acceptance(system, state, k, first)
-    stiffest = stiffest_mode(system, now)
-    rate = mean_square_rate(system, now, k)
-    best = (0.0, stage, 0.0)
+
+    def with_steps(integrator: str, timestep_fs: float, steps: int) -> Stage:
+        decided = stage.with_integrator(integrator, timestep_fs)
+        return decided.model_copy(update={"trajectory_steps": steps})
+
+    now, _ = _acceptance(system, state, k, with_steps(TRIED[0], stage.timestep_fs, WARMING_STEPS))
+    stiffest, rate = stiffest_mode(system, now), mean_square_rate(system, now, k)
     if stiffest is None or rate == 0:
         raise SimulationError(
             f"stages.{k}: nothing sets a step for integrator = 'auto'; name an integrator and a"
             " step"
         )
+    best = (0.0, 0.0, stage)
     for integrator in TRIED:
+        scheme = stage.with_integrator(integrator, 1.0).scheme
         for fraction in FRACTIONS:
-            scheme = stage.with_integrator(integrator, 1.0).scheme
             step = round_down(fraction * stable_angle(scheme) / stiffest.rate / FEMTOSECOND)
-            steps = stage.trajectory_steps or max(
-                1, round(RADIANS / sqrt(rate) / (step * FEMTOSECOND))
-            )
-            decided = stage.with_integrator(integrator, step).model_copy(
-                update={"trajectory_steps": steps}
-            )
+            steps = max(1, round(RADIANS / sqrt(rate) / (step * FEMTOSECOND)))
+            decided = with_steps(integrator, step, stage.trajectory_steps or steps)
             now, chance = _acceptance(system, now, k, decided)
-            gain = chance * step * FEMTOSECOND / scheme.force_evaluations
-            best = max(best, (gain, decided, chance), key=lambda one: one[0])
-            if chance < 0.2:
+            motion = chance * step / scheme.force_evaluations
+            best = max(best, (motion, chance, decided), key=lambda tried: tried[0])
+            if chance < LEAST_ACCEPTANCE:
                 break
-    gain, decided, chance = best
-    if gain == 0:
+    motion, chance, decided = best
+    if motion == 0:
         raise SimulationError(
             f"stages.{k}: no pilot trajectory was accepted; name an integrator and a shorter step"
         )
-    return (
-        decided.with_defaults,
-        (
-            f"the longest accepted motion per force evaluation of {', '.join(TRIED)}; {chance:.0%}"
-            f" of {TRAJECTORIES} pilot trajectories of {decided.trajectory_steps} steps would be"
-            " accepted"
-        ),
+    return decided.with_defaults, (
+        f"the longest accepted motion per force evaluation of {', '.join(TRIED)}; {chance:.0%}"
+        f" of {TRAJECTORIES} pilot trajectories of {decided.trajectory_steps} steps would be"
+        " accepted"
     )
 
 
 def _acceptance(system: System, state: State, k: int, stage: Stage) -> tuple[State, float]:
     """The state after pilot trajectories from a state on, and their mean probability of
     acceptance."""
-    engine, method = system.engine(), _integrator(system, k, stage)
-    now = engine.begin(state, method)
+    engine = system.engine()
+    now, scheme = _begun(system, state, k, stage, engine)
     now.begin_segment()
+    until = int(now.step[NOW]) + TRAJECTORIES * stage.steps_together
     try:
-        steps = TRAJECTORIES * stage.steps_together
-        engine.advance(now, method, stage.timestep_fs * FEMTOSECOND, int(now.step[NOW]) + steps)
+        engine.advance(now, scheme, stage.timestep_fs * FEMTOSECOND, until)
     except SimulationError:  # a molecule was lost in a step that is too long
         return state, 0.0
     sums = not_none(engine.trajectories)

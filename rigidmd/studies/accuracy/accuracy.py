@@ -20,16 +20,17 @@ from rigidmd.figures.style import (
 )
 from rigidmd.io.write import Column, Table
 from rigidmd.run.force_errors import single_precision_errors
-from rigidmd.run.pilot.trial_systems import (
+from rigidmd.run.trial_systems import (
     COMPARATORS,
     SPAN_PS,
     body_trial_system,
     molecular_trial_system,
 )
-from rigidmd.run.pilot.trials import IntegratorAccuracy, Trial, measure, plan
+from rigidmd.run.trials import Trial
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
+from rigidmd.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
 from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
 
 #: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body

@@ -18,7 +18,7 @@ from rigidmd.errors import SceneError, SimulationError, option
 from rigidmd.run import Simulation
 from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.observers import Every
-from rigidmd.run.pilot.stable_step import stiffest_mode
+from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.couplings import THERMOSTATS
 from rigidmd.scene.stage import ERROR_TARGETS, Stage
