@@ -241,17 +241,17 @@ def every_site(molecule: Molecule) -> np.ndarray:
 
 
 def close_pairs(
-    system: System, state: State, *wanted: tuple[float, Callable[[Molecule], np.ndarray]]
+    system: System, state: State, *ranges: tuple[float, Callable[[Molecule], np.ndarray]]
 ) -> list[tuple[int, int, float]]:
     """Sites (i, j) of different molecules, not both frozen, within a radius, and their distances,
-    Å. `wanted` are radii, and functions for the indices of the sites of a molecule to which they
+    Å. `ranges` are radii, and functions for the indices of the sites of a molecule to which they
     apply."""
     cell = state.cell if state.volume < inf else None
     position = system.site_positions(state)
     owner = system.sites.molecule
     free = mobile(system.model)
     near: dict[tuple[int, int], float] = {}
-    for radius, sites_of in wanted:
+    for radius, sites_of in ranges:
         chosen = system.of_sites(
             lambda m, sites_of=sites_of: np.isin(every_site(m), sites_of(m))
         ).nonzero()[0]

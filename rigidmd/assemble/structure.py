@@ -62,7 +62,7 @@ class Configuration(NamedTuple):
 def read_structure(
     path: Path,
     species: list[Molecule],
-    wanted: np.ndarray | None,
+    cell_of_scene: np.ndarray | None,
     periodic: bool,
     tolerance: float,
     frame: int | None = None,
@@ -73,7 +73,7 @@ def read_structure(
 ) -> Configuration:
     """The molecules of a structure file. Raises StructureError.
 
-    wanted : cell (3, 3) of the scene, or None to use the cell of the file. tolerance, frame,
+    cell_of_scene : (3, 3), or None to use the cell of the file. tolerance, frame,
         repeat, atom_types,
     topology : see Scene.structure. content : of a file that is not on disk, see
         `Scene.embedded_files`
@@ -88,13 +88,13 @@ def read_structure(
                 str(path), [f"holds one state with its names: leave out {' and '.join(needless)}"]
             )
         configuration = _read_state(path, species)
-        if periodic and wanted is None:
+        if periodic and cell_of_scene is None:
             _check_box(path, configuration.cell, [])
     else:
         configuration = _read_molecules(
-            path, species, wanted, periodic, tolerance, frame, atom_types, topology, content
+            path, species, cell_of_scene, periodic, tolerance, frame, atom_types, topology, content
         )
-    cell = None if not periodic else configuration.cell if wanted is None else wanted
+    cell = None if not periodic else configuration.cell if cell_of_scene is None else cell_of_scene
     if (
         cell is not None
         and configuration.cell is not None
@@ -115,34 +115,36 @@ def read_structure(
         configuration = _repeated(configuration, repeat)
     return with_reduced_cell(
         configuration,
-        "its" if wanted is None else "the scene's box: its",
-        may_rotate=wanted is None,
+        "its" if cell_of_scene is None else "the scene's box: its",
+        may_rotate=cell_of_scene is None,
     )
 
 
-def with_reduced_cell(found: Configuration, whose: str, may_rotate: bool) -> Configuration:
+def with_reduced_cell(configuration: Configuration, whose: str, may_rotate: bool) -> Configuration:
     """The same configuration in a cell with small tilts; rotated, if this allows a longer cutoff.
     `whose` is the owner of the lattice, for the note."""
-    if found.cell is None:
-        return found
-    cell, rotation = (
-        least_skewed_cell(found.cell) if may_rotate else (reduced_cell(found.cell), np.eye(3))
-    )
-    if np.array_equal(cell, found.cell):
-        return found
-    basis = basis_of(cell @ rotation, found.cell)
+    if configuration.cell is None:
+        return configuration
+    given_cell, velocity = configuration.cell, configuration.velocity
+    if may_rotate:
+        cell, rotation = least_skewed_cell(given_cell)
+    else:
+        cell, rotation = reduced_cell(given_cell), np.eye(3)
+    if np.array_equal(cell, given_cell):
+        return configuration
+    basis = basis_of(cell @ rotation, given_cell)
     used = f"{describe_cell(cell)}, {describe_basis(basis)}"
     note = (
-        f"{whose} lattice is given by the cell with {used}, in place of {describe_cell(found.cell)}"
+        f"{whose} lattice is given by the cell with {used}, in place of {describe_cell(given_cell)}"
     )
     if not np.array_equal(rotation, np.eye(3)):
         note += "; rotated, contents included"
-        found = found._replace(
-            position=found.position @ rotation.T,
-            rotation=rotation @ found.rotation,
-            velocity=None if found.velocity is None else found.velocity @ rotation.T,
+        configuration = configuration._replace(
+            position=configuration.position @ rotation.T,
+            rotation=rotation @ configuration.rotation,
+            velocity=None if velocity is None else velocity @ rotation.T,
         )
-    return found._replace(cell=cell, notes=(*found.notes, note), basis=basis)
+    return configuration._replace(cell=cell, notes=(*configuration.notes, note), basis=basis)
 
 
 def _repeated(configuration: Configuration, repeat: tuple[int, int, int]) -> Configuration:
@@ -370,12 +372,12 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
 def _other_model(molecule: Molecule, saved: np.ndarray) -> str:
     """The difference between a molecule and a saved one with this `Molecule.fingerprint`; empty if
     there is none."""
-    here = np.array(molecule.fingerprint)
+    fingerprint = np.array(molecule.fingerprint)
     names = ("mass, u", "moment of inertia 1, u Å²", "moment 2", "moment 3", "number of sites")
-    size = np.array([here[0], *[max(here[1:4].max(), saved[1:4].max())] * 3, 1.0])
+    size = np.array([fingerprint[0], *[max(fingerprint[1:4].max(), saved[1:4].max())] * 3, 1.0])
     differs = [
         f"{name}: {saved_value:.6g}, here {value:.6g}"
-        for name, saved_value, value, scale in zip(names, saved, here, size, strict=True)
+        for name, saved_value, value, scale in zip(names, saved, fingerprint, size, strict=True)
         if abs(saved_value - value) > SAME_MODEL * scale
     ]
     return f"holds another {molecule.name} than the scene ({'; '.join(differs)})" if differs else ""

@@ -44,10 +44,10 @@ SIZE = np.int64(2**63 - 1)
 
 
 def largest_values(state: State, load: Load = EXAMPLE[1]) -> LargestValues:
-    found = np.empty(len(LargestValues._fields))
+    values = np.empty(len(LargestValues._fields))
     arrays = (state.position, state.velocity, state.rotation, state.angular_momentum_body, *load)
-    find_largest(*(array.ravel() for array in arrays), found)
-    return LargestValues(*found.tolist())
+    find_largest(*(array.ravel() for array in arrays), values)
+    return LargestValues(*values.tolist())
 
 
 @kernel(from_python=True)
@@ -71,7 +71,7 @@ def _largest(values):
 
 def sums_of_state(model: Model, state: State, load: Load = EXAMPLE[1]) -> StateSums:
     """Sums over a state and the load on it; without a load `force` and `torque` are 0."""
-    found = np.zeros(SUM_COUNT)
+    sums = np.zeros(SUM_COUNT)
     fill_sums(
         model.species,
         model.mass,
@@ -82,15 +82,15 @@ def sums_of_state(model: Model, state: State, load: Load = EXAMPLE[1]) -> StateS
         state.angular_momentum_body,
         load.force,
         load.torque_body,
-        found,
+        sums,
     )
-    return unpack_sums(found)
+    return unpack_sums(sums)
 
 
-def unpack_sums(found: np.ndarray) -> StateSums:
+def unpack_sums(sums: np.ndarray) -> StateSums:
     """The sums from the numbers of `fill_sums`."""
-    translation, rotation, force, torque, orthogonality_error = found[:5].tolist()
-    vectors = found[5:].copy()
+    translation, rotation, force, torque, orthogonality_error = sums[:5].tolist()
+    vectors = sums[5:].copy()
     return StateSums(
         translation,
         rotation,

@@ -151,18 +151,20 @@ def coupling_passes(
     kinds = {flow.kind for flow in scheme.flows}
     thermostat, barostat = scheme.thermostat, scheme.barostat
     code = thermostat_code(thermostat, model)
-    found = {REMOVE_MOMENTUM: Pass("removal of momentum", _remove_momentum, (model, state))}
+    passes = {REMOVE_MOMENTUM: Pass("removal of momentum", _remove_momentum, (model, state))}
     if thermostat is not None:
-        found[THERMOSTAT] = thermostat_pass(thermostat, model, code, state, heat, registers)
+        passes[THERMOSTAT] = thermostat_pass(thermostat, model, code, state, heat, registers)
     if box is not None:
-        found[BAROSTAT] = barostat_pass(barostat, model, terms, state, load, box, registers, status)
-        found[SCALE_BOX] = piston_pass(barostat, state, registers)
+        passes[BAROSTAT] = barostat_pass(
+            barostat, model, terms, state, load, box, registers, status
+        )
+        passes[SCALE_BOX] = piston_pass(barostat, state, registers)
     if trajectory is not None:
         kinds |= {FAILED} | ({AFTER_BAROSTAT} if box is not None else set())
-        found |= trajectory_passes(
+        passes |= trajectory_passes(
             thermostat, model, code, terms, state, load, heat, trajectory, registers, status
         )
-    return {kind: one for kind, one in found.items() if kind in kinds}
+    return {kind: one for kind, one in passes.items() if kind in kinds}
 
 
 @kernel
@@ -338,12 +340,12 @@ class Advance:
 
 def registers_of(workspaces: CouplingWorkspaces) -> Registers:
     """New registers, which share what a barostat and trajectories remember."""
-    found = new_registers()
+    registers = new_registers()
     if workspaces.box is not None:
-        found = found._replace(tally=workspaces.box.tally, known=workspaces.box.known)
+        registers = registers._replace(tally=workspaces.box.tally, known=workspaces.box.known)
     if workspaces.trajectory is not None:
-        found = found._replace(resting=workspaces.trajectory.diverged)
-    return found
+        registers = registers._replace(resting=workspaces.trajectory.diverged)
+    return registers
 
 
 #: Indices of `Advance._integers`: `until` and `observed` of `advance`, and its status.

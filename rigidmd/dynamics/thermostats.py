@@ -140,15 +140,15 @@ def thermostat_workspace() -> np.ndarray:
 def thermostat_code(thermostat: NamedTuple, model: NamedTuple) -> Code:
     """The tasks of a thermostat that act on blocks of molecules."""
     state, workspace = EXAMPLE[0], thermostat_workspace()
-    found: dict[str, tuple] = {}
+    tasks: dict[str, tuple] = {}
     if isinstance(thermostat, Langevin | Andersen | HybridMonteCarlo):
         apply = _apply_andersen if isinstance(thermostat, Andersen) else _apply_langevin
-        found["molecules"] = apply, (thermostat, model, state, workspace, 0.0, 0)
+        tasks["molecules"] = apply, (thermostat, model, state, workspace, 0.0, 0)
     if isinstance(thermostat, VelocityRescaling | NoseHoover | HybridMonteCarlo):
-        found["kinetic_energies"] = _compute_kinetic_energies, (model, state, workspace)
+        tasks["kinetic_energies"] = _compute_kinetic_energies, (model, state, workspace)
     if isinstance(thermostat, VelocityRescaling | NoseHoover):
-        found["scale"] = _scale, (state, 0.0, 0.0)
-    return Code(**found)
+        tasks["scale"] = _scale, (state, 0.0, 0.0)
+    return Code(**tasks)
 
 
 @chosen_by_type

@@ -104,11 +104,12 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     return register
 
 
-def _check_arguments(function: Callable, wanted: tuple[str, ...]) -> None:
-    given = list(inspect.signature(function).parameters)
-    if len(given) != len(wanted):
+def _check_arguments(function: Callable, expected: tuple[str, ...]) -> None:
+    arguments = list(inspect.signature(function).parameters)
+    if len(arguments) != len(expected):
         raise TypeError(
-            f"the function has the arguments ({', '.join(given)}), must have ({', '.join(wanted)})"
+            f"the function has the arguments ({', '.join(arguments)}), must have"
+            f" ({', '.join(expected)})"
         )
 
 

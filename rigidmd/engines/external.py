@@ -242,10 +242,10 @@ class Comparison(NamedTuple):
         return bool(self.difference <= self.tolerance)
 
 
-def compare_at(system: System, state: State, here: Engine, there: Engine) -> list[Comparison]:
+def compare_at(system: System, state: State, engine: Engine, other: Engine) -> list[Comparison]:
     """Compare energies by term, forces and torques on bodies, and the virial of two engines at a
     state. The tail correction is compared with `tail_of_formulas`."""
-    ours, theirs = (observe(system, engine, state, energy_unit=1.0) for engine in (here, there))
+    ours, theirs = (observe(system, engine, state, energy_unit=1.0) for engine in (engine, other))
     independent = {}  # instead of what both observations take from the system
     if TAIL in theirs.components:
         independent[TAIL] = tail_of_formulas(force_field_of(system), state.volume)
@@ -253,7 +253,7 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
         value - theirs.components[name] for name, value in independent.items()
     )
     their_components = theirs.components | independent
-    virial = sum(abs(float(tally.virial.trace())) for tally in here.evaluate(state)[1].values())
+    virial = sum(abs(float(tally.virial.trace())) for tally in engine.evaluate(state)[1].values())
 
     kinetic = sum(kinetic_energies(system, state))
     size = (
@@ -261,7 +261,7 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
         + kinetic
     )
     size = max(size, virial / STEEPEST)
-    plain = PLAIN + there.force_tolerance
+    plain = PLAIN + other.force_tolerance
     force_error = system.force_error or 0.0
     sites = system.site_count
     alpha = system.scene.forces.ewald_alpha_per_A
@@ -297,7 +297,7 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
         a, b = (float(observation.virial.trace()) for observation in (ours, theirs))
         lines.append(
             _energy(
-                "virial", a, b, (plain + there.virial_tolerance) * max(size, virial) + 3 * ewald
+                "virial", a, b, (plain + other.virial_tolerance) * max(size, virial) + 3 * ewald
             )
         )
     return lines
@@ -309,10 +309,10 @@ def _energy(name: str, ours: float, theirs: float, tolerance: float) -> Comparis
     )
 
 
-def describe_comparison(lines: list[Comparison], there: str) -> str:
-    """A table of comparisons; `there` is the name of the other engine."""
+def describe_comparison(lines: list[Comparison], name: str) -> str:
+    """A table of comparisons; `name` : of the other engine."""
     wide = max(len(line.name) for line in lines)
-    rows = [f"  {'':<{wide}}  {'rigidmd':>20}  {there:>20}  {'difference':>10}  {'tolerance':>9}"]
+    rows = [f"  {'':<{wide}}  {'rigidmd':>20}  {name:>20}  {'difference':>10}  {'tolerance':>9}"]
     for line in lines:
         values = (
             f"{line.here:>20.10g}  {line.there:>20.10g}  {line.difference:>10.2g} "

@@ -184,12 +184,12 @@ def select_by_number(
         mask = of_species & (first <= number) & (number <= last)
         fault, present = "", number[of_species]
         if not mask.any() or last > present.max():
-            there = (
+            existing = (
                 f"they have {present.min()} to {present.max()}"
                 if len(present)
                 else "there are none"
             )
-            fault = f"no {name} has the number {text}; {there}"
+            fault = f"no {name} has the number {text}; {existing}"
         yield text, mask, fault
 
 
@@ -208,10 +208,10 @@ def sites_named(species: list[Any], name: str) -> list[np.ndarray]:
     species."""
     owner, _, site = name.rpartition(".")
     for attribute in ("site_names", "elements"):
-        found = [
+        masks = [
             np.array([owner in ("", m.name) and other == site for other in getattr(m, attribute)])
             for m in species
         ]
-        if any(mask.any() for mask in found):
+        if any(mask.any() for mask in masks):
             break
-    return found
+    return masks

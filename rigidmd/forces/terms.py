@@ -243,10 +243,10 @@ class TermDispatcher:
         return self._load
 
     def _passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
-        found: list[Pass] = []
+        passes: list[Pass] = []
         for workspace, tally in zip(workspaces, self._tallies, strict=True):
-            found += trait(workspace, "passes")(Evaluation(state, load, tally, self._status))
-        return found
+            passes += trait(workspace, "passes")(Evaluation(state, load, tally, self._status))
+        return passes
 
     def _rate_passes(self, workspaces: tuple[NamedTuple, ...], state: State) -> list[Pass]:
         dependent = [w for w in workspaces if trait(type(w), "time_dependent")]

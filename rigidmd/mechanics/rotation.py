@@ -26,8 +26,8 @@ def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
 
 def unit_vector(vector: ArrayLike) -> np.ndarray:
     """Unit vector along a non-zero vector (k,) of any length, without overflow or underflow."""
-    given = np.asarray(vector, dtype=float)
-    scaled = given / np.abs(given).max()
+    components = np.asarray(vector, dtype=float)
+    scaled = components / np.abs(components).max()
     return scaled / np.linalg.norm(scaled)
 
 

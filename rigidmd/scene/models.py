@@ -326,30 +326,30 @@ def molecule(
     )
 
 
-def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
+def with_masses(original: Molecule, masses: dict[str, float]) -> Molecule:
     """The same molecule with other masses (u) of isotopes, by site name or else element. Raises
     MoleculeError."""
     faults, changed = [], {}
     for key, mass in masses.items():
-        sites = [i for i, name in enumerate(found.site_names) if name == key]
-        sites = sites or [i for i, element in enumerate(found.elements) if element == key]
-        heavy = [i for i in sites if found.masses[i] > 0]
+        sites = [i for i, name in enumerate(original.site_names) if name == key]
+        sites = sites or [i for i, element in enumerate(original.elements) if element == key]
+        heavy = [i for i in sites if original.masses[i] > 0]
         if not heavy:
-            known = ", ".join(dict.fromkeys([*found.elements, *found.site_names]))
+            known = ", ".join(dict.fromkeys([*original.elements, *original.site_names]))
             if sites:
                 why = "is massless, and stays so"
             else:
                 why = f"is not a site or element of it; there are {known}"
             faults.append(f"masses_u.{key} {why}")
-        changed |= {i: mass for i in heavy if i not in changed or found.site_names[i] == key}
+        changed |= {i: mass for i in heavy if i not in changed or original.site_names[i] == key}
     if faults:
-        raise MoleculeError(f"molecule {found.name}", faults)
+        raise MoleculeError(f"molecule {original.name}", faults)
     sites = [
         Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])})
-        for i, entry in enumerate(found.sites())
+        for i, entry in enumerate(original.sites())
     ]
     copied_keys = ("name", "residue_names", "title", "source", "group", "note", "mixing")
-    return molecule(sites=tuple(sites), **{key: getattr(found, key) for key in copied_keys})
+    return molecule(sites=tuple(sites), **{key: getattr(original, key) for key in copied_keys})
 
 
 def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[Site, ...]:

@@ -239,13 +239,13 @@ class BoundForce:
             ) from error
 
 
-def real_numbers(given: Any) -> np.ndarray | None:
+def real_numbers(values: Any) -> np.ndarray | None:
     """An array of real numbers; None for anything else, such as complex numbers and masked
     values."""
     try:
-        return (
-            None if np.iscomplexobj(given) or np.ma.is_masked(given) else np.asarray(given, float)
-        )
+        if np.iscomplexobj(values) or np.ma.is_masked(values):
+            return None
+        return np.asarray(values, float)
     except (TypeError, ValueError):
         return None
 

@@ -44,7 +44,7 @@ class KVectors(NamedTuple):
 
 
 def k_vectors_up_to(
-    most: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = SAME_BASIS
+    largest: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = SAME_BASIS
 ) -> KVectors:
     """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` if
     given.
@@ -56,9 +56,9 @@ def k_vectors_up_to(
 
     def inside(n: np.ndarray) -> np.ndarray:
         other = _in_other(n, basis)
-        return (np.abs(other) <= most).all(axis=-1) & ((other**2).sum(axis=-1) <= square)
+        return (np.abs(other) <= largest).all(axis=-1) & ((other**2).sum(axis=-1) <= square)
 
-    return _in_columns(np.abs(basis) @ most, inside)
+    return _in_columns(np.abs(basis) @ largest, inside)
 
 
 def k_vectors_within(
@@ -74,7 +74,7 @@ def k_vectors_within(
     basis : for the limit, see `k_vectors_up_to`
     """
     cell = 2 * pi * np.linalg.inv(reciprocal).T
-    most = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi)).astype(int)
+    largest = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi)).astype(int)
 
     def inside(n: np.ndarray) -> np.ndarray:
         short = ((n @ reciprocal) ** 2).sum(axis=-1) <= radius**2
@@ -82,7 +82,9 @@ def k_vectors_within(
             short if limit is None else short & (np.abs(_in_other(n, basis)) <= limit).all(axis=-1)
         )
 
-    return _in_columns(most if limit is None else np.minimum(most, np.abs(basis) @ limit), inside)
+    if limit is not None:
+        largest = np.minimum(largest, np.abs(basis) @ limit)
+    return _in_columns(largest, inside)
 
 
 def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
@@ -90,19 +92,18 @@ def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
     return n @ np.rint(np.linalg.inv(basis)).astype(int).T
 
 
-def _in_columns(most, inside) -> KVectors:
-    mx, my, mz = (int(m) for m in most)
+def _in_columns(largest, inside) -> KVectors:
+    mx, my, mz = (int(m) for m in largest)
     z = np.arange(-mz, mz + 1)
     columns, counts = [], []
     for x in range(mx + 1):
         y = np.arange(-my if x else 0, my + 1)
         n = np.stack(np.broadcast_arrays(x, y[:, None], z), axis=-1)
-        found = inside(n) & ((x > 0) | (y[:, None] > 0) | (z > 0))
-        here = np.flatnonzero(found.any(axis=1))
-        columns.append(
-            np.stack([np.full(len(here), x), y[here], z[found[here].argmax(axis=1)]], axis=1)
-        )
-        counts.append(np.count_nonzero(found[here], axis=1))
+        is_inside = inside(n) & ((x > 0) | (y[:, None] > 0) | (z > 0))
+        has_vectors = is_inside.any(axis=1)
+        y, is_inside = y[has_vectors], is_inside[has_vectors]
+        columns.append(np.stack([np.full(len(y), x), y, z[is_inside.argmax(axis=1)]], axis=1))
+        counts.append(np.count_nonzero(is_inside, axis=1))
     count = np.concatenate(counts).astype(np.int64)
     ends = np.cumsum(count)
     total = int(count.sum())

@@ -81,24 +81,24 @@ def settings(forces: Any, composition: Composition, cutoff: float | None) -> Set
             [f"forces.dispersion_grid = {list(grid)} refers to a cell with a large tilt; {fault}"],
         )
     if grid is None or order is None:
-        found = pme_grid_for(sites, beta, cell, part, order, grid)
-        if found is None:
+        grid_and_order = pme_grid_for(sites, beta, cell, part, order, grid)
+        if grid_and_order is None:
             return Settings(
                 numbers, [f"{unreachable} on a grid; use a lower accuracy or a longer cutoff"]
             )
-        grid, order = found
+        grid, order = grid_and_order
         grid = grid if is_given_cell else (max(grid),) * 3
     return Settings(numbers | {"dispersion_order": order, "dispersion_grid": grid}, [])
 
 
 def _error(accuracy: float, species: list[Any], counts: np.ndarray) -> float:
     """The error of a force (u Å/ps²) that is meant by an accuracy."""
-    found = [
+    force_scales = [
         m.epsilon[m.epsilon > 0] / m.sigma[m.epsilon > 0]
         for m, n in zip(species, counts, strict=True)
         if n
     ]
-    return accuracy * 24 * float(np.concatenate(found).max())
+    return accuracy * 24 * float(np.concatenate(force_scales).max())
 
 
 def interactions(parts: SystemParts) -> Interactions:

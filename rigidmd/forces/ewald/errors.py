@@ -44,10 +44,10 @@ class Charges(NamedTuple):
     def form(self, k: np.ndarray) -> np.ndarray:
         """Sum over molecules of |sum q exp(i k r)|², averaged over orientations, e²; k (1/Å) of any
         shape."""
-        found = np.full(np.shape(k), self.square)
+        square = np.full(np.shape(k), self.square)
         for product, distance in self.pairs:
-            found += product * np.sinc(k * distance / pi)
-        return found
+            square += product * np.sinc(k * distance / pi)
+        return square
 
     def transform(self, alpha: float, square: np.ndarray) -> np.ndarray:
         """Fourier transform of the smooth part of the potential of a unit charge at k² > 0."""
@@ -129,9 +129,9 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
             is_less = real_error(charges, middle / cutoff, cutoff, volume) <= error
             low, high = (low, middle) if is_less else (middle, high)
         return high / cutoff
-    most = real_error(charges, 0.0, cutoff, volume)
+    unscreened_error = real_error(charges, 0.0, cutoff, volume)
     # a large error allows almost no screening; the formula holds for alpha cutoff down to 1/2
-    return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
+    return max(0.5, sqrt(max(0.0, np.log(unscreened_error / error)))) / cutoff
 
 
 def filled_fraction(
@@ -212,13 +212,15 @@ def pme_error(
         weakened = weakened + 2 * metric[d, o] * first[d] * first[o] * every[e]
     square = square * np.ones_like(weakened)
     square[0, 0, 0] = weakened[0, 0, 0] = 1.0  # k = 0 is excluded
-    kept, whole = unaliased[0] * unaliased[1] * unaliased[2], every[0] * every[1] * every[2]
+    unaliased_product = unaliased[0] * unaliased[1] * unaliased[2]
+    product = every[0] * every[1] * every[2]
     g = charges.transform(alpha, square)
-    influence = square * g * kept / (whole * weakened)
-    here = charges.form(np.sqrt(square))
-    wrong = square * (g - influence * kept) ** 2 * here
+    influence = square * g * unaliased_product / (product * weakened)
+    form = charges.form(np.sqrt(square))
+    wrong = square * (g - influence * unaliased_product) ** 2 * form
+    aliased = (product - unaliased_product) * weakened * charges.square
     wrong += influence**2 * (
-        kept * here * (weakened - kept * square) + (whole - kept) * weakened * charges.square
+        unaliased_product * form * (weakened - unaliased_product * square) + aliased
     )
     wrong[0, 0, 0] = 0.0
     twice = np.full(wrong.shape[2], 2.0)

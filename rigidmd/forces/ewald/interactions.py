@@ -102,12 +102,15 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
             and forces.ewald_k_max is None
             and radius * longest > 2 * pi * MOST_K_VECTORS
         ):
-            given = (
+            radius_and_origin = (
                 f"forces.ewald_k_radius_per_A = {radius:g}{_default(forces.ewald_k_radius_per_A)}"
             )
             return Settings(
                 numbers,
-                [f"{given} is more than {MOST_K_VECTORS} k-vectors along an edge of the box"],
+                [
+                    f"{radius_and_origin} is more than {MOST_K_VECTORS} k-vectors along an edge of"
+                    " the box"
+                ],
             )
         if (
             count := _number_of_k_vectors(forces, radius, composition.space.volume)
@@ -126,18 +129,18 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
         )
         return Settings(numbers, [fault])
     if grid is None or order is None:
-        found = pme_grid_for(charges, alpha, cell, part, order, grid)
-        if found is None and longest > MAX_GRID_POINTS * COARSE_SPACING:
+        grid_and_order = pme_grid_for(charges, alpha, cell, part, order, grid)
+        if grid_and_order is None and longest > MAX_GRID_POINTS * COARSE_SPACING:
             fault = f"an edge of {longest:.4g} Å is too long for a grid of {MAX_GRID_POINTS} points"
             return Settings(numbers, [f"forces.electrostatics = 'pme': {fault}"])
-        if found is None:
-            given = " with the given forces.pme_order or pme_grid" if order or grid else ""
+        if grid_and_order is None:
+            settings_used = " with the given forces.pme_order or pme_grid" if order or grid else ""
             fault = (
-                f"{unreachable}{given} at alpha = {alpha:.3g} 1/Å; use a lower accuracy or a longer"
-                " cutoff"
+                f"{unreachable}{settings_used} at alpha = {alpha:.3g} 1/Å; use a lower accuracy or"
+                " a longer cutoff"
             )
             return Settings(numbers, [fault])
-        grid, order = found
+        grid, order = grid_and_order
     numbers["pme_order"] = order
     if has_given_cell or forces.pme_grid is not None:
         numbers["pme_grid"] = grid
@@ -146,17 +149,17 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
     return Settings(numbers, [], grid)
 
 
-def _default(given: object) -> str:
-    return "" if given else " (the default)"
+def _default(value: object) -> str:
+    return "" if value else " (the default)"
 
 
 def _number_of_k_vectors(forces: Any, radius: float | None, volume: float) -> float:
     """Approximate number of k-vectors within a radius (1/Å) and the limits of [forces]."""
-    most = forces.ewald_k_max
+    limit = forces.ewald_k_max
     boxed = (
         inf
-        if most is None
-        else prod(2.0 * n + 1 for n in (most if isinstance(most, tuple) else (most,) * 3))
+        if limit is None
+        else prod(2.0 * n + 1 for n in (limit if isinstance(limit, tuple) else (limit,) * 3))
     )
     return min(boxed, inf if radius is None else radius**3 * volume / (6 * pi**2))
 
@@ -178,13 +181,13 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
                 reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * error)
             )
         return real, error, vectors
-    most, radius = forces.ewald_k_max, forces.ewald_k_radius_per_A
-    if isinstance(most, int):
-        most = (most, most, most)
+    limit, radius = forces.ewald_k_max, forces.ewald_k_radius_per_A
+    if isinstance(limit, int):
+        limit = (limit, limit, limit)
     if radius is None:
-        vectors = direct_sum.k_vectors_up_to(most, forces.ewald_k2_max, parts.basis)
+        vectors = direct_sum.k_vectors_up_to(limit, forces.ewald_k2_max, parts.basis)
     else:
-        vectors = direct_sum.k_vectors_within(reciprocal, radius, most, parts.basis)
+        vectors = direct_sum.k_vectors_within(reciprocal, radius, limit, parts.basis)
     if vectors.total == 0:
         raise SceneError(
             parts.scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no k-vector"]

@@ -114,8 +114,8 @@ class Pme(NamedTuple):
         kind = np.dtype(setup.dtype)
         pair = np.complex64 if kind == np.float32 else np.complex128
         s, width = len(self.charge), 4 if order <= 4 else 8
-        most = min(max(BLOCKS, grid[0] // PLANES), MOST_BLOCKS, grid[0] // order)
-        blocks = max(1, most) if np.prod(grid) > SERIAL_POINTS else 1
+        usable_blocks = min(max(BLOCKS, grid[0] // PLANES), MOST_BLOCKS, grid[0] // order)
+        blocks = max(1, usable_blocks) if np.prod(grid) > SERIAL_POINTS else 1
         value = np.zeros((order, width))
         value[:, :order] = weights(order)
         slope = value[1:] * np.arange(1, order)[:, None]

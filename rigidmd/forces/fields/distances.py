@@ -44,11 +44,11 @@ class DistanceRestraint(NamedTuple):
 def nearest_images(vectors: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) to nearest images in a cell (3, 3), exact up to half its smallest height;
     unchanged if its edges are infinite."""
-    found = np.array(vectors, float)
+    images = np.array(vectors, float)
     if np.isfinite(cell[0, 0]):
         for k in (2, 1, 0):
-            found -= np.rint(found[..., k, None] / cell[k, k]) * cell[k]
-    return found
+            images -= np.rint(images[..., k, None] / cell[k, k]) * cell[k]
+    return images
 
 
 def _centre_in(state: State, members: np.ndarray, fraction: np.ndarray) -> np.ndarray:
@@ -71,12 +71,12 @@ def distance_restraint(
         faults.append(f"{where} would do nothing: all its molecules are frozen")
     mass = [parts.model.mass[parts.model.species[group]] for group in groups]
     fractions = [of / of.sum() for of in mass]
-    found = DistanceRestraint(
+    restraint = DistanceRestraint(
         *groups, *fractions, entry.distance_A, entry.stiffness[0] * KJ_PER_MOL
     )
     if np.isfinite(state.cell[0, 0]):
-        faults += _faults_in_box(found, parts, where)
-    return found if len(faults) == before else None
+        faults += _faults_in_box(restraint, parts, where)
+    return restraint if len(faults) == before else None
 
 
 def _faults_in_box(term: DistanceRestraint, parts: SystemParts, where: str) -> list[str]:

@@ -90,18 +90,18 @@ def term(
     sites = sites_of(index, points, parts.model.inverse_inertia)
     positions = (walls.direction, *walls.positions_A)
     if walls.kind == "harmonic":
-        found = HarmonicWalls(*positions, walls.stiffness_kJ_mol_A2 * KJ_PER_MOL, sites)
+        term_of_walls = HarmonicWalls(*positions, walls.stiffness_kJ_mol_A2 * KJ_PER_MOL, sites)
     else:
         epsilon, cutoff = walls.epsilon_kJ_mol * KJ_PER_MOL, walls.cutoff_A or inf
-        found = LennardJonesWalls(*positions, walls.sigma_A, epsilon, cutoff, sites)
-        if (behind := found.behind(parts.state)) is not None:
+        term_of_walls = LennardJonesWalls(*positions, walls.sigma_A, epsilon, cutoff, sites)
+        if (behind := term_of_walls.behind(parts.state)) is not None:
             m, reason = behind
             faults.append(
                 f"{where}: at the start, molecule {m + 1} ({parts.species[index[m]].name}) {reason}"
             )
     if walls is parts.scene.fields.walls[-1]:
         faults += _gap_errors(parts)
-    return found
+    return term_of_walls
 
 
 def _acted_on(walls: Any, species: list[Any], moves: np.ndarray) -> list[np.ndarray]:
@@ -143,13 +143,13 @@ def _gap_errors(parts: SystemParts) -> list[str]:
 
 def _protrusion(walls: Any, parts: SystemParts) -> float:
     """Largest distance of interacting sites from the points on which walls act, Å."""
-    found = 0.0
+    farthest = 0.0
     for m, points in zip(parts.species, _acted_on(walls, parts.species, parts.moves), strict=True):
         acting = m.positions_body[(m.epsilon > 0) | (m.charges != 0)]
         if len(points) and len(acting):
             distance = np.linalg.norm(acting[:, None] - points, axis=2).min(axis=1)
-            found = max(found, float(distance.max()))
-    return found
+            farthest = max(farthest, float(distance.max()))
+    return farthest
 
 
 def range_of_centres(walls: Any, species: list[Any]) -> tuple[float, float]:

@@ -191,11 +191,11 @@ CHECKPOINTED = ("boxes", "origin", "reference")
 def checkpoint_arrays(pairs: PairList) -> dict[str, np.ndarray]:
     """The arrays from which `restored` makes this list again, bit for bit, although sites have
     moved since."""
-    found = {"skin": np.array(pairs.skin)}
+    arrays = {"skin": np.array(pairs.skin)}
     if pairs.counters[USABLE] == 1:
-        found |= {name: getattr(pairs.clusters, name) for name in CHECKPOINTED}
-        found |= {"order": order_of(pairs.clusters), "built": pairs.built, "times": pairs.times}
-    return found
+        arrays |= {name: getattr(pairs.clusters, name) for name in CHECKPOINTED}
+        arrays |= {"order": order_of(pairs.clusters), "built": pairs.built, "times": pairs.times}
+    return arrays
 
 
 def restored(
@@ -211,10 +211,10 @@ def restored(
     if arrays.keys() not in ({"skin"}, {"skin", *like}):
         raise ValueError(f"a neighbour list has {', '.join(arrays) or 'no arrays'}")
     for name, array in ({"skin": np.array(pairs.skin)} | like).items():
-        found = arrays.get(name, array)
-        if (found.shape, found.dtype) != (array.shape, array.dtype):
+        stored = arrays.get(name, array)
+        if (stored.shape, stored.dtype) != (array.shape, array.dtype):
             raise ValueError(f"{name} of a neighbour list has another shape or type")
-        if name in arrays and name not in ("skin", "built") and not np.isfinite(found).all():
+        if name in arrays and name not in ("skin", "built") and not np.isfinite(stored).all():
             raise ValueError(f"{name} of a neighbour list is not finite")
     skin = float(arrays["skin"])
     if not (

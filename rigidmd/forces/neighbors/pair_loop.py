@@ -148,23 +148,23 @@ class PairWorkspace(NamedTuple):
         blocks, content = len(tallies), (self.slot_potential, pairs, sums)
         moved = (self.list_code, pairs, sites, into.state, into.status)
         numbers = (self.potential, self.slot_potential, pairs, sums, into.status)
-        found = [
+        passes = [
             Pass("update the neighbour list", update_pair_list, moved),
             Pass("numbers of sites in its order, if it is new", _arrange_numbers, numbers),
             Pass("forces of pairs", _sum_forces, (*content, None, None), blocks, FORCES_ONLY),
         ]
         energies, virials = (*content, tallies, tallies), (*content, tallies, None)
         when = WITH_ENERGIES if self.needs_virials else TALLIED
-        found.append(Pass("forces and energies of pairs", _sum_forces, energies, blocks, when))
+        passes.append(Pass("forces and energies of pairs", _sum_forces, energies, blocks, when))
         if self.needs_virials:
-            found.append(
+            passes.append(
                 Pass("forces and virials of pairs", _sum_forces, virials, blocks, WITH_VIRIALS)
             )
-        found += [
+        passes += [
             Pass("sum forces on sites", _gather_forces, (pairs, sums, None), blocks, FORCES_ONLY),
             Pass("sum forces on sites", _gather_forces, (pairs, sums, tallies), blocks, TALLIED),
         ]
-        return found + load_passes(sites, into, self.forces_in_slots, sums)
+        return passes + load_passes(sites, into, self.forces_in_slots, sums)
 
     def with_capacity(self, cell: np.ndarray) -> "PairWorkspace":
         """With the capacity that the last build of the list needed."""
@@ -180,10 +180,10 @@ class PairWorkspace(NamedTuple):
     def restore(self, arrays: dict[str, np.ndarray], skin: float, now: float) -> "PairWorkspace":
         """With the list of a checkpoint; needs machine code. Raises ValueError if the arrays do not
         fit this term."""
-        found = self._replace(pairs=lists.restored(self.pairs, arrays, skin, now))
-        while "order" in arrays and found._refill() != OK:
-            found = found.with_capacity(found.pairs.cell)
-        return found
+        restored = self._replace(pairs=lists.restored(self.pairs, arrays, skin, now))
+        while "order" in arrays and restored._refill() != OK:
+            restored = restored.with_capacity(restored.pairs.cell)
+        return restored
 
     def _refill(self) -> int:
         """Build the list again from its clusters; a status code."""

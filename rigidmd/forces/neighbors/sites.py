@@ -327,18 +327,18 @@ def load_passes(
     """
     state, load, tally = into.state, into.load, into.tally
     blocks = blocks_of(len(state.position))
-    found = [
+    passes = [
         Pass("forces and torques on molecules", _load_block, (sites, state, load, force), blocks),
         Pass("sum energies and virials", _sum_tallies, (sums.tallies, tally), when=TALLIED),
     ]
     if isinstance(sites, BodySites):
         offsets = (sites, state, force, sums.virial)
         virial = (sums.virial[:blocks], tally)
-        found += [
+        passes += [
             Pass("virial within molecules", _sum_offset_virial_of_block, offsets, blocks, TALLIED),
             Pass("subtract it", _subtract_offset_virial, virial, when=TALLIED),
         ]
-    return found
+    return passes
 
 
 def virial_buffer() -> np.ndarray:

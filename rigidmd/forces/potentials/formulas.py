@@ -93,13 +93,13 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
             " NamedTuple class"
         )
     formula_class = _class_for(kind, function)
-    given = [one.name for one in arguments[1:]]
+    names_of_distances = [one.name for one in arguments[1:]]
 
     def called(values: Mapping[str, float], distance: float) -> tuple[float, float]:
         asked = {"r": distance, "r2": distance**2, "inverse": 1 / distance}
         try:
-            found = function(formula_class(**values), *(asked[name] for name in given))
-            energy, force = map(float, found)
+            distances = (asked[name] for name in names_of_distances)
+            energy, force = map(float, function(formula_class(**values), *distances))
         except (Exception, SystemExit) as error:  # a user function may raise anything
             raise FormulaError(
                 f"{name} at r = {distance:g} Å must give (energy, force), two numbers;"

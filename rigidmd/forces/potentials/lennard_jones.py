@@ -93,8 +93,8 @@ class LennardJones(NamedTuple):
                 *addends,
                 dispersion,
             )
-        if found := switch_correction_of(self.truncation, {12: c12, 6: -c6}, dtype):
-            return LennardJonesOneKind(*head, c12, c6, NO_SWITCH, NO_SWITCH, found, dispersion)
+        if correction := switch_correction_of(self.truncation, {12: c12, 6: -c6}, dtype):
+            return LennardJonesOneKind(*head, c12, c6, NO_SWITCH, NO_SWITCH, correction, dispersion)
         return LennardJonesOneKind(*head, c12, c6, *addends, NO_SWITCH, dispersion)
 
 
@@ -224,12 +224,12 @@ def _sites_of_pairs(parts: SystemParts) -> list[np.ndarray]:
     """Masks (pairs, 2, sites) for each species: whether the first or second name of forces.pairs
     means the site. Raises SceneError."""
     entries, species, faults = parts.scene.forces.pairs, parts.species, []
-    found = [np.zeros((len(entries), 2, len(m.site_names)), bool) for m in species]
+    is_meant = [np.zeros((len(entries), 2, len(m.site_names)), bool) for m in species]
     for n, entry in enumerate(entries):
         for side, text in enumerate(entry.sites):
             masks = sites_named(species, text)
             for k, mask in enumerate(masks):
-                found[k][n, side] = mask
+                is_meant[k][n, side] = mask
             if not any(mask.any() for mask in masks):
                 known = dict.fromkeys(f"{m.name}.{site}" for m in species for site in m.site_names)
                 faults.append(
@@ -237,7 +237,7 @@ def _sites_of_pairs(parts: SystemParts) -> list[np.ndarray]:
                 )
     if faults:
         raise SceneError(parts.scene.source, faults)
-    return found
+    return is_meant
 
 
 def _short_cutoff_notes(potential: LennardJones, name: np.ndarray) -> tuple[str, ...]:

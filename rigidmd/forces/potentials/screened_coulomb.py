@@ -101,16 +101,16 @@ def screening_of_lanes(
     """The faster form for lanes of a NumPy dtype: a table, if this machine supports it and it is
     accurate enough. The error of a table grows with alpha times the cutoff. It is used up to about
     3.2, or more if `error` (see `screening`) allows it."""
-    found = screening(alpha, cutoff, dtype, error)
+    by_formula = screening(alpha, cutoff, dtype, error)
     if not HAS_AVX512 or dtype != np.float32:
-        return found
+        return by_formula
     density, table, off = force_table(alpha, cutoff)
     at_zero = 4 * alpha**3 / (3 * sqrt(pi))
     if off > max(error, TABLE_ERROR * at_zero * cutoff):
-        return found
-    kept = zeros(table.size, np.float32)
-    kept[:] = table.ravel()
-    return TabledScreening(found.scale, found.energy, density, kept)
+        return by_formula
+    aligned = zeros(table.size, np.float32)
+    aligned[:] = table.ravel()
+    return TabledScreening(by_formula.scale, by_formula.energy, density, aligned)
 
 
 def force_table(alpha: float, cutoff: float) -> tuple[np.float32, np.ndarray, float]:

@@ -41,12 +41,12 @@ def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -
     constants : values of parameters that are the same for all sites. Raises FormulaError.
     """
     try:
-        found = _parsed(energy, constants or {})
+        parsed = _parsed(energy, constants or {})
         r = sympy.Symbol(DISTANCE, positive=True)
-        if r not in found.free_symbols:
+        if r not in parsed.free_symbols:
             raise FormulaError(f"{energy!r} does not depend on the distance {DISTANCE}")
-        symbols = sorted(found.free_symbols - {r}, key=str)
-        u = sympy.Add(*(round(KJ_PER_MOL) * term for term in _terms(found, r)))
+        symbols = sorted(parsed.free_symbols - {r}, key=str)
+        u = sympy.Add(*(round(KJ_PER_MOL) * term for term in _terms(parsed, r)))
         hoisted, total = _hoisted(u, r)
         of: dict[sympy.Expr, sympy.Expr] = {}
         # force/r times r²
@@ -68,14 +68,14 @@ def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -
     module = module_of(source.encode(), f"<pair potential {energy}>")
     names = {symbol.name[len(PARAMETER_PREFIX) :]: symbol for symbol in symbols}
 
-    def numbers(given: Mapping[str, float]) -> tuple[float, ...]:
-        values = {symbol: given[name] for name, symbol in names.items()}
+    def numbers(parameters: Mapping[str, float]) -> tuple[float, ...]:
+        values = {symbol: parameters[name] for name, symbol in names.items()}
         return tuple(_jet(hoisted.get(symbol, symbol), values, r, 0.0)[0] for symbol in fields) or (
             0.0,
         )
 
-    def radial(given: Mapping[str, float]) -> Radial:
-        values = {symbol: given[name] for name, symbol in names.items()}
+    def radial(parameters: Mapping[str, float]) -> Radial:
+        values = {symbol: parameters[name] for name, symbol in names.items()}
 
         def value(distance: float) -> tuple[float, float, float]:
             v, first, second = _jet(u, values, r, float(distance))
@@ -92,20 +92,20 @@ def _derivative(e: sympy.Expr, r: sympy.Symbol, known: dict[sympy.Expr, sympy.Ex
     if e not in known:
         args, inner = e.args, [_derivative(part, r, known) for part in e.args]
         if not inner:
-            found = sympy.Integer(e == r)
+            derivative = sympy.Integer(e == r)
         elif e.is_Add:
-            found = sympy.Add(*inner)
+            derivative = sympy.Add(*inner)
         elif e.is_Mul:
-            found = sympy.Add(
+            derivative = sympy.Add(
                 *(sympy.Mul(*args[:k], d, *args[k + 1 :]) for k, d in enumerate(inner) if d != 0)
             )
         elif e.is_Pow and inner[1] == 0:
-            found = args[1] * args[0] ** (args[1] - 1) * inner[0]
+            derivative = args[1] * args[0] ** (args[1] - 1) * inner[0]
         elif e.is_Pow:
-            found = e * (inner[1] * sympy.log(args[0]) + inner[0] * args[1] / args[0])
+            derivative = e * (inner[1] * sympy.log(args[0]) + inner[0] * args[1] / args[0])
         else:
-            found = e.fdiff(1) * inner[0]
-        known[e] = found
+            derivative = e.fdiff(1) * inner[0]
+        known[e] = derivative
     return known[e]
 
 
@@ -159,11 +159,11 @@ def _jet(e: sympy.Expr, values: Mapping[sympy.Symbol, float], r: sympy.Symbol, x
 def _terms(u: sympy.Expr, r: sympy.Symbol) -> list[sympy.Expr]:
     """The terms of a sum, multiplied by factors without r. Nothing else is expanded, which could
     take too long."""
-    found = []
+    terms = []
     for term in sympy.Add.make_args(u):
         factor, rest = term.as_independent(r, as_Add=False)
-        found += [factor * part for part in _terms(rest, r)] if rest.is_Add else [term]
-    return found
+        terms += [factor * part for part in _terms(rest, r)] if rest.is_Add else [term]
+    return terms
 
 
 def _hoisted(u: sympy.Expr, r: sympy.Symbol) -> tuple[dict[sympy.Symbol, sympy.Expr], sympy.Expr]:
@@ -289,10 +289,10 @@ def _parsed(energy: str, constants: Mapping[str, float]) -> sympy.Expr:
         ) from None
     if sum(1 for _ in ast.walk(tree)) > MAX_NODES:
         raise FormulaError(f"it has more than {MAX_NODES} numbers, names and operations")
-    found = _read(tree.body, constants, 0).value
-    if found.has(sympy.zoo, sympy.nan, sympy.oo, sympy.I):
+    parsed = _read(tree.body, constants, 0).value
+    if parsed.has(sympy.zoo, sympy.nan, sympy.oo, sympy.I):
         raise FormulaError(f"{energy!r} is not finite")
-    return found
+    return parsed
 
 
 class _Part(NamedTuple):

@@ -167,15 +167,15 @@ def switch_correction_of(
 
     x = np.linspace(-1, 1, 200)
     with np.errstate(all="ignore"):  # a switch that starts near 0 is too wide
-        found = chebyshev.chebinterpolate(over_square, 2 * COEFFICIENTS[-1])
+        coefficients = chebyshev.chebinterpolate(over_square, 2 * COEFFICIENTS[-1])
         largest = np.abs((x + 1) ** 2 * over_square(x)).max()
     # at most, without this coefficient and those after it
-    left_out = 4 * np.abs(found[::-1]).cumsum()[::-1]
+    left_out = 4 * np.abs(coefficients[::-1]).cumsum()[::-1]
     needed = int(np.argmax(left_out < CORRECTION_ERROR * largest))
     counts = [count for count in COEFFICIENTS if 0 < needed <= count]
     if not counts:
         return NO_SWITCH
-    powers = chebyshev.cheb2poly(found[: counts[0]])
+    powers = chebyshev.cheb2poly(coefficients[: counts[0]])
     return SwitchCorrection(tuple(np.pad(powers, (0, counts[0] - len(powers))).tolist()))
 
 
@@ -296,20 +296,20 @@ def removed_energy(
 
     energy : v, only called where it is needed, and not at 0 unless the truncation starts there
     """
-    found = np.full(r.shape, -terms[0])
+    removed = np.full(r.shape, -terms[0])
     if isinstance(truncation, ForceShifted):
         polynomial_terms = tuple(float(x) for x in terms)
-        found -= [
+        removed -= [
             truncation_polynomial(polynomial_terms, max(x - truncation.start, 0.0))[0]
             for x in r.tolist()
         ]
     elif not isinstance(truncation, Unmodified):
         switched, switch = r > truncation.start, SWITCH_FUNCTIONS[type(truncation)]
-        found[switched] = energy(r[switched]) * [
+        removed[switched] = energy(r[switched]) * [
             1 - switch(truncation, x)[0] for x in r[switched].tolist()
         ]
-    found[r > truncation.cutoff] = energy(r[r > truncation.cutoff])
-    return found
+    removed[r > truncation.cutoff] = energy(r[r > truncation.cutoff])
+    return removed
 
 
 def integral_of_removed_energy(
