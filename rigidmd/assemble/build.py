@@ -286,10 +286,8 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total
     momentum."""
     stage = system.scene.stages[k]
-    scheme, thermostat = stage.scheme, system.thermostat
-    if thermostat is not None and hasattr(thermostat, "for_stage"):
-        thermostat = thermostat.for_stage(system, k)
-    elif thermostat is None and stage.has_thermostat:
+    scheme, thermostat = stage.scheme, system.user_thermostat(k)
+    if system.thermostat is None and stage.has_thermostat:
         thermostat = thermostat_of(system, k)
     if stage.is_hybrid and system.thermostat is None:
         scheme = scheme.with_trajectories(thermostat_of(system, k), stage.steps_together)

@@ -110,6 +110,12 @@ class System:
         """Cutoff between sites, Å; inf without one."""
         return self.scene.forces.cutoff_A or inf
 
+    def user_thermostat(self, k: int) -> Any:
+        """The user-defined thermostat in stage k; None without one."""
+        if hasattr(self.thermostat, "for_stage"):
+            return self.thermostat.for_stage(self, k)
+        return self.thermostat
+
     @property
     def external(self) -> list[str]:
         """Names of the terms of external fields, which may change the total momentum."""

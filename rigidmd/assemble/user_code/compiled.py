@@ -64,10 +64,10 @@ def _thermostats(system: System) -> Iterator[tuple[str, Any, float]]:
     for k, stage in enumerate(system.scene.stages):
         if stage.is_minimisation or stage.is_auto:
             continue
-        outer = system.thermostat
-        thermostat = outer.for_stage(system, k) if hasattr(outer, "for_stage") else outer
+        thermostat = system.user_thermostat(k)
         if type(thermostat) in THERMOSTATS:
-            yield f"thermostat {name_of(outer)}", thermostat, float(stage.timestep_fs * FEMTOSECOND)
+            name = f"thermostat {name_of(system.thermostat)}"
+            yield name, thermostat, float(stage.timestep_fs * FEMTOSECOND)
 
 
 def _faults(name: str, function: Callable, arguments: tuple) -> list[str]:
