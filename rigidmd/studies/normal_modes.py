@@ -444,7 +444,7 @@ def animation_files(scene: MolecularScene | BodyScene) -> list[str]:
     ]
 
 
-def write_animation(folder: Path, found: NormalModes, number: int) -> None:
+def write_animation(folder: Path, modes: NormalModes, number: int) -> None:
     """Write the harmonic motion along a mode, at rest in each frame, with its energies, as a run
     for `view`."""
     from rigidmd.io.trajectory import (  # MDAnalysis is slow to import
@@ -453,20 +453,20 @@ def write_animation(folder: Path, found: NormalModes, number: int) -> None:
     )
 
     c, system, scene, output = (
-        found.coordinates,
-        found.system,
-        found.system.scene,
-        found.system.scene.output,
+        modes.coordinates,
+        modes.system,
+        modes.system.scene,
+        modes.system.scene.output,
     )
-    if not found.is_vibration(number):
+    if not modes.is_vibration(number):
         raise SceneError(
             scene.source,
             [f"mode {number} is not a vibration that was computed, and has no animation"],
         )
-    k = int(np.flatnonzero(found.number == number)[0])
+    k = int(np.flatnonzero(modes.number == number)[0])
     period, q = (
-        2 * pi / abs(found.rate[k]),
-        AMPLITUDE / np.abs(c.scale * found.vector[k]).max() * found.vector[k],
+        2 * pi / abs(modes.rate[k]),
+        AMPLITUDE / np.abs(c.scale * modes.vector[k]).max() * modes.vector[k],
     )
     write_scene(folder, scene)
     write_topology(folder / output.topology, system, c.state, False)
@@ -485,7 +485,7 @@ def write_animation(folder: Path, found: NormalModes, number: int) -> None:
     frames.close()
     log.close()
     note = (
-        f"mode {number}, {found.wavenumber[k]:.4g} cm⁻¹: harmonic motion by up to {AMPLITUDE:g} Å,"
+        f"mode {number}, {modes.wavenumber[k]:.4g} cm⁻¹: harmonic motion by up to {AMPLITUDE:g} Å,"
         " not a run"
     )
     write_json(folder / SUMMARY, {"notes": [note]})

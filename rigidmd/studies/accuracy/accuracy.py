@@ -128,11 +128,11 @@ def measure_accuracy(
         )
         for name in integrators
     }
-    found = measure(
+    measured = measure(
         trial_system, plan(trial_system, steps), repeats, progress=progress, extend=not timesteps
     )
-    found.left_out = left_out
-    return found
+    measured.left_out = left_out
+    return measured
 
 
 def _method_name(name: str, scene: MolecularScene | BodyScene) -> str:
@@ -149,9 +149,9 @@ FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")
 DOUBTFUL = 0.2  # spread of repeated timings that causes a warning
 
 
-def trial_table(found: IntegratorAccuracy) -> Table:
+def trial_table(measured: IntegratorAccuracy) -> Table:
     """A row for each trial: its cost, the errors of Q, X, and of all conserved quantities."""
-    s = found.trial_system
+    s = measured.trial_system
     per = "ps" if s.time_unit == "fs" else "s"
 
     def column(header: str, value: Callable[[Trial], float | None], short: str = "") -> Column:
@@ -161,7 +161,7 @@ def trial_table(found: IntegratorAccuracy) -> Table:
 
         return Column(header, known, short)
 
-    others = dict.fromkeys(name for trial in found.trials for name in trial.conserved_errors)
+    others = dict.fromkeys(name for trial in measured.trials for name in trial.conserved_errors)
     return Table(
         [
             Column("integrator", lambda t: t.integrator),
@@ -186,43 +186,45 @@ def trial_table(found: IntegratorAccuracy) -> Table:
             ),
             column("orthogonality error", lambda t: t.orthogonality_error, "QᵀQ"),
         ],
-        found.trials,
+        measured.trials,
     )
 
 
-def table_text(found: IntegratorAccuracy) -> str:
+def table_text(measured: IntegratorAccuracy) -> str:
     text = "errors of Q, X, the energy (rms, drift over the span) and other conserved quantities\n"
-    return text + trial_table(found).text()
+    return text + trial_table(measured).text()
 
 
-def recommendations(found: IntegratorAccuracy) -> list[str]:
+def recommendations(measured: IntegratorAccuracy) -> list[str]:
     """Sentences on the cheapest integrator for each accuracy, and `remarks`."""
-    s, lines = found.trial_system, []
-    for error, best, faster, rivals in cheapest(found):
+    s, lines = measured.trial_system, []
+    for error, best, faster, rivals in cheapest(measured):
         faster = f": {faster}" if faster else ""
         rivals = f"; as fast within the spread of the timings: {rivals}" if rivals else ""
-        lines.append(f"for {error} over {_span(found)} the cheapest is {best}{faster}{rivals}")
+        lines.append(f"for {error} over {_span(measured)} the cheapest is {best}{faster}{rivals}")
     if lines and s.time_unit == "fs":
         lines.append(
             "energy errors grow over longer runs, by a random walk where forces are truncated:"
             f" --span measures them over more than {s.span:g} ps"
         )
-    return [*lines, *remarks(found)]
+    return [*lines, *remarks(measured)]
 
 
-def _span(found: IntegratorAccuracy) -> str:
-    return f"{found.trial_system.span:g} {'ps' if found.trial_system.time_unit == 'fs' else 's'}"
+def _span(measured: IntegratorAccuracy) -> str:
+    return (
+        f"{measured.trial_system.span:g} {'ps' if measured.trial_system.time_unit == 'fs' else 's'}"
+    )
 
 
-def remarks(found: IntegratorAccuracy) -> list[str]:
+def remarks(measured: IntegratorAccuracy) -> list[str]:
     """Sentences on the reference, the longest stable steps, what failed or was left out, and the
     timings."""
-    s = found.trial_system
+    s = measured.trial_system
     lines = [
         f"unit of energy errors: {s.energy_unit}{s.energy_note}",
         (
-            f"reference: {s.reference} in {found.reference_steps} steps, error about"
-            f" {found.reference_error:.0e}"
+            f"reference: {s.reference} in {measured.reference_steps} steps, error about"
+            f" {measured.reference_error:.0e}"
         ),
     ]
     if s.rounding is not None:
@@ -237,10 +239,10 @@ def remarks(found: IntegratorAccuracy) -> list[str]:
             f"mixed precision: forces differ from double ones by {force:.1e} of their rms{torques};"
             f" {which}"
         )
-    for name in dict.fromkeys(t.integrator for t in found.trials):
-        failures = [t.failure for t in found.trials if t.integrator == name and t.failure]
+    for name in dict.fromkeys(t.integrator for t in measured.trials):
+        failures = [t.failure for t in measured.trials if t.integrator == name and t.failure]
         if "diverges" in failures:
-            step = found.stable_step(name)
+            step = measured.stable_step(name)
             lines.append(
                 f"{name} diverges"
                 + (f" beyond {step:.3g} {s.time_unit}" if step else " at every step tried")
@@ -248,16 +250,14 @@ def remarks(found: IntegratorAccuracy) -> list[str]:
         lines += [
             f"{name}: {failure}" for failure in dict.fromkeys(failures) if failure != "diverges"
         ][:1]
-    for why in dict.fromkeys(found.left_out.values()):
-        lines.append(
-            "left out:"
-            f" {', '.join(name for name in found.left_out if found.left_out[name] == why)}: {why}"
-        )
-    return lines + _describe_timings(found)
+    for why in dict.fromkeys(measured.left_out.values()):
+        names = ", ".join(name for name, reason in measured.left_out.items() if reason == why)
+        lines.append(f"left out: {names}: {why}")
+    return lines + _describe_timings(measured)
 
 
-def _describe_timings(found: IntegratorAccuracy) -> list[str]:
-    timed = [trial for trial in found.trials if not trial.diverged]
+def _describe_timings(measured: IntegratorAccuracy) -> list[str]:
+    timed = [trial for trial in measured.trials if not trial.diverged]
     if timed and timed[0].spread is None:
         return ["timed once: the spread of the seconds is unknown; see --repeats"]
     doubtful = [
@@ -268,7 +268,7 @@ def _describe_timings(found: IntegratorAccuracy) -> list[str]:
     if not doubtful:
         return []
     spread, worst = max(doubtful, key=lambda pair: pair[0])
-    which = f"{worst.integrator} at {worst.timestep:.3g} {found.trial_system.time_unit}"
+    which = f"{worst.integrator} at {worst.timestep:.3g} {measured.trial_system.time_unit}"
     return [
         f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than"
         f" {DOUBTFUL:.0%}, those of {which} by {spread:.0%} (± % in the table): was another program"
@@ -279,11 +279,11 @@ def _describe_timings(found: IntegratorAccuracy) -> list[str]:
 COMMON = "velocity_verlet"  # integrator to compare with
 
 
-def cheapest(found: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
+def cheapest(measured: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
     """For each error of the energy, and of Q or X: the cheapest integrator, how much faster than
     `COMMON` it is, others that are as fast. Errors with the same answer are one row."""
-    s, rows, unit = found.trial_system, [], found.trial_system.time_unit
-    rotates = any(not np.isnan(t.rotation_error) for t in found.trials)
+    s, rows, unit = measured.trial_system, [], measured.trial_system.time_unit
+    rotates = any(not np.isnan(t.rotation_error) for t in measured.trials)
     # A motion of a body with the right energy is not advised if QᵀQ or another invariant is worse.
     energy = "energy_rms" if s.time_unit == "fs" else "conservation_error"
     kinds = {
@@ -291,12 +291,12 @@ def cheapest(found: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
         "trajectory_error": ("an error of Q", "") if rotates else ("an error of X", s.length_unit),
     }
     for error, (what, of) in kinds.items():
-        worst = max((getattr(t, error) for t in found.trials if not t.diverged), default=0.0)
+        worst = max((getattr(t, error) for t in measured.trials if not t.diverged), default=0.0)
         answers: dict[tuple[str, str, str], list[float]] = {}  # -> the targets that have it
         for target in 10.0 ** np.arange(0, -15, -2):
-            names = dict.fromkeys(t.integrator for t in found.trials)
-            reached = {name: at for name in names if (at := found.time_for(name, error, target))}
-            blind = error == "trajectory_error" and target < 3 * found.reference_error
+            names = dict.fromkeys(t.integrator for t in measured.trials)
+            reached = {name: at for name in names if (at := measured.time_for(name, error, target))}
+            blind = error == "trajectory_error" and target < 3 * measured.reference_error
             if target > worst or len(reached) < 2 or blind:
                 continue
             best = min(reached, key=lambda name: reached[name].seconds)
@@ -324,11 +324,11 @@ def cheapest(found: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def write_accuracy(folder: Path, found: IntegratorAccuracy, command: str) -> list[Path]:
-    trial_table(found).write(folder / FILES[0])
-    title = f"{found.trial_system.name}: error against run time"
-    write_figure(folder / FILES[1], lambda: accuracy_figure(found), title)
-    write_page(folder / FILES[2], lambda: accuracy_page(found, command))
+def write_accuracy(folder: Path, measured: IntegratorAccuracy, command: str) -> list[Path]:
+    trial_table(measured).write(folder / FILES[0])
+    title = f"{measured.trial_system.name}: error against run time"
+    write_figure(folder / FILES[1], lambda: accuracy_figure(measured), title)
+    write_page(folder / FILES[2], lambda: accuracy_page(measured, command))
     return [folder / name for name in FILES if (folder / name).is_file()]
 
 
@@ -354,26 +354,26 @@ def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
             before = at
 
 
-def accuracy_figure(found: IntegratorAccuracy):
+def accuracy_figure(measured: IntegratorAccuracy):
     """Log error against log run time, a curve for each integrator; rings mark the best trials, bars
     the time spread."""
-    s = found.trial_system
+    s = measured.trial_system
     per = "ps" if s.time_unit == "fs" else "s"
     figure = new_figure(10, 4.8)
     left, right = figure.subplots(1, 2)
-    rotates = any(not np.isnan(t.rotation_error) for t in found.trials)
+    rotates = any(not np.isnan(t.rotation_error) for t in measured.trials)
     titles = {
         "trajectory_error": (
             f"error of {'Q' if rotates else f'X ({s.length_unit})'} after {s.span:g} {per}"
         ),
         "energy_rms": f"rms error of the energy, {s.energy_unit}",
     }
-    names = list(dict.fromkeys(t.integrator for t in found.trials))
+    names = list(dict.fromkeys(t.integrator for t in measured.trials))
     for axis, (error, title) in zip((left, right), titles.items(), strict=True):
         for k, name in enumerate(names):
             trials = [
                 t
-                for t in found.trials
+                for t in measured.trials
                 if t.integrator == name and not t.diverged and getattr(t, error) > 0
             ]
             times, errors = [t.time / s.span for t in trials], [getattr(t, error) for t in trials]
@@ -385,7 +385,7 @@ def accuracy_figure(found: IntegratorAccuracy):
             axis.errorbar(
                 times, errors, xerr=[low, high], fmt="none", ecolor=style["color"], elinewidth=0.7
             )
-        front = [t for t in found.front(error) if getattr(t, error) > 0]
+        front = [t for t in measured.front(error) if getattr(t, error) > 0]
         ring = {
             "ms": 9,
             "mfc": "none",
@@ -402,10 +402,10 @@ def accuracy_figure(found: IntegratorAccuracy):
         label_minor_ticks(axis.xaxis)
         label_minor_ticks(axis.yaxis)
     figure.supxlabel(f"computing time (s) per {per} of motion", color=INK, fontsize=10)
-    left.axhline(found.reference_error, color=FAINT, lw=0.8, ls=":")
+    left.axhline(measured.reference_error, color=FAINT, lw=0.8, ls=":")
     left.annotate(
         "error of the reference",
-        (1, found.reference_error),
+        (1, measured.reference_error),
         xycoords=("axes fraction", "data"),
         fontsize=8,
         color=FAINT,
@@ -423,23 +423,25 @@ def accuracy_figure(found: IntegratorAccuracy):
     return figure
 
 
-def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
-    colored = chips(list(dict.fromkeys(t.integrator for t in found.trials)))
+def accuracy_page(measured: IntegratorAccuracy, command: str) -> str:
+    colored = chips(list(dict.fromkeys(t.integrator for t in measured.trials)))
     titles = [
-        f"for, over {_span(found)}",
+        f"for, over {_span(measured)}",
         "the cheapest is",
         "gain",
         "as fast within the spread of the timings",
     ]
     parts = [
         section(
-            "Recommendations", table(titles, cheapest(found), words=True), items(remarks(found))
+            "Recommendations",
+            table(titles, cheapest(measured), words=True),
+            items(remarks(measured)),
         ),
         section(
             "Error against run time",
-            wide(accuracy_figure(found), "accuracy", "log error over log run time"),
+            wide(accuracy_figure(measured), "accuracy", "log error over log run time"),
         ),
-        section("All trials", table(*trial_table(found).shown(), marked=colored)),
+        section("All trials", table(*trial_table(measured).shown(), marked=colored)),
         section("How to repeat it", code(command)),
     ]
-    return page(f"{found.trial_system.name}: error against run time", parts)
+    return page(f"{measured.trial_system.name}: error against run time", parts)

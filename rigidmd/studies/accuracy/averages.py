@@ -207,13 +207,13 @@ def measure_averages(
     progress(0.0)
     simulation, state = start_of_last_stage(scene)
     remove_momentum(simulation.system.model, state.velocity)
-    found = stiffest_mode(simulation.system, state)
+    stiffest = stiffest_mode(simulation.system, state)
     plan: list[tuple[Stage, AverageRun]] = []
     for integrator, thermostat in pairs:
         scheme = schemes[integrator]
         steps = timesteps or [ratio * stage.timestep_fs for ratio in LADDER_AROUND_SCENE]
-        if found is not None and not timesteps:
-            exact = [ratio * stable_angle(scheme) / found.rate / FEMTOSECOND for ratio in LADDER]
+        if stiffest is not None and not timesteps:
+            exact = [ratio * stable_angle(scheme) / stiffest.rate / FEMTOSECOND for ratio in LADDER]
             # two digits, for tables and legends
             steps = [round(step, 1 - floor(log10(step))) for step in exact]
         for step in sorted(set(steps)):
