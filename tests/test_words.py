@@ -158,6 +158,8 @@ REFUSED_NAMES = set(
         "crew",
         "ending",
         "endings",
+        "law",
+        "laws",
         "leader",
         "lean",
         "leaning",
@@ -183,8 +185,8 @@ REFUSED_NAMES = set(
         "waves",
     ]
 )
-#: Names that stay: keys of scenes and names of other libraries.
-ALLOWED_NAMES: set[str] = set()
+#: Names that stay: keys of scenes, names of other libraries and former public names.
+ALLOWED_NAMES = {"pair_law"}
 
 
 def names_in(path):

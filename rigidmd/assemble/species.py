@@ -75,17 +75,17 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
 
 
 def sites_of_geometry(
-    path: Path, own_entries: tuple[Site, ...], table: tuple[Site, ...], where: str
+    path: Path, entries_of_scene: tuple[Site, ...], table: tuple[Site, ...], where: str
 ) -> tuple[Site, ...]:
-    """Sites with positions from a file and parameters from its own entries or a table, by atom name
-    or else by element. `where` names the entries in messages. Raises StructureError with all
+    """Sites with positions from a file and parameters from entries of the scene or a table, by atom
+    name or else by element. `where` names the entries in messages. Raises StructureError with all
     errors."""
     faults, sites, used = [], [], set()
-    available = list(dict.fromkeys(site.name for site in (*own_entries, *table))) or ["none"]
+    available = list(dict.fromkeys(site.name for site in (*entries_of_scene, *table))) or ["none"]
     listed = ", ".join(available[:MOST_LISTED]) + (", ..." if len(available) > MOST_LISTED else "")
     hint = f"there are {listed}. The atoms of the file may have these names in place of elements"
     for name, element, mass, position in zip(*read_geometry(path), strict=True):
-        match, shared = find_site(own_entries, name, element), find_site(table, name, element)
+        match, shared = find_site(entries_of_scene, name, element), find_site(table, name, element)
         if match is None and shared is None:
             faults.append(
                 f"atom {name}: no entry of {where} has this name or the name {element}; {hint}"
@@ -102,7 +102,9 @@ def sites_of_geometry(
             "position_A": tuple(map(float, position)),
         }
         sites.append(match.model_copy(update=known) if match else Site(**known))
-    faults += [f"sites: {s.name} is not an atom of it" for s in own_entries if s.name not in used]
+    faults += [
+        f"sites: {s.name} is not an atom of it" for s in entries_of_scene if s.name not in used
+    ]
     if faults:
         raise StructureError(str(path), list(dict.fromkeys(faults)))
     return with_parameters(tuple(sites), table)
