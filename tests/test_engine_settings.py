@@ -594,4 +594,4 @@ def test_adding_an_engine_takes_a_folder_and_a_file(tmp_path):
     schema = run("schema").stdout
     assert '"mirror"' in schema and '"Angle of mirror; default: 2"' in schema
     text = run("run", "--help").stdout
-    assert "rigidmd, lammps, mirror or openmm" in text and "--tilt N" in text
+    assert "rigidmd, lammps, openmm or mirror" in text and "--tilt N" in text
