@@ -33,9 +33,9 @@ from rigidmd.core.state import NOW, State, state_of
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError, describe_error
-from rigidmd.io.formats import STRUCTURE
-from rigidmd.io.formats.cells import basis_of, least_skewed_cell, standard_rotation
-from rigidmd.io.formats.through_ase import EV, atoms_of_sites
+from rigidmd.formats import STRUCTURE
+from rigidmd.formats.cells import basis_of, least_skewed_cell, standard_rotation
+from rigidmd.formats.through_ase import EV, atoms_of_sites
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.io.trajectory import read_frames
 from rigidmd.run.atom_forces import Form, ase_results
@@ -69,18 +69,26 @@ class RigidMD(Calculator):
 
     Parameters
     ----------
-    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a
-        scene file; or a scene, whose species, [forces], [fields], precision and forces from Python
+    models
+        Names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene
+        file; or a scene, whose species, [forces], [fields], precision and forces from Python
         (`with_user_code`) are used
-    atom_forces : "gradient" of the energy of the fitted molecules, or of "sites": each atom has the
-        forces of its site
-    bend, tolerance : largest distance of an atom from its rigid position without a warning, and
-        without an error, over the molecule's radius
-    precision : "double", the default, or "mixed"
-    fields, forces : the table [fields] of a scene file, and keys of its table [forces]: cutoff_A,
+    atom_forces
+        "gradient" of the energy of the fitted molecules, or of "sites": each atom has the forces of
+        its site
+    bend, tolerance
+        Largest distance of an atom from its rigid position without a warning, and without an error,
+        over the molecule's radius
+    precision
+        "double", the default, or "mixed"
+    fields, forces
+        The table [fields] of a scene file, and keys of its table [forces]: cutoff_A,
         electrostatics, ...
 
-    Raises SceneError or StructureError if atoms and models do not match.
+    Raises
+    ------
+    SceneError, StructureError
+        If atoms and models do not match.
     """
 
     # ASE has it so
@@ -170,12 +178,17 @@ class RigidMD(Calculator):
         """Move rigid molecules to a near minimum of the energy, or of the enthalpy with
         pressure_bar.
 
-        stage_keys : keys of a stage with ensemble = "minimise": force_limit_kJ_mol_A, pressure_bar,
-            ...
-
         Sets positions, and the cell with pressure_bar. Constraints of the atoms are ignored; models
-        set what is frozen. Returns the values of the minimum, as in summary.json. Raises
-        SceneError, SimulationError.
+        set what is frozen. Returns the values of the minimum, as in summary.json.
+
+        Parameters
+        ----------
+        stage_keys
+            Keys of a stage with ensemble = "minimise": force_limit_kJ_mol_A, pressure_bar, ...
+
+        Raises
+        ------
+        SceneError, SimulationError
         """
         assembly = self._assemble(atoms, stage_keys)
         fitted = assembly.fit(atoms)
@@ -295,9 +308,8 @@ class _Assembly(NamedTuple):
     numbers: np.ndarray
     pbc: np.ndarray
     cell: np.ndarray  # (3, 3) for which numbers such as the grid of PME were chosen
-    basis: (
-        np.ndarray
-    )  # (3, 3) integers: edges of the engine's cell in terms of the edges of the atoms' cell
+    # (3, 3) integers: edges of the engine's cell in terms of the edges of the atoms' cell
+    basis: np.ndarray
 
     @property
     def order(self) -> np.ndarray:
@@ -351,17 +363,25 @@ class CalculatorForce(Force):
 
     Parameters
     ----------
-    calculator : with energies (eV) and forces (eV/Å) of periodic or free atoms, as the scene has
-        them, and for a barostat or the pressure with a stress (eV/Å³)
-    name : in logs and messages; default: the name of the calculator's class
-    energy_noise_eV : random error of its energies, as of self-consistent iterations or of single
-        precision; larger differences between forces and differences of the energy are refused at
-        the start of a run
-    changes_momentum : which components of the total momentum it may change: True for external
-        fields and restraints
+    calculator
+        With energies (eV) and forces (eV/Å) of periodic or free atoms, as the scene has them, and
+        for a barostat or the pressure with a stress (eV/Å³)
+    name
+        In logs and messages; default: the name of the calculator's class
+    energy_noise_eV
+        Random error of its energies, as of self-consistent iterations or of single precision;
+        larger differences between forces and differences of the energy are refused at the start of
+        a run
+    changes_momentum
+        Which components of the total momentum it may change: True for external fields and
+        restraints
 
-    Raises SceneError where a calculator without stress is used with a barostat, and SimulationError
-    with the step and the closest atoms if the calculator fails.
+    Raises
+    ------
+    SceneError
+        If a calculator without stress is used with a barostat.
+    SimulationError
+        If the calculator fails; it names the step and the closest atoms.
     """
 
     def __init__(

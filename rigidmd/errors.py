@@ -77,8 +77,12 @@ class RigidMDError(Exception):
 class InputError(RigidMDError):
     """Bad input, with all errors found.
 
-    where : what was read, usually a file
-    errors : one sentence each: where, what is wrong, what was expected
+    Parameters
+    ----------
+    where
+        What was read, usually a file
+    errors
+        One sentence each: where, what is wrong, what was expected
     """
 
     def __init__(self, where: str, errors: list[str]):

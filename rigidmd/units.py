@@ -13,9 +13,10 @@ VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
 
 KJ_PER_MOL = 100.0  # u Å²/ps²
 BOLTZMANN = BOLTZMANN_SI * AVOGADRO * 1e-3 * KJ_PER_MOL  # u Å²/ps² per K
+# u Å³/ps² per e²
 COULOMB = (
     ELEMENTARY_CHARGE**2 * AVOGADRO / (4 * pi * VACUUM_PERMITTIVITY) * 1e10 * 1e-3 * KJ_PER_MOL
-)  # u Å³/ps² per e²
+)
 COULOMB_CHARGE = sqrt(COULOMB)  # one e, in units where q²/r is an energy in u Å²/ps²
 
 #: One debye in e Å: 1e-21 C m²/s over the speed of light and e (1 e Å = 4.80320471 D).

@@ -22,7 +22,7 @@ from hooks import (  # noqa: E402, F401
     pytest_sessionfinish,
     pytest_terminal_summary,
 )
-from support import MODULES, ROOT  # noqa: E402
+from support import ROOT  # noqa: E402
 
 
 @pytest.fixture(scope="session")
@@ -38,7 +38,7 @@ def reference() -> Path:
 def no_analysis_outlives_its_test():
     """Examples of the documentation register analyses, and a worker runs many files."""
     yield
-    registry = sys.modules.get(f"rigidmd.{MODULES['registry']}")
+    registry = sys.modules.get("rigidmd.analysis.registry")
     for name in (
         [name for name, entry in registry.KNOWN.items() if entry.is_user] if registry else ()
     ):

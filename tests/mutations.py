@@ -126,6 +126,8 @@ def run_tests(copy: Path, arguments: Sequence[str], limit: float) -> tuple[int |
         "-m",
         "pytest",
         "-x",
+        "-m",
+        "not soak",
         "-q",
         "-rfE",
         "--tb=no",

@@ -9,44 +9,33 @@ import tomllib
 
 import numpy as np
 import pytest
-from support import (
-    FORMULATIONS,
-    ROOT,
-    SCHEMES,
-    SPRING,
+from support import ROOT, SPRING, small_scene, springs
+
+from rigidmd.commands.cli import main
+from rigidmd.core.integrators import FORMULATIONS, SCHEMES
+from rigidmd.core.statistics import mean_and_error
+from rigidmd.errors import SceneError, SimulationError
+from rigidmd.run import Simulation
+from rigidmd.run.pilot import trials as measuring
+from rigidmd.run.pilot.trial_systems import body_trial_system
+from rigidmd.run.pilot.trials import IntegratorAccuracy, Method, Trial, measure, time_span
+from rigidmd.scene import Scene
+from rigidmd.studies.accuracy import accuracy, averages, averages_report
+from rigidmd.studies.accuracy.accuracy import (
+    measure_accuracy,
+    recommendations,
+    table_text,
+    trial_table,
+    write_accuracy,
+)
+from rigidmd.studies.accuracy.averages import (
     UNSEEN,
     AveragedQuantity,
     AverageRun,
     Averages,
-    IntegratorAccuracy,
-    MeanAtStep,
-    Method,
-    Together,
-    Trial,
-    averages_report,
-    body_trial_system,
-    choosing,
-    extrapolate,
-    mean_and_error,
-    means_of_runs,
-    measure,
-    measure_accuracy,
     measure_averages,
-    measuring,
-    sampling,
-    small_scene,
-    springs,
-    time_span,
-    trial_table,
-    write_accuracy,
 )
-from support import accuracy_recommendations as recommendations
-from support import accuracy_table as table_text
-
-from rigidmd.commands.cli import main
-from rigidmd.errors import SceneError, SimulationError
-from rigidmd.run import Simulation
-from rigidmd.scene import Scene
+from rigidmd.studies.extrapolation import MeanAtStep, Together, extrapolate, means_of_runs
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 
@@ -545,7 +534,7 @@ def test_the_formulation_of_the_scene_is_the_one_measured():
 def planned(monkeypatch):
     """(names tried, what was left out) by default on a scene; nothing is run."""
     monkeypatch.setattr(
-        choosing,
+        accuracy,
         "measure",
         lambda trial_system, trials, *_, **options: IntegratorAccuracy(
             trial_system, trials, 1, 0.0
@@ -976,7 +965,7 @@ def test_averages_need_a_thermostat_at_one_temperature(capsys):
 
 
 def test_methods_and_steps_that_are_averaged_by_default(monkeypatch):
-    monkeypatch.setattr(sampling, "_sample", lambda *_: None)
+    monkeypatch.setattr(averages, "_sample", lambda *_: None)
     found = measure_averages(springs(thermostat="nose_hoover", friction_translation_per_ps=None))
     assert list(dict.fromkeys((run.integrator, run.thermostat) for run in found.runs)) == [
         ("velocity_verlet", "nose_hoover"),
@@ -985,7 +974,7 @@ def test_methods_and_steps_that_are_averaged_by_default(monkeypatch):
     ]
     longest = 2e3 * np.sqrt(39.948 / SPRING)
     steps = [run.timestep for run in found.runs if run.integrator == "baoab"]
-    assert steps == pytest.approx([share * longest for share in sampling.LADDER], rel=0.05)
+    assert steps == pytest.approx([share * longest for share in averages.LADDER], rel=0.05)
 
 
 @pytest.mark.soak

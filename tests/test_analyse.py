@@ -7,38 +7,33 @@ from math import inf
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from support import (
+from support import history, noise_with_memory, small_scene, system_of
+
+from rigidmd.analysis.built_in.rotation import PER_CM, dielectric, orientation, spectrum
+from rigidmd.analysis.built_in.structure import (
+    density_profile,
+    hydrogen_bonds,
+    rdf,
+    structure_factor,
+)
+from rigidmd.analysis.built_in.transport import (
     MPA_S,
     NM2_PER_S,
-    PER_CM,
-    Runs,
-    build,
-    converged_value,
     correlation,
-    count_pairs,
-    density_profile,
-    dielectric,
     diffusion,
-    fit_frames,
-    heights,
-    history,
-    hydrogen_bonds,
-    kinds_of,
     msd,
-    noise_with_memory,
-    orientation,
-    random_rotations,
-    rdf,
-    small_scene,
-    spectrum,
     squared_displacement,
-    steady_from,
-    structure_factor,
-    system_of,
     viscosity,
 )
-
+from rigidmd.analysis.pair_histogram import count_pairs, heights
+from rigidmd.analysis.result import converged_value
+from rigidmd.analysis.rigid_frames import fit_frames
+from rigidmd.analysis.runs import Runs
+from rigidmd.assemble.build import build
+from rigidmd.core.statistics import steady_from
 from rigidmd.errors import OutputError
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.run.rigid_fit import kinds_of
 from rigidmd.units import BAR, BOLTZMANN, COULOMB
 
 MIXTURE = {

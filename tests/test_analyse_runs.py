@@ -14,21 +14,18 @@ import numpy as np
 import pytest
 from MDAnalysis.analysis.msd import EinsteinMSD
 from MDAnalysis.analysis.rdf import InterRDF
-from support import (
-    ROOT,
-    build,
-    frames_of_folder,
-    gmx,
-    read_record,
-    registry,
-    small_scene,
-    total_dipole,
-)
+from support import ROOT, gmx, small_scene
 
 import rigidmd
 from rigidmd import Scene, Simulation
+from rigidmd.analysis import registry
+from rigidmd.analysis.built_in.rotation import total_dipole
+from rigidmd.analysis.files import read_table
+from rigidmd.analysis.rigid_frames import frames_of_folder
+from rigidmd.assemble.build import build
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.run.record import read_record
 from rigidmd.units import DEBYE
 
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
@@ -152,8 +149,13 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     assert {name: (copy / name).read_bytes() for name in kept} == kept
     assert cli.main(["analyse", str(copy), "--only", "rdf", "--from", "100fs"]) == 0
     again = json.loads((copy / "analysis.json").read_text())["analyses"]
-    assert again["rdf"]["stretch"]["from_ps"] == pytest.approx(0.1, abs=0.003)
+    assert again["rdf"]["frames_used"]["from_ps"] == pytest.approx(0.1, abs=0.003)
     assert again["rdf"] != found["rdf"] and again["spectrum"] == found["spectrum"]
+    # a file of rigidmd 0.2 has another name for the frames
+    written = (copy / "analysis.json").read_text()
+    (copy / "analysis.json").write_text(written.replace('"frames_used"', '"stretch"'))
+    assert {entry.frames_used.runs for entry in read_table(copy).values()} == {1}
+    (copy / "analysis.json").write_text(written)
     capsys.readouterr()
 
 
@@ -509,7 +511,7 @@ def test_a_run_that_was_killed_is_analysed_as_far_as_it_came(copy, capsys):
         "This run has not ended" in text
         and "trajectory.trr ends within a frame, which is left out" in text
     )
-    found = json.loads((copy / "analysis.json").read_text())["analyses"]["msd"]["stretch"]
+    found = json.loads((copy / "analysis.json").read_text())["analyses"]["msd"]["frames_used"]
     assert found["to_ps"] < 0.16 and found["frames"] == 34
 
 

@@ -10,7 +10,9 @@ import tomllib
 from fnmatch import fnmatch
 
 import pytest
-from support import BY_EXTENSION, ROOT
+from support import ROOT
+
+from rigidmd.formats import BY_EXTENSION
 
 PACKAGE = ROOT / "rigidmd"
 
@@ -26,7 +28,7 @@ LAYERS = (
     "mechanics",
     "forces",
     "dynamics",
-    "io.formats",
+    "formats",
     "scene",
     "engines",
     "io",
@@ -45,13 +47,13 @@ RANK = {name: rank for rank, name in enumerate((*LAYERS, *ABOVE_ALL))}
 
 #: Library -> the packages and files that import it.
 LIBRARIES = {
-    "ase": {"io", "assemble", "run", "ase.py"},
+    "ase": {"formats", "io", "assemble", "run", "ase.py"},
     "chemiscope": {"view"},
     "distributed": {"studies/sweep"},
-    "gsd": {"io/formats"},
+    "gsd": {"formats"},
     "IPython": {"io/progress.py"},
     "llvmlite": {"compile"},
-    "MDAnalysis": {"io", "run/results.py"},
+    "MDAnalysis": {"formats", "io", "run/results.py"},
     "matplotlib": {"figures", "analysis/files.py", "view", "studies"},
     "numba": {"compile", "forces"},
     "numba.core": {"compile"},
@@ -115,27 +117,30 @@ def upward(package, found):
             yield f"{line}: imports {module}: {package} is below {other.replace('__init__', 'rigidmd')}"
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_imports_point_down(path):
+def test_imports_point_down():
     """Imports inside functions and for type checkers count. The order of layers excludes circles of
     packages."""
-    assert package_of(path) in RANK, f"{name_of(path)} is in no layer"
-    found = [f"{name_of(path)}:{message}" for message in upward(package_of(path), imports(path))]
-    assert not found, "\n".join(found)
+    assert not [name_of(path) for path in FILES if package_of(path) not in RANK], "in no layer"
+    errors = [
+        f"{name_of(path)}:{message}"
+        for path in FILES
+        for message in upward(package_of(path), imports(path))
+    ]
+    assert not errors, "\n".join(errors)
 
 
 def test_every_kind_of_upward_import_is_found():
     source = """
 from typing import TYPE_CHECKING
 import numpy
-from PACKAGE.core.state import State
+from rigidmd.core.state import State
 if TYPE_CHECKING:
-    from PACKAGE.view.plots import plot
+    from rigidmd.view.plots import plot
 def build():
-    from PACKAGE import run
-    import PACKAGE.assemble.build
-    from PACKAGE import Scene
-""".replace("PACKAGE", "rigidmd")  # test_support.py would take these imports for ours
+    from rigidmd import run
+    import rigidmd.assemble.build
+    from rigidmd import Scene
+"""
     assert [message.split(":")[0] for message in upward("scene", imports_in(source))] == [
         "6",
         "8",
@@ -144,8 +149,8 @@ def build():
     ]
     assert not list(upward("__init__", imports_in(source)))
     inner = [
-        (1, "rigidmd.io.formats.gro"),
-        (2, "rigidmd.io.formats"),
+        (1, "rigidmd.formats.gro"),
+        (2, "rigidmd.formats"),
         (3, "rigidmd.io.trajectory"),
         (4, "rigidmd.io"),
     ]
@@ -154,26 +159,22 @@ def build():
 
 
 def test_a_part_of_a_package_can_be_below_it():
-    light = imports_in(
-        "from PACKAGE.engines.lammps.options import PROGRAM".replace("PACKAGE", "rigidmd")
-    )
-    heavy = imports_in(
-        "from PACKAGE.engines.lammps.files import fixes".replace("PACKAGE", "rigidmd")
-    )
+    light = imports_in("from rigidmd.engines.lammps.options import PROGRAM")
+    heavy = imports_in("from rigidmd.engines.lammps.files import fixes")
     assert not list(upward("scene", light)) and len(list(upward("scene", heavy))) == 1
     assert len(list(upward("engines.*.options", heavy))) == 1
 
 
-@pytest.mark.parametrize("library", LIBRARIES)
-def test_each_library_has_its_packages(library):
-    strange = [
+def test_each_library_has_its_packages():
+    errors = [
         f"{name_of(path)}:{line}: imports {module}"
+        for library, packages in LIBRARIES.items()
         for path in FILES
         for line, module in imports(path)
         if f"{module}.".startswith(f"{library}.")
-        and not any(f"{name_of(path)}/".startswith(f"{place}/") for place in LIBRARIES[library])
+        and not any(f"{name_of(path)}/".startswith(f"{package}/") for package in packages)
     ]
-    assert not strange, "\n".join(strange)
+    assert not errors, "\n".join(errors)
 
 
 #: Packages and files with kernels, and those that ask for the processor, the cache or its sources.
@@ -210,7 +211,7 @@ NAMED_EXTENSIONS = {
 
 
 def test_only_a_format_names_its_extensions():
-    """In texts except docstrings; `io.formats` also has the default names of files."""
+    """In texts except docstrings; `formats` also has the default names of files."""
     extension = re.compile(rf"[.]({'|'.join(name[1:] for name in BY_EXTENSION)})\b")
     naming = {}
     for path in FILES:
@@ -223,7 +224,7 @@ def test_only_a_format_names_its_extensions():
         ]
         if found := [text for text in texts if isinstance(text, str) and extension.search(text)]:
             naming[name_of(path)] = found
-    strange = {name: texts for name, texts in naming.items() if not name.startswith("io/formats/")}
+    strange = {name: texts for name, texts in naming.items() if not name.startswith("formats/")}
     assert set(strange) == set(NAMED_EXTENSIONS), strange
     assert len(naming) >= len(strange) + 8  # the registry and seven modules
 
@@ -256,7 +257,7 @@ def test_ase_loads_little_of_rigidmd():
         f"from importlib.metadata import EntryPoint\nEntryPoint(*{point}, 'ase.ioformats').load()"
     )
     assert "rigidmd.io.ase_plugin" in found
-    assert not {"numba", "MDAnalysis", "matplotlib", "rigidmd.io.formats"} & found
+    assert not {"numba", "MDAnalysis", "matplotlib", "rigidmd.formats"} & found
 
 
 @pytest.mark.parametrize(

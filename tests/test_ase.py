@@ -19,28 +19,20 @@ from ase.constraints import FixAtoms, FixBondLengths
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from scenes import FORTY_WATERS, forty_waters
-from support import (
-    EV,
-    ROOT,
-    TrajFile,
-    TrajReader,
-    _transfer_matrices,
-    build,
-    contents,
-    load_model,
-    random_rotations,
-    read_frames,
-    same_after_stops,
-    small_scene,
-    stopped_at,
-)
+from support import ROOT, contents, same_after_stops, small_scene, stopped_at
 
 import rigidmd
 from rigidmd import BodyScene, MolecularScene, Scene, Simulation
 from rigidmd.ase import RigidMD
+from rigidmd.assemble.build import build
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SceneError, StructureError
+from rigidmd.formats.through_ase import EV, TrajFile, TrajReader
+from rigidmd.io.trajectory import read_frames
+from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.run import Every
+from rigidmd.run.atom_forces import _transfer_matrices
+from rigidmd.scene.models import load_model
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
 FORCES = FORTY_WATERS["forces"]

@@ -5,31 +5,19 @@ from math import comb
 
 import numpy as np
 import pytest
-from support import (
-    DRIFT,
-    KICK,
-    ROOT,
-    SCHEMES,
-    SPRING,
-    EnergyWalk,
-    Method,
-    TrialSystem,
-    _fit_step,
-    bias_of_potential,
-    choice,
-    choose,
-    mean_square_rate,
-    measure_averages,
-    small_scene,
-    springs,
-    start_of_last_stage,
-    weight,
-)
+from support import ROOT, SPRING, small_scene, springs
 
 from rigidmd.commands.cli import main
+from rigidmd.core.integrators import DRIFT, KICK, SCHEMES
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
+from rigidmd.run.pilot import choice
+from rigidmd.run.pilot.choice import EnergyWalk, choose, weight
+from rigidmd.run.pilot.sampling import bias_of_potential, mean_square_rate
+from rigidmd.run.pilot.trial_systems import _fit_step
+from rigidmd.run.pilot.trials import Method, TrialSystem
 from rigidmd.scene import Scene
+from rigidmd.studies.accuracy.averages import measure_averages, start_of_last_stage
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 

@@ -9,19 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import GOOD
-from support import (
-    MOLECULES,
-    ROOT,
-    Site,
-    build,
-    check_folder,
-    load_model,
-    molecule,
-    read_molecule,
-    small_scene,
-    step_warnings,
-)
+from support import MOLECULES, ROOT, small_scene
 
+from rigidmd.assemble.build import build
+from rigidmd.assemble.time_step import step_warnings
 from rigidmd.commands.cli import CommandLine, main
 from rigidmd.errors import (
     MoleculeError,
@@ -31,8 +22,10 @@ from rigidmd.errors import (
     StructureError,
     worded_by,
 )
+from rigidmd.io.folder import check_folder
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene, parse_override, schema
+from rigidmd.scene.models import Site, load_model, molecule, read_molecule
 
 
 def refused(capsys, tmp_path, text, *arguments, code=2):
@@ -759,7 +752,7 @@ def test_a_trusted_file_that_nothing_names_is_refused(capsys, tmp_path):
         capsys, tmp_path, GOOD, "--trust", own
     )
     assert main(["sweep", str(tmp_path / "bad.toml"), "--set", "seed=1,2", "--trust", own]) == 2
-    assert "names no Python file by module in [[forces.custom]]" in capsys.readouterr().err
+    assert "own.py is not a file that [[forces.custom]]" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -1124,11 +1117,11 @@ def test_structure_files_with_other_faults(capsys, tmp_path):
 def test_molecules_by_order_and_by_geometry(tmp_path):
     """An .xyz has no residues: waters atom by atom, and one with all oxygens first, split across
     the boundary."""
-    from support import read_structure
+    from rigidmd.assemble.structure import read_structure
 
     water, nitrogen = load_model("spce"), load_model("nitrogen")
     rng = np.random.default_rng(0)
-    from support import random_rotations
+    from rigidmd.mechanics.rotation import random_rotations
 
     centres = np.array([[0.1, 0.2, 9.9], [5.0, 5.0, 0.1], [9.95, 5.0, 5.0]])
     q = random_rotations(rng, 3)

@@ -5,36 +5,25 @@ import numba
 import numpy as np
 import pytest
 from scipy import stats
-from support import (
-    BAROSTAT,
+from support import built, move, observe, small_scene
+
+from rigidmd.assemble.build import barostat_of, build, integrator_of_stage
+from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
+from rigidmd.core.state import NOW, WORK
+from rigidmd.dynamics import barostats
+from rigidmd.dynamics.barostats import (
     COMPONENTS,
     COUPLINGS,
-    NOW,
-    SCHEMES,
-    THERMOSTAT,
-    WITH_THERMOSTAT,
-    WORK,
     CellRescaling,
-    Langevin,
     Pressure,
-    VelocityRescaling,
     VolumeMoves,
-    barostat_of,
     barostat_workspace,
-    boxes,
-    build,
-    built,
-    constant_ramp,
-    integrator_of_stage,
-    key_of,
-    move,
-    observe,
-    remove_overlaps,
-    small_scene,
 )
-
+from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
+from rigidmd.dynamics.thermostats import Langevin, VelocityRescaling, constant_ramp
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
+from rigidmd.run.minimise import remove_overlaps
 from rigidmd.scene import Scene
 from rigidmd.units import BAR, BOLTZMANN
 
@@ -46,22 +35,22 @@ QUIET = {"trajectory": False, "figures": False}
 
 @numba.njit
 def driving(box, model, state, room, k, volume, thermal):
-    return boxes.strain_force(box, model, state, room, k, volume, thermal)
+    return barostats.strain_force(box, model, state, room, k, volume, thermal)
 
 
 @numba.njit
 def log_acceptance(box, model, state, room, h):
-    return boxes.log_acceptance(box, model, state, room, h)
+    return barostats.log_acceptance(box, model, state, room, h)
 
 
 @numba.njit
 def set_matrices(room):
-    boxes.set_matrices(room)
+    barostats.set_matrices(room)
 
 
 @numba.njit
 def strain_state(box, state, room):
-    boxes.apply_strain(box, state, room)
+    barostats.apply_strain(box, state, room)
 
 
 @pytest.fixture(
@@ -159,7 +148,7 @@ def test_a_move_and_its_reverse_are_in_balance(liquid, coupling):
 
 @numba.njit
 def drift(box, model, state, room, h, mean, variance):
-    boxes.drift(box, model, state, room, h, mean, variance)
+    barostats.drift(box, model, state, room, h, mean, variance)
 
 
 def prepared(system, engine, box, before, after, room, h):

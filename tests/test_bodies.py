@@ -6,25 +6,17 @@ from itertools import permutations
 import known
 import numpy as np
 import pytest
-from support import (
-    BODIES,
-    ROOT,
-    SCHEMES,
-    Body,
-    Engine,
-    ExactRotor,
-    NoTranslation,
-    from_vector,
-    kernel,
-    move,
-    orthogonality_error,
-    random_rotations,
-    rotate,
-    split_rotor,
-    state_of,
-)
+from support import BODIES, ROOT, move
 
+from rigidmd.compile import kernel
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.state import state_of
+from rigidmd.dynamics.body_step_loop import Body
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SimulationError
+from rigidmd.mechanics.free_rotor import ExactRotor, rotate, split_rotor
+from rigidmd.mechanics.rotation import from_vector, orthogonality_error, random_rotations
+from rigidmd.mechanics.translation import NoTranslation
 from rigidmd.run import Simulation
 from rigidmd.scene import BodyScene, Scene
 

@@ -6,37 +6,35 @@ import pytest
 from numba import njit
 from scipy.integrate import quad, solve_ivp
 from scipy.stats import spearmanr
-from support import (
+from support import move
+
+from rigidmd.assemble.body import build_body
+from rigidmd.core.integrators import (
     DRIFT,
     KICK,
     SCHEMES,
     WITH_THERMOSTAT,
-    Body,
-    Engine,
     Flow,
-    NoTranslation,
     Scheme,
-    SteadyForce,
-    build_body,
     composed,
-    from_vector,
-    hat,
-    move,
-    random_rotations,
-    resistance,
     split,
-    split_rotor,
-    state_of,
 )
-from support import constant_function as steady
-from support import integrate_function as integral
-from support import interpolated_function as table
-from support import is_constant_function as is_steady
-from support import pulse_function as window
-from support import sum_functions as total
-from support import values_at as value_at
-
+from rigidmd.core.state import state_of
+from rigidmd.dynamics.body_step_loop import Body
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.forces.body import resistance
+from rigidmd.forces.body.applied import SteadyForce
+from rigidmd.mechanics.free_rotor import split_rotor
+from rigidmd.mechanics.rotation import from_vector, hat, random_rotations
+from rigidmd.mechanics.time_functions import constant_function as steady
+from rigidmd.mechanics.time_functions import integrate_function as integral
+from rigidmd.mechanics.time_functions import interpolated_function as table
+from rigidmd.mechanics.time_functions import is_constant_function as is_steady
+from rigidmd.mechanics.time_functions import pulse_function as window
+from rigidmd.mechanics.time_functions import sum_functions as total
+from rigidmd.mechanics.time_functions import values_at as value_at
+from rigidmd.mechanics.translation import NoTranslation
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 

@@ -2,8 +2,9 @@
 once."""
 
 import pytest
-from support import ROOT, build_body
+from support import ROOT
 
+from rigidmd.assemble.body import build_body
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.scene import Scene

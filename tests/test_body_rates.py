@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import ellipk
-from support import ROOT, free_body_period, heavy_top_motion
+from support import ROOT
 
 import rigidmd
 from rigidmd.commands.cli import main
+from rigidmd.run.body_theory import free_body_period, heavy_top_motion
 
 SYSTEMS = ROOT / "systems"
 #: A top whose spin is fast enough for steady precession at 30°.

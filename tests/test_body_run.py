@@ -10,12 +10,17 @@ import MDAnalysis as mda
 import numpy as np
 import pytest
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from support import BODIES, ROOT, CheckpointSchedule, Picture, build_body, read_record, write_scene
+from support import BODIES, ROOT
 
 import rigidmd
+from rigidmd.assemble.body import build_body
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.figures.picture import Picture
+from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Every, Simulation
+from rigidmd.run.record import read_record
+from rigidmd.run.schedule import CheckpointSchedule
 from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"

@@ -5,9 +5,10 @@ from itertools import product
 
 import numpy as np
 import pytest
-from support import BUILDS, IMAGES_FOUND, built
+from support import built
 
 from rigidmd import Scene, Simulation
+from rigidmd.forces.neighbors.lists import BUILDS, IMAGES_FOUND
 
 IMAGES = np.array(list(product((-1, 0, 1), repeat=3)), float)
 #: Å

@@ -8,25 +8,19 @@ import sys
 
 import numpy as np
 import pytest
-from support import (
-    BODIES,
-    DIRECTIONS,
-    KICK,
-    NOW,
-    ROOT,
-    SCHEMES,
-    Engine,
-    build,
-    small_scene,
-    stable_angle,
-    stable_step,
-    stiffest_mode,
-    watch,
-)
+from support import BODIES, ROOT, small_scene
 
+from rigidmd.assemble.build import build
+from rigidmd.assemble.time_step import stable_angle
 from rigidmd.commands.cli import main
+from rigidmd.core.integrators import KICK, SCHEMES
+from rigidmd.core.state import NOW
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
+from rigidmd.run import checks as watch
+from rigidmd.run.pilot import stable_step
+from rigidmd.run.pilot.stable_step import DIRECTIONS, stiffest_mode
 from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"

@@ -6,9 +6,11 @@ import re
 import ase.data
 import numpy as np
 import pytest
-from support import load_model, read_atoms, read_structure
 
+from rigidmd.assemble.structure import read_structure
 from rigidmd.errors import StructureError
+from rigidmd.io.structure_file import read_atoms
+from rigidmd.scene.models import load_model
 
 CELL_KEYS = ("length_a", "length_b", "length_c", "angle_alpha", "angle_beta", "angle_gamma")
 #: A bent molecule of three atoms, fractional.

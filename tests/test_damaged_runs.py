@@ -8,25 +8,17 @@ import random
 import shutil
 
 import pytest
-from support import (
-    ANALYSIS,
-    ROOT,
-    Manifest,
-    Summary,
-    SweepPoint,
-    compare,
-    describe_run_comparison,
-    read_json,
-    read_manifest,
-    read_record,
-    read_results,
-    write_manifest,
-    write_report,
-)
+from support import ROOT
 
 from rigidmd import Scene, Simulation
+from rigidmd.analysis.files import ANALYSIS, read_results
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, RigidMDError
+from rigidmd.io.run_files import Summary, read_json
+from rigidmd.run.record import read_record
+from rigidmd.studies.compare import compare, describe_run_comparison
+from rigidmd.studies.sweep.folder import Manifest, SweepPoint, read_manifest
+from rigidmd.view.run_page import write_report
 
 DEEP = "[" * 5000 + "]" * 5000
 #: What a value of a file of JSON becomes, as text.
@@ -193,10 +185,10 @@ def test_any_value_of_an_analysis(argon, tmp_path):
 
 def test_any_value_of_a_manifest(tmp_path):
     points = [SweepPoint(f"p{k}", {"seed": k}, "0" * 64) for k in range(2)]
-    write_manifest(
-        tmp_path,
-        Manifest("s", "s.toml", {"seed": ["seed"]}, {"a.b": 1}, {"c": [1]}, {"file": "0"}, points),
-    )
+    keys = {"seed": ["seed"]}
+    manifest = Manifest("s", "s.toml", keys, {"a.b": 1}, {"c": [1]}, {"file": "0"}, points)
+    manifest.folder = tmp_path
+    manifest.write()
     data = json.loads((tmp_path / "sweep.json").read_text())
     assert read_manifest(tmp_path).points == points
     found = [0, 0]

@@ -9,26 +9,17 @@ from math import erfc, inf, sqrt
 import numpy as np
 import pytest
 from scipy.special import erfcinv
-from support import (
-    MARGIN,
-    MIXED_ERROR,
-    ROOT,
-    SCHEMES,
-    WITH_THERMOSTAT,
-    build,
-    charges_in,
-    coulomb_errors,
-    describe,
-    error_of_step,
-    pme_error,
-    real_error,
-    stable_angle,
-    step_error,
-)
+from support import ROOT
 
 from rigidmd import Scene, Simulation, resolve
+from rigidmd.assemble.build import build
+from rigidmd.assemble.describe import describe
+from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, error_of_step, stable_angle, step_error
 from rigidmd.commands.cli import main
+from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.errors import SceneError
+from rigidmd.forces.ewald.errors import charges_in, pme_error, real_error
+from rigidmd.run.force_errors import coulomb_errors
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 WATER = {"model": "spce", "count": 64}

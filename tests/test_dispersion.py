@@ -7,22 +7,16 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import erfc
-from support import (
-    MOST_THREADS,
-    bits_with,
-    build,
-    built,
-    describe,
-    external_engine,
-    from_vector,
-    observe,
-    shaken,
-    slope,
-    small_scene,
-)
+from support import bits_with, built, observe, shaken, small_scene
 
 import rigidmd
+from rigidmd.assemble.build import build
+from rigidmd.assemble.describe import describe
+from rigidmd.compile.machine import MOST_THREADS
+from rigidmd.core.statistics import slope
+from rigidmd.engines.external import external_engine
 from rigidmd.errors import SceneError
+from rigidmd.mechanics.rotation import from_vector
 from rigidmd.run import Simulation
 from rigidmd.units import KJ_PER_MOL
 

@@ -38,23 +38,18 @@ from typing import NamedTuple
 
 import pytest
 from pydantic import BaseModel
-from support import (
-    BY_EXTENSION,
-    CHAPTERS,
-    DOCS,
-    ROOT,
-    SCHEMES,
-    WITH_THERMOSTAT,
-    describe,
-    find_example,
-    read_parameters,
-    read_scene,
-)
+from support import ROOT
 
 import rigidmd
+from rigidmd.assemble.describe import describe
 from rigidmd.commands import cli
+from rigidmd.commands.arguments import read_scene
+from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
+from rigidmd.core.shipped import CHAPTERS, DOCS, find_example
 from rigidmd.errors import SceneError
+from rigidmd.formats import BY_EXTENSION
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
+from rigidmd.scene.models import read_parameters
 
 README = ROOT / "README.md"
 #: The chapters of this checkout; those of an installed package may be elsewhere.

@@ -4,23 +4,20 @@ random walks."""
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from support import (
-    AveragedQuantity,
-    AverageRun,
-    Averages,
-    brief_table,
+from support import small_scene
+
+from rigidmd import Simulation
+from rigidmd.core.statistics import (
     correlation_time,
-    describe_failures,
     error_of_mean,
     format_signed,
     inefficiency,
     slope,
-    small_scene,
     steady_from,
 )
-from support import mean_and_error as mean
-
-from rigidmd import Simulation
+from rigidmd.core.statistics import mean_and_error as mean
+from rigidmd.studies.accuracy.averages import AveragedQuantity, AverageRun, Averages
+from rigidmd.studies.accuracy.averages_report import brief_table, describe_failures
 
 SERIES = 400
 

@@ -4,40 +4,27 @@ every time."""
 import numba
 import numpy as np
 import pytest
-from support import (
-    HEAT,
-    MOST_THREADS,
-    SCHEMES,
-    THERMOSTAT,
-    Engine,
-    State,
-    VelocityRescaling,
-    blocks_of,
-    build,
-    built,
-    constant_ramp,
-    draw_momenta,
-    groups,
-    integrator_rows,
-    key_of,
-    largest_values,
-    measure_accuracy,
-    move,
-    no_load,
-    observe,
-    orthogonality_error,
-    random_rotations,
-    slope,
-    small_scene,
-    state_of,
-    sums_of_state,
-)
+from support import built, move, observe, small_scene
 
 import rigidmd
+from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
+from rigidmd.compile.machine import MOST_THREADS
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.state import HEAT, State, no_load, state_of
+from rigidmd.core.statistics import slope
+from rigidmd.dynamics.model import draw_momenta
+from rigidmd.dynamics.noise import THERMOSTAT, key_of
+from rigidmd.dynamics.observables import largest_values, sums_of_state
+from rigidmd.dynamics.thermostats import VelocityRescaling, constant_ramp
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
+from rigidmd.forces.neighbors.sites import blocks_of
+from rigidmd.mechanics import batches
+from rigidmd.mechanics.rotation import orthogonality_error, random_rotations
 from rigidmd.run import Simulation
-from rigidmd.scene import Scene
+from rigidmd.scene import Scene, integrators
+from rigidmd.studies.accuracy.accuracy import measure_accuracy
 from rigidmd.units import BOLTZMANN
 
 VERLET = SCHEMES["velocity_verlet"]
@@ -380,7 +367,7 @@ def test_maxwell_boltzmann_on_every_axis():
 
 @numba.njit
 def kinetic_energies(model, state, first, end):
-    return groups.kinetic_energies(
+    return batches.kinetic_energies(
         model.species,
         model.mass,
         model.inverse_inertia,
@@ -557,7 +544,7 @@ def test_adding_an_integrator_to_a_scene(tmp_path, capsys):
 
 
 def test_adding_an_integrator_from_python(monkeypatch):
-    monkeypatch.setattr(integrator_rows, "_REGISTERED", {})
+    monkeypatch.setattr(integrators, "_REGISTERED", {})
     body = Scene.read("systems/heavy_top_3.toml")
     with pytest.raises(SceneError, match="is 'jump', must be 'velocity_verlet', "):
         Scene.read("systems/heavy_top_3.toml", {"run.integrator": "jump"})

@@ -16,21 +16,17 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from support import (
-    MIXED_ERROR,
-    ROOT,
-    build,
-    force_field_of,
-    lammps_files,
-    openmm_engine,
-    programs,
-    shaken,
-    small_scene,
-    write_gromacs,
-    write_openmm,
-)
+from support import ROOT, shaken, small_scene
 
+from rigidmd.assemble.build import build
+from rigidmd.assemble.time_step import MIXED_ERROR
+from rigidmd.engines.force_field import force_field_of
+from rigidmd.engines.gromacs.files import write_gromacs
+from rigidmd.engines.lammps import files
+from rigidmd.engines.openmm import engine
+from rigidmd.engines.openmm.files import write_openmm
 from rigidmd.engines.openmm.system import Group, integration_groups
+from rigidmd.engines.registry import programs
 from rigidmd.errors import SceneError
 
 COUNTS = {"spce": 6, "nitrogen": 4}
@@ -173,7 +169,7 @@ ATM = 1 / 1.01325
 
 def commands(stage, **sections):
     """Fixes of a stage: name -> words behind its style."""
-    lines = lammps_files.fixes(drawn(stage, **sections), 0)
+    lines = files.fixes(drawn(stage, **sections), 0)
     return {line.split()[1]: line.split()[3:] for line in lines}
 
 
@@ -225,7 +221,7 @@ def test_lammps_has_pressures_in_atm_less_that_of_the_tail(counts, ensemble, tai
     stage = NPT | CHAINS if ensemble == "npt" else {"ensemble": "nph", "duration_ps": 0.4}
     stage = stage | {"pressure_bar": [100.0, 300.0], "barostat_time_ps": 1.7}
     own = drawn(stage, counts=counts, tail=tail)
-    (line,) = lammps_files.fixes(own, 0)
+    (line,) = files.fixes(own, 0)
     words = line.split()[3:]
     beyond = own.system.tail.pressure(13.0**3) / 6.02214076e-3 if tail else 0.0  # bar
     assert (beyond < -1) == tail
@@ -248,7 +244,7 @@ def test_lammps_has_a_pressure_along_each_axis():
 
 
 def test_lammps_has_steps_in_fs():
-    text = lammps_files.input_script(
+    text = files.input_script(
         drawn(NVT | LANGEVIN, output={"log_interval_ps": 0.03, "trajectory": False})
     )
     lines = [line.split() for line in text.splitlines()]
@@ -432,7 +428,7 @@ def test_what_no_table_has_is_refused(name, what, message):
     ],
 )
 def test_a_gpu_has_mixed_precision_unless_the_scene_says_otherwise(platform, precision, properties):
-    assert openmm_engine.properties_of(platform, precision, 3) == properties
+    assert engine.properties_of(platform, precision, 3) == properties
     given = {"name": "openmm", "platform": platform} | (
         {"precision": precision} if precision else {}
     )
@@ -475,9 +471,8 @@ def test_the_error_of_mixed_precision_is_the_one_in_the_manual():
 
 # a new engine
 
-#: PACKAGE is rigidmd; test_support.py would take these imports for ours.
 OPTIONS = """
-from PACKAGE.engines.registry import Option, Program
+from rigidmd.engines.registry import Option, Program
 
 PROGRAM = Program(
     "Mirror", "it needs nothing", "mirror:TABLE", engine="mirror:MirrorEngine", installed="mirror:installed",
@@ -488,8 +483,8 @@ PROGRAM = Program(
 MIRROR = """
 import numpy as np
 
-from PACKAGE.engines.external import ExternalEngine
-from PACKAGE.engines.external import Key, Translations
+from rigidmd.engines.external import ExternalEngine
+from rigidmd.engines.external import Key, Translations
 
 TABLE = Translations("Mirror", (), (Key("thermostat", {None: "", "langevin": ""}),), (), ())
 
@@ -533,16 +528,16 @@ class MirrorEngine(ExternalEngine):
 SCRIPT = """
 import sys
 
-import PACKAGE.engines
-from PACKAGE.engines import registry
+import rigidmd.engines
+from rigidmd.engines import registry
 
-PACKAGE.engines.__path__.append(sys.argv[1])
+rigidmd.engines.__path__.append(sys.argv[1])
 registry.NAMES.append("mirror")
 
-from PACKAGE.commands import cli
+from rigidmd.commands import cli
 
 if sys.argv[2] == "wrong":
-    from PACKAGE.engines.mirror.mirror import MirrorEngine
+    from rigidmd.engines.mirror.mirror import MirrorEngine
 
     MirrorEngine.error = 0.1
 sys.exit(cli.main(sys.argv[3:]))
@@ -554,8 +549,8 @@ def test_adding_an_engine_takes_a_folder_and_a_line(tmp_path):
     folder = tmp_path / "engines" / "mirror"
     folder.mkdir(parents=True)
     for name, text in (("__init__", ""), ("options", OPTIONS), ("mirror", MIRROR)):
-        (folder / f"{name}.py").write_text(text.replace("PACKAGE", "rigidmd"))
-    (tmp_path / "script.py").write_text(SCRIPT.replace("PACKAGE", "rigidmd"))
+        (folder / f"{name}.py").write_text(text)
+    (tmp_path / "script.py").write_text(SCRIPT)
     scene = tmp_path / "argon.toml"
     scene.write_text(
         "[box]\nlengths_A = 16.0\n[[molecules]]\nmodel = 'argon'\ncount = 20\n[forces]\ncutoff_A = 7.0\n"

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from ase.build import bulk
 from scipy import stats
-from support import System
 
+from rigidmd.engines.system import System
 from rigidmd.run import Every, Results, Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL, VOLT_PER_NM

@@ -10,43 +10,34 @@ import numpy as np
 import pytest
 from reference import KE, EwaldOracle, Oracle, nearest
 from scipy.special import erfc, hyp1f1
-from support import (
+from support import ROOT, bits_with, built, observe, shaken, small_scene
+
+from rigidmd.assemble.build import build
+from rigidmd.assemble.describe import describe
+from rigidmd.commands.cli import main
+from rigidmd.compile import kernel, simd
+from rigidmd.compile.machine import MOST_THREADS
+from rigidmd.core.statistics import slope
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
+from rigidmd.errors import SceneError
+from rigidmd.forces.ewald.direct_sum import ewald_sum_in_numpy, k_vectors_up_to
+from rigidmd.forces.neighbors.space import Triclinic, cell_of
+from rigidmd.forces.potentials.screened_coulomb import (
     INTERVALS,
-    MOST_THREADS,
-    ROOT,
     TABLE_ERROR,
-    Box,
-    Engine,
     TabledScreening,
-    Triclinic,
-    bits_with,
-    build,
-    built,
-    cell_of,
-    coulomb_errors,
-    describe,
-    estimated_error,
-    ewald_error_notes,
-    ewald_sum_in_numpy,
     force_table,
-    from_vector,
-    k_vectors_up_to,
-    kernel,
-    lanes,
-    observe,
     screened,
     screening,
     screening_of_lanes,
-    shaken,
-    slope,
-    small_scene,
-    summary_text,
 )
-
-from rigidmd.commands.cli import main
-from rigidmd.errors import SceneError
+from rigidmd.mechanics.rotation import from_vector
 from rigidmd.run import Every, Simulation
+from rigidmd.run.force_errors import coulomb_errors, estimated_error
+from rigidmd.run.report import summary_text
+from rigidmd.run.summary import ewald_error_notes
 from rigidmd.scene import Scene
+from rigidmd.scene.species import Box
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
 
 BOXES = [
@@ -163,7 +154,7 @@ def test_a_table_serves_where_it_is_accurate_enough():
         for error in (0.0, 0.9 * off, 1.1 * off):
             found = screening_of_lanes(alpha, cutoff, np.float32, error)
             assert isinstance(found, TabledScreening) == (
-                lanes.HAS_AVX512 and off < max(error, allowed)
+                simd.HAS_AVX512 and off < max(error, allowed)
             )
             assert found.energy == screening(alpha, cutoff, np.float32).energy
         assert screening_of_lanes(alpha, cutoff, np.float64) == screening(alpha, cutoff)
@@ -171,12 +162,12 @@ def test_a_table_serves_where_it_is_accurate_enough():
 
 @kernel(from_python=True)
 def screened_pairs(law, r2, energy, force):
-    for i in range(0, len(r2), lanes.lanes_of(r2)):
-        at = lanes.load(r2, i)
-        inverse, one, two = lanes.inverse_root_and_cube(at)
+    for i in range(0, len(r2), simd.lanes_of(r2)):
+        at = simd.load(r2, i)
+        inverse, one, two = simd.inverse_root_and_cube(at)
         u, w = screened(law, inverse, (one, two), at)
-        lanes.store(energy, i, u)
-        lanes.store(force, i, w)
+        simd.store(energy, i, u)
+        simd.store(force, i, w)
 
 
 @pytest.mark.parametrize("x", [1.0, 2.0, 2.77, 3.1, 4.0, 5.0])
@@ -1457,7 +1448,7 @@ def test_scenes_without_pme_need_no_fourier_transforms():
 import sys
 sys.modules["rocket_fft"] = None  # an import of it fails
 sys.path.insert(0, "tests")
-from support import build
+from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
 from rigidmd.scene import Scene
 for forces in ({"electrostatics": "reaction_field"}, {"electrostatics": "ewald", "cutoff_A": 6.0}):

@@ -17,22 +17,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import (
-    CHECKPOINT,
-    FINAL,
-    LOG,
-    PREVIOUS,
-    ROOT,
-    AppendedFile,
-    interruptible,
-    latest,
-    read_checkpoint,
-    read_state,
-)
+from support import ROOT
 
 import rigidmd
 from rigidmd.commands import cli
+from rigidmd.core.files import AppendedFile
+from rigidmd.core.state_file import read_state
 from rigidmd.errors import RigidMDError
+from rigidmd.io.checkpoint import latest, read_checkpoint
+from rigidmd.io.folder import CHECKPOINT, FINAL, LOG, PREVIOUS
+from rigidmd.run.schedule import interruptible
 
 SCENE = """\
 box.density_g_cm3 = 0.9

@@ -7,29 +7,21 @@ from math import inf, pi, sqrt
 
 import numpy as np
 import pytest
-from support import (
-    REMOVED,
-    SCHEMES,
-    BehindWallError,
-    Engine,
-    build,
-    describe,
-    distances,
-    draw_momenta,
-    edited,
-    export,
-    from_vector,
-    molecular_trial_system,
-    move,
-    observe,
-    random_rotations,
-    remove_momentum,
-    run_with_files,
-    small_scene,
-)
+from support import edited, move, observe, run_with_files, small_scene
 
+from rigidmd.assemble.build import build
+from rigidmd.assemble.describe import describe
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.state import REMOVED
+from rigidmd.dynamics.model import draw_momenta, remove_momentum
+from rigidmd.engines.cpu.engine import BehindWallError
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.forces.fields import distances
+from rigidmd.mechanics.rotation import from_vector, random_rotations
 from rigidmd.run import Simulation
+from rigidmd.run.pilot.trial_systems import molecular_trial_system
+from rigidmd.studies.other_engines import export
 from rigidmd.units import AVOGADRO, BOLTZMANN, DEBYE, ELEMENTARY_CHARGE
 
 VERLET = SCHEMES["velocity_verlet"]
@@ -828,7 +820,10 @@ TRAP_ENTRY = """FIELDS = {
 TRAP_SCRIPT = """
 import json
 import numpy as np
-from support import Scene, build, describe, shaken
+from support import shaken
+from rigidmd import Scene
+from rigidmd.assemble.build import build
+from rigidmd.assemble.describe import describe
 from rigidmd.errors import SceneError
 from rigidmd.scene import schema
 

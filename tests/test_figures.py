@@ -11,35 +11,23 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
-from support import (
-    AT_ONCE,
-    COMPARATORS,
-    ROOT,
-    SCHEMES,
-    Curve,
-    IntegratorAccuracy,
-    Picture,
-    Sample,
-    Samples,
-    Trial,
-    accuracy_report,
-    body_trial_system,
-    build,
-    columns_figure,
-    draw_panel,
-    energy_figure,
-    load_model,
-    panels,
-    record_of,
-    save_figure,
-    shown_range,
-    small_scene,
-    write_molecule_figure,
-)
-from support import SAMPLE_NUMBERS as NUMBERS
-from support import analysis_curve_figure as drawn
+from support import ROOT, small_scene
 
+from rigidmd.analysis.curve_figure import curve_figure as drawn
+from rigidmd.analysis.result import Curve
+from rigidmd.assemble.build import build
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.engines.samples import NUMBERS, Sample, Samples
+from rigidmd.figures.picture import Picture
+from rigidmd.figures.run import energy_figure
+from rigidmd.figures.style import AT_ONCE, save_figure, shown_range
+from rigidmd.run.pilot.trial_systems import COMPARATORS, body_trial_system
+from rigidmd.run.pilot.trials import IntegratorAccuracy, Trial
 from rigidmd.scene import Scene
+from rigidmd.scene.models import load_model
+from rigidmd.studies.accuracy import accuracy
+from rigidmd.view.molecule_figure import write_molecule_figure
+from rigidmd.view.plots import columns_figure, draw_panel, panels, record_of
 
 
 def ink(x, y, save):
@@ -247,7 +235,7 @@ def test_as_many_integrators_as_there_are_are_told_apart():
         for n, name in enumerate(names)
         for k in (1, 2, 3)
     ]
-    figure = accuracy_report.accuracy_figure(IntegratorAccuracy(trial_system, trials, 10, 1e-30))
+    figure = accuracy.accuracy_figure(IntegratorAccuracy(trial_system, trials, 10, 1e-30))
     for axis in figure.axes:
         curves = [line for line in axis.lines if line.get_label() in names]
         assert [line.get_label() for line in curves] == names

@@ -5,48 +5,40 @@ import json
 import numpy as np
 import pytest
 from reference import Oracle
-from support import (
+from support import built, edited, move, observe, run_with_files, small_scene
+
+from rigidmd.assemble.build import build
+from rigidmd.compile import kernel
+from rigidmd.compile.simd import lane_count
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.state import no_load
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
+from rigidmd.engines.protocol import NotFiniteError
+from rigidmd.errors import SimulationError
+from rigidmd.forces.neighbors.clusters import BUILT, LEAD_TIME, clusters_of
+from rigidmd.forces.neighbors.lists import (
     BUILDS,
-    BUILT,
     ENTRIES,
-    LEAD_TIME,
     MAX_NEIGHBORS,
     NEIGHBORS,
     NEIGHBORS_OF_ONE,
-    SCHEMES,
-    SWITCH_FUNCTIONS,
-    TRUNCATIONS,
     USABLE,
     WINDOW,
-    Engine,
-    NotFiniteError,
+)
+from rigidmd.forces.neighbors.sites import predict_site
+from rigidmd.forces.neighbors.space import cell_of
+from rigidmd.forces.neighbors.tree import ahead
+from rigidmd.forces.potentials.coulomb import radial, reaction_field
+from rigidmd.forces.potentials.lennard_jones import energy_and_force, lennard_jones
+from rigidmd.forces.potentials.truncation import (
+    SWITCH_FUNCTIONS,
+    TRUNCATIONS,
     SwitchCorrection,
     SwitchTerm,
-    TermDispatcher,
     Unmodified,
-    build,
-    built,
-    cell_of,
-    clusters_of,
-    edited,
-    from_vector,
-    kernel,
-    lane_count,
-    lennard_jones,
-    move,
-    no_load,
-    observe,
-    predict_site,
-    radial,
-    reaction_field,
-    run_with_files,
-    small_scene,
 )
-from support import lennard_jones_energy_and_force as energy_and_force
-from support import tree_ahead as ahead
-
-from rigidmd.errors import SimulationError
-from rigidmd.forces.terms import WITH_ENERGIES
+from rigidmd.forces.terms import WITH_ENERGIES, TermDispatcher
+from rigidmd.mechanics.rotation import from_vector
 from rigidmd.units import BAR, BOLTZMANN
 
 ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
@@ -905,7 +897,10 @@ SOFT_SCRIPT = """
 import json
 from pathlib import Path
 import numpy as np
-from support import Scene, build, describe, shaken
+from support import shaken
+from rigidmd import Scene
+from rigidmd.assemble.build import build
+from rigidmd.assemble.describe import describe
 from rigidmd import Simulation
 from rigidmd.errors import SceneError
 from rigidmd.scene import schema

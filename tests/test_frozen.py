@@ -3,20 +3,14 @@
 import numpy as np
 import pytest
 from reference import Oracle
-from support import (
-    SCHEMES,
-    build,
-    built,
-    describe,
-    mobile,
-    move,
-    nearest_rotation,
-    observe,
-    shaken,
-    small_scene,
-)
+from support import built, move, observe, shaken, small_scene
 
+from rigidmd.assemble.build import build
+from rigidmd.assemble.describe import describe
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.dynamics.model import mobile
 from rigidmd.errors import SceneError
+from rigidmd.mechanics.rotation import nearest_rotation
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 

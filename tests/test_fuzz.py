@@ -23,10 +23,12 @@ import tomli_w
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scenes import FROM_FILE, SATELLITE, STRUCTURES
-from support import Checkpoint, SavedState, read_checkpoint, state_of, write_checkpoint, write_state
 
 from rigidmd.commands.cli import main
+from rigidmd.core.state import state_of
+from rigidmd.core.state_file import SavedState, write_state
 from rigidmd.errors import UNPRINTABLE, CheckpointError
+from rigidmd.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 
 SECONDS, BYTES = 5.0, 2e9  # of computing, that an input may take
 FEW, MANY = 38, 1250  # inputs of each of the eight tests, in CI and in the soak tier

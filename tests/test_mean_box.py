@@ -4,12 +4,14 @@ stops, error messages."""
 import numpy as np
 import pytest
 from scipy.stats import t as student
-from support import same_after_stops, small_scene, start_of_last_stage, summary_text
+from support import same_after_stops, small_scene
 
 from rigidmd.commands import cli
 from rigidmd.errors import SceneError
 from rigidmd.run import Simulation
+from rigidmd.run.report import summary_text
 from rigidmd.scene import Scene
+from rigidmd.studies.accuracy.averages import start_of_last_stage
 
 FS = 1e-3  # ps
 LIQUID = {"timestep_fs": 2.0, "temperature_K": 300.0}

@@ -3,9 +3,9 @@ atoms."""
 
 import numpy as np
 import pytest
-from support import Window, potential_of_mean_force
 
 import rigidmd
+from rigidmd.analysis.mean_force import Window, potential_of_mean_force
 from rigidmd.commands.cli import main
 from rigidmd.errors import OutputError
 

@@ -5,25 +5,19 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from support import (
-    LANES,
-    NO_SYMMETRY,
-    ExactRotor,
-    Load,
+from support import spin
+
+from rigidmd.compile import kernel
+from rigidmd.core.state import Load, state_of
+from rigidmd.mechanics.batches import LANES, kick_group, rotate_group
+from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, rotate, split_rotor
+from rigidmd.mechanics.inertia import kind_of_body, principal_frame
+from rigidmd.mechanics.rotation import (
     align,
     from_quaternion,
     from_vector,
-    kernel,
-    kick_group,
-    kind_of_body,
     orthogonality_error,
-    principal_frame,
     random_rotations,
-    rotate,
-    rotate_group,
-    spin,
-    split_rotor,
-    state_of,
 )
 
 

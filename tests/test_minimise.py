@@ -10,35 +10,28 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from support import (
-    NOW,
-    CheckpointSchedule,
-    Enthalpy,
-    State,
-    build,
-    describe,
-    load_model,
-    measure_accuracy,
-    minimise,
-    mobile,
-    molecular_run,
-    panels,
-    read_frames,
-    read_record,
-    shaken,
-    small_scene,
-    state_of,
-    write_report,
-)
+from support import shaken, small_scene
 
+from rigidmd.assemble.build import build
+from rigidmd.assemble.describe import describe
 from rigidmd.commands.cli import main
+from rigidmd.core.state import NOW, State, state_of
+from rigidmd.dynamics.model import mobile
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
+from rigidmd.io.trajectory import read_frames
 from rigidmd.run import Every, Simulation
 from rigidmd.run import minimise as minimise_module
-from rigidmd.run.minimise import precision_of_minimisation
+from rigidmd.run import molecular as molecular_run
+from rigidmd.run.minimise import Enthalpy, minimise, precision_of_minimisation
+from rigidmd.run.record import read_record
+from rigidmd.run.schedule import CheckpointSchedule
 from rigidmd.scene import Scene
+from rigidmd.scene.models import load_model
+from rigidmd.studies.accuracy.accuracy import measure_accuracy
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
+from rigidmd.view.plots import panels
+from rigidmd.view.run_page import write_report
 
 MIXTURE = {"argon": 4, "nitrogen": 4, "spce": 6}
 FORCES = {"cutoff_A": 6.0, "tail_correction": True}
@@ -718,12 +711,12 @@ def test_a_minimisation_and_its_overlap_removal_end_in_their_time(tmp_path, monk
     assert results.out_of_time
     (found,) = [stage["minimum"] for stage in results.summary["stages"]]
     assert (found["converged"], found["ended_by"], found["iterations"]) == (False, "interrupted", 0)
-    assert found["relief_steps"] <= 2
+    assert found["overlap_removal_steps"] <= 2
     monkeypatch.undo()
     results = Simulation(scene, tmp_path / "out", resume=True, warn=lambda warning: None).run()
     assert not results.interrupted
     assert results.summary["stages"][0]["minimum"]["converged"]
-    assert results.summary["stages"][0]["minimum"]["relief_steps"] > 2
+    assert results.summary["stages"][0]["minimum"]["overlap_removal_steps"] > 2
 
 
 def test_a_minimum_alone_has_one_frame(tmp_path):

@@ -11,21 +11,18 @@ import numpy as np
 import pytest
 from reference import inverse_power
 from scipy.spatial.transform import Rotation
-from support import (
-    RigidFrames,
-    build,
-    built,
+from support import built, small_scene
+
+from rigidmd.analysis.built_in.rotation import dielectric, orientation, spectrum
+from rigidmd.analysis.built_in.structure import (
     density_profile,
-    dielectric,
     hydrogen_bonds,
-    msd,
-    orientation,
     rdf,
-    small_scene,
-    spectrum,
     structure_factor,
 )
-
+from rigidmd.analysis.built_in.transport import msd
+from rigidmd.analysis.rigid_frames import RigidFrames
+from rigidmd.assemble.build import build
 from rigidmd.engines.external import compare_at
 
 GRAM_PER_CM3 = 1 / 1.66053906660  # u/Å³

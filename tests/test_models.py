@@ -6,25 +6,25 @@ import re
 
 import numpy as np
 import pytest
-from support import (
+from support import small_scene
+
+from rigidmd.assemble.build import build
+from rigidmd.commands.cli import main
+from rigidmd.errors import MoleculeError, SceneError
+from rigidmd.formats.bonds import bonds
+from rigidmd.io.scene_file import write_scene
+from rigidmd.run import Simulation
+from rigidmd.scene import Scene
+from rigidmd.scene.models import (
     GROUPS,
     MODELS,
     available_models,
-    bonds,
-    build,
     load_model,
-    models_table,
     read_molecule,
-    small_scene,
     with_masses,
-    write_scene,
 )
-
-from rigidmd.commands.cli import main
-from rigidmd.errors import MoleculeError, SceneError
-from rigidmd.run import Simulation
-from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+from rigidmd.view.molecule_figure import models_table
 
 ALL = available_models()
 DEBYE = 4.80320471  # D in e Å

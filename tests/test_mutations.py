@@ -7,7 +7,7 @@ from functools import cache
 
 import mutations
 import pytest
-from mutations import MUTATIONS, ROOT, applied, chosen, main, mutated
+from mutations import MUTATIONS, ROOT, applied, chosen, find_once, main, mutated
 
 
 @cache
@@ -21,14 +21,30 @@ def functions_of(name: str) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.name)
-def test_a_mutation_applies_once_and_names_tests_that_there_are(mutation):
-    text = (ROOT / "rigidmd" / mutation.file).read_text(encoding="utf-8")
-    compile(mutated(mutation, text), mutation.file, "exec")
-    assert mutation.new != mutation.old and 1 <= len(mutation.tests) <= 3
-    for test in mutation.tests:
-        name, _, function = test.partition("::")
-        assert function.partition("[")[0] in functions_of(name), test
+def test_mutations_apply_once_and_name_tests_that_exist():
+    errors = []
+    for mutation in MUTATIONS:
+        text = (ROOT / "rigidmd" / mutation.file).read_text(encoding="utf-8")
+        try:
+            compile(mutated(mutation, text), mutation.file, "exec")
+        except (ValueError, SyntaxError) as error:
+            errors.append(f"{mutation.name}: {error}")
+        if mutation.new == mutation.old or not 1 <= len(mutation.tests) <= 3:
+            errors.append(f"{mutation.name}: changes nothing, or has not one to three tests")
+        for test in mutation.tests:
+            name, _, function = test.partition("::")
+            if function.partition("[")[0] not in functions_of(name):
+                errors.append(f"{mutation.name}: there is no test {test}")
+    assert not errors, "\n".join(errors)
+
+
+def test_code_is_found_whatever_its_line_breaks_and_trailing_commas_are():
+    text = "x = f(\n    a,\n    b,\n) + g(a, b)\n"
+    assert find_once("f(a, b) + g", text).span() == (4, 26)
+    assert find_once("g(a, b)", text).group() == "g(a, b)"
+    for code in ("f(a, c)", "a, b"):
+        with pytest.raises(ValueError, match=r"occurs [02] times"):
+            find_once(code, text)
 
 
 def test_names_are_given_once():

@@ -5,22 +5,20 @@ import ast
 import re
 import shlex
 import subprocess
+from unittest.mock import patch
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from support import (
-    Manifest,
-    SweepPoint,
-    build,
-    force_field_of,
-    gromacs_files,
-    lammps_files,
-    write_slurm_script,
-)
 
+from rigidmd.assemble.build import build
+from rigidmd.engines.force_field import force_field_of
+from rigidmd.engines.gromacs import files as gromacs_files
+from rigidmd.engines.lammps import files as lammps_files
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.scene import Scene
+from rigidmd.studies.sweep.folder import Manifest, SweepPoint
+from rigidmd.studies.sweep.sweeping import write_slurm_script
 
 PLAIN = ("one", "two", "first", "AR", "RES")
 #: What some language obeys, at the ends of names and within them.
@@ -164,7 +162,7 @@ def test_names_change_no_setting_of_gromacs(usual, tmp_path, names):
 @example((EVIL[0], EVIL[1], "{stages}{title}{system}{kick}", '"""', "&"))
 def test_names_change_no_statement_of_the_script_for_openmm(usual, tmp_path, names):
     pytest.importorskip("openmm")
-    from support import write_openmm
+    from rigidmd.engines.openmm.files import write_openmm
 
     texts = []
     for drawn in (usual[1], force_field_of(build(named(names)))):
@@ -181,9 +179,10 @@ def test_names_change_no_statement_of_the_script_for_openmm(usual, tmp_path, nam
 def script(folder, name, scene, trust):
     points = [SweepPoint(f"p{k}", {}, "") for k in range(3)]
     folder.mkdir(parents=True, exist_ok=True)
-    path, _ = write_slurm_script(
-        folder, Manifest(name, scene, {}, {}, {}, {}, points), 3600.0, 1, trust, 75
-    )
+    manifest = Manifest(name, scene, {}, {}, {}, {}, points)
+    manifest.folder = folder
+    with patch("rigidmd.studies.sweep.sweeping.trusted_by", lambda sweep, point, trust: trust):
+        path, _ = write_slurm_script(manifest, 3600.0, 1, trust)
     return path.read_text()
 
 
@@ -214,13 +213,15 @@ def test_paths_change_no_word_of_the_script_of_a_job(tmp_path, name, folder, sce
     assert [line.split("=")[0] for line in options[0]] == [
         line.split("=")[0] for line in options[1]
     ]
-    run = next(shlex.split(line) for line in text.splitlines() if line.startswith("rigidmd "))
-    assert run[:7] == [
+    run = next(shlex.split(line) for line in text.splitlines() if line.startswith("1) "))
+    assert run[:9] == [
+        "1)",
         "rigidmd",
-        "sweep",
+        "run",
         scene,
         "-o",
-        str(tmp_path / folder),
+        str(tmp_path / folder / "p1"),
+        "--resume",
         "--trust",
         str(tmp_path.cwd() / trust),
     ]

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 from scipy import stats
-from support import (
+
+from rigidmd.compile import kernel
+from rigidmd.dynamics.noise import (
     BATCH,
     LATTICE,
     MOMENTA,
@@ -11,7 +13,6 @@ from support import (
     Key,
     chi_square,
     fill_normals,
-    kernel,
     key_of,
     normals,
     philox,

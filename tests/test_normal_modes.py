@@ -9,24 +9,19 @@ import scipy.constants as si
 from scipy.differentiate import hessian
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
-from support import (
-    ROOT,
-    SPRING,
-    build,
-    load_model,
-    normal_modes,
-    periodic_basis,
-    read_frames,
-    read_record,
-    shaken,
-    small_scene,
-    state_of,
-    stiffest_mode,
-)
+from support import ROOT, SPRING, shaken, small_scene
 
 import rigidmd
+from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
+from rigidmd.core.state import state_of
 from rigidmd.errors import SceneError, SimulationError
+from rigidmd.io.trajectory import read_frames
+from rigidmd.run.pilot.stable_step import stiffest_mode
+from rigidmd.run.record import read_record
+from rigidmd.scene.models import load_model
+from rigidmd.studies import normal_modes
+from rigidmd.studies.gamma_point import periodic_basis
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
 DIMER = ROOT / "systems" / "water_dimer.toml"

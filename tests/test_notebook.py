@@ -10,25 +10,19 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from support import (
-    NOTEBOOKS,
-    ROOT,
-    SYSTEMS,
-    AnalysisResult,
-    Curve,
-    Value,
-    examples_in,
-    live_plot,
-    progress,
-    save_figure,
-    small_scene,
-)
+from support import ROOT, SYSTEMS, small_scene
 
 import rigidmd
+from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.commands.cli import main
+from rigidmd.core.shipped import NOTEBOOKS
+from rigidmd.core.shipped import examples as examples_in
 from rigidmd.errors import RigidMDWarning
+from rigidmd.figures.style import save_figure
+from rigidmd.io import progress
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
+from rigidmd.view import plots
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 SHORT = {"run.duration_s": 0.05, "output.figures": False}
@@ -69,7 +63,7 @@ def cell(monkeypatch):
 
     monkeypatch.setattr(display, "DisplayHandle", Handle)
     monkeypatch.setattr(progress, "in_notebook", lambda: True)
-    monkeypatch.setattr(live_plot, "in_notebook", lambda: True)
+    monkeypatch.setattr(plots, "in_notebook", lambda: True)
     return outputs
 
 
@@ -136,7 +130,7 @@ def test_elsewhere_progress_is_asked_for(capsys, monkeypatch):
 
 
 def test_a_live_plot_is_one_picture_that_changes(cell, monkeypatch):
-    monkeypatch.setattr(live_plot, "TIME_FRACTION", 1.0)  # of the time may go into drawing
+    monkeypatch.setattr(plots, "TIME_FRACTION", 1.0)  # of the time may go into drawing
     plain = Simulation(top(**FEW)).run(progress=False)
     live = rigidmd.LivePlot("theta", "energy_error", pause=0.0)
     watched = Simulation(top(**FEW), observers=live).run(progress=False)

@@ -9,30 +9,24 @@ import numpy as np
 import pytest
 from reference import Oracle
 from scipy.special import erfc
-from support import (
-    HEAT,
-    NotFiniteError,
-    OpenmmEngine,
-    RigidBodies,
-    available_models,
-    build,
-    built,
-    external_engine,
-    force_field_of,
-    inertia_tensor,
-    kinetic_energies,
-    load_model,
-    mass_points,
-    random_rotations,
-    read_record,
-    shaken,
-    small_scene,
-    write_openmm,
-)
-from support import openmm_table as table
+from support import built, shaken, small_scene
 
+from rigidmd.assemble.build import build
 from rigidmd.commands import cli
+from rigidmd.core.state import HEAT
+from rigidmd.engines.external import external_engine
+from rigidmd.engines.force_field import force_field_of
+from rigidmd.engines.observables import kinetic_energies
+from rigidmd.engines.openmm.engine import OpenmmEngine
+from rigidmd.engines.openmm.files import write_openmm
+from rigidmd.engines.openmm.system import TRANSLATIONS as table
+from rigidmd.engines.protocol import NotFiniteError
+from rigidmd.engines.rigid_bodies import RigidBodies, mass_points
 from rigidmd.errors import EngineError, SceneError
+from rigidmd.mechanics.inertia import inertia_tensor
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.run.record import read_record
+from rigidmd.scene.models import available_models, load_model
 from rigidmd.units import BAR, BOLTZMANN, COULOMB
 
 pytest.importorskip("openmm")

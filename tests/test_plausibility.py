@@ -4,14 +4,15 @@ warning."""
 import numpy as np
 import pytest
 from scenes import GOOD
-from support import MOLECULES, ROOT, build, load_model, small_scene
+from support import MOLECULES, ROOT, small_scene
 
 import rigidmd
+from rigidmd.assemble.build import build
 from rigidmd.assemble.plausibility import molecule_warnings
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.scene import Scene
-from rigidmd.scene.models import available_models
+from rigidmd.scene.models import available_models, load_model
 
 ARGON = {
     "name": "Ar",

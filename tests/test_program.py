@@ -3,13 +3,16 @@ printed."""
 
 import numpy as np
 import pytest
-from support import SCHEMES, build, built, integrator_of_stage, small_scene, write_scene
+from support import built, small_scene
 
+from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.commands.cli import main
 from rigidmd.compile import ALWAYS, Pass, Program, kernel, load_arguments, run_passes, task
+from rigidmd.core.integrators import SCHEMES
 from rigidmd.dynamics import step_loop
 from rigidmd.engines.cpu.program import program_of
 from rigidmd.forces.neighbors import update
+from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Simulation
 
 EARLY, LATE = 1, 2

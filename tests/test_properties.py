@@ -5,21 +5,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import (
-    ExactRotor,
-    State,
+from support import spin
+
+from rigidmd.core.state import State
+from rigidmd.errors import RigidMDError
+from rigidmd.mechanics.free_rotor import ExactRotor, split_rotor
+from rigidmd.mechanics.inertia import inertia_tensor, principal_frame
+from rigidmd.mechanics.rotation import (
     from_euler_angles,
     from_quaternion,
-    inertia_tensor,
     orthogonality_error,
-    principal_frame,
-    spin,
-    split_rotor,
     to_euler_angles,
     to_quaternion,
 )
-
-from rigidmd.errors import RigidMDError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 

@@ -12,23 +12,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import (
-    BODIES,
-    BODY,
-    BODY_COLUMNS,
-    COLUMNS,
-    ROOT,
-    TENSOR,
-    Observation,
-    contents,
-    load_model,
-    small_scene,
-)
+from support import BODIES, ROOT, contents, small_scene
 
 import rigidmd
+from rigidmd.engines.observables import Observation
+from rigidmd.engines.samples import BODY, BODY_COLUMNS, COLUMNS
 from rigidmd.errors import OutputError, SceneError, StructureError
+from rigidmd.io.run_files import TENSOR
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
+from rigidmd.scene.models import load_model
 from rigidmd.units import KJ_PER_MOL
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
@@ -700,7 +693,7 @@ def test_messages_name_arguments_of_python_not_options(tmp_path):
         "call rigidmd.trust(": lambda: rigidmd.resolve(
             Scene.read(path, {"forces.custom": [entry]})
         ),
-        "no Python file by module": lambda: rigidmd.sweep(
+        "names by module: it names none": lambda: rigidmd.sweep(
             path, {"seed": [1, 2]}, trust=[tmp_path / "spring.py"]
         ),
         "there is no such file": lambda: rigidmd.trust(tmp_path / "other.py"),

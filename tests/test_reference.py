@@ -5,20 +5,17 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from support import (
-    CentralSites,
-    Engine,
-    Model,
-    NoRotor,
-    build,
-    lennard_jones,
-    observe,
-    pair_forces,
-    state_of,
-)
-from support import lennard_jones_tail as tail
+from support import observe
 
+from rigidmd.assemble.build import build
+from rigidmd.core.state import state_of
+from rigidmd.dynamics.model import Model
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import StructureError
+from rigidmd.forces.neighbors.pair_loop import pair_forces
+from rigidmd.forces.neighbors.sites import CentralSites
+from rigidmd.forces.potentials.lennard_jones import lennard_jones, tail
+from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN

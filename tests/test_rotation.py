@@ -6,7 +6,8 @@ import itertools
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import (
+
+from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates,
     attitude_matrix,
     euler_rates,

@@ -16,48 +16,31 @@ import numba
 import numpy as np
 import pytest
 from MDAnalysis.lib.formats.libmdaxdr import XTCFile
-from support import (
-    BUILDS,
-    COLUMNS,
-    COMMANDS,
-    FIGURES,
-    MOLECULES,
-    NOW,
-    REMOVED,
-    ROOT,
-    SCHEMES,
-    Engine,
-    MolecularRecord,
-    MolecularRun,
-    Sample,
-    Samples,
-    State,
-    System,
-    build,
-    built,
-    columns,
-    compare_at,
-    describe,
-    integrator_of_stage,
-    log,
-    mean_and_error,
-    minimise,
-    molecular_run,
-    observe,
-    progress,
-    rigidmd_command,
-    run_observers,
-    shaken,
-    small_scene,
-    summarise,
-    summary_text,
-)
+from support import MOLECULES, ROOT, built, observe, rigidmd_command, shaken, small_scene
 
 import rigidmd
+from rigidmd.assemble.build import build, integrator_of_stage
+from rigidmd.assemble.describe import describe
+from rigidmd.commands.arguments import COMMANDS
 from rigidmd.commands.cli import main
 from rigidmd.compile.cache import CacheIndex
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.state import NOW, REMOVED, State
+from rigidmd.core.statistics import mean_and_error
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
+from rigidmd.engines.external import compare_at
+from rigidmd.engines.samples import COLUMNS, Sample, Samples
+from rigidmd.engines.system import System
 from rigidmd.errors import OutputError, RigidMDWarning, SceneError, SimulationError
-from rigidmd.run import Every, Observer, Simulation, run_together
+from rigidmd.figures.body import FIGURES
+from rigidmd.forces.neighbors.lists import BUILDS
+from rigidmd.io import progress, run_files
+from rigidmd.io.run_files import columns
+from rigidmd.run import Every, Observer, Simulation, molecular, observers, run_together
+from rigidmd.run.minimise import minimise
+from rigidmd.run.molecular import MolecularRecord, MolecularRun
+from rigidmd.run.report import summary_text
+from rigidmd.run.summary import summarise
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -456,7 +439,7 @@ def test_the_topology_is_the_first_frame_relief_included(tmp_path):
     results = Simulation(
         Scene.read(ROOT / "systems" / "water_nitrogen.toml", short), tmp_path / "out"
     ).run()
-    assert results.summary["relief_steps"] > 0
+    assert results.summary["overlap_removal_steps"] > 0
     universe = results.universe()
     first = mda.Universe(str(tmp_path / "out" / "topology.gro")).atoms.positions
     assert first == pytest.approx(universe.trajectory[0].positions, abs=0.011)
@@ -1087,12 +1070,12 @@ def test_frames_of_xtc_are_those_that_mdanalysis_writes(box, tmp_path):
 
 def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
     now = 0.0
-    monkeypatch.setattr(log.clock, "monotonic", lambda: now)
+    monkeypatch.setattr(run_files.clock, "monotonic", lambda: now)
     path, samples = (
         tmp_path / "log.csv",
         Simulation(small_scene({"argon": 5}, 30.0)).run().samples.rows,
     )
-    file = log.Log(path, False)
+    file = run_files.Log(path, False)
 
     def lines():
         return len(path.read_text().splitlines()) - 1
@@ -1309,7 +1292,7 @@ def test_the_time_left_is_of_the_steps_of_this_run(monkeypatch, capsys, tmp_path
         return [line for line in capsys.readouterr().err.splitlines() if "ps/s" in line]
 
     monkeypatch.setattr(progress.clock, "monotonic", lambda: now[0])
-    monkeypatch.setattr(molecular_run, "minimise", slowly)
+    monkeypatch.setattr(molecular, "minimise", slowly)
     first, *_, last = lines(0.02)
     assert first == "  0.004 of 0.04 ps, 0.0001 ps/s, 06:00 left"
     assert last == "  0.04 of 0.04 ps, 0.0001 ps/s, 00:00 left"
@@ -1436,7 +1419,7 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
     def fail(*given, **options):
         raise ValueError("ParseException: no mathematics")
 
-    monkeypatch.setattr(run_observers, "save_files", fail)
+    monkeypatch.setattr(observers, "save_files", fail)
     pictures = [Failing("see", draws=True), Failing("end", draws=True)]
     notes = []
     results = Simulation(scene, tmp_path / "out", observers=pictures, warn=notes.append).run()
@@ -1459,12 +1442,12 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
 
 
 def test_one_figure_of_a_body_that_fails_leaves_the_others(tmp_path, monkeypatch):
-    def fails_first(figure, stem, suffixes, write=run_observers.save_files):
+    def fails_first(figure, stem, suffixes, write=observers.save_files):
         if stem.name == "axis":
             raise ValueError("no axis")
         return write(figure, stem, suffixes)
 
-    monkeypatch.setattr(run_observers, "save_files", fails_first)
+    monkeypatch.setattr(observers, "save_files", fails_first)
     scene = Scene.read(
         ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.interval_s": 0.001}
     )

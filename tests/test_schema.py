@@ -6,10 +6,11 @@ import tomllib
 
 import pytest
 from jsonschema import Draft202012Validator
-from support import SYSTEMS, available_models
+from support import SYSTEMS
 
 from rigidmd.commands.cli import main
 from rigidmd.scene import schema
+from rigidmd.scene.models import available_models
 
 VALIDATOR = Draft202012Validator(schema())
 WATER = """

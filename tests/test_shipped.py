@@ -8,9 +8,10 @@ import sys
 import tomllib
 
 import pytest
-from support import BODIES, ROOT, SHIPPED, SYSTEMS
+from support import BODIES, ROOT, SYSTEMS
 
 from rigidmd.commands.cli import main
+from rigidmd.core.shipped import SYSTEMS as SHIPPED
 from rigidmd.scene import Scene
 
 

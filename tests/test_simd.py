@@ -11,11 +11,14 @@ import numba
 import numpy as np
 import pytest
 from numba import types
-from support import BUILDS, ROOT, SCHEMES, build, built, move, small_scene
-from support import pair_loop as pairs
+from support import ROOT, built, move, small_scene
 
+from rigidmd.assemble.build import build
 from rigidmd.compile import SIMD_BITS, TaskArguments, kernel, simd
 from rigidmd.compile.simd_memory import load_matrices, load_vectors, store_matrices, store_vectors
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.forces.neighbors import pair_loop as pairs
+from rigidmd.forces.neighbors.lists import BUILDS
 from rigidmd.units import KJ_PER_MOL
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}

@@ -9,21 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import (
-    Engine,
-    build,
-    history,
-    interfaces,
-    noise_with_memory,
-    random_rotations,
-    slab_of,
-    small_scene,
-    surface_tension,
-    system_of,
-)
+from support import history, noise_with_memory, small_scene, system_of
 
 from rigidmd import Scene, Simulation
+from rigidmd.analysis.built_in.interfaces import interfaces, slab_of, surface_tension
+from rigidmd.assemble.build import build
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.units import BAR, GRAM_PER_CM3, KJ_PER_MOL
 
 IONS = [{"model": "na_spce", "count": 7}, {"model": "cl_spce", "count": 7}]

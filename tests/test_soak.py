@@ -1,9 +1,12 @@
-"""The record of the soak tier: what is told of parts that passed, that failed and that have not
-run."""
+"""The tiers of tests: which tests are extended; the record of the soak tier."""
 
+import ast
+import re
 import sys
 
 import soak
+from hooks import EXTENDED, is_extended
+from support import ROOT
 
 
 def test_the_record_names_the_last_run_and_the_last_one_that_passed(tmp_path, capsys):
@@ -41,3 +44,14 @@ def test_a_part_that_fails_fails_the_soak(tmp_path, monkeypatch):
     record = ["--record", str(tmp_path / "new" / "record.jsonl")]
     assert soak.main(["statistics", *record]) == 0
     assert soak.main(["statistics", "faults", *record]) == 1
+
+
+def test_every_variant_of_the_extended_tier_exists():
+    for file, patterns in EXTENDED.items():
+        tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
+        names = [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
+        for pattern in patterns:
+            function = re.split(r"\[\[\]|\*", pattern)[0]
+            assert any(name.startswith(f"test_{function}") for name in names), (file, pattern)
+            assert is_extended(file, f"test_{pattern.replace('[[]', '[').replace('*', '')}")
+    assert not is_extended("test_run.py", "test_every_system_runs_a_few_steps[water]")

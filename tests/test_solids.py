@@ -6,9 +6,11 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from scipy.special import elliprd
-from support import COMPONENTS_PER_DIMENSION as NUMBERS
-from support import ROOT, SOLIDS, added_mass_of_ellipsoid, build_body, inertia_tensor, solid
+from support import ROOT
 
+from rigidmd.assemble.body import build_body
+from rigidmd.mechanics.inertia import COMPONENTS_PER_DIMENSION as NUMBERS
+from rigidmd.mechanics.inertia import SOLIDS, added_mass_of_ellipsoid, inertia_tensor, solid
 from rigidmd.scene import Scene
 
 MASS = 2.5

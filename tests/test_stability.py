@@ -4,7 +4,10 @@ import csv
 from math import inf, nan
 
 import pytest
-from support import (
+
+from rigidmd.commands.cli import main
+from rigidmd.errors import SceneError
+from rigidmd.studies.stability.cases import (
     CASES,
     CRASH,
     REFUSED,
@@ -15,14 +18,8 @@ from support import (
     Outcome,
     failure,
     longest_step,
-    run_cases,
-    selected_cases,
 )
-from support import stability_conclusions as conclusions
-from support import stability_table as table_text
-
-from rigidmd.commands.cli import main
-from rigidmd.errors import SceneError
+from rigidmd.studies.stability.report import conclusions, run_cases, selected_cases, table_text
 
 NAMES = [case.name for case in selected_cases(None)]
 

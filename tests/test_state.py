@@ -3,26 +3,14 @@ else."""
 
 import numpy as np
 import pytest
-from support import (
-    HEAT,
-    NOW,
-    ORIGIN,
-    ROOT,
-    SCHEMES,
-    THERMOSTAT,
-    Solver,
-    VelocityRescaling,
-    build_body,
-    built,
-    constant_ramp,
-    key_of,
-    move,
-    read_state,
-    small_scene,
-    state_of,
-    write_state,
-)
+from support import ROOT, built, move, small_scene
 
+from rigidmd.assemble.body import build_body
+from rigidmd.core.integrators import SCHEMES, Solver
+from rigidmd.core.state import HEAT, NOW, ORIGIN, state_of
+from rigidmd.core.state_file import read_state, write_state
+from rigidmd.dynamics.noise import THERMOSTAT, key_of
+from rigidmd.dynamics.thermostats import VelocityRescaling, constant_ramp
 from rigidmd.errors import StructureError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
@@ -123,7 +111,7 @@ DAMAGES = {
         r"written by a later rigidmd \(version 99 of the format",
     ),
     "shape": (lambda s: s.update(position=s["position"][:3]), "position: damaged"),
-    "nan": (lambda s: s.update(books=np.full(3, np.nan)), "books: damaged"),
+    "nan": (lambda s: s.update(energy_ledger=np.full(3, np.nan)), "energy_ledger: damaged"),
     "species": (lambda s: s.update(species=s["species"] + 5), "species: damaged"),
     "rotation": (lambda s: s.update(rotation=1.1 * s["rotation"]), "rotation: damaged"),
     "mirror": (lambda s: s.update(rotation=-s["rotation"]), "rotation: damaged"),
@@ -145,7 +133,7 @@ def test_a_damaged_state_is_refused_in_words(tmp_path, damage):
 
 
 def test_a_state_of_the_first_version_is_read(tmp_path):
-    """It had neither a version nor books; time and work were of one number each."""
+    """It had neither a version nor an energy ledger; time and work were of one number each."""
     state = state_of(np.ones((2, 3)), cell=10 * np.eye(3))
     old = {
         key: getattr(state, key)
@@ -161,3 +149,16 @@ def test_a_state_of_the_first_version_is_read(tmp_path):
     )
     saved = read_state(tmp_path / "s.npz")
     assert same_bits(saved.state[:5], state[:5]) and saved.state.time[NOW] == 0
+
+
+def test_a_state_of_the_second_version_has_other_names(tmp_path):
+    system, _, state = built({"spce": 3}, 20.0, 1)
+    state.energy_ledger[:] = 1.5, -2.0, 0.25
+    write_state(tmp_path / "s.npz", system.saved(state._replace(extra_variables=np.arange(4.0))))
+    with np.load(tmp_path / "s.npz") as data:
+        arrays = {name: data[name] for name in data.files} | {"schema": 2}
+    arrays["books"], arrays["bath"] = arrays.pop("energy_ledger"), arrays.pop("extra_variables")
+    np.savez(tmp_path / "old.npz", **arrays)
+    read = read_state(tmp_path / "old.npz").state
+    assert read.energy_ledger.tolist() == [1.5, -2.0, 0.25]
+    assert read.extra_variables.tolist() == [0.0, 1.0, 2.0, 3.0]

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import ROOT, TENSOR, small_scene
+from support import ROOT, small_scene
 
 import rigidmd
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError
+from rigidmd.io.run_files import TENSOR
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
 

@@ -18,28 +18,22 @@ import pytest
 import tomli_w
 from ase.data import chemical_symbols
 from scenes import FROM_FILE, GOOD, SATELLITE, STRUCTURES
-from support import (
-    COLUMNS,
-    ROOT,
-    Sample,
-    Samples,
-    SavedState,
-    build,
-    line_of,
-    memory,
-    read_molecule,
-    state_of,
-    write_state,
-)
-from support import memory_room as room
-from support import wave_vectors as vectors
+from support import ROOT
 
 import rigidmd
+from rigidmd.assemble import memory_check as room
+from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
+from rigidmd.core import process
 from rigidmd.core.process import python_process
+from rigidmd.core.state import state_of
+from rigidmd.core.state_file import SavedState, write_state
+from rigidmd.core.toml import line_of
+from rigidmd.engines.samples import COLUMNS, Sample, Samples
 from rigidmd.errors import MoleculeError, RigidMDError, SceneError, StructureError
+from rigidmd.forces.ewald import direct_sum as vectors
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.scene.models import SYMBOLS
+from rigidmd.scene.models import SYMBOLS, read_molecule
 
 DEEP = "[" * 1000 + "]" * 1000
 AT_ONCE = 5.0  # s of computing
@@ -324,7 +318,7 @@ def test_a_state_that_unpacks_to_more_than_there_is(monkeypatch, tmp_path):
     with zipfile.ZipFile(tmp_path / "final.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("position.npy", bytes(10_000_000))
     (tmp_path / "scene.toml").write_text(FROM_FILE.replace("FILE", "final.npz"))
-    monkeypatch.setattr(memory, "free_memory", lambda: 1e7)
+    monkeypatch.setattr(process, "free_memory", lambda: 1e7)
     with pytest.raises(
         StructureError, match=r"not enough memory: reading its 0.01 GB needs 0.02 GB of memory"
     ):
@@ -419,7 +413,7 @@ def test_a_scene_beyond_the_machine_is_refused_with_numbers(
     text, expected, capsys, monkeypatch, tmp_path
 ):
     monkeypatch.chdir(tmp_path)
-    for free in (memory, room):
+    for free in (process, room):
         monkeypatch.setattr(
             free, "free_memory", lambda: 8e9
         )  # between commands what is free changes
@@ -441,9 +435,9 @@ def test_the_memory_of_a_run_is_compared_before_it_is_used(monkeypatch, tmp_path
     assert isinstance(scene, MolecularScene)
     needed = room.bytes_of(build(scene))
     assert needed > 5e6
-    monkeypatch.setattr(memory, "free_memory", lambda: needed / 0.94)
+    monkeypatch.setattr(process, "free_memory", lambda: needed / 0.94)
     build(scene)
-    monkeypatch.setattr(memory, "free_memory", lambda: needed / 0.96)
+    monkeypatch.setattr(process, "free_memory", lambda: needed / 0.96)
     with pytest.raises(
         SceneError, match=r"not enough memory: the run needs .* and this machine has .* GB free"
     ):
@@ -451,7 +445,7 @@ def test_the_memory_of_a_run_is_compared_before_it_is_used(monkeypatch, tmp_path
 
 
 def test_a_body_with_more_samples_than_there_is_room_for(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(memory, "free_memory", lambda: 8e9)
+    monkeypatch.setattr(process, "free_memory", lambda: 8e9)
     text = SATELLITE.replace("timestep_s = 0.01", "timestep_s = 1e-8").replace(
         "interval_s = 0.1", "interval_s = 1e-8"
     )
@@ -487,7 +481,7 @@ def test_a_body_with_more_samples_than_there_is_room_for(capsys, monkeypatch, tm
 def test_molecules_with_more_samples_than_there_is_room_for(
     changes, lines, gigabytes, capsys, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(memory, "free_memory", lambda: 8e9)
+    monkeypatch.setattr(process, "free_memory", lambda: 8e9)
     options = [part for key, value in changes.items() for part in ("--set", f"{key}={value}")]
     message = refusal(capsys, tmp_path, GOOD, *options)
     assert (
@@ -561,7 +555,7 @@ def test_a_sample_takes_no_more_than_its_numbers():
 
 
 def test_what_is_free_is_no_more_than_the_limits():
-    assert 1e8 < memory.free_memory() < 1e14
+    assert 1e8 < process.free_memory() < 1e14
     code = (
         "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9, 3 * 10**9))\n"
         "from rigidmd.core.process import free_memory; print(free_memory())"
@@ -664,7 +658,7 @@ def test_the_name_of_a_trajectory_fits_into_a_folder():
 
 #: Packages that rigidmd, or what it needs, imports.
 PACKAGES = (
-    "MDAnalysis ase dask distributed filelock gemmi gsd llvmlite matplotlib numba numpy pandas platformdirs pydantic "
+    "MDAnalysis ase dask distributed filelock gemmi gsd lazy_loader llvmlite matplotlib numba numpy pandas platformdirs pydantic "
     "pymbar rigidmd rocket_fft scipy sympy tomli_w tqdm yaml"
 )
 

@@ -18,37 +18,29 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support import (
-    Box,
-    Molecule,
-    Site,
-    TrajectoryFile,
+from support import built, small_scene
+
+from rigidmd.assemble.build import build
+from rigidmd.assemble.start import close_pairs, every_site
+from rigidmd.assemble.structure import read_structure
+from rigidmd.core.state_file import write_state
+from rigidmd.errors import SceneError, StructureError
+from rigidmd.formats.atoms import element_of, element_of_mass
+from rigidmd.formats.cells import (
     basis_of,
-    build,
-    built,
-    close_pairs,
     describe_basis,
-    element_of,
-    element_of_mass,
-    every_site,
     least_skewed_cell,
-    load_model,
-    molecule,
     nearest_images,
     pairs_within,
-    random_rotations,
-    read_geometry,
-    read_structure,
     reduced_cell,
-    small_scene,
     standard_rotation,
-    with_masses,
-    write_state,
-    write_topology,
 )
-
-from rigidmd.errors import SceneError, StructureError
+from rigidmd.io.structure_file import read_geometry
+from rigidmd.io.trajectory import TrajectoryFile, write_topology
+from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import Scene
+from rigidmd.scene.models import Molecule, Site, load_model, molecule, with_masses
+from rigidmd.scene.species import Box
 from rigidmd.units import GRAM_PER_CM3
 
 TOLERANCE = 0.15

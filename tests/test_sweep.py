@@ -5,49 +5,41 @@ import csv
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
-from contextlib import ExitStack
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support import (
-    ROOT,
-    Axis,
-    FolderLock,
-    Pool,
-    SweepRow,
-    Waiting,
-    axis_label,
-    code_kind,
-    extrapolate,
-    format_ranges,
-    format_walltime,
-    limits,
-    parse_axis,
-    point_name,
-    read_manifest,
-    read_record,
-    registry,
-    run_points,
-    short_keys,
-    summarise_run,
-    sweeping,
-    value_name,
-    worker,
-)
-from support import axis_settings as settings
+from support import ROOT
 
 import rigidmd
+from rigidmd.analysis import registry
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.io.folder import FolderLock
+from rigidmd.io.progress import progress_of
 from rigidmd.run import Simulation
-from rigidmd.scene import Scene
+from rigidmd.run.record import read_record
+from rigidmd.scene import Scene, parse_override
+from rigidmd.scene.base import format_override
+from rigidmd.studies.extrapolation import extrapolate
+from rigidmd.studies.sweep import figure, limits, sweeping
+from rigidmd.studies.sweep import points as sweep_points
+from rigidmd.studies.sweep.figure import axis_label
+from rigidmd.studies.sweep.folder import point_name, read_manifest, short_keys, value_name
+from rigidmd.studies.sweep.plan import Axis, parse_axis, settings
+from rigidmd.studies.sweep.points import format_walltime, wait_for_folder
+from rigidmd.studies.sweep.table import SweepRow, summarise_run
+from rigidmd.studies.sweep.table import Table as SweepTable
 
 ARGON = """
 [box]
@@ -121,6 +113,15 @@ def same_runs(first, second):
     )
 
 
+def run_here(scene, axes, folder, **more):
+    """The manifest of a sweep whose points ran in this process."""
+    with sweeping.open_sweep(scene, axes, folder, **more) as manifest:
+        for point in manifest.points:
+            overrides = manifest.overrides(point.values)
+            Simulation(Scene.read(scene, overrides), folder / point.folder).run(progress=False)
+    return read_manifest(folder)
+
+
 # What is asked for
 
 
@@ -145,7 +146,14 @@ def test_values_of_a_key(text, keys, values):
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("a=3", 3), ("a=[1,2]", [1, 2]), ("a=", None), ('a="1,2"', "1,2"), ("a=x.gro", "x.gro")],
+    [
+        ("a=3", 3),
+        ("a=[1,2]", [1, 2]),
+        ("a=", None),
+        ('a="1,2"', "1,2"),
+        ("a=x.gro", "x.gro"),
+        ("a=../x.gro", "../x.gro"),
+    ],
 )
 def test_one_value_is_the_same_for_all_points(text, value):
     assert parse_axis(text) == Axis(("a",), (value,), swept=False)
@@ -162,9 +170,10 @@ def test_one_value_is_the_same_for_all_points(text, value):
         ("seed=4..1", "the range 4..1 is empty"),
         ("seed=0.1..0.5", "not a range of whole numbers"),
         ("seed=1..10000000", "more than 100000 values"),
-        ("a=[1,2", "] is missing"),
-        ("a=1]", "] closes nothing"),
-        ('a="x,y', '" is missing'),
+        ("a=[1,2", "brackets or quotation marks do not match"),
+        ("a=1]", "brackets or quotation marks do not match"),
+        ('a="x,y', "brackets or quotation marks do not match"),
+        ("a=[1,2],x]", "brackets or quotation marks do not match"),
     ],
 )
 def test_values_that_are_none(text, expected):
@@ -214,13 +223,12 @@ def test_all_combinations_with_keys_that_go_together():
 
 
 def test_cores_are_full(monkeypatch):
-    monkeypatch.setattr(sweeping, "cores", lambda: 8)
-    assert sweeping.jobs_and_threads(24, None, None, False) == (8, 1)
-    assert sweeping.jobs_and_threads(3, None, None, False) == (3, 2)
-    assert sweeping.jobs_and_threads(24, 2, None, False) == (2, 4)
-    assert sweeping.jobs_and_threads(24, None, 4, False) == (2, 4)
-    assert sweeping.jobs_and_threads(24, 16, None, False) == (16, 1)
-    assert sweeping.jobs_and_threads(3, None, None, True) == (3, 1)
+    monkeypatch.setattr(sweeping, "MOST_THREADS", 8)
+    assert sweeping.jobs_and_threads(24, None, None) == (8, 1)
+    assert sweeping.jobs_and_threads(3, None, None) == (3, 2)
+    assert sweeping.jobs_and_threads(24, 2, None) == (2, 4)
+    assert sweeping.jobs_and_threads(24, None, 4) == (2, 4)
+    assert sweeping.jobs_and_threads(24, 16, None) == (16, 1)
 
 
 # Runs
@@ -326,11 +334,8 @@ def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
     # --force removes what a sweep and its analyses wrote, and no more
     (copied / "notes.txt").write_text("mine")
     (copied / "temperature_K=90_seed=1" / "mine.txt").write_text("mine")
-    with ExitStack() as stack:
-        assert (
-            sweeping.open_sweep(stack, argon, [Axis(("seed",), (1, 2))], copied, force=True).left
-            == 2
-        )
+    with sweeping.open_sweep(argon, [Axis(("seed",), (1, 2))], copied, force=True) as manifest:
+        assert len(manifest.unfinished) == 2
     assert [path.name for path in copied.iterdir() if path.is_dir()] == ["temperature_K=90_seed=1"]
     assert [path.name for path in (copied / "temperature_K=90_seed=1").iterdir()] == ["mine.txt"]
     assert {
@@ -357,13 +362,8 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
         "-o",
         str(folder),
     ]
-    with ExitStack() as stack:
-        axes = [parse_axis(text) for text in (*swept[1::2][:2], fixed[1], fixed[3])]
-        there = sweeping.open_sweep(stack, argon, axes, folder, step=STEP)
-        for point in there.manifest.points:
-            Simulation(
-                Scene.read(argon, there.manifest.overrides(point)), folder / point.folder
-            ).run(progress=False)
+    axes = [parse_axis(text) for text in (*swept[1::2][:2], fixed[1], fixed[3])]
+    run_here(argon, axes, folder, step=STEP)
     assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
     assert re.search(r"first peak \(Å\) .*\d ± \d", capsys.readouterr().out)
     assert cli.main(["sweep", str(argon), *swept, *fixed, "--extrapolate", STEP]) == 0
@@ -395,12 +395,7 @@ def test_values_of_replicas_together_are_extrapolated(argon, tmp_path):
     there."""
     folder = tmp_path / "steps"
     swept = {STEP: [5, 10], "seed": [1, 2, 3], "stages.0.duration_ps": 2.0}
-    with ExitStack() as stack:
-        there = sweeping.open_sweep(stack, argon, sweeping.axes_of(swept), folder, step=STEP)
-        for point in there.manifest.points:
-            Simulation(
-                Scene.read(argon, there.manifest.overrides(point)), folder / point.folder
-            ).run(progress=False)
+    points = run_here(argon, sweeping.axes_of(swept), folder, step=STEP).points
     assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
     with (folder / "analysis.csv").open(encoding="utf-8") as file:
         together = {float(row[STEP]): row for row in csv.DictReader(file)}
@@ -414,7 +409,7 @@ def test_values_of_replicas_together_are_extrapolated(argon, tmp_path):
             json.loads((folder / point.folder / "analysis.json").read_text())["analyses"]["rdf"][
                 "values"
             ]
-            for point in there.manifest.points
+            for point in points
             if point.values[STEP] == step
         ]
         singles = [
@@ -432,14 +427,8 @@ def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path
         "output.log_interval_ps": 0.02,
         "stages.0.integrator": "srkn_4",
     }
-    with ExitStack() as stack:
-        axes = sweeping.axes_of({STEP: [5, 10, 20]} | fixed)
-        there = sweeping.open_sweep(stack, argon, axes, folder, step=STEP)
-        for point in there.manifest.points:
-            Simulation(
-                Scene.read(argon, there.manifest.overrides(point)), folder / point.folder
-            ).run(progress=False)
-        found = limits.extrapolate_sweep(folder, there.manifest, STEP)
+    axes = sweeping.axes_of({STEP: [5, 10, 20]} | fixed)
+    found = limits.extrapolate_sweep(run_here(argon, axes, folder, step=STEP), STEP)
     assert "dt⁴ (srkn_4)" in found.title
     assert {limit.fit.order for limit in found.limits} == {4}
     limit = next(limit for limit in found.limits if len(limit.points) == 3)
@@ -454,19 +443,19 @@ def test_a_file_of_one_point_that_changes_is_noticed(tmp_path, monkeypatch):
     text = ARGON.replace("count = 20\n", "") + '\n[structure]\nfile = "a.xyz"\n'
     (scene := tmp_path / "argon.toml").write_text(text)
     axes = sweeping.axes_of({"structure.file": ["a.xyz", "b.xyz"]})
-    with ExitStack() as stack:
-        before = sweeping.open_sweep(stack, scene, axes, tmp_path / "s").manifest
+    with sweeping.open_sweep(scene, axes, tmp_path / "s") as before:
+        pass
     (tmp_path / "b.xyz").write_text("2\n\nAr 0 0 0\nAr 0 0 6\n")
     with (
         pytest.raises(
             OutputError, match=r"another scene: a file that file=b.xyz reads has changed"
         ),
-        ExitStack() as stack,
+        sweeping.open_sweep(scene, axes, tmp_path / "s"),
     ):
-        sweeping.open_sweep(stack, scene, axes, tmp_path / "s")
+        pass
     (tmp_path / "b.xyz").write_text("2\n\nAr 0 0 0\nAr 0 0 5\n")
-    with ExitStack() as stack:
-        after = sweeping.open_sweep(stack, scene, axes, tmp_path / "s").manifest
+    with sweeping.open_sweep(scene, axes, tmp_path / "s") as after:
+        pass
     assert [point.scene_sha256 for point in after.points] == [
         point.scene_sha256 for point in before.points
     ]
@@ -567,16 +556,11 @@ timestep_fs = 5
     (scene := tmp_path / "pair.toml").write_text(text + "log_interval_ps = 0.02\n")
     together = "stages.density.temperature_K,stages.production.temperature_K"
     folder = tmp_path / "s"
-    with ExitStack() as stack:
-        there = sweeping.open_sweep(stack, scene, [parse_axis(f"{together}=90,110")], folder)
-        for point in there.manifest.points:
-            Simulation(
-                Scene.read(scene, there.manifest.overrides(point)), folder / point.folder
-            ).run(progress=False)
+    points = run_here(scene, [parse_axis(f"{together}=90,110")], folder).points
     assert cli.main(["sweep", str(scene), "-o", str(folder), "--collect"]) == 0
     said = capsys.readouterr().out
     assert "density: Density (g/mL)" in said
-    for row, point in zip(table(folder), there.manifest.points, strict=True):
+    for row, point in zip(table(folder), points, strict=True):
         stage = json.loads((folder / point.folder / "summary.json").read_text())["stages"][0]
         assert float(row["density: Density (g/mL)"]) == pytest.approx(
             stage["density_g_cm3"], rel=1e-6
@@ -608,6 +592,22 @@ timestep_fs = 5
 )
 def test_axes_have_units_and_name_the_keys_that_vary_together(key, together, label):
     assert axis_label(key, together) == label
+
+
+@pytest.mark.parametrize("errors", [0.5, None])
+def test_a_figure_shows_all_points_of_all_curves(errors, tmp_path):
+    """Curves with errors are displaced, which must not move them out of the panel."""
+    rows = [
+        SweepRow({"a.b_K": x, "word": word}, {None: {"x": (x + shift, errors)}})
+        for x in (300.0, 280.0, 290.0)
+        for word, shift in (("one", 0.0), ("two", 40.0))
+    ]
+    drawn = figure.draw_table(SweepTable(tmp_path, ["a.b_K", "word"], rows, ["x"]), ["x"])
+    (axis,) = drawn.axes
+    assert axis.get_xlim()[0] <= 280 < 300 <= axis.get_xlim()[1] < 310
+    assert axis.get_ylim()[0] <= 280 < 340 <= axis.get_ylim()[1] < 350
+    assert axis.lines[0].get_xdata().tolist() == [280, 290, 300]
+    assert [text.get_text() for text in drawn.legends[0].texts] == ["word = one", "word = two"]
 
 
 def test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run():
@@ -708,8 +708,42 @@ def long_sweep(argon, folder, **more):
         "output.log_interval_ps": 1.0,
         "seed": range(1, 4),
     } | more
-    with ExitStack() as stack:
-        return sweeping.open_sweep(stack, argon, sweeping.axes_of(changes), folder).manifest
+    with sweeping.open_sweep(argon, sweeping.axes_of(changes), folder) as manifest:
+        return manifest
+
+
+def finish(manifest, jobs=2, receive=lambda name, line: None, pool=None):
+    """Run what is left of a sweep, and return the signal that stopped it."""
+    bar = progress_of(1.0, "points", False)
+    with bar, pool or ThreadPoolExecutor(jobs) as executor:
+        return sweep_points.run_points(manifest, executor, bar, receive=receive)
+
+
+def names_in(manifest, *states):
+    return [point.folder for point in manifest.points_in(*states)]
+
+
+def when_running(folder, act):
+    """Call `act(name)` with the first point of a sweep whose log has grown, from another thread.
+    Returns a function that ends the thread."""
+    ended = threading.Event()
+
+    def watch():
+        while not ended.wait(0.05):
+            for log in folder.glob("*/log.csv"):
+                is_moving = log.read_bytes().count(b"\n") > 3
+                if is_moving and not (log.parent / "summary.json").exists():
+                    act(log.parent.name)
+                    return
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+
+    def end():
+        ended.set()
+        thread.join()
+
+    return end
 
 
 @pytest.fixture(scope="module")
@@ -717,36 +751,78 @@ def whole(argon, tmp_path_factory):
     """Three points that were never stopped."""
     folder = tmp_path_factory.mktemp("whole") / "sweep"
     manifest = long_sweep(argon, folder)
-    for point in manifest.points:
-        assert worker.run_task(sweeping.task_of(folder, manifest, point))["state"] == "finished"
+    assert finish(manifest) is None and not manifest.unfinished
     return folder
 
 
-def test_a_killed_worker_loses_its_point_alone_and_a_signal_stops_all(argon, whole, tmp_path):
-    """The first point that moves is killed, then the sweep is stopped, and goes on later."""
+def kill_run(folder):
+    """Kill the process of a run in a folder."""
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            words = (process / "cmdline").read_bytes().split(b"\0")
+            if str(folder).encode() in words:
+                os.kill(int(process.name), signal.SIGKILL)
+
+
+def test_a_killed_process_loses_its_point_alone_and_a_signal_stops_all(argon, whole, tmp_path):
+    """The first point that moves is killed, then the sweep is stopped, and continues later."""
     folder = tmp_path / "sweep"
-    manifest, pool, killed, died = long_sweep(argon, folder), Pool(2, 1), [], []
+    manifest, killed = long_sweep(argon, folder), []
 
-    def disturb(name, kind, value):
-        if kind == "died":
-            died.append(name)
-        elif kind == "fraction" and not killed:
-            killed.append(name)
-            pool.busy[name].kill()
-        elif kind == "fraction" and died:
-            os.kill(os.getpid(), signal.SIGTERM)
+    def kill_first(name):
+        killed.append(name)
+        kill_run(folder / name)
 
-    outcome = run_points(folder, manifest, pool, receive=disturb)
-    assert outcome.failed == killed
-    assert outcome.signal == signal.SIGTERM
-    assert outcome.left
+    def stop_later(name):
+        kill_first(name)
+        while states(folder)[name] != "failed":
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    end = when_running(folder, stop_later)
+    stopped = finish(manifest)
+    end()
+    assert stopped == signal.SIGTERM
+    assert names_in(manifest, "failed") == killed
+    assert names_in(manifest, "interrupted", "waiting")
     failed = next(point for point in read_manifest(folder).points if point.folder == killed[0])
     assert "was killed" in failed.message
     assert set(states(folder).values()) <= {"interrupted", "waiting", "finished", "failed"}
-    again = run_points(folder, long_sweep(argon, folder), Pool(2, 1))
-    assert not again.left
-    assert killed[0] in again.finished
+    assert not list(folder.glob(".points-*"))
+    again = long_sweep(argon, folder)
+    assert finish(again) is None and not again.unfinished
     assert same_runs(folder, whole)
+
+
+def test_a_second_interrupt_ends_all_points_at_once(argon, tmp_path):
+    folder = tmp_path / "sweep"
+    manifest = long_sweep(argon, folder, **{"stages.0.duration_ps": 1e6})
+
+    end = when_running(folder, lambda name: [os.kill(os.getpid(), signal.SIGINT) for _ in "12"])
+    began = time.monotonic()
+    assert finish(manifest) == signal.SIGINT
+    end()
+    assert time.monotonic() - began < 120
+    assert not names_in(manifest, "finished", "failed")
+
+
+def test_points_end_with_their_sweep(argon, tmp_path):
+    """Their standard input ends with the process of the sweep, however it dies."""
+    folder = tmp_path / "sweep"
+    words = ["--set", "seed=1,2", "--set", "stages.0.duration_ps=1e6", "-o", str(folder)]
+    command = [sys.executable, "-m", "rigidmd", "sweep", str(argon), *words, "--jobs", "1"]
+    sweep = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    moving = threading.Event()
+    end = when_running(folder, lambda name: moving.set())
+    assert moving.wait(300)
+    end()
+    sweep.kill()
+    sweep.wait()
+    wait_for_folder(folder / "seed=1", 60.0)
+    assert (folder / "seed=1" / "checkpoint.npz").is_file()
+    assert len(list(folder.glob(".points-*"))) == 1
+    assert cli.main([*command[3:], "--walltime", "0:00:01"]) == 75
+    assert not list(folder.glob(".points-*"))
 
 
 def test_points_that_fail_are_told_and_repeated(argon, tmp_path, capsys):
@@ -807,47 +883,23 @@ def test_a_point_waits_for_a_run_that_is_about_to_stop(tmp_path):
     lock = FolderLock(tmp_path)
     lock.take()
     with pytest.raises(OutputError, match="did not end within"):
-        worker.wait_for_folder(tmp_path, 0.1)
+        wait_for_folder(tmp_path, 0.1)
     lock.release()
-    worker.wait_for_folder(tmp_path, 0.1)
+    wait_for_folder(tmp_path, 0.1)
 
 
 def test_a_scene_that_changes_meanwhile_is_not_run(argon, tmp_path):
-    manifest = long_sweep(argon, tmp_path / "sweep")
-    point = manifest.points[0]
-    point.scene_sha256 = "other"
-    ended = worker.run_task(sweeping.task_of(tmp_path / "sweep", manifest, point))
-    assert ended["state"] == "failed"
-    assert "has changed since the sweep began" in ended["message"]
-
-
-def test_one_point_of_a_kind_compiles_before_the_others(argon, tmp_path):
-    manifest = long_sweep(
-        argon, tmp_path / "sweep", **{"stages.0.integrator": ["velocity_verlet", "pefrl"]}
-    )
-    waiting = Waiting(manifest, manifest.points)
-    first = waiting.next()
-    assert first is not None
-    assert (
-        waiting.next() is None
-    )  # the code of the first is not there yet, and one compiles at a time
-    waiting.compiled(first)
-    others = [waiting.next() for _ in range(3)]
-    kinds = [point.values["stages.0.integrator"] for point in others]
-    assert kinds == ["velocity_verlet", "velocity_verlet", "pefrl"] or kinds[0] == "pefrl"
-    assert waiting.next() is None
-    scenes = [
-        Scene.read(argon, {"seed": 2, "start.temperature_K": 50}),
-        Scene.read(argon),
-        Scene.read(argon, {"precision": "mixed"}),
-    ]
-    kinds = [code_kind(scene) for scene in scenes]
-    assert kinds[0] == kinds[1] != kinds[2]
+    manifest = long_sweep(argon, tmp_path / "sweep", seed=[1, 2])
+    for point in manifest.points:
+        point.scene_sha256 = "other"
+    finish(manifest)
+    assert len(manifest.points_in("failed")) == 2
+    assert "has changed since the sweep began" in manifest.points[0].message
 
 
 @pytest.mark.soak
 def test_a_sweep_that_is_killed_goes_on(argon, tmp_path):
-    """3 temperatures, 8 seeds, two workers; parent and workers are killed in the middle."""
+    """3 temperatures, 8 seeds, two at a time; the sweep is killed in the middle."""
     arguments = [
         str(argon),
         "--set",
@@ -863,13 +915,10 @@ def test_a_sweep_that_is_killed_goes_on(argon, tmp_path):
     parent = subprocess.Popen(command, start_new_session=True)
     while sum(state == "finished" for state in states_or_none(tmp_path / "parts").values()) < 6:
         time.sleep(0.1)
-    children = subprocess.run(
-        ["pgrep", "-P", str(parent.pid)], capture_output=True, text=True
-    ).stdout.split()
-    assert len(children) == 2
-    for number in (parent.pid, *map(int, children)):
-        os.kill(number, signal.SIGKILL)
+    parent.kill()
     parent.wait()
+    for point in (tmp_path / "parts").glob("seed=*"):
+        wait_for_folder(point, 60.0)
     done = written(tmp_path / "parts")
     assert 6 <= len(done) < 24
     assert cli.main(["sweep", *arguments, "-o", str(tmp_path / "parts")]) == 0
@@ -905,33 +954,31 @@ def test_points_run_on_a_cluster_of_dask(argon, finished, tmp_path, capsys):
 
 @pytest.mark.soak
 def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
-    pytest.importorskip("distributed")
-    from support import Cluster
-
+    distributed = pytest.importorskip("distributed")
     folder = tmp_path / "sweep"
-
-    def stop(name, kind, value):
-        if kind == "fraction":
-            os.kill(os.getpid(), signal.SIGTERM)
-
     manifest = long_sweep(argon, folder)
-    outcome = run_points(folder, manifest, Cluster("local", 2, 1, folder, Path.cwd()), receive=stop)
-    assert outcome.left
-    assert not outcome.failed
-    assert not run_points(folder, long_sweep(argon, folder), Pool(2, 1)).left
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, protocol="tcp"
+    ) as cluster:
+        end = when_running(folder, lambda name: os.kill(os.getpid(), signal.SIGTERM))
+        stopped = finish(manifest, pool=sweep_points.cluster(cluster.scheduler_address))
+        end()
+    assert stopped == signal.SIGTERM
+    assert manifest.unfinished and not manifest.points_in("failed")
+    again = long_sweep(argon, folder)
+    finish(again)
+    assert not again.unfinished
     assert same_runs(folder, whole)
 
 
 def test_without_a_cluster(argon, tmp_path, monkeypatch, capsys):
-    from support import cluster
-
-    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr(sweep_points, "CONNECT_TIMEOUT", 0.5)
     arguments = ["sweep", str(argon), *GRID, "-o", str(tmp_path / "sweep"), "--scheduler"]
     if "distributed" in sys.modules:
         assert cli.main([*arguments, "tcp://127.0.0.1:9"]) == 2
         assert "no scheduler of dask.distributed answers" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert cli.main([*arguments, "local"]) == 2
+    assert cli.main([*arguments, "tcp://127.0.0.1:9"]) == 2
     assert "pip install distributed" in capsys.readouterr().err
 
 
@@ -989,7 +1036,80 @@ def test_a_script_for_slurm(argon, finished, slurm, capsys):
         )
         == 0
     )
-    assert "#SBATCH --array=1-2\n" in script.read_text()
+    assert "#SBATCH --array=1,2\n" in script.read_text()
+
+
+def test_commands_for_any_scheduler(argon, finished, slurm, capsys):
+    """A line for each point that has not finished, which a shell runs."""
+    axes = ["--set", "start.temperature_K=120", "--set", "seed=1..2"]
+    assert cli.main(["sweep", str(argon), *axes, "-o", "my sweep", "--to", "commands"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2
+    assert not list(Path("my sweep").glob("*/log.csv"))
+    subprocess.run(["bash", "-c", lines[0]], check=True)
+    assert cli.main(["sweep", str(argon), *axes, "-o", "my sweep", "--to", "commands"]) == 0
+    assert capsys.readouterr().out.splitlines() == lines[1:]
+    ours, theirs = Path("my sweep") / "seed=1", finished / "temperature_K=120_seed=1"
+    assert (ours / "log.csv").read_bytes() == (theirs / "log.csv").read_bytes()
+
+
+SPRING = """
+from typing import NamedTuple
+
+import rigidmd
+
+
+class Spring(NamedTuple):
+    stiffness: float
+    tied_to_places = True
+
+
+@rigidmd.compiled_force(Spring)
+def add_spring(term, state, load, tally):
+    load.force[0, 0] -= term.stiffness * state.position[0, 0]
+
+
+def spring():
+    return Spring({size})
+"""
+
+
+def test_each_point_trusts_the_file_that_it_runs(argon, tmp_path, capsys):
+    """A sweep over modules, each of which has to be trusted."""
+    text = argon.read_text() + '[[forces.custom]]\nmodule = "one.py"\nname = "spring"\n'
+    (scene := tmp_path / "argon.toml").write_text(text)
+    for name, size in (("one.py", 1.0), ("two.py", 2.0), ("three.py", 3.0)):
+        (tmp_path / name).write_text(SPRING.format(size=size))
+    names = [str(tmp_path / name) for name in ("one.py", "two.py", "three.py")]
+    arguments = ["sweep", str(scene), "--set", f"forces.custom.0.module={names[0]},{names[1]}"]
+    arguments += ["--to", "commands", "-o", str(tmp_path / "s")]
+    trusted = ["--trust", names[0], "--trust", names[1]]
+    assert cli.main([*arguments, *trusted, "--trust", names[2]]) == 2
+    assert "three.py is not a file that [[forces.custom]]" in capsys.readouterr().err
+    assert cli.main([*arguments, *trusted]) == 0
+    for line, name in zip(capsys.readouterr().out.splitlines(), names, strict=False):
+        assert shlex.split(line)[-2:] == ["--trust", name]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        True,
+        3,
+        -0.25,
+        1e-30,
+        "spce",
+        "a b,c",
+        'quo"te\\',
+        "3",
+        [30, 30.5],
+        ["x", "y"],
+        {"between": [1, 2], "a key": {"x": "é"}},
+    ],
+)
+def test_an_override_of_a_command_is_read_as_the_same_value(value):
+    assert parse_override(format_override("a.b", value)) == ("a.b", value)
 
 
 @pytest.mark.soak
@@ -1014,7 +1134,6 @@ def test_slurm_jobs_submit_themselves_again(argon, slurm):
 
 
 def test_words_for_slurm():
-    assert format_ranges([0, 1, 2, 5, 7, 8]) == "0-2,5,7-8"
     assert format_walltime(3661.9) == "1:01:01"
     assert format_walltime(100 * 3600) == "100:00:00"
 
@@ -1042,6 +1161,7 @@ def test_words_for_slurm():
             ["--set", "seed=1..3", "--to", "slurm", "--walltime", "1:00:00", "--collect"],
             "cannot be combined",
         ),
+        (["--set", "seed=1..3", "--to", "commands", "--walltime", "1:00:00"], "starts no run"),
         (["--set", "seed=1..3", "--trust", "nothing.py"], "there is no such file"),
     ],
 )
@@ -1098,8 +1218,6 @@ def test_folders_that_are_none(argon, tmp_path, copied, capsys):
             assert expected in capsys.readouterr().err
     assert cli.main(["sweep", str(argon), "-o", str(tmp_path / "none"), "--collect"]) == 2
     assert "holds no sweep" in capsys.readouterr().err
-    assert cli.main(["sweep", str(argon), "-o", str(copied), "--point", "4"]) == 2
-    assert "has points 0 to 3, not 4" in capsys.readouterr().err
     assert cli.main(["report", str(copied)]) == 2
     assert "is the folder of a sweep; name one of the runs in it" in capsys.readouterr().err
     for text in (

@@ -1,7 +1,11 @@
 """What thermostats evolve besides momenta: it outlives a stop."""
 
 import numpy as np
-from support import STORED_NAMES, build, same_after_stops, small_scene, state_from
+from support import same_after_stops, small_scene
+
+from rigidmd.assemble.build import build
+from rigidmd.core.state import State
+from rigidmd.run.resume import state_from
 
 WATER = {
     "box": {"density_g_cm3": 0.9},
@@ -31,7 +35,7 @@ def test_a_checkpoint_gives_back_all_of_a_state():
     for array in (state.position, state.velocity, state.angular_momentum_body, state.energy_ledger):
         array[:] = rng.standard_normal(array.shape)
     found = state_from(
-        {name: array.copy() for name, array in zip(STORED_NAMES, state, strict=True)}, state
+        {name: array.copy() for name, array in zip(State._fields, state, strict=True)}, state
     )
     for name, a, b in zip(state._fields, found, state, strict=True):
         assert a.tobytes() == b.tobytes(), name

@@ -6,40 +6,23 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from scipy import stats
-from support import (
-    BATCH,
-    HEAT,
-    ROOT,
-    SCHEMES,
-    THERMOSTAT,
-    WITH_THERMOSTAT,
-    Andersen,
-    Engine,
-    Langevin,
-    NoseHoover,
-    Ramp,
-    apply_langevin_group,
-    boxes,
-    build,
-    built,
-    constant_ramp,
-    couplings,
-    describe_stage,
-    implements,
-    integrator_of_stage,
-    kernel,
-    key_of,
-    move,
-    observe,
-    ramps,
-    remove_overlaps,
-    small_scene,
-)
+from support import ROOT, built, move, observe, small_scene
 
 import rigidmd
+from rigidmd.assemble.build import build, integrator_of_stage
+from rigidmd.assemble.stage_description import describe_stage
+from rigidmd.compile import implements, kernel
+from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
+from rigidmd.core.state import HEAT
+from rigidmd.dynamics import barostats, thermostats
+from rigidmd.dynamics.noise import BATCH, THERMOSTAT, key_of
+from rigidmd.dynamics.thermostats import Andersen, Langevin, NoseHoover, Ramp, constant_ramp
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
+from rigidmd.mechanics.batches import apply_langevin_group
 from rigidmd.run import Simulation
-from rigidmd.scene import schema
+from rigidmd.run.minimise import remove_overlaps
+from rigidmd.scene import couplings, schema
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 VERLET, BAOAB = SCHEMES["velocity_verlet"], WITH_THERMOSTAT["baoab"]
@@ -370,20 +353,20 @@ class Swelling(NamedTuple):
     key: tuple
 
 
-@implements(boxes.propose_strain, Swelling)
+@implements(barostats.propose_strain, Swelling)
 def propose_swelling(barostat, model, state, workspace, h, draw):
     for k in range(3):
         workspace.strain[0, k] = barostat.strain
-    boxes.set_matrices(workspace)
+    barostats.set_matrices(workspace)
     return True
 
 
-@implements(boxes.rescale_velocities, Swelling)
+@implements(barostats.rescale_velocities, Swelling)
 def keep_velocities(barostat, state, workspace):
     return None
 
 
-@implements(boxes.log_acceptance, Swelling)
+@implements(barostats.log_acceptance, Swelling)
 def accept_swelling(barostat, model, state, workspace, h):
     return 0.1
 
@@ -408,10 +391,10 @@ def test_adding_a_thermostat_and_a_barostat(monkeypatch):
     )
     monkeypatch.setitem(couplings.BAROSTATS, "swelling", made)
     monkeypatch.setitem(
-        ramps.THERMOSTATS, "braking", lambda stage, *given: Braking(stage.thermostat_time)
+        thermostats.THERMOSTATS, "braking", lambda stage, *given: Braking(stage.thermostat_time)
     )
     monkeypatch.setitem(
-        boxes.BAROSTATS, "swelling", lambda stage, given: Swelling(0.01, given.tail, given.key)
+        barostats.BAROSTATS, "swelling", lambda stage, given: Swelling(0.01, given.tail, given.key)
     )
     properties = schema()["$defs"]["Stage"]["properties"]
     assert (

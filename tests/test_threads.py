@@ -12,7 +12,7 @@ import warnings
 import numba
 import numpy as np
 import pytest
-from support import ROOT, SCHEMES, small_scene
+from support import ROOT, small_scene
 
 from rigidmd import Every, Simulation, run_together
 from rigidmd.compile import (
@@ -35,6 +35,7 @@ from rigidmd.compile.thread_pool import (  # noqa: F401
     _run_ranges,
     _write,
 )
+from rigidmd.core.integrators import SCHEMES
 from rigidmd.errors import SimulationError
 
 

@@ -11,31 +11,30 @@ import numpy as np
 import pytest
 from MDAnalysis.analysis.dielectric import DielectricConstant
 from scenes import FORTY_WATERS, NVT, forty_waters
-from support import (
-    Frame,
-    build,
-    export,
-    formats,
-    from_files,
-    in_memory,
-    load_model,
-    open_trajectory,
-    random_rotations,
-    read_atoms,
-    read_frames,
-    read_geometry,
-    read_structure,
-    reader_of,
-    reading_process,
-    small_scene,
-    without_rounding,
-    write_topology,
-)
+from support import small_scene
 
+from rigidmd import formats
+from rigidmd.analysis.rigid_frames import without_rounding
+from rigidmd.assemble.build import build
+from rigidmd.assemble.structure import read_structure
 from rigidmd.commands import cli
 from rigidmd.errors import SceneError, SimulationError, StructureError
+from rigidmd.formats import through_mdanalysis
+from rigidmd.formats.atoms import Frame
+from rigidmd.io.structure_file import read_atoms, read_geometry
+from rigidmd.io.trajectory import (
+    from_files,
+    in_memory,
+    open_trajectory,
+    read_frames,
+    reader_of,
+    write_topology,
+)
+from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
+from rigidmd.scene.models import load_model
+from rigidmd.studies.other_engines import export
 
 TEXT = """
 [structure]
@@ -294,7 +293,7 @@ def test_what_cannot_be_a_start(ending, fault, said, tmp_path, capsys, monkeypat
         case "crash":
             program = tmp_path / "crash.py"
             program.write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n")
-            monkeypatch.setattr(reading_process, "PROGRAM", (str(program),))
+            monkeypatch.setattr(through_mdanalysis, "PROGRAM", (str(program),))
         case "outside":
             shutil.move(folder / "topology.gro", tmp_path)
             more = 'topology = "../topology.gro"'
@@ -519,7 +518,7 @@ from functools import partial
 
 import numpy as np
 
-from PACKAGE.io.formats import Atoms, Format, Frame, register
+from PACKAGE.formats import Atoms, Format, Frame, register
 
 
 def encoder(system, interval, velocities):
@@ -587,7 +586,7 @@ def test_adding_a_format_takes_one_file(tmp_path, monkeypatch):
         )
     finally:
         formats.BY_EXTENSION.pop(".toy", None)
-        sys.modules.pop("rigidmd.io.formats.toy", None)
+        sys.modules.pop("rigidmd.formats.toy", None)
     with pytest.raises(
         SceneError, match=r"must end in one of \.dcd \.gsd \.nc \.pdb \.traj \.trr \.xtc \.xyz"
     ):

@@ -14,22 +14,17 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from PIL import Image, ImageSequence
-from support import (
-    ROOT,
-    SOLIDS,
-    UNITS,
-    build_body,
-    connections,
-    mesh_of,
-    molecule_film,
-    read_record,
-    shifted_inertia,
-    solid,
-    write_film,
-)
+from support import ROOT
 
 from rigidmd import Scene, Simulation
+from rigidmd.assemble.body import build_body
 from rigidmd.commands import cli
+from rigidmd.formats.bonds import connections
+from rigidmd.mechanics.inertia import SOLIDS, shifted_inertia, solid
+from rigidmd.run.record import read_record
+from rigidmd.view import molecule_animation
+from rigidmd.view.animation import write_film
+from rigidmd.view.mesh import UNITS, mesh_of
 
 CHROMIUM = next(
     (
@@ -172,14 +167,14 @@ def test_the_film_of_a_body_is_its_motion(top, tmp_path):
 
 
 def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch):
-    monkeypatch.setattr(molecule_film, "chemiscope_script", lambda: "var Chemiscope;")
+    monkeypatch.setattr(molecule_animation, "chemiscope_script", lambda: "var Chemiscope;")
     page = tmp_path / "water.html"
     assert cli.main(["view", str(water), "-o", str(page)]) == 0
     data, record = data_of(page), read_record(water)
     seen = (numbers(data["positions"], "<i2").astype(float) + data["steps"]) * data["scale"] + data[
         "low"
     ]
-    frames = molecule_film.frames_of(record, 100)
+    frames = molecule_animation.frames_of(record, 100)
     assert np.allclose(seen.reshape(frames.positions.shape), frames.positions, atol=data["scale"])
     assert data["scale"] < 1e-3
     assert numbers(data["time"], "<f8") == pytest.approx([0, 0.01, 0.02, 0.03, 0.04], abs=1e-6)
@@ -194,7 +189,7 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
 def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
     more = SHORT_WATER | {"output.trajectory": f"t{ending}", "stages.production.duration_ps": 0.01}
     results = Simulation(Scene.read(ROOT / "systems" / "water.toml", more), tmp_path / "run").run()
-    frames = molecule_film.frames_of(read_record(tmp_path / "run"), 100)
+    frames = molecule_animation.frames_of(read_record(tmp_path / "run"), 100)
     assert frames.time == pytest.approx([0, 0.01, 0.02, 0.03], abs=1e-6)
     assert frames.cells[-1] == pytest.approx(results.state.cell, abs=1e-3)
 
@@ -325,7 +320,7 @@ def test_a_film_moves(kind, request, tmp_path, capsys):
 
 
 def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
-    from support import film
+    from rigidmd.view import animation as film
 
     monkeypatch.setattr(film.shutil, "which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # not installed
@@ -374,7 +369,7 @@ def test_a_film_as_mp4(top, tmp_path):
 
 
 def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
-    from support import BodyAnimation
+    from rigidmd.view.body_animation import BodyAnimation
 
     film = BodyAnimation(read_record(top))
     assert film.loop_end() == (0.5, [])  # this top has fallen and risen, but turned elsewhere
@@ -427,7 +422,7 @@ def test_a_folder_that_is_no_run(command, fault, said, water, tmp_path, capsys):
 )  # of MDAnalysis, for a file of one frame
 @pytest.mark.parametrize("fault", ["missing", "other atoms", "other shapes", "noise", "empty"])
 def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(molecule_film, "chemiscope_script", lambda: "")
+    monkeypatch.setattr(molecule_animation, "chemiscope_script", lambda: "")
     folder = tmp_path / "run"
     shutil.copytree(water, folder, ignore=shutil.ignore_patterns(".trajectory*"))
     path = folder / "trajectory.xtc"
@@ -457,7 +452,7 @@ def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, c
 
 
 def test_a_run_that_was_killed_shows_what_there_is(water, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(molecule_film, "chemiscope_script", lambda: "")
+    monkeypatch.setattr(molecule_animation, "chemiscope_script", lambda: "")
     folder = tmp_path / "run"
     shutil.copytree(water, folder, ignore=shutil.ignore_patterns(".trajectory*"))
     (folder / "summary.json").unlink()
@@ -484,8 +479,8 @@ def test_a_body_that_was_killed_shows_its_last_checkpoint(top, tmp_path, capsys)
 
 
 def test_a_film_says_what_it_leaves_out(water, tmp_path, monkeypatch):
-    monkeypatch.setattr(molecule_film, "chemiscope_script", lambda: "")
-    monkeypatch.setattr(molecule_film, "MOST_COORDINATES", 3 * 3 * 648)
+    monkeypatch.setattr(molecule_animation, "chemiscope_script", lambda: "")
+    monkeypatch.setattr(molecule_animation, "MOST_COORDINATES", 3 * 3 * 648)
     page = tmp_path / "water.html"
     assert cli.main(["view", str(water), "-o", str(page)]) == 0
     assert len(numbers(data_of(page)["time"], "<f8")) == 3

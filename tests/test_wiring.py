@@ -6,26 +6,16 @@ from math import pi
 import numba
 import numpy as np
 import pytest
-from support import (
-    BAROSTAT,
-    NOW,
-    ORIGIN,
-    REMOVE_MOMENTUM,
-    REMOVED,
-    BoundTask,
-    advance,
-    barostat_of,
-    boxes,
-    build,
-    draw_momenta,
-    observe,
-    ramps,
-    remove_momentum,
-    small_scene,
-    thermostat_of,
-)
-from support import BATH_STEP as THERMOSTAT
-from support import integrator_of_stage as row
+from support import observe, small_scene
+
+from rigidmd.assemble.build import barostat_of, build, thermostat_of
+from rigidmd.assemble.build import integrator_of_stage as row
+from rigidmd.compile import BoundTask
+from rigidmd.core.integrators import REMOVE_MOMENTUM, THERMOSTAT
+from rigidmd.core.state import NOW, ORIGIN, REMOVED
+from rigidmd.dynamics import barostats, step_loop, thermostats
+from rigidmd.dynamics.model import draw_momenta, remove_momentum
+from rigidmd.dynamics.noise import BAROSTAT
 
 #: In u, Å and ps, from SI: 1 u = 1.66053906660e-27 kg.
 KILOGRAM = 1 / 1.66053906660e-27
@@ -203,7 +193,7 @@ def test_a_stress_has_its_components_in_the_order_of_the_strain(coupling, coordi
     assert box.coordinate == coordinate
     assert box.pressure.first[: len(given)] == pytest.approx(np.array(given) * BAR)
     assert box.pressure.first == box.pressure.last
-    assert boxes.COMPONENTS == ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
+    assert barostats.COMPONENTS == ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
 
 
 def test_a_piston_has_the_period_that_was_asked_for():
@@ -236,7 +226,7 @@ def test_a_ramp_is_even_over_the_steps_of_its_stage():
     """At step k of n, counted from the begin of the stage, the pressure is p0 + (p1 - p0) k/n."""
     system = system_of(NPT)
     box, state = barostat_of(system, 0), system.state.copy()
-    asked, present = boxes.target_pressure.py_func, ramps.ramp_value.py_func
+    asked, present = barostats.target_pressure.py_func, thermostats.ramp_value.py_func
     state.step[ORIGIN] = 1000
     for taken in (0, 99, 249):  # the step that is being taken is the next one
         state.step[NOW] = 1000 + taken
@@ -249,14 +239,14 @@ def test_a_ramp_is_even_over_the_steps_of_its_stage():
 
 @numba.njit
 def _driving(box, model, state, room, k, volume, thermal):
-    return boxes.strain_force(box, model, state, room, k, volume, thermal)
+    return barostats.strain_force(box, model, state, room, k, volume, thermal)
 
 
 def test_what_drives_the_cell_follows_a_ramp_of_the_pressure():
     """Between two steps of a ramp only the pressure differs: the drive falls by V dP."""
     system = system_of(NPT)
     box, state = barostat_of(system, 0), system.state.copy()
-    room, found = boxes.barostat_workspace(state), []
+    room, found = barostats.barostat_workspace(state), []
     for taken in (0, 124, 249):
         state.step[NOW] = taken
         found.append(_driving(box, system.model, state, room, 1, state.volume, 300 * KELVIN))
@@ -267,7 +257,7 @@ def test_what_drives_the_cell_follows_a_ramp_of_the_pressure():
 
 @numba.njit
 def _log_acceptance(box, model, state, room, h):
-    return boxes.log_acceptance(box, model, state, room, h)
+    return barostats.log_acceptance(box, model, state, room, h)
 
 
 def test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecules():
@@ -275,7 +265,7 @@ def test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecu
     system = system_of(MONTE_CARLO)
     box, state = barostat_of(system, 0), system.state.copy()
     state.step[NOW] = 249  # 310 K, 500 bar
-    room = boxes.barostat_workspace(state)
+    room = barostats.barostat_workspace(state)
     room.tally[:, 0] = 250.0, 100.0
     state.cell[:] *= 1.02
     before, after = 14.0**3, (1.02 * 14.0) ** 3
@@ -309,7 +299,7 @@ def test_a_mixture_is_brought_to_rest_by_one_velocity_for_all(counts):
     before = state.velocity.copy()
     momentum = mass @ before
     kept = np.array([not field, True, True])
-    BoundTask(advance._remove_momentum, (system.model, state))()
+    BoundTask(step_loop._remove_momentum, (system.model, state))()
     assert (mass @ state.velocity)[kept] == pytest.approx(np.zeros(kept.sum()), abs=1e-12)
     assert before - state.velocity == pytest.approx(
         np.tile(kept * momentum / mass.sum(), (len(mass), 1))

@@ -80,10 +80,11 @@ def _function_of_results(entry: Analysis) -> Callable[..., AnalysisResult]:
             Runs(tuple(one._analysis_frames[start] for one in each)), *arguments, **options
         )
 
-    ours, (_, *more) = signature(function), signature(entry.function).parameters.values()
-    given = [ours.parameters["results"], *more, ours.parameters["start"]]
-    given.sort(key=lambda parameter: parameter.kind is Parameter.KEYWORD_ONLY)
-    function.__signature__ = ours.replace(parameters=given)  # pyright: ignore[reportFunctionMemberAccess]
+    ours = signature(function)
+    _, *function_parameters = signature(entry.function).parameters.values()
+    parameters = [ours.parameters["results"], *function_parameters, ours.parameters["start"]]
+    parameters.sort(key=lambda parameter: parameter.kind is Parameter.KEYWORD_ONLY)
+    function.__signature__ = ours.replace(parameters=parameters)  # pyright: ignore[reportFunctionMemberAccess]
     function.__name__ = function.__qualname__ = entry.name
     function.__doc__ = entry.function.__doc__
     return function

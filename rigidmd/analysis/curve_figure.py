@@ -60,7 +60,7 @@ def curves_figure(curves: "Sequence[Curve]", title: str) -> "Picture":
 def _draw(axis: Any, curve: "Curve") -> None:
     header, x = curve.axis
     shown = [title for title in curve.columns if not UNDRAWN.fullmatch(title)][:MOST_CURVES]
-    seen = x > 0 if curve.log[0] else np.ones(len(x), bool)
+    is_drawn = x > 0 if curve.log[0] else np.ones(len(x), bool)
     if curve.level is not None:
         axis.axhline(curve.level, color=FAINT, lw=0.7)
     for color, title in zip(COLORS, shown, strict=False):
@@ -68,11 +68,11 @@ def _draw(axis: Any, curve: "Curve") -> None:
         if curve.bars:
             axis.bar(x, values, color=color, width=0.7)
             continue
-        axis.plot(*thin_series(x[seen], values[seen]), color=color, lw=1.0, label=title)
+        axis.plot(*thin_series(x[is_drawn], values[is_drawn]), color=color, lw=1.0, label=title)
         error = curve.errors.get(title)
         if error is not None and np.isfinite(error).all():
-            low, high = (values - error)[seen], (values + error)[seen]
-            axis.fill_between(x[seen], low, high, color=color, alpha=0.25, lw=0)
+            low, high = (values - error)[is_drawn], (values + error)[is_drawn]
+            axis.fill_between(x[is_drawn], low, high, color=color, alpha=0.25, lw=0)
     for line, is_log, name in ((axis.xaxis, curve.log[0], "x"), (axis.yaxis, curve.log[1], "y")):
         if is_log:
             getattr(axis, f"set_{name}scale")("log")

@@ -9,7 +9,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from rigidmd.analysis.curve_figure import curve_figure
 from rigidmd.analysis.registry import analysis_order, is_built_in, selected
@@ -64,9 +64,7 @@ def write_results(
     add_to_folder(folder, [ANALYSIS, *new])
     entries, curves = {}, [curve for result in results for curve in result.curves]
     for name, entry in known.items():
-        entries[name] = entry.model_dump(by_alias=True) | {
-            "values": [value._asdict() for value in entry.values]
-        }
+        entries[name] = entry.model_dump() | {"values": [value._asdict() for value in entry.values]}
     for result in [
         *results,
         *(AnalysisResult(name, name, notes=[reason]) for name, reason in failed.items()),
@@ -79,7 +77,7 @@ def write_results(
                 {key: getattr(curve, key) for key in _Curve.model_fields} for curve in result.curves
             ],
             "files": files.get(result.name, []),
-            "stretch": frames_used,
+            "frames_used": frames_used,
         }
     entries = dict(sorted(entries.items(), key=lambda entry: analysis_order(entry[0])))
     for curve in curves:
@@ -123,7 +121,8 @@ class _Entry(BaseModel):
     notes: list[str]
     curves: list[_Curve]
     files: list[str]
-    frames_used: _FramesUsed = Field(alias="stretch")
+    # `stretch` in files of rigidmd 0.2
+    frames_used: _FramesUsed = Field(validation_alias=AliasChoices("frames_used", "stretch"))
 
 
 class _Analyses(BaseModel):
@@ -134,14 +133,14 @@ class _Analyses(BaseModel):
 
 def read_table(folder: Path) -> dict[str, _Entry]:
     """The entries of analysis.json by analysis, if there are any. Raises OutputError."""
-    found = read_json(folder / ANALYSIS, _Analyses, "; remove it, and analyse again")
-    return {} if found is None else found.analyses
+    analyses = read_json(folder / ANALYSIS, _Analyses, "; remove it, and analyse again")
+    return {} if analyses is None else analyses.analyses
 
 
 def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
     """The results of analyses in the folder of a run, each with a phrase on the frames used. Raises
     OutputError."""
-    found = []
+    results = []
     for name, entry in read_table(folder).items():
         curves, used = [], entry.frames_used
         for described in entry.curves:
@@ -149,12 +148,12 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
             read = read_columns(path)
             if read is None or not read.cells:
                 raise OutputError(f"{path} cannot be read: it has no curve; analyse again")
-            head, *rest = read.cells
+            head, *titles = read.cells
             table = {title: read.numbers(title) for title in read.cells}
             columns = {
-                t: table[t] for t in rest if t.removesuffix(" error") not in table.keys() - {t}
+                t: table[t] for t in titles if t.removesuffix(" error") not in table.keys() - {t}
             }
-            errors = {t.removesuffix(" error"): table[t] for t in rest if t not in columns}
+            errors = {t.removesuffix(" error"): table[t] for t in titles if t not in columns}
             curves.append(
                 Curve(
                     **described.model_dump(),
@@ -164,8 +163,10 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
                 )
             )
         phrase = f"{used.frames} frames from {used.from_ps:g} to {used.to_ps:g} ps"
-        found.append((AnalysisResult(name, entry.about, entry.values, curves, entry.notes), phrase))
-    return found
+        results.append(
+            (AnalysisResult(name, entry.about, entry.values, curves, entry.notes), phrase)
+        )
+    return results
 
 
 READING = 0.25  # fraction of the progress for reading frames

@@ -69,30 +69,36 @@ def potential_of_mean_force(
     free, overlap = _free_energies(windows, samples, thermal_energy, start)
     notes = _overlap_notes(windows, overlap)
     counts = np.histogram(np.concatenate(samples), edges)[0]
-    kept = counts >= LEAST_IN_BIN
-    whole = _profile(windows, samples, thermal_energy, free, edges, kept)
-    rng, found = np.random.default_rng(0), []
+    filled = counts >= LEAST_IN_BIN
+    profile_of_all = _profile(windows, samples, thermal_energy, free, edges, filled)
+    rng, profiles = np.random.default_rng(0), []
     for _ in range(RESAMPLED):
         drawn = [rng.choice(some, len(some)) for some in samples]
         again, _ = _free_energies(windows, drawn, thermal_energy, free)
-        found.append(_profile(windows, drawn, thermal_energy, again, edges, kept))
-    found = [profile for profile in found if np.isfinite(profile).all()]  # in some a bin is empty
-    if len(found) < RESAMPLED // 2 or kept.sum() < 2:
+        profiles.append(_profile(windows, drawn, thermal_energy, again, edges, filled))
+    # in some a bin is empty
+    profiles = [profile for profile in profiles if np.isfinite(profile).all()]
+    if len(profiles) < RESAMPLED // 2 or filled.sum() < 2:
         raise OutputError(
             "the windows have too few samples for a potential of mean force: run longer"
         )
-    error = np.std(found, axis=0)
-    r = centre[kept]
+    error = np.std(profiles, axis=0)
+    r = centre[filled]
     outer = _outer(len(r))
     jacobian = 2 * thermal_energy * np.log(r)
     jacobian -= jacobian[outer].mean()
     titles = "W (kJ/mol)", "free energy of r (kJ/mol)"
     curve = Curve(NAME, ("r (A)", r), "potential of mean force (kJ/mol)", {}, level=0.0)
-    curve.add(titles[0], whole, error)
-    curve.add(titles[1], whole - jacobian, error)
-    k = int(whole.argmin())
+    curve.add(titles[0], profile_of_all, error)
+    curve.add(titles[1], profile_of_all - jacobian, error)
+    k = int(profile_of_all.argmin())
     value = Value(
-        "W lowest", "kJ/mol", float(whole[k]), float(error[k]), None, f"at r = {r[k]:.4g} Å"
+        "W lowest",
+        "kJ/mol",
+        float(profile_of_all[k]),
+        float(error[k]),
+        None,
+        f"at r = {r[k]:.4g} Å",
     )
     total = sum(len(window.samples) for window in windows)
     notes.append(
@@ -135,10 +141,10 @@ def _free_energies(
 
     free = np.zeros(1)
     if len(windows) > 1:
-        found = minimize(
+        solution = minimize(
             function, start[1:] - start[0], jac=True, hess=curvature, method="trust-exact"
         )
-        free = np.append(0.0, found.x)
+        free = np.append(0.0, solution.x)
     part = fractions(free)[1]
     return free, part @ part.T / count
 
@@ -149,17 +155,17 @@ def _profile(
     thermal_energy: float,
     free: np.ndarray,
     edges: np.ndarray,
-    kept: np.ndarray,
+    filled: np.ndarray,
 ) -> np.ndarray:
     """W (b,) in the kept bins, kJ/mol; not finite where samples are missing."""
     x = np.concatenate(samples)
     count = np.array([len(some) for some in samples], float)
     bias = _biases(windows, x, thermal_energy)
     weight = -np.asarray(logsumexp(np.log(count)[:, None] + free[:, None] - bias, axis=0))
-    density = np.histogram(x, edges, weights=np.exp(weight - weight.max()) / x**2)[0][kept]
+    density = np.histogram(x, edges, weights=np.exp(weight - weight.max()) / x**2)[0][filled]
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = -thermal_energy * np.log(density)
-        return found - found[_outer(len(found))].mean()
+        profile = -thermal_energy * np.log(density)
+        return profile - profile[_outer(len(profile))].mean()
 
 
 def _outer(bins: int) -> slice:

@@ -76,7 +76,12 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
     The function gets a `rigidmd.analysis.rigid_frames.RigidFrames` (time, positions, Q, L,
     velocities, cell, ...) and returns one number for each frame (f,), or a dictionary of such
     arrays, of which means, errors, a CSV file and a figure are made. The first line of its
-    docstring is the title. Raises OutputError if the name is not free.
+    docstring is the title.
+
+    Raises
+    ------
+    OutputError
+        If the name is not free.
     """
     name = getattr(function, "__name__", "")
     if is_built_in(name):
@@ -95,7 +100,7 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
         columns = {
             title: [of_run[title] for of_run in every if title in of_run] for title in every[0]
         }
-        found = AnalysisResult(name, about)
+        result = AnalysisResult(name, about)
         for title, series in columns.items():
             if len(series) < len(every):
                 raise OutputError(
@@ -103,18 +108,18 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
                 )
             value, error = mean_of_series(runs, series)
             if max(map(np.ptp, series)) == 0 and not error:
-                found.values.append(Value(title, "", value, None))  # a constant
+                result.values.append(Value(title, "", value, None))  # a constant
             else:
                 tau = correlation_time_of(runs, series)
-                found.values.append(converged_value(title, "", value, error, runs.span, tau))
+                result.values.append(converged_value(title, "", value, error, runs.span, tau))
         shown = {
             title: np.mean([values[: runs.shortest] for values in series], axis=0)
             for title, series in columns.items()
         }
-        found.curves.append(
+        result.curves.append(
             Curve(name, ("Time (ps)", runs.first.time[: runs.shortest]), about, shown)
         )
-        return found
+        return result
 
     KNOWN[name] = Analysis(name, about, analysis, inf, True)
     return function
@@ -162,29 +167,29 @@ def _series_of(
     """What a user-defined analysis returns for the frames of a run: a number for each frame (f,) by
     title. Raises OutputError."""
     try:
-        found = function(frames)
+        returned = function(frames)
     except (Exception, SystemExit) as error:  # a user's function may raise anything
         raise OutputError(f"the analysis {name} raised {type(error).__name__}: {error}") from error
-    series = dict(found) if isinstance(found, Mapping) else {name: found}
+    series = dict(returned) if isinstance(returned, Mapping) else {name: returned}
     if not series:
         raise OutputError(f"the analysis {name} returned an empty dictionary")
     return {
-        str(title): _checked_series(name, title, given, len(frames))
-        for title, given in series.items()
+        str(title): _checked_series(name, title, values, len(frames))
+        for title, values in series.items()
     }
 
 
-def _checked_series(name: str, title: object, given: Any, count: int) -> np.ndarray:
+def _checked_series(name: str, title: object, values: Any, count: int) -> np.ndarray:
     """What a user-defined analysis returned, as one number for each frame (f,). Raises
     OutputError."""
     try:
-        array = np.asarray(given, float)
+        array = np.asarray(values, float)
     except (TypeError, ValueError):
         array = np.array([])
     if array.shape != (count,):
         raise OutputError(
             f"the analysis {name} must return one number for each of the {count} frames, or a"
-            f" dictionary of such arrays; {title!r} has the shape {np.shape(given)}"
+            f" dictionary of such arrays; {title!r} has the shape {np.shape(values)}"
         )
     if not np.isfinite(array).all():
         frame = np.isfinite(array).argmin() + 1

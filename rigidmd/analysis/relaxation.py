@@ -36,9 +36,8 @@ class Bands(NamedTuple):
 
     frequency: np.ndarray  # mean of each band
     density: np.ndarray  # mean of each band: twice the integral of the correlation at frequency 0
-    freedom: (
-        np.ndarray
-    )  # half the number of degrees of freedom of the chi² distribution of each mean
+    #: Half the number of degrees of freedom of the chi² distribution of each mean
+    freedom: np.ndarray
 
 
 class Relaxations(NamedTuple):
@@ -103,7 +102,7 @@ def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
     """
     bands, span = spectral_bands(runs, interval), interval * min(map(len, runs))
     longest = longest_time(len(runs), span)
-    found = None
+    limit = None
     for part in PARTS:
         highest = part / (2 * interval)
         some = Bands(*(values[: np.searchsorted(bands.frequency, highest)] for values in bands))
@@ -118,20 +117,18 @@ def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
         )
         value = float(np.average(limits, weights=weights))
         error = float(np.sqrt(np.average(errors**2 + (limits - value) ** 2, weights=weights)))
-        found = Limit(value, ERROR_FACTOR * error, best, highest)
+        limit = Limit(value, ERROR_FACTOR * error, best, highest)
         if best.chi2 <= GROUPS + 2 * np.sqrt(2 * GROUPS):
             break
-    return found
+    return limit
 
 
 def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
     """The most likely model with a number of relaxations, by Fisher's scoring in the logarithms of
     its parameters, with the damping of Levenberg and Marquardt."""
     squares = (2 * np.pi * bands.frequency) ** 2
-    top, low = (
-        float(np.average(bands.density[:6], weights=bands.freedom[:6])),
-        float(bands.density[-1]),
-    )
+    top = float(np.average(bands.density[:6], weights=bands.freedom[:6]))
+    low = float(bands.density[-1])
     shortest = 0.5 / (2 * np.pi * float(bands.frequency[-1]))
     times = np.geomspace(4 * shortest, max(8 * shortest, longest / 3), count + 2)[1:-1]
     bottom = np.log([*[1e-4 * top] * count, *[shortest] * count, 1e-5 * top])
@@ -140,15 +137,17 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
 
     def model(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Density (b,) and its relative slopes with all parameters (b, p)."""
-        parts, times, rest = (
-            np.exp(parameters[:count]),
-            np.exp(parameters[count:-1]),
-            np.exp(parameters[-1]),
-        )
+        parts = np.exp(parameters[:count])
+        times = np.exp(parameters[count:-1])
+        plateau = np.exp(parameters[-1])
         below = 1 + squares[:, None] * times**2
-        density = (parts / below).sum(axis=1) + rest
+        density = (parts / below).sum(axis=1) + plateau
         slopes = np.column_stack(
-            [parts / below, -2 * parts * squares[:, None] * times**2 / below**2, 0 * squares + rest]
+            [
+                parts / below,
+                -2 * parts * squares[:, None] * times**2 / below**2,
+                0 * squares + plateau,
+            ]
         )
         return density, slopes / density[:, None]
 
@@ -175,26 +174,20 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
                 break
             continue
         gain, before = before - after, after
-        parameters, density, slopes, damping = (
-            tried,
-            density_there,
-            slopes_there,
-            max(0.2 * damping, 1e-7),
-        )
+        parameters, density, slopes = tried, density_there, slopes_there
+        damping = max(0.2 * damping, 1e-7)
         if gain < CLOSE:
             break
     weighted = slopes * bands.freedom[:, None]
-    parts, times, rest = (
-        np.exp(parameters[:count]),
-        np.exp(parameters[count:-1]),
-        float(np.exp(parameters[-1])),
-    )
-    of_limit = np.concatenate([parts, np.zeros(count), [rest]])
+    parts = np.exp(parameters[:count])
+    times = np.exp(parameters[count:-1])
+    plateau = float(np.exp(parameters[-1]))
+    of_limit = np.concatenate([parts, np.zeros(count), [plateau]])
     variance = float(of_limit @ np.linalg.pinv(weighted.T @ slopes, hermitian=True) @ of_limit)
     residual = bands.freedom * (bands.density / density - 1)
     groups = np.array_split(np.arange(len(residual)), GROUPS)
     chi2 = sum(float(residual[group].sum() ** 2 / bands.freedom[group].sum()) for group in groups)
     score = 2 * before + 2 * (2 * count + 1)
     return Relaxations(
-        0.5 * rest, 0.5 * parts, times, 0.5 * np.sqrt(max(0.0, variance)), score, chi2
+        0.5 * plateau, 0.5 * parts, times, 0.5 * np.sqrt(max(0.0, variance)), score, chi2
     )

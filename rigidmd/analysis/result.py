@@ -90,12 +90,12 @@ class Curve:
     @property
     def table(self) -> dict[str, np.ndarray]:
         """The columns of its CSV file: the axis, and each column followed by its errors."""
-        found = dict([self.axis])
+        table = dict([self.axis])
         for header, values in self.columns.items():
-            found[header] = values
+            table[header] = values
             if header in self.errors:
-                found[f"{header} error"] = self.errors[header]
-        return found
+                table[f"{header} error"] = self.errors[header]
+        return table
 
     def add(self, title: str, values: np.ndarray, errors: np.ndarray) -> None:
         self.columns[title], self.errors[title] = values, errors
@@ -237,10 +237,10 @@ def with_block_error(
     if runs.are_several:
         return runs.estimate([measure(run) for run in runs.members], conclude)
     frames = runs.first
-    whole, size = np.asarray(conclude(measure(frames)), float), len(frames) // BLOCKS
+    value, size = np.asarray(conclude(measure(frames)), float), len(frames) // BLOCKS
     blocks = range(len(frames) - size * BLOCKS, len(frames), size) if size > 1 else ()
     parts = [np.asarray(conclude(measure(frames[k : k + size])), float) for k in blocks]
-    return whole, error_of_mean(parts) if parts else np.full_like(whole, np.nan)
+    return value, error_of_mean(parts) if parts else np.full_like(value, np.nan)
 
 
 def with_group_error(
@@ -252,7 +252,7 @@ def with_group_error(
     """An array computed from the molecules of a species, and its standard error: of one run the
     larger of two, from blocks of frames and from groups of molecules; of several runs from their
     scatter. Blocks are too similar in a gas, groups where molecules move together."""
-    whole, error = with_block_error(runs, lambda part: measure(part, kind), conclude)
+    value, error = with_block_error(runs, lambda part: measure(part, kind), conclude)
     if (count := min(MAX_GROUPS, len(kind.index))) > 1 and not runs.are_several:
         groups = (
             kind._replace(index=kind.index[k::count], sites=kind.sites[k::count])
@@ -261,7 +261,7 @@ def with_group_error(
         error = np.fmax(
             error, error_of_mean([conclude(measure(runs.first, group)) for group in groups])
         )
-    return whole, error
+    return value, error
 
 
 def mean_of_series(runs: Runs, series: list[np.ndarray]) -> tuple[float, float | None]:
@@ -282,5 +282,5 @@ def correlation_time_of(runs: Runs, series: list[np.ndarray]) -> float:
     series : the numbers (f,) of each run
     """
     pairs = zip(series, runs.members, strict=True)
-    found = [correlation_time(values, run.span / (len(run) - 1)) for values, run in pairs]
-    return float(runs.mean(found))
+    times = [correlation_time(values, run.span / (len(run) - 1)) for values, run in pairs]
+    return float(runs.mean(times))

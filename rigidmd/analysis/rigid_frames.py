@@ -78,9 +78,8 @@ class RigidFrames:
     def interval(self) -> float | None:
         """Time between frames, ps; None if they are not evenly spaced."""
         gaps = np.diff(self.time)
-        rounding = 2 * float(
-            np.spacing(np.float32(np.abs(self.time).max()))
-        )  # files hold times in single precision
+        # files hold times in single precision
+        rounding = 2 * float(np.spacing(np.float32(np.abs(self.time).max())))
         if len(gaps) == 0 or gaps.min() <= 0 or np.ptp(gaps) > EVEN * gaps.max() + rounding:
             return None
         return self.span / len(gaps)
@@ -179,11 +178,11 @@ class RigidFrames:
 def sites_named(molecule: Molecule, name: str) -> list[int]:
     """Sites of a molecule with this name, or else with this name before a number, or else of this
     element."""
-    found = [k for k, site in enumerate(molecule.site_names) if site == name]
-    found = found or [
+    indices = [k for k, site in enumerate(molecule.site_names) if site == name]
+    indices = indices or [
         k for k, site in enumerate(molecule.site_names) if site.rstrip("0123456789") == name
     ]
-    return found or [
+    return indices or [
         k for k, element in enumerate(molecule.elements) if element == name and name != "X"
     ]
 
@@ -210,10 +209,10 @@ def fit_frames(
     )
     for k, frame in enumerate(sites):
         try:
-            found = fit.bodies(frame, None if velocities is None else velocities[k])
+            bodies = fit.bodies(frame, None if velocities is None else velocities[k])
         except OutputError as error:
             raise OutputError(f"frame {k + 1}: {error}") from None
-        for array, values in zip((position, Q, velocity, L), found, strict=True):
+        for array, values in zip((position, Q, velocity, L), bodies, strict=True):
             if array is not None:
                 array[k] = values
         progress((k + 1) / f)
@@ -252,8 +251,8 @@ def frames_of_folder(
         what = "a run of a single body, and analyses are for molecules"
         raise OutputError(f"{record.folder} is {what}; `rigidmd report` shows it")
     system, path = record.system, record.trajectory
-    most = max(2, MOST_NUMBERS // (3 * system.site_count + 18 * len(system.model.species)))
-    frames = read_frames(path, system.site_count, most)
+    frame_limit = max(2, MOST_NUMBERS // (3 * system.site_count + 18 * len(system.model.species)))
+    frames = read_frames(path, system.site_count, frame_limit)
     tensor = read_tensor(record.folder / TENSOR_FILE)
     notes = list(record.missing)
     if frames.stride > 1:

@@ -76,9 +76,9 @@ class Runs:
     def interval(self) -> float | None:
         """Time between frames, ps; None if they are not evenly spaced, or differently in different
         runs."""
-        found = [run.interval for run in self.members]
-        known = [interval for interval in found if interval is not None]
-        if len(known) < len(found) or np.ptp(known) > EVEN * max(known):
+        intervals = [run.interval for run in self.members]
+        known = [interval for interval in intervals if interval is not None]
+        if len(known) < len(intervals) or np.ptp(known) > EVEN * max(known):
             return None
         return float(np.mean(known))
 
@@ -110,17 +110,16 @@ class Runs:
 
         conclude : function of the mean of `values`, which may be nonlinear
         """
-        parts, weights = (
-            np.asarray(values, float),
-            np.array([len(run) for run in self.members], float),
-        )
-        whole = np.asarray(conclude(np.average(parts, axis=0, weights=weights)), float)
+        parts = np.asarray(values, float)
+        weights = np.array([len(run) for run in self.members], float)
+        value = np.asarray(conclude(np.average(parts, axis=0, weights=weights)), float)
         others = [np.arange(len(parts)) != k for k in range(len(parts))]
         without = [
-            conclude(np.average(parts[rest], axis=0, weights=weights[rest])) for rest in others
+            conclude(np.average(parts[selection], axis=0, weights=weights[selection]))
+            for selection in others
         ]
         count = len(parts)
-        return whole, sqrt(count - 1) * np.std(np.asarray(without, float), axis=0)
+        return value, sqrt(count - 1) * np.std(np.asarray(without, float), axis=0)
 
 
 def as_runs(frames: "RigidFrames | Runs") -> Runs:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.io.formats.bonds import shortest_links
+from rigidmd.formats.bonds import shortest_links
 from rigidmd.mechanics.rotation import align
 from rigidmd.scene.models import Molecule
 
@@ -47,9 +47,8 @@ class Assignment(NamedTuple):
 
     order: np.ndarray  # (m, s) atom of each site
     fit: TemplateFit
-    rival: (
-        np.ndarray
-    )  # (m,) rms of the best order in which an atom is a site with other parameters, Å; inf if none
+    #: (m,) rms of the best order in which an atom is a site with other parameters, Å; inf if none
+    rival: np.ndarray
 
     def of(self, rows: np.ndarray) -> "Assignment":
         """That of some of the molecules."""
@@ -128,10 +127,12 @@ class Orders:
         """The best orders for whole molecules (m, s, 3). If several fit equally well, the given
         order is kept."""
         order = np.tile(np.arange(points.shape[1]), (len(points), 1))
-        found = self._best_of_alike(points, order)
+        assignment = self._best_of_alike(points, order)
         if self._is_fixed:
-            return found
-        open_ = np.flatnonzero((found.fit.deviation > self.limit) | (found.fit.rms > self._certain))
+            return assignment
+        open_ = np.flatnonzero(
+            (assignment.fit.deviation > self.limit) | (assignment.fit.rms > self._certain)
+        )
         open_ = open_[self._distances_agree(points[open_])]
         while len(open_):
             other = self.search(points[open_[0]], self.limit)
@@ -142,16 +143,16 @@ class Orders:
             order = np.tile(other, (len(open_), 1))
             others = self._best_of_alike(points[open_], order)
             before = np.where(
-                found.fit.deviation[open_] <= self.limit, found.fit.rms[open_], np.inf
+                assignment.fit.deviation[open_] <= self.limit, assignment.fit.rms[open_], np.inf
             )
             worse = np.flatnonzero(before > self.equal_to(others.fit.rms))
-            found = found.with_better(open_[worse], others.of(worse), self.limit)
-            fits = (found.fit.deviation[open_] <= self.limit) & (
-                found.fit.rms[open_] <= self._certain
+            assignment = assignment.with_better(open_[worse], others.of(worse), self.limit)
+            fits = (assignment.fit.deviation[open_] <= self.limit) & (
+                assignment.fit.rms[open_] <= self._certain
             )
             fits[0] = True  # nothing better was found
             open_ = open_[~fits]
-        return found
+        return assignment
 
     def search(self, points: np.ndarray, limit: float) -> np.ndarray | None:
         """The best order (s,) for a molecule (s, 3) in which no atom deviates by more than a limit,
@@ -199,7 +200,7 @@ class Orders:
         those that they replace, massless ones included."""
         keys = self._parameters
         sites = massive_sites(self.molecule)
-        kept = (keys[sites][orders] == keys[sites]).all(axis=1)
+        keeps = (keys[sites][orders] == keys[sites]).all(axis=1)
         massless = np.setdiff1d(np.arange(len(keys)), sites)
         if len(massless):
             at = self.molecule.positions_body[massless]
@@ -209,8 +210,8 @@ class Orders:
                 distance
                 <= 2 * fit.deviation[:, None, None] + EQUAL_OF_RADIUS * self.molecule.radius
             )
-            kept &= (close & (keys[massless][:, None] == keys[massless])).any(axis=2).all(axis=1)
-        return kept
+            keeps &= (close & (keys[massless][:, None] == keys[massless])).any(axis=2).all(axis=1)
+        return keeps
 
     @cached_property
     def _parameters(self) -> np.ndarray:
@@ -235,12 +236,12 @@ class Orders:
         placed = np.empty_like(alike)
         np.put_along_axis(placed, alike, np.broadcast_to(keys, alike.shape), axis=1)
         fit = fit_template(self._template[alike], self.molecule)
-        kept = self._keeps_parameters(alike, fit) | (placed != keys).any(axis=1)
+        keeps_of_orders = self._keeps_parameters(alike, fit) | (placed != keys).any(axis=1)
         # a symmetry of the atoms that is none of the massless sites is a variant of its own
         return numbered(
             [
                 (*row, k * (not keeps))
-                for k, (row, keeps) in enumerate(zip(placed.tolist(), kept, strict=True))
+                for k, (row, keeps) in enumerate(zip(placed.tolist(), keeps_of_orders, strict=True))
             ]
         )
 
@@ -254,9 +255,8 @@ class Orders:
         ]
         if len(fits) == 1:
             return Assignment(order, fits[0], np.full(len(points), np.inf))
-        rms = np.array(
-            [np.where(fit.deviation <= self.limit, fit.rms, np.inf) for fit in fits]
-        )  # (k, m)
+        # (k, m)
+        rms = np.array([np.where(fit.deviation <= self.limit, fit.rms, np.inf) for fit in fits])
         of_variant = np.full((self._variants.max() + 1, len(points)), np.inf)
         np.minimum.at(of_variant, self._variants, rms)
         given_fits = of_variant[0] <= self.equal_to(of_variant.min(axis=0))
@@ -286,10 +286,13 @@ class Orders:
             order = np.lexsort((distance, np.broadcast_to(pair, distance.shape)), axis=1)
             return np.take_along_axis(distance, order, 1)
 
-        wanted = sorted_distances(self._template[None])
+        template_distances = sorted_distances(self._template[None])
         blocks = np.array_split(points, 1 + len(points) * len(i) // MOST_DISTANCES)
         return np.concatenate(
-            [(np.abs(sorted_distances(b) - wanted) <= 2 * self.limit).all(axis=1) for b in blocks]
+            [
+                (np.abs(sorted_distances(b) - template_distances) <= 2 * self.limit).all(axis=1)
+                for b in blocks
+            ]
         )
 
     @cached_property
@@ -300,9 +303,8 @@ class Orders:
         size = np.bincount(self.classes)[self.classes]
         far = distance >= WIDE * distance.max()
         axis = self._centred / np.where(distance > 0, distance, 1.0)[:, None]
-        off_axis = np.linalg.norm(
-            np.cross(axis[:, None], self._centred), axis=2
-        )  # (s, s) of the second from the first
+        # (s, s) of the second from the first
+        off_axis = np.linalg.norm(np.cross(axis[:, None], self._centred), axis=2)
         off_axis[~far] = 0.0
         if off_axis.max() <= LINEAR * distance.max():
             return [int(np.where(far, size, np.inf).argmin())]
@@ -313,8 +315,8 @@ class Orders:
         """Orientations (k, 3, 3) of the template in which its anchors point at atoms (s, 3), whose
         distances differ by no more than `slack`; the most likely ones first."""
         anchors = self._anchors
-        wanted = np.linalg.norm(self._centred, axis=1)[anchors]
-        off = np.abs(np.linalg.norm(centred, axis=1) - wanted[:, None])  # (anchors, s)
+        radii = np.linalg.norm(self._centred, axis=1)[anchors]
+        off = np.abs(np.linalg.norm(centred, axis=1) - radii[:, None])  # (anchors, s)
         off[self.classes != self.classes[anchors][:, None]] = np.inf
         if len(anchors) == 1:
             [mismatch], pairs = off, np.arange(len(centred))[:, None]

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats.atoms import (
     CHARMM_IONS,
     CHARMM_WATER,
     SAME_MASS,
@@ -57,11 +57,9 @@ def kinds_of(atoms: Atoms, species: list[Molecule]) -> list[str]:
     def isotope(element: str) -> str:
         """The isotope of hydrogen in the scene, for others in the file: light water from a file of
         heavy water."""
-        return (
-            hydrogen
-            if hydrogen and element in ("H", "D", "T") and element not in vocabulary
-            else element
-        )
+        if hydrogen and element in ("H", "D", "T") and element not in vocabulary:
+            return hydrogen
+        return element
 
     def without_element(mass: float) -> str:
         """The site of this mass that has no element, such as a united atom; X, without mass, if

@@ -3,6 +3,7 @@ no effect on it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.errors import SceneError
 from rigidmd.forces.body.applied import PythonForce, SteadyForce, TimeDependentForce
 from rigidmd.forces.body.resistance import NoResistance, Resistance
-from rigidmd.io.formats import format_of
+from rigidmd.formats import format_of
 from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor, split_rotor
 from rigidmd.mechanics.inertia import (
     Assembly,
@@ -94,9 +95,8 @@ def build_body(
     if added_mass.any() and not scene.body.pinned:
         translation = FluidTranslation(mass, mass + added_mass)
     body = Body(translation, rotor, frame_of(scene), resistance_of(scene))
-    terms = terms_of(scene, mass, axes, centre, displaced) | {
-        name: PythonForce() for name in applied
-    }
+    terms: dict[str, NamedTuple] = terms_of(scene, mass, axes, centre, displaced)
+    terms |= {name: PythonForce() for name in applied}
     system = BodySystem(
         scene=scene,
         body=body,
@@ -141,11 +141,10 @@ def has_finite_energy(system: BodySystem) -> bool:
 def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
     """The state at the start; spin (3,) along the principal axes, relative to the frame."""
     start, time = scene.start, np.zeros(1)
-    frame = (
-        np.zeros(3)
-        if isinstance(body.frame, InertialFrame)
-        else values_at(body.frame.angular_velocity, time)[0]
-    )
+    if isinstance(body.frame, InertialFrame):
+        frame = np.zeros(3)
+    else:
+        frame = values_at(body.frame.angular_velocity, time)[0]
     position = velocity = np.zeros((0, 3))
     rotation, momentum = np.zeros((0, 3, 3)), np.zeros((0, 3))
     principal_rotation = attitude @ axes
@@ -281,11 +280,9 @@ def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) ->
             f"dry friction is discontinuous where a body stops, which {run.integrator} cannot"
             " resolve"
         )
-        return (
-            [f"run: {what}: use velocity_verlet"]
-            if resisted and resistance.rotation_dry.any()
-            else []
-        )
+        if resisted and resistance.rotation_dry.any():
+            return [f"run: {what}: use velocity_verlet"]
+        return []
     scheme = run.scheme
     if resisted and min(scheme.kicks) < 0:
         forward = ", ".join(name for name, other in SCHEMES.items() if min(other.kicks) >= 0)
@@ -313,8 +310,8 @@ def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) ->
     return [
         f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be"
         f" of order 2; use one of {', '.join(split)} with rotor = 'split'"
-        for what, there in why.items()
-        if there and scheme.exact_rotor
+        for what, is_present in why.items()
+        if is_present and scheme.exact_rotor
     ]
 
 
@@ -507,8 +504,8 @@ def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray
         )
     for k, entry in enumerate(scene.applied):
         force, torque = (
-            constant_function(np.zeros(3)) if given is None else _time_function(entry, given)
-            for given in (entry.force_N, entry.torque_N_m)
+            constant_function(np.zeros(3)) if vector is None else _time_function(entry, vector)
+            for vector in (entry.force_N, entry.torque_N_m)
         )
         if entry.axes == "body":
             force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)

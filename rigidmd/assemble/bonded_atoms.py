@@ -4,9 +4,9 @@ import numpy as np
 
 from rigidmd.assemble.assignment import BOND_REACH, massive_sites
 from rigidmd.assemble.atom_kinds import UNKNOWN, labels_of
-from rigidmd.io.formats.atoms import Atoms, is_element
-from rigidmd.io.formats.bonds import shortest_links
-from rigidmd.io.formats.cells import pairs_within
+from rigidmd.formats.atoms import Atoms, is_element
+from rigidmd.formats.bonds import shortest_links
+from rigidmd.formats.cells import pairs_within
 from rigidmd.scene.models import Molecule
 
 #: Two ways along bonds that end this close, relative to a bond, end at the same image of an atom.

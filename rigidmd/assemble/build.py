@@ -32,7 +32,8 @@ from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of
 from rigidmd.forces.parts import Composition, Interactions, SystemParts, sum_of_tails
-from rigidmd.io.formats.cells import describe_basis, describe_cell
+from rigidmd.forces.terms import trait
+from rigidmd.formats.cells import describe_basis, describe_cell
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene, couplings
 from rigidmd.scene.fields import FIELDS, field_notes
@@ -56,11 +57,10 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     warnings = scene_warnings(scene, species)
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
-    cell = (
-        ""
-        if start.cell is None
-        else f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
-    )
+    if start.cell is None:
+        cell = ""
+    else:
+        cell = f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
     if implausible := scene_errors(scene, species, counts, space):
         raise SceneError(scene.source, implausible)
     composition = Composition(species, counts, space, start.basis, cell, start.position)
@@ -71,10 +71,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     velocity = (
         start.velocity if scene.structure is not None and scene.structure.velocities else None
     )
-    mass, inertia = (
-        np.array([m.mass for m in species]),
-        np.where(frozen[:, None], 0.0, [m.inertia for m in species]),
-    )
+    mass = np.array([m.mass for m in species])
+    inertia = np.where(frozen[:, None], 0.0, [m.inertia for m in species])
     rotor = split_rotor(inertia)
     model = Model(
         index.astype(np.int32),
@@ -94,21 +92,19 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     acting.terms.update(field_terms(parts))
     model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
-    thermal = (
-        0.0
-        if velocity is None
-        else float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
-    )
+    if velocity is None:
+        thermal = 0.0
+    else:
+        thermal = float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
     free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
     scene, precision_reason = with_precision(scene, free, thermal / BOLTZMANN, acting.force_error)
     without_tail = ""
     if scene.forces.dispersion == "cutoff" and not scene.forces.tail_correction:
         is_choice = written.forces.tail_correction is False
-        without_tail = (
-            "forces.tail_correction is false"
-            if is_choice
-            else without_tail_reason(written, composition)
-        )
+        if is_choice:
+            without_tail = "forces.tail_correction is false"
+        else:
+            without_tail = without_tail_reason(written, composition)
     system = System(
         scene=scene,
         species=species,
@@ -149,9 +145,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         ]
         if faults:
             raise SceneError(scene.source, faults)
-    driven = [
-        name for name, term in system.terms.items() if getattr(type(term), "time_dependent", False)
-    ]
+    driven = [name for name, term in system.terms.items() if trait(type(term), "time_dependent")]
     if faults := [
         f"stages.{k}" for k, stage in enumerate(scene.stages) if stage.is_hybrid and driven
     ]:
@@ -181,10 +175,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     if scene.structure is None:
         system.notes.extend(f"box: {note}" for note in start.notes)
         return system
-    file, off = (
-        scene.structure.file,
-        f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å",
-    )
+    file = scene.structure.file
+    off = f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å"
     system.notes.append(
         f"{len(index)} molecules read from {file}; distances of atoms from rigid templates: {off}"
     )
@@ -204,14 +196,16 @@ def interactions(parts: SystemParts) -> Interactions:
         names.append(ELECTROSTATICS[forces.electrostatics].module)
     if forces.dispersion != "cutoff":
         names.append("ewald.dispersion")
-    found = [import_module(f"rigidmd.forces.{name}").interactions(parts) for name in names if name]
+    contributions = [
+        import_module(f"rigidmd.forces.{name}").interactions(parts) for name in names if name
+    ]
     return Interactions(
-        {name: term for part in found for name, term in part.terms.items()},
-        {name: value for part in found for name, value in part.constants.items()},
-        sum(part.pressure for part in found),
-        sum_of_tails([part.tail for part in found if part.tail is not None]),
-        next((part.force_error for part in found if part.force_error is not None), None),
-        tuple(note for part in found for note in part.notes),
+        {name: term for part in contributions for name, term in part.terms.items()},
+        {name: value for part in contributions for name, value in part.constants.items()},
+        sum(part.pressure for part in contributions),
+        sum_of_tails([part.tail for part in contributions if part.tail is not None]),
+        next((part.force_error for part in contributions if part.force_error is not None), None),
+        tuple(note for part in contributions for note in part.notes),
     )
 
 
@@ -259,10 +253,8 @@ def left_out(
     forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
     has_sums = any(name.endswith("_reciprocal") for name in terms)
     direct = has_sums and forces.electrostatics == "ewald" and forces.dispersion != "pme"
-    method, has_charges = (
-        forces.electrostatics,
-        any(getattr(term, "acts_on_charges", False) for term in terms.values()),
-    )
+    method = forces.electrostatics
+    has_charges = any(trait(term, "acts_on_charges") for term in terms.values())
     reasons = {
         f"{title}: {'no site has it' if getattr(forces, key) else without}": key not in terms
         for key, (title, without) in POTENTIALS.items()
@@ -294,28 +286,27 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total
     momentum."""
     stage = system.scene.stages[k]
-    found, thermostat = stage.scheme, system.thermostat
+    scheme, thermostat = stage.scheme, system.thermostat
     if thermostat is not None and hasattr(thermostat, "for_stage"):
         thermostat = thermostat.for_stage(system, k)
     elif thermostat is None and stage.has_thermostat:
         thermostat = thermostat_of(system, k)
     if stage.is_hybrid and system.thermostat is None:
-        found = found.with_trajectories(thermostat_of(system, k), stage.steps_together)
+        scheme = scheme.with_trajectories(thermostat_of(system, k), stage.steps_together)
     elif thermostat is not None:
-        found = found.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
+        scheme = scheme.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
     if stage.has_barostat:
         barostat = barostat_of(system, k)
         in_steps = couplings.BAROSTATS[stage.barostat_kind].in_verlet_steps
-        found = (
-            found.with_piston(barostat)
-            if in_steps
-            else found.with_barostat(barostat, stage.moves_every)
-        )
+        if in_steps:
+            scheme = scheme.with_piston(barostat)
+        else:
+            scheme = scheme.with_barostat(barostat, stage.moves_every)
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
-        found = found.with_momentum_removal(
+        scheme = scheme.with_momentum_removal(
             max(1, round(interval / (stage.timestep_fs * FEMTOSECOND)))
         )
-    return found
+    return scheme
 
 
 def thermostat_of(system: System, k: int) -> NamedTuple:
@@ -327,11 +318,10 @@ def thermostat_of(system: System, k: int) -> NamedTuple:
 def barostat_of(system: System, k: int) -> NamedTuple:
     stage, key = system.scene.stages[k], key_of(system.scene.seed, BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
-    pressure = Pressure(
-        *(tuple(x * BAR for x in ends) for ends in stage.pressures), float(stage.steps)
-    )
+    first, last = (tuple(x * BAR for x in ends) for ends in stage.pressures)
+    pressure = Pressure(first, last, float(stage.steps))  # pyright: ignore[reportArgumentType]
     x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
-    given = Confinement(
+    confinement = Confinement(
         _thermal(stage),
         pressure,
         stage.compressibility / BAR,
@@ -341,7 +331,7 @@ def barostat_of(system: System, k: int) -> NamedTuple:
         (0.0, 0.0) if system.tail is None else system.tail[:2],
         key,
     )
-    return BAROSTATS[stage.barostat_kind](stage, given)
+    return BAROSTATS[stage.barostat_kind](stage, confinement)
 
 
 def _thermal(stage: Stage) -> Ramp:

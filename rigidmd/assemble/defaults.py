@@ -20,7 +20,7 @@ from rigidmd.core.integrators import RK4, SOLVERS
 from rigidmd.forces.neighbors.space import Triclinic, longest_gaps
 from rigidmd.forces.parts import Composition, Grid, Settings
 from rigidmd.forces.potentials.truncation import default_switch_start
-from rigidmd.io.formats import BODY_TOPOLOGY, TOPOLOGY
+from rigidmd.formats import BODY_TOPOLOGY, TOPOLOGY
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.forces import ELECTROSTATICS, OPEN, PERIODIC, Forces
@@ -44,7 +44,7 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
         return scene, []
     notes, stages = [f"computed by {scene.engine.title}"], []
     for k, stage in enumerate(scene.stages):
-        found = {}
+        defaults = {}
         if (
             program.thermostat
             and stage.has_thermostat
@@ -53,10 +53,10 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
         ):
             why = f"because {program.name} has no velocity_rescaling"
             notes.append(f"stages.{k}: thermostat {program.thermostat}, {why}")
-            found["thermostat"] = program.thermostat
+            defaults["thermostat"] = program.thermostat
         if stage.ensemble == "npt" and stage.barostat is None:
-            found["barostat"] = program.barostat
-        stages.append(stage.model_copy(update=found))
+            defaults["barostat"] = program.barostat
+        stages.append(stage.model_copy(update=defaults))
     changed: dict[str, Any] = {"stages": tuple(stages)}
     if scene.run.remove_momentum_interval_ps is None:
         changed["run"] = scene.run.model_copy(update={"remove_momentum_interval_ps": False})
@@ -78,15 +78,15 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
     """A scene of molecules with all defaults except `with_momentum_removal` and
     `with_precision`."""
     scene, faults = _with_electrostatics(scene, composition)
-    numbers, more = _cutoff_and_switch(scene.forces, composition)
-    faults += more
-    found, of_method = (
-        Settings({}, faults),
-        getattr(electrostatics_module(scene.forces), "settings", None),
-    )
+    numbers, cutoff_errors = _cutoff_and_switch(scene.forces, composition)
+    faults += cutoff_errors
+    settings = Settings({}, faults)
+    of_method = getattr(electrostatics_module(scene.forces), "settings", None)
     if not faults and of_method is not None:
-        found = of_method(scene.forces, composition, numbers["cutoff_A"], scene.engine.is_external)
-        faults = found.errors
+        settings = of_method(
+            scene.forces, composition, numbers["cutoff_A"], scene.engine.is_external
+        )
+        faults = settings.errors
     if not faults and scene.forces.dispersion != "cutoff":
         from rigidmd.forces.ewald import dispersion  # for these scenes only
 
@@ -106,7 +106,7 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
                 update={"barostat": None, "barostat_interval_ps": None}
             )
     tables = {
-        "forces": scene.forces.model_copy(update=numbers | found.numbers),
+        "forces": scene.forces.model_copy(update=numbers | settings.numbers),
         "output": output,
         "stages": tuple(stages),
         # the folder of a run has a copy of the file under another name, which must not rename the
@@ -126,7 +126,7 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
     if scene.start.temperature_K is None and not reads_velocities:
         temperature = scene.first_moving.temperatures[0] if scene.first_moving else 0.0
         tables["start"] = scene.start.model_copy(update={"temperature_K": temperature})
-    return SceneWithDefaults(scene.model_copy(update=tables), faults, found.grid)
+    return SceneWithDefaults(scene.model_copy(update=tables), faults, settings.grid)
 
 
 def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> MolecularScene:
@@ -134,10 +134,8 @@ def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> 
     components."""
     if scene.run.remove_momentum_interval_ps is not None:
         return scene
-    conserved = (
-        ELECTROSTATICS[scene.forces.electrostatics].conserves_momentum
-        and scene.forces.dispersion != "pme"
-    )
+    electrostatics = ELECTROSTATICS[scene.forces.electrostatics or "none"]
+    conserved = electrostatics.conserves_momentum and scene.forces.dispersion != "pme"
     removed = not conserved and keeps_momentum.any()
     run = {"remove_momentum_interval_ps": REMOVE_MOMENTUM_INTERVAL if removed else False}
     return scene.model_copy(update={"run": scene.run.model_copy(update=run)})
@@ -210,8 +208,8 @@ def _cutoff_and_switch(
 ) -> tuple[dict[str, Any], list[str]]:
     """Cutoff and start of a switch as keys of [forces], and error messages."""
     space = composition.space
-    given = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
-    cutoff, start, faults = given or inf, forces.switch_start_A, []
+    cutoff_A = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
+    cutoff, start, faults = cutoff_A or inf, forces.switch_start_A, []
     half = min(space.edges) / 2
     least = "the smallest of a_x, b_y, c_z" if isinstance(space, Triclinic) else "the shortest edge"
     limit = f"half {least} of the box, {half:.3f} Å"
@@ -242,7 +240,7 @@ def _cutoff_and_switch(
         start = next(
             (default_switch_start(name, cutoff) for name in schemes if "switch" in name), None
         )
-    return {"cutoff_A": given, "switch_start_A": start}, faults
+    return {"cutoff_A": cutoff_A, "switch_start_A": start}, faults
 
 
 def body_with_defaults(scene: BodyScene, rotates: bool, radius: float) -> BodyScene:

@@ -21,7 +21,7 @@ from rigidmd.errors import SceneError
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.potentials.coulomb import ReactionField
-from rigidmd.io.formats.cells import right_angled
+from rigidmd.formats.cells import right_angled
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.scene import BodyScene, MolecularScene
@@ -83,19 +83,19 @@ def _describe_body(system: BodySystem) -> str:
         pose = system.pose(0.0, system.state)
         angles = " ".join(f"{x:.6g}" for x in np.degrees(to_euler_angles(pose.rotation)))
         spin = float(np.linalg.norm(pose.angular_velocity_body))
-        period = (
-            f": period {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps"
-            if spin
-            else ""
-        )
+        if spin:
+            period = (
+                f": period {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps"
+            )
+        else:
+            period = ""
         lines.append(
             f"  starts at phi theta psi = {angles} degrees, rotating at {spin:.6g} rad/s{period}"
         )
-    body = (
-        system.engine().model_for(system.method)
-        if isinstance(system.method, Scheme)
-        else system.body
-    )
+    if isinstance(system.method, Scheme):
+        body = system.engine().model_for(system.method)
+    else:
+        body = system.body
     parts = [words for part in body if part and not (words := _words(part)).startswith("no ")]
     lines.append(f"\ncompiled in: {', '.join(parts)}")
     lines += [f"  {name.replace('_', ' ')}: {_words(term)}" for name, term in system.terms.items()]
@@ -116,11 +116,10 @@ def _describe_molecules(system: System) -> str:
     lines = [f"{scene.name}: {len(system.model.species)} molecules, {system.site_count} sites"]
     for k, m in enumerate(system.species):
         count = int((system.model.species == k).sum())
-        freely = (
-            "frozen"
-            if system.model.inverse_mass[k] == 0
-            else f"{m.degrees_of_freedom} degrees of freedom each"
-        )
+        if system.model.inverse_mass[k] == 0:
+            freely = "frozen"
+        else:
+            freely = f"{m.degrees_of_freedom} degrees of freedom each"
         lines.append(f"  {count} {m.name}: {m.description}, {freely}")
     charges = np.array([m.charge for m in system.species])[system.model.species]
     if abs(charges.sum()) > 1e-9 * np.abs(charges).sum():
@@ -133,11 +132,10 @@ def _describe_molecules(system: System) -> str:
     if system.space.volume < inf:
         cell = cell_of(system.space)
         edges = " x ".join(f"{edge:.4f}" for edge in np.linalg.norm(cell, axis=1))
-        angles = (
-            ""
-            if right_angled(cell)
-            else f", angles {', '.join(f'{x:.4g}' for x in edges_and_angles(cell)[3:])}°"
-        )
+        if right_angled(cell):
+            angles = ""
+        else:
+            angles = f", angles {', '.join(f'{x:.4g}' for x in edges_and_angles(cell)[3:])}°"
         box = f"box: {edges} Å{angles}, {system.density:.4f} g/cm³"
     lines += [f"  {box}", *(f"  {note}" for note in system.notes), "\ncompiled in:"]
     fields = scene.fields.entries
@@ -161,14 +159,15 @@ def _describe_molecules(system: System) -> str:
         lines += [f"  {what}: {kind.replace('_', ' ')}" for kind in kinds if kind]
     if any(stage.ensemble == "nph" for stage in scene.stages):
         lines.append("  barostat: piston, in the nph stages only")
-    kept = [axis for axis, keeps in zip("xyz", system.model.keeps_momentum, strict=True) if keeps]
+    conserved = [
+        axis for axis, keeps in zip("xyz", system.model.keeps_momentum, strict=True) if keeps
+    ]
     if (interval := system.removes_momentum_every) is not None:
-        part = "" if len(kept) == 3 else f" along {' and '.join(kept)}"
+        part = "" if len(conserved) == 3 else f" along {' and '.join(conserved)}"
         lines.append(f"  total momentum: removed{part} every {interval:g} ps")
-    if (system.external or system.user_terms) and len(kept) < 3:
-        lines.append(
-            f"  total momentum: conserved {'along ' + ' and '.join(kept) if kept else 'nowhere'}"
-        )
+    if (system.external or system.user_terms) and len(conserved) < 3:
+        where = f"along {' and '.join(conserved)}" if conserved else "nowhere"
+        lines.append(f"  total momentum: conserved {where}")
     lines += ["left out:", *(f"  {reason}" for reason in system.left_out), "\nstages:"]
     for k, stage in enumerate(scene.stages):
         steps, sampled = describe_stage(stage)
@@ -186,7 +185,7 @@ def _describe_molecules(system: System) -> str:
     return "\n".join(lines)
 
 
-def _words(part: NamedTuple) -> str:
+def _words(part: object) -> str:
     """The name of a class as words: "split rotor"."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()
 

@@ -20,8 +20,8 @@ from rigidmd.assemble.assignment import (
 )
 from rigidmd.assemble.atom_kinds import kinds_of, labels_of
 from rigidmd.assemble.bonded_atoms import bonded_atoms
-from rigidmd.io.formats.atoms import Atoms
-from rigidmd.io.formats.cells import make_whole
+from rigidmd.formats.atoms import Atoms
+from rigidmd.formats.cells import make_whole
 from rigidmd.scene.models import Molecule
 
 #: Up to this multiple of the tolerance the best order of atoms is searched, for messages on
@@ -77,8 +77,8 @@ def match(
         names = ", ".join(name or "(no name)" for name in unknown[:5]) + (
             ", ..." if len(unknown) > 5 else ""
         )
-        wanted = ", ".join(f"{molecule.name} ({_composition(molecule)})" for molecule in species)
-        return [f"has atoms named {names}, which are in no molecule of the scene: {wanted}"]
+        expected = ", ".join(f"{molecule.name} ({_composition(molecule)})" for molecule in species)
+        return [f"has atoms named {names}, which are in no molecule of the scene: {expected}"]
     return by_bonds
 
 
@@ -105,9 +105,8 @@ class _Candidate(NamedTuple):
 
     species: int
     order: list[int]  # atoms of the group, in the order of the sites with mass
-    classes: list[
-        np.ndarray
-    ]  # (s,) atoms of one class may be exchanged: by names, then by elements
+    #: (s,) atoms of one class may be exchanged: by names, then by elements
+    classes: list[np.ndarray]
     nameless: bool
 
 
@@ -157,7 +156,7 @@ class _Matcher:
             key = (residue[1] if residue else "", names, tuple(kinds[i] for i in run))
             alike.setdefault(key, []).append(number)
         fit = TemplateFit(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros(n), np.zeros(n))
-        found = MatchedMolecules(np.full(n, -1), [np.zeros(0, int)] * n, fit, Counter(), notes=[])
+        matched = MatchedMolecules(np.full(n, -1), [np.zeros(0, int)] * n, fit, Counter(), notes=[])
         faults: dict[int, str] = {}
         notes: Counter[str] = Counter()
         for (residue, names, run_kinds), members in alike.items():
@@ -165,10 +164,10 @@ class _Matcher:
             if isinstance(groups, str):
                 faults |= dict.fromkeys(members, groups)
                 continue
-            faults |= self._choose(groups, members, found, notes, len(faults))
+            faults |= self._choose(groups, members, matched, notes, len(faults))
             if any(group.candidate.nameless for group in groups) and not faults:
                 listed = ", ".join(name or "(no name)" for name in names)
-                by_shape = self._species[found.species[members[0]]].name
+                by_shape = self._species[matched.species[members[0]]].name
                 notes[
                     f"the names of atoms {listed} are not elements: assigned to {by_shape} by shape"
                 ] += 1
@@ -181,13 +180,15 @@ class _Matcher:
             return [
                 f"{self._described(m, runs[m], how)} {fault}" for m, fault in sorted(faults.items())
             ]
-        others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
-        found.massless.update(atoms.names[i] for i in others)
-        found.notes.extend(
+        others = np.delete(
+            np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *matched.atoms])
+        )
+        matched.massless.update(atoms.names[i] for i in others)
+        matched.notes.extend(
             note.replace(COUNT, f"{count} molecule{'s' * (count > 1)}")
             for note, count in notes.items()
         )
-        return found
+        return matched
 
     def _described(self, number: int, run: list[int], how: str) -> str:
         listed = ", ".join(str(i + 1) for i in run[:MOST_LISTED]) + (
@@ -208,10 +209,10 @@ class _Matcher:
         eligible = named or list(range(len(self._species)))
         candidates = [c for k in eligible if (c := _candidate(names, kinds, self._species[k], k))]
         if not candidates:
-            wanted = " or ".join(
+            expected = " or ".join(
                 f"{self._species[k].name} ({_composition(self._species[k])})" for k in eligible
             )
-            return f"has atoms {_formula(kind.rstrip('?') for kind in kinds)}, expected {wanted}"
+            return f"has atoms {_formula(kind.rstrip('?') for kind in kinds)}, expected {expected}"
         return [self._assigned(c, runs[:, c.order]) for c in candidates]
 
     def _assigned(self, candidate: _Candidate, order: np.ndarray) -> _Group:
@@ -240,16 +241,15 @@ class _Matcher:
         self,
         groups: list[_Group],
         members: list[int],
-        found: MatchedMolecules,
+        matched: MatchedMolecules,
         notes: Counter[str],
         known: int,
     ) -> dict[int, str]:
         """Write the species of molecules `members`, of which `groups` are the possible ones, into
-        `found`. Returns error messages by molecule; `known` is the number of those found before."""
+        `matched`. Returns error messages by molecule; `known` is the number of earlier ones."""
         faults = {}
-        rms = np.array(
-            [np.where(g.fits, g.assigned.fit.rms, np.inf) for g in groups]
-        )  # (groups, m)
+        # (groups, m)
+        rms = np.array([np.where(g.fits, g.assigned.fit.rms, np.inf) for g in groups])
         chosen, fitting = rms.argmin(axis=0), np.asarray(np.isfinite(rms))
         clear = np.where(np.eye(len(groups), dtype=bool)[chosen].T, np.inf, rms).min(axis=0)
         least = rms.min(axis=0) + EQUAL_OF_RADIUS * max(g.limit for g in groups) / self._tolerance
@@ -264,8 +264,8 @@ class _Matcher:
                 faults[m] = self._misfit(groups, row, search=known + len(faults) < MOST_SEARCHED)
             else:
                 group = groups[chosen[row]]
-                found.species[m], found.atoms[m] = group.candidate.species, group.order[row]
-                for array, values in zip(found.fit, group.assigned.fit, strict=True):
+                matched.species[m], matched.atoms[m] = group.candidate.species, group.order[row]
+                for array, values in zip(matched.fit, group.assigned.fit, strict=True):
                     array[m] = values[row]
         if not faults:
             for k, group in enumerate(groups):
@@ -313,11 +313,8 @@ class _Matcher:
         if not count:
             return
         orders = self._orders_of(group.candidate.species, group.candidate.classes[-1])
-        others = [
-            other
-            for other, fits in zip(names, np.isfinite(rms[:, rows]).any(axis=1), strict=True)
-            if fits
-        ]
+        fits_one = np.isfinite(rms[:, rows]).any(axis=1)
+        others = [names[k] for k in np.flatnonzero(fits_one)]
         if len(others) > 1:
             best = " and not ".join([name, *(other for other in others if other != name)])
             notes[f"{COUNT} taken for {best}, which fits less well"] += count
@@ -369,7 +366,7 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
     name follows from the geometry."""
     sites = massive_sites(molecule)
     labels = labels_of(molecule)
-    wanted = [(molecule.site_names[s], labels[s]) for s in sites]
+    template = [(molecule.site_names[s], labels[s]) for s in sites]
     if names == molecule.site_names and all(
         kinds[s] == labels[s] or kinds[s].endswith("?") for s in sites
     ):
@@ -392,16 +389,16 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
         alike = np.zeros(len(sites), int)
         return _Candidate(k, indices, [alike, alike], nameless=True)
     present = [(names[i], kinds[i]) for i in indices]
-    if Counter(kind for _, kind in present) != Counter(label for _, label in wanted):
+    if Counter(kind for _, kind in present) != Counter(label for _, label in template):
         return None
-    count, count_wanted = Counter(present), Counter(wanted)
+    count, count_wanted = Counter(present), Counter(template)
     shared = {atom for atom in count if count[atom] == count_wanted[atom]}
     group, group_wanted = (
-        [key if key in shared else key[1] for key in keys] for keys in (present, wanted)
+        [key if key in shared else key[1] for key in keys] for keys in (present, template)
     )
     queues: dict[Any, deque[int]] = {key: deque() for key in group_wanted}
     for index, key in zip(indices, group, strict=True):
         queues[key].append(index)
     order = [queues[key].popleft() for key in group_wanted]
-    classes = [numbered(group_wanted), numbered(label for _, label in wanted)]
+    classes = [numbered(group_wanted), numbered(label for _, label in template)]
     return _Candidate(k, order, classes, nameless=False)

@@ -110,13 +110,13 @@ def bytes_of(system: System) -> int:
 
 def array_bytes(value: tuple) -> int:
     """Bytes of all arrays in nested tuples. Memory that several arrays use counts once."""
-    found, rest = {}, [value]
-    while rest:
-        part = rest.pop()
+    sizes, pending = {}, [value]
+    while pending:
+        part = pending.pop()
         if isinstance(part, tuple):
-            rest += part
+            pending += part
         elif isinstance(part, np.ndarray):
             while isinstance(part.base, np.ndarray):  # the array whose memory it uses
                 part = part.base
-            found[id(part)] = part.nbytes
-    return sum(found.values())
+            sizes[id(part)] = part.nbytes
+    return sum(sizes.values())

@@ -85,8 +85,8 @@ def scene_errors(
     values = {"density": (scene.box.density_g_cm3 or density, key)}
     heaviest = max(m.masses.max() for m in species)
     limits = {name: limit for name, limit in REFUSED.items() if heaviest <= limit.heaviest_site}
-    found = (limit.outside(*values[name]) for name, limit in limits.items())
-    faults = [*filter(None, found)]
+    refusals = (limit.outside(*values[name]) for name, limit in limits.items())
+    faults = [*filter(None, refusals)]
     contact = shortest_contact(species)
     cutoff = scene.forces.cutoff_A
     if (
@@ -145,17 +145,17 @@ def scene_warnings(scene: MolecularScene, species: list[Molecule]) -> list[str]:
 def _implausible(values: Iterable[tuple[str, float, str]]) -> list[str]:
     """Sentences on values outside the limits of `PLAUSIBLE`: quantity, value and where it
     stands."""
-    found = (PLAUSIBLE[name].outside(value, where) for name, value, where in values)
-    return [*dict.fromkeys(filter(None, found))]
+    descriptions = (PLAUSIBLE[name].outside(value, where) for name, value, where in values)
+    return [*dict.fromkeys(filter(None, descriptions))]
 
 
 def _scene_values(scene: MolecularScene) -> Iterator[tuple[str, float, str]]:
     """Quantity, value and key of numbers of a scene that do not depend on its molecules."""
     for k, stage in enumerate(scene.stages):
-        given = (
+        pressures = (
             [x for ends in stage.pressures for x in ends] if stage.pressure_bar is not None else []
         )
-        largest = max(given, key=abs, default=0.0)
+        largest = max(pressures, key=abs, default=0.0)
         if abs(abs(largest) - ATMOSPHERE_PA) >= TO_ATMOSPHERE * ATMOSPHERE_PA:
             yield "pressure_bar", largest, f"stages.{k}.pressure_bar"
     for angle in scene.box.angles_deg or ():
@@ -196,18 +196,17 @@ def _mass_warnings(m: Molecule) -> list[str]:
     """Warnings of masses that differ from the masses of the elements."""
     from ase.data import atomic_masses, atomic_numbers  # not needed for shipped models
 
-    found = {}
+    messages = {}
     for name, element, mass in zip(m.site_names, m.elements, m.masses.tolist(), strict=True):
-        usual = (
-            float(atomic_masses[atomic_numbers[element]])
-            if atomic_numbers.get(element, 0) > 0
-            else 0.0
-        )
+        if atomic_numbers.get(element, 0) > 0:
+            usual = float(atomic_masses[atomic_numbers[element]])
+        else:
+            usual = 0.0
         if mass > 0 and usual and not LIGHTEST * usual <= mass <= HEAVIEST * usual + HYDROGENS:
-            found[element] = (
+            messages[element] = (
                 f"{m.name}: mass_u of {name} is {mass:g} u, and {element} has {usual:.4g} u"
             )
-    return list(found.values())
+    return list(messages.values())
 
 
 def gravity_warnings(key: str, acceleration: tuple[float, float, float]) -> list[str]:
@@ -221,11 +220,10 @@ def gravity_warnings(key: str, acceleration: tuple[float, float, float]) -> list
 
 def body_warnings(scene: BodyScene) -> list[str]:
     """Warnings of numbers of a single body that are probably in another unit."""
-    warnings = (
-        []
-        if scene.gravity is None
-        else gravity_warnings("gravity.acceleration_m_s2", scene.gravity.acceleration_m_s2)
-    )
+    if scene.gravity is None:
+        warnings = []
+    else:
+        warnings = gravity_warnings("gravity.acceleration_m_s2", scene.gravity.acceleration_m_s2)
     for key in ("euler_angles_deg", "yaw_pitch_roll_deg"):
         angles: Any = getattr(scene.start, key)
         if angles is not None and any(map(in_radians, angles)) and max(map(abs, angles)) <= 2 * pi:

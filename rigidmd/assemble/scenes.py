@@ -15,9 +15,9 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.core.toml import plain_values
 from rigidmd.errors import RigidMDWarning, SceneError
-from rigidmd.io.formats import STRUCTURE
-from rigidmd.io.formats.cells import cell_error
-from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, atoms_of_system
+from rigidmd.formats import STRUCTURE
+from rigidmd.formats.cells import cell_error
+from rigidmd.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, atoms_of_system
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.base import AnyScene, with_absolute_paths
 from rigidmd.scene.molecules import Settings
@@ -34,8 +34,15 @@ SHAPES = {"FixLinearTriatomic", "FixInternals"}
 
 def resolve(scene: AnyScene) -> AnyScene:
     """The same scene with all defaults, which runs to the same bits. The integrator "auto" stays
-    until a run has chosen one. Raises SceneError, and for molecules StructureError and
-    MoleculeError."""
+    until a run has chosen one.
+
+    Raises
+    ------
+    SceneError
+        If the scene has errors.
+    StructureError, MoleculeError
+        For molecules, if a file of a structure or of a model has errors.
+    """
     return build_body(scene).scene if isinstance(scene, BodyScene) else build(scene).scene
 
 
@@ -57,18 +64,28 @@ def scene_from_atoms(
     TIP4P, need not be among the atoms. The scene contains the atoms; a run in a folder writes them
     there.
 
-    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a
-        scene file
-    settings : the other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}],
-        seed=3. start={"temperature_K": 300} draws momenta instead of using the atoms' momenta.
-        Default of stages: 1 ps of nve, or a minimisation if neither atoms nor settings give momenta
+    Atoms that do not match the models are found when the system is built.
 
-    Raises SceneError. Atoms that do not match the models are found when the system is built.
+    Parameters
+    ----------
+    models
+        Names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene
+        file
+    settings
+        The other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}], seed=3.
+        start={"temperature_K": 300} draws momenta instead of using the atoms' momenta. Default of
+        stages: 1 ps of nve, or a minimisation if neither atoms nor settings give momenta
+
+    Raises
+    ------
+    SceneError
     """
     if faults := atoms_errors(atoms):
         raise SceneError(SOURCE, faults)
     data = with_absolute_paths(settings)
-    filled = {key: data.setdefault(key, {}) for key in ("structure", "start", "box")}
+    filled: dict[str, dict[str, Any]] = {
+        key: data.setdefault(key, {}) for key in ("structure", "start", "box")
+    }
     faults = ["molecules is given by the atoms and models"] if "molecules" in data else []
     for key, table in filled.items():
         if not isinstance(table, Mapping):
@@ -77,12 +94,12 @@ def scene_from_atoms(
                 f"{key} is a {kind}, must be a dictionary like the table [{key}] of a scene file"
             )
     structure, start, box = filled.values()
-    given = [
+    taken = [
         key
         for key in ("file", "frame", "topology")
         if isinstance(structure, Mapping) and key in structure
     ]
-    if faults := faults + [f"structure.{key} is given by the atoms" for key in given]:
+    if faults := faults + [f"structure.{key} is given by the atoms" for key in taken]:
         raise SceneError(SOURCE, faults)
     draws = start.get("temperature_K") is not None
     structure["file"] = STRUCTURE
@@ -116,8 +133,8 @@ def atoms_errors(atoms: Any) -> list[str]:
     import ase
 
     if not isinstance(atoms, ase.Atoms):
-        more = "; ase.io.read returns a list of them for ':'" if isinstance(atoms, list) else ""
-        return [f"are of the type {type(atoms).__name__}, must be one ase.Atoms{more}"]
+        hint = "; ase.io.read returns a list of them for ':'" if isinstance(atoms, list) else ""
+        return [f"are of the type {type(atoms).__name__}, must be one ase.Atoms{hint}"]
     if len(atoms) == 0:
         return ["there are no atoms"]
     values = [("position", atoms.positions)]
@@ -133,11 +150,10 @@ def atoms_errors(atoms: Any) -> list[str]:
         faults.append(f"they are periodic along {axes} only: {advice}")
     elif atoms.pbc.all():
         cell = atoms.cell.array
-        why = (
-            cell_error(cell)
-            if np.isfinite(cell).all()
-            else "it has an edge that is not a finite number"
-        )
+        if np.isfinite(cell).all():
+            why = cell_error(cell)
+        else:
+            why = "it has an edge that is not a finite number"
         if why:
             faults.append(
                 f"they are periodic, but their cell is invalid: {why}. Set atoms.cell, or atoms.pbc"
@@ -182,7 +198,7 @@ def models_with_absolute_paths(
 ) -> list[dict[str, Any]]:
     """Tables [[molecules]] of models, with absolute paths, so that they do not depend on the
     working directory."""
-    found = []
+    entries = []
     models = plain_values(models)
     for entry in models if isinstance(models, list) else [models]:
         if isinstance(entry, dict):
@@ -191,9 +207,9 @@ def models_with_absolute_paths(
                 for key in SPECIES_FILES
                 if isinstance(entry.get(key), str)
             }
-            found.append(entry | paths)
+            entries.append(entry | paths)
         elif isinstance(entry, str) and entry.endswith(".toml"):
-            found.append({"file": os.path.abspath(entry)})
+            entries.append({"file": os.path.abspath(entry)})
         else:
-            found.append({"model": entry})
-    return found
+            entries.append({"model": entry})
+    return entries

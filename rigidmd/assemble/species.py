@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidmd.errors import InputError, MoleculeError, SceneError, StructureError
 from rigidmd.forces.parts import select_by_number
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms
+from rigidmd.formats.atoms import HEAVY_HYDROGEN, Atoms
 from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import (
@@ -34,27 +34,27 @@ MOST_LISTED = 8  # entries of parameters in a message
 
 def species_of(scene: MolecularScene) -> list[Molecule]:
     """The species of a scene, in its order. Raises SceneError with all errors."""
-    found, faults = [], []
+    species, faults = [], []
     for k, entry in enumerate(scene.molecules):
         try:
-            found.append(_one_species(scene, entry))
+            species.append(_one_species(scene, entry))
         except InputError as error:
             faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.errors]
-    names = [m.name for m in found]
+    names = [m.name for m in species]
     twice = sorted({name for name in names if names.count(name) > 1})
     faults += [
         f"molecules: {name} appears twice; give these species different names" for name in twice
     ]
     if faults:
         raise SceneError(scene.source, faults)
-    return found
+    return species
 
 
 def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
     if entry.model is not None:
-        found = load_model(entry.model)
+        kind = load_model(entry.model)
     elif entry.file is not None and entry.file.endswith(".toml"):
-        found = read_molecule(scene.path(entry.file))
+        kind = read_molecule(scene.path(entry.file))
     else:
         table = (
             () if entry.parameters is None else read_parameters(scene.path(entry.parameters)).sites
@@ -64,14 +64,14 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
         else:
             where = "sites or of parameters" if entry.parameters is not None else "sites"
             sites = sites_of_geometry(scene.path(entry.file), entry.sites or (), table, where)
-        found = molecule(entry.label, sites)
+        kind = molecule(entry.label, sites)
     if entry.masses_u is not None:
-        found = with_masses(found, entry.masses_u)
+        kind = with_masses(kind, entry.masses_u)
     changed = {
-        "name": entry.name or found.name,
-        "residue_names": entry.residue_names or found.residue_names,
+        "name": entry.name or kind.name,
+        "residue_names": entry.residue_names or kind.residue_names,
     }
-    return replace(found, **changed)
+    return replace(kind, **changed)
 
 
 def sites_of_geometry(
@@ -189,18 +189,17 @@ def model_from_geometry(
         )
     except ValidationError as error:
         raise MoleculeError(str(geometry), validation_messages(error, MoleculeFile)) from None
-    found = molecule_of(file)
+    model = molecule_of(file)
     notes += _one_molecule(geometry, atoms, elements)
-    whole = round(found.charge)
-    off = abs(found.charge - whole)
+    nearest = round(model.charge)
+    off = abs(model.charge - nearest)
     if off > EXACTLY:
-        nearly = (
-            f"nearly but not exactly {f'{whole:+d}' if whole else 0}"
-            if off < NEARLY
-            else "not a whole number"
-        )
-        notes.append(f"the charges sum to {found.charge:+.6g} e, {nearly}")
-    return file, found, notes
+        if off < NEARLY:
+            nearly = f"nearly but not exactly {f'{nearest:+d}' if nearest else 0}"
+        else:
+            nearly = "not a whole number"
+        notes.append(f"the charges sum to {model.charge:+.6g} e, {nearly}")
+    return file, model, notes
 
 
 def _numbered(sites: tuple[Site, ...]) -> tuple[Site, ...]:
@@ -260,6 +259,7 @@ def _parts(symbols: list[str], position: np.ndarray, cell: np.ndarray | None) ->
     from scipy.sparse.csgraph import connected_components
 
     atoms = AseAtoms(symbols, position, cell=cell, pbc=cell is not None)
-    first, second = neighbor_list("ij", atoms, natural_cutoffs(atoms, SLACK))
+    bonding_distances = [SLACK * distance for distance in natural_cutoffs(atoms)]
+    first, second = neighbor_list("ij", atoms, bonding_distances)
     links = coo_array((np.ones(len(first)), (first, second)), shape=(len(symbols), len(symbols)))
     return connected_components(links)[1]

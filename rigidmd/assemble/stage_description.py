@@ -23,10 +23,8 @@ def describe_stage(stage: Stage) -> list[str]:
     """Two lines: steps, thermostat and barostat; sampled distribution and conserved quantities. For
     a minimisation: the minimised quantity; the limits of convergence."""
     if stage.is_minimisation:
-        what, limits = (
-            "the potential energy",
-            [f"forces of {stage.force_limit_kJ_mol_A:g} kJ/(mol Å)"],
-        )
+        what = "the potential energy"
+        limits = [f"forces of {stage.force_limit_kJ_mol_A:g} kJ/(mol Å)"]
         limits.append(f"torques of {stage.torque_limit_kJ_mol:g} kJ/mol")
         if stage.changes_box:
             what = (
@@ -58,10 +56,8 @@ def describe_stage(stage: Stage) -> list[str]:
         choice = f"integrator and step chosen at its start for an error of {error}"
         text = f"{stage.label}: {stage.duration_ps:g} ps, {choice}"
     if stage.has_thermostat:
-        kind, described = (
-            stage.thermostat_kind,
-            THERMOSTATS[stage.thermostat_kind].description(stage.thermostat_values),
-        )
+        kind = stage.thermostat_kind
+        described = THERMOSTATS[stage.thermostat_kind].description(stage.thermostat_values)
         text += f", {_ramp(stage.temperatures)} K by {kind.replace('_', ' ')}, {described}"
     if stage.has_barostat:
         text += f", {_barostat(stage)}"

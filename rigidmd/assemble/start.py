@@ -16,8 +16,8 @@ from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.fields.walls import range_of_centres
 from rigidmd.forces.parts import gather_per_molecule
-from rigidmd.io.formats import format_of
-from rigidmd.io.formats.cells import cell_error, pairs_within
+from rigidmd.formats import format_of
+from rigidmd.formats.cells import cell_error, pairs_within
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import AXES
@@ -29,20 +29,20 @@ from rigidmd.units import GRAM_PER_CM3
 def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Configuration:
     """Positions and orientations from the structure file, or on a lattice, with the vacuum of the
     scene. Raises SceneError, StructureError."""
-    found = _without_vacuum(scene, species)
-    if (length := scene.box.vacuum_A) is None or found.cell is None:
-        return found
-    if not np.array_equal(found.basis, SAME_BASIS):
+    configuration = _without_vacuum(scene, species)
+    if (length := scene.box.vacuum_A) is None or configuration.cell is None:
+        return configuration
+    if not np.array_equal(configuration.basis, SAME_BASIS):
         raise SceneError(
             scene.source,
             ["box.vacuum_A: the cell has a large tilt; give an equivalent cell without"],
         )
-    k, cell = "xyz".index(scene.box.vacuum_axis), found.cell.copy()
+    k, cell = "xyz".index(scene.box.vacuum_axis), configuration.cell.copy()
     added = length / np.linalg.norm(cell[k]) * cell[k]
-    images = np.floor(found.position @ np.linalg.inv(cell)[:, k])
-    position = found.position - images[:, None] * cell[k] + 0.5 * added
+    images = np.floor(configuration.position @ np.linalg.inv(cell)[:, k])
+    position = configuration.position - images[:, None] * cell[k] + 0.5 * added
     cell[k] += added
-    return found._replace(position=position, cell=cell)
+    return configuration._replace(position=position, cell=cell)
 
 
 def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configuration:
@@ -56,7 +56,7 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
         start, content = scene.structure, scene.embedded_files.get("structure.file")
         path = scene.path(start.file) if content is None else Path(start.file)
         try:
-            found = read_structure(
+            configuration = read_structure(
                 path,
                 species,
                 cell,
@@ -70,28 +70,26 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
             )
         except StructureError as error:
             raise StructureError(scene.structure_source, error.errors) from None
-        faults, present = [], np.bincount(found.species, minlength=len(species))
-        for k, (entry, there) in enumerate(zip(scene.molecules, present, strict=True)):
-            if entry.count is not None and entry.count != there:
+        faults, present = [], np.bincount(configuration.species, minlength=len(species))
+        for k, (entry, present_count) in enumerate(zip(scene.molecules, present, strict=True)):
+            if entry.count is not None and entry.count != present_count:
                 faults.append(
-                    f"has {there} molecules of {species[k].name}, molecules.{k}.count is"
+                    f"has {present_count} molecules of {species[k].name}, molecules.{k}.count is"
                     f" {entry.count}"
                 )
-        if scene.structure.velocities and found.velocity is None:
-            why = "".join(f"; {note}" for note in found.notes if "velocit" in note)
+        if scene.structure.velocities and configuration.velocity is None:
+            why = "".join(f"; {note}" for note in configuration.notes if "velocit" in note)
             faults.append(
                 f"has no velocities of all atoms{why}. Leave out structure.velocities = true"
             )
         if faults:
             raise StructureError(scene.structure_source, faults)
-        return found
-    n, sites = (
-        sum(counts),
-        sum(count * len(m.masses) for count, m in zip(counts, species, strict=True)),
-    )
+        return configuration
+    n = sum(counts)
+    sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
     check_memory_of_molecules(scene.source, n, sites)
     cell, rng = not_none(cell), np.random.default_rng([scene.seed, LATTICE])
-    found = Configuration(
+    configuration = Configuration(
         species=np.repeat(np.arange(len(species)), counts),
         position=_start_lattice(scene, species, n, np.diag(cell), rng),
         rotation=random_rotations(rng, n),
@@ -99,7 +97,7 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
         angular_momentum_body=None,
         cell=cell if scene.box.periodic else None,
     )
-    return with_reduced_cell(found, "its", may_rotate=False)
+    return with_reduced_cell(configuration, "its", may_rotate=False)
 
 
 def output_errors(system: System) -> list[str]:
@@ -126,11 +124,11 @@ def residue_numbers(configuration: Configuration) -> np.ndarray:
     """Residue numbers (n,) of the file, else 1, 2, ... within each species."""
     if configuration.number is not None:
         return configuration.number
-    found = np.zeros(len(configuration.species), np.int32)
+    numbers = np.zeros(len(configuration.species), np.int32)
     for k in np.unique(configuration.species):
         members = configuration.species == k
-        found[members] = np.arange(1, members.sum() + 1)
-    return found
+        numbers[members] = np.arange(1, members.sum() + 1)
+    return numbers
 
 
 def set_momenta(
@@ -222,9 +220,9 @@ def overlaps(system: System) -> list[str]:
     inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
     cores = [np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species]
     widest = max((sigma.max() for sigma in cores), default=0.0)
-    wanted = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
+    ranges = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
     sigma, faults = gather_per_molecule(cores, system.model.species), []
-    for i, j, distance in close_pairs(system, system.state, *wanted):
+    for i, j, distance in close_pairs(system, system.state, *ranges):
         if distance <= max(
             inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if sigma[i] > 0 and sigma[j] > 0 else 0.0
         ):
@@ -249,11 +247,9 @@ def close_pairs(
     Å. `wanted` are radii, and functions for the indices of the sites of a molecule to which they
     apply."""
     cell = state.cell if state.volume < inf else None
-    position, owner, free = (
-        system.site_positions(state),
-        system.sites.molecule,
-        mobile(system.model),
-    )
+    position = system.site_positions(state)
+    owner = system.sites.molecule
+    free = mobile(system.model)
     near: dict[tuple[int, int], float] = {}
     for radius, sites_of in wanted:
         chosen = system.of_sites(
@@ -261,9 +257,12 @@ def close_pairs(
         ).nonzero()[0]
         i, j, step = pairs_within(position[chosen], cell, radius)
         i, j, distance = chosen[i], chosen[j], np.linalg.norm(step, axis=1)
-        kept = (owner[i] != owner[j]) & (free[owner[i]] | free[owner[j]])
+        is_allowed = (owner[i] != owner[j]) & (free[owner[i]] | free[owner[j]])
         for *pair, length in zip(
-            i[kept].tolist(), j[kept].tolist(), distance[kept].tolist(), strict=True
+            i[is_allowed].tolist(),
+            j[is_allowed].tolist(),
+            distance[is_allowed].tolist(),
+            strict=True,
         ):
             near[min(pair), max(pair)] = min(length, near.get((min(pair), max(pair)), inf))
     return [(*pair, near[pair]) for pair in sorted(near)]

@@ -16,9 +16,9 @@ from rigidmd.core.state import edges_and_angles
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
-from rigidmd.io.formats import has_types
-from rigidmd.io.formats.atoms import SAME_MASS, Atoms
-from rigidmd.io.formats.cells import (
+from rigidmd.formats import has_types
+from rigidmd.formats.atoms import SAME_MASS, Atoms
+from rigidmd.formats.cells import (
     basis_of,
     cell_error,
     describe_basis,
@@ -87,28 +87,36 @@ def read_structure(
             raise StructureError(
                 str(path), [f"holds one state with its names: leave out {' and '.join(needless)}"]
             )
-        found = _read_state(path, species)
+        configuration = _read_state(path, species)
         if periodic and wanted is None:
-            _check_box(path, found.cell, [])
+            _check_box(path, configuration.cell, [])
     else:
-        found = _read_molecules(
+        configuration = _read_molecules(
             path, species, wanted, periodic, tolerance, frame, atom_types, topology, content
         )
-    cell = None if not periodic else found.cell if wanted is None else wanted
-    if cell is not None and found.cell is not None and not same_lattice(found.cell, cell, SAME_BOX):
-        found = found._replace(
-            notes=(*found.notes, "the box of the scene is used, not the box of the file")
+    cell = None if not periodic else configuration.cell if wanted is None else wanted
+    if (
+        cell is not None
+        and configuration.cell is not None
+        and not same_lattice(configuration.cell, cell, SAME_BOX)
+    ):
+        configuration = configuration._replace(
+            notes=(*configuration.notes, "the box of the scene is used, not the box of the file")
         )
     if cell is not None and (fault := cell_error(cell)):
         raise StructureError(str(path), [f"its box: {fault}"])
-    found = found._replace(cell=cell)
+    configuration = configuration._replace(cell=cell)
     if repeat != (1, 1, 1):
-        count = prod(repeat) * np.bincount(found.species, minlength=len(species)).astype(object)
+        count = prod(repeat) * np.bincount(configuration.species, minlength=len(species)).astype(
+            object
+        )
         sites = sum(n * len(m.masses) for n, m in zip(count, species, strict=True))
         check_memory_of_molecules(str(path), sum(count), sites)
-        found = _repeated(found, repeat)
+        configuration = _repeated(configuration, repeat)
     return with_reduced_cell(
-        found, "its" if wanted is None else "the scene's box: its", may_rotate=wanted is None
+        configuration,
+        "its" if wanted is None else "the scene's box: its",
+        may_rotate=wanted is None,
     )
 
 
@@ -137,33 +145,33 @@ def with_reduced_cell(found: Configuration, whose: str, may_rotate: bool) -> Con
     return found._replace(cell=cell, notes=(*found.notes, note), basis=basis)
 
 
-def _repeated(found: Configuration, repeat: tuple[int, int, int]) -> Configuration:
+def _repeated(configuration: Configuration, repeat: tuple[int, int, int]) -> Configuration:
     """The cell and its molecules, repeated along each edge."""
-    cell = not_none(found.cell)
+    cell = not_none(configuration.cell)
     shifts = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ cell
 
     def tiled(values):
         return None if values is None else np.tile(values, (len(shifts), *[1] * (values.ndim - 1)))
 
-    return found._replace(
-        species=tiled(found.species),
-        number=tiled(found.number),
-        position=(found.position + shifts[:, None]).reshape(-1, 3),
-        rotation=tiled(found.rotation),
-        velocity=tiled(found.velocity),
-        angular_momentum_body=tiled(found.angular_momentum_body),
+    times = " x ".join(map(str, repeat))
+    note = f"its {len(configuration.species)} molecules are repeated {times} times"
+
+    return configuration._replace(
+        species=tiled(configuration.species),
+        number=tiled(configuration.number),
+        position=(configuration.position + shifts[:, None]).reshape(-1, 3),
+        rotation=tiled(configuration.rotation),
+        velocity=tiled(configuration.velocity),
+        angular_momentum_body=tiled(configuration.angular_momentum_body),
         cell=cell * np.array(repeat)[:, None],
-        notes=(
-            *found.notes,
-            f"its {len(found.species)} molecules are repeated {' x '.join(map(str, repeat))} times",
-        ),
+        notes=(*configuration.notes, note),
     )
 
 
 def _read_molecules(
     path: Path,
     species: list[Molecule],
-    wanted,
+    scene_cell,
     periodic: bool,
     tolerance: float,
     frame,
@@ -204,21 +212,24 @@ def _read_molecules(
                 notes.append(f"its angles of {angles}° were set to right angles")
             cell = upright
         atoms = atoms._replace(cell=cell)
-    if periodic and wanted is None:
+    if periodic and scene_cell is None:
         _check_box(path, atoms.cell, notes)
     if atoms.cell is not None and periodic and (fault := cell_error(atoms.cell)):
         raise StructureError(str(path), [f"its box: {fault}"])
     matched = match(
-        atoms, species, atoms.cell if atoms.cell is not None or not periodic else wanted, tolerance
+        atoms,
+        species,
+        atoms.cell if atoms.cell is not None or not periodic else scene_cell,
+        tolerance,
     )
     if isinstance(matched, list):
-        more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
+        others = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
         if atom_types is None and has_types(path) and matched[0].startswith("has atoms named"):
             matched[0] += ". If these are types, structure.atom_types gives them names"
         faults = (
             _unknown_masses(atoms, species)
             + matched[:MOST_NAMED]
-            + more
+            + others
             + _other_units(atoms, species)
         )
         faults += [f"as read: {note}" for note in atoms.notes]
@@ -252,42 +263,44 @@ def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
         for name, mass in sorted(set(zip(atoms.names, atoms.masses.tolist(), strict=True)))
         if mass >= NO_MASS and np.abs(masses - mass).min() > SAME_MASS * mass
     ]
-    there = f"the scene's molecules ({', '.join(f'{mass:g}' for mass in masses)} u)"
+    expected = f"the scene's molecules ({', '.join(f'{mass:g}' for mass in masses)} u)"
     advice = "set structure.atom_types, or these masses by masses_u"
-    return (
-        [f"its atom types {', '.join(unknown)} have masses of no site of {there}: {advice}"]
-        if unknown
-        else []
-    )
+    if unknown:
+        return [
+            f"its atom types {', '.join(unknown)} have masses of no site of {expected}: {advice}"
+        ]
+    return []
 
 
 def _notes(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> Iterator[str]:
     """Notes on massless sites, whose positions follow from the template and not from the file, and
     on masses in the file that differ from the masses of the scene."""
     lacking = [len(molecule.masses) - len(massive_sites(molecule)) for molecule in species]
-    there, expected = sum(matched.massless.values()), int(np.array(lacking)[matched.species].sum())
-    if there > expected:
+    massless_count = sum(matched.massless.values())
+    expected = int(np.array(lacking)[matched.species].sum())
+    if massless_count > expected:
         yield (
-            f"{there - expected} sites without mass ({', '.join(matched.massless)}) are in no"
-            " model: left out"
+            f"{massless_count - expected} sites without mass ({', '.join(matched.massless)}) are"
+            " in no model: left out"
         )
-    elif there < expected:
+    elif massless_count < expected:
         names = ", ".join(
             molecule.name for molecule, count in zip(species, lacking, strict=True) if count
         )
-        what = f"{expected - there} sites without mass are missing in the file ({names})"
+        what = f"{expected - massless_count} sites without mass are missing in the file ({names})"
         yield f"{what}: built from the rigid template"
     others = {}
-    for k, molecule in enumerate(species if atoms.masses is not None else ()):
+    masses = atoms.masses
+    for k, molecule in enumerate(species if masses is not None else ()):
+        assert masses is not None
         for s, site in enumerate(massive_sites(molecule)):
             members = np.array(
                 [matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int
             )
             mass = float(molecule.masses[site])
-            for i in members[np.abs(atoms.masses[members] - mass) > SAME_MASS * mass]:
+            for i in members[np.abs(masses[members] - mass) > SAME_MASS * mass]:
                 others[
-                    f"{atoms.names[i]} {atoms.masses[i]:g} and {molecule.site_names[site]}"
-                    f" {mass:g} u"
+                    f"{atoms.names[i]} {masses[i]:g} and {molecule.site_names[site]} {mass:g} u"
                 ] = None
     if listed := "; ".join(others):
         yield (
@@ -361,9 +374,9 @@ def _other_model(molecule: Molecule, saved: np.ndarray) -> str:
     names = ("mass, u", "moment of inertia 1, u Å²", "moment 2", "moment 3", "number of sites")
     size = np.array([here[0], *[max(here[1:4].max(), saved[1:4].max())] * 3, 1.0])
     differs = [
-        f"{name}: {there:.6g}, here {value:.6g}"
-        for name, there, value, scale in zip(names, saved, here, size, strict=True)
-        if abs(there - value) > SAME_MODEL * scale
+        f"{name}: {saved_value:.6g}, here {value:.6g}"
+        for name, saved_value, value, scale in zip(names, saved, here, size, strict=True)
+        if abs(saved_value - value) > SAME_MODEL * scale
     ]
     return f"holds another {molecule.name} than the scene ({'; '.join(differs)})" if differs else ""
 

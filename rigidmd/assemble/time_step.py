@@ -100,7 +100,7 @@ class FastMotion(NamedTuple):
 
 def fastest_motion(species: list[Molecule], temperature: float) -> FastMotion | None:
     """The fastest motion at a temperature, K; None without molecules or temperature."""
-    found, thermal = [], BOLTZMANN * temperature
+    motions, thermal = [], BOLTZMANN * temperature
     for m in species if thermal > 0 else ():
         diameter = max(
             (sigma for sigma, depth in zip(m.sigma, m.epsilon, strict=True) if depth > 0),
@@ -108,13 +108,13 @@ def fastest_motion(species: list[Molecule], temperature: float) -> FastMotion | 
         )
         lightest = min((moment for moment in m.inertia if moment > 0), default=inf)
         moving, rotating = diameter * sqrt(m.mass / thermal), sqrt(lightest / thermal)
-        found += [
+        motions += [
             FastMotion(SWING_DIAMETERS * moving, SWING_DIAMETERS, "diameters", m.name, "moves"),
             FastMotion(
                 SWING_RAD * rotating, SWING_RAD, "rad", m.name, "rotates about its lightest axis"
             ),
         ]
-    return min(found, key=attrgetter("time"), default=None)
+    return min(motions, key=attrgetter("time"), default=None)
 
 
 def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
@@ -225,8 +225,8 @@ def with_precision(
     if scene.precision != "auto":
         return scene, ""
     errors = {
-        k: error_of_step(species, found or temperature, stage.scheme, stage.timestep_fs)
-        for k, stage, found in _given_steps(scene)
+        k: error_of_step(species, stage_temperature or temperature, stage.scheme, stage.timestep_fs)
+        for k, stage, stage_temperature in _given_steps(scene)
     }
     seeks = [
         k

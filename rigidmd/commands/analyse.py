@@ -109,7 +109,7 @@ def _analyse(options: Options) -> int:
                 print()
             print(f"values of all in {folder / ANALYSES}")
             if options.extrapolate is not None:
-                names = print_limits(folder, read_manifest(folder), options.extrapolate)
+                names = print_limits(read_manifest(folder), options.extrapolate)
                 print(f"\n  files in {folder}: {', '.join(names)}")
             return FAILED if options.only and any(of.failed for of in found) else 0
         if mean_force.NAME in options.only:

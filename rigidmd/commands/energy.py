@@ -52,9 +52,8 @@ def _energy(options: Options) -> int:
 
 
 def _print_molecules(name: str, found: dict[str, Any], unit: str) -> None:
-    removal = (
-        f", after {found['relief_steps']} steps of overlap removal" if found["relief_steps"] else ""
-    )
+    steps = found["overlap_removal_steps"]
+    removal = f", after {steps} steps of overlap removal" if steps else ""
     print(f"{name}: energies of the start, {found['molecules']} molecules{removal}")
     for note in found["notes"]:
         print(f"  {note}")

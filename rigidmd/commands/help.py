@@ -23,9 +23,8 @@ def _help(options: Options) -> int:
 
     if options.chapter is not None:
         os.environ.setdefault("LESS", "FRX")  # `less` then ends at once after a text of one screen
-        pager(
-            f"{chapter_text(options.chapter)}\n"
-        )  # $PAGER or `less` on a terminal, else plain text
+        # $PAGER or `less` on a terminal, else plain text
+        pager(f"{chapter_text(options.chapter)}\n")
         return 0
     print(
         "chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` describes a"

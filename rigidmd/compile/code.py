@@ -102,9 +102,8 @@ class CompiledTask:
             digest = hashlib.sha256(repr((self.name, arguments_type)).encode()).hexdigest()[:16]
             with lock_in_cache(digest, LONGEST_WAIT):
                 code = compile_callback(self.function, (arguments_type, types.intp), self.options)
-            self.compiled.setdefault(
-                arguments_type, code
-            )  # the code of another thread may already be in use
+            # the code of another thread may already be in use
+            self.compiled.setdefault(arguments_type, code)
         return self.compiled[arguments_type].address
 
     def is_ready(self, arguments_type: TaskArguments) -> bool:

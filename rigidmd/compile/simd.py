@@ -146,10 +146,11 @@ def add_lane_sums(typing, array, index, step, x, y):
         return None
     lanes = lanes_like(array)
     three = types.UniTuple(lanes, 3)
+    # part: number of lanes within which shuffling is fastest
     width, part = (
         lanes.count,
         128 // array.dtype.bitwidth,
-    )  # part: number of lanes within which shuffling is fastest
+    )
 
     def merged(builder, a, b, first, second):
         """The sum of two selections of lanes of a and b, the same in each part."""

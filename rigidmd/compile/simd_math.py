@@ -73,9 +73,8 @@ class VectorOperations:
         self.whole = ir.VectorType(ir.IntType(self.bits), self.count)
         self.fraction_bits = 52 if self.is_double else 23
         self.bias = 1023 if self.is_double else 127
-        self.magic = (
-            1.5 * 2.0**self.fraction_bits
-        )  # added to a number, it leaves the nearest integer in the last bits
+        # added to a number, it leaves the nearest integer in the last bits
+        self.magic = 1.5 * 2.0**self.fraction_bits
 
     def number(self, x: float):
         return ir.Constant(self.type, [x] * self.count)

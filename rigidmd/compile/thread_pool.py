@@ -41,29 +41,33 @@ from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS, function_
 INT64 = ir.IntType(64)
 # Indices of 64-bit cells in the memory of the pool. A cache line has 8; different threads write to
 # different lines.
+# address of `_run_task`; workers in use; polls of a waiting thread before it sleeps
 RUN_TASK, WORKERS, POLLS = (
     0,
     1,
     2,
-)  # address of `_run_task`; workers in use; polls of a waiting thread before it sleeps
+)
 BUSY = 8  # 1 while a calling thread uses the pool
 JOB = 16  # even number of the present job; odd while a job is being written
+# the job: address of its task, address of its arguments, number of blocks
 ADDRESS, ARGUMENTS, BLOCKS = (
     24,
     25,
     26,
-)  # the job: address of its task, address of its arguments, number of blocks
+)
 DONE = 32  # number of its ranges that are finished
+# 1 while the calling thread sleeps; the lock on which it sleeps
 CALLER_SLEEPS, CALLER_LOCK = (
     40,
     41,
-)  # 1 while the calling thread sleeps; the lock on which it sleeps
+)
 RANGE_JOBS = 48  # for each work range, the last job in which a thread began it
 MOST_RANGES = MOST_BLOCKS  # if there are more blocks, a work range has several
+# a cache line for each worker: 1 while it sleeps, and its lock
 FIRST_WORKER, LINE = (
     RANGE_JOBS + MOST_RANGES,
     8,
-)  # a cache line for each worker: 1 while it sleeps, and its lock
+)
 SLEEPS, LOCK = 0, 1
 SYMBOL = "rigidmd_thread_pool"
 ALLOCATE, ACQUIRE, RELEASE = (
@@ -293,9 +297,8 @@ class _ThreadPool:
 
     def __init__(self):
         memory = np.zeros(FIRST_WORKER + LINE * (MOST_THREADS + 1), np.int64)
-        ctypes.pythonapi.Py_IncRef(
-            ctypes.py_object(memory)
-        )  # workers may still read it while Python exits
+        # workers may still read it while Python exits
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(memory))
         self.cells = memory[-memory.ctypes.data % 64 // 8 :]
         llvmlite.binding.add_symbol(SYMBOL, self.cells.ctypes.data)
         for name in (ACQUIRE, RELEASE):
@@ -348,9 +351,8 @@ class _ThreadPool:
         self.started, self._starting = 0, threading.RLock()
         self.cells[[WORKERS, BUSY, CALLER_SLEEPS]] = 0
         self.cells[FIRST_WORKER:] = 0
-        self.cells[RANGE_JOBS:FIRST_WORKER] = self.cells[
-            JOB
-        ]  # nothing is left of a job that another thread had begun
+        # nothing is left of a job that another thread had begun
+        self.cells[RANGE_JOBS:FIRST_WORKER] = self.cells[JOB]
         if self.code:
             self.cells[CALLER_LOCK] = _new_lock()
 

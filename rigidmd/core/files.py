@@ -27,21 +27,19 @@ def unreadable_reason(path: Path, largest: float = inf) -> str:
     largest : greatest size in bytes
     """
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError as error:
-        return (
-            "there is no such file"
-            if error.errno == errno.ENOENT
-            else f"cannot be read: {error.strerror}"
-        )
+        if error.errno == errno.ENOENT:
+            return "there is no such file"
+        return f"cannot be read: {error.strerror}"
     except ValueError:
         return "there is no such file: its name contains a zero byte"
-    if stat.S_ISDIR(found.st_mode):
+    if stat.S_ISDIR(status.st_mode):
         return "is a folder"
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         return "is a pipe, a socket or a device, not a file"
-    if found.st_size > largest:
-        return f"has {found.st_size / 1e6:.4g} MB; files of up to {largest / 1e6:.4g} MB are read"
+    if status.st_size > largest:
+        return f"has {status.st_size / 1e6:.4g} MB; files of up to {largest / 1e6:.4g} MB are read"
     return ""
 
 
@@ -169,10 +167,10 @@ class AppendedFile:
         another program."""
         ours = os.fstat(self._file.fileno())
         try:
-            found = self._path.lstat()
+            status = self._path.lstat()
         except OSError:
             raise LostFileError(f"{self._path} was removed while the run was writing it") from None
-        if (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino):
+        if (status.st_dev, status.st_ino) != (ours.st_dev, ours.st_ino):
             raise LostFileError(
                 f"{self._path} was replaced by another file while the run was writing it"
             )
@@ -207,16 +205,18 @@ class AppendedFile:
 
     def _difference(self, offset: int, first: bytes) -> str:
         """How the file differs from its size and checksum; empty if it does not."""
-        found, left = 0, self._size
+        checksum, left = 0, self._size
         while left and (piece := bytearray(self._file.read(min(left, CHUNK)))):
             if left == self._size:
                 piece[offset : offset + len(first)] = first
-            found, left = zlib.crc32(piece, found), left - len(piece)
+            checksum, left = zlib.crc32(piece, checksum), left - len(piece)
         if left:
             return f"is shorter than it was: {self._size} bytes are needed to continue it"
-        return "" if found == self._sum else "has changed or is damaged: its checksum has changed"
+        return (
+            "" if checksum == self._sum else "has changed or is damaged: its checksum has changed"
+        )
 
     def _write(self, piece: bytes) -> None:
-        rest = memoryview(piece)
-        while rest:
-            rest = rest[self._file.write(rest) :]
+        unwritten = memoryview(piece)
+        while unwritten:
+            unwritten = unwritten[self._file.write(unwritten) :]

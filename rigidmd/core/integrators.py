@@ -182,10 +182,10 @@ def split(
     gradients : of each kick, see `Flow.gradient`
     """
     if len(kicks) != len(drifts) + 1 or (gradients is not None and len(gradients) != len(kicks)):
-        given = f"{len(kicks)} kicks, {len(drifts)} drifts" + (
+        counts = f"{len(kicks)} kicks, {len(drifts)} drifts" + (
             f", {len(gradients)} gradients" if gradients else ""
         )
-        wrong = f"{given}: kicks must be one more than drifts, and gradients as many as kicks"
+        wrong = f"{counts}: kicks must be one more than drifts, and gradients as many as kicks"
         raise ValueError(f"integrator {name}: {wrong}; a fraction may be 0")
     return Scheme(name, _alternating(kicks, drifts, gradients), order, True, source, **flags)
 
@@ -242,15 +242,18 @@ def auto_errors(
 ) -> list[str]:
     """Conflicts between an integrator, the requested errors (key -> value) and keys that pilot runs
     decide."""
-    given = [key for key, value in requested.items() if value is not None]
+    set_keys = [key for key, value in requested.items() if value is not None]
     if integrator != AUTO:
-        return [f"{', '.join(given)} would do nothing without integrator = 'auto'"] if given else []
-    errors = (
-        [f"{', '.join(unused)} would do nothing with integrator = 'auto', which chooses it"]
-        if unused
-        else []
-    )
-    if len(given) != 1:
+        if set_keys:
+            return [f"{', '.join(set_keys)} would do nothing without integrator = 'auto'"]
+        return []
+    if unused:
+        errors = [
+            f"{', '.join(unused)} would do nothing with integrator = 'auto', which chooses it"
+        ]
+    else:
+        errors = []
+    if len(set_keys) != 1:
         errors.append(f"integrator = 'auto' needs one of {', '.join(requested)}")
     return errors
 

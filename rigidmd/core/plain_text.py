@@ -29,12 +29,12 @@ def as_identifier(text: str) -> str:
 
 def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
     """Names with numbers where they would be equal to others or taken: a, a_2."""
-    found = list(taken)
-    first = len(found)
+    names_in_use = list(taken)
+    first = len(names_in_use)
     for name in names:
         numbered = (f"{name}_{k}" for k in count(2))
-        found.append(next(one for one in chain([name], numbered) if one not in found))
-    return found[first:]
+        names_in_use.append(next(one for one in chain([name], numbered) if one not in names_in_use))
+    return names_in_use[first:]
 
 
 #: With more similar names than this, no suggestion is made from a common beginning or end.

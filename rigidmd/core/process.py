@@ -28,6 +28,12 @@ def ignore_warnings() -> Iterator[None]:
         yield
 
 
+#: Exit codes of commands, which other processes read. The first is added to the number of a signal
+#: that ended it: 130 for Ctrl-C, 143 for SIGTERM. The second is of a run that stopped because its
+#: wall time was up: run it again with --resume.
+BY_SIGNAL, OUT_OF_TIME = 128, 75
+
+
 #: Configuration files that libraries read in the working directory: Numba and Matplotlib.
 LOCAL_SETTINGS = (".numba_config.yaml", "matplotlibrc")
 

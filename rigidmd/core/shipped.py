@@ -79,14 +79,17 @@ class Example(NamedTuple):
 def examples(files: str = "*.toml") -> list[Example]:
     """The shipped scenes, or the examples among other files, sorted by name; numbers within names
     by their value."""
-    found = []
+    shipped = []
     for path in SYSTEMS.glob(files):
         text = path.read_text(encoding="utf-8")
         is_body = path.suffix == ".toml" and "body" in tomllib.loads(text)
         first = "".join(json.loads(text)["cells"][0]["source"]) if path.suffix == ".ipynb" else text
-        found.append(Example(path.stem, path, first.partition("\n")[0].removeprefix("# "), is_body))
+        shipped.append(
+            Example(path.stem, path, first.partition("\n")[0].removeprefix("# "), is_body)
+        )
     return sorted(
-        found, key=lambda one: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", one.name)]
+        shipped,
+        key=lambda one: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", one.name)],
     )
 
 
@@ -129,14 +132,14 @@ def copy_example(
         raise OutputError(f"{path} must end in {example.path.suffix}: {other}")
     inputs = {path.parent / file.relative_to(example.path.parent): file for file in read}
     for target in (path, *inputs):
-        kept = (
+        is_equal_input = (
             target in inputs
             and target.is_file()
             and target.read_bytes() == inputs[target].read_bytes()
         )
         if target.is_dir():
             raise OutputError(f"{target} is a folder; {option('file')} names another file")
-        if target.exists() and not force and not kept:
+        if target.exists() and not force and not is_equal_input:
             raise OutputError(
                 f"{target} exists; {option('force')} replaces it, {option('file')} names another"
                 " file"
@@ -162,12 +165,12 @@ def chapter_text(name: str) -> str:
     InputError."""
     if name not in CHAPTERS:
         word = re.compile(rf"\b{re.escape(name)}", re.IGNORECASE)
-        found = {
+        occurrences = {
             chapter: len(word.findall(_plain(chapter)))
             for chapter in CHAPTERS
             if chapter != "changelog"
         }
-        named = [f"{chapter} ({count})" for chapter, count in found.items() if count]
+        named = [f"{chapter} ({count})" for chapter, count in occurrences.items() if count]
         where = (
             f"the word is in {', '.join(named)}" if named else f"there are {', '.join(CHAPTERS)}"
         )
@@ -187,8 +190,8 @@ def _plain(name: str) -> str:
         files = textwrap.fill(", ".join(f"{stem}{extension}" for stem, extension in copied), 120)
         title += f"\n\n`rigidmd new NAME` copies the shipped files that are named here:\n{files}"
 
-    def picture(found: re.Match) -> str:
-        about, path = found.groups()
+    def picture(match: re.Match) -> str:
+        about, path = match.groups()
         return f"[picture: {about}, {(CHAPTERS[name].parent / path).resolve()}]"
 
     text = re.sub(r"!\[([^\]]*)\]\(([^)]*)\)", picture, _SHIPPED.sub(r"\1\2", text))

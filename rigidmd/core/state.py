@@ -50,12 +50,10 @@ class State(NamedTuple):
     cell: np.ndarray  # (3, 3) rows a along x, b in the xy plane, c; infinite edges without a box
     time: np.ndarray  # (2,) now; when this segment of equal steps began
     step: np.ndarray  # (2,) int64, steps since the start; those when this segment began
-    energy_ledger: (
-        np.ndarray
-    )  # (3,) energies added so far, see HEAT; the energy less their sum is conserved
-    extra_variables: (
-        np.ndarray
-    )  # (m,) of a thermostat, a piston or an ODE formulation; (0,) in most runs
+    #: (3,) energies added so far, see HEAT; the energy less their sum is conserved
+    energy_ledger: np.ndarray
+    #: (m,) of a thermostat, a piston or an ODE formulation; (0,) in most runs
+    extra_variables: np.ndarray
 
     def copy(self) -> "State":
         """A state with copies of all arrays."""
@@ -96,9 +94,6 @@ class State(NamedTuple):
         self.step[ORIGIN] = self.step[NOW]
 
 
-#: Names of a state's arrays in files, in the order of `State`; two differ, so that older files can
-#: be read.
-STORED_NAMES = (*State._fields[:7], "books", "bath")
 #: The cell of a scene without a box.
 NO_CELL = np.diag([inf, inf, inf])
 

@@ -9,12 +9,14 @@ import numpy as np
 
 from rigidmd.core.files import atomic_file, unreadable_reason
 from rigidmd.core.process import format_gigabytes, memory_shortage
-from rigidmd.core.state import NO_CELL, STORED_NAMES, State, state_of
+from rigidmd.core.state import NO_CELL, State, state_of
 from rigidmd.errors import StructureError
 
 #: Version of the format. Version 1 (rigidmd 0.1) had neither a version number nor the arrays from
 #: `step` on.
-SCHEMA = 2
+SCHEMA = 3
+#: Names of arrays in files of versions 1 and 2 -> their names now.
+FORMER_NAMES = {"books": "energy_ledger", "bath": "extra_variables"}
 LARGEST = 1e30  # largest magnitude of any number in a state
 NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
 
@@ -32,16 +34,16 @@ class SavedState(NamedTuple):
 
 def write_state(path: Path, saved: SavedState) -> None:
     """Write a state of molecules, without pickle. Raises OutputError."""
-    more = {"residue_number": saved.residue_number, "models": saved.models}
-    more = {name: array for name, array in more.items() if array is not None}
+    optional = {"residue_number": saved.residue_number, "models": saved.models}
+    optional = {name: array for name, array in optional.items() if array is not None}
     with atomic_file(path) as temporary:
-        arrays: dict[str, Any] = dict(zip(STORED_NAMES, saved.state, strict=True))
+        arrays: dict[str, Any] = dict(zip(State._fields, saved.state, strict=True))
         np.savez(
             temporary,
             schema=SCHEMA,
             species_names=np.array(saved.names),
             species=saved.species,
-            **more,
+            **optional,
             **arrays,
         )
 
@@ -56,7 +58,8 @@ def read_state(path: Path) -> SavedState:
         if reason := memory_shortage(2 * size, f"reading its {format_gigabytes(size)}"):
             raise ValueError(f"not enough memory: {reason}")
         with np.load(path, allow_pickle=False) as data:
-            arrays = {key: data[key] for key in data.files}
+            names_in_file = map(str, data.files)
+            arrays = {FORMER_NAMES.get(name, name): data[name] for name in names_in_file}
         schema = int(arrays.pop("schema", 1))
         names = [str(name) for name in arrays.pop("species_names")]
         species = arrays["species"]
@@ -72,11 +75,11 @@ def read_state(path: Path) -> SavedState:
     if schema == 1:
         arrays = {
             key: arrays[key]
-            for key in ("species", "residue_number", *STORED_NAMES[:5])
+            for key in ("species", "residue_number", *State._fields[:5])
             if key in arrays
         }
-        arrays |= dict(zip(STORED_NAMES[5:], example[5:], strict=True))
-    if missing := [key for key in STORED_NAMES if key not in arrays]:
+        arrays |= dict(zip(State._fields[5:], example[5:], strict=True))
+    if missing := [key for key in State._fields if key not in arrays]:
         raise StructureError(
             str(path), [f"is not a state that rigidmd wrote: it holds no {', '.join(missing)}"]
         )
@@ -87,7 +90,7 @@ def read_state(path: Path) -> SavedState:
     state = State(
         *(
             np.asarray(arrays[k], like.dtype, order="C")
-            for k, like in zip(STORED_NAMES, example, strict=True)
+            for k, like in zip(State._fields, example, strict=True)
         )
     )
     return SavedState(state, names, species, arrays.get("residue_number"), arrays.get("models"))
@@ -104,8 +107,8 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
         "cell": (3, 3),
         "rotation": (m, 3, 3),
     }
-    shapes |= {"angular_momentum_body": (m, 3), "time": (2,), "step": (2,), "books": (3,)}
-    shapes |= {"bath": (arrays["bath"].size,)}
+    shapes |= {"angular_momentum_body": (m, 3), "time": (2,), "step": (2,), "energy_ledger": (3,)}
+    shapes |= {"extra_variables": (arrays["extra_variables"].size,)}
     shapes |= {"residue_number": (n,)} if "residue_number" in arrays else {}
     shapes |= {"models": (len(names), 5)} if "models" in arrays else {}
     bad = {*array_errors(arrays, shapes)}
@@ -130,22 +133,22 @@ def array_errors(
 
     exact : whether matrices must be rotations, not only numbers
     """
-    found = {}
+    errors = {}
     for name, shape in shapes.items():
         array = arrays[name]
         if array.shape != shape:
-            found[name] = f"has the shape {array.shape}, not {shape}"
+            errors[name] = f"has the shape {array.shape}, not {shape}"
         elif array.dtype.kind not in "fi":
-            found[name] = f"is of the type {array.dtype}, not of real numbers"
+            errors[name] = f"is of the type {array.dtype}, not of real numbers"
         elif name == "cell" and not is_cell(array):
-            found[name] = (
+            errors[name] = (
                 "is not a cell with a along x, b in the xy plane and positive a_x, b_y, c_z"
             )
         elif name != "cell" and not (np.abs(array) <= LARGEST).all():  # NaN is not
-            found[name] = "is not finite"
+            errors[name] = "is not finite"
         elif name == "rotation" and exact and not are_rotations(array):
-            found[name] = "has matrices Q that are not rotations, with QᵀQ = 1 and determinant 1"
-    return found
+            errors[name] = "has matrices Q that are not rotations, with QᵀQ = 1 and determinant 1"
+    return errors
 
 
 def are_rotations(matrices: np.ndarray) -> bool:

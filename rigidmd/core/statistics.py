@@ -46,10 +46,11 @@ def mean_and_error(values: ArrayLike) -> tuple[float | None, float | None]:
         return average, None
     variance = centred @ centred / (n - 1)
     window = variance * ratio * freedom / (freedom - LOST_FREEDOM)
-    kept = max(
-        0.25, 1 - ratio / n
-    )  # fraction of the variance about the true mean that is left about the sample mean
-    return average, sqrt(max(window, BATCH_FACTOR * _batch_variance(centred)) / kept / n)
+    # fraction of the variance about the true mean that is left about the sample mean
+    variance_fraction = max(0.25, 1 - ratio / n)
+    return average, sqrt(
+        max(window, BATCH_FACTOR * _batch_variance(centred)) / variance_fraction / n
+    )
 
 
 def standard_error(values: ArrayLike) -> np.ndarray:

@@ -78,34 +78,34 @@ def plain_values(data: Any, depth: int = 0) -> Any:
 def values_in(data: Any) -> Iterator[tuple[list, Any]]:
     """All values in nested tables and lists in their order, each with its path of keys, before the
     values in it."""
-    rest: list[tuple[list, Any]] = [([], data)]
-    while rest:
-        keys, value = rest.pop()
+    pending: list[tuple[list, Any]] = [([], data)]
+    while pending:
+        keys, value = pending.pop()
         yield keys, value
         if isinstance(value, dict | list | tuple):
             inner = list(value.items() if isinstance(value, dict) else enumerate(value))
-            rest += [([*keys, key], part) for key, part in reversed(inner)]
+            pending += [([*keys, key], part) for key, part in reversed(inner)]
 
 
 def impossible_values(data: Any) -> list[tuple[list, str]]:
     """Values that are not allowed in any table, each with its path of keys and what is wrong with
     it. These are tables deeper than `DEEPEST`, whole numbers of more than 64 bits and texts with
     unprintable characters."""
-    found: list[tuple[list, str]] = []
+    errors: list[tuple[list, str]] = []
     for keys, value in values_in(data):
         match value:
             case dict() | list() | tuple() if len(keys) > DEEPEST:
                 return [(keys[:DEEPEST], f"has lists or tables more than {DEEPEST} deep")]
             case dict():
                 odd = [key for key in value if isinstance(key, str) and UNPRINTABLE.search(key)]
-                found += [([*keys, key], "has a control character in its name") for key in odd]
+                errors += [([*keys, key], "has a control character in its name") for key in odd]
             case int() if not LEAST_WHOLE <= value <= LARGEST_WHOLE:
-                found.append((keys, "is a whole number of more than 64 bits"))
+                errors.append((keys, "is a whole number of more than 64 bits"))
             case str() if UNPRINTABLE.search(value):
-                found.append(
+                errors.append(
                     (keys, f"is {shorten_repr(value)}: control characters are not allowed")
                 )
-    return found
+    return errors
 
 
 def shorten_text(text: str, most: int = 80) -> str:
@@ -141,11 +141,10 @@ def describe_toml_error(error: TOMLDecodeError, text: str) -> str:
         ),
         "",
     )
-    keys = (
-        [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number][-1:]
-        if bare
-        else []
-    )
+    keys = []
+    if bare:
+        before = [[*table, *entry] for at, table, entry in _lines(text) if entry and at <= number]
+        keys = before[-1:]
     if not keys or re.fullmatch(r"\s*\[[^=]*\]\s*", line):  # a table header after an unclosed list
         return f"is not TOML: {error}"
     where = f"line {number}: {'.'.join(map(str, keys[0]))}: "

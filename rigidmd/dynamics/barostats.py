@@ -59,9 +59,8 @@ class CellRescaling(NamedTuple):
     pressure: Pressure
     rate: float  # compressibility over time constant, Å ps²/u/ps
     coordinate: tuple[int, int, int, int, int, int]  # of COUPLINGS
-    at_rest: tuple[
-        float, float, float
-    ]  # 1 for each axis along which the total momentum is kept at zero, else 0
+    # 1 for each axis along which the total momentum is kept at zero, else 0
+    at_rest: tuple[float, float, float]
     tail: tuple[float, float]  # dispersion beyond the cutoff: energy times V, pressure times V²
     key: Key
 
@@ -138,9 +137,8 @@ BAROSTATS = {
 class BarostatWorkspace(NamedTuple):
     """Arrays to make a move and to undo it if it is rejected."""
 
-    tally: (
-        np.ndarray
-    )  # (2, 10) energies and virials: now, before the move; virials only for a piston
+    # (2, 10) energies and virials: now, before the move; virials only for a piston
+    tally: np.ndarray
     strain: np.ndarray  # (3, 6) strain of the move, its drift, its variance
     matrices: np.ndarray  # (2, 3, 3) T and its inverse
     position: np.ndarray  # as in State

@@ -10,7 +10,7 @@ from rigidmd.dynamics.force_gradient import GradientWorkspace, add_gyration, dis
 from rigidmd.dynamics.registers import DONE, LOADED
 from rigidmd.dynamics.step_loop import ORTHOGONALITY_INTERVAL
 from rigidmd.forces.body.resistance import NoResistance, Resistance, kick_with_resistance
-from rigidmd.forces.terms import compute_body_load, total_power
+from rigidmd.forces.terms import compute_body_load, total_power, trait
 from rigidmd.mechanics.free_rotor import (
     DrivenRotor,
     ExactRotor,
@@ -148,7 +148,7 @@ def _add_gyration_of_body(model, load, tau, gain):
 def accumulate_work(model, terms, state, h):
     """Add the work of time-dependent terms over h to the energy ledger, half before a kick and half
     after it: their power at the present velocity."""
-    if not any(getattr(term.instance_class, "time_dependent", False) for term in terms.types):
+    if not any(trait(term.instance_class, "time_dependent") for term in terms.types):
         return lambda model, terms, state, h: None
 
     def accumulate_work_of_body(model, terms, state, h):

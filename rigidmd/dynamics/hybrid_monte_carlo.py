@@ -38,9 +38,8 @@ class TrajectoryWorkspace(NamedTuple):
     load: Load
     energies: np.ndarray  # (2,) potential, without constants, and kinetic, u Å²/ps²
     known: np.ndarray  # (1,) whether the potential energy belongs to the present positions
-    diverged: (
-        np.ndarray
-    )  # (1,) whether the present trajectory has diverged, so that it rests at its start
+    # (1,) whether the present trajectory has diverged, so that it rests at its start
+    diverged: np.ndarray
     sums: np.ndarray  # (5,) see ENDED
 
 

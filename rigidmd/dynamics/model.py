@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
+from rigidmd.forces.terms import trait
 from rigidmd.mechanics.free_rotor import ExactRotor, NoRotor, SplitRotor
 from rigidmd.units import BOLTZMANN
 
@@ -20,9 +21,8 @@ class Model(NamedTuple):
     inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 about an axis without inertia
     inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
     rotor: SplitRotor | ExactRotor | NoRotor
-    keeps_momentum: np.ndarray = np.ones(
-        3, bool
-    )  # (3,) whether each component of the total momentum is conserved
+    # (3,) whether each component of the total momentum is conserved
+    keeps_momentum: np.ndarray = np.ones(3, bool)
 
 
 #: A total momentum below this fraction of the sum of |m v| is rounding.
@@ -51,10 +51,11 @@ def conserved_momentum(model: Model, terms: Mapping[str, NamedTuple]) -> np.ndar
     """Whether each component (3,) of the total momentum is conserved, as in `Model.keeps_momentum`.
     None is conserved if there are frozen molecules. `changes_momentum` of a term lists the
     components that it changes."""
-    kept = np.full(3, bool(mobile(model).all()))
+    conserved = np.full(3, bool(mobile(model).all()))
     for term in terms.values():
-        kept &= ~getattr(term, "changes_momentum", np.zeros(3, bool))
-    return kept
+        if (changed := trait(term, "changes_momentum")) is not None:
+            conserved &= ~changed
+    return conserved
 
 
 def mobile(model: Model) -> np.ndarray:

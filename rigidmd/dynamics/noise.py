@@ -119,8 +119,11 @@ def fill_words(words, key, draw, first, step):
 @kernel
 def fill_normals(found, words, key, draw, first, step):
     """Six normal numbers of each of BATCH molecules, from `first` on: two draws (Box & Muller 1958,
-    with vectors). Number k of molecule first + m goes to found[BATCH k + m]. words : scratch (2, 4,
-    BATCH). Each radius has 53 random bits, so that numbers go up to 8.6, and each angle 32."""
+    with vectors). Number k of molecule first + m goes to found[BATCH k + m]. Each radius has 53
+    random bits, so that numbers go up to 8.6, and each angle 32.
+
+    words : scratch (2, 4, BATCH)
+    """
     fill_words(words[0], key, draw, first, step)
     fill_words(words[1], key, draw + 1, first, step)
     _fill_pairs(found, words.reshape(-1))

@@ -74,14 +74,19 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     conserved. It acts half before and half after each step (`halved = False` in the class: all of
     it after the step); with integrator = "baoab" in its middle.
 
-    model : `rigidmd.dynamics.model.Model`; masses and moments are by species,
+    `changes_momentum = True` in the class means that it changes the total momentum.
+
+    Parameters
+    ----------
+    model
+        `rigidmd.dynamics.model.Model`; masses and moments are by species,
         `model.mass[model.species[m]]`
-    state : `rigidmd.core.state.State`
-    draw : an integer, the first of the random numbers of this call. `rigidmd.dynamics.noise` has
+    state
+        `rigidmd.core.state.State`
+    draw
+        An integer, the first of the random numbers of this call. `rigidmd.dynamics.noise` has
         `normals(thermostat.key, draw, m, state.step[0])`, two normal numbers for molecule m; draw +
         1, ... gives more. The key is a field of the class, from `key_of(seed, THERMOSTAT, stage)`
-
-    `changes_momentum = True` in the class means that it changes the total momentum.
     """
     _check_class(kind)
 

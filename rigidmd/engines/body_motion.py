@@ -112,10 +112,8 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
     n = len(times)
     kinetic, potential, about_origin = np.zeros(n), np.zeros(n), np.zeros((n, 3))
     if system.rotates:
-        rotation, momentum = (
-            states.rotation.reshape(n, 3, 3),
-            states.angular_momentum_body.reshape(n, 3),
-        )
+        rotation = states.rotation.reshape(n, 3, 3)
+        momentum = states.angular_momentum_body.reshape(n, 3)
         inertia, carried = system.moments(times)
         twice = np.divide(
             (momentum - carried) ** 2, inertia, out=np.zeros((n, 3)), where=inertia > 0
@@ -123,10 +121,8 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
         kinetic += 0.5 * twice.sum(axis=1)
         about_origin += np.einsum("tij,tj->ti", rotation, momentum)
     if system.translates:
-        position, impulse = (
-            states.position.reshape(n, 3),
-            system.mass * states.velocity.reshape(n, 3),
-        )
+        position = states.position.reshape(n, 3)
+        impulse = system.mass * states.velocity.reshape(n, 3)
         along = np.einsum("tji,tj->ti", rotation, impulse) if system.rotates else impulse
         kinetic += 0.5 * (along**2 / inertial_masses(system.body.translation)).sum(axis=1)
         about_origin += np.cross(position, impulse)

@@ -66,20 +66,22 @@ class BodySystem:
     @property
     def notes(self) -> list[str]:
         """Notes on a duration or an interval that is not a whole number of steps."""
-        run, dt, found = self.scene.run, self.scene.run.timestep_s, []
+        notes = []
+        run = self.scene.run
+        dt = run.timestep_s
         interval = not_none(self.scene.output.interval_s)
-        given = interval != run.duration_s / SAMPLES
-        for key, wanted in (
+        is_set = interval != run.duration_s / SAMPLES
+        for key, duration in (
             ("run.duration_s", run.duration_s),
-            ("output.interval_s", given and interval),
+            ("output.interval_s", is_set and interval),
         ):
-            used = wanted and max(1, round(wanted / dt)) * dt
-            if not run.is_auto and wanted and abs(used - wanted) > 1e-9 * wanted:
-                found.append(
-                    f"{key} = {wanted:g} is not a whole number of steps of {dt:g} s: {used:g} s is"
-                    " used"
+            used = duration and max(1, round(duration / dt)) * dt
+            if not run.is_auto and duration and abs(used - duration) > 1e-9 * duration:
+                notes.append(
+                    f"{key} = {duration:g} is not a whole number of steps of {dt:g} s:"
+                    f" {used:g} s is used"
                 )
-        return found
+        return notes
 
     @property
     def left_out(self) -> list[str]:
@@ -121,11 +123,11 @@ class BodySystem:
             return SCHEMES["velocity_verlet"]
         if run.has_scheme:
             return run.scheme
-        found = Solver(run.integrator, run.formulation or FORMULATION, run.duration_s)
+        solver = Solver(run.integrator, run.formulation or FORMULATION, run.duration_s)
         if run.integrator == RK4:
-            return found
+            return solver
         relative, absolute = not_none(run.relative_tolerance), not_none(run.absolute_tolerance)
-        return found._replace(relative_tolerance=relative, absolute_tolerance=absolute)
+        return solver._replace(relative_tolerance=relative, absolute_tolerance=absolute)
 
     def engine(self) -> CpuEngine:
         """A new engine for this body at time 0, which calls the functions in `applied`."""
@@ -139,10 +141,8 @@ class BodySystem:
 
     def breaks(self) -> list[float]:
         """Times within the run at which a prescribed function of time has a jump or a kink."""
-        end, parts = (
-            self.scene.run.steps * self.scene.run.timestep_s,
-            (*self.body, *self.terms.values()),
-        )
+        end = self.scene.run.steps * self.scene.run.timestep_s
+        parts = (*self.body, *self.terms.values())
         functions = [value for part in parts for value in part if isinstance(value, TimeFunction)]
         return sorted({float(t) for function in functions for t in function.times if 0 < t < end})
 
@@ -161,13 +161,12 @@ class BodySystem:
         velocity = (
             1.3 * start.velocity + rate * reach * along if self.translates else start.velocity
         )
-        spin = (
-            1.3 * start.angular_velocity_body + rate * along[::-1]
-            if self.rotates
-            else start.angular_velocity_body
-        )
+        if self.rotates:
+            spin = 1.3 * start.angular_velocity_body + rate * along[::-1]
+        else:
+            spin = start.angular_velocity_body
         other = start._replace(velocity=velocity, angular_velocity_body=spin)
-        found = []
+        names = []
         for name, function in self.applied.items():
             try:
                 one, again, moved = (
@@ -177,29 +176,28 @@ class BodySystem:
             except (Exception, SystemExit):  # user code may raise anything; the run reports it
                 continue
             if np.array_equal(one, again) and not np.array_equal(one, moved):
-                found.append(name)
-        return found
+                names.append(name)
+        return names
 
     def _load_function(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
         """A user's function of a pose as a function of time and state that returns force and
         torque, checked."""
 
         def load(time: float, state: State) -> tuple:
-            given = function(self.pose(time, state))
+            returned = function(self.pose(time, state))
             try:
-                force, torque = (np.asarray(part, dtype=float).reshape(3) for part in given)
+                force, torque = (np.asarray(part, dtype=float).reshape(3) for part in returned)
             except (TypeError, ValueError):
                 raise SimulationError(
-                    f"t = {time:g} s: an applied function gave {given!r}, must give force and"
+                    f"t = {time:g} s: an applied function gave {returned!r}, must give force and"
                     " torque of 3 numbers each"
                 ) from None
-            if (
-                not self.translates
-            ):  # the force acts at the centre of mass, the torque is about the pivot
+            # the force acts at the centre of mass, the torque is about the pivot
+            if not self.translates:
                 torque = torque + np.cross(self.centre, self.pose(time, state).rotation.T @ force)
             if not (np.isfinite(force).all() and np.isfinite(torque).all()):
                 raise SimulationError(
-                    f"t = {time:g} s: an applied function gave infinite or NaN values: {given!r}"
+                    f"t = {time:g} s: an applied function gave infinite or NaN values: {returned!r}"
                 )
             return force, self.axes.T @ torque
 

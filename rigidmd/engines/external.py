@@ -92,7 +92,7 @@ class Translations(NamedTuple):
 
 
 def _limits(limits: tuple[Limit, ...], subject: Any) -> Iterator[str]:
-    return (limit.message.format(found) for limit in limits if (found := limit.applies(subject)))
+    return (limit.message.format(value) for limit in limits if (value := limit.applies(subject)))
 
 
 def checked_view(
@@ -101,8 +101,8 @@ def checked_view(
     """The view of a system for an external engine. Raises SceneError with all it lacks, and `more`,
     after `where`."""
     view = force_field_of(system)
-    if found := [*program.load(program.translations).refusals(view), *more]:
-        raise SceneError(system.scene.source, [f"{where}: {message}" for message in found])
+    if refusals := [*program.load(program.translations).refusals(view), *more]:
+        raise SceneError(system.scene.source, [f"{where}: {message}" for message in refusals])
     return view
 
 
@@ -135,11 +135,9 @@ class ExternalEngine(Engine, ABC):
     whole virial."""
 
     def __init__(self, system: System, stage: int):
-        self._system, self._view, self._stage = (
-            system,
-            force_field_of(system),
-            system.scene.stages[stage],
-        )
+        self._system = system
+        self._view = force_field_of(system)
+        self._stage = system.scene.stages[stage]
         self.conserves_energy = not (self._stage.has_thermostat or self._stage.has_barostat)
         self._known_state: State | None = None  # the present state of the program
         self._heat_offset = (
@@ -268,11 +266,9 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
     )
     size = max(size, virial / STEEPEST)
     plain = PLAIN + there.force_tolerance
-    force_error, sites, alpha = (
-        system.force_error or 0.0,
-        system.site_count,
-        system.scene.forces.ewald_alpha_per_A,
-    )
+    force_error = system.force_error or 0.0
+    sites = system.site_count
+    alpha = system.scene.forces.ewald_alpha_per_A
     ewald = (
         force_error * (1 / alpha if alpha else 0.0) * (PER_SITE * sites + ERRORS * np.sqrt(sites))
     )
@@ -302,7 +298,7 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
             values = (x / KJ_PER_MOL for x in (*rms, plain * scale + tolerance))
             lines.append(Comparison(f"rms {name} on a molecule", unit, *values))
     if np.isfinite(ours.pressure_bar) and np.isfinite(theirs.pressure_bar):
-        a, b = (float(seen.virial.trace()) for seen in (ours, theirs))
+        a, b = (float(observation.virial.trace()) for observation in (ours, theirs))
         lines.append(
             _energy(
                 "virial", a, b, (plain + there.virial_tolerance) * max(size, virial) + 3 * ewald
@@ -311,9 +307,9 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
     return lines
 
 
-def _energy(name: str, here: float, there: float, tolerance: float) -> Comparison:
+def _energy(name: str, ours: float, theirs: float, tolerance: float) -> Comparison:
     return Comparison(
-        name, "kJ/mol", *(x / KJ_PER_MOL for x in (here, there, abs(there - here), tolerance))
+        name, "kJ/mol", *(x / KJ_PER_MOL for x in (ours, theirs, abs(theirs - ours), tolerance))
     )
 
 

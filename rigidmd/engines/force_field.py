@@ -29,6 +29,7 @@ from rigidmd.forces.potentials.truncation import (
     Truncation,
     Unmodified,
 )
+from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.validation import not_none
 
@@ -160,13 +161,11 @@ def unknown_terms(system: System, title: str) -> Iterator[str]:
         kind = type(term.potential if isinstance(term, PairForces) else term)
         what = "a user-defined force"
         if name not in system.user_terms:
-            what = "a field" if hasattr(term, "changes_momentum") else f"the term {kind.__name__}"
+            is_field = trait(term, "changes_momentum") is not None
+            what = "a field" if is_field else f"the term {kind.__name__}"
             what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
-            what = (
-                "forces.ewald_slab or ewald_surface_permittivity"
-                if isinstance(term, SurfaceDipole)
-                else what
-            )
+            if isinstance(term, SurfaceDipole):
+                what = "forces.ewald_slab or ewald_surface_permittivity"
         if name in system.user_terms or kind not in DESCRIBED:
             yield f"{name.replace('_', ' ')}: {what} has no translation for {title}"
     if system.thermostat is not None:
@@ -179,29 +178,25 @@ Potential = TypeVar("Potential")
 def _potential(system: System, name: str, kind: type[Potential]) -> Potential | None:
     """The pair potential of a term if it is of a class, else None."""
     term = system.terms.get(name)
-    return (
-        term.potential
-        if isinstance(term, PairForces) and isinstance(term.potential, kind)
-        else None
-    )
+    if isinstance(term, PairForces) and isinstance(term.potential, kind):
+        return term.potential
+    return None
 
 
 def _lennard_jones_kinds(system: System) -> list[list[int]]:
     """The Lennard-Jones kind of each site of each species; -1 for sites without Lennard-Jones
     forces."""
-    found = [[-1] * len(m.masses) for m in system.species]
+    kinds = [[-1] * len(m.masses) for m in system.species]
     term, law = system.terms.get("lennard_jones"), _potential(system, "lennard_jones", LennardJones)
     if law is None or not isinstance(term, PairForces):
-        return found
+        return kinds
     sites = term.sites
     for k, member in zip(*np.unique(system.model.species, return_index=True), strict=True):
-        of_member, positions = (
-            slice(sites.first[member], sites.first[member + 1]),
-            system.species[k].positions_body,
-        )
+        of_member = slice(sites.first[member], sites.first[member + 1])
+        positions = system.species[k].positions_body
         for kind, offset in zip(law.kind[of_member], sites.offsets()[of_member], strict=True):
-            found[k][int(np.linalg.norm(positions - offset, axis=1).argmin())] = int(kind)
-    return found
+            kinds[k][int(np.linalg.norm(positions - offset, axis=1).argmin())] = int(kind)
+    return kinds
 
 
 # Pair potentials as formulas and tables of r, for engines that lack the potential with its
@@ -234,17 +229,17 @@ def coulomb_formula(potential: ReactionField | DampedShiftedForce, strength: flo
 def _truncated(formula: str, truncation: Truncation, end: tuple[float, ...]) -> str:
     """A formula with a truncation and its terms, see `forces.potentials.truncation`."""
     constant, linear, quadratic, cubic = (float(part) for part in end)
-    whole = f"{formula}+({constant!r})" if constant else formula
+    shifted = f"{formula}+({constant!r})" if constant else formula
     if isinstance(truncation, ForceShifted):
         added = f"x*({linear!r})+x^3*({quadratic / 3!r})+x^4*({cubic / 4!r})"
-        return f"{whole}-({added}); x=max(0,r-{float(truncation.start)!r})"
+        return f"{shifted}-({added}); x=max(0,r-{float(truncation.start)!r})"
     if isinstance(truncation, Switched | SmoothlySwitched):
         width = float(truncation.cutoff - truncation.start)
         return (
-            f"({whole})*({SWITCHES[type(truncation)]});"
+            f"({shifted})*({SWITCHES[type(truncation)]});"
             f" t=max(0,(r-{float(truncation.start)!r})/{width!r})"
         )
-    return whole
+    return shifted
 
 
 def table(formula: str, first: float, last: float, entries: int) -> str:
@@ -310,12 +305,12 @@ def _removed_by_truncation(
     powers = 4 * epsilon * sigma**12, 4 * epsilon * sigma**6
     nothing = (0.0,) * 4
     unmodified = law._replace(truncation=Unmodified(inf), terms12=nothing, terms6=nothing)
-    r, whole = _symbolic(lennard_jones_formula(unmodified, *powers, 1.0))
+    r, energy = _symbolic(lennard_jones_formula(unmodified, *powers, 1.0))
     # expanded, so that 1/r¹² cancels where it is not truncated
     inside = sympy.lambdify(
-        r, sympy.expand(whole - _symbolic(lennard_jones_formula(law, *powers, 1.0))[1])
+        r, sympy.expand(energy - _symbolic(lennard_jones_formula(law, *powers, 1.0))[1])
     )
-    beyond = sympy.lambdify(r, whole)
+    beyond = sympy.lambdify(r, energy)
 
     def removed(distance: float) -> float:
         return float(inside(max(distance, CONTACT)) if distance <= law.cutoff else beyond(distance))

@@ -32,9 +32,8 @@ class Observation(NamedTuple):
     components: dict[str, float]  # potential energy by term and constant
     kinetic_translation: float
     kinetic_rotation: float
-    pressure_tensor_bar: (
-        np.ndarray
-    )  # (3, 3) molecular, tail correction included, symmetric; NaN without a box
+    #: (3, 3) molecular, tail correction included, symmetric; NaN without a box
+    pressure_tensor_bar: np.ndarray
     virial: np.ndarray  # (3, 3) molecular, without the tail correction; an energy
     momentum: np.ndarray  # (3,) u Å/ps
     load: Load  # u Å/ps² and u Å²/ps²
@@ -188,16 +187,18 @@ def _temperature(kinetic: float, freedom: int) -> float:
 def describe_quantities(system: System) -> dict[str, str]:
     """Explanations for `rigidmd energy`: name of an energy of charges, `virial` or `pressure` ->
     text."""
-    method, found = system.scene.forces.electrostatics, {}
+    method, descriptions = system.scene.forces.electrostatics, {}
     if method == "reaction_field" and system.cutoff < inf and "coulomb" in system.terms:
-        found = _describe_reaction_field(system)
+        descriptions = _describe_reaction_field(system)
     elif method in ("ewald", "pme"):
-        found = _describe_ewald(system)
-    found = {
-        name: text for name, text in found.items() if name in {*system.terms, *system.constants}
+        descriptions = _describe_ewald(system)
+    descriptions = {
+        name: text
+        for name, text in descriptions.items()
+        if name in {*system.terms, *system.constants}
     }
     if system.space.volume == inf:
-        return found
+        return descriptions
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
     if system.external:
         virial += (
@@ -209,7 +210,7 @@ def describe_quantities(system: System) -> dict[str, str]:
     if "coulomb_frozen" in system.constants:
         constant = f"{system.constant_pressure / BAR:.10g} bar"
         pressure += f", and {constant}, which removes the forces between frozen molecules"
-    return found | {"virial": virial, "pressure": pressure}
+    return descriptions | {"virial": virial, "pressure": pressure}
 
 
 def _describe_reaction_field(system: System) -> dict[str, str]:
@@ -234,13 +235,13 @@ def _describe_ewald(system: System) -> dict[str, str]:
     real, self_energy = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
     if system.scene.forces.ewald_truncation == "plain":
         return {"coulomb_real": f"{real}, plain at the cutoff", "coulomb_self": self_energy}
-    more = "; shifted energies add nothing to it, as every molecule is neutral"
+    of_shift = "; shifted energies add nothing to it, as every molecule is neutral"
     if any(abs(m.charge) > NEUTRAL * np.abs(m.charges).sum() for m in system.species):
-        more = (
+        of_shift = (
             ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted; R is"
             " the cutoff"
         )
     return {
         "coulomb_real": f"{real}, less its value at the cutoff",
-        "coulomb_self": self_energy + more,
+        "coulomb_self": self_energy + of_shift,
     }

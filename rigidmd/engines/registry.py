@@ -31,12 +31,10 @@ class Program(NamedTuple):
     installed: str = ""  # a function that describes what is installed here
     options: Mapping[str, Option] = {}
     describe: Callable[..., str] = lambda **options: ""  # name and options for reports
-    option_errors: Callable[..., str] = lambda **options: (
-        ""
-    )  # a message on options that contradict each other
-    precise: Mapping[
-        str, Any
-    ] = {}  # the options with which `rigidmd verify` compares, unless others are given
+    #: A message on options that contradict each other
+    option_errors: Callable[..., str] = lambda **options: ""
+    # the options with which `rigidmd verify` compares, unless others are given
+    precise: Mapping[str, Any] = {}
     thermostat: str | None = None  # its default thermostat in place of rigidmd's
     barostat: str | None = None  # likewise of npt; None if its barostat has no name in a scene
     writer: str = (

@@ -105,14 +105,14 @@ class RigidBodies:
         """Rotations (n, 3, 3) that bring the body-frame offsets nearest to the offsets (s, 3) in
         the lab."""
         products = np.einsum("si,sj->sij", arm, self._body).reshape(-1, 9)
-        found = nearest_rotation(self._sum(products).reshape(-1, 3, 3))
+        rotation = nearest_rotation(self._sum(products).reshape(-1, 3, 3))
         if (line := self._linear).any():
             axis_body = (self._inertia[line] == 0).astype(float)
-            found[line] = _tilted(
+            rotation[line] = _tilted(
                 before[line],
-                *(np.einsum("nij,nj->ni", q[line], axis_body) for q in (before, found)),
+                *(np.einsum("nij,nj->ni", q[line], axis_body) for q in (before, rotation)),
             )
-        return found
+        return rotation
 
 
 def _tilted(rotation: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -178,14 +178,18 @@ class MassPoints(NamedTuple):
     @property
     def distances(self) -> list[tuple[int, int, float]]:
         """All pairs of points and their distances, Å."""
-        found: list[tuple[int, int, float]] = []
+        distances: list[tuple[int, int, float]] = []
         for i in range(len(self.mass)):
             for j in range(i):
                 d = float(np.linalg.norm(self.position_body[i] - self.position_body[j]))
-                found.append(
-                    (j, i, next((other for *_, other in found if abs(d - other) <= SAME * d), d))
+                distances.append(
+                    (
+                        j,
+                        i,
+                        next((other for *_, other in distances if abs(d - other) <= SAME * d), d),
+                    )
                 )
-        return found
+        return distances
 
 
 def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:
@@ -196,10 +200,8 @@ def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) ->
             molecule.masses, molecule.positions_body, np.arange(len(molecule.masses)), {}
         )
     mass, position, site = _points(molecule, sites)
-    limit, others = (
-        OFF * molecule.radius,
-        np.setdiff1d(np.arange(len(molecule.masses)), site).tolist(),
-    )
+    limit = OFF * molecule.radius
+    others = np.setdiff1d(np.arange(len(molecule.masses)), site).tolist()
     virtual = {k: _virtual_site(position, molecule.positions_body[k], limit) for k in others}
     return MassPoints(mass, position, site, virtual)
 
@@ -232,9 +234,8 @@ def _can_be_points(molecule: Molecule, heavy: np.ndarray) -> bool:
     if molecule.kind == "linear" or len(heavy) != 3:
         return molecule.kind == "linear" and len(heavy) == 2
     mass, where = molecule.masses[heavy], molecule.positions_body[heavy]
-    side = [
-        float(np.linalg.norm(where[k - 1] - where[k - 2])) for k in range(3)
-    ]  # opposite to point k
+    # opposite to point k
+    side = [float(np.linalg.norm(where[k - 1] - where[k - 2])) for k in range(3)]
     return all(
         abs(side[k - 1] - side[k - 2]) > ISOSCELES * side[k - 1]
         or abs(mass[k - 1] - mass[k - 2]) <= SAME * mass[k - 1]
@@ -245,10 +246,8 @@ def _can_be_points(molecule: Molecule, heavy: np.ndarray) -> bool:
 def _virtual_site(points: np.ndarray, where: np.ndarray, limit: float) -> VirtualSite:
     if len(points) == 1:
         return VirtualSite(np.ones(1), 0.0)
-    weight, cross = (
-        np.linalg.lstsq((points[1:] - points[0]).T, where - points[0], rcond=None)[0],
-        0.0,
-    )
+    weight = np.linalg.lstsq((points[1:] - points[0]).T, where - points[0], rcond=None)[0]
+    cross = 0.0
     if len(points) == 3:
         normal = np.cross(points[1] - points[0], points[2] - points[0])
         length = float(np.linalg.norm(normal))

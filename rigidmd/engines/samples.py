@@ -97,9 +97,8 @@ class Sample(NamedTuple):
         float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")
     ]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
-    user_energies: tuple[
-        float, ...
-    ] = ()  # of user-defined forces, kJ/mol; then distances, Å, and OF_TRAJECTORIES
+    # of user-defined forces, kJ/mol; then distances, Å, and OF_TRAJECTORIES
+    user_energies: tuple[float, ...] = ()
 
 
 _HINTS = get_type_hints(Sample, include_extras=True)
@@ -150,7 +149,7 @@ def more_columns(names: Sequence[str]) -> dict[str, Column]:
         return Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")
 
     distances = dict(
-        distance_column(int(found[1])) for name in names if (found := DISTANCE.fullmatch(name))
+        distance_column(int(match[1])) for name in names if (match := DISTANCE.fullmatch(name))
     )
     return {name: (OF_TRAJECTORIES | distances).get(name) or energy(name) for name in names}
 
@@ -330,10 +329,10 @@ class Samples(SampleTable):
 
     def of_stage(self, k: int) -> "Samples":
         """The samples of stage k, which are contiguous."""
-        found, width = Samples(self.stages, self.user_terms), len(self._numbers)
+        samples, width = Samples(self.stages, self.user_terms), len(self._numbers)
         if len(rows := np.flatnonzero(self._column("stage") == k)):
-            found._values = self._values[rows[0] * width : (rows[-1] + 1) * width]
-        return found
+            samples._values = self._values[rows[0] * width : (rows[-1] + 1) * width]
+        return samples
 
     def table(self) -> np.ndarray:
         """A copy of all numbers (rows, columns) as float64, which represents each of them
@@ -387,12 +386,15 @@ def describe_equilibrated(
     """The equilibrated part of a stage that began at a time (ps), such as "the last 14.2 of 20
     ps"."""
     time, start = of_stage["time"], equilibrated_from(of_stage, stage)
-    whole = f"all {time[-1] - begin:.4g} ps"
+    all_of_stage = f"all {time[-1] - begin:.4g} ps"
     if stage.ramps:
-        return f"{whole}, in which the set point changes"
+        return f"{all_of_stage}, in which the set point changes"
     if len(time) < LEAST_SAMPLES:
-        return f"{whole}, too short to detect equilibration"
-    part = f"the last {time[-1] - time[start]:.4g} of {time[-1] - begin:.4g} ps" if start else whole
+        return f"{all_of_stage}, too short to detect equilibration"
+    if start:
+        part = f"the last {time[-1] - time[start]:.4g} of {time[-1] - begin:.4g} ps"
+    else:
+        part = all_of_stage
     drifts = any(
         least_error_from(values) == len(time) // 2 for values in _slow_series(of_stage, stage)
     )

@@ -17,6 +17,7 @@ from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.parts import Tail, gather_per_molecule
+from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
@@ -54,9 +55,8 @@ class System:
     constants: dict[str, float]  # constant energies, u Å²/ps²
     constant_pressure: float  # a constant part of the pressure, u/(Å ps²)
     tail: Tail | None  # the tail correction, where the scene requests it
-    residue_number: (
-        np.ndarray
-    )  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
+    #: (n,) numbers by which a scene may select molecules: see Molecules.frozen
+    residue_number: np.ndarray
     from_lattice: bool
     left_out: list[str]
     precision_reason: str = ""  # where the scene has precision = "auto"
@@ -65,13 +65,11 @@ class System:
     )
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)  # of what is allowed and probably not meant
-    python_forces: dict[str, Callable] = field(
-        default_factory=dict
-    )  # name of a term that Python computes -> function
+    #: Name of a term that Python computes -> function
+    python_forces: dict[str, Callable] = field(default_factory=dict)
     thermostat: Any = None  # user-defined, in place of the thermostat of every stage
-    user_terms: dict[str, str] = field(
-        default_factory=dict
-    )  # name of a user-defined term -> description
+    #: Name of a user-defined term -> description
+    user_terms: dict[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<System of {self.scene.in_short}>"
@@ -115,13 +113,14 @@ class System:
     @property
     def external(self) -> list[str]:
         """Names of the terms of external fields, which may change the total momentum."""
-        return [name for name, term in self.terms.items() if hasattr(term, "changes_momentum")]
+        terms = self.terms.items()
+        return [name for name, term in terms if trait(term, "changes_momentum") is not None]
 
     @property
     def position_dependent(self) -> list[str]:
         """Names of the terms whose energy depends on positions in the lab, which exclude a
         barostat. A field is among them only if a molecule has a net charge."""
-        return [name for name, term in self.terms.items() if getattr(term, "tied_to_places", False)]
+        return [name for name, term in self.terms.items() if trait(term, "tied_to_places")]
 
     @property
     def distances(self) -> dict[str, DistanceRestraint]:
@@ -145,11 +144,9 @@ class System:
         """Time between removals of the total momentum, ps; None for never, also where every
         thermostat changes it."""
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
-        return (
-            (self.scene.run.remove_momentum_interval_ps or None)
-            if any(map(self.keeps_momentum_in, moving))
-            else None
-        )
+        if any(map(self.keeps_momentum_in, moving)):
+            return self.scene.run.remove_momentum_interval_ps or None
+        return None
 
     def keeps_momentum_in(self, k: int) -> bool:
         """Whether the thermostat of stage k leaves the total momentum as it is."""
@@ -204,16 +201,15 @@ class System:
         names = State._fields[:5]
         arrays = {name: np.asarray(getattr(state, name)) for name in names}
         shapes = {name: getattr(self.state, name).shape for name in names}
-        if found := array_errors(arrays, shapes):
+        if problems := array_errors(arrays, shapes):
             about = f"the scene has {len(self.state.position)} molecules"
-            return [f"{name} of the state {problem}; {about}" for name, problem in found.items()]
+            return [f"{name} of the state {problem}; {about}" for name, problem in problems.items()]
         cell = arrays["cell"]
         if np.isfinite(cell).all() != np.isfinite(self.state.cell).all():
             return ["one of scene and state has a periodic box, and the other has none"]
         half = min(space_of(cell).edges) / 2
-        reach = [
-            term.potential.cutoff for term in self.terms.values() if isinstance(term, PairForces)
-        ]  # type: ignore[attr-defined]
+        pair_terms = [term for term in self.terms.values() if isinstance(term, PairForces)]
+        reach = [term.potential.cutoff for term in pair_terms]  # type: ignore[attr-defined]
         return [
             f"half the shortest edge of its box, {half:.4g} Å, is below the cutoff of {r:g} Å"
             for r in reach
@@ -244,8 +240,8 @@ class System:
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of
         mass inside the box."""
-        whole = state._replace(position=self.centres(state, wrapped))
-        return self.positions_of(whole, self.sites.molecule, self.sites.offset_body)
+        placed = state._replace(position=self.centres(state, wrapped))
+        return self.positions_of(placed, self.sites.molecule, self.sites.offset_body)
 
     def positions_of(
         self, state: State, molecule: np.ndarray, offset_body: np.ndarray

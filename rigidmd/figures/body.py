@@ -311,9 +311,8 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
         )
     axis.axhline(np.finfo(float).eps, color=FAINT, lw=0.8, ls=":")
     axis.set_yscale("log")
-    axis.yaxis.set_major_formatter(
-        "{x:.0e}"
-    )  # as in the legend; powers of ten as formulas are slow to draw
+    # as in the legend; powers of ten as formulas are slow to draw
+    axis.yaxis.set_major_formatter("{x:.0e}")
     axis.set_ylim(FLOOR / 2, max(1e-13, 5 * max(np.nanmax(error) for error in errors.values())))
     note = f"largest of each {size} samples; " if size > 1 else ""
     axis.set_title(

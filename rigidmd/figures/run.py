@@ -41,9 +41,8 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
     shown = moving(stages, samples["stage"])
     column = {name: samples[name][shown] for name in DRAWN}
     time, stage = column["time"], samples["stage"][shown]
-    known = bool(
-        np.isfinite(column["drift"][stage == stage[-1]]).any()
-    )  # an external engine may not report it
+    # an external engine may not report it
+    known = bool(np.isfinite(column["drift"][stage == stage[-1]]).any())
     figure = new_figure(8, 7, title=f"{system.scene.name}: {n} molecules")
     axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :], sharex=True)
     *_, parts, temperature = axes

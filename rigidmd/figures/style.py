@@ -53,9 +53,8 @@ class InPieces:
 
     def draw_path(self, renderer, gc, path, affine, rgbFace=None):
         sides = len(path.vertices) - 1
-        pieces = -(
-            -sides // (AT_ONCE - 1)
-        )  # of equal length: a short level one would be snapped to whole pixels
+        # of equal length: a short level one would be snapped to whole pixels
+        pieces = -(-sides // (AT_ONCE - 1))
         for first, last in pairwise(sides * k // pieces for k in range(pieces + 1)):
             piece = type(path)(path.vertices[first : last + 1])
             piece.simplify_threshold = path.simplify_threshold

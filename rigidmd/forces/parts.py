@@ -30,9 +30,8 @@ class SystemParts(NamedTuple):
     space: Space
     state: State  # the start
     number: np.ndarray  # (n,) residue numbers, by which a scene selects molecules
-    basis: (
-        np.ndarray
-    )  # (3, 3) integers: the edges of the box in terms of the edges of the given cell
+    # (3, 3) integers: the edges of the box in terms of the edges of the given cell
+    basis: np.ndarray
     grid: Grid | None  # of PME, along the edges of the box
 
     @property

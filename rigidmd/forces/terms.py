@@ -8,7 +8,8 @@ one file with a NamedTuple and an `@implements(add_forces)`, a new pair potentia
 `@implements(pair_loop.pair)`.
 """
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import literal_unroll
@@ -38,47 +39,99 @@ class Setup(NamedTuple):
     needs_virials: bool  # whether virials will be needed without energies
 
 
-def workspace_of(term: NamedTuple, setup: Setup) -> NamedTuple:
-    """The workspace of a term, with nothing compiled yet; the term itself if it needs none."""
-    return term.workspace(setup) if hasattr(term, "workspace") else term
+class Term:
+    """What a force term and its workspace may have, besides an implementation of `add_forces`.
+
+    A term has what is given here unless it defines it. A named tuple cannot inherit: `trait` finds
+    an attribute of either.
+    """
+
+    # of a term
+
+    #: Components (3,) of the total momentum that it changes; None unless it is an external field.
+    changes_momentum: np.ndarray | None = None
+    #: Whether its energy depends on positions in the lab, which excludes a barostat.
+    tied_to_places = False
+    #: Whether it is an interaction of charges.
+    acts_on_charges = False
+    #: Whether its energy depends on time; then there is an implementation of `power` or
+    #: `energy_rate` for it.
+    time_dependent = False
+
+    def workspace(self, setup: Setup):
+        """Its workspace, with nothing compiled yet."""
+        return self
+
+    # of a workspace
+
+    #: An array that is used only while forces are computed, which terms share by `with_scratch`.
+    scratch: np.ndarray | None = None
+
+    def with_scratch(self, array: np.ndarray):
+        """The workspace with this array, at least as large as its own, as scratch."""
+        return self
+
+    def with_code(self):
+        """The workspace with its machine code."""
+        return self
+
+    def with_capacity(self, cell: np.ndarray):
+        """The workspace with the capacity that it needed, for a cell (3, 3). May raise
+        SimulationError."""
+        return self
+
+    def checkpoint_arrays(self) -> dict[str, np.ndarray]:
+        """Arrays on which the next forces depend besides the state."""
+        return {}
+
+    def restore(self, arrays: dict[str, np.ndarray], skin: float, now: float):
+        """The workspace, which has machine code, with its `checkpoint_arrays`.
+
+        skin : of neighbour lists, as requested, Å
+        now : the present time, ps
+
+        Raises ValueError if the arrays do not fit.
+        """
+        if arrays:
+            raise ValueError(f"{type(self).__name__} has no checkpoint arrays")
+        return self
+
+    def passes(self, into: "Evaluation") -> list[Pass]:
+        """Its passes: here one that calls `add_forces`."""
+        state, load, tally, status = into
+        plain, tallied = (self, state, load, status), (self, state, load, tally, status)
+        return [
+            Pass("add forces", _add_plain, plain, when=FORCES_ONLY),
+            Pass("add forces and energies", _add_tallied, tallied, when=TALLIED),
+        ]
 
 
-def with_code(workspace: NamedTuple) -> NamedTuple:
-    return workspace.with_code() if hasattr(workspace, "with_code") else workspace
-
-
-def with_capacity(workspace: NamedTuple, cell: np.ndarray) -> NamedTuple:
-    """The workspace with the capacity that it needed, for a cell (3, 3). May raise
-    SimulationError."""
-    return workspace.with_capacity(cell) if hasattr(workspace, "with_capacity") else workspace
+def trait(term: Any, name: str) -> Any:
+    """An attribute of a term, of its workspace or of a class of these; else that of `Term`."""
+    if hasattr(term, name):
+        return getattr(term, name)
+    default = getattr(Term, name)
+    return partial(default, term) if callable(default) else default
 
 
 def with_common_scratch(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple, ...]:
-    """The workspaces with one common scratch array, the largest of theirs, for use while forces are
-    computed."""
-    arrays = [workspace.scratch for workspace in workspaces if hasattr(workspace, "scratch")]
+    """The workspaces with one common scratch array, the largest of theirs."""
+    arrays = [trait(workspace, "scratch") for workspace in workspaces]
+    arrays = [array for array in arrays if array is not None]
     if not arrays:
         return workspaces
     largest = max(arrays, key=np.size)
-    return tuple(w.with_scratch(largest) if hasattr(w, "scratch") else w for w in workspaces)
-
-
-def checkpoint_arrays(workspace: NamedTuple) -> dict[str, np.ndarray]:
-    """Arrays on which the next forces depend besides the state, for `restored`; most workspaces
-    have none."""
-    return workspace.checkpoint_arrays() if hasattr(workspace, "checkpoint_arrays") else {}
+    return tuple(trait(workspace, "with_scratch")(largest) for workspace in workspaces)
 
 
 def restored(
     workspace: NamedTuple, arrays: dict[str, np.ndarray], skin: float, now: float
 ) -> NamedTuple:
-    """The workspace, which has machine code, with its `checkpoint_arrays`. Raises ValueError if
-    these do not fit. skin : of neighbour lists, as requested, Å. now : the present time, ps"""
-    if bool(arrays) != hasattr(workspace, "checkpoint_arrays"):
-        raise ValueError(
-            f"{type(workspace).__name__} {'lacks' if not arrays else 'has no'} checkpoint arrays"
-        )
-    return workspace.restore(arrays, skin, now) if arrays else workspace
+    """The workspace with its checkpoint arrays, see `Term.restore`. Raises ValueError if these do
+    not fit."""
+    if not arrays and hasattr(workspace, "checkpoint_arrays"):
+        raise ValueError(f"{type(workspace).__name__} lacks checkpoint arrays")
+    return trait(workspace, "restore")(arrays, skin, now)
 
 
 def add_forces(term, state, load, tally):
@@ -98,8 +151,11 @@ def worse_status(status, other):
 @chosen_by_type
 def power(term, state, velocity, omega):
     """Power of a term whose class has `time_dependent = True`; 0 for any other, since its energy
-    includes its work. velocity (lab axes) and omega (body axes) : tuples, relative to the frame"""
-    if not getattr(term.instance_class, "time_dependent", False):
+    includes its work.
+
+    velocity, omega : tuples, along the axes of the lab and of the body, relative to the frame
+    """
+    if not trait(term.instance_class, "time_dependent"):
         return lambda term, state, velocity, omega: 0.0
 
 
@@ -107,7 +163,7 @@ def power(term, state, velocity, omega):
 def energy_rate(term, state):
     """dU/dt at fixed positions of a term of molecules whose class has `time_dependent = True`; 0
     for any other."""
-    if not getattr(term.instance_class, "time_dependent", False):
+    if not trait(term.instance_class, "time_dependent"):
         return lambda term, state: 0.0
 
 
@@ -137,22 +193,6 @@ class Evaluation(NamedTuple):
     load: Load
     tally: np.ndarray  # (10,) of the term
     status: np.ndarray  # (1,) of the program
-
-
-def passes_of(workspace: NamedTuple, into: Evaluation) -> list[Pass]:
-    """The passes of a term: those that it has, or one that calls `add_forces`."""
-    if hasattr(workspace, "passes"):
-        return workspace.passes(into)
-    state, load, tally, status = into
-    return [
-        Pass("add forces", _add_plain, (workspace, state, load, status), when=FORCES_ONLY),
-        Pass(
-            "add forces and energies",
-            _add_tallied,
-            (workspace, state, load, tally, status),
-            when=TALLIED,
-        ),
-    ]
 
 
 @task()
@@ -215,11 +255,11 @@ class TermDispatcher:
     def _passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
         found: list[Pass] = []
         for workspace, tally in zip(workspaces, self._tallies, strict=True):
-            found += passes_of(workspace, Evaluation(state, load, tally, self._status))
+            found += trait(workspace, "passes")(Evaluation(state, load, tally, self._status))
         return found
 
     def _rate_passes(self, workspaces: tuple[NamedTuple, ...], state: State) -> list[Pass]:
-        dependent = [w for w in workspaces if getattr(type(w), "time_dependent", False)]
+        dependent = [w for w in workspaces if trait(type(w), "time_dependent")]
         return [
             Pass("rate of the energy", _add_rate, (w, state, self._power))
             for w in dependent

@@ -14,11 +14,13 @@ from rigidmd.errors import CheckpointError, option
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 
 #: Version of the format. Version 1 (rigidmd 0.1) named observers by their number; 2 had no record
-#: of the run.
-SCHEMA = 3
+#: of the run; 3 had other names.
+SCHEMA = 4
 #: Members besides the arrays of the run: all other values as JSON, and names, lengths and CRC-32 of
 #: all other members.
-JSON, CONTENTS = "told", "contents"
+JSON, CONTENTS = "values", "contents"
+#: The name of JSON in version 3.
+FORMER_JSON = "told"
 
 
 class Checkpoint(NamedTuple):
@@ -28,12 +30,12 @@ class Checkpoint(NamedTuple):
     def of(self, owner: str) -> "Checkpoint":
         """The part of one owner, whose arrays have names of the form owner/name."""
         start = f"{owner}/"
-        found = {
+        arrays = {
             name.removeprefix(start): array
             for name, array in self.arrays.items()
             if name.startswith(start)
         }
-        return Checkpoint(dict(self.values["of"].get(owner, {})), found)
+        return Checkpoint(dict(self.values["of"].get(owner, {})), arrays)
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
@@ -73,7 +75,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
                 raise ValueError("its contents differ from those that were written")
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files if name != CONTENTS}
-        values = json.loads(arrays.pop(JSON).tobytes())
+        name = JSON if JSON in arrays else FORMER_JSON
+        values = json.loads(arrays.pop(name).tobytes())
         schema = int(values.pop("schema"))
     except (
         Exception
@@ -103,14 +106,13 @@ def latest(folder: Path) -> tuple[Checkpoint, list[str]]:
                 return read_checkpoint(path), errors
             except CheckpointError as error:
                 errors.append(str(error))
-    there = (
-        sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-        if folder.is_dir()
-        else []
-    )
+    if folder.is_dir():
+        file_names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    else:
+        file_names = []
     if errors:
         raise CheckpointError("; ".join(errors) + f". The run cannot be resumed from {folder}")
-    listed = f"it holds {', '.join(there)}" if there else "it is empty"
+    listed = f"it holds {', '.join(file_names)}" if file_names else "it is empty"
     raise CheckpointError(
         f"{folder} holds no checkpoint ({listed}); {option('force')} begins the run again"
     )

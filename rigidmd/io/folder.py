@@ -51,11 +51,10 @@ def check_folder(
         if not (folder / marker).is_file():
             raise OutputError(f"{folder} is not empty and holds no earlier {what}; {elsewhere()}")
         if not force:
-            resume = (
-                f"{resume_command(folder)} continues it, "
-                if (folder / CHECKPOINT).is_file()
-                else ""
-            )
+            if (folder / CHECKPOINT).is_file():
+                resume = f"{resume_command(folder)} continues it, "
+            else:
+                resume = ""
             advice = f"{resume}{option('force')} replaces it, {elsewhere()}"
             raise OutputError(f"{folder} holds an earlier {what}; {advice}")
         replaced = {(folder / name).resolve() for name in written_by_runs(folder, marker)}
@@ -146,9 +145,8 @@ class FolderLock:
 
     def __init__(self, folder: Path):
         self._folder = folder
-        self._lock = FileLock(
-            folder / LOCK, timeout=0, thread_local=False
-        )  # any thread may end a run
+        # any thread may end a run
+        self._lock = FileLock(folder / LOCK, timeout=0, thread_local=False)
 
     @property
     def is_taken(self) -> bool:
@@ -185,9 +183,8 @@ def never_began(folder: Path) -> bool:
         return False
     log = folder / LOG
     with writing(log, "read"):
-        is_short = (
-            not unreadable_reason(log, 1e5) and len(log.read_bytes().splitlines()) <= 2
-        )  # its header, its start
+        # its header, its start
+        is_short = not unreadable_reason(log, 1e5) and len(log.read_bytes().splitlines()) <= 2
     return is_short or not log.exists()
 
 
@@ -201,10 +198,10 @@ class RunMark:
 
     def _last_written(self) -> tuple[int, int] | None:
         try:
-            found = (self._folder / SCENE).stat()
+            status = (self._folder / SCENE).stat()
         except OSError:
             return None
-        return found.st_ino, found.st_mtime_ns
+        return status.st_ino, status.st_mtime_ns
 
     @property
     def is_there(self) -> bool:

@@ -102,11 +102,9 @@ class Bar(tqdm):
     @property
     def left(self) -> str:
         """The remaining time as text; empty before the first advance."""
-        return (
-            f", {tqdm.format_interval(round((self.total - self.n) / self.rate))} left"
-            if self.rate > 0
-            else ""
-        )
+        if self.rate > 0:
+            return f", {tqdm.format_interval(round((self.total - self.n) / self.rate))} left"
+        return ""
 
 
 class _NotebookBar(Bar):

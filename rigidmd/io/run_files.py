@@ -133,17 +133,17 @@ class Columns(NamedTuple):
         """A column as numbers. An empty cell is NaN, or an error if all must be `finite`. Raises
         OutputError."""
         try:
-            found = np.array([float(cell or "nan") for cell in self.cells[header]])
+            values = np.array([float(cell or "nan") for cell in self.cells[header]])
         except ValueError:
             raise OutputError(
                 f"{self.path}: column {header!r} has a cell that is not a number"
             ) from None
         empty = np.array([not cell for cell in self.cells[header]], bool)
-        if not ((np.abs(found) <= LARGEST_NUMBER) | (empty & (not finite))).all():
+        if not ((np.abs(values) <= LARGEST_NUMBER) | (empty & (not finite))).all():
             raise OutputError(
                 f"{self.path}: column {header!r} has a cell that is not a finite number below 1e100"
             )
-        return found
+        return values
 
 
 def read_columns(path: Path) -> Columns | None:
@@ -163,9 +163,10 @@ def read_columns(path: Path) -> Columns | None:
 def read_motion(path: Path) -> Columns | None:
     """motion.csv as `read_columns`, its columns by their names in Python, as far as they are known;
     of any version."""
-    found = read_columns(path)
-    return found and Columns(
-        path, {samples.BODY_HEADERS.get(header, header): c for header, c in found.cells.items()}
+    columns_read = read_columns(path)
+    return columns_read and Columns(
+        path,
+        {samples.BODY_HEADERS.get(header, header): c for header, c in columns_read.cells.items()},
     )
 
 
@@ -194,11 +195,9 @@ def columns(tensor: bool = True, user_terms: Sequence[str] = ()) -> dict[str, st
     `Samples`"""
     described = samples.COLUMNS | samples.more_columns(user_terms)
     written = {name: column.header for name, column in described.items() if column.header}
-    return (
-        written
-        if tensor
-        else {name: header for name, header in written.items() if name not in TENSOR}
-    )
+    if tensor:
+        return written
+    return {name: header for name, header in written.items() if name not in TENSOR}
 
 
 class Log(AppendedFile):
@@ -286,10 +285,10 @@ class TensorFile(AppendedFile):
 
 def read_tensor(path: Path) -> np.ndarray | None:
     """Complete lines (n, 7) of pressure_tensor.csv; None without a file. Raises OutputError."""
-    if (found := read_columns(path)) is None:
+    if (columns_read := read_columns(path)) is None:
         return None
-    if list(found.cells) != HEADER:
+    if list(columns_read.cells) != HEADER:
         raise OutputError(
             f"{path} is not a pressure tensor of rigidmd: its columns must be {', '.join(HEADER)}"
         )
-    return np.array([found.numbers(header, finite=True) for header in HEADER]).T
+    return np.array([columns_read.numbers(header, finite=True) for header in HEADER]).T

@@ -11,8 +11,8 @@ import tomli_w
 
 from rigidmd.core.files import atomic_file, write_text
 from rigidmd.core.toml import plain_values
+from rigidmd.formats import STRUCTURE
 from rigidmd.io.folder import SCENE
-from rigidmd.io.formats import STRUCTURE
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.base import override
 from rigidmd.scene.models import MoleculeFile

@@ -1,5 +1,5 @@
 """The atoms of a structure file of any format, read through ASE or by the readers in
-`io.formats`."""
+`formats`."""
 
 import bz2
 import codecs
@@ -16,10 +16,10 @@ import numpy as np
 from rigidmd.core.files import unreadable_reason
 from rigidmd.core.process import format_gigabytes, memory_shortage
 from rigidmd.errors import UNPRINTABLE
-from rigidmd.io.formats import BY_CONTENT, BY_EXTENSION, TOPOLOGIES, Format, format_of
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of, structure_error
-from rigidmd.io.formats.through_ase import from_ase, read_by_ase, read_text_by_ase
-from rigidmd.io.formats.through_mdanalysis import index_of, read_in_process
+from rigidmd.formats import BY_CONTENT, BY_EXTENSION, TOPOLOGIES, Format, format_of
+from rigidmd.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of, structure_error
+from rigidmd.formats.through_ase import from_ase, read_by_ase, read_text_by_ase
+from rigidmd.formats.through_mdanalysis import index_of, read_in_process
 from rigidmd.scene.validation import not_none
 
 FARTHEST = 1e9  # Å, of an atom from the origin
@@ -113,9 +113,9 @@ def _read_trajectory(
             path, f"holds no names of atoms, and {missing}: name a file by structure.topology"
         )
     atoms = read_atoms(topology, None, atom_types)
-    found = read_in_process(form.read_arrays, path, frame, len(atoms.names))
+    arrays = read_in_process(form.read_arrays, path, frame, len(atoms.names))
     return atoms._replace(
-        position=found["position"], velocity=found.get("velocity"), cell=found.get("cell")
+        position=arrays["position"], velocity=arrays.get("velocity"), cell=arrays.get("cell")
     )
 
 

@@ -25,11 +25,11 @@ from rigidmd.core.state import State
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError, SimulationError, StructureError
-from rigidmd.io.formats import BY_EXTENSION, written
-from rigidmd.io.formats.atoms import Frame
-from rigidmd.io.formats.bonds import charges, connections
-from rigidmd.io.formats.frame_file import FrameFile
-from rigidmd.io.formats.through_mdanalysis import (
+from rigidmd.formats import BY_EXTENSION, written
+from rigidmd.formats.atoms import Frame
+from rigidmd.formats.bonds import charges, connections
+from rigidmd.formats.frame_file import FrameFile
+from rigidmd.formats.through_mdanalysis import (
     dimensions,
     read_in_process,
     set_frame,
@@ -68,10 +68,8 @@ def in_memory(system: System | BodySystem, frames: Sequence[Frame]) -> mda.Unive
     """A Universe of frames in memory, each with its time and box."""
     u = universe(system, system.state)
     _connect(u, system)
-    times, positions = (
-        _checked([frame.time for frame in frames]),
-        np.array([frame.positions for frame in frames]),
-    )
+    times = _checked([frame.time for frame in frames])
+    positions = np.array([frame.positions for frame in frames])
     boxes = None if u.dimensions is None else np.array([dimensions(frame.cell) for frame in frames])
     velocities = np.array([frame.velocities for frame in frames])
     u.trajectory = timed(MemoryReader)(
@@ -166,10 +164,10 @@ def _read(function: Callable[..., T], path: Path, sites: int, *arguments: Any) -
     raise OutputError(f"{path} cannot be read as a trajectory: {reason}")
 
 
-def _frames(path: Path, sites: int, most: int) -> Frames:
+def _frames(path: Path, sites: int, frame_limit: int) -> Frames:
     with contextlib.closing(_opened(path, sites)) as reader:
         count = reader.n_frames
-        stride = max(1, -(-count // most))
+        stride = max(1, -(-count // frame_limit))
         selected = range(0, count, stride)
         times, boxes = [], []
         positions = np.empty((len(selected), sites, 3), np.float32)
@@ -234,11 +232,11 @@ def _times_and_cells_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]
     with path.open("rb") as file:
         for line in file:
             if (b"Time=" in line or line.startswith(b"REMARK")) and (
-                found := re.search(pattern, line)
+                match := re.search(pattern, line)
             ):
-                times.append(float(found[2]))
-                if found[1]:
-                    cells.append(np.array(found[1].split(), float).reshape(3, 3))
+                times.append(float(match[2]))
+                if match[1]:
+                    cells.append(np.array(match[1].split(), float).reshape(3, 3))
     return times, cells
 
 
@@ -291,11 +289,11 @@ class SiteReader(ReaderBase):
     def _read_frame(self, i):
         if not 0 <= i < self.n_frames:
             raise OSError(f"frame {i} does not exist")
-        found = self._file.frame(i)
-        if len(found.positions) != self.n_atoms:
+        stored = self._file.frame(i)
+        if len(stored.positions) != self.n_atoms:
             raise ValueError(f"frame {i + 1} has another number of sites")
         self._frame = self.ts.frame = i
-        set_frame(self.ts, found)
+        set_frame(self.ts, stored)
         return self.ts
 
     def _read_next_timestep(self, ts=None):
@@ -309,9 +307,8 @@ class _WithTimes(ProtoReader):
     def __init__(self, *source, times: list[float], **options):
         self._times = times
         self._dt = float(times[1] - times[0]) if len(times) > 1 else 0.0
-        super().__init__(
-            *source, **options | {"times": times}
-        )  # a reader passes its options to its copies
+        # a reader passes its options to its copies
+        super().__init__(*source, **options | {"times": times})
         self._set_time(self.ts)
 
     @property
@@ -345,11 +342,10 @@ class _WithoutOffsetsFile:
 def reader_of(extension: str) -> Any:
     """MDAnalysis' class of readers of a format."""
     form = BY_EXTENSION[extension]
-    reader = (
-        SiteReader
-        if form.reader
-        else get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
-    )
+    if form.reader:
+        reader = SiteReader
+    else:
+        reader = get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
     return _subclass(_WithoutOffsetsFile, reader) if issubclass(reader, XDRBaseReader) else reader
 
 
@@ -386,10 +382,8 @@ def write_topology(path: Path, system: System | BodySystem, state: State, wrappe
     positions = system.site_positions(state, wrapped)
     others = written(lambda form: form.write_topology and form.exceeded(positions) is None)
     _check_fits(path, positions, "output.topology", others)
-    with (
-        atomic_file(path) as temporary,
-        ignore_warnings(),
-    ):  # of missing attributes (occupancies, ...)
+    # warnings of missing attributes (occupancies, ...)
+    with atomic_file(path) as temporary, ignore_warnings():
         write = not_none(BY_EXTENSION[path.suffix].write_topology)
         write(temporary, universe(system, state, wrapped).select_atoms("all"))
 

@@ -128,13 +128,13 @@ class Table(NamedTuple):
         """The table for a terminal, without columns that have no values. left : indices of columns
         aligned left"""
         _, cells = self.shown()
-        kept = [
-            k for k in range(len(self.columns)) if any(line[k] not in ("", "-") for line in cells)
-        ]
-        lines = [[column.short or column.header for column in self.columns], *cells]
-        return columns_text(
-            [[line[k] for k in kept] for line in lines], [kept.index(k) for k in left if k in kept]
-        )
+        count = len(self.columns)
+        filled = [any(line[k] not in ("", "-") for line in cells) for k in range(count)]
+        shown_columns = [k for k in range(count) if filled[k]]
+        header = [column.short or column.header for column in self.columns]
+        lines = [[line[k] for k in shown_columns] for line in (header, *cells)]
+        aligned_left = [shown_columns.index(k) for k in left if k in shown_columns]
+        return columns_text(lines, aligned_left)
 
     def write(self, path: Path, quoting: Any = csv.QUOTE_MINIMAL) -> None:
         """Write the table as CSV. Raises OutputError."""

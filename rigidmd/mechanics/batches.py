@@ -320,9 +320,8 @@ def _rotate_lanes(constants, about, rotation, angular_momentum_body, first, mome
             angle, sign, L1, L2, q1, q2, q4, q5, q7, q8
         )
     x, y, z = _from_rotor_axes((L0, L1, L2), axes)
-    unchanged = (
-        load(constants, RATE * LANES) == 0.0
-    )  # its momentum is kept, with the signs of zeros
+    # its momentum is kept, with the signs of zeros
+    unchanged = load(constants, RATE * LANES) == 0.0
     unchanged = (
         unchanged
         & (load(constants, (RATE + 1) * LANES) == 0.0)

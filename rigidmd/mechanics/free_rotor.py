@@ -25,9 +25,8 @@ class SplitRotor(NamedTuple):
     inverse_inertia: np.ndarray  # (species, 3), 1/(u Å²); 0 where the moment is 0
     symmetry: np.ndarray  # (species,) SPHERICAL, or the axis of symmetry 0, 1, 2, or NO_SYMMETRY
     common: np.ndarray  # (species,) g
-    excess: (
-        np.ndarray
-    )  # (species, 3) 1/I - g; 0 for linear bodies, which have no momentum along their axis
+    # (species, 3) 1/I - g; 0 for linear bodies, which have no momentum along their axis
+    excess: np.ndarray
     order: np.ndarray  # (species, 3) axes a, b, c
 
 

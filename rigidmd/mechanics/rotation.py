@@ -48,9 +48,8 @@ def to_quaternion(rotation: np.ndarray) -> np.ndarray:
     largest = np.diagonal(products, axis1=-2, axis2=-1).argmax(axis=-1)
     row = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
     first = np.take_along_axis(row, (row != 0).argmax(axis=-1)[..., None], axis=-1)
-    return (
-        np.sign(first) * row / np.linalg.norm(row, axis=-1, keepdims=True) + 0.0
-    )  # + 0.0: no -0 among the zeros
+    # + 0.0: no -0 among the zeros
+    return np.sign(first) * row / np.linalg.norm(row, axis=-1, keepdims=True) + 0.0
 
 
 def from_vector(vector: np.ndarray) -> np.ndarray:
@@ -92,9 +91,8 @@ def to_euler_angles(rotation: np.ndarray) -> np.ndarray:
     sin_theta = np.hypot(q[..., 0, 2], q[..., 1, 2])
     locked = sin_theta == 0
     phi = np.where(locked, _angle(q[..., 1, 0], q[..., 0, 0]), _angle(q[..., 0, 2], -q[..., 1, 2]))
-    row = (
-        np.cos(phi)[..., None] * q[..., 0, :] + np.sin(phi)[..., None] * q[..., 1, :]
-    )  # (cos psi, -sin psi, 0)
+    # (cos psi, -sin psi, 0)
+    row = np.cos(phi)[..., None] * q[..., 0, :] + np.sin(phi)[..., None] * q[..., 1, :]
     psi = np.where(locked, 0.0, _angle(-row[..., 1], row[..., 0]))
     return np.stack([phi, np.arctan2(sin_theta, q[..., 2, 2]), psi], axis=-1) + 0.0  # + 0.0: no -0
 

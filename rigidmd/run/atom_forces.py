@@ -22,8 +22,8 @@ from rigidmd.engines.observables import observe
 from rigidmd.engines.system import System
 from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
-from rigidmd.io.formats import format_of
-from rigidmd.io.formats.through_ase import EV, atoms_of_sites, atoms_of_system
+from rigidmd.formats import format_of
+from rigidmd.formats.through_ase import EV, atoms_of_sites, atoms_of_system
 from rigidmd.mechanics.rotation import hat
 from rigidmd.run.force_errors import forces_inside
 from rigidmd.run.rigid_fit import kinds_of
@@ -62,21 +62,22 @@ def atoms_of_results(
     def with_logged_energy(atoms: "ase.Atoms", time: float) -> "ase.Atoms":
         """Atoms with the energy of the log, if it has a line at their time."""
         if len(same := np.flatnonzero(_same(results["time"], time))):
-            energy = (
-                results["potential"][same[-1]] * KJ_PER_MOL / EV
-            )  # after a minimisation that begins then
+            # after a minimisation that begins then
+            energy = results["potential"][same[-1]] * KJ_PER_MOL / EV
             atoms.calc = SinglePointCalculator(atoms, energy=float(energy))
         return atoms
 
     def final() -> "ase.Atoms":
         """The final state, exactly, with its energy, forces and stress."""
         state = results.state
-        found = atoms_of_system(system, state, system.scene.output.positions == "wrapped")
-        found.info["time_ps"] = float(state.time[NOW])
+        last_atoms = atoms_of_system(system, state, system.scene.output.positions == "wrapped")
+        last_atoms.info["time_ps"] = float(state.time[NOW])
         if results._is_stored:
-            return with_logged_energy(found, float(state.time[NOW]))
-        found.calc = SinglePointCalculator(found, **ase_results(system, system.engine(), state))
-        return found
+            return with_logged_energy(last_atoms, float(state.time[NOW]))
+        last_atoms.calc = SinglePointCalculator(
+            last_atoms, **ase_results(system, system.engine(), state)
+        )
+        return last_atoms
 
     if frame is None:
         return final()
@@ -85,14 +86,14 @@ def atoms_of_results(
             "this run has no frames (output.trajectory = false); atoms() is the final state"
         )
     indices, sites = _frame_indices(frame, len(frames)), _sites_of_frames(results)
-    found, last = [], results._state
+    frames_read, last = [], results._state
     for k in indices:
         time = frames[k].time
         if k == len(frames) - 1 and last is not None and _same(time, float(last.time[NOW])):
-            found.append(final())
+            frames_read.append(final())
         else:
-            found.append(with_logged_energy(atoms_of_sites(system, *sites(k), time), time))
-    return found if isinstance(indices, range) else found[0]
+            frames_read.append(with_logged_energy(atoms_of_sites(system, *sites(k), time), time))
+    return frames_read if isinstance(indices, range) else frames_read[0]
 
 
 def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
@@ -100,19 +101,19 @@ def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
     ValueError."""
     from ase.utils import string2index
 
-    wanted: Any = frame
+    selection: Any = frame
     if isinstance(frame, str):
         with contextlib.suppress(ValueError, TypeError):
-            wanted = string2index(frame)
-    if isinstance(wanted, slice) and wanted.step != 0:
-        return range(count)[wanted]
-    if not isinstance(wanted, int | np.integer):
+            selection = string2index(frame)
+    if isinstance(selection, slice) and selection.step != 0:
+        return range(count)[selection]
+    if not isinstance(selection, int | np.integer):
         raise ValueError(
             f"frame is {frame!r}, must be a number, a slice or a text like '-1' or '::10'"
         )
-    if not -count <= wanted < count:
-        raise IndexError(f"frame {wanted} is out of range: this run has {count}")
-    return [int(wanted) % count]
+    if not -count <= selection < count:
+        raise IndexError(f"frame {selection} is out of range: this run has {count}")
+    return [int(selection) % count]
 
 
 def _sites_of_frames(results: "Results") -> Callable[[int], tuple[Any, Any, Any]]:
@@ -160,48 +161,52 @@ def ase_results(
     from ase.stress import full_3x3_to_voigt_6_stress
 
     velocity, momentum = np.zeros_like(state.velocity), np.zeros_like(state.angular_momentum_body)
-    seen = observe(
+    observation = observe(
         system,
         engine,
         state._replace(velocity=velocity, angular_momentum_body=momentum),
         energy_unit=EV,
     )
-    load, torque = seen.load, np.zeros_like(seen.load.force)
+    load, torque = observation.load, np.zeros_like(observation.load.force)
     if len(state.rotation):
         torque = np.einsum("nij,nj->ni", state.rotation, load.torque_body)
     if form == "sites":
         force = site_forces(system, engine, state, load.force, torque, atoms)
     else:
         force = gradient_forces(system, state, load.force, torque, atoms)
-    found = {"energy": seen.potential, "forces": force / EV}
+    results = {"energy": observation.potential, "forces": force / EV}
     if np.isfinite(state.cell).all():
-        found["stress"] = full_3x3_to_voigt_6_stress(-seen.pressure_tensor_bar) * (BAR / EV)
-    return found
+        results["stress"] = full_3x3_to_voigt_6_stress(-observation.pressure_tensor_bar) * (
+            BAR / EV
+        )
+    return results
 
 
 def gradient_forces(
     system: System, state: State, force: np.ndarray, torque: np.ndarray, atoms: np.ndarray | None
 ) -> np.ndarray:
-    """Forces (a, 3) on the sites with mass, u Å/ps²: the first form of this file. force, torque (n,
-    3) : of the molecules, lab frame; atoms : as in `ase_results`"""
+    """Forces (a, 3) on the sites with mass, u Å/ps²: the first form of this file.
+
+    force, torque : (n, 3) of the molecules, lab frame
+    atoms : as in `ase_results`
+    """
     atom = system.sites.mass > 0
     of_atom, mass = system.sites.molecule[atom], system.sites.mass[atom, None]
-    found = mass * (force / system.model.mass[system.model.species][:, None])[of_atom]
+    atom_force = mass * (force / system.model.mass[system.model.species][:, None])[of_atom]
     if len(state.rotation):
         arm, r = _arms(system, state, atoms)
         y = arm[atom]
         moments = _sum_per_molecule(
             of_atom, mass[..., None] * y[:, :, None] * r[:, None, :], len(force)
         )
-        moments = 0.5 * (
-            moments + moments.swapaxes(1, 2)
-        )  # it is symmetric where the fit is the best
+        # it is symmetric where the fit is the best
+        moments = 0.5 * (moments + moments.swapaxes(1, 2))
         tensor = moments.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments
         turn = np.einsum(
             "nij,nj->ni", np.linalg.pinv(tensor, rcond=MIN_MOMENT, hermitian=True), torque
         )
-        found += mass * np.cross(turn[of_atom], y)
-    return found
+        atom_force += mass * np.cross(turn[of_atom], y)
+    return atom_force
 
 
 def site_forces(
@@ -227,38 +232,34 @@ def site_forces(
         of_term = np.array(cast(Any, workspace).site_force)
         at = _site_indices(system, sites)
         if name.endswith("reciprocal"):
-            term, position = (
-                cast(EwaldSum, system.terms[name]),
-                (state.position[system.sites.molecule] + arm)[at],
-            )
+            term = cast(EwaldSum, system.terms[name])
+            position = (state.position[system.sites.molecule] + arm)[at]
             of_term = of_term + forces_inside(term.charge, position, sites.first, term.smooth)
         np.add.at(on_sites, at, of_term)
     atom = system.sites.mass > 0
-    found = on_sites[atom] + _massless_forces_on_atoms(system, state, on_sites)[atom]
+    atom_force = on_sites[atom] + _massless_forces_on_atoms(system, state, on_sites)[atom]
     of_atom, n = system.sites.molecule[atom], len(state.position)
-    rest = force - _sum_per_molecule(of_atom, found, n)
-    torque = torque - _sum_per_molecule(of_atom, np.cross(from_centre, found), n)
-    return found + gradient_forces(system, state, rest, torque, atoms)
+    remainder = force - _sum_per_molecule(of_atom, atom_force, n)
+    torque = torque - _sum_per_molecule(of_atom, np.cross(from_centre, atom_force), n)
+    return atom_force + gradient_forces(system, state, remainder, torque, atoms)
 
 
 def _arms(system: System, state: State, atoms: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Positions from the centres of mass, lab frame: (s, 3) of the sites, (a, 3) of the atoms."""
-    arm, atom = (
-        system.site_positions(state) - state.position[system.sites.molecule],
-        system.sites.mass > 0,
-    )
+    arm = system.site_positions(state) - state.position[system.sites.molecule]
+    atom = system.sites.mass > 0
     return arm, arm[atom] if atoms is None else atoms - state.position[system.sites.molecule[atom]]
 
 
 def _sum_per_molecule(owner: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
-    found = np.zeros((n, *values.shape[1:]))
-    np.add.at(found, owner, values)
-    return found
+    sums = np.zeros((n, *values.shape[1:]))
+    np.add.at(sums, owner, values)
+    return sums
 
 
 def _site_indices(system: System, sites: BodySites | CentralSites) -> np.ndarray:
     """Index (s,) of the sites of a pair potential among all sites."""
-    offset, found = sites.offsets(), np.zeros(len(sites.molecule), int)
+    offset, indices = sites.offsets(), np.zeros(len(sites.molecule), int)
     for kind in kinds_of(system):
         has_sites = np.diff(sites.first)[kind.index] > 0
         first = sites.first[kind.index[has_sites]]
@@ -267,29 +268,27 @@ def _site_indices(system: System, sites: BodySites | CentralSites) -> np.ndarray
             nearest = cdist(
                 offset[first[0] : first[0] + count], kind.molecule.positions_body
             ).argmin(axis=1)
-            found[first[:, None] + np.arange(count)] = kind.sites[has_sites][:, nearest]
-    return found
+            indices[first[:, None] + np.arange(count)] = kind.sites[has_sites][:, nearest]
+    return indices
 
 
 def _massless_forces_on_atoms(system: System, state: State, force: np.ndarray) -> np.ndarray:
     """Forces (s, 3) on the atoms that are equivalent to the forces (s, 3) on massless sites."""
-    found = np.zeros_like(force)
+    on_atoms = np.zeros_like(force)
     for kind in kinds_of(system):
         m = kind.molecule
         bare, heavy = np.flatnonzero(m.masses == 0), np.flatnonzero(m.masses > 0)
         if len(bare) == 0:
             continue
-        Q = (
-            state.rotation[kind.index]
-            if len(state.rotation)
-            else np.tile(np.eye(3), (len(kind.index), 1, 1))
-        )
-        matrices = np.array(
-            [_transfer_matrices(m, int(site)) for site in bare]
-        )  # (bare, heavy, 3, 3)
+        if len(state.rotation):
+            Q = state.rotation[kind.index]
+        else:
+            Q = np.tile(np.eye(3), (len(kind.index), 1, 1))
+        # (bare, heavy, 3, 3)
+        matrices = np.array([_transfer_matrices(m, int(site)) for site in bare])
         body = np.einsum("nij,nbi->nbj", Q, force[kind.sites[:, bare]])
-        found[kind.sites[:, heavy]] = np.einsum("nij,bhjk,nbk->nhi", Q, matrices, body)
-    return found
+        on_atoms[kind.sites[:, heavy]] = np.einsum("nij,bhjk,nbk->nhi", Q, matrices, body)
+    return on_atoms
 
 
 def _transfer_matrices(molecule: Molecule, site: int) -> np.ndarray:

@@ -12,17 +12,17 @@ from pydantic import PositiveFloat
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.time_step import stable_angle
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
+from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines.body_motion import Motion, Snapshot, energies, is_balanced, motion
 from rigidmd.engines.body_system import BodySystem, Pose
-from rigidmd.engines.protocol import Engine, NotFiniteError
+from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import MATRIX
 from rigidmd.errors import SimulationError
 from rigidmd.figures.body import FIGURES
 from rigidmd.forces.body.applied import SteadyForce
+from rigidmd.formats import format_of
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import MOTION, MOTION_NPZ
-from rigidmd.io.formats import format_of
 from rigidmd.io.write import write_columns, write_npz
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run.checks import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
@@ -58,32 +58,32 @@ class Sampler(Observer):
     @property
     def stacked(self) -> dict[str, np.ndarray]:
         """The arrays of all snapshots, by name."""
-        found = {
-            name: np.array([seen.state[k] for seen in self.snapshots])
-            for k, name in enumerate(STORED_NAMES)
+        columns = {
+            name: np.array([snapshot.state[k] for snapshot in self.snapshots])
+            for k, name in enumerate(State._fields)
         }
-        return found | {"t": np.array([seen.time for seen in self.snapshots])}
+        return columns | {"t": np.array([snapshot.time for snapshot in self.snapshots])}
 
     @stacked.setter
     def stacked(self, stacked: dict[str, np.ndarray]) -> None:
         times = stacked.pop("t")
-        states = [State(*(stacked[name][k] for name in STORED_NAMES)) for k in range(len(times))]
+        states = [State(*(stacked[name][k] for name in State._fields)) for k in range(len(times))]
         self.snapshots = [
             Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)
         ]
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         super().resume(run, kept)
-        times = np.array([seen.time for seen in self.snapshots])
+        times = np.array([snapshot.time for snapshot in self.snapshots])
         if not (
             (np.diff(times) >= 0).all()
             and (times >= 0).all()
             and (times <= run.part.state.time[NOW]).all()
         ):
             raise ValueError("the times of its samples cannot be of a run")
-        for seen in self.snapshots:
+        for snapshot in self.snapshots:
             state_from(
-                dict(zip(STORED_NAMES, seen.state, strict=True)), run.part.state, exact=False
+                dict(zip(State._fields, snapshot.state, strict=True)), run.part.state, exact=False
             )
 
     def see(self, moment: Moment) -> None:
@@ -107,14 +107,11 @@ class BodyWatch(Observer):
 
     def __init__(self, run: "Simulation"):
         self._run, self._system, self._limits = run, run.system, run.scene.watch
-        system, every = (
-            run.system,
-            max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s)),
-        )
-        most = EVALUATIONS_PER_CHECK // getattr(
-            system.method, "force_evaluations", 1
-        )  # half a second of computing
-        self.steps = min(most, SAMPLES_PER_CHECK * every)
+        system = run.system
+        every = max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
+        # half a second of computing
+        step_limit = EVALUATIONS_PER_CHECK // getattr(system.method, "force_evaluations", 1)
+        self.steps = min(step_limit, SAMPLES_PER_CHECK * every)
         self._start = energies_of(system, system.state)
         weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
         swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
@@ -239,16 +236,12 @@ class BodyRecord(RunRecord):
     stable: PositiveFloat | None = None  # the longest stable step, s
 
 
-class BodyRun(RunPart):
+class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
     """The part of a simulation of a single body."""
 
     time_unit = "s"
     record_type = BodyRecord
     summary_text = staticmethod(body_summary_text)
-
-    system: BodySystem
-    engine: Engine
-    record: BodyRecord
 
     def __init__(
         self,
@@ -286,9 +279,8 @@ class BodyRun(RunPart):
                 " order 2; otherwise integrator = 'dop853'"
             )
         rate, angle = fastest_body_rate(system), stable_angle(system.method)
-        if (
-            not self.scene.watch.stable_step or rate == 0 or angle == inf
-        ):  # some solvers choose their own steps
+        # some solvers choose their own steps
+        if not self.scene.watch.stable_step or rate == 0 or angle == inf:
             return
         self.record.stable = angle / rate
         for sentence in body_step_warnings(system):
@@ -304,11 +296,9 @@ class BodyRun(RunPart):
         return self._segments[k]
 
     def restore(self, kept: Checkpoint) -> None:
-        arrays, method, k = (
-            kept.of("state").arrays,
-            self.system.method,
-            self.record.position.segment,
-        )
+        arrays = kept.of("state").arrays
+        method = self.system.method
+        k = self.record.position.segment
         check_same_scene(self.scene, self.record.scene, {}, int(arrays["step"][NOW]))
         self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
         if k > 0:
@@ -328,13 +318,13 @@ class BodyRun(RunPart):
         segments, steps = [], 0
         for begin, end in pairwise((0.0, *self.system.breaks(), run.steps * run.timestep_s)):
             exact = (end - begin) / run.timestep_s
-            whole = round(exact)
-            if abs(exact - whole) > 1e-9 * max(1.0, exact):
-                whole = ceil(exact)
+            step_count = round(exact)
+            if abs(exact - step_count) > 1e-9 * max(1.0, exact):
+                step_count = ceil(exact)
             # nothing lies between two breaks that are equal to rounding
-            dt = (end - begin) / whole if whole not in (0, exact) else run.timestep_s
-            segments.append(Segment(self.system.method, dt, whole, steps))
-            steps += whole
+            dt = (end - begin) / step_count if step_count not in (0, exact) else run.timestep_s
+            segments.append(Segment(self.system.method, dt, step_count, steps))
+            steps += step_count
         return segments
 
     def observe(self, moment: Moment) -> Pose:
@@ -368,19 +358,21 @@ class BodyRun(RunPart):
     def summary(self, samples: Motion, preparing: float, wall: float) -> dict[str, Any]:
         steps = sum(segment.steps for segment in self._segments)
         computing, interrupted = sum(self.record.position.computing), self.simulation.is_interrupted
-        found = summarise_body(self.system, samples, steps, preparing, wall, computing, interrupted)
-        found["stable_timestep_s"] = self.record.stable
+        summary = summarise_body(
+            self.system, samples, steps, preparing, wall, computing, interrupted
+        )
+        summary["stable_timestep_s"] = self.record.stable
         if self.engine.is_stiff:
             self.simulation.note(
                 "the motion is stiff: stability, not accuracy, limits the steps of dop853;"
                 " integrator = 'radau' takes much longer ones"
             )
-        found["notes"] = [
+        summary["notes"] = [
             *([self._choice] if self._choice else []),
-            *found["notes"],
+            *summary["notes"],
             *self.record.notes,
         ]
-        return found
+        return summary
 
     def explain(self, error: SimulationError) -> str:
         return self._watch.explain(error, self.record.stable)
@@ -402,11 +394,11 @@ class BodyRun(RunPart):
         with interruptible():
             self.prepare()
         load, _ = self.engine.evaluate(self.state)
-        seen = motion(self.system, [Snapshot(0.0, self.state)])
+        columns = motion(self.system, [Snapshot(0.0, self.state)])
         torque = load.torque_body @ self.system.axes.T
         return {
             "unit": "J",
-            **{name: float(seen[name][0]) for name in ("kinetic", "potential", "energy")},
+            **{name: float(columns[name][0]) for name in ("kinetic", "potential", "energy")},
             "force_N": load.force[0].tolist() if len(load.force) else None,
             "torque_body_N_m": torque[0].tolist() if len(torque) else None,
         }

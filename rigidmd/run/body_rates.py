@@ -95,10 +95,8 @@ def _of_heavy_body(
     path = _path_of_axis(motion, system.axes @ axis)
     polar, azimuth = _angles(path, -down)
     rates = {}
-    along, across = (
-        axis**2 @ system.inertia,
-        float(np.delete(system.inertia, np.abs(axis).argmax())[0]),
-    )
+    along = axis**2 @ system.inertia
+    across = float(np.delete(system.inertia, np.abs(axis).argmax())[0])
     even = across * np.eye(3) + (along - across) * np.outer(axis, axis)
     symmetric = np.abs(even - np.diag(system.inertia)).max() <= EQUAL_MOMENTS * system.inertia.max()
     nutation = precession = None

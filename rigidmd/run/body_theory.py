@@ -38,12 +38,10 @@ def heavy_top_motion(
     """
     from scipy.special import ellipk, elliprf, elliprj  # slow to import
 
-    alpha, kappa, w, c = (
-        2 * moment / across,
-        transverse / across**2,
-        vertical / across,
-        momentum / across,
-    )
+    alpha = 2 * moment / across
+    kappa = transverse / across**2
+    w = vertical / across
+    c = momentum / across
     sine = 1 - cosine * cosine
     cubic = np.array(
         [

@@ -78,9 +78,8 @@ class StepCheck:
         self._per_momentum = model.inverse_inertia * np.array(arms)  # (species, 3)
         self._most_per_momentum = float(self._per_momentum.max())
         self._diameter = system.smallest_diameter
-        self._mass_root = sqrt(
-            model.inverse_mass.max()
-        )  # of the lightest, inverse; 0 if all are frozen
+        # of the lightest, inverse; 0 if all are frozen
+        self._mass_root = sqrt(model.inverse_mass.max())
         self._inertia_root = sqrt(model.inertia[model.inertia > 0].min(initial=inf))
         self._deepest_well = max((m.epsilon.max() for m in system.species), default=0.0)
 
@@ -110,13 +109,12 @@ class StepCheck:
             if not np.isfinite(values).all():
                 m = int((~np.isfinite(values).all(axis=1)).argmax())
                 return FailedCheck(f"the {what} on {molecule_label(system, m)} is not finite", m)
-        found: list[
-            tuple[np.ndarray, float, str]
-        ] = []  # a measure (n,), its limit, a message about its largest value
+        # a measure (n,), its limit, a message about its largest value
+        measures: list[tuple[np.ndarray, float, str]] = []
         if limits.kick and self.thermal > 0:
             size = kicks(model, load, self.thermal, dt * max(map(abs, scheme.kicks)))
             times = f"by {size.max():.3g} times its thermal size (watch.kick = {limits.kick:g})"
-            found.append((size, limits.kick, f"one kick changes a momentum of {{}} {times}"))
+            measures.append((size, limits.kick, f"one kick changes a momentum of {{}} {times}"))
         stride, between = dt * max(map(abs, scheme.drifts)), "between two force evaluations"
         if limits.move:
             way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
@@ -124,7 +122,7 @@ class StepCheck:
                 f"{way.max() / self._diameter:.3g} of the smallest diameter (watch.move ="
                 f" {limits.move:g})"
             )
-            found.append(
+            measures.append(
                 (
                     way / self._diameter,
                     limits.move,
@@ -138,8 +136,8 @@ class StepCheck:
                 f"{{}} rotates by {angle.max():.3g} rad {between} (watch.turn_rad ="
                 f" {limits.turn_rad:g})"
             )
-            found.append((angle, limits.turn_rad, message))
-        for size, limit, message in found:
+            measures.append((angle, limits.turn_rad, message))
+        for size, limit, message in measures:
             if size.max() > limit:
                 m = int(size.argmax())
                 return FailedCheck(
@@ -205,11 +203,10 @@ def check_sample(system: System, limits: Watch, since: Sample, now: Sample) -> F
         kinetic = max(
             kinetic, per_kelvin * max(stage.temperatures) * system.freedom_in(now.stage).total
         )
-        fraction = (
-            min(1.0, stage.thermostat_time / (now.time - since.time))
-            if now.time > since.time
-            else 1.0
-        )
+        if now.time > since.time:
+            fraction = min(1.0, stage.thermostat_time / (now.time - since.time))
+        else:
+            fraction = 1.0
     drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
     if np.isnan(drift):  # another engine, which does not count the heat of its thermostat
         return None
@@ -263,18 +260,18 @@ def most_overlapping_pair(
     )
     acts = any(name.startswith("coulomb") for name in system.terms)
     charge = system.of_sites(lambda m: m.charges) if acts else np.zeros(len(sigma))
-    found = []
+    pairs = []
     reach = max(OVERLAP * sigma.max(), near.max() * system.smallest_diameter)
     for i, j, distance in close_pairs(system, state, (reach, every_site)):
         repel = sigma[i] > 0 and sigma[j] > 0
         size = (sigma[i] + sigma[j]) / 2 if repel else system.smallest_diameter
         attract = not repel and charge[i] * charge[j] < 0
         if (repel or attract) and distance <= (OVERLAP if repel else max(near[i], near[j])) * size:
-            found.append(OverlappingPair(i, j, distance, distance / size, attract))
+            pairs.append(OverlappingPair(i, j, distance, distance / size, attract))
     of_molecule = [
-        pair for pair in found if molecule in system.sites.molecule[[pair.first, pair.second]]
+        pair for pair in pairs if molecule in system.sites.molecule[[pair.first, pair.second]]
     ]
-    return min(of_molecule or found, key=lambda pair: pair.fraction, default=None)
+    return min(of_molecule or pairs, key=lambda pair: pair.fraction, default=None)
 
 
 def _first_overlap(
@@ -339,11 +336,10 @@ def _user_code(system: System) -> str:
     rows = {row.name for row in system.scene.integrators} & {
         stage.integrator for stage in system.scene.stages
     }
-    named = (
-        []
-        if system.thermostat is None
-        else [f"the thermostat {name_of(system.thermostat)}, from Python"]
-    )
+    if system.thermostat is None:
+        named = []
+    else:
+        named = [f"the thermostat {name_of(system.thermostat)}, from Python"]
     named += [f"the integrator {name}, from the scene" for name in sorted(rows)]
     return f"{' or '.join(named)} (the run without it shows whether), or " if named else ""
 
@@ -409,7 +405,7 @@ def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:
     liquid. The measure is relative to the masses, temperature and time step of the scene.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = (
+        largest = (
             np.abs(load.force).max(axis=1)
             * dt
             * np.sqrt(model.inverse_mass[model.species] / thermal)
@@ -420,5 +416,5 @@ def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:
             / np.sqrt(model.inertia[model.species] * thermal)[: len(load.torque_body)]
         )
     turn = np.where((model.inertia[model.species] > 0)[: len(turn)], turn, 0.0)
-    found[: len(turn)] = np.maximum(found[: len(turn)], turn.max(axis=1, initial=0.0))
-    return found
+    largest[: len(turn)] = np.maximum(largest[: len(turn)], turn.max(axis=1, initial=0.0))
+    return largest

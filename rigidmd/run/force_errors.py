@@ -65,13 +65,11 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> dict[str,
     forces = scene.forces.model_copy(update=changes)
     reference = build(scene.model_copy(update={"forces": forces, "precision": "double"}))
     moves = mobile(system.model)[cast(PairForces, system.terms["coulomb_real"]).sites.molecule]
-    found, energy = _coulomb(system, state)
+    coulomb, energy = _coulomb(system, state)
     exact, exact_energy = _coulomb(reference, state)
-    error = np.linalg.norm((found - exact)[moves], axis=1)
-    measured, force = (
-        float(np.sqrt((error**2).mean())),
-        float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean())),
-    )
+    error = np.linalg.norm((coulomb - exact)[moves], axis=1)
+    measured = float(np.sqrt((error**2).mean()))
+    force = float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean()))
     return {
         "reference": next(note for note in reference.notes if note.startswith("ewald")),
         "rms_force_per_A": force / size,
@@ -89,10 +87,8 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     a system."""
     term, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
     counts = np.bincount(system.model.species, minlength=len(system.species))
-    charges, cutoff = (
-        charges_in(system.species, counts),
-        not_none(system.scene.forces.ewald_cutoff_A),
-    )
+    charges = charges_in(system.species, counts)
+    cutoff = not_none(system.scene.forces.ewald_cutoff_A)
     if isinstance(term, EwaldSum):
         reciprocal = k_space_error(
             charges, term.smooth.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume
@@ -112,10 +108,10 @@ def single_precision_errors(system: System, state: State) -> tuple[float, float]
     if system.precision == "double" and not system.precision_reason:
         return None
     exact = system.engine_of(system.terms, "double").evaluate(state)[0]
-    found = system.engine_of(system.terms, "mixed").evaluate(state)[0]
+    mixed = system.engine_of(system.terms, "mixed").evaluate(state)[0]
     sizes = [
         (float(np.linalg.norm(a - b)), float(np.linalg.norm(b)))
-        for a, b in zip(found, exact, strict=True)
+        for a, b in zip(mixed, exact, strict=True)
     ]
     force, torque = (error / size if size > 0 else 0.0 for error, size in sizes)
     return force, torque
@@ -192,7 +188,7 @@ def velocity_notes(system: System, state: State) -> list[str]:
     spin = np.abs(state.angular_momentum_body).max(initial=0.0) or 1.0
     other.velocity[:] += speed * rng.standard_normal(other.velocity.shape)
     other.angular_momentum_body[:] += spin * rng.standard_normal(other.angular_momentum_body.shape)
-    found = []
+    notes = []
     for name in system.user_terms:
         if isinstance(system.terms[name], PairForces):
             continue
@@ -205,13 +201,13 @@ def velocity_notes(system: System, state: State) -> list[str]:
             for a, b in zip(moved, load, strict=True)
         ]
         if any(c > NOISY * n + ROUNDING * s for c, n, s in zip(change, noise, size, strict=True)):
-            found.append(
+            notes.append(
                 f"{name}: its forces depend on velocities. Integrators take them as forces of"
                 " positions, with an error of order 1 in the step, and such forces have no energy"
                 " that is conserved. For friction use thermostat = 'langevin'; otherwise test with"
                 " shorter steps"
             )
-    return found
+    return notes
 
 
 def _error_of_force(system: System, state: State, name: str) -> str:
@@ -226,18 +222,18 @@ def _error_of_force(system: System, state: State, name: str) -> str:
     )
 
     def difference(
-        moved: Callable[[float], State], steps: Sequence[float], given: float, size: float
+        moved: Callable[[float], State], steps: Sequence[float], derivative: float, size: float
     ) -> float | None:
-        found = []
+        slopes = []
         for step in [NOISY * steps[0]] if random else steps:
             ahead, behind = (engine.evaluate(moved(way))[1][name].energy for way in (step, -step))
-            found.append((behind - ahead) / (2 * step))
+            slopes.append((behind - ahead) / (2 * step))
             if (
-                abs(found[-1] - given)
-                <= TOLERANCE * max(size, abs(found[-1])) + (noise + random) / step
+                abs(slopes[-1] - derivative)
+                <= TOLERANCE * max(size, abs(slopes[-1])) + (noise + random) / step
             ):
                 return None
-        return found[0]
+        return slopes[0]
 
     wrong = _check_molecules(system, state, load, difference)
     if not wrong and state.volume < inf and name not in system.position_dependent:
@@ -274,19 +270,21 @@ def _check_molecules(system: System, state: State, load: Load, difference: _Diff
             if not along.any():
                 continue
             along /= np.linalg.norm(along)
-            given = float(acting[m] @ along)
+            derivative = float(acting[m] @ along)
             steps = [
                 fraction * (system.smallest_diameter if kind == "force" else 1.0)
                 for fraction in STEP_FRACTIONS
             ]
-            found = difference(partial(_moved, state, kind, m, along), steps, given, size.max())
-            if found is not None:
+            slope = difference(
+                partial(_moved, state, kind, m, along), steps, derivative, size.max()
+            )
+            if slope is not None:
                 where = "the lab's axes" if kind == "force" else "the axes of its body"
                 return (
                     f"the {kind} on molecule {m + 1} ({species[m].name}) is not the derivative of"
                     f" the energy: along ({', '.join(f'{x:.3f}' for x in along)}) in {where} it is"
-                    f" {given / KJ_PER_MOL:.8g} {unit}, and the energy falls by"
-                    f" {found / KJ_PER_MOL:.8g} {unit}"
+                    f" {derivative / KJ_PER_MOL:.8g} {unit}, and the energy falls by"
+                    f" {slope / KJ_PER_MOL:.8g} {unit}"
                 )
     return ""
 
@@ -307,18 +305,18 @@ def _check_virial(state: State, virial: np.ndarray, size: float, difference: _Di
 
         def strained(by: float, i=i, j=j) -> State:
             """A copy of the state with centres of mass and cell strained, x_j += by x_i (lab)."""
-            found = state.copy()
-            for array in (found.position, found.cell):
+            strained_state = state.copy()
+            for array in (strained_state.position, strained_state.cell):
                 array[:, j] += by * array[:, i]
-            return found
+            return strained_state
 
-        given = float(virial[j, i])
-        found = difference(strained, STRAINS, given, size)
-        if found is not None:
+        derivative = float(virial[j, i])
+        slope = difference(strained, STRAINS, derivative, size)
+        if slope is not None:
             return (
                 f"the component {'xyz'[j]}{'xyz'[i]} of its molecular virial is"
-                f" {given / KJ_PER_MOL:.8g} kJ/mol, and when box and centres of mass are strained"
-                f" the energy falls by {found / KJ_PER_MOL:.8g} kJ/mol:"
+                f" {derivative / KJ_PER_MOL:.8g} kJ/mol, and when box and centres of mass are"
+                f" strained the energy falls by {slope / KJ_PER_MOL:.8g} kJ/mol:"
                 f" {'correct it' if virial.any() else 'add it'}, or, if the energy depends on"
                 " positions in the lab, set tied_to_places = True in its class"
             )

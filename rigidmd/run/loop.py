@@ -18,7 +18,7 @@ import numpy as np
 from rigidmd.compile.cache import compiling_announced, describe_cache
 from rigidmd.core.files import LostFileError, writing
 from rigidmd.core.process import PROCESS_LOCK
-from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES
+from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines.protocol import Halted, NotFiniteError
 from rigidmd.errors import OutputError, RigidMDError, SimulationError, resume_command
 from rigidmd.io import folder as run_folder
@@ -28,6 +28,7 @@ from rigidmd.io.progress import progress_of
 from rigidmd.io.write import write_json
 from rigidmd.run import resume
 from rigidmd.run.observers import GrowingFile, Moment, Observer
+from rigidmd.run.part import RunPart
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import (
     SEGMENT_SECONDS,
@@ -50,14 +51,14 @@ def _observers_by_name(
 ) -> dict[str, Observer]:
     """Observers by the names under which a checkpoint has their data: class, and number in its
     class."""
-    found: dict[str, Observer] = {}
+    observer_of: dict[str, Observer] = {}
     for start, observers in (("", default), (USER, user)):
         count: Counter[str] = Counter()
         for observer in observers:
             kind = type(observer).__name__
             count[kind] += 1
-            found[f"{start}{kind}{f'-{count[kind]}' if count[kind] > 1 else ''}"] = observer
-    return found
+            observer_of[f"{start}{kind}{f'-{count[kind]}' if count[kind] > 1 else ''}"] = observer
+    return observer_of
 
 
 class RunLoop:
@@ -71,7 +72,8 @@ class RunLoop:
     def __init__(
         self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None
     ):
-        self._simulation, self._folder, self._part = simulation, simulation.folder, simulation.part
+        self._simulation, self._folder = simulation, simulation.folder
+        self._part: RunPart[Any, Any, Any] = simulation.part
         self._force, self._resumes = force, resumes
         self.checkpoints = CheckpointSchedule(
             simulation.folder, simulation.scene.output.checkpoint_minutes, deadline
@@ -85,10 +87,8 @@ class RunLoop:
         self._failed_before: list[Observer] = []
         self._bar, self._progress = progress_of(0.0, "", False), False
         self._until = 0.0  # the step at which the run pauses
-        self._wall, self._since = (
-            0.0,
-            clock.perf_counter(),
-        )  # seconds before, and the time since which it runs
+        self._wall = 0.0  # seconds before the time since which it runs
+        self._since = clock.perf_counter()
         self._observers: dict[str, Observer] = {}
         self._course = self._run()
 
@@ -118,12 +118,12 @@ class RunLoop:
                 )
             if getgeneratorstate(self._course) == GEN_CREATED:
                 next(self._course)
-            part, whole = self._part, sum(self._part.durations())
+            part, total = self._part, sum(self._part.durations())
             before = int(part.state.step[NOW])
             self._until = before + steps
             stack.enter_context(signal_handler(self._stop_by_signal, *stop_signals()))
             self._bar = progress_of(
-                whole, part.time_unit, progress if whole > 0 else False, self._simulation.spot
+                total, part.time_unit, progress if total > 0 else False, self._simulation.spot
             )
             stack.enter_context(self._bar).skip(float(part.state.time[NOW]))
             self._since = clock.perf_counter()
@@ -137,25 +137,25 @@ class RunLoop:
         """The run. It pauses before its first step, and whenever step `_until` is reached."""
         simulation, part = self._simulation, self._part
         with contextlib.ExitStack() as stack:
-            kept, stays = None, False
+            checkpoint, stays = None, False
             if self._folder is not None:
                 lock = FolderLock(self._folder)
                 stack.callback(self._if_not_forked, lock.release)
                 lock.take()
                 if self._resumes:
-                    kept, stays = self._read_checkpoint(self._folder)
+                    checkpoint, stays = self._read_checkpoint(self._folder)
             part.reset()
             began, input_sha256 = clock.perf_counter(), resume.input_digests(simulation.scene)
             scene, changed = resume.plain(simulation.scene), None
-            if kept is not None:
+            if checkpoint is not None:
                 with resume.as_checkpoint_errors(self._folder):
                     kind = part.record_type
                     part.record = kind(
-                        **resume.restored(kept.of(RECORD), kind.types(), part.scene.rows)
+                        **resume.restored(checkpoint.of(RECORD), kind.types(), part.scene.rows)
                     )
-                    part.restore(kept)
+                    part.restore(checkpoint)
                     part.check_position()
-                    changed = resume.describe_changes(kept.values["with"])
+                    changed = resume.describe_changes(checkpoint.values["with"])
             part.record.scene, part.record.inputs = scene, input_sha256
             self._observers = _observers_by_name(part.default_observers(), simulation.observers)
             observers = list(self._observers.values())
@@ -170,7 +170,7 @@ class RunLoop:
                     *([source] if source.is_file() else []),
                 ]
                 run_folder.check_folder(self._folder, self._force, inputs, names)
-            if kept is None:
+            if checkpoint is None:
                 for warning in part.system.warnings:
                     simulation.note(warning)
                 # of several runs one compiles, and the others read its cache
@@ -179,13 +179,13 @@ class RunLoop:
             preparing = clock.perf_counter() - began
             for observer in observers:
                 stack.push(partial(self._close, observer))
-            if kept is not None:  # all checks come before the first change of a file
+            if checkpoint is not None:  # all checks come before the first change of a file
                 with resume.as_checkpoint_errors(self._folder):
                     for name, observer in self._observers.items():
-                        if name.startswith(USER) and name not in kept.values["of"]:
+                        if name.startswith(USER) and name not in checkpoint.values["of"]:
                             observer.begin(simulation)
                         else:
-                            observer.resume(simulation, kept.of(name))
+                            observer.resume(simulation, checkpoint.of(name))
                 if changed is not None:
                     simulation.note(changed)
                 simulation.announce(f"continuing from step {part.state.step[NOW]}")
@@ -198,12 +198,12 @@ class RunLoop:
             self.has_begun = True
             yield
             for observer in observers:
-                if kept is None:
+                if checkpoint is None:
                     observer.begin(simulation)
                 else:
                     observer.cut()
             try:
-                yield from self._run_segments(kept is not None)
+                yield from self._run_segments(checkpoint is not None)
                 while self._until < inf and self.signal is None and self._error is None:
                     yield  # `run` or `close` completes the run
                 self._finish(preparing, self._wall + clock.perf_counter() - self._since)
@@ -248,11 +248,9 @@ class RunLoop:
         simulation, part, notes = self._simulation, self._part, self._part.record.notes
         self._note_lost_files()
         results = Results(part.system, part.state, part.samples())
-        results.interrupted, results.signal, results.out_of_time = (
-            self.interrupted,
-            self.signal,
-            self.out_of_time,
-        )
+        results.interrupted = self.interrupted
+        results.signal = self.signal
+        results.out_of_time = self.out_of_time
         made_by = resume.provenance(
             simulation.scene, part.threads, part.record.inputs, part.engine_version
         )
@@ -319,10 +317,10 @@ class RunLoop:
             return None, not run_folder.is_empty(folder)
         for path in folder.iterdir():
             run_folder.check_inside(path)
-        kept, problems = latest(folder)
+        checkpoint, problems = latest(folder)
         for problem in problems:
             self._simulation.warn(f"{problem}. The checkpoint before it is used")
-        return kept, True
+        return checkpoint, True
 
     def _checkpoint(self) -> None:
         """Write a checkpoint, if the run has checkpoints and its engine can give its memory as
@@ -343,16 +341,16 @@ class RunLoop:
         parts |= {
             RECORD: resume.stored(record, record.types()),
             "engine": Checkpoint({}, memory),
-            "state": Checkpoint({}, dict(zip(STORED_NAMES, part.state, strict=True))),
+            "state": Checkpoint({}, dict(zip(State._fields, part.state, strict=True))),
         }
         arrays = {
             f"{owner}/{name}": array
-            for owner, kept in parts.items()
-            for name, array in kept.arrays.items()
+            for owner, part_of_owner in parts.items()
+            for name, array in part_of_owner.arrays.items()
         }
         data = {
             "with": resume.computed_with(),
-            "of": {owner: kept.values for owner, kept in parts.items()},
+            "of": {owner: part_of_owner.values for owner, part_of_owner in parts.items()},
         }
         position = record.position.segment, int(part.state.step[NOW]), record.position.seconds > 0
         self.checkpoints.write_once(Checkpoint(data, arrays), position)
@@ -366,11 +364,9 @@ class RunLoop:
                 part.segment = segment = part.reenter_segment(k)
             else:
                 part.segment = segment = part.enter_segment(k)
-                position.segment, position.first, position.seconds = (
-                    k,
-                    int(part.state.step[NOW]),
-                    0.0,
-                )
+                position.segment = k
+                position.first = int(part.state.step[NOW])
+                position.seconds = 0.0
                 if k == 0:
                     self._notify(0, [observer.interval is not None for observer in observers])
                     self._checkpoint()
@@ -385,10 +381,8 @@ class RunLoop:
             shown, pace = None, inf
             self._bar.unpause()
             while done < segment.steps and not self.interrupted:
-                to, together = (
-                    min(schedule.next_observation(done), self._until - position.first),
-                    segment.together,
-                )
+                to = min(schedule.next_observation(done), self._until - position.first)
+                together = segment.together
                 if pace > 0:  # the first step alone, as it may be slow
                     to = min(to, done + max(1, int(SEGMENT_SECONDS / pace)))
                 to = done + -int((done - to) // together) * together
@@ -418,12 +412,11 @@ class RunLoop:
                     yield
             if not (segment.action is not None and self.interrupted):
                 self._checkpoint()
-            if (
-                done < segment.steps and shown is not None
-            ):  # only a run that stops here calls these observers
+            # only a run that stops here calls these observers
+            if done < segment.steps and shown is not None:
                 due = [
-                    observer.ends and not seen
-                    for observer, seen in zip(observers, shown, strict=True)
+                    observer.ends and not is_shown
+                    for observer, is_shown in zip(observers, shown, strict=True)
                 ]
                 self._notify(done, due)
             position.time += done * segment.dt
@@ -455,10 +448,8 @@ class RunLoop:
             if isinstance(error, RigidMDError) and method == observer.see:
                 raise
             self._failed_before.append(observer)
-            reason, name = (
-                f"{type(error).__name__}: {' '.join(str(error).split())}",
-                type(observer).__name__,
-            )
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            name = type(observer).__name__
             if observer.draws:
                 self._simulation.note(
                     f"{', '.join(observer.files()) or name} cannot be drawn: {reason}"

@@ -6,7 +6,7 @@ from rigidmd.core.state import WORK, State
 from rigidmd.engines.observables import observe
 from rigidmd.engines.samples import Samples, equilibrated
 from rigidmd.engines.system import System
-from rigidmd.io.formats.cells import cell_of
+from rigidmd.formats.cells import cell_of
 from rigidmd.scene.validation import not_none
 
 

@@ -74,9 +74,8 @@ def remove_overlaps(
         # Each molecule moves along its own force by at most `length`, so overlaps do not slow down
         # the others.
         shift, rotation = load.force * free[:, None], load.torque_body * rotates / arm
-        largest = (
-            np.abs(shift).max() or np.abs(rotation).max()
-        )  # in a uniform field there are torques alone
+        # in a uniform field there are torques alone
+        largest = np.abs(shift).max() or np.abs(rotation).max()
         shift, rotation = shift / largest, rotation / largest
         reach = np.linalg.norm(shift, axis=1)
         reach[: len(rotation)] = np.maximum(
@@ -109,10 +108,8 @@ def remove_overlaps(
 
 def _rotations(system: System, state: State) -> tuple[np.ndarray, np.ndarray]:
     """Which principal axes (n, 3) rotate; radii (n, 1) of molecules, Å, 1 for points."""
-    species, radius = (
-        system.model.species[: len(state.rotation)],
-        np.array([m.radius for m in system.species]),
-    )
+    species = system.model.species[: len(state.rotation)]
+    radius = np.array([m.radius for m in system.species])
     return (system.model.inertia > 0)[species], np.where(radius > 0, radius, 1.0)[species, None]
 
 
@@ -123,9 +120,8 @@ class EnthalpyPoint(NamedTuple):
     energy: float  # potential energy with constants and tail correction, u Å²/ps²
     scale: float  # sum of the absolute values of its parts, to which rounding is relative
     load: Load
-    pressure: (
-        np.ndarray
-    )  # (6,) by `barostats.COMPONENTS`, without the kinetic part, u/(Å ps²); NaN without a box
+    #: (6,) by `barostats.COMPONENTS`, without the kinetic part, u/(Å ps²); NaN without a box
+    pressure: np.ndarray
     gradient: np.ndarray  # (k,) of the enthalpy in the coordinates of `Enthalpy.moved`, u Å/ps²
 
     @property
@@ -188,27 +184,25 @@ class Enthalpy:
         used = self.coordinate >= 0
         slopes = np.zeros(len(self._lengths))
         np.add.at(slopes, self.coordinate[used], volume * (self.target - pressure)[used])
-        shifts, rotations = (
-            -load.force * self.free[:, None],
-            -load.torque_body * self.rotates / self.arm,
-        )
+        shifts = -load.force * self.free[:, None]
+        rotations = -load.torque_body * self.rotates / self.arm
         gradient = np.concatenate([shifts.ravel(), rotations.ravel(), slopes / self._lengths])
         return EnthalpyPoint(state, sum(parts), sum(map(abs, parts)), load, pressure, gradient)
 
     def moved(self, state: State, move: np.ndarray) -> State:
         """A copy of a state after a move (k,)."""
         shift, rotation, strain = self._parts(move)
-        found = state.copy()
+        moved_state = state.copy()
         if strain.any():
             matrix = np.diag(np.exp(strain[:3]))
             for k in range(3, 6):
                 matrix[COMPONENTS[k]] = strain[k]
-            found.position[:] = state.position @ matrix
-            found.cell[:] = state.cell @ matrix
-        found.position[:] += shift
+            moved_state.position[:] = state.position @ matrix
+            moved_state.cell[:] = state.cell @ matrix
+        moved_state.position[:] += shift
         if len(rotation):
-            found.rotation[:] = state.rotation @ from_vector(rotation / self.arm)
-        return found
+            moved_state.rotation[:] = state.rotation @ from_vector(rotation / self.arm)
+        return moved_state
 
     def gain(self, point: EnthalpyPoint, other: EnthalpyPoint, move: np.ndarray) -> float:
         """Change of the enthalpy by a move from a point to another, u Å²/ps².
@@ -420,14 +414,14 @@ class _Descent:
 
     def step(self, point: EnthalpyPoint) -> EnthalpyPoint | None:
         """The next point, lower than this one; None if there is none. Raises SimulationError."""
-        found = self._along(point, self._direction(point.gradient))
-        if found is None and self._memory:
+        move_and_point = self._along(point, self._direction(point.gradient))
+        if move_and_point is None and self._memory:
             self._memory.clear()
             self._fraction = FIRST_MOVE
             return self.step(point)
-        if found is None:
+        if move_and_point is None:
             return None
-        move, other = found
+        move, other = move_and_point
         change = other.gradient - point.gradient
         if move @ change > 1e-8 * np.linalg.norm(move) * np.linalg.norm(change):
             self._memory.append((move, change))
@@ -438,17 +432,17 @@ class _Descent:
     def _direction(self, gradient: np.ndarray) -> np.ndarray:
         """The quasi-Newton move, or one along the negative gradient; no longer than allowed."""
         if self._memory:
-            found = gradient.copy()
+            direction = gradient.copy()
             weights = []
             for move, change in reversed(self._memory):
-                weights.append(move @ found / (move @ change))
-                found -= weights[-1] * change
+                weights.append(move @ direction / (move @ change))
+                direction -= weights[-1] * change
             move, change = self._memory[-1]
-            found *= move @ change / (change @ change)
+            direction *= move @ change / (change @ change)
             for (move, change), weight in zip(self._memory, reversed(weights), strict=True):
-                found += (weight - change @ found / (move @ change)) * move
-            if found @ gradient > 1e-6 * np.linalg.norm(found) * np.linalg.norm(gradient):
-                return -found * min(1.0, self._enthalpy.bound(found))
+                direction += (weight - change @ direction / (move @ change)) * move
+            if direction @ gradient > 1e-6 * np.linalg.norm(direction) * np.linalg.norm(gradient):
+                return -direction * min(1.0, self._enthalpy.bound(direction))
             self._memory.clear()
             self._fraction = FIRST_MOVE
         return -gradient * self._fraction * self._enthalpy.bound(gradient)
@@ -458,11 +452,9 @@ class _Descent:
     ) -> tuple[np.ndarray, EnthalpyPoint] | None:
         """An accepted move along a direction, and the point it leads to; None without one. Raises
         SimulationError."""
-        slope, length, noise = (
-            float(direction @ point.gradient),
-            1.0,
-            self._enthalpy.rounding * point.scale,
-        )
+        slope = float(direction @ point.gradient)
+        length = 1.0
+        noise = self._enthalpy.rounding * point.scale
         for _ in range(TRIALS):
             move = length * direction
             try:

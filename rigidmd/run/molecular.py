@@ -23,9 +23,9 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.engines.samples import OF_TRAJECTORIES, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError, SimulationError, StructureError
+from rigidmd.formats import format_of
+from rigidmd.formats.through_ase import atoms_of_system
 from rigidmd.io.checkpoint import Checkpoint
-from rigidmd.io.formats import format_of
-from rigidmd.io.formats.through_ase import atoms_of_system
 from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
@@ -62,13 +62,11 @@ class MolecularRecord(RunRecord):
 
     stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
     removal: OverlapRemoval | None = None
-    choices: dict[Count, str] = field(
-        default_factory=dict
-    )  # of integrator and step, with the reasons
+    #: Integrators and steps that were chosen, with the reasons
+    choices: dict[Count, str] = field(default_factory=dict)
     stable: dict[Count, PositiveFloat] = field(default_factory=dict)  # the longest stable step, ps
-    moves: dict[Count, tuple[Count, Count]] = field(
-        default_factory=dict
-    )  # of the box, tried and accepted
+    #: Moves of the box, tried and accepted
+    moves: dict[Count, tuple[Count, Count]] = field(default_factory=dict)
     minima: dict[Count, Minimum] = field(default_factory=dict)
 
 
@@ -76,25 +74,21 @@ class MolecularRecord(RunRecord):
 REPLAYED = 20
 
 
-class MolecularRun(RunPart):
+class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     """The part of a simulation of molecules."""
 
     time_unit = "ps"
     record_type = MolecularRecord
     summary_text = staticmethod(summary_text)
 
-    system: System
-    engine: Engine
-    record: MolecularRecord
-
     def __init__(
         self, simulation: "Simulation", scene: MolecularScene, forces: Any, thermostat: Any
     ):
         super().__init__(simulation)
-        given = (
+        user_forces = (
             forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
         )
-        self._start = build(scene.with_user_code(() if forces is None else given, thermostat))
+        self._start = build(scene.with_user_code(() if forces is None else user_forces, thermostat))
         self.reset()
 
     @property
@@ -160,9 +154,8 @@ class MolecularRun(RunPart):
         if self.scene.engine.is_external:
             from rigidmd.engines.external import compare_at, describe_comparison, external_engine
 
-            other = external_engine(
-                self.system
-            )  # first: the error of a missing program comes before compilation
+            # first: the error of a missing program comes before compilation
+            other = external_engine(self.system)
             try:
                 self._remove_overlaps()
                 lines = compare_at(
@@ -356,11 +349,11 @@ class MolecularRun(RunPart):
                     bar.unpause()
                     bar.skip(count)
 
-            found = minimise(self.system, self.state, stage, self.simulation.must_end, advance)
+            minimum = minimise(self.system, self.state, stage, self.simulation.must_end, advance)
         self.engine.forget()
-        self.record.minima[k] = found
-        if not found.converged:
-            self.simulation.note(f"stages.{k}: {describe_minimum(found, stage)}")
+        self.record.minima[k] = minimum
+        if not minimum.converged:
+            self.simulation.note(f"stages.{k}: {describe_minimum(minimum, stage)}")
 
     def _estimate(self, k: int) -> None:
         """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is
@@ -370,18 +363,18 @@ class MolecularRun(RunPart):
         is_cheap = len(self.system.model.species) <= SMALL_SYSTEM or evaluations >= 100 * DIRECTIONS
         if not self.scene.watch.stable_step or not is_cheap:
             return
-        found = stiffest_mode(
+        mode = stiffest_mode(
             self.system, self.state, self.engine if self.engine.is_repeatable else None
         )
-        if found is None:
+        if mode is None:
             return
-        stable = self.record.stable[k] = stable_angle(stage.scheme) / found.rate
+        stable = self.record.stable[k] = stable_angle(stage.scheme) / mode.rate
         if stage.timestep_fs * FEMTOSECOND > stable:
             self.simulation.note(
                 f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable:"
                 " the stiffest motion at its start, of"
-                f" {checks.molecule_label(self.system, found.molecule)}, has a period of"
-                f" {2 * np.pi / found.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows"
+                f" {checks.molecule_label(self.system, mode.molecule)}, has a period of"
+                f" {2 * np.pi / mode.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows"
                 f" up to {stable / FEMTOSECOND:.3g} fs"
             )
 
@@ -554,14 +547,13 @@ class MolecularRun(RunPart):
     @property
     def headline(self) -> str:
         system, asked = self.system, self.scene.threads or 0
-        more = (
-            f" (the scene requests {asked}; this machine has no more)"
-            if asked > self.threads
-            else ""
-        )
+        if asked > self.threads:
+            hint = f" (the scene requests {asked}; this machine has no more)"
+        else:
+            hint = ""
         return (
             f"{self.scene.name}: {len(system.model.species)} molecules, {system.site_count} sites, "
-            f"{system.last_freedom.total} degrees of freedom; {self.threads} threads{more}"
+            f"{system.last_freedom.total} degrees of freedom; {self.threads} threads{hint}"
         )
 
     @property
@@ -593,35 +585,37 @@ class MolecularRun(RunPart):
             )
         removal = self.start()
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
-        seen = observe(
+        observation = observe(
             self.system, self._engine_of(moving[0] if moving else 0), self.state, energy_unit=1.0
         )
-        forces = np.linalg.norm(seen.load.force, axis=1)
+        forces = np.linalg.norm(observation.load.force, axis=1)
         n, meaning = len(self.system.model.species), describe_quantities(self.system)
-        lattice_energy = seen.potential / size / n if self._is_crystal else None
+        lattice_energy = observation.potential / size / n if self._is_crystal else None
         if lattice_energy is not None:
             meaning["lattice_energy"] = (
                 "the potential energy per molecule at the positions of the structure file, relative"
                 " to the same rigid molecules far from each other; static: without zero-point and"
                 " thermal energy"
             )
-        found = {
+        energies = {
             "unit": unit,
             "molecules": n,
-            "relief_steps": removal.steps if removal else 0,
+            "overlap_removal_steps": removal.steps if removal else 0,
             "notes": [*self.system.notes, *self.system.warnings],
-            "components": {name: energy / size for name, energy in seen.components.items()},
-            "potential": seen.potential / size,
-            "potential_per_molecule": seen.potential / size / n,
+            "components": {name: energy / size for name, energy in observation.components.items()},
+            "potential": observation.potential / size,
+            "potential_per_molecule": observation.potential / size / n,
             "lattice_energy_per_molecule": lattice_energy,
-            "kinetic": seen.kinetic / size,
-            "virial": float(seen.virial.trace()) / size,
-            "virial_tensor": (seen.virial / size).tolist(),
-            "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
+            "kinetic": observation.kinetic / size,
+            "virial": float(observation.virial.trace()) / size,
+            "virial_tensor": (observation.virial / size).tolist(),
+            "pressure_bar": None
+            if np.isnan(observation.pressure_bar)
+            else observation.pressure_bar,
             "largest_force_per_A": float(forces.max()) / size,
             "largest_force_molecule": int(forces.argmax()) + 1,
             "meaning": meaning,
         }
         if measure_accuracy:
-            found["accuracy"] = coulomb_errors(self.system, self.state, size)
-        return found
+            energies["accuracy"] = coulomb_errors(self.system, self.state, size)
+        return energies

@@ -95,9 +95,8 @@ class Sampler(Observer):
         self.trajectories = np.zeros(5)  # see `Engine.trajectories`, at the last sample
         if any(stage.is_hybrid for stage in run.scene.stages):
             self.remembers = self.remembers | {"trajectories": np.ndarray}
-        self._begins: dict[
-            int, int
-        ] = {}  # stage -> row of the last sample before it, or of the first
+        # stage -> row of the last sample before it, or of the first
+        self._begins: dict[int, int] = {}
 
     def origin(self, stage: int) -> float | None:
         """Conserved energy (kJ/mol) at the start of a stage: of the last sample before it, or else
@@ -142,7 +141,8 @@ class Sampler(Observer):
         step, time = int(run.part.state.step[NOW]), float(run.part.state.time[NOW])
         series = ((steps, step), (times, time), (stages, len(samples.stages)))
         if not all(
-            ((of >= 0) & (of <= most)).all() and (np.diff(of) >= 0).all() for of, most in series
+            ((of >= 0) & (of <= largest)).all() and (np.diff(of) >= 0).all()
+            for of, largest in series
         ):
             raise ValueError(f"its samples are not those of a run of {step} steps ({time:g} ps)")
         first = {k: int(np.argmax(stages == k)) for k in np.unique(stages).tolist()}
@@ -181,9 +181,8 @@ class StepWatch(Observer):
             for stage in moving
         ]
         every = checks.check_interval(run.system)
-        self.steps = (
-            every if max(of_samples, default=0.0) > every else None
-        )  # samples come at least as often
+        # samples come at least as often
+        self.steps = every if max(of_samples, default=0.0) > every else None
 
     def see(self, moment: Moment) -> None:
         if (load := self._run.engine.load) is not None:  # forces have been evaluated

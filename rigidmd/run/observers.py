@@ -18,9 +18,9 @@ from pydantic import Field
 from rigidmd.core.state import NOW, State
 from rigidmd.figures.run import run_figures
 from rigidmd.figures.style import save_files
+from rigidmd.formats.atoms import Frame
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import SCENE
-from rigidmd.io.formats.atoms import Frame
 from rigidmd.run.resume import restored, stored
 
 if TYPE_CHECKING:
@@ -33,9 +33,17 @@ class Moment:
     """The argument of observers: position in the run, state and observation. Its values do not
     change later.
 
-    step : steps since the start; time : ps, or s for a single body; stage : index of the stage
-    state : for molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body
-        in SI units
+    Parameters
+    ----------
+    step
+        Steps since the start
+    time
+        In ps, or s for a single body
+    stage
+        Index of the stage
+    state
+        For molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in
+        SI units
     """
 
     def __init__(self, run: "Simulation", step: int, time: float, stage: int):
@@ -77,9 +85,12 @@ def above_zero(interval: float, name: str) -> float:
 class Observer:
     """Base class; its methods do nothing.
 
-    remembers : name -> type of each attribute that a checkpoint has and a resumed run gets back: an
-        array (`np.ndarray`), arrays by name (`dict[str, np.ndarray]`), or what JSON can hold, which
-        is checked
+    Parameters
+    ----------
+    remembers
+        Name -> type of each attribute that a checkpoint has and a resumed run gets back: an array
+        (`np.ndarray`), arrays by name (`dict[str, np.ndarray]`), or what JSON can hold, which is
+        checked
     """
 
     remembers: ClassVar[dict[str, Any]] = {}
@@ -102,7 +113,13 @@ class Observer:
         """Called before the first step; the folder exists."""
 
     def see(self, moment: Moment) -> None:
-        """Observe a moment. Raises SimulationError to stop the run."""
+        """Observe a moment.
+
+        Raises
+        ------
+        SimulationError
+            To stop the run.
+        """
 
     def memory(self) -> Checkpoint:
         """The data that `resume` needs, for a checkpoint. Its files must be on the disk when it
@@ -146,15 +163,14 @@ def as_observer(value: Any) -> Observer:
             f"{value!r:.60} is not an observer: it needs an interval and a method see(moment); "
             "rigidmd.Every(interval, function) makes one of a function"
         )
-    observer = type(
-        type(value).__name__, (Observer,), {}
-    )()  # its name is in messages and checkpoints
-    given = {
+    # its name is in messages and checkpoints
+    observer = type(type(value).__name__, (Observer,), {})()
+    attributes = {
         name: getattr(value, name)
         for name in dir(Observer)
         if name[0] != "_" and hasattr(value, name)
     }
-    vars(observer).update(given)
+    vars(observer).update(attributes)
     return observer
 
 
@@ -227,10 +243,8 @@ class Figures(Observer):
     draws = True
 
     def __init__(self, stems: Sequence[str], suffixes: Sequence[str]):
-        self._suffixes, self._names = (
-            suffixes,
-            [f"{stem}.{suffix}" for stem in stems for suffix in suffixes],
-        )
+        self._suffixes = suffixes
+        self._names = [f"{stem}.{suffix}" for stem in stems for suffix in suffixes]
 
     def end(self, run: "Simulation", results: "Results") -> None:
         failed = None

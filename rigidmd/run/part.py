@@ -1,59 +1,140 @@
 """The part of a simulation that depends on the kind of its system; `molecular` and `body` implement
 it."""
 
+from abc import ABC, abstractmethod
 from math import isclose
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+import numpy as np
 
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW, ORIGIN, State
-from rigidmd.run.observers import Moment
+from rigidmd.engines.body_motion import Motion
+from rigidmd.engines.body_system import BodySystem
+from rigidmd.engines.protocol import Engine
+from rigidmd.engines.samples import Samples
+from rigidmd.engines.system import System
+from rigidmd.errors import SimulationError
+from rigidmd.io.checkpoint import Checkpoint
+from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.resume import RunRecord
 from rigidmd.run.schedule import Segment
 
 if TYPE_CHECKING:
     from rigidmd.run.simulation import Simulation
 
+SystemT = TypeVar("SystemT", System, BodySystem)
+RecordT = TypeVar("RecordT", bound=RunRecord)
+SamplesT = TypeVar("SamplesT", Samples, Motion)
 
-class RunPart:
+
+class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
     """What a `Simulation` moves: system, engine, state, the present segment, and the record of the
-    run. Subclasses have
+    run.
 
-    time_unit, record_type : "ps" or "s"; a dataclass, the type of `record`
-    headline : first line of the introduction
-    prepare() : do everything before the first step, including compilation
-    durations() : of all segments, ps or s; 0 without steps
-    enter_segment(k), reenter_segment(k) : prepare segment k and return it; return it, when the run
-    is resumed in it restore(kept) : return to a checkpoint, whose record is read; CheckpointError
-    if it is of another scene, ValueError
-        if it is invalid
-    observe(moment) : the observation, which `Moment.observation` keeps
-    observe_now(), energy_now(), forces_now() : of the present state, for `Simulation`
-    default_observers() : the observers that sample, check and write
-    samples(), summary(samples, preparing, wall), summary_text(summary, known) : the samples; the
-        summary, with seconds of preparing (compiling, removal of overlaps) and of segments with
-        observers and output; the latter as text without the notes in `known`
-    explain(error) : an error in full: what was seen, the likely cause, what to try
-    start_energy(...) : energies and forces at the start
+    time_unit : "ps" or "s"
+    record_type : a dataclass, the type of `record`
     """
 
-    record_type: type[RunRecord]
-    engine_version = "rigidmd"
-    threads: Any = 1
-
-    system: Any
-    engine: Any
-    state: State
-    record: Any
-    segment: Segment
-    durations: Any
-    reenter_segment: Any
     time_unit: str
+    record_type: type[RecordT]
+    engine_version = "rigidmd"
 
-    scene: Any = property(attrgetter("system.scene"))
+    system: SystemT
+    engine: Engine
+    state: State
+    record: RecordT
+    segment: Segment
 
     def __init__(self, simulation: "Simulation"):
         self.simulation = simulation
+
+    @property
+    def scene(self):
+        """The scene as it runs."""
+        return self.system.scene
+
+    @property
+    def threads(self) -> int:
+        """Number of threads; a single body has one."""
+        return 1
+
+    @property
+    @abstractmethod
+    def headline(self) -> str:
+        """First line of the introduction."""
+
+    # the run
+
+    @abstractmethod
+    def prepare(self) -> None:
+        """Do everything before the first step, including compilation."""
+
+    @abstractmethod
+    def durations(self) -> list[float]:
+        """Durations of all segments, ps or s; 0 without steps."""
+
+    @abstractmethod
+    def enter_segment(self, k: int) -> Segment:
+        """Prepare segment k."""
+
+    @abstractmethod
+    def reenter_segment(self, k: int) -> Segment:
+        """Segment k of a run that is resumed in it or after it."""
+
+    @abstractmethod
+    def restore(self, kept: Checkpoint) -> None:
+        """Return to a checkpoint, whose record is read. Raises CheckpointError if it is of another
+        scene, ValueError if it is invalid."""
+
+    # observation
+
+    @abstractmethod
+    def observe(self, moment: Moment) -> Any:
+        """The observation that `Moment.observation` keeps."""
+
+    @abstractmethod
+    def observe_now(self) -> Any:
+        """The observation of the present state."""
+
+    @abstractmethod
+    def energy_now(self) -> float:
+        """Potential plus kinetic energy of the present state, kJ/mol, for a body J."""
+
+    @abstractmethod
+    def forces_now(self) -> np.ndarray:
+        """Forces (n, 3) at the present state, kJ/mol/Å, for a body N."""
+
+    @abstractmethod
+    def default_observers(self) -> list[Observer]:
+        """The observers that sample, check and write."""
+
+    # results
+
+    @abstractmethod
+    def samples(self) -> SamplesT:
+        """What the observers have sampled."""
+
+    @abstractmethod
+    def summary(self, samples: SamplesT, preparing: float, wall: float) -> dict[str, Any]:
+        """The summary of the run.
+
+        preparing : seconds of compiling and removal of overlaps
+        wall : seconds of the run, with observers and output
+        """
+
+    @staticmethod
+    @abstractmethod
+    def summary_text(summary: dict[str, Any], known: Any) -> str:
+        """The summary as text, without the notes in `known`."""
+
+    @abstractmethod
+    def explain(self, error: SimulationError) -> str:
+        """An error in full: what was seen, the likely cause, what to try."""
+
+    @abstractmethod
+    def start_energy(self, *arguments: Any, **options: Any) -> dict[str, Any]:
+        """Energies and forces at the start."""
 
     def take_threads(self, count: int) -> None:
         """Set the number of threads; a single body always has one."""

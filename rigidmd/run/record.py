@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
-from rigidmd.core.state import STORED_NAMES, State
+from rigidmd.core.state import State
 from rigidmd.engines import samples
 from rigidmd.engines.body_motion import Snapshot, motion
 from rigidmd.engines.body_system import BodySystem
@@ -123,33 +123,34 @@ def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
     if lacking := [name for name in ("step", "time", "stage_name") if name not in headers]:
         header = samples.COLUMNS[lacking[0]].header
         raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {header!r}")
-    found = {
+    columns = {
         name: np.array(read.cells[header])
         if name == "stage_name"
         else read.numbers(header, finite=name == "time")
         for name, header in headers.items()
     }
-    return found | {"stage": _stage_of(found["stage_name"], found["time"], scene.stages)}
+    return columns | {"stage": _stage_of(columns["stage_name"], columns["time"], scene.stages)}
 
 
 def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:
     """Index of the stage of each row. Stages with the same name are distinguished by their
     times."""
-    found, first, end = np.full(len(names), len(stages) - 1), 0, 0.0
+    stage_of_row, first, end = np.full(len(names), len(stages) - 1), 0, 0.0
     for k, stage in enumerate(stages[:-1]):
         end += stage.duration
         of_stage = (names[first:] == stage.label) & (
             time[first:] <= end + 0.5e-3 * stage.timestep_fs
         )
         count = len(of_stage) if of_stage.all() else int(of_stage.argmin())
-        found[first : first + count] = k
+        stage_of_row[first : first + count] = k
         first += count
-    return found
+    return stage_of_row
 
 
 def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
     """Columns of motion.csv, or, of a run that has not written it, of its last checkpoint."""
-    if (found := read_motion(folder / MOTION)) is not None:
+    if (columns := read_motion(folder / MOTION)) is not None:
+        # that every motion has
         families = [
             "time",
             "position",
@@ -157,7 +158,7 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
             "potential",
             "energy",
             "work",
-        ]  # that every motion has
+        ]
         if system.rotates:
             families += [
                 "rotation",
@@ -168,19 +169,19 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
                 "L_lab",
             ]
         needed = [name for family in families for name in BODY[family].names]
-        if lacking := [BODY_COLUMNS[name].header for name in needed if name not in found.cells]:
+        if lacking := [BODY_COLUMNS[name].header for name in needed if name not in columns.cells]:
             raise OutputError(
-                f"{found.path} is not the motion of this run: it has no column {lacking[0]!r}"
+                f"{columns.path} is not the motion of this run: it has no column {lacking[0]!r}"
             )
-        return {name: found.numbers(name, finite=name in needed) for name in found.cells}
+        return {name: columns.numbers(name, finite=name in needed) for name in columns.cells}
     try:
-        kept, _ = latest(folder)
+        checkpoint, _ = latest(folder)
     except CheckpointError:
         return {}
-    for owner in kept.values.get("of", {}):
-        part = kept.of(owner).arrays
+    for owner in checkpoint.values.get("of", {}):
+        part = checkpoint.of(owner).arrays
         if "stacked/t" in part:  # of `run.body.Sampler`
-            states = zip(*(part[f"stacked/{name}"] for name in STORED_NAMES), strict=True)
+            states = zip(*(part[f"stacked/{name}"] for name in State._fields), strict=True)
             times = part["stacked/t"].tolist()
             snapshots = [Snapshot(t, State(*state)) for t, state in zip(times, states, strict=True)]
             missing.append(

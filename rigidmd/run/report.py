@@ -133,13 +133,12 @@ def body_rows(summary: dict) -> list[tuple[str, str]]:
 
 def stage_title(stage: dict) -> str:
     """Steps and speed of a stage, or how its minimisation ended."""
-    if found := stage["minimum"]:
-        ended = "converged" if found["converged"] else f"not converged ({found['ended_by']}),"
-        removal = (
-            f" and {found['relief_steps']} of overlap removal" if found["relief_steps"] else ""
-        )
+    if minimum := stage["minimum"]:
+        ended = "converged" if minimum["converged"] else f"not converged ({minimum['ended_by']}),"
+        steps = minimum["overlap_removal_steps"]
+        removal = f" and {steps} of overlap removal" if steps else ""
         return (
-            f"{stage['name']}: {ended} after {found['iterations']} iterations{removal};"
+            f"{stage['name']}: {ended} after {minimum['iterations']} iterations{removal};"
             f" {stage['computing_s']:.1f} s"
         )
     title = (
@@ -151,20 +150,20 @@ def stage_title(stage: dict) -> str:
     return title
 
 
-def _minimum_rows(stage: dict, found: dict) -> list[tuple[str, str]]:
-    before, after = (
-        found["energy_before_kJ_mol_per_molecule"],
-        found["energy_after_kJ_mol_per_molecule"],
-    )
-    force, torque = found["largest_force_kJ_mol_A"], found["largest_torque_kJ_mol"]
+def _minimum_rows(stage: dict, minimum: dict) -> list[tuple[str, str]]:
+    before = minimum["energy_before_kJ_mol_per_molecule"]
+    after = minimum["energy_after_kJ_mol_per_molecule"]
+    force, torque = minimum["largest_force_kJ_mol_A"], minimum["largest_torque_kJ_mol"]
     rows = [
         ("potential", f"{before:.6g} before, {after:.6f} kJ/mol per molecule after"),
         ("largest force", f"{force:.2g} kJ/(mol Å), torque {torque:.2g} kJ/mol"),
     ]
-    if found["pressure_bar"] is not None:
-        off = found["largest_pressure_deviation_bar"]
-        more = "" if off is None else f", within {off:.2g} bar of the given pressure"
-        rows.append(("pressure", f"{found['pressure_bar']:.4g} bar without the kinetic part{more}"))
+    if minimum["pressure_bar"] is not None:
+        off = minimum["largest_pressure_deviation_bar"]
+        deviation = "" if off is None else f", within {off:.2g} bar of the given pressure"
+        rows.append(
+            ("pressure", f"{minimum['pressure_bar']:.4g} bar without the kinetic part{deviation}")
+        )
     if stage.get("density_g_cm3") is not None:
         rows.append(("density", f"{stage['density_g_cm3']:.4f} g/cm³"))
         edges = (f"{edge} {stage[f'{edge}_A']:.4f}" for edge in "abc")
@@ -179,10 +178,8 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
     rows.append(("means", f"over {stage['means_over']}"))
     if stage.get("volume_nm3") is not None:
-        mean, end = (
-            format_with_error(stage["volume_nm3"], stage["volume_error_nm3"]),
-            stage["volume_before_nm3"],
-        )
+        mean = format_with_error(stage["volume_nm3"], stage["volume_error_nm3"])
+        end = stage["volume_before_nm3"]
         rows.append(
             (
                 "volume",
@@ -197,14 +194,12 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         if parts := _temperatures(stage, "_unbiased"):
             rows.append(("", f"{parts} corrected for the time step"))
         if (scatter := stage.get("temperature_scatter_K")) is not None:
-            off, before = (
-                stage["temperature_K"] - stage["temperature_before_K"],
-                stage["temperature_before_K"],
-            )
+            off = stage["temperature_K"] - stage["temperature_before_K"]
+            before = stage["temperature_before_K"]
             moment = "this stage keeps the energy of one moment; such temperatures scatter by"
-            more = "" if abs(off) < 3 * scatter else ", less than this: equilibrate longer"
+            hint = "" if abs(off) < 3 * scatter else ", less than this: equilibrate longer"
             rows.append(
-                ("", f"{off:+.2g} K from the {before:g} K before: {moment} {scatter:.2g} K{more}")
+                ("", f"{off:+.2g} K from the {before:g} K before: {moment} {scatter:.2g} K{hint}")
             )
     error = stage["potential_error_kJ_mol_per_molecule"]
     rows.append(
@@ -240,19 +235,15 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         )
     elif stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
-        value, error = (
-            stage["drift_kJ_mol_ns_per_molecule"],
-            stage["drift_error_kJ_mol_ns_per_molecule"],
-        )
+        value = stage["drift_kJ_mol_ns_per_molecule"]
+        error = stage["drift_error_kJ_mol_ns_per_molecule"]
         verdict = f": {stage['drift_verdict']}" if stage["drift_verdict"] else ""
         rows.append(
             ("drift", f"{format_signed(value, error)} kJ/mol/ns per molecule ({what}){verdict}")
         )
         if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
-            value, error = (
-                stage["drift_kT_ns_per_degree_of_freedom"],
-                stage["drift_error_kT_ns_per_degree_of_freedom"],
-            )
+            value = stage["drift_kT_ns_per_degree_of_freedom"]
+            error = stage["drift_error_kT_ns_per_degree_of_freedom"]
             rows.append(("", f"{format_signed(value, error)} kT/ns per degree of freedom"))
             total = f"in total {value * stage['duration_ps'] / 1000:+.2g} kT per degree of freedom"
             if stage["drift_over_kinetic_std"] is not None:
@@ -273,11 +264,11 @@ def _with_error(value: float, error: float | None, places: int, unit: str = "") 
     return f"{text} {unit}".rstrip() + (f" ({NO_ERROR})" if error is None and unit else "")
 
 
-def _set_point(given: float | Sequence[float] | None, unit: str) -> str:
+def _set_point(set_point: float | Sequence[float] | None, unit: str) -> str:
     """The set point of a thermostat or barostat, two values if it changes; empty without one."""
-    if given is None:
+    if set_point is None:
         return ""
-    values = given if isinstance(given, Sequence) else [given]
+    values = set_point if isinstance(set_point, Sequence) else [set_point]
     return (
         ", set point"
         f" {(' to ' if len(values) == 2 else ', ').join(f'{value:g}' for value in values)} {unit}"
@@ -285,10 +276,10 @@ def _set_point(given: float | Sequence[float] | None, unit: str) -> str:
 
 
 def _temperatures(stage: dict, kind: str) -> str:
-    found = []
+    texts = []
     for name, motion in (("T_trans", "translation"), ("T_rot", "rotation")):
         if (value := stage[f"temperature_{motion}{kind}_K"]) is not None:
-            found.append(
+            texts.append(
                 f"{name} {_with_error(value, stage[f'temperature_{motion}{kind}_error_K'], 2)}"
             )
-    return f"{', '.join(found)} K" if found else ""
+    return f"{', '.join(texts)} K" if texts else ""

@@ -11,7 +11,7 @@ import numpy as np
 from rigidmd.core.display import Displayed
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
-from rigidmd.io.formats import BY_EXTENSION
+from rigidmd.formats import BY_EXTENSION
 
 if TYPE_CHECKING:
     import ase
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rigidmd.engines.body_system import BodySystem
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
-    from rigidmd.io.formats.atoms import Frame
+    from rigidmd.formats.atoms import Frame
 
 
 @dataclass(repr=False)
@@ -33,10 +33,16 @@ class Results(Displayed):
     whole system, K, bar, Å, ps) or, for a body, in SI units. `units` lists all columns with their
     units.
 
-    summary : values with units in their keys, as in summary.json
-    files : paths of the files written
-    interrupted : whether the run ended early, by a signal or at its walltime (`out_of_time`)
-    signal : number of the signal, 2 for Ctrl-C, 15 for SIGTERM
+    Parameters
+    ----------
+    summary
+        Values with units in their keys, as in summary.json
+    files
+        Paths of the files written
+    interrupted
+        Whether the run ended early, by a signal or at its walltime (`out_of_time`)
+    signal
+        Number of the signal, 2 for Ctrl-C, 15 for SIGTERM
     """
 
     system: "System | BodySystem"
@@ -49,9 +55,8 @@ class Results(Displayed):
     out_of_time: bool = False
     _frames: "Sequence[Frame]" = field(default_factory=list)
     _tensor: np.ndarray | None = None  # (n, 7) rows of the pressure tensor of a run without files
-    _analysis_frames: dict[float | None, Any] = field(
-        default_factory=dict
-    )  # kept by rigidmd.analysis, by their start
+    #: Kept by rigidmd.analysis, by their start
+    _analysis_frames: dict[float | None, Any] = field(default_factory=dict)
     _is_stored: bool = False  # read from a folder, without user-defined forces
     _no_state: str = ""  # why a stored run has no final state
 
@@ -69,8 +74,13 @@ class Results(Displayed):
 
     @property
     def state(self) -> State:
-        """The final state, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units. Raises
-        OutputError if a run that was read from a folder has none."""
+        """The final state, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units.
+
+        Raises
+        ------
+        OutputError
+            If a run that was read from a folder has none.
+        """
         if self._state is None:
             raise OutputError(self._no_state)
         return self._state
@@ -96,8 +106,13 @@ class Results(Displayed):
         return {name: column.unit for name, column in self.samples.described.items()}
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """The samples under the headers of log.csv (motion.csv of a body). Raises ImportError
-        without pandas."""
+        """The samples under the headers of log.csv (motion.csv of a body).
+
+        Raises
+        ------
+        ImportError
+            Without pandas.
+        """
         try:
             import pandas
         except ImportError:
@@ -115,7 +130,11 @@ class Results(Displayed):
 
         Lengths in Å, times in ps; for a body a second becomes a picosecond. Every frame has its
         time in the run, also where the file format has none. Warns if frames are not evenly spaced.
-        Raises ValueError without a trajectory.
+
+        Raises
+        ------
+        ValueError
+            Without a trajectory.
         """
         from rigidmd.io import trajectory
 
@@ -151,7 +170,13 @@ class Results(Displayed):
         frame at its time, is exact, with energy, forces and stress; other frames have the digits of
         the trajectory (single precision but for .traj), and the energy where the log has a line at
         their time. So has the final state of a run that was read from a folder, without forces.
-        Raises ValueError for a body or without frames, IndexError.
+
+        Raises
+        ------
+        ValueError
+            For a body, or without frames.
+        IndexError
+            If there are fewer frames.
         """
         from rigidmd.run.atom_forces import atoms_of_results
 
@@ -164,7 +189,12 @@ class Results(Displayed):
         For molecules Q rotates the principal axes of `rigidmd models NAME`, for a body the body's
         axes, at all samples. A trajectory.gsd stores Q. With other files it is fitted to the
         positions of sites, as exact as these, with an arbitrary rotation of linear molecules about
-        their axes. Raises ValueError if nothing rotates.
+        their axes.
+
+        Raises
+        ------
+        ValueError
+            If nothing rotates.
         """
         if "Q" in self.samples.described:
             return self["Q"][:, None]

@@ -17,8 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigidmd.compile.machine import CODE_SETTINGS, PROCESSOR, PROCESSOR_FEATURES, SIMD_BITS
 from rigidmd.core.integrators import Scheme
-from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
+from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.core.state_file import array_errors
+from rigidmd.core.toml import shorten_text
 from rigidmd.errors import CheckpointError, SceneError, option
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import elsewhere
@@ -128,6 +129,14 @@ def differences(
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
+def describe_differences(values: Mapping[str, tuple[Any, Any]], files: Iterable[str]) -> list[str]:
+    """Phrases: keys with their values now and before, and keys of files that have changed."""
+    changes = []
+    for key, (now, before) in values.items():
+        changes.append(f"{key} is {shorten_text(str(now))}, there {shorten_text(str(before))}")
+    return changes + [f"the file of {key} has changed" for key in files]
+
+
 def _flat(data: Any, name: str = "") -> dict[str, Any]:
     """Dotted key -> value of nested tables, without None."""
     if isinstance(data, list) and any(isinstance(value, Mapping) for value in data):
@@ -162,10 +171,9 @@ def check_same_scene(
                 f"{scene.source}: the run in the folder is already longer, {steps} steps"
             )
     unlike = differences(keys_of(plain(scene), excluded), keys_of(before, excluded))
-    changes = [f"{key} is {now}, there {then}" for key, (now, then) in unlike.items()]
-    found = input_digests(scene)
-    changes += [f"the file of {key} has changed" for key in found if found[key] != inputs.get(key)]
-    if changes:
+    digests = input_digests(scene)
+    changed = [key for key in digests if digests[key] != inputs.get(key)]
+    if changes := describe_differences(unlike, changed):
         raise CheckpointError(
             f"{scene.source}: is not the scene of the run in the folder: {'; '.join(changes[:8])}. "
             f"{option('force')} begins a new run, {elsewhere()}"
@@ -194,24 +202,24 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True
 
     exact : whether the method of the run keeps rotation matrices orthogonal to rounding
     """
-    found = State(*(np.array(arrays[name], order="C") for name in STORED_NAMES))
-    shapes = {name: expected.shape for name, expected in zip(STORED_NAMES, like, strict=True)}
+    state = State(*(np.array(arrays[name], order="C") for name in State._fields))
+    shapes = {name: expected.shape for name, expected in zip(State._fields, like, strict=True)}
     for name, problem in array_errors(
-        dict(zip(STORED_NAMES, found, strict=True)), shapes, exact
+        dict(zip(State._fields, state, strict=True)), shapes, exact
     ).items():
         raise ValueError(f"{name} of its state {problem}")
-    for name, array, expected in zip(STORED_NAMES, found, like, strict=True):
+    for name, array, expected in zip(State._fields, state, like, strict=True):
         if array.dtype != expected.dtype:
             raise ValueError(
                 f"{name} of its state is of the type {array.dtype}, not {expected.dtype}"
             )
-    if (np.isfinite(found.cell) != np.isfinite(like.cell)).any():
+    if (np.isfinite(state.cell) != np.isfinite(like.cell)).any():
         raise ValueError("its state has another kind of box")
     if not (
-        0 <= found.step[ORIGIN] <= found.step[NOW] and 0 <= found.time[ORIGIN] <= found.time[NOW]
+        0 <= state.step[ORIGIN] <= state.step[NOW] and 0 <= state.time[ORIGIN] <= state.time[NOW]
     ):
         raise ValueError("its step or time is before the start")
-    return found
+    return state
 
 
 def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
@@ -226,10 +234,10 @@ def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
         else:
             plain_types[name] = kind
     values = {name: getattr(owner, name) for name in plain_types}
-    found = (
+    dumped = (
         _model_of(plain_types).model_construct(**values).model_dump(mode="json", exclude_none=True)
     )
-    return Checkpoint({name: found.get(name) for name in plain_types}, arrays)
+    return Checkpoint({name: dumped.get(name) for name in plain_types}, arrays)
 
 
 def restored(
@@ -249,11 +257,11 @@ def restored(
         }
     try:
         model = _model_of({name: types[name] for name in types if name not in arrays})
-        found = model.model_validate(kept.values, context=rows)
+        values = model.model_validate(kept.values, context=rows)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-    return {name: getattr(found, name) for name in types if name not in arrays} | arrays
+    return {name: getattr(values, name) for name in types if name not in arrays} | arrays
 
 
 def _model_of(types: Mapping[str, Any]) -> type[BaseModel]:

@@ -38,11 +38,9 @@ class RigidFit:
         Q = np.tile(np.eye(3), (self._n if self._rotates else 0, 1, 1))
         velocity, L = np.empty((self._n, 3)), np.zeros((len(Q), 3))
         for kind in self._kinds:
-            at, index, body = (
-                sites[kind.sites].astype(float),
-                kind.index,
-                kind.molecule.positions_body,
-            )
+            at = sites[kind.sites].astype(float)
+            index = kind.index
+            body = kind.molecule.positions_body
             middle, middle_body = at.mean(axis=1), body.mean(axis=0)
             rotation = align(body - middle_body, at - middle[:, None], np.ones(len(body)))
             centre[index] = middle - rotation @ middle_body
@@ -91,10 +89,10 @@ class Kind(NamedTuple):
 def kinds_of(system: System) -> list[Kind]:
     """The species of a system that have molecules, frozen and mobile ones separately."""
     first = np.flatnonzero(np.diff(system.sites.molecule, prepend=-1))
-    found = []
+    kinds = []
     for k, molecule in enumerate(system.species):
         index = np.flatnonzero(system.model.species == k)
         if len(index):
             sites = first[index][:, None] + np.arange(len(molecule.masses))
-            found.append(Kind(molecule, index, sites, bool(system.model.inverse_mass[k] > 0)))
-    return found
+            kinds.append(Kind(molecule, index, sites, bool(system.model.inverse_mass[k] > 0)))
+    return kinds

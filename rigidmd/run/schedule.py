@@ -40,9 +40,8 @@ class ObservationSchedule:
 
     def __init__(self, observers: Collection[Observer], segment: Segment):
         self._observers, self._last, together = observers, segment.steps, segment.together
-        self._regular: list[
-            tuple[int, int]
-        ] = []  # steps between two calls of each, or 0; steps before the segment
+        # steps between two calls of each, or 0; steps before the segment
+        self._regular: list[tuple[int, int]] = []
         for observer in observers:
             if observer.interval is None:
                 self._regular.append((-(-(observer.steps or 0) // together) * together, 0))
@@ -68,10 +67,12 @@ class ObservationSchedule:
 
     def due(self, done: int) -> list[bool]:
         """Which observers are called after `done` steps."""
-        return [
-            (observer.ends and done == self._last) or (every > 0 and (before + done) % every == 0)
-            for observer, (every, before) in zip(self._observers, self._regular, strict=True)
-        ]
+        is_last = done == self._last
+        is_due = []
+        for observer, (every, before) in zip(self._observers, self._regular, strict=True):
+            is_regular = every > 0 and (before + done) % every == 0
+            is_due.append((observer.ends and is_last) or is_regular)
+        return is_due
 
 
 #: Seconds of computing after which the clock and signals are checked.

@@ -12,9 +12,18 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from math import inf
-from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Generic,
+    NamedTuple,
+    TypedDict,
+    TypeVar,
+    Unpack,
+    cast,
+    overload,
+)
 
 import numpy as np
 
@@ -29,19 +38,39 @@ from rigidmd.run.loop import RunLoop
 from rigidmd.run.observers import as_observer
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import checked_walltime, signal_handler, stop_signals
-from rigidmd.scene import BodyScene, Scene
+from rigidmd.scene import BodyScene, MolecularScene, Scene
 
 if TYPE_CHECKING:
     import ase
 
     from rigidmd.assemble.user_code.force import Force, HasStage, HasTerm
     from rigidmd.assemble.user_code.pair_potential import PairLaw
-    from rigidmd.engines.body_system import Pose
+    from rigidmd.engines.body_system import BodySystem, Pose
+    from rigidmd.engines.observables import Observation
+    from rigidmd.engines.protocol import Engine
+    from rigidmd.engines.system import System
+    from rigidmd.run.body import BodyRun
     from rigidmd.run.minimise import OverlapRemoval
     from rigidmd.run.molecular import MolecularRun
+    from rigidmd.run.schedule import Segment
 
     UserForce = Force | PairLaw | HasTerm | NamedTuple
 
+    class Options(TypedDict, total=False):
+        """The keyword arguments of `Simulation`, which are described there."""
+
+        observers: Any
+        say: Callable[[str], object] | None
+        warn: Callable[[str], object]
+        resume: bool
+        walltime: float | None
+        forces: UserForce | Sequence[UserForce] | None
+        thermostat: NamedTuple | HasStage | None
+        applied: Mapping[str, Callable[[Pose], tuple]] | None
+
+
+SystemT = TypeVar("SystemT")
+SceneT = TypeVar("SceneT")
 
 #: Simulations that have begun and not ended, which are closed when the interpreter exits.
 _BEGUN: "weakref.WeakSet[Simulation]" = weakref.WeakSet()
@@ -55,34 +84,77 @@ def _as_warning(sentence: str) -> None:
     warnings.warn(sentence, RigidMDWarning, stacklevel=level)
 
 
-class Simulation(Displayed):
+class Simulation(Displayed, Generic[SystemT, SceneT]):
     """A scene, ready to run: `run()` runs it to its end, `step(n)` advances it by n steps; both can
     be mixed.
 
-    scene : the scene
-    folder : folder for the files; None writes nothing and keeps the frames in memory
-    force : replace an earlier run in that folder
-    observers : user-defined, called between steps: `Every`, `LivePlot`, any object with `interval`
-        and `see(moment)`
-    `say` : called with a sentence before something slow (compiling, pilot runs). Default: printed
-        with the progress
-    warn : called with each warning; the summary repeats them. Default: a `RigidMDWarning` of
-        Python's `warnings`
-    resume : continue from the last checkpoint in the folder, to the same bits; begin if the folder
-        is empty or absent
-    walltime : seconds from now until the run has to have ended; it stops shortly before, with a
-        checkpoint
-    forces : for molecules, user-defined forces, besides the forces of the scene: `rigidmd.Force`,
+    Parameters
+    ----------
+    scene
+        The scene
+    folder
+        Folder for the files; None writes nothing and keeps the frames in memory
+    force
+        Replace an earlier run in that folder
+    observers
+        user-defined, called between steps: `Every`, `LivePlot`, any object with `interval` and
+        `see(moment)`
+    `say`
+        Called with a sentence before something slow (compiling, pilot runs). Default: printed with
+        the progress
+    warn
+        Called with each warning; the summary repeats them. Default: a `RigidMDWarning` of Python's
+        `warnings`
+    resume
+        Continue from the last checkpoint in the folder, to the same bits; begin if the folder is
+        empty or absent
+    walltime
+        Seconds from now until the run has to have ended; it stops shortly before, with a checkpoint
+    forces
+        For molecules, user-defined forces, besides the forces of the scene: `rigidmd.Force`,
         `rigidmd.pair_law`, terms of classes with `rigidmd.compiled_force`, or objects whose method
         term(system) makes such a term. At the start forces and torques are compared with
         differences of the energy, and the virial with the effect of a strain of the box
-    thermostat : for molecules, a user-defined thermostat for every stage: a NamedTuple of a class
-        with `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
-    applied : for a single body, name -> function of a `Pose` that gives a force (3,) in N along the
-        lab's axes, at the centre of mass, and a torque (3,) in N m along the body's axes. It is
-        called once for each position of the body. Forces that depend on the velocity are constant
-        within a step, which reduces its order to 1
+    thermostat
+        For molecules, a user-defined thermostat for every stage: a NamedTuple of a class with
+        `rigidmd.compiled_thermostat`, or an object whose method for_stage(system, k) makes one
+    applied
+        For a single body, name -> function of a `Pose` that gives a force (3,) in N along the lab's
+        axes, at the centre of mass, and a torque (3,) in N m along the body's axes. It is called
+        once for each position of the body. Forces that depend on the velocity are constant within a
+        step, which reduces its order to 1
     """
+
+    part: "MolecularRun | BodyRun"
+
+    if TYPE_CHECKING:
+
+        @overload
+        def __init__(
+            self: "Simulation[System, MolecularScene]",
+            scene: MolecularScene,
+            folder: str | Path | None = None,
+            force: bool = False,
+            **options: Unpack[Options],
+        ) -> None: ...
+
+        @overload
+        def __init__(
+            self: "Simulation[BodySystem, BodyScene]",
+            scene: BodyScene,
+            folder: str | Path | None = None,
+            force: bool = False,
+            **options: Unpack[Options],
+        ) -> None: ...
+
+        @overload
+        def __init__(
+            self: "Simulation[Any, Any]",
+            scene: Scene,
+            folder: str | Path | None = None,
+            force: bool = False,
+            **options: Unpack[Options],
+        ) -> None: ...
 
     def __init__(
         self,
@@ -99,9 +171,8 @@ class Simulation(Displayed):
         thermostat: "NamedTuple | HasStage | None" = None,
         applied: "Mapping[str, Callable[[Pose], tuple]] | None" = None,
     ):
-        self.folder = (
-            None if folder is None else Path(folder).absolute()
-        )  # a callback may change the directory
+        # a callback may change the directory
+        self.folder = None if folder is None else Path(folder).absolute()
         if resume and folder is None:
             raise ValueError("a run without a folder has no checkpoint to resume from")
         self._force, self._resume, self._user_say, self.warn = force, resume, say, warn
@@ -120,13 +191,12 @@ class Simulation(Displayed):
             None  # of the last run by this object in the folder
         )
         of_molecules = {"forces": forces, "thermostat": thermostat}
-        self.part: Any  # a `RunPart`
         if isinstance(scene, BodyScene):
             from rigidmd.run.body import BodyRun
 
-            if given := [key for key, value in of_molecules.items() if value is not None]:
+            if set_keys := [key for key, value in of_molecules.items() if value is not None]:
                 problem = (
-                    f"{' and '.join(given)}: for molecules; a single body takes applied={{name:"
+                    f"{' and '.join(set_keys)}: for molecules; a single body takes applied={{name:"
                     " function}"
                 )
                 raise SceneError(scene.source, [problem])
@@ -158,15 +228,30 @@ class Simulation(Displayed):
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    scene = property(
-        attrgetter("part.scene"), doc="The scene as it runs, with defaults and choices."
-    )
-    system = property(attrgetter("part.system"), doc="The `System` or `BodySystem`.")
-    engine = property(attrgetter("part.engine"), doc="The present engine.")
-    segment = property(
-        attrgetter("part.segment"), doc="The present segment: its method, step and number of steps."
-    )
-    threads = property(attrgetter("part.threads"), doc="Number of threads.")
+    @property
+    def scene(self) -> SceneT:
+        """The scene as it runs, with defaults and choices."""
+        return cast(SceneT, self.part.scene)
+
+    @property
+    def system(self) -> SystemT:
+        """The system that the scene describes."""
+        return cast(SystemT, self.part.system)
+
+    @property
+    def engine(self) -> "Engine":
+        """The present engine."""
+        return self.part.engine
+
+    @property
+    def segment(self) -> "Segment":
+        """The present segment: its method, step and number of steps."""
+        return self.part.segment
+
+    @property
+    def threads(self) -> int:
+        """Number of threads."""
+        return self.part.threads
 
     @property
     def state(self) -> State:
@@ -178,12 +263,17 @@ class Simulation(Displayed):
         return self.part.state.read_only
 
     @property
-    def observation(self) -> Any:
+    def observation(self) -> "Observation | Pose":
         """Observables of the present state, before, within and after a run; each use evaluates the
         forces.
 
         An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log; the `Pose` of a body,
-        in SI units. Raises SimulationError if the forces cannot be evaluated.
+        in SI units.
+
+        Raises
+        ------
+        SimulationError
+            If the forces cannot be evaluated.
         """
         return self.part.observe_now()
 
@@ -205,7 +295,13 @@ class Simulation(Displayed):
         return list(self.part.record.notes)
 
     def path(self, file: str) -> Path:
-        """Path of a file in the folder of the run. Raises ValueError without a folder."""
+        """Path of a file in the folder of the run.
+
+        Raises
+        ------
+        ValueError
+            Without a folder.
+        """
         if self.folder is None:
             raise ValueError(f"this run has no folder for {file}")
         return self.folder / file
@@ -217,20 +313,20 @@ class Simulation(Displayed):
 
     def introduction(self) -> str:
         """A few lines for the start of a run."""
-        return "\n".join([self.part.headline, *(f"  {note}" for note in self.system.notes)])
+        return "\n".join([self.part.headline, *(f"  {note}" for note in self.part.system.notes)])
 
     def conclusion(self, results: Results) -> str:
         """The summary as text, without the notes of the introduction and the warnings that were
         issued."""
-        return self.part.summary_text(results.summary, [*self.system.notes, *self._issued])
+        return self.part.summary_text(results.summary, [*self.part.system.notes, *self._issued])
 
     def write_scene(self, folder: Path) -> None:
         """Write the scene as it runs, with copies of the files that it reads."""
-        write_scene(folder, self.scene)
+        write_scene(folder, self.part.scene)
 
     # Before a run.
 
-    def _before_run(self) -> Any:
+    def _before_run(self) -> "MolecularRun | BodyRun":
         """The part, which is changed before a run. Raises RuntimeError within a run."""
         if self._loop is not None:
             raise RuntimeError("the run has begun; close() ends it")
@@ -240,15 +336,18 @@ class Simulation(Displayed):
         """The part of molecules. Raises TypeError for a body, RuntimeError within a run unless it
         may have `begun`."""
         part = self.part if begun else self._before_run()
-        if isinstance(self.scene, BodyScene):
-            raise TypeError(f"{self.scene.name} is a single body; this method is for molecules")
-        return part
+        if isinstance(part.scene, BodyScene):
+            raise TypeError(f"{part.scene.name} is a single body; this method is for molecules")
+        return cast("MolecularRun", part)
 
     def start_from(self, state: State) -> None:
         """Let runs of molecules begin at the given positions and momenta, without removal of
         overlaps.
 
-        state : of as many molecules in the same order, in the units of `state`, such as
+        Parameters
+        ----------
+        state
+            A state of as many molecules in the same order, in the units of `state`, such as
             `results.state`. Time and step begin at 0. Raises StructureError for a state that this
             scene cannot have, TypeError for anything else.
         """
@@ -298,10 +397,20 @@ class Simulation(Displayed):
         run in a folder that was interrupted is continued from its last checkpoint. Without a folder
         there is none, and it begins anew.
 
-        Raises OutputError (before computing), SimulationError if it fails, CheckpointError.
+        Parameters
+        ----------
+        progress
+            Whether to show progress, by a bar or, if not on a terminal, lines every 30 s; default:
+            in notebooks
 
-        progress : whether to show progress, by a bar or, if not on a terminal, lines every 30 s;
-            default: in notebooks
+        Raises
+        ------
+        OutputError
+            Before computing, if the folder cannot be used.
+        CheckpointError
+            If the run cannot be resumed.
+        SimulationError
+            If the run fails.
         """
         return cast(Results, self._drive(inf, progress).results)
 
@@ -311,7 +420,12 @@ class Simulation(Displayed):
 
         The first call begins the run: it compiles and writes the first files. A minimisation is
         done with the next step after it. `run` or `close` completes the run. A signal such as
-        Ctrl-C ends the run with all files, and is raised then. Raises ValueError, and as `run`.
+        Ctrl-C ends the run with all files, and is raised then.
+
+        Raises
+        ------
+        ValueError
+            For a count below 1. Errors of `run` occur here too.
         """
         if count < 1:
             raise ValueError(f"step({count}): at least one step")
@@ -333,7 +447,10 @@ class Simulation(Displayed):
         """End the run at its next observation, with all files. Observers and other threads may call
         it.
 
-        number : of the signal that requests it
+        Parameters
+        ----------
+        number
+            Of the signal that requests it
         """
         if self._loop is not None:
             self._loop.stop(number)
@@ -413,12 +530,15 @@ def run_together(
     For many small systems this is faster than one run after another on all cores: no thread waits
     for another, and the steps of one run continue while the observers of another are called.
 
-    jobs : runs at a time; default: the number of cores
-
     Ctrl-C and SIGTERM stop all runs at their next observations; a run that had not begun is None in
     the list. A second Ctrl-C then raises KeyboardInterrupt. If a run fails, the others continue,
     and the first error is raised at the end, with a note on the runs that failed. Summaries and
     scenes of the simulations have one thread.
+
+    Parameters
+    ----------
+    jobs
+        Runs at a time; default: the number of cores
     """
     simulations = list(simulations)
     if wrong := [value for value in simulations if not isinstance(value, Simulation)]:

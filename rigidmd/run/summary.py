@@ -63,12 +63,10 @@ class Minimum(NamedTuple):
     energy_after: float  # at the end
     force: float  # largest force on a molecule that is not frozen
     torque: float  # largest torque about a principal axis
-    pressure: (
-        tuple[float, ...] | None
-    )  # six, by `barostats.COMPONENTS`, without the kinetic part; None without a box
-    deviation: (
-        float | None
-    )  # largest deviation from the requested pressure; None if the cell does not relax
+    #: Six, by `barostats.COMPONENTS`, without the kinetic part; None without a box
+    pressure: tuple[float, ...] | None
+    #: Largest deviation from the requested pressure; None if the cell does not relax
+    deviation: float | None
     precision: str = "double"  # of the last forces
 
 
@@ -83,15 +81,12 @@ def summarise(
 ) -> dict:
     """The summary of a run of molecules, without its `provenance`; seconds as in
     `RunPart.summary`."""
-    scene, minima, computing, last = (
-        system.scene,
-        record.minima,
-        record.position.computing,
-        samples.row(-1),
-    )
-    size = float(
-        system.model.mass[system.model.species] @ np.linalg.norm(state.velocity, axis=1)
-    )  # sum of |m v|
+    scene = system.scene
+    minima = record.minima
+    computing = record.position.computing
+    last = samples.row(-1)
+    # sum of |m v|
+    size = float(system.model.mass[system.model.species] @ np.linalg.norm(state.velocity, axis=1))
     moving = [k for k in range(len(computing)) if k not in minima]
     stages = []
     for k in np.unique(samples["stage"]).tolist():
@@ -126,16 +121,16 @@ def summarise(
         "precision_reason": (
             f"{system.precision}: {system.precision_reason}" if system.precision_reason else None
         ),
-        "relief_steps": record.removal.steps if record.removal else 0,
+        "overlap_removal_steps": record.removal.steps if record.removal else 0,
         "preparing_s": preparing,
         "wall_s": wall,
         "largest_orthogonality_error": float(samples["orthogonality_error"].max()),
         "momentum_u_A_ps": last.momentum,
         "momentum_relative": last.momentum / size if size else 0.0,
         "momentum_conserved": [
-            axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept
+            axis for axis, keeps in zip("xyz", system.model.keeps_momentum, strict=True) if keeps
         ],
-        "own_forces": dict(system.user_terms),
+        "user_forces": dict(system.user_terms),
         "forces_by_python": {
             name: [f.calls, f.seconds] for name, f in system.python_forces.items()
         },
@@ -222,13 +217,11 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     half = len(of_stage) // 2
     if len(of_stage) - half < MIN_SAMPLES:
         return []
-    time, drift, whole = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
-    found, stage, freedom, level = (
-        [],
-        system.scene.stages[k],
-        system.freedom_in(k),
-        float(whole.mean()),
-    )
+    time, drift, temperature = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
+    notes = []
+    stage = system.scene.stages[k]
+    freedom = system.freedom_in(k)
+    level = float(temperature.mean())
     line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
     if (
         thermal > 0
@@ -236,37 +229,33 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         > _drift_limit(time[-1] - time[0]) * thermal + STANDARD_ERRORS * line.error
     ):
         rate, error = (value * 1000 / thermal for value in (line.value, line.error))
-        smooth = (
-            ""
-            if system.scene.forces.truncation == "smooth_switch"
-            else " or truncation = 'smooth_switch'"
-        )
-        hides = (
-            "; the thermostat hides this and leaves temperatures wrong"
-            if stage.has_thermostat
-            else ""
-        )
-        found.append(
+        if system.scene.forces.truncation == "smooth_switch":
+            smooth = ""
+        else:
+            smooth = " or truncation = 'smooth_switch'"
+        if stage.has_thermostat:
+            hides = "; the thermostat hides this and leaves temperatures wrong"
+        else:
+            hides = ""
+        notes.append(
             f"stages.{k}: in its second half the conserved energy drifts by {rate:+.2g} ±"
             f" {error:.1g} kT/ns per degree of freedom, as from a step that is too long or forces"
             f" that jump at the cutoff{hides}. Try a shorter timestep_fs than"
             f" {stage.timestep_fs:g}{smooth}"
         )
     if not stage.has_thermostat:
-        return found
+        return notes
     moving, rotating = pair = [of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS]
-    unbiased, corrected = (
-        [of_stage[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS],
-        "",
-    )
+    unbiased = [of_stage[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS]
+    corrected = ""
     if any(np.isfinite(values).all() for values in unbiased):
         (moving, rotating), corrected = unbiased, " without the error of the step"
         both = zip(unbiased, (freedom.translation, freedom.rotation), strict=True)
         right = (
-            sum((values * count for values, count in both if count), np.zeros(len(whole)))
+            sum((values * count for values, count in both if count), np.zeros(len(temperature)))
             / freedom.total
         )
-        heat, error = mean_and_error(right - whole)
+        heat, error = mean_and_error(right - temperature)
         if (
             heat is not None
             and error is not None
@@ -278,7 +267,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
                 if v[0] > 0
             ]
             shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heat))
-            found.append(
+            notes.append(
                 f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules"
                 f" {abs(heat):.2g} K too {'hot' if heat > 0 else 'cold'}: their"
                 f" temperature{corrected} is"
@@ -293,19 +282,22 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         and error is not None
         and abs(gap) > max(DIFFERENCE_LIMIT * level, STANDARD_ERRORS * error)
     ):
-        found.append(
+        notes.append(
             f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot"
             f" {rotating.mean():.4g} K{corrected}, a difference of {abs(gap):.2g} ± {error:.1g} K"
             " that sampling does not explain: timestep_fs is too long, or translation and rotation"
             " exchange energy too slowly in this stage. Try a shorter step, or run longer before"
             " means are taken"
         )
-    return found
+    return notes
 
 
 def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list[str]:
     """A note if few trajectories of hybrid Monte Carlo were accepted, in the second half of enough
-    samples, or if none was. acceptance (t,) : between samples, NaN where no trajectory ended"""
+    samples, or if none was.
+
+    acceptance : (t,) between samples, NaN where no trajectory ended
+    """
     known = acceptance[np.isfinite(acceptance)]
     enough = len(acceptance) - len(acceptance) // 2 >= MIN_SAMPLES
     judged, where = (known[len(known) // 2 :], "in its second half ") if enough else (known, "")
@@ -352,16 +344,13 @@ def stage_summary(
     n, steps = len(system.model.species), of_stage.row(-1).step - first.step
     speed = steps / computing if computing > 0 else None
     time, drift = of_stage["time"], of_stage["drift"]
-    line = (
-        slope(np.append(first.time, time), np.append(0.0, drift))
-        if len(before)
-        else slope(time, drift)
-    )
+    if len(before):
+        line = slope(np.append(first.time, time), np.append(0.0, drift))
+    else:
+        line = slope(time, drift)
     temperatures = _means(steady, TEMPERATURES)
-    potential, pressure = (
-        mean_and_error(steady["potential"] / n),
-        mean_and_error(steady["pressure_bar"]),
-    )
+    potential = mean_and_error(steady["potential"] / n)
+    pressure = mean_and_error(steady["pressure_bar"])
     spread, duration = float(of_stage["kinetic"].std()), steps * stage.timestep_fs * FEMTOSECOND
     thermal = (
         BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total
@@ -422,9 +411,12 @@ def stage_summary(
     return values
 
 
-def _minimised(system: System, samples: Samples, k: int, computing: float, found: Minimum) -> dict:
+def _minimised(
+    system: System, samples: Samples, k: int, computing: float, minimum: Minimum
+) -> dict:
     """Values of a minimisation, at its end; None for those that only a stage of motion has."""
-    stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
+    stage = system.scene.stages[k]
+    minimum_values = minimum_figures(minimum, len(system.model.species))
     end = Samples(samples.stages, samples.user_terms, samples.of_stage(k).table()[-1:])
     return dict.fromkeys(stage_summary(system, samples, k, computing, (0, 0))) | {
         "name": stage.label,
@@ -432,24 +424,24 @@ def _minimised(system: System, samples: Samples, k: int, computing: float, found
         "steps": 0,
         "duration_ps": 0.0,
         "computing_s": computing,
-        "potential_kJ_mol_per_molecule": figures["energy_after_kJ_mol_per_molecule"],
-        "pressure_bar": figures["pressure_bar"],
+        "potential_kJ_mol_per_molecule": minimum_values["energy_after_kJ_mol_per_molecule"],
+        "pressure_bar": minimum_values["pressure_bar"],
         **(_means(end, BOX) if stage.changes_box else {}),
         "moves_tried": 0,
         "moves_accepted": 0,
-        "minimum": figures,
+        "minimum": minimum_values,
     }
 
 
 def _means(samples: Samples, columns: Mapping[str, str]) -> dict[str, float | None]:
     """Means of columns, and their errors; the columns have the units of their keys."""
-    found = {}
+    means = {}
     for name, unit in columns.items():
         values = samples[name]  # no trajectory has ended at the first sample
-        found[f"{name}_{unit}"], found[f"{name}_error_{unit}"] = mean_and_error(
+        means[f"{name}_{unit}"], means[f"{name}_error_{unit}"] = mean_and_error(
             values[np.isfinite(values)]
         )
-    return found
+    return means
 
 
 def _finite_or_none(value: float) -> float | None:
@@ -465,7 +457,7 @@ def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
         "ended_by": found.ended_by or None,
         "iterations": found.iterations,
         "precision": found.precision,
-        "relief_steps": found.overlap_steps,
+        "overlap_removal_steps": found.overlap_steps,
         "energy_before_kJ_mol_per_molecule": found.energy_before / KJ_PER_MOL / molecules,
         "energy_after_kJ_mol_per_molecule": found.energy_after / KJ_PER_MOL / molecules,
         "largest_force_kJ_mol_A": found.force / KJ_PER_MOL,

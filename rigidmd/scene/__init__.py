@@ -25,16 +25,14 @@ def schema() -> dict[str, Any]:
         (BodyScene, "validation"),
         (MolecularScene, "validation"),
     ]
-    _, found = models_json_schema(kinds, schema_generator=_TomlSchema)
-    found["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
-    for kind, section in (
-        ("MolecularScene", "Stage"),
-        ("BodyScene", "Run"),
-    ):  # other names need [[integrators]]
-        enum = found["$defs"][section]["properties"]["integrator"].pop("enum")
+    _, document = models_json_schema(kinds, schema_generator=_TomlSchema)
+    document["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
+    # other names need [[integrators]]
+    for kind, section in (("MolecularScene", "Stage"), ("BodyScene", "Run")):
+        enum = document["$defs"][section]["properties"]["integrator"].pop("enum")
         known = {"properties": {"integrator": {"enum": enum}}}
         sections = {"run": known} if section == "Run" else {"stages": {"items": known}}
-        found["$defs"][kind] |= {
+        document["$defs"][kind] |= {
             "if": {"required": ["integrators"]},
             "else": {"properties": sections},
         }
@@ -46,7 +44,7 @@ def schema() -> dict[str, Any]:
         "if": {"required": ["body"]},
         "then": {"$ref": "#/$defs/BodyScene"},
         "else": {"$ref": "#/$defs/MolecularScene"},
-        **found,
+        **document,
     }
 
 
@@ -58,11 +56,11 @@ class _TomlSchema(GenerateJsonSchema):
         return self.generate_inner(schema["schema"])
 
     def default_schema(self, schema) -> JsonSchemaValue:
-        found = super().default_schema(schema)
-        default = found.get("default")
+        entry = super().default_schema(schema)
+        default = entry.get("default")
         if default is None or default == float("inf") or isinstance(default, dict):
-            found.pop("default", None)
-        return found
+            entry.pop("default", None)
+        return entry
 
     def field_title_should_be_set(self, schema) -> bool:
         return False  # "Timestep Fs" adds nothing to timestep_fs

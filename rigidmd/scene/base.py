@@ -1,6 +1,7 @@
 """The base class of scenes: reading one from a TOML file or a dictionary, and setting single keys
 of it."""
 
+import json
 import os
 import re
 import shlex
@@ -34,7 +35,7 @@ from rigidmd.core.toml import (
     values_in,
 )
 from rigidmd.errors import SceneError, option
-from rigidmd.io.formats import Format, format_of, written
+from rigidmd.formats import Format, format_of, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
     MOST_TABLES,
@@ -87,9 +88,8 @@ class Scene(Section, Displayed):
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
-    _read_in: Path = PrivateAttr(
-        default_factory=lambda: _working_directory()
-    )  # from which `_folder` begins
+    #: From which `_folder` begins
+    _read_in: Path = PrivateAttr(default_factory=lambda: _working_directory())
     _embedded_files: dict[str, bytes] = PrivateAttr(default_factory=dict)
 
     @field_validator("integrators")
@@ -128,8 +128,13 @@ class Scene(Section, Displayed):
         return self._source
 
     def with_end(self, time: float) -> "Scene":
-        """The same scene with its end at a time of the run, ps. Raises SceneError if the end cannot
-        be set."""
+        """The same scene with its end at a time of the run, ps.
+
+        Raises
+        ------
+        SceneError
+            If the end cannot be set.
+        """
         raise SceneError(
             self.source,
             [f"{option('until')} is for molecules; set run.duration_s of a single body"],
@@ -173,11 +178,14 @@ class Scene(Section, Displayed):
         cls, path: PathName, overrides: dict[str, Any] | None = None
     ) -> "MolecularScene | BodyScene":
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}.
-        Raises SceneError.
 
         An override of None removes the key. Files named in the scene must lie in its folder or
         below; files named in `overrides` may be anywhere, and are taken relative to the working
         directory.
+
+        Raises
+        ------
+        SceneError
         """
         path = Path(path)
         data, text = read_tables(path)
@@ -216,25 +224,31 @@ class Scene(Section, Displayed):
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
     ) -> "MolecularScene | BodyScene":
-        """The scene in a nested dictionary like the one of a TOML file. Raises SceneError with all
-        errors.
+        """The scene in a nested dictionary like the one of a TOML file.
 
         Numbers and arrays of NumPy and paths are accepted as numbers, lists and texts. The
         dictionary is not changed.
 
-        source, text : path of the TOML file, for messages, and its text, for the numbers of lines
-            in them
-        embedded_files : see `embedded_files`; with them, files may be outside `folder`
+        Parameters
+        ----------
+        source, text
+            Path of the TOML file, for messages, and its text, for the numbers of lines in them
+        embedded_files
+            See `embedded_files`; with them, files may be outside `folder`
+
+        Raises
+        ------
+        SceneError
+            With all errors.
         """
         folder, data = Path(folder), plain_values(data)
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
         from rigidmd.scene import BodyScene, MolecularScene
 
-        kind = (
-            cls
-            if issubclass(cls, (BodyScene, MolecularScene))
-            else _kind_of_scene(data, BodyScene, MolecularScene)
-        )
+        if issubclass(cls, (BodyScene, MolecularScene)):
+            kind = cls
+        else:
+            kind = _kind_of_scene(data, BodyScene, MolecularScene)
         if kind is None:
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults, overridden = [], []
@@ -267,10 +281,10 @@ class Scene(Section, Displayed):
                 )
             elif fault := unreadable_reason(path):
                 faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
-        whole, rows = with_registered_rows(exact_names(data, kind))
+        complete, rows = with_registered_rows(exact_names(data, kind))
         scene = None
         try:
-            scene = kind.model_validate(whole, context=rows)
+            scene = kind.model_validate(complete, context=rows)
         except ValidationError as error:
             faults += validation_messages(error, kind, text, overridden)
         if scene is None or faults:
@@ -287,11 +301,10 @@ def read_tables(path: Path) -> tuple[dict[str, Any], str]:
     fault = unreadable_reason(path)
     if fault.startswith("there is no such file"):
         shipped = similar_names(path.stem, [example.name for example in examples()])
-        new = (
-            f"; `rigidmd new {shipped[0]}` copies a shipped scene"
-            if shipped
-            else "; `rigidmd examples` lists scenes"
-        )
+        if shipped:
+            new = f"; `rigidmd new {shipped[0]}` copies a shipped scene"
+        else:
+            new = "; `rigidmd examples` lists scenes"
         raise SceneError(str(path), [fault + (_similar_files(path, ".toml") or new)])
     if path.is_dir():
         raise SceneError(str(path), [fault + _scenes_in(path)])
@@ -380,11 +393,8 @@ def is_inside(path: Path, folder: Path) -> bool:
     missing."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
-    except (
-        OSError,
-        RuntimeError,
-        ValueError,
-    ):  # a name that is too long, a loop of links, a zero byte
+    # a name that is too long, a loop of links, a zero byte
+    except (OSError, RuntimeError, ValueError):
         return True
 
 
@@ -392,11 +402,15 @@ def _similar_files(path: Path, suffix: str = "") -> str:
     """'; did you mean ...?' for files of similar names in the folder of a path; empty if there are
     none."""
     try:
-        there = [other for other in sorted(path.parent.iterdir()) if other.name.endswith(suffix)]
+        neighbours = [
+            other for other in sorted(path.parent.iterdir()) if other.name.endswith(suffix)
+        ]
     except (OSError, ValueError):
         return ""
-    stems = similar_names(path.stem, {other.stem for other in there if other.name != path.name})
-    return suggestion([other.name for other in there if other.stem in stems])
+    stems = similar_names(
+        path.stem, {other.stem for other in neighbours if other.name != path.name}
+    )
+    return suggestion([other.name for other in neighbours if other.stem in stems])
 
 
 def file_name(wanted: Callable[[Format], Any]) -> AfterValidator:
@@ -441,14 +455,15 @@ def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
     if not re.search("not both|omit one|contradict", fault):
         return ""
     names = re.findall(r"[a-z]\w*(?:\.\w+)*", fault)
-    tables = (
-        dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)])
-        if overridden
-        else ()
-    )
+    if overridden:
+        tables = dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)])
+    else:
+        tables = ()
     keys = [table + name for table in tables for name in names]
-    there = [key for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)]
-    return "".join(f"; {setting(key)} removes it" for key in there)
+    removable = [
+        key for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)
+    ]
+    return "".join(f"; {setting(key)} removes it" for key in removable)
 
 
 def _has_key(data: Any, key: str) -> bool:
@@ -481,23 +496,22 @@ def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
                 [e[k] for k in ("name", "ensemble", "model") if isinstance(e, dict) and k in e]
                 for e in target
             ]
-            names = [found[0] if found else "" for found in named]
+            names = [labels[0] if labels else "" for labels in named]
             if number is None and names.count(part) == 1:
                 number = names.index(part)
             if number is None or number >= len(target):
-                called = (
-                    f" ({', '.join(map(shorten_repr, names))})"
-                    if number is None and any(names)
-                    else ""
-                )
+                if number is None and any(names):
+                    called = f" ({', '.join(map(shorten_repr, names))})"
+                else:
+                    called = ""
                 return key, [
                     f"{where}: {here} has entries 0 to {len(target) - 1}{called}, not {part!r}"
                 ]
         elif not table:
             return key, [f"{where}: {here} is not a table"]
         elif value is None and part not in target:
-            there = did_you_mean(part, target) or f"; there are {', '.join(target)}"
-            return key, [f"{setting(key)}: {here or 'the scene'} has no {part} to remove{there}"]
+            hint = did_you_mean(part, target) or f"; there are {', '.join(target)}"
+            return key, [f"{setting(key)}: {here or 'the scene'} has no {part} to remove{hint}"]
         index: Any = number if listed else part
         indices.append(index)
         if depth == len(parents) and value is None:
@@ -525,3 +539,25 @@ def parse_override(text: str) -> tuple[str, Any]:
         return key.strip(), parse_toml(f"value = {value}")["value"]
     except TOMLDecodeError:
         return key.strip(), value.strip()
+
+
+def format_override(key: str, value: Any) -> str:
+    """KEY=VALUE of the command line, which `parse_override` reads as this value."""
+    return f"{key}={_format_toml(value)}"
+
+
+def _format_toml(value: Any) -> str:
+    """A value in one line of TOML; empty for None."""
+    match value:
+        case None:
+            return ""
+        case bool():
+            return str(value).lower()
+        case str():
+            return json.dumps(value, ensure_ascii=False)
+        case list() | tuple():
+            return f"[{', '.join(map(_format_toml, value))}]"
+        case Mapping():
+            pairs = (f"{json.dumps(key)} = {_format_toml(part)}" for key, part in value.items())
+            return f"{{{', '.join(pairs)}}}"
+    return repr(value)

@@ -18,7 +18,7 @@ from rigidmd.core.integrators import (
     Rotor,
     auto_errors,
 )
-from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY
+from rigidmd.formats import BODY_TOPOLOGY, TRAJECTORY
 from rigidmd.mechanics.inertia import (
     COMPONENTS_PER_DIMENSION,
     SOLIDS,
@@ -117,11 +117,11 @@ class Solid(Section):
         }
 
     def _errors(self):
-        wanted, given = set(SOLIDS[self.shape].dimensions), set(self.dimensions)
-        if wanted != given:
+        expected, dimensions = set(SOLIDS[self.shape].dimensions), set(self.dimensions)
+        if expected != dimensions:
             yield (
-                f"a {self.shape} has {' and '.join(sorted(wanted))}, not"
-                f" {' and '.join(sorted(given)) or 'none'}"
+                f"a {self.shape} has {' and '.join(sorted(expected))}, not"
+                f" {' and '.join(sorted(dimensions)) or 'none'}"
             )
 
 
@@ -237,9 +237,9 @@ class BodyTable(Section):
                 about_pivot and ways[:1] in (["solid"], ["solids"], ["points"])
             ),
         }
-        found, tensor = [fault for fault, is_there in faults.items() if is_there], self.tensor
-        if found or tensor is None or self.mass_kg is None:
-            return found
+        messages, tensor = [fault for fault, is_there in faults.items() if is_there], self.tensor
+        if messages or tensor is None or self.mass_kg is None:
+            return messages
         if np.abs(tensor - tensor.T).max() > 1e-12 * np.abs(tensor).max():
             return ["inertia_tensor_kg_m2 is not symmetric"]
         if why := inertia_error(tensor):
@@ -304,9 +304,9 @@ class BodyStart(Section):
             ATTITUDES,
             ("euler_rates_rad_s", "angular_velocity_body_rad_s", "angular_velocity_lab_rad_s"),
         ):
-            given = [key for key in keys if getattr(self, key) is not None]
-            if len(given) > 1:
-                yield f"give one of {', '.join(given)}"
+            set_keys = [key for key in keys if getattr(self, key) is not None]
+            if len(set_keys) > 1:
+                yield f"give one of {', '.join(set_keys)}"
         matrix = self.rotation or self.attitude_matrix
         if self.project and matrix is None:
             yield "project would do nothing: no matrix is given"
@@ -320,11 +320,10 @@ class BodyStart(Section):
                 )
                 yield f"the matrix is not a rotation with rounded digits: {what}"
             elif not self.project and (error > LARGEST_ORTHOGONALITY_ERROR or sense < 0):
-                what = (
-                    "a reflection"
-                    if error <= LARGEST_ORTHOGONALITY_ERROR
-                    else f"|Q^T Q - 1| is {error:.2g}"
-                )
+                if error <= LARGEST_ORTHOGONALITY_ERROR:
+                    what = "a reflection"
+                else:
+                    what = f"|Q^T Q - 1| is {error:.2g}"
                 limit = (
                     f"must be below {LARGEST_ORTHOGONALITY_ERROR:g}; project = true uses the"
                     " nearest rotation"
@@ -345,9 +344,9 @@ class BodyStart(Section):
     @property
     def attitude(self) -> np.ndarray:
         """Q (3, 3), a rotation to rounding."""
-        given = [(to_rotation, getattr(self, key)) for key, to_rotation in ATTITUDES.items()]
+        attitudes = [(to_rotation, getattr(self, key)) for key, to_rotation in ATTITUDES.items()]
         return next(
-            (to_rotation(np.array(value)) for to_rotation, value in given if value is not None),
+            (to_rotation(np.array(value)) for to_rotation, value in attitudes if value is not None),
             np.eye(3),
         )
 
@@ -512,34 +511,34 @@ class BodyScene(Scene):
 
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
-        found: list[tuple[list, str]] = []
+        messages: list[tuple[list, str]] = []
         tables = {key: value for key, value in data.items() if isinstance(value, dict)}
         body, start, fluid = (tables.get(key, {}) for key in ("body", "start", "fluid"))
         if body.get("pinned") is True:
             moved = "the body is pinned at a point and cannot be moved: omit it"
-            found += [
+            messages += [
                 (["start", key], moved) for key in ("position_m", "velocity_m_s") if key in start
             ]
             forces = ("linear_resistance_kg_s", "quadratic_resistance_kg_m", "added_mass_kg")
-            given = [
+            resisting = [
                 key
                 for key in forces
                 if isinstance(fluid.get(key), list | tuple) and any(fluid[key])
             ]
-            found += [
+            messages += [
                 (["fluid", key], "the body is pinned at a point: no such force acts on it")
-                for key in given
+                for key in resisting
             ]
-        given = [key for key in WAYS_OF_INERTIA if key in body]
-        if "changing_inertia" in data and given:
-            found.append(
-                (["body", given[0]], "changing_inertia defines the inertia: omit one of them")
+        inertias = [key for key in WAYS_OF_INERTIA if key in body]
+        if "changing_inertia" in data and inertias:
+            messages.append(
+                (["body", inertias[0]], "changing_inertia defines the inertia: omit one of them")
             )
         if "fluid" in data and "frame" in data:
-            found.append(
+            messages.append(
                 (["frame"], "a fluid at rest and an accelerated frame together are not supported")
             )
-        return [f"{location_of(keys, text)}: {fault}" for keys, fault in found]
+        return [f"{location_of(keys, text)}: {fault}" for keys, fault in messages]
 
     def _errors(self):
         fluid, body = self.fluid, self.body
@@ -555,10 +554,10 @@ class BodyScene(Scene):
                         " not pinned"
                     )
                 follow = ("displaced_mass_kg", "added_mass_kg", "added_inertia_kg_m2")
-                given = [key for key in follow if getattr(fluid, key) is not None]
+                set_keys = [key for key in follow if getattr(fluid, key) is not None]
                 yield from [
                     f"fluid.{key} contradicts fluid.density_kg_m3, from which it follows"
-                    for key in given
+                    for key in set_keys
                 ]
             buoyant = fluid.displaced_mass_kg is not None or fluid.density_kg_m3 is not None
             if fluid.centre_of_buoyancy_m is not None and not buoyant:

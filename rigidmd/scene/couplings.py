@@ -26,9 +26,8 @@ class Coupling(NamedTuple):
 
     summary: str  # for the description of the key `thermostat` or `barostat`
     source: str
-    keys: dict[
-        str, float | Callable[[Any], float]
-    ]  # its keys -> their defaults, or functions of the stage
+    #: Its keys -> their defaults, or functions of the stage
+    keys: dict[str, float | Callable[[Any], float]]
     ensembles: tuple[str, ...] = ("nvt", "npt")
     #: For a thermostat: whether it acts on each molecule by itself, so that the total momentum is
     #: not conserved and diffusion and spectra change; its time constant (ps) and its description by

@@ -47,9 +47,9 @@ class _Engine(Section):
     def options(self) -> dict[str, Any]:
         """The options of this engine, with defaults."""
         options = self.program.options if self.program else {}
-        given = {key: getattr(self, key) for key in options}
+        values = {key: getattr(self, key) for key in options}
         return {
-            key: options[key].default if value is None else value for key, value in given.items()
+            key: options[key].default if value is None else value for key, value in values.items()
         }
 
     @property

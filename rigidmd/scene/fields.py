@@ -47,10 +47,10 @@ class Walls(Section):
 
     def _errors(self):
         for kind, keys in KEYS_OF_WALLS.items():
-            given = [key for key in keys if getattr(self, key) is not None]
-            if kind != self.kind and given:
-                yield f"{', '.join(given)} would do nothing with kind = {self.kind!r}"
-            missing = [key for key, needed in keys.items() if needed and key not in given]
+            set_keys = [key for key in keys if getattr(self, key) is not None]
+            if kind != self.kind and set_keys:
+                yield f"{', '.join(set_keys)} would do nothing with kind = {self.kind!r}"
+            missing = [key for key, needed in keys.items() if needed and key not in set_keys]
             if kind == self.kind and missing:
                 yield f"kind = {kind!r} needs {' and '.join(missing)}"
         lower, upper = self.positions_A
@@ -107,19 +107,19 @@ class Restraint(Section):
             yield "between needs distance_A, at which the spring has no energy"
         if isinstance(self.stiffness_kJ_mol_A2, tuple):
             yield "stiffness_kJ_mol_A2 has one number for a distance"
-        if given := [
+        if set_keys := [
             key for key in ("species", "molecules", "position_A") if getattr(self, key) is not None
         ]:
-            yield f"{', '.join(given)} would do nothing with between, which names the molecules"
+            yield f"{', '.join(set_keys)} would do nothing with between, which names the molecules"
 
     @property
     def groups(self) -> tuple[list[int], ...]:
         """The numbers of the molecules of both groups; empty without `between`."""
-        found = []
+        groups = []
         for group in self.between or ():
             ranges = [(group, group)] if isinstance(group, int) else spans(group)
-            found.append([number for first, last in ranges for number in range(first, last + 1)])
-        return tuple(found)
+            groups.append([number for first, last in ranges for number in range(first, last + 1)])
+        return tuple(groups)
 
     @property
     def spans(self) -> list[tuple[int, int]]:
@@ -160,30 +160,28 @@ class Fields(Section):
     def entries(self) -> dict[str, tuple["FieldKind", Section, str]]:
         """Name of each term -> its kind, the table with its keys, and the path of that table or key
         in the scene."""
-        found: dict[str, tuple[FieldKind, Section, str]] = {}
+        entries: dict[str, tuple[FieldKind, Section, str]] = {}
         for name, kind in FIELDS.items():
             value = getattr(self, kind.key)
             if isinstance(value, tuple) and all(isinstance(entry, Section) for entry in value):
-                found |= {
+                entries |= {
                     f"{name}_{k}": (kind, entry, f"fields.{kind.key}.{k}")
                     for k, entry in enumerate(value)
                 }
             elif value is not None:
-                found[name] = (
+                entries[name] = (
                     kind,
                     value if isinstance(value, Section) else self,
                     f"fields.{kind.key}",
                 )
-        return found
+        return entries
 
     def bounds(self, axis: int) -> tuple[float, float] | None:
         """Range of positions between the walls perpendicular to an axis, Å; None without walls."""
         ranges = [walls.positions_A for walls in self.walls if walls.direction == axis]
-        return (
-            (max(lower for lower, _ in ranges), min(upper for _, upper in ranges))
-            if ranges
-            else None
-        )
+        if ranges:
+            return max(lower for lower, _ in ranges), min(upper for _, upper in ranges)
+        return None
 
 
 class FieldKind(NamedTuple):
@@ -192,9 +190,8 @@ class FieldKind(NamedTuple):
     module: str  # in `forces.fields`, with the function `term`
     key: str  # of `Fields`: a value, a table or a list of tables, each of which is one term
     title: str  # in the list of unused interactions of a scene
-    sentence: Callable[
-        [Any, Any], str
-    ]  # of the table with its keys and of its term, for `rigidmd check`
+    #: Of the table with its keys and of its term, for `rigidmd check`
+    sentence: Callable[[Any, Any], str]
 
 
 def _electric_sentence(fields: Fields, term: Any) -> str:
@@ -226,21 +223,18 @@ def _restraint_sentence(entry: Restraint, term: Any) -> str:
         spring = f"restrained to {entry.distance_A:g} Å, {entry.stiffness[0]:g} kJ/mol/Å²"
         return f"distance of {one} and {other} {spring}"
     size = f"{entry.stiffness[0]:g}" if len(set(entry.stiffness)) == 1 else _vector(entry.stiffness)
-    where = (
-        "to their starting positions"
-        if entry.position_A is None
-        else f"to {_vector(entry.position_A)} Å"
-    )
+    if entry.position_A is None:
+        where = "to their starting positions"
+    else:
+        where = f"to {_vector(entry.position_A)} Å"
     return f"{len(term.molecule)} molecules restrained {where}, {size} kJ/mol/Å²"
 
 
 def _numbers(group: list[int]) -> str:
     """A group of molecules, for messages."""
-    return (
-        f"molecule {group[0]}"
-        if len(group) == 1
-        else f"the centre of {len(group)} molecules ({group[0]}, ...)"
-    )
+    if len(group) == 1:
+        return f"molecule {group[0]}"
+    return f"the centre of {len(group)} molecules ({group[0]}, ...)"
 
 
 def _vector(values: Any) -> str:
@@ -277,9 +271,8 @@ def field_notes(scene: "MolecularScene") -> list[str]:
 def field_errors(scene: "MolecularScene") -> Iterator[str]:
     """Messages on fields of a scene that contradict its other tables."""
     fields, boxed = scene.fields, scene.box.periodic
-    held = any(entry.between is None for entry in fields.restraints) or any(
-        species.frozen for species in scene.molecules
-    )
+    has_anchors = any(entry.between is None for entry in fields.restraints)
+    held = has_anchors or any(species.frozen for species in scene.molecules)
     for k, walls in enumerate(fields.walls):
         if boxed and inf in map(abs, walls.positions_A):
             why = "or molecules would cross the periodic boundary to the other side"

@@ -126,7 +126,7 @@ class CustomForce(Section):
     """With an energy: where a switch begins; default: forces.switch_start_A"""
 
     def _errors(self):
-        if sum(given is not None for given in (self.module, self.energy, self.table)) != 1:
+        if sum(source is not None for source in (self.module, self.energy, self.table)) != 1:
             kinds = (
                 "a module, a Python file with the force, an energy, a formula of r, or a table, a"
                 " file of energies"

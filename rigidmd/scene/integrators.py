@@ -105,15 +105,24 @@ def integrator(
     rigidmd.integrator("ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth
     1990")
 
-    steps : lengths of successive velocity Verlet steps, as fractions of the time step; or
-    kicks, drifts : fractions of kick, drift, ..., drift, kick; gradients : of each kick, see
-        `core.integrators.Flow`
-
     Fractions sum to 1 and read the same from both ends. A scene that names the row keeps its
     coefficients in its table [[integrators]], so that its file and the folder of its run are
-    complete. Raises SceneError.
+    complete.
+
+    Parameters
+    ----------
+    steps
+        Lengths of successive velocity Verlet steps, as fractions of the time step; or
+    kicks, drifts
+        Fractions of kick, drift, ..., drift, kick
+    gradients
+        Of each kick, see `core.integrators.Flow`
+
+    Raises
+    ------
+    SceneError
     """
-    given = {
+    values = {
         "name": name,
         "order": order,
         "steps": steps,
@@ -123,7 +132,7 @@ def integrator(
     }
     table = {
         key: value
-        for key, value in plain_values(given | {"source": source}).items()
+        for key, value in plain_values(values | {"source": source}).items()
         if value is not None
     }
     try:
@@ -139,24 +148,20 @@ def integrator(
 def with_registered_rows(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Scheme]]:
     """Tables of a scene with those registered rows that it names and does not have; and its names
     of rows, each with a scheme that stands for an invalid row, so that only the row is an error."""
-    there, stages = (
-        [*given] if isinstance(given := data.get(key), list) else []
+    tables, stages = (
+        [*entries] if isinstance(entries := data.get(key), list) else []
         for key in ("integrators", "stages")
     )
     names = [
         table.get("integrator") for table in (*stages, data.get("run")) if isinstance(table, dict)
     ]
-    taken = [
-        name
-        for table in there
-        if isinstance(table, dict) and isinstance(name := table.get("name"), str)
-    ]
+    given_names = [table.get("name") for table in tables if isinstance(table, dict)]
+    taken = [name for name in given_names if isinstance(name, str)]
     rows = [row for name, row in _REGISTERED.items() if name in names and name not in taken]
-    changed = (
-        {"integrators": [*there, *(row.model_dump(exclude_none=True) for row in rows)]}
-        if rows
-        else {}
-    )
+    changed = {}
+    if rows:
+        new_tables = [row.model_dump(exclude_none=True) for row in rows]
+        changed = {"integrators": [*tables, *new_tables]}
     return data | changed, dict.fromkeys(taken, SCHEMES["velocity_verlet"])
 
 

@@ -98,10 +98,11 @@ class Site(Section):
     """Parameters of custom pair potentials, by name"""
 
     def _errors(self):
-        given = [key for key in DEPTHS if getattr(self, key) is not None]
-        if len(given) > 1:
-            yield f"give one of {', '.join(given)}, not {'both' if len(given) == 2 else 'all'}"
-        if bool(given) != (self.sigma_A is not None):
+        set_keys = [key for key in DEPTHS if getattr(self, key) is not None]
+        if len(set_keys) > 1:
+            number = "both" if len(set_keys) == 2 else "all"
+            yield f"give one of {', '.join(set_keys)}, not {number}"
+        if bool(set_keys) != (self.sigma_A is not None):
             yield f"a Lennard-Jones site needs both sigma_A and one of {', '.join(DEPTHS)}"
 
     @property
@@ -228,10 +229,8 @@ class Molecule:
     def description(self) -> str:
         """Kind of body, number of sites, mass, charge and dipole, for reports."""
         shape = f"{self.kind}, planar" if self.planar else self.kind
-        charge, count = (
-            f"net charge {self.charge:+g} e" if self.charge else "neutral",
-            len(self.masses),
-        )
+        charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
+        count = len(self.masses)
         dipole = ""
         if self.charges.any() and self.radius > 0:
             dipole = f", dipole {self.dipole_debye:.3f} D" if self.has_dipole else ", no dipole"
@@ -295,10 +294,8 @@ def molecule(
         for i, j in sorted(near[:, ::-1].tolist())
     ]
     if frame.kind == "linear" or (frame.kind == "point" and not faults):
-        off, limit = (
-            np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1),
-            OFF_AXIS * size,
-        )
+        off = np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1)
+        limit = OFF_AXIS * size
         where = "from the centre of mass, but all the mass is there: nothing resists its torque"
         if frame.kind == "linear":
             where = "off the axis of a linear body: nothing resists its torque about that axis"
@@ -339,11 +336,10 @@ def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
         heavy = [i for i in sites if found.masses[i] > 0]
         if not heavy:
             known = ", ".join(dict.fromkeys([*found.elements, *found.site_names]))
-            why = (
-                "is massless, and stays so"
-                if sites
-                else f"is not a site or element of it; there are {known}"
-            )
+            if sites:
+                why = "is massless, and stays so"
+            else:
+                why = f"is not a site or element of it; there are {known}"
             faults.append(f"masses_u.{key} {why}")
         changed |= {i: mass for i in heavy if i not in changed or found.site_names[i] == key}
     if faults:
@@ -352,8 +348,8 @@ def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
         Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])})
         for i, entry in enumerate(found.sites())
     ]
-    kept = ("name", "residue_names", "title", "source", "group", "note", "mixing")
-    return molecule(sites=tuple(sites), **{key: getattr(found, key) for key in kept})
+    copied_keys = ("name", "residue_names", "title", "source", "group", "note", "mixing")
+    return molecule(sites=tuple(sites), **{key: getattr(found, key) for key in copied_keys})
 
 
 def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[Site, ...]:
@@ -372,9 +368,8 @@ def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[S
 
 def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
     """The entry of this name, or else of the element."""
-    return next((s for s in sites if s.name == name), None) or next(
-        (s for s in sites if s.name == element), None
-    )
+    by_name = {site.name: site for site in reversed(sites)}  # the first of several
+    return by_name.get(name) or by_name.get(element)
 
 
 @cache

@@ -9,7 +9,7 @@ from pydantic import Field, PrivateAttr, Strict
 
 from rigidmd.core.plain_text import distinct
 from rigidmd.errors import SceneError, option
-from rigidmd.io.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
+from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors
@@ -56,10 +56,10 @@ def name_of(thing: Any) -> str:
 
 def missing_user_code(wanted: Sequence[str], given: Sequence[str]) -> str:
     """The error message of a scene without the user code that its `from_python` lists."""
-    there = f"; this has {', '.join(given)}" if given else ""
+    hint = f"; this has {', '.join(given)}" if given else ""
     advice = "Run it from Python with the same: Simulation(scene, forces=[...], thermostat=...)"
     return (
-        f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{there}."
+        f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{hint}."
         f" {advice}"
     )
 
@@ -203,8 +203,12 @@ class MolecularScene(Scene):
     def with_user_code(
         self, forces: Sequence[Any] = (), thermostat: Any = None
     ) -> "MolecularScene":
-        """The same scene with forces and a thermostat from Python, see `Simulation`. Raises
-        SceneError."""
+        """The same scene with forces and a thermostat from Python, see `Simulation`.
+
+        Raises
+        ------
+        SceneError
+        """
         thermostat = self._user_code.thermostat if thermostat is None else thermostat
         user_code = UserCode((*self._user_code.forces, *forces), thermostat)
         if self.from_python not in ((), user_code.names):
@@ -214,16 +218,19 @@ class MolecularScene(Scene):
         return scene
 
     def with_end(self, time: float) -> "MolecularScene":
-        """The same scene with a last stage that ends at a time of the run, ps. Raises
-        SceneError."""
+        """The same scene with a last stage that ends at a time of the run, ps.
+
+        Raises
+        ------
+        SceneError
+        """
         before = sum(stage.duration for stage in self.stages[:-1])
         last = self.stages[-1]
         if last.is_minimisation or last.ramps:
-            what = (
-                "is a minimisation"
-                if last.is_minimisation
-                else "changes temperature or pressure over its duration"
-            )
+            if last.is_minimisation:
+                what = "is a minimisation"
+            else:
+                what = "changes temperature or pressure over its duration"
             raise SceneError(
                 self.source, [f"the last stage {what}: {option('until')} cannot set its end"]
             )
@@ -259,26 +266,24 @@ class MolecularScene(Scene):
 
     @property
     def inputs(self) -> dict[str, Path]:
-        found: dict[str, str | None] = {}
+        names: dict[str, str | None] = {}
         if self.structure is not None and "structure.file" not in self.embedded_files:
-            found["structure.file"] = self.structure.file
-        found["structure.topology"] = self.topology
+            names["structure.file"] = self.structure.file
+        names["structure.topology"] = self.topology
         for k, species in enumerate(self.molecules):
-            found |= {f"molecules.{k}.{key}": getattr(species, key) for key in SPECIES_FILES}
+            names |= {f"molecules.{k}.{key}": getattr(species, key) for key in SPECIES_FILES}
         for k, force in enumerate(self.forces.custom):
-            found |= {f"forces.custom.{k}.{key}": getattr(force, key) for key in FORCE_FILES}
-        return {key: self.path(name) for key, name in found.items() if name is not None}
+            names |= {f"forces.custom.{k}.{key}": getattr(force, key) for key in FORCE_FILES}
+        return {key: self.path(name) for key, name in names.items() if name is not None}
 
     @property
     def structure_source(self) -> str:
         """Path of the structure file, or "atoms", for messages; empty without a structure."""
         if self.structure is None:
             return ""
-        return (
-            "atoms"
-            if "structure.file" in self.embedded_files
-            else str(self.path(self.structure.file))
-        )
+        if "structure.file" in self.embedded_files:
+            return "atoms"
+        return str(self.path(self.structure.file))
 
     @property
     def topology(self) -> str | None:
@@ -293,19 +298,19 @@ class MolecularScene(Scene):
         ):
             return start.topology
         candidates = [str(Path(start.file).with_name(name)) for name in TOPOLOGIES]
-        found = next((name for name in candidates if self.path(name).is_file()), None)
-        if found is None:
+        topology = next((name for name in candidates if self.path(name).is_file()), None)
+        if topology is None:
             return None
-        path = self.path(found)
+        path = self.path(topology)
         if not any(is_inside(path, folder) for folder in (self.path("."), path.parent)):
             problem = (
-                f"{found} next to the trajectory is a link out of the scene's folder; name it by"
+                f"{topology} next to the trajectory is a link out of the scene's folder; name it by"
                 " --set"
             )
             raise SceneError(
                 self.source, [f"structure.topology: {problem} structure.topology=PATH"]
             )
-        return found
+        return topology
 
     def _errors(self):
         if self.structure is None:
@@ -330,21 +335,18 @@ class MolecularScene(Scene):
             yield (
                 "box.vacuum_A and fields.walls across the same axis contradict each other: omit one"
             )
-        first, from_file = (
-            self.first_moving,
-            self.structure is not None and self.structure.velocities,
-        )
+        first = self.first_moving
+        from_file = self.structure is not None and self.structure.velocities
         if (
             self.start.temperature_K is None
             and first is not None
             and first.temperature_K is None
             and not from_file
         ):
-            which = (
-                "the first stage"
-                if first is self.stages[0]
-                else "the first stage that is not a minimisation"
-            )
+            if first is self.stages[0]:
+                which = "the first stage"
+            else:
+                which = "the first stage that is not a minimisation"
             yield (
                 f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are"
                 " read"
@@ -399,15 +401,14 @@ class MolecularScene(Scene):
             before = self.stages[k - 1] if k else None
             if stage.volume and (before is None or not before.has_barostat or before.ramps):
                 changes = ", and its set point changes" if before and before.ramps else ""
-                found = (
-                    f"stages.{k - 1} is {before.ensemble}{changes}"
-                    if before
-                    else "it is the first stage"
-                )
+                if before:
+                    preceding = f"stages.{k - 1} is {before.ensemble}{changes}"
+                else:
+                    preceding = "it is the first stage"
                 why = (
                     "needs an npt or nph stage just before it, at constant temperature and pressure"
                 )
-                yield f"stages.{k}.volume = 'mean' {why}; {found}. Add one, or leave volume out"
+                yield f"stages.{k}.volume = 'mean' {why}; {preceding}. Add one, or leave volume out"
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
             yield "forces.tail_correction assumes a uniform liquid: omit it with frozen molecules"
         if self.forces.dispersion != "cutoff" and any(species.frozen for species in self.molecules):
@@ -431,7 +432,7 @@ class MolecularScene(Scene):
     def rounded_times(self, stages: Sequence[int] | None = None) -> list[str]:
         """Notes on intervals and durations that are not a whole number of steps, of all stages or
         these."""
-        output, found = self.output, {}
+        output, stages_of = self.output, {}
         of_run = [
             ("output.log_interval_ps", output.log_interval_ps),
             ("output.trajectory_interval_ps", output.trajectory and output.trajectory_interval_ps),
@@ -449,19 +450,19 @@ class MolecularScene(Scene):
                 of_stage.insert(
                     0, ("run.remove_momentum_interval_ps", self.run.remove_momentum_interval_ps)
                 )
-            for key, wanted in [*of_run, *of_stage]:
-                taken = wanted and stage.steps_of(wanted) * stage.timestep_fs / 1000
+            for key, duration in [*of_run, *of_stage]:
+                taken = duration and stage.steps_of(duration) * stage.timestep_fs / 1000
                 if (
-                    wanted
+                    duration
                     and taken < MOST_STEPS * stage.timestep_fs / 1000
-                    and abs(taken - wanted) > 1e-9 * wanted
+                    and abs(taken - duration) > 1e-9 * duration
                 ):
                     together = f"trajectories of {stage.steps_together} " if stage.is_hybrid else ""
                     unit = f"a whole number of {together}steps of {stage.timestep_fs:g} fs"
-                    found.setdefault((key, wanted, unit, taken), []).append(f"stages.{k}")
+                    stages_of.setdefault((key, duration, unit, taken), []).append(f"stages.{k}")
         return [
-            f"{key} = {wanted:g} is not {unit} ({', '.join(where)}): it is {taken:g} ps"
-            for (key, wanted, unit, taken), where in found.items()
+            f"{key} = {duration:g} is not {unit} ({', '.join(where)}): it is {taken:g} ps"
+            for (key, duration, unit, taken), where in stages_of.items()
         ]
 
     def _uneven_frames(self) -> Iterator[str]:
@@ -470,21 +471,21 @@ class MolecularScene(Scene):
         kind = Path(self.output.trajectory or "").suffix
         if not kind or not BY_EXTENSION[kind].even:
             return
-        wanted, other = self.output.trajectory_interval_ps, f"use {Path(TRAJECTORY).suffix}"
+        interval, other = self.output.trajectory_interval_ps, f"use {Path(TRAJECTORY).suffix}"
         for k, stage in enumerate(self.stages):
             if stage.is_minimisation:
                 continue
-            every = stage.steps_of(wanted)
+            every = stage.steps_of(interval)
             uneven = stage.steps % every and k < len(self.stages) - 1
             if stage.is_auto:
                 yield (
                     f"output.trajectory: a {kind} file cannot follow the step of stages.{k};"
                     f" {other}"
                 )
-            elif abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven:
+            elif abs(every * stage.timestep_fs / 1000 - interval) > 1e-9 * interval or uneven:
                 fault = (
                     f"a {kind} file stores one time between frames, and stages.{k} cannot keep"
-                    f" {wanted:g} ps"
+                    f" {interval:g} ps"
                 )
                 advice = (
                     f"make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"

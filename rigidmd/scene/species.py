@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, Strict, field_validator
 
-from rigidmd.io.formats import extensions
-from rigidmd.io.formats.cells import cell_of
+from rigidmd.formats import extensions
+from rigidmd.formats.cells import cell_of
 from rigidmd.scene.models import Site, SiteName, available_models, model_error
 from rigidmd.scene.validation import (
     Count,
@@ -93,19 +93,19 @@ class Molecules(Section):
         model, file, sites, table = (
             key is not None for key in (self.model, self.file, self.sites, self.parameters)
         )
-        whole = file and str(self.file).endswith(".toml")
+        is_complete = file and str(self.file).endswith(".toml")
         faults = {
             "give a model, or a custom file and sites, not both": model and (file or sites),
             "parameters would do nothing: a model or a .toml file contains parameters": (
-                table and (model or whole)
+                table and (model or is_complete)
             ),
             f"parameters = {self.parameters!r} must be a .toml file with [[sites]]": (
                 table and not str(self.parameters).endswith(".toml")
             ),
             "needs one of model, file, sites": not (model or file or sites),
-            "a .toml file has its own sites: leave out one of them": whole and sites,
+            "a .toml file has its own sites: leave out one of them": is_complete and sites,
             "a geometry file needs sites, or a file of parameters, for its atoms": (
-                file and not (whole or sites or table)
+                file and not (is_complete or sites or table)
             ),
             "a custom molecule needs a name": sites and not file and self.name is None,
         }
@@ -184,9 +184,8 @@ class Box(Section):
         if self.vacuum_A is not None and not self.periodic:
             yield "vacuum_A would do nothing: periodic is false"
         angles = [radians(angle) for angle in self.angles_deg or (90, 90, 90)]
-        if (
-            not 2 * max(angles) < sum(angles) < 2 * pi
-        ):  # the edges would be in one plane, or could not meet
+        # the edges would be in one plane, or could not meet
+        if not 2 * max(angles) < sum(angles) < 2 * pi:
             yield "angles_deg: three edges cannot form these angles"
 
     @property

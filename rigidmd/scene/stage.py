@@ -192,11 +192,11 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         targets = {key: getattr(self, key) for key in ERROR_TARGETS}
         step_keys = [key for key in ("timestep_fs", "rotor") if self._is_given(key)]
         if self.is_hybrid and self.is_auto:
-            if given := [key for key, target in targets.items() if target is not None]:
+            if set_keys := [key for key, target in targets.items() if target is not None]:
                 kind = self.thermostat_kind
                 yield (
-                    f"{', '.join(given)} would do nothing: averages of {kind} have no error of the"
-                    " step"
+                    f"{', '.join(set_keys)} would do nothing: averages of {kind} have no error of"
+                    " the step"
                 )
         else:
             yield from auto_errors(self.integrator, targets, step_keys)
@@ -244,8 +244,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         )
 
     def _pressure_errors(self):
-        given, coupling = self.pressure_bar, self.pressure_coupling
-        several = len(given) if isinstance(given, tuple) else 1
+        pressure, coupling = self.pressure_bar, self.pressure_coupling
+        several = len(pressure) if isinstance(pressure, tuple) else 1
         if self.is_minimisation and several == 2:
             yield "pressure_bar: a minimum has one pressure, not one that changes"
         if self.integrator == AUTO:
@@ -255,9 +255,9 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             )
         unequal = (
             coupling == "semi_isotropic"
-            and isinstance(given, tuple)
+            and isinstance(pressure, tuple)
             and several == 3
-            and given[0] != given[1]
+            and pressure[0] != pressure[1]
         )
         if unequal or (coupling == "isotropic" and several == 3):
             yield (
@@ -299,10 +299,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             return
         step = self.timestep_fs * FEMTOSECOND
         least = pi * step
-        thermostat, barostat = (
-            THERMOSTATS.get(self.thermostat_kind),
-            BAROSTATS.get(self.barostat_kind),
-        )
+        thermostat = THERMOSTATS.get(self.thermostat_kind)
+        barostat = BAROSTATS.get(self.barostat_kind)
         if thermostat and thermostat.oscillates and self.thermostat_time < least:
             yield (
                 f"thermostat_time_ps = {self.thermostat_time:g} is a period shorter than pi steps,"
@@ -328,8 +326,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         """The nearest number of steps to an interval (ps), at least one step or trajectory; at most
         `MOST_STEPS`, which no stage has."""
         together = self.steps_together
-        wanted = min(interval * 1000 / self.timestep_fs, MOST_STEPS)
-        return max(1, round(wanted / together)) * together
+        steps = min(interval * 1000 / self.timestep_fs, MOST_STEPS)
+        return max(1, round(steps / together)) * together
 
     @property
     def steps_together(self) -> int:
@@ -346,8 +344,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def refreshment_rate(self) -> float:
         """The friction (1/ps) that draws the momenta of hybrid Monte Carlo anew in one step;
         infinite for all of it."""
-        kept = 1 - self.momentum_refreshment
-        return -log(kept) / (2 * self.timestep_fs * FEMTOSECOND) if kept else inf
+        kept_fraction = 1 - self.momentum_refreshment
+        return -log(kept_fraction) / (2 * self.timestep_fs * FEMTOSECOND) if kept_fraction else inf
 
     @property
     def duration(self) -> float:
@@ -374,15 +372,15 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def with_defaults(self) -> "Stage":
         """This stage with the defaults of all keys that it uses."""
-        found: dict[str, Any] = {}
+        defaults: dict[str, Any] = {}
         if self.has_thermostat and not self.thermostat_is_open:
-            found |= {"thermostat": self.thermostat_kind} | self.thermostat_values
+            defaults |= {"thermostat": self.thermostat_kind} | self.thermostat_values
         if self.has_barostat:
             named = {"barostat": self.barostat_kind} if self.ensemble == "npt" else {}
-            found |= (
+            defaults |= (
                 named | {"compressibility_per_bar": self.compressibility} | self.barostat_values
             )
-        return self.model_copy(update=found)
+        return self.model_copy(update=defaults)
 
     @property
     def label(self) -> str:
@@ -425,8 +423,10 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def temperatures(self) -> tuple[float, float]:
         """Temperature of the thermostat at begin and end, K."""
-        both = self.temperature_K
-        return both if isinstance(both, tuple) else (both or 0.0, both or 0.0)
+        temperature = self.temperature_K
+        if isinstance(temperature, tuple):
+            return temperature
+        return temperature or 0.0, temperature or 0.0
 
     @property
     def thermostat_time(self) -> float:
@@ -441,8 +441,10 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def pressures(self) -> tuple[Six, Six]:
         """Pressure at begin and end, bar: xx, yy, zz, xy, xz, yz."""
-        given = self.pressure_bar
-        first, last = given if isinstance(given, tuple) and len(given) == 2 else (given, given)
+        pressure = self.pressure_bar
+        first, last = (
+            pressure if isinstance(pressure, tuple) and len(pressure) == 2 else (pressure, pressure)
+        )
         return _tensor(first), _tensor(last)
 
     @property
@@ -478,7 +480,7 @@ def _users(key: str) -> set[str]:
     }
 
 
-def _tensor(given: Any) -> Six:
+def _tensor(pressure: Any) -> Six:
     """One, three or six pressures as a tensor."""
-    values = given if isinstance(given, tuple) else (given,) * 3
+    values = pressure if isinstance(pressure, tuple) else (pressure,) * 3
     return (*values, 0.0, 0.0, 0.0) if len(values) == 3 else values

@@ -246,12 +246,12 @@ KEY_WITH_UNIT = re.compile(rf"(?:.*_)?[a-z]{{4,}}_({'|'.join(OTHER_UNITS)})")
 def _as_number(text: str, keys: list) -> str:
     """Advice on a text where a number is expected: the number in the unit of the key; empty for
     other texts."""
-    found = WITH_UNIT.fullmatch(text)
-    if not found:
+    match = WITH_UNIT.fullmatch(text)
+    if not match:
         return ""
-    number, unit = float(found[1]), found[2]
+    number, unit = float(match[1]), match[2]
     if not unit:
-        return f"{ADVICE}{found[1]} without quotes"
+        return f"{ADVICE}{match[1]} without quotes"
     key = KEY_WITH_UNIT.fullmatch(
         str(next((key for key in reversed(keys) if isinstance(key, str)), ""))
     )
@@ -263,13 +263,12 @@ def _as_number(text: str, keys: list) -> str:
 
 def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     value = detail["input"]
-    shown = (
-        "a table"
-        if isinstance(value, dict)
-        else "a list"
-        if isinstance(value, list)
-        else shorten_repr(value)
-    )
+    if isinstance(value, dict):
+        shown = "a table"
+    elif isinstance(value, list):
+        shown = "a list"
+    else:
+        shown = shorten_repr(value)
     context = detail.get("ctx", {})
     match detail["type"]:
         case "extra_forbidden":
@@ -282,9 +281,9 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
         case "literal_error":
-            wanted = context["expected"].replace("False", "false").replace("True", "true")
-            return f"is {shown}, must be {wanted}" + did_you_mean(
-                str(value), re.findall(r"'([^']*)'", wanted)
+            expected = context["expected"].replace("False", "false").replace("True", "true")
+            return f"is {shown}, must be {expected}" + did_you_mean(
+                str(value), re.findall(r"'([^']*)'", expected)
             )
         case "tuple_type" | "list_type" if isinstance(value, dict):
             return f"is a table, must be a list of tables: write [[{'.'.join(map(str, keys))}]]"
@@ -311,13 +310,12 @@ def _foreign(name: str, model: type[BaseModel]) -> str:
             if table == "none" and "stages" in model.model_fields:
                 return f"; not needed: {note}"
             if (section or not path) and key in _known_keys(model, path):
-                place = (
-                    f" in [[{table}]]"
-                    if "tuple" in str(section)
-                    else f" in [{table}]"
-                    if path
-                    else ""
-                )
+                if "tuple" in str(section):
+                    place = f" in [[{table}]]"
+                elif path:
+                    place = f" in [{table}]"
+                else:
+                    place = ""
                 return f"; in rigidmd this is {key}{place}{note and f' ({note})'}"
     return ""
 
@@ -363,11 +361,9 @@ def _choices(annotation: Any) -> list[str]:
     if isinstance(annotation, str):
         return [annotation]
     parts = (*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ()))
-    return (
-        [*annotation.names]
-        if isinstance(annotation, NameIn)
-        else [n for part in parts for n in _choices(part)]
-    )
+    if isinstance(annotation, NameIn):
+        return [*annotation.names]
+    return [n for part in parts for n in _choices(part)]
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

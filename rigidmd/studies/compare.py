@@ -29,9 +29,8 @@ class CellDifference:
     column: str
     first: str
     second: str
-    bits: (
-        int | None
-    )  # last bits of 53 that differ: 1 for neighbours, 53 for unlike numbers; None for text
+    # last bits of 53 that differ: 1 for neighbours, 53 for unlike numbers; None for text
+    bits: int | None
 
 
 @dataclass
@@ -45,9 +44,8 @@ class SampleComparison:
     at: str | None = None  # the clock's value at the first sample that differs
     index: int = 0  # that sample among the common ones, from 0
     first: list[CellDifference] = field(default_factory=list)  # columns that differ there
-    last: list[CellDifference] = field(
-        default_factory=list
-    )  # columns that differ at the last common sample
+    # columns that differ at the last common sample
+    last: list[CellDifference] = field(default_factory=list)
     only: list[str] = field(default_factory=list)  # columns of one file alone
 
 
@@ -57,15 +55,13 @@ class RunComparison:
 
     folders: tuple[str, str]
     scene: dict[str, tuple] = field(default_factory=dict)  # dotted key -> values that differ
-    made: dict[str, tuple] = field(
-        default_factory=dict
-    )  # key of summary.json -> values that differ
+    # key of summary.json -> values that differ
+    made: dict[str, tuple] = field(default_factory=dict)
     samples: SampleComparison | None = None
     # array of final.npz -> largest difference, internal units; None for unlike shapes
     state: dict[str, float | None] = field(default_factory=dict)
-    files: dict[str, bool] = field(
-        default_factory=dict
-    )  # other files of both -> whether their bytes are the same
+    # other files of both -> whether their bytes are the same
+    files: dict[str, bool] = field(default_factory=dict)
     missing: list[str] = field(default_factory=list)  # what could not be compared
 
     @property

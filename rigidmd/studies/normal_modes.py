@@ -137,19 +137,15 @@ class NormalModes:
     number: np.ndarray  # (k,) of each mode among all d, from 1
     rate: np.ndarray  # (k,) w, rad/ps; 0 of zero modes, negative of unstable modes
     wavenumber: np.ndarray  # (k,) w/(2 pi c), cm⁻¹
-    error: (
-        np.ndarray
-    )  # (k,) cm⁻¹, by the asymmetry of the Hessian or the residual of the vector; NaN of zero modes
-    vector: (
-        np.ndarray
-    )  # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
-    translation: (
-        np.ndarray
-    )  # (k,) fraction of the kinetic energy that is of translation, not of libration
+    # (k,) cm⁻¹, by the asymmetry of the Hessian or the residual of the vector; NaN of zero modes
+    error: np.ndarray
+    # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
+    vector: np.ndarray
+    # (k,) fraction of the kinetic energy that is of translation, not of libration
+    translation: np.ndarray
     weight: np.ndarray  # (k, n) fraction of the kinetic energy in each molecule
-    intensity: (
-        np.ndarray
-    )  # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges
+    # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges
+    intensity: np.ndarray
     total: int  # number of all modes; at the Gamma point those of a unit cell
     cells: int = 0  # number of unit cells, if these are modes at the Gamma point
 
@@ -220,15 +216,27 @@ def normal_modes(
 
     A minimisation comes first, to the rounding of forces and torques and at constant cell.
 
-    minimise : False requires that the start is a minimum
-    count : of the lowest and of the highest modes, by Lanczos; default: all, or 20 if there are
-        more than 6000
-    gamma : only modes with the period of the unit cell that `structure.repeat` repeats (k = 0)
-    required : number of a mode that has to be computed, which is checked before computing
-    progress : called with the fraction done
+    Parameters
+    ----------
+    minimise
+        False requires that the start is a minimum
+    count
+        Of the lowest and of the highest modes, by Lanczos; default: all, or 20 if there are more
+        than 6000
+    gamma
+        Only modes with the period of the unit cell that `structure.repeat` repeats (k = 0)
+    required
+        Number of a mode that has to be computed, which is checked before computing
+    progress
+        Called with the fraction done
 
-    Raises SceneError for a single body, for a required mode that does not exist, and at the Gamma
-    point without a unit cell; SimulationError where a minimum is required and not found.
+    Raises
+    ------
+    SceneError
+        For a single body, for a required mode that does not exist, and at the Gamma point without a
+        unit cell.
+    SimulationError
+        If a minimum is required and not found.
     """
     simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
     if isinstance(simulation.scene, BodyScene):
@@ -406,9 +414,8 @@ def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np
 
     high = largest(c.curvature)
     top = max(q @ c.curvature(q) for q in high)
-    low = largest(
-        lambda q: c.relative(top * q) - c.curvature(q)
-    )  # w² near 0 would converge to a fraction of itself
+    # w² near 0 would converge to a fraction of itself
+    low = largest(lambda q: c.relative(top * q) - c.curvature(q))
     vector = np.concatenate([c.translations, low, high])
     image = np.concatenate([0 * c.translations, [c.curvature(q) for q in (*low, *high)]])
     square = (vector * image).sum(axis=1)

@@ -10,13 +10,13 @@ from rigidmd.core.state import State
 from rigidmd.core.state_file import read_state
 from rigidmd.engines.body_motion import Motion
 from rigidmd.errors import CheckpointError, StructureError
+from rigidmd.formats.atoms import Frame
 from rigidmd.io.checkpoint import latest
 from rigidmd.io.folder import FINAL, SWEEP, written_by_runs
-from rigidmd.io.formats.atoms import Frame
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.results import Results
 from rigidmd.run.resume import state_from
-from rigidmd.studies.sweep.folder import read_manifest, state_on_disk
+from rigidmd.studies.sweep.folder import read_manifest
 from rigidmd.studies.sweep.table import Table, table_of
 
 
@@ -35,20 +35,15 @@ def read_run(folder: str | Path) -> Results | Table:
     `notes` and an empty `stages`, its state is the one of the last checkpoint. A sweep gives the
     `Table` that `rigidmd.sweep` returned, with the points that have finished.
 
-    Raises OutputError if the folder has no run, or a damaged one.
+    Raises
+    ------
+    OutputError
+        If the folder has no run, or a damaged one.
     """
     folder = Path(folder)
     if (folder / SWEEP).is_file():
-        return _read_sweep(folder)
+        return table_of(read_manifest(folder))
     return _results_of(read_record(folder))
-
-
-def _read_sweep(folder: Path) -> Table:
-    """The table of a sweep; the states of its points are read from their folders."""
-    manifest = read_manifest(folder)
-    for point in manifest.points:
-        point.state = state_on_disk(folder, point)
-    return table_of(folder, manifest)
 
 
 def _results_of(record: Record) -> Results:
@@ -87,7 +82,9 @@ def _state_of(record: Record) -> tuple[State | None, str]:
                 )
             return found, ""
         arrays = latest(record.folder)[0].of("state").arrays
-        return state_from(arrays, start._replace(extra_variables=arrays["bath"]), exact=False), ""
+        return state_from(
+            arrays, start._replace(extra_variables=arrays["extra_variables"]), exact=False
+        ), ""
     except (CheckpointError, StructureError, ValueError, KeyError) as error:
         return None, f"the final state is not available: {error}"
 

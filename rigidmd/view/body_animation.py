@@ -54,12 +54,18 @@ EXACT_RETURN = 0.02
 class BodyAnimation:
     """Lengths are in units of the picture's half width, about its centre; (t,) samples.
 
-    position (t, 3) : of the pivot or the centre of mass; centre (3,) : centre of mass in the body's
-    axes quaternion (t, 4) : w, x, y, z, without jumps of sign; angles (t, 3) : phi, theta, psi,
-    degrees; empty for a point path (p, 3) and when (p,) : the body axis on the sphere, or the
-    centre of mass; sphere : its radius, 0 without one
-    vectors : name -> (t, 3), and largest : name -> largest size with its unit; gravity (3,) or None
-    unit : of the picture, m; azimuth : of the eye, rad; notes : on thinning and enlargement
+    position : (t, 3) of the pivot or the centre of mass
+    centre : (3,) centre of mass in the body's axes
+    quaternion : (t, 4) w, x, y, z, without jumps of sign
+    angles : (t, 3) phi, theta, psi, degrees; empty for a point
+    path, when : (p, 3) and (p,) the body axis on the sphere, or the centre of mass
+    sphere : its radius, 0 without one
+    vectors : name -> (t, 3)
+    largest : name -> largest size with its unit
+    gravity : (3,) or None
+    unit : of the picture, m
+    azimuth : of the eye, rad
+    notes : on thinning and enlargement
     """
 
     def __init__(self, record: Record):
@@ -213,9 +219,8 @@ class BodyAnimation:
     def _faces(self, axes, rotation: np.ndarray, origin: np.ndarray) -> None:
         from matplotlib.collections import PolyCollection
 
-        seen = (
-            self.mesh.vertices @ rotation.T + origin
-        ) @ self._view.T  # right, up, towards the eye
+        # right, up, towards the eye
+        seen = (self.mesh.vertices @ rotation.T + origin) @ self._view.T
         light = np.array([-0.5, 0.65, 0.55])
         shown = []
         for face, painted in zip(self.mesh.faces, self.mesh.painted, strict=True):
@@ -263,9 +268,8 @@ class BodyAnimation:
         back = np.flatnonzero((off < 1) & (np.arange(len(off)) > left[0])) if len(left) else left
         if len(back) == 0:
             return float(self.time[-1]), []
-        near = back[
-            np.searchsorted(back, back[-1] - 0.1 * len(off)) :
-        ]  # the best of the last returns
+        # the best of the last returns
+        near = back[np.searchsorted(back, back[-1] - 0.1 * len(off)) :]
         end = float(self.time[near[off[near].argmin()]])
         how = (
             "returns to its start"

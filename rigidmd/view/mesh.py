@@ -9,7 +9,7 @@ import numpy as np
 from rigidmd.assemble.body import assembled, inertia_at_centre, inertia_of, principal
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.figures.style import camera
-from rigidmd.io.formats.bonds import shortest_links
+from rigidmd.formats.bonds import shortest_links
 from rigidmd.mechanics.inertia import SOLIDS
 from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
 
@@ -75,9 +75,8 @@ def mesh_of(system: BodySystem) -> Mesh:
     symmetric = axis_of_symmetry(moments)
     if wanted in (None, "top") and symmetric is not None:
         return _top_mesh(mass, moments, axes, symmetric, centre, table.pinned)
-    lengths = np.sqrt(
-        np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0)
-    )  # half axes of the ellipsoid
+    # half axes of the ellipsoid
+    lengths = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))
     lengths, unit, shape = np.maximum(lengths, MIN_THICKNESS * lengths.max()), BALL, "ellipsoid"
     if wanted != "ellipsoid":
         lengths, unit, shape = CUBOID_EDGES * lengths, CUBOID, "cuboid"
@@ -215,9 +214,8 @@ def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:
     angle = 2 * np.pi * corner / n
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     vertices = np.concatenate([np.column_stack([r * circle, np.full(n, z)]) for r, z in rings])
-    below = (
-        n * np.arange(len(rings) - 1)[:, None]
-    )  # the first corner of each strip between two circles
+    # the first corner of each strip between two circles
+    below = n * np.arange(len(rings) - 1)[:, None]
     i, j = below + corner, below + (corner + 1) % n
     faces = np.stack([i, j, j + n, i + n], axis=-1).reshape(-1, 4).tolist()
     painted = (corner < n // 4).tolist() * (len(rings) - 1)

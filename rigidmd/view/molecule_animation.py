@@ -10,7 +10,7 @@ import numpy as np
 from rigidmd.engines.system import Sites, System
 from rigidmd.errors import OutputError
 from rigidmd.figures.style import FAINT, INK, UP, camera, draw_scale
-from rigidmd.io.formats.bonds import COVALENT, connections
+from rigidmd.formats.bonds import COVALENT, connections
 from rigidmd.io.trajectory import Frames, read_frames
 from rigidmd.run.record import Record
 from rigidmd.view.molecule_figure import COLOURS, OTHER

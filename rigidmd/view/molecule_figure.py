@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rigidmd.figures.style import COOL, FAINT, INK, draw_scale, new_figure, save_files
-from rigidmd.io.formats.bonds import COVALENT, bonds, distance
+from rigidmd.formats.bonds import COVALENT, bonds, distance
 from rigidmd.io.write import check_target
 from rigidmd.scene.models import GROUPS, Molecule
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL

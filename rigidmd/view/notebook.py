@@ -130,9 +130,8 @@ def _drawing(drawing: "Picture | None", salt: str, about: str) -> str:
     if drawing is None:
         return ""
     svg = figure(drawing, salt, about).replace("#000000", "var(--ink)")
-    svg = svg.replace(
-        "*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin"
-    )  # not of the rest of the notebook
+    # not of the rest of the notebook
+    svg = svg.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")
     return f'<div class="{"paper" if "<image" in svg else "figure"}">{svg}</div>'
 
 
@@ -286,8 +285,15 @@ class AnimationPage:
 
 
 def show(results: Results) -> "StructureWidget | AnimationPage":
-    """The animation of a run in a notebook: molecules by chemiscope, a body on a small page. Raises
-    ImportError without chemiscope, ValueError without a trajectory."""
+    """The animation of a run in a notebook: molecules by chemiscope, a body on a small page.
+
+    Raises
+    ------
+    ImportError
+        Without chemiscope.
+    ValueError
+        Without a trajectory.
+    """
     if isinstance(results.system, BodySystem):
         record = record_of(results.system, results.samples, results.summary)
         return AnimationPage(

@@ -178,10 +178,14 @@ def record_of(
 def plot(results: Results, *columns: str, log: bool = False) -> Picture:
     """A Matplotlib figure of a run, which a notebook displays and `savefig` writes.
 
-    columns : names of columns, drawn against time, with one panel for each unit; default: the main
-        figure of the run (energy.png, or the path of the axis of a body); or the name of another
-        figure of a body ("angles", "ellipsoids", "path", "invariants")
-    log : absolute values on a logarithmic axis. Raises KeyError
+    Parameters
+    ----------
+    columns
+        Names of columns, drawn against time, with one panel for each unit; default: the main figure
+        of the run (energy.png, or the path of the axis of a body); or the name of another figure of
+        a body ("angles", "ellipsoids", "path", "invariants")
+    log
+        Absolute values on a logarithmic axis. Raises KeyError
     """
     figures = {}
     if not set(columns[:1]) & set(results.units):
@@ -251,10 +255,14 @@ class LivePlot(Observer):
     """Draws columns of the samples so far in the output of a notebook cell; elsewhere it does
     nothing.
 
-    columns : names, as in `results[...]`; default: temperature and drift, for a body energy_error
-    interval : of the run (ps, s for a body) between two drawings; default: the interval of its
-        samples
-    pause : least seconds between two drawings, which take at most a fifth of the time
+    Parameters
+    ----------
+    columns
+        names, as in `results[...]`; default: temperature and drift, for a body energy_error
+    interval
+        Of the run (ps, s for a body) between two drawings; default: the interval of its samples
+    pause
+        Least seconds between two drawings, which take at most a fifth of the time
     """
 
     ends = draws = True
@@ -265,7 +273,13 @@ class LivePlot(Observer):
         self._spot: DisplayArea | None = None
 
     def begin(self, run: Simulation) -> None:
-        """Prepare the drawing. Raises KeyError for an unknown column."""
+        """Prepare the drawing.
+
+        Raises
+        ------
+        KeyError
+            For an unknown column.
+        """
         self._run, self._due = run, 0.0
         scene = cast(MolecularScene | BodyScene, run.scene)
         if isinstance(scene, BodyScene):

@@ -22,8 +22,8 @@ from rigidmd.core.statistics import format_with_error
 from rigidmd.engines.samples import BODY
 from rigidmd.errors import InputError
 from rigidmd.figures.style import new_figure
+from rigidmd.formats import BY_EXTENSION
 from rigidmd.io.folder import SCENE
-from rigidmd.io.formats import BY_EXTENSION
 from rigidmd.run import Simulation
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.report import body_rows, stage_rows, stage_title

@@ -35,6 +35,5 @@ scene = rigidmd.Scene.from_dict(
 results = rigidmd.Simulation(scene, forces=[ElectricField([0, 0, 1.0])]).run()
 half = len(results["electric_field"]) // 2
 print("energy in the field:", results["electric_field"][half:].mean() / 64, "kJ/mol per molecule")
-assert (
-    results["electric_field"][half:].mean() < 0
-)  # dipoles align with the field, by Langevin's function
+# dipoles align with the field, by Langevin's function
+assert results["electric_field"][half:].mean() < 0

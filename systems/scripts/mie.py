@@ -28,9 +28,8 @@ scene = rigidmd.Scene.from_dict(
         "stages": [{"duration_ps": 2, "timestep_fs": 4}],
     }
 )
-potential = rigidmd.pair_law(
-    mie, {"Ar": Mie(1.0, 3.4), "Kr": Mie(1.4, 3.65)}
-)  # between Ar and Kr: mean sigma, root of eps
+# between Ar and Kr: mean sigma, root of eps
+potential = rigidmd.pair_law(mie, {"Ar": Mie(1.0, 3.4), "Kr": Mie(1.4, 3.65)})
 results = rigidmd.Simulation(scene, forces=[potential]).run()
 print(results["mie"][-1], "kJ/mol; drift", results["drift"][-1])
 assert abs(results["drift"][-1]) < 2e-3 * results["kinetic"][-1]

@@ -30,12 +30,13 @@ def couple(thermostat, model, state, h, draw):
     state.energy_ledger[0] += heat  # energy less heat is conserved
 
 
+# in the middle of a step
 stage = {
     "ensemble": "nvt",
     "temperature_K": 330,
     "duration_ps": 2,
     "integrator": "baoab",
-}  # in the middle of a step
+}
 water = {
     "box": {"density_g_cm3": 0.997},
     "molecules": [{"model": "spce", "count": 216}],

@@ -22,10 +22,9 @@ from ase.optimize import LBFGS
 from tblite.ase import TBLite
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import INK, new_figure, open_axis
-
 from rigidmd import Simulation, scene_from_atoms
 from rigidmd.ase import CalculatorForce
+from rigidmd.figures.style import INK, new_figure, open_axis
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 TEMPERATURE, DURATION, INTERVAL = 200.0, 2.0, 0.012  # K, ps, ps

@@ -96,13 +96,12 @@ def command_of(name: str) -> str:
 
 def measure(name: str) -> None:
     """Measure a scene and write its table, picture and advice."""
-    from support import accuracy_report
-
     from rigidmd.scene import Scene, parse_override
+    from rigidmd.studies.accuracy import accuracy
 
     _, file, settings = SCENES[name]
     scene = Scene.read(ROOT / "systems" / f"{file}.toml", dict(map(parse_override, settings)))
-    found = accuracy_report.measure_accuracy(scene, repeats=REPEATS)
+    found = accuracy.measure_accuracy(scene, repeats=REPEATS)
     system, reached = found.trial_system, {}
     for target in TARGETS:
         points = {
@@ -135,11 +134,11 @@ def measure(name: str) -> None:
         "median_spread": float(np.median([t.spread for t in found.trials if not t.diverged])),
         "reference_error": found.reference_error,
         "reached": reached,
-        "advice": accuracy_report.recommendations(found),
+        "advice": accuracy.recommendations(found),
     }
     DATA.mkdir(exist_ok=True)
-    accuracy_report.trial_table(found).write(DATA / f"{name}.csv")
-    figure = accuracy_report.accuracy_figure(found)
+    accuracy.trial_table(found).write(DATA / f"{name}.csv")
+    figure = accuracy.accuracy_figure(found)
     figure.lay_out(100)
     figure.savefig(DOCS / "images" / f"collection_{name}.png", dpi=85)
     (DATA / f"{name}.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")

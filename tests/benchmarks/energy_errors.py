@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import SCHEMES, choice
-
 from rigidmd import Scene, Simulation
+from rigidmd.core.integrators import SCHEMES
 from rigidmd.errors import SimulationError
+from rigidmd.run.pilot import choice
 
 WATER = {
     "box": {"lengths_A": 12.42},

@@ -10,9 +10,10 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from scenes import SCENES
-from support import small_scene, verify
+from support import small_scene
 
 from rigidmd.errors import RigidMDError
+from rigidmd.studies.other_engines import verify
 
 
 def main(engine: str) -> None:

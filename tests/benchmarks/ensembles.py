@@ -16,9 +16,8 @@ from peers import WORKLOADS, choice, start_of
 from scaling import STEP, speed
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import integrator_of_stage
-
 from rigidmd import Scene, Simulation
+from rigidmd.assemble.build import integrator_of_stage
 
 WARM, PRESSED = {"temperature_K": 300.0}, {"pressure_bar": 1.0}
 STAGES = {

@@ -26,25 +26,14 @@ from peers import WORKLOADS, choice, numbers, start_of
 from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import (
-    BUILDS,
-    DTYPES,
-    MASKED,
-    SCHEMES,
-    SIMD_BITS,
-    PairWorkspace,
-    State,
-    blocks_of,
-    call,
-    call_blocks,
-    compute_site_positions,
-    end_of_row,
-    largest_displacement,
-    no_load,
-    pack_arguments,
-)
-
 from rigidmd import Scene, Simulation
+from rigidmd.compile import SIMD_BITS, call, call_blocks, pack_arguments
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.state import State, no_load
+from rigidmd.engines.cpu.engine import DTYPES
+from rigidmd.forces.neighbors.lists import BUILDS, MASKED, end_of_row, largest_displacement
+from rigidmd.forces.neighbors.pair_loop import PairWorkspace
+from rigidmd.forces.neighbors.sites import blocks_of, compute_site_positions
 
 STEP = 2e-3  # ps
 STEPS = 100  # before anything is measured, so that lists are of a usual age; and of the rate of a whole step

@@ -19,18 +19,10 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import (
-    FAINT,
-    INK,
-    SCHEMES,
-    body_trial_system,
-    curve_style,
-    molecular_trial_system,
-    new_figure,
-    open_axis,
-)
-
 from rigidmd import Scene, Simulation
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis
+from rigidmd.run.pilot.trial_systems import body_trial_system, molecular_trial_system
 
 ROOT = Path(__file__).parents[2]
 DATA, IMAGE = (

@@ -21,9 +21,8 @@ from scaling import STEP, relax, speed
 from scaling import scene as small
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import SCHEMES
-
 from rigidmd import Scene, Simulation
+from rigidmd.core.integrators import SCHEMES
 
 SMALL = "216"
 VERLET = SCHEMES["velocity_verlet"]

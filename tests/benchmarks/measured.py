@@ -14,9 +14,8 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import analyse_folder
-
 from rigidmd import Scene, Simulation
+from rigidmd.analysis.files import analyse_folder
 
 TEMPERATURE = 298.15
 

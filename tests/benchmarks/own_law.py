@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import build
-from support import integrator_of_stage as row
-
 import rigidmd
+from rigidmd.assemble.build import build
+from rigidmd.assemble.build import integrator_of_stage as row
 
 STEPS = 40
 

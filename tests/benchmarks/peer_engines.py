@@ -89,9 +89,10 @@ class Rigidmd:
 
     @staticmethod
     def run(job: dict, sites: dict, folder: Path) -> dict:
-        from support import SCHEMES, observe
+        from support import observe
 
         from rigidmd import Scene, Simulation
+        from rigidmd.core.integrators import SCHEMES
         from rigidmd.units import KJ_PER_MOL
 
         simulation = Simulation(Scene.from_dict(job["scene"], Path(job["sites"]).parent))

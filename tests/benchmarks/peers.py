@@ -56,9 +56,15 @@ from scipy.spatial import cKDTree
 from scipy.special import erfc
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import FAINT, INK, align, build, cache_folder, intramolecular_energy, observe, slope
+from support import observe
 
 from rigidmd import Scene, Simulation
+from rigidmd.assemble.build import build
+from rigidmd.compile.cache import cache_folder
+from rigidmd.core.statistics import slope
+from rigidmd.figures.style import FAINT, INK
+from rigidmd.forces.ewald.corrections import intramolecular_energy
+from rigidmd.mechanics.rotation import align
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 HERE = Path(__file__).resolve().parent

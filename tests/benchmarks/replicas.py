@@ -24,9 +24,8 @@ from peers import choice
 from scaling import STEP, speed
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import integrator_of_stage as row
-
 from rigidmd import Scene, Simulation, run_together
+from rigidmd.assemble.build import integrator_of_stage as row
 
 CORES = len(os.sched_getaffinity(0))
 #: Molecules -> what their scene has of its own.

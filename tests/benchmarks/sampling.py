@@ -54,10 +54,10 @@ from peer_engines import (
 from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import FAINT, INK, MeanAtStep, extrapolate
-
 from rigidmd import Every, Scene, Simulation
 from rigidmd.errors import RigidMDError
+from rigidmd.figures.style import FAINT, INK
+from rigidmd.studies.extrapolation import MeanAtStep, extrapolate
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 COUNT, TEMPERATURE, DENSITY, CUTOFF, SWITCH = 512, 298.15, 0.997, 9.0, 1.0  # K, g/cm³, Å

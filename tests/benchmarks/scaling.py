@@ -27,9 +27,10 @@ from peer_engines import environment
 from peers import WORKLOADS, numbers, write_start
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import NOW, SCHEMES, array_bytes
-
 from rigidmd import Scene, Simulation
+from rigidmd.assemble.memory_check import array_bytes
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.state import NOW
 
 WORK = WORKLOADS["W1"]
 UNIT = 216  # molecules in the box that is copied, whose edge is little more than twice the cut-off

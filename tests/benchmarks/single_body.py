@@ -22,8 +22,9 @@ from scipy.integrate import solve_ivp
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import known
-from support import SCHEMES, OdeEngine, Solver
 
+from rigidmd.core.integrators import SCHEMES, Solver
+from rigidmd.engines.ode.engine import OdeEngine
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 

@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import Slab, fitted, mean_and_error
+from rigidmd.analysis.built_in.interfaces import Slab, fitted
+from rigidmd.core.statistics import mean_and_error
 
 SCENE = Path(__file__).parents[2] / "systems" / "water_slab.toml"
 EQUILIBRATION, BLOCKS = 60.0, 10

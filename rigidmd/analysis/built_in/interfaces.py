@@ -69,10 +69,8 @@ def slab_of(frames: RigidFrames, axis: str) -> Slab:
     def centred(fraction: np.ndarray) -> np.ndarray:
         return ((fraction - middle + 0.5) % 1.0 - 0.5) * height[:, None]
 
-    area, centre = (
-        float(np.mean(frames.volume / height)),
-        frames.positions[:, :, k] / height[:, None],
-    )
+    area = float(np.mean(frames.volume / height))
+    centre = frames.positions[:, :, k] / height[:, None]
     return Slab(k, area, float(height.mean()), centred(at), centred(centre), mass)
 
 
@@ -90,10 +88,12 @@ def fitted(z: np.ndarray, density: np.ndarray, height: float) -> np.ndarray:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", optimize.OptimizeWarning)
-            found, _ = optimize.curve_fit(profile, z, density, (top, low, half, 2.0), maxfev=4000)
+            parameters, _ = optimize.curve_fit(
+                profile, z, density, (top, low, half, 2.0), maxfev=4000
+            )
     except (RuntimeError, optimize.OptimizeWarning):
         raise OutputError("the density has no profile of a slab between two vapours") from None
-    liquid, vapour, half, width = found
+    liquid, vapour, half, width = parameters
     if not (vapour < LARGEST_RATIO * liquid and abs(width) < half < height / 2 - abs(width)):
         raise OutputError("the box has no slab between two vapours along this axis")
     return np.array([liquid, vapour, half, abs(width)])
@@ -156,14 +156,18 @@ def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
     Errors of one run are from the correlated series of what each frame changes in the fit. The
     curve also has the mean cosine of dipoles with the outward normal. Raises OutputError.
     """
-    seen = profiles_of(runs, axis)
-    means = [densities.mean(axis=0) for densities in seen.densities]
+    profiles = profiles_of(runs, axis)
+    means = [densities.mean(axis=0) for densities in profiles.densities]
     density = runs.mean(means)
-    whole = fitted(seen.z, density, seen.height)
-    series = [_changes_of_fit(seen.z, densities, whole) for densities in seen.densities]
+    fit = fitted(profiles.z, density, profiles.height)
+    series = [_changes_of_fit(profiles.z, densities, fit) for densities in profiles.densities]
     errors: list[float | None]
     if runs.are_several:
-        errors = runs.estimate(means, lambda mean: fitted(seen.z, mean, seen.height))[1].tolist()
+
+        def fit_of(mean: np.ndarray) -> np.ndarray:
+            return fitted(profiles.z, mean, profiles.height)
+
+        errors = runs.estimate(means, fit_of)[1].tolist()
     else:
         errors = [mean_and_error(values)[1] for values in series[0].T]
     names = (
@@ -172,43 +176,43 @@ def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
         ("thickness of the slab", "Å", 2.0),
         ("width d", "Å", 1.0),
     )
-    found = AnalysisResult("interfaces", f"interfaces of a slab across {axis}")
+    result = AnalysisResult("interfaces", f"interfaces of a slab across {axis}")
     for k, (name, unit, factor) in enumerate(names):
         note = "from 10 to 90 % of the density it is 2.197 d" if name == "width d" else ""
         error = None if errors[k] is None else factor * float(errors[k] or 0.0)
         tau = correlation_time_of(runs, [of_run[:, k] for of_run in series])
         if error is None:
-            found.values.append(
-                too_short(name, unit, factor * float(whole[k]), None, "too short for an error", tau)
+            result.values.append(
+                too_short(name, unit, factor * float(fit[k]), None, "too short for an error", tau)
             )
         else:
-            found.values.append(Value(name, unit, factor * float(whole[k]), error, tau, note))
-    axis_of_curve = ("distance from the middle (A)", seen.z)
+            result.values.append(Value(name, unit, factor * float(fit[k]), error, tau, note))
+    axis_of_curve = ("distance from the middle (A)", profiles.z)
     curve = Curve("interfaces", axis_of_curve, "density (g/cm³)", {"density (g/cm3)": density})
-    curve.columns["fit (g/cm3)"] = profile(seen.z, *whole)
-    found.curves.append(curve)
+    curve.columns["fit (g/cm3)"] = profile(profiles.z, *fit)
+    result.curves.append(curve)
     for kind in runs.kinds:
         if kind.molecule.has_dipole and runs.has_rotations:
-            mean = _mean_cosine(runs, seen, kind)
+            mean = _mean_cosine(runs, profiles, kind)
             title = f"mean cosine of dipoles {kind.name}"
-            found.curves.append(
+            result.curves.append(
                 Curve(f"dipoles_{kind.name}", curve.axis, "mean cosine", {title: mean}, level=0.0)
             )
-    return found
+    return result
 
 
-def _mean_cosine(runs: Runs, seen: Profiles, kind: Kind) -> np.ndarray:
+def _mean_cosine(runs: Runs, profiles: Profiles, kind: Kind) -> np.ndarray:
     """Mean cosine (bins,) of the dipoles of a species with the outward normal; NaN where there are
     few."""
     dipole = kind.molecule.charges @ kind.molecule.positions_body
-    count, total = np.zeros(len(seen.z)), np.zeros(len(seen.z))
-    for run, slab in zip(runs.members, seen.slabs, strict=True):
+    count, total = np.zeros(len(profiles.z)), np.zeros(len(profiles.z))
+    for run, slab in zip(runs.members, profiles.slabs, strict=True):
         cosine = run.Q[:, kind.index, slab.axis] @ (dipole / np.linalg.norm(dipole))
         at = slab.centre[:, kind.index]
-        count += np.histogram(np.abs(at), seen.edges)[0]
-        total += np.histogram(np.abs(at), seen.edges, weights=cosine * np.sign(at))[0]
+        count += np.histogram(np.abs(at), profiles.edges)[0]
+        total += np.histogram(np.abs(at), profiles.edges, weights=cosine * np.sign(at))[0]
     return np.divide(
-        total, count, out=np.full(len(seen.z), np.nan), where=count > FEWEST * count.max()
+        total, count, out=np.full(len(profiles.z), np.nan), where=count > FEWEST * count.max()
     )
 
 
@@ -217,9 +221,12 @@ def surface_tension(runs: Runs, axis: str = "z") -> AnalysisResult:
     """Surface tension (mN/m) of the two interfaces of a slab: L/2 <P_N - P_T> (Kirkwood & Buff
     1949), with the edge L and the pressure P_N along the normal, and the mean pressure P_T across
     it. Raises OutputError."""
-    seen = profiles_of(runs, axis)
-    fitted(seen.z, runs.mean([densities.mean(axis=0) for densities in seen.densities]), seen.height)
-    samples = [_tension_of(run, slab) for run, slab in zip(runs.members, seen.slabs, strict=True)]
+    profiles = profiles_of(runs, axis)
+    density = runs.mean([densities.mean(axis=0) for densities in profiles.densities])
+    fitted(profiles.z, density, profiles.height)  # raises without a slab
+    samples = [
+        _tension_of(run, slab) for run, slab in zip(runs.members, profiles.slabs, strict=True)
+    ]
     series = [values for _, values in samples]
     value, error = mean_of_series(runs, series)
     spans = [float(time[-1] - time[0]) for time, _ in samples]
@@ -232,16 +239,16 @@ def surface_tension(runs: Runs, axis: str = "z") -> AnalysisResult:
         1, fewest + 1
     )
     some = np.unique(np.linspace(fewest // 20, fewest - 1, 500).astype(int))
-    found = AnalysisResult("surface_tension", f"surface tension across {axis}")
+    result = AnalysisResult("surface_tension", f"surface tension across {axis}")
     time, title = ("Time (ps)", samples[0][0][some]), "running mean (mN/m)"
-    found.curves.append(Curve("surface_tension", time, title, {title: running[some]}))
+    result.curves.append(Curve("surface_tension", time, title, {title: running[some]}))
     is_cut = runs.system.scene.forces.dispersion == "cutoff"
     note = "of the forces in the run: without dispersion beyond the cutoff" if is_cut else ""
     tau = float(np.mean(of_runs))
-    found.values.append(
+    result.values.append(
         converged_value("surface tension", "mN/m", value, error, sum(spans), tau, note)
     )
-    return found
+    return result
 
 
 def _tension_of(frames: RigidFrames, slab: Slab) -> tuple[np.ndarray, np.ndarray]:
@@ -260,10 +267,10 @@ def _pressures(frames: RigidFrames) -> tuple[np.ndarray, np.ndarray]:
     Raises OutputError."""
     if frames.tensor is not None:
         return frames.tensor[:, 0], frames.tensor[:, 1:4].T
-    found = [frames.columns.get(f"pressure_{x}{x}") for x in "xyz"]
-    if any(column is None or not np.isfinite(column).all() for column in found):
+    diagonal = [frames.columns.get(f"pressure_{x}{x}") for x in "xyz"]
+    if any(column is None or not np.isfinite(column).all() for column in diagonal):
         raise OutputError(
             "a surface tension needs the pressure tensor, which this run did not write: set "
             "output.pressure_tensor_interval_ps = 0.05, or output.pressure_tensor = true"
         )
-    return frames.columns["time"], np.array(found)
+    return frames.columns["time"], np.array(diagonal)

@@ -24,7 +24,7 @@ from rigidmd.analysis.result import (
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs
 from rigidmd.errors import OutputError
-from rigidmd.io.formats import written
+from rigidmd.formats import written
 from rigidmd.mechanics.inertia import rotational_freedom
 from rigidmd.run.rigid_fit import Kind
 from rigidmd.units import COULOMB, DEBYE
@@ -63,12 +63,12 @@ def orientation(runs: Runs) -> AnalysisResult:
         raise OutputError("no molecule of this run rotates")
     interval, lags = interval_and_lags(runs, "an orientational correlation")
     time = interval * np.arange(lags)
-    found = AnalysisResult("orientation", "orientational correlation")
+    result = AnalysisResult("orientation", "orientational correlation")
     curve = Curve("orientation", ("Time (ps)", time), "C(t)", {}, level=0.0)
-    found.curves.append(curve)
+    result.curves.append(curve)
     for kind in kinds:
         if (along := _axis_along_dipole(kind)) is not None:
-            found.notes.append(f"axis {along + 1} of {kind.name} is along its dipole")
+            result.notes.append(f"axis {along + 1} of {kind.name} is along its dipole")
         for axis in _axes(kind):
 
             def compute(part: RigidFrames, group: Kind, axis=axis) -> np.ndarray:
@@ -100,7 +100,7 @@ def orientation(runs: Runs) -> AnalysisResult:
                         f"C{l + 1} is still {C[-1]:.2f} after {time[-1]:.3g} ps, too short for a"
                         f" value; it needs {about} {need:.2g} ps"
                     )
-                    found.values.append(too_short(name, "ps", tau, None, why))
+                    result.values.append(too_short(name, "ps", tau, None, why))
                     continue
                 low, note = int(C.argmin()), ""
                 if C[low] < -max(TAIL, 3 * float(np.nan_to_num(doubt[low]))):
@@ -108,11 +108,11 @@ def orientation(runs: Runs) -> AnalysisResult:
                         f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is"
                         f" {C[low]:.2f}"
                     )
-                found.values.append(
+                result.values.append(
                     converged_value(name, "ps", tau, error, runs.span, tau, note, BLOCKS)
                 )
-        found.values += _rotational_diffusion(runs, kind, interval, lags)
-    return found
+        result.values += _rotational_diffusion(runs, kind, interval, lags)
+    return result
 
 
 def _axis_along_dipole(kind: Kind) -> int | None:
@@ -164,10 +164,10 @@ def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) ->
     def slopes(part: RigidFrames, group: Kind) -> np.ndarray:
         rotations = _rotations(part, group)
         path = np.concatenate([np.zeros_like(rotations[:1]), np.cumsum(rotations, axis=0)])
-        seen = np.stack(
+        displacements = np.stack(
             [squared_displacement(path[..., k : k + 1], lags)[first:] for k in range(3)], axis=1
         )
-        return (time - time.mean()) @ seen / np.sum((time - time.mean()) ** 2) / 2
+        return (time - time.mean()) @ displacements / np.sum((time - time.mean()) ** 2) / 2
 
     values, errors = with_group_error(runs, kind, slopes)
     decay = 1 / (2 * max(float(values.mean()), 1e-300))
@@ -192,7 +192,7 @@ def spectrum(runs: Runs) -> AnalysisResult:
         )
     interval, lags = interval_and_lags(runs, "a spectrum")
     size = min(runs.frame_count // BLOCKS, runs.shortest)
-    found = AnalysisResult("spectrum", "densities of states")
+    result = AnalysisResult("spectrum", "densities of states")
     wavenumbers = np.fft.rfftfreq(size, interval) / PER_CM
     power = Curve("spectrum", ("wave number (1/cm)", wavenumbers), "density of states (cm)", {})
     memory = Curve(
@@ -202,7 +202,7 @@ def spectrum(runs: Runs) -> AnalysisResult:
         {},
         level=0.0,
     )
-    found.curves += [power, memory]
+    result.curves += [power, memory]
     for kind in runs.moving:
         if kind.molecule.degrees_of_freedom > 3:
 
@@ -211,15 +211,15 @@ def spectrum(runs: Runs) -> AnalysisResult:
 
             memory.add(f"correlation L {kind.name}", *with_group_error(runs, kind, momenta))
         for title, (weight, of) in _rates(kind).items():
-            seen, errors = with_group_error(
+            correlations, errors = with_group_error(
                 runs, kind, lambda part, group, of=of: _normalised(of(part, group), lags)
             )
-            if not seen[1] > CLOSE:
+            if not correlations[1] > CLOSE:
                 raise OutputError(
                     f"frames every {interval:g} ps are not enough for a spectrum: {title} decays"
                     " between them; output.trajectory_interval_ps = 0.004 suits water"
                 )
-            memory.add(f"correlation {title}", seen, errors)
+            memory.add(f"correlation {title}", correlations, errors)
 
             def states(
                 part: RigidFrames, group: Kind, of=of, weight=weight / runs.thermal_energy
@@ -238,26 +238,26 @@ def spectrum(runs: Runs) -> AnalysisResult:
             power.add(title, *with_group_error(runs, kind, states))
             top = int(np.argmax(power.columns[title][1:])) + 1
             at, half = float(wavenumbers[top]), float(wavenumbers[1] / 2)
-            found.values.append(
+            result.values.append(
                 Value(f"highest peak of {title}", "1/cm", at, half, None, "half the resolution")
             )
     highest, fine = 1 / (2 * interval * PER_CM), wavenumbers[1]
     resolved = f"wave numbers up to {highest:.4g}/cm, in steps of {fine:.2g}/cm"
-    found.notes.append(f"frames every {interval:g} ps resolve {resolved}")
-    return found
+    result.notes.append(f"frames every {interval:g} ps resolve {resolved}")
+    return result
 
 
 def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[RigidFrames, Kind], Any]]]:
     """The velocities of a species by name: mass or moment of inertia, and a function that returns
     their series."""
     name, moments = kind.name, kind.molecule.inertia.tolist()
-    found: dict[str, Any] = {
+    rates: dict[str, Any] = {
         f"V {name}": (kind.molecule.mass, lambda part, group: part.velocities[:, group.index])
     }
     if kind.molecule.degrees_of_freedom <= 3:
-        return found
+        return rates
     if len(_axes(kind)) == 1:  # its two other axes are equivalent
-        found[f"omega {name}"] = (
+        rates[f"omega {name}"] = (
             moments[2],
             lambda part, group: _lab_momenta(part, group) / moments[2],
         )
@@ -267,8 +267,8 @@ def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[RigidFrames, Kind], A
             def of(part, group, k=k, moment=moment):
                 return part.L[:, group.index, k : k + 1] / moment
 
-            found[f"omega {name} axis {k + 1}"] = moment, of
-    return found
+            rates[f"omega {name} axis {k + 1}"] = moment, of
+    return rates
 
 
 def _lab_momenta(frames: RigidFrames, kind: Kind) -> np.ndarray:
@@ -278,8 +278,8 @@ def _lab_momenta(frames: RigidFrames, kind: Kind) -> np.ndarray:
 
 
 def _normalised(values: np.ndarray, lags: int) -> np.ndarray:
-    seen = correlation(values, lags)
-    return seen / seen[0]
+    unnormalised = correlation(values, lags)
+    return unnormalised / unnormalised[0]
 
 
 def total_dipole(frames: RigidFrames) -> np.ndarray:
@@ -318,17 +318,14 @@ def dielectric(runs: Runs) -> AnalysisResult:
     cause = _broken_symmetry(runs)
     centre, lost = np.zeros(3), 0.0
     if cause:
-        centre, lost = (
-            runs.mean([M.mean(axis=0) for M in dipoles]),
-            min(0.5, 2 * correlation / runs.span),
-        )
+        centre = runs.mean([M.mean(axis=0) for M in dipoles])
+        lost = min(0.5, 2 * correlation / runs.span)
     squares = [np.sum((M - centre) ** 2, axis=1) / (1 - lost) for M in dipoles]
-    per_square = (
-        4 * np.pi * COULOMB / (3 * runs.volume * runs.thermal_energy)
-    )  # y = <M²>/(3 eps0 V kT)
+    # y = <M²>/(3 eps0 V kT)
+    per_square = 4 * np.pi * COULOMB / (3 * runs.volume * runs.thermal_energy)
     size, error = mean_of_series(runs, squares)
     y = per_square * size
-    found = AnalysisResult("dielectric", "dielectric constant")
+    result = AnalysisResult("dielectric", "dielectric constant")
     if y >= 2 * around + 1:
         raise OutputError(
             f"the dipole fluctuates more than it can with a permittivity of {around:g} around: the"
@@ -347,28 +344,28 @@ def dielectric(runs: Runs) -> AnalysisResult:
         f" {correlation:.3g} ps"
     )
     name, value = "dielectric constant", float(epsilon)
-    found.values.append(converged_value(name, "1", value, spread, runs.span, correlation, note))
+    result.values.append(converged_value(name, "1", value, spread, runs.span, correlation, note))
     for k, axis in enumerate("xyz"):
         mean, doubt = mean_of_series(runs, [M[:, k] / DEBYE for M in dipoles])
         name = f"mean total dipole along {axis}"
         if doubt is None:
-            found.values.append(
+            result.values.append(
                 too_short(name, "D", mean, None, "too short for an error", correlation)
             )
         else:
-            found.values.append(Value(name, "D", mean, doubt, correlation))
+            result.values.append(Value(name, "D", mean, doubt, correlation))
     if cause:
-        found.notes.append(f"{cause}: the mean dipole was subtracted")
+        result.notes.append(f"{cause}: the mean dipole was subtracted")
     shown = dipoles[0][: runs.shortest], runs.first.time[: runs.shortest]
     count = np.arange(1, runs.shortest + 1)
     running = np.mean([np.cumsum(of_run[: runs.shortest]) / count for of_run in squares], axis=0)
     time = ("Time (ps)", shown[1])
     so_far = {"dielectric constant": _of_fluctuation(per_square * running, around)[0]}
-    found.curves.append(Curve("dielectric", time, "dielectric constant so far", so_far))
+    result.curves.append(Curve("dielectric", time, "dielectric constant so far", so_far))
     if not runs.are_several:
         columns = {f"M{axis} (D)": shown[0][:, k] / DEBYE for k, axis in enumerate("xyz")}
-        found.curves.append(Curve("dipole", time, "total dipole (D)", columns))
-    return found
+        result.curves.append(Curve("dipole", time, "total dipole (D)", columns))
+    return result
 
 
 def _permittivity_around(runs: Runs) -> float:
@@ -417,6 +414,6 @@ def _of_fluctuation(y, around: float):
     """
     if np.isinf(around):
         return 1 + y, 1.0
-    whole = 2 * around + 1
-    left = np.where(y < whole, whole - y, np.nan)
-    return (whole + 2 * around * y) / left, (whole / left) ** 2
+    largest = 2 * around + 1
+    left = np.where(y < largest, largest - y, np.nan)
+    return (largest + 2 * around * y) / left, (largest / left) ** 2

@@ -73,10 +73,10 @@ def rdf(
     shells = 4 / 3 * np.pi * np.diff(edges**3)
     r = 0.5 * (edges[1:] + edges[:-1])
     curve = Curve("rdf", ("r (A)", r), "g(r)", {}, level=1.0)
-    found = AnalysisResult("rdf", "radial distribution functions", curves=[curve], notes=notes)
+    result = AnalysisResult("rdf", "radial distribution functions", curves=[curve], notes=notes)
     for a, b in pairs:
         if (pair_count := _pair_count(thinned.first, a, b)) == 0:
-            found.notes.append(f"g(r) of {a} and {b}: no two different molecules have these sites")
+            result.notes.append(f"g(r) of {a} and {b}: no two different molecules have these sites")
             continue
         g = [_g_of_frames(run, a, b, pair_count, width, shells) for run in thinned.members]
         # of the others that each a has, so that two molecules have one neighbour each
@@ -85,13 +85,12 @@ def rdf(
         mean, error = _mean_of_frames(thinned, g)
         curve.columns[title] = mean
         within = mean * shells * density
-        curve.columns[f"n {a}-{b}"] = (
-            np.cumsum(within) - 0.5 * within
-        )  # up to the middle of each bin
+        # up to the middle of each bin
+        curve.columns[f"n {a}-{b}"] = np.cumsum(within) - 0.5 * within
         if error is not None:
             curve.errors[title] = error
-        found.values += _peaks(f"{a}-{b}", r, thinned, g, shells * density)
-    return found
+        result.values += _peaks(f"{a}-{b}", r, thinned, g, shells * density)
+    return result
 
 
 def _g_of_frames(
@@ -110,13 +109,13 @@ def _g_of_frames(
 def _thinned(runs: Runs, enough: int) -> tuple[Runs, list[str]]:
     """Evenly spaced frames with about `enough` molecules in total, and a note if these are not all
     frames."""
-    most = min(MOST, max(FEWEST, enough // len(runs.system.model.species))) * max(
+    frame_limit = min(MOST, max(FEWEST, enough // len(runs.system.model.species))) * max(
         1.0, len(runs.members) / BLOCKS
     )
-    every = max(1, -(-runs.frame_count // int(most)))
-    found = Runs(tuple(run[::every] for run in runs.members))
-    note = f"of {found.frame_count} of {runs.frame_count} frames, evenly spaced"
-    return found, [note] if every > 1 else []
+    every = max(1, -(-runs.frame_count // int(frame_limit)))
+    thinned = Runs(tuple(run[::every] for run in runs.members))
+    note = f"of {thinned.frame_count} of {runs.frame_count} frames, evenly spaced"
+    return thinned, [note] if every > 1 else []
 
 
 def _mean_of_frames(runs: Runs, values: list[np.ndarray]) -> Measured | tuple[np.ndarray, None]:
@@ -181,36 +180,35 @@ def _peaks(
         fraction = np.clip((end - edges[:-1]) / width, 0.0, 1.0)  # of each bin
         return (g * filled) @ fraction
 
-    def seen(g: np.ndarray, top: int) -> np.ndarray:
+    def peak_of(g: np.ndarray, top: int) -> np.ndarray:
         low, middle, high = g[top - 1 : top + 2]
         shift = _shift_of_vertex(low, middle, high)
         position, height = r[top] + shift * width, middle - 0.25 * (low - high) * shift
         return np.array([position, height, within(g, valley(g, top))])
 
-    def seen_near(g: np.ndarray) -> np.ndarray:
-        return seen(g, around.start + int(g[around].argmax()))
+    def peak_near(g: np.ndarray) -> np.ndarray:
+        return peak_of(g, around.start + int(g[around].argmax()))
 
     g = runs.mean([of_run.mean(axis=0) for of_run in frames])
     top = _first_top(g)
     if g.max() < 1.05 or not 0 < top < len(g) - 3:
         return []
-    whole = seen(g, top)
+    peak = peak_of(g, top)
     around = slice(max(1, top - max(3, top // 5)), min(len(g) - 3, top + max(3, top // 5) + 1))
     end = valley(g, top)
     inside = [within(of_run, end) for of_run in frames]
     tau = correlation_time_of(runs, inside) if min(map(len, frames)) > 2 else None
     errors: list[float | None] = [None] * 3
     if runs.are_several:
-        errors = runs.estimate([of_run.mean(axis=0) for of_run in frames], seen_near)[1].tolist()
+        errors = runs.estimate([of_run.mean(axis=0) for of_run in frames], peak_near)[1].tolist()
     elif len(frames[0]) >= 2 * BLOCKS:
         samples = max(
             inefficiency(series - series.mean()) for series in (frames[0][:, top], inside[0])
         )
-        of_blocks, left_out = _errors_over_blocks(frames[0], seen_near, samples)
+        of_blocks, left_out = _errors_over_blocks(frames[0], peak_near, samples)
         errors = np.maximum(of_blocks, left_out).tolist()
-        errors[2] = float(
-            np.hypot(of_blocks[2], left_out[2]) / np.sqrt(2)
-        )  # jumps of the minimum count once
+        # jumps of the minimum count once
+        errors[2] = float(np.hypot(of_blocks[2], left_out[2]) / np.sqrt(2))
     titles = (
         ("first peak", "Å"),
         ("height of that peak", "1"),
@@ -218,7 +216,7 @@ def _peaks(
     )
     return [
         Value(f"g {name}: {title}", unit, float(value), None if e is None else float(e), tau)
-        for (title, unit), value, e in zip(titles, whole, errors, strict=True)
+        for (title, unit), value, e in zip(titles, peak, errors, strict=True)
     ]
 
 
@@ -298,7 +296,7 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
     title = f"S {name or 'centres'}"
     curve = Curve("structure_factor", ("k (1/A)", length), "S(k)", {title: mean}, level=1.0)
     vectors_used = f"at most {VECTORS_PER_BIN} k-vectors in each of {bins} bins"
-    found = AnalysisResult(
+    result = AnalysisResult(
         "structure_factor", "structure factor", curves=[curve], notes=[*notes, vectors_used]
     )
     if error_of_curve is not None:
@@ -308,31 +306,33 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
         error = max(float(error_of_curve[top]), mean_of_series(thinned, peak)[1] or 0.0)
         note = f"at {length[top]:.2f} 1/Å, bins of {K_WIDTH} 1/Å"
         tau = correlation_time_of(thinned, peak)
-        found.values.append(Value("highest peak of S(k)", "1", float(mean[top]), error, tau, note))
-    return found
+        result.values.append(Value("highest peak of S(k)", "1", float(mean[top]), error, tau, note))
+    return result
 
 
 def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
     """Integer wave vectors (w, 3), one of k and -k, and the bin of each; evenly chosen in bins with
     many."""
     reach = np.ceil(largest / heights(reciprocal)).astype(int)
-    found, bin_index = [], []
+    vector_blocks, bin_index = [], []
     for h in range(reach[0] + 1):
-        rest = np.array(
+        indices = np.array(
             list(product([h], range(-reach[1], reach[1] + 1), range(-reach[2], reach[2] + 1)))
         )
         if h == 0:
-            rest = rest[(rest[:, 1] > 0) | ((rest[:, 1] == 0) & (rest[:, 2] > 0))]
-        size = np.linalg.norm(rest @ reciprocal, axis=1)
+            indices = indices[(indices[:, 1] > 0) | ((indices[:, 1] == 0) & (indices[:, 2] > 0))]
+        size = np.linalg.norm(indices @ reciprocal, axis=1)
         near = size < largest
-        found.append(rest[near])
+        vector_blocks.append(indices[near])
         bin_index.append((size[near] / K_WIDTH).astype(int))
-    vectors, bin_of = np.concatenate(found), np.concatenate(bin_index)
-    kept = []
+    vectors, bin_of = np.concatenate(vector_blocks), np.concatenate(bin_index)
+    chosen_blocks = []
     for k in np.unique(bin_of):
         of_bin = np.flatnonzero(bin_of == k)
-        kept.append(of_bin[np.unique(np.linspace(0, len(of_bin) - 1, VECTORS_PER_BIN).astype(int))])
-    chosen = np.concatenate(kept)
+        chosen_blocks.append(
+            of_bin[np.unique(np.linspace(0, len(of_bin) - 1, VECTORS_PER_BIN).astype(int))]
+        )
+    chosen = np.concatenate(chosen_blocks)
     return vectors[chosen], bin_of[chosen]
 
 
@@ -389,15 +389,16 @@ def hydrogen_bonds(
         raise OutputError(f"{why}: there are no hydrogen bonds")
     thinned, notes = _thinned(runs, ENOUGH_MOLECULES)
     number = len(runs.system.model.species)
+    # (f, n) each
     bonds = [
         np.array([_bonds(run, k, distance, angle) for k in range(len(run))])
         for run in thinned.members
-    ]  # (f, n) each
+    ]
     each = [of_run.mean(axis=1) for of_run in bonds]
     value, error = mean_of_series(thinned, each)
-    most = int(max(of_run.max() for of_run in bonds)) + 1
-    fractions = [[np.mean(of_run == k) for k in range(most)] for of_run in bonds]
-    axis = ("hydrogen bonds", np.arange(most))
+    size = int(max(of_run.max() for of_run in bonds)) + 1
+    fractions = [[np.mean(of_run == k) for k in range(size)] for of_run in bonds]
+    axis = ("hydrogen bonds", np.arange(size))
     curve = Curve(
         "hydrogen_bonds",
         axis,
@@ -407,32 +408,29 @@ def hydrogen_bonds(
     )
     about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
     tau = correlation_time_of(thinned, each)
-    found = Value("hydrogen bonds of a molecule", "1", value, error, tau, about)
+    mean_bonds = Value("hydrogen bonds of a molecule", "1", value, error, tau, about)
     return AnalysisResult(
-        "hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], notes
+        "hydrogen_bonds", f"hydrogen bonds of {number} molecules", [mean_bonds], [curve], notes
     )
 
 
 def _donors(molecule: Molecule) -> list[tuple[int, int]]:
     """(heavy site, hydrogen) of the donors of a molecule."""
     heavy = [k for k, element in enumerate(molecule.elements) if element in BONDING]
-    found = []
+    donors = []
     for h in (k for k, element in enumerate(molecule.elements) if element == "H"):
         gaps = np.linalg.norm(molecule.positions_body - molecule.positions_body[h], axis=1)
         gaps[[k for k in range(len(gaps)) if molecule.masses[k] == 0 or k == h]] = np.inf
         if (nearest := int(gaps.argmin())) in heavy:
-            found.append((nearest, h))
-    return found
+            donors.append((nearest, h))
+    return donors
 
 
 def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float) -> np.ndarray:
     """Hydrogen bonds of each molecule (n,) in a frame."""
-    heavy, owner, arms = (
-        [],
-        [],
-        [],
-    )  # arms (sites, 3) to the first hydrogen of each, the second, ...; NaN without one
-    most = len(max((_donors(kind.molecule) for kind in frames.kinds), key=len))
+    heavy, owner = [], []
+    arms = []  # (sites, 3) to the first hydrogen of each, the second, ...; NaN without one
+    arm_count = len(max((_donors(kind.molecule) for kind in frames.kinds), key=len))
     for kind in frames.kinds:
         centre = frames.positions[frame, kind.index]
         rotation = frames.Q[frame, kind.index] if frames.Q.shape[1] else np.eye(3)[None]
@@ -440,7 +438,7 @@ def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float) -> np
         for site in (k for k, element in enumerate(kind.molecule.elements) if element in BONDING):
             heavy.append(centre + rotation @ body[site])
             owner.append(kind.index)
-            arm = np.full((most, *centre.shape), np.nan)
+            arm = np.full((arm_count, *centre.shape), np.nan)
             for k, hydrogen in enumerate(h for donor, h in _donors(kind.molecule) if donor == site):
                 arm[k] = rotation @ (body[hydrogen] - body[site])
             arms.append(arm)

@@ -35,10 +35,9 @@ def correlation(series: np.ndarray, lags: int) -> np.ndarray:
     power = np.zeros(size // 2 + 1)
     chunk = max(1, AT_ONCE // size)
     for first in range(0, flat.shape[1], chunk):
-        found: Any = fft.rfft(flat[:, first : first + chunk], size, axis=0)
-        power += np.einsum("fm,fm->f", found.real, found.real) + np.einsum(
-            "fm,fm->f", found.imag, found.imag
-        )
+        transform: Any = fft.rfft(flat[:, first : first + chunk], size, axis=0)
+        real, imaginary = transform.real, transform.imag
+        power += np.einsum("fm,fm->f", real, real) + np.einsum("fm,fm->f", imaginary, imaginary)
     return np.asarray(fft.irfft(power, size))[:lags] / (frames - np.arange(lags)) / flat.shape[1]
 
 
@@ -91,10 +90,10 @@ def msd(runs: Runs) -> AnalysisResult:
         "msd", ("Time (ps)", interval * np.arange(lags)), "MSD (Å²)", {}, log=(True, True)
     )
     for kind in runs.moving:
-        found = with_group_error(
+        displacement_and_error = with_group_error(
             runs, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
         )
-        curve.add(f"MSD {kind.name} (A^2)", *found)
+        curve.add(f"MSD {kind.name} (A^2)", *displacement_and_error)
     return AnalysisResult("msd", "mean squared displacement", curves=[curve])
 
 
@@ -120,23 +119,22 @@ def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResul
     half = len(time) // 2
 
     def slopes(part: RigidFrames, kind: Kind) -> np.ndarray:
-        seen = squared_displacement(part.paths[:, kind.index], lags)[first:]
-        whole, first_half, second_half = (
-            np.polyfit(time[part], seen[part], 1)[0]
+        displacement = squared_displacement(part.paths[:, kind.index], lags)[first:]
+        slope, first_half, second_half = (
+            np.polyfit(time[part], displacement[part], 1)[0]
             for part in (slice(None), slice(half), slice(half, None))
         )
-        return np.array([whole, second_half - first_half]) / 6
+        return np.array([slope, second_half - first_half]) / 6
 
     later = interval * np.arange(1, lags)
     curve = Curve("diffusion", ("Time (ps)", later), "MSD/6t (1e-9 m²/s)", {})  # it tends to D
-    found = AnalysisResult("diffusion", "diffusion coefficients", curves=[curve])
-    found.notes.append(
+    result = AnalysisResult("diffusion", "diffusion coefficients", curves=[curve])
+    result.notes.append(
         f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps"
     )
     edge = None  # of a cubic box
-    distance = (
-        runs.system.smallest_diameter
-    )  # over which a molecule has to move to change its surroundings
+    # over which a molecule has to move to change its surroundings
+    distance = runs.system.smallest_diameter
     if runs.has_box:
         distance = float((runs.volume / len(runs.system.model.species)) ** (1 / 3))
         cell = runs.mean_cell
@@ -149,10 +147,10 @@ def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResul
         except OutputError as error:
             eta = eta._replace(note=str(error))
     for kind in runs.moving:
-        seen = with_group_error(
+        displacement_and_error = with_group_error(
             runs, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
         )
-        so_far = (values[1:] / (6 * NM2_PER_S * later) for values in seen)
+        so_far = (values[1:] / (6 * NM2_PER_S * later) for values in displacement_and_error)
         curve.add(f"MSD/6t {kind.name} (1e-9 m^2/s)", *so_far)
         name = f"D of {kind.name}"
         (D, bend), (error, doubt) = np.array(with_group_error(runs, kind, slopes)).tolist()
@@ -162,36 +160,40 @@ def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResul
                 f" too short for a value; a run of {4 * runs.span:.3g} ps follows it four times"
                 " as far"
             )
-            found.values.append(too_short(name, "1e-9 m²/s", D / NM2_PER_S, error / NM2_PER_S, why))
+            result.values.append(
+                too_short(name, "1e-9 m²/s", D / NM2_PER_S, error / NM2_PER_S, why)
+            )
             continue
         away = distance**2 / (6 * D)
         value = converged_value(
             name, "1e-9 m²/s", D / NM2_PER_S, error / NM2_PER_S, runs.span, away, least=BLOCKS
         )
-        found.values.append(value)
+        result.values.append(value)
         if value.value is None or edge is None:
             continue
         name = f"D of {kind.name} in an infinite box"
         if eta.value is None:
             note = f"no correction for the size of the box without a viscosity: {eta.note}"
-            found.values.append(Value(name, "1e-9 m²/s", None, None, None, note))
+            result.values.append(Value(name, "1e-9 m²/s", None, None, None, note))
             continue
-        more = YEH_HUMMER * runs.thermal_energy / (6 * np.pi * eta.value * MPA_S * edge) / NM2_PER_S
+        correction = (
+            YEH_HUMMER * runs.thermal_energy / (6 * np.pi * eta.value * MPA_S * edge) / NM2_PER_S
+        )
         source = "measured here" if viscosity_mPa_s is None else "as given, without its error"
         note = (
-            f"corrected by {more:.3g} for L = {edge:.4g} Å with a viscosity of {eta.value:.3g} mPa"
-            f" s, {source}"
+            f"corrected by {correction:.3g} for L = {edge:.4g} Å with a viscosity of"
+            f" {eta.value:.3g} mPa s, {source}"
         )
-        doubt = more * (eta.error or 0.0) / eta.value
+        doubt = correction * (eta.error or 0.0) / eta.value
         both = None if value.error is None else float(np.hypot(value.error, doubt))
-        found.values.append(
-            value._replace(name=name, value=value.value + more, error=both, note=note)
+        result.values.append(
+            value._replace(name=name, value=value.value + correction, error=both, note=note)
         )
     if edge is None and runs.has_box:
-        found.notes.append(
+        result.notes.append(
             "no correction for the size of the box: the one of Yeh and Hummer is for cubic boxes"
         )
-    return found
+    return result
 
 
 LEAST_TENSOR = 20.0  # least length of the pressure tensor of all runs, ps
@@ -237,7 +239,7 @@ def viscosity(runs: Runs) -> AnalysisResult:
         )
     slowest = float(limit.best.times.max())
     lags = int(max(8, min(SHOWN_TIMES * slowest / interval, min(map(len, stresses)) // 2)))
-    found = AnalysisResult(
+    result = AnalysisResult(
         "viscosity", "viscosity", curves=_curves_of(stresses, interval, lags, factor, limit.best)
     )
     value, error = factor * limit.value, factor * limit.error
@@ -248,14 +250,14 @@ def viscosity(runs: Runs) -> AnalysisResult:
             f" for a value; a run of {4 * (length - interval * len(stresses)):.3g} ps follows it"
             " four times as far"
         )
-        found.values.append(too_short("viscosity", "mPa s", value, error, why))
-        return found
+        result.values.append(too_short("viscosity", "mPa s", value, error, why))
+        return result
     tau = limit.value / float(start[0])  # integral over the value at 0
     note = (
         f"relaxation times up to {slowest:.2g} ps, from the spectrum below {limit.highest:.3g}/ps"
     )
-    found.values.append(converged_value("viscosity", "mPa s", value, error, length, tau, note))
-    return found
+    result.values.append(converged_value("viscosity", "mPa s", value, error, length, tau, note))
+    return result
 
 
 def _stresses(frames: RigidFrames) -> np.ndarray:
@@ -288,12 +290,15 @@ def _curves_of(
     each = -(-SEGMENTS // len(stresses))  # segments of a run
     parts = [part for stress in stresses for part in np.array_split(stress, each)]
     lags = min(lags, min(map(len, parts)) // 2)
-    seen = np.array([correlation(part[:, k], lags) for part in parts for k in range(COMPONENTS)])
-    running = factor * interval * (np.cumsum(seen, axis=1) - 0.5 * (seen + seen[:, :1]))
+    correlations = np.array(
+        [correlation(part[:, k], lags) for part in parts for k in range(COMPONENTS)]
+    )
+    ends = 0.5 * (correlations + correlations[:, :1])  # by the trapezoidal rule
+    running = factor * interval * (np.cumsum(correlations, axis=1) - ends)
     time, title = interval * np.arange(lags), "integral (mPa s)"
     columns = {title: running.mean(axis=0), "fit (mPa s)": factor * model.integral(time)}
     errors = {title: running.std(axis=0, ddof=1) / np.sqrt(len(running))}
-    memory = {"correlation": seen.mean(axis=0) / seen[:, 0].mean()}
+    memory = {"correlation": correlations.mean(axis=0) / correlations[:, 0].mean()}
     return [
         Curve("viscosity", ("Time (ps)", time), "viscosity (mPa s)", columns, errors),
         Curve(

@@ -40,10 +40,10 @@ RESERVED = {
 
 def custom_forces(scene: MolecularScene) -> list[Any]:
     """The objects of [[forces.custom]]. Raises SceneError with all errors."""
-    found, faults = [], []
+    forces, faults = [], []
     for k, entry in enumerate(scene.forces.custom):
         try:
-            found.append(_custom(scene, entry, f"forces.custom.{k}"))
+            forces.append(_custom(scene, entry, f"forces.custom.{k}"))
         except (SceneError, ValueError) as error:
             module = entry.module if isinstance(error, SceneError) else None
             faults += [
@@ -53,7 +53,7 @@ def custom_forces(scene: MolecularScene) -> list[Any]:
     if faults:  # each file once
         messages = {module or fault: fault for module, fault in reversed(faults)}
         raise SceneError(scene.source, list(messages.values())[::-1])
-    return found
+    return forces
 
 
 def _custom(scene: MolecularScene, entry: CustomForce, key: str) -> Any:
@@ -74,10 +74,9 @@ def _custom(scene: MolecularScene, entry: CustomForce, key: str) -> Any:
         )
     module = trusted_module(scene.path(entry.module), f"{key}.module")
     if not hasattr(module, entry.name):
-        there = [name for name in vars(module) if not name.startswith("_")]
-        raise ValueError(
-            f"name: {entry.module} has no {entry.name}{did_you_mean(entry.name, there) or ''}"
-        )
+        public_names = [name for name in vars(module) if not name.startswith("_")]
+        hint = did_you_mean(entry.name, public_names) or ""
+        raise ValueError(f"name: {entry.module} has no {entry.name}{hint}")
     made = getattr(module, entry.name)
     if isinstance(made, type) or (callable(made) and not isinstance(made, Force)):
         try:
@@ -114,12 +113,12 @@ def with_user_code(system: System) -> System:
     with all errors."""
     scene, (added, thermostat) = system.scene, system.scene.user_code
     forces = [*custom_forces(scene), *added]
-    wanted = [*(entry.name for entry in scene.forces.custom), *map(name_of, added)]
-    names = distinct(wanted, [*system.terms, *system.constants])
-    found = replace(
+    force_names = [*(entry.name for entry in scene.forces.custom), *map(name_of, added)]
+    names = distinct(force_names, [*system.terms, *system.constants])
+    bound = replace(
         system, python_forces={}, thermostat=thermostat, user_terms={}, notes=[*system.notes]
     )
-    found = replace(found, warnings=[*system.warnings])
+    bound = replace(bound, warnings=[*system.warnings])
     terms, tails = {}, [] if system.tail is None else [system.tail]
     faults = [
         f"{name} is {RESERVED[name]}; name the force otherwise"
@@ -129,7 +128,7 @@ def with_user_code(system: System) -> System:
     changed = np.zeros(3, bool)  # whether they may change components of the total momentum
     for name, made in zip(names, forces, strict=True):
         try:
-            term = _term(made, name, system, found, tails)
+            term = _term(made, name, system, bound, tails)
             if not isinstance(term, PairForces):
                 changed |= changes_momentum(term)
             terms[name] = term
@@ -146,15 +145,15 @@ def with_user_code(system: System) -> System:
     if faults:
         raise SceneError(scene.source, faults)
     if thermostat is not None:
-        found.notes.append(
+        bound.notes.append(
             f"thermostat: {name_of(thermostat)}, from Python, replaces the thermostats of all"
             " stages"
         )
     model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~changed)
     # Forces computed by Python come first: as long as they are missing, no other need be computed.
-    terms = {name: terms[name] for name in found.python_forces} | system.terms | terms
+    terms = {name: terms[name] for name in bound.python_forces} | system.terms | terms
     return replace(
-        found,
+        bound,
         scene=with_momentum_removal(scene, model.keeps_momentum),
         terms=terms,
         model=model,
@@ -163,30 +162,28 @@ def with_user_code(system: System) -> System:
     )
 
 
-def _term(made: Any, name: str, system: System, found: System, tails: list[Tail]) -> NamedTuple:
+def _term(made: Any, name: str, system: System, target: System, tails: list[Tail]) -> NamedTuple:
     """The term of one object for a system. Its function, description and notes are added to
-    `found`, its tail correction to `tails`. Raises PairPotentialError, ValueError,
+    `target`, its tail correction to `tails`. Raises PairPotentialError, ValueError,
     UserForceError."""
     if isinstance(made, PairLaw):
         term, formula, tail, notes, warnings = made.bind(system)
         if formula.error:
-            found.notes.append(
+            target.notes.append(
                 f"{name}: the error of its spline is {formula.error:.1e} of its deepest energy"
             )
-        found.notes.extend(f"{name}: {note}" for note in notes)
-        found.warnings.extend(f"{name} {warning}" for warning in warnings)
+        target.notes.extend(f"{name}: {note}" for note in notes)
+        target.warnings.extend(f"{name} {warning}" for warning in warnings)
         tails += [] if tail is None else [tail]
-        cutoff, truncation = (
-            made.cutoff_A or system.cutoff,
-            made.truncation or system.scene.forces.truncation,
-        )
+        cutoff = made.cutoff_A or system.cutoff
+        truncation = made.truncation or system.scene.forces.truncation
         reach = f"cutoff {cutoff:g} Å, {truncation}" if cutoff < inf else "no cutoff"
-        found.user_terms[name] = f"{formula.text}, {len(term.group)} sites, {reach}"
+        target.user_terms[name] = f"{formula.text}, {len(term.group)} sites, {reach}"
         return term
     if isinstance(made, Force):
-        bound = BoundForce(made, name, found)
-        found.python_forces[name] = bound
-        found.user_terms[name] = f"{type(made).__qualname__}, computed by Python"
+        bound = BoundForce(made, name, target)
+        target.python_forces[name] = bound
+        target.user_terms[name] = f"{type(made).__qualname__}, computed by Python"
         return bound.term
     if hasattr(made, "term"):
         try:
@@ -208,5 +205,5 @@ def _term(made: Any, name: str, system: System, found: System, tails: list[Tail]
     numbers = ", ".join(
         f"{key} = {x:.6g}" for key, x in made._asdict().items() if isinstance(x, int | float)
     )
-    found.user_terms[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
+    target.user_terms[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
     return made

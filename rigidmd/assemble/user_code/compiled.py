@@ -37,10 +37,8 @@ def check_compiled_code(system: System, state: State) -> list[str]:
         after, function = state.copy(), THERMOSTATS[type(thermostat)]
         if wrong := _faults(name, function, (thermostat, system.model, after, h, 0)):
             faults += wrong
-        elif (
-            _kinetic_energy(system, state) == 0
-        ):  # at rest, a factor of the momenta may be infinite
-            continue
+        elif _kinetic_energy(system, state) == 0:
+            continue  # at rest, a factor of the momenta may be infinite
         elif not after.is_finite:
             faults.append(
                 f"{name}: {_place(function)} makes momenta that are not finite, in a time of"
@@ -66,10 +64,10 @@ def _thermostats(system: System) -> Iterator[tuple[str, Any, float]]:
     for k, stage in enumerate(system.scene.stages):
         if stage.is_minimisation or stage.is_auto:
             continue
-        given = system.thermostat
-        thermostat = given.for_stage(system, k) if hasattr(given, "for_stage") else given
+        outer = system.thermostat
+        thermostat = outer.for_stage(system, k) if hasattr(outer, "for_stage") else outer
         if type(thermostat) in THERMOSTATS:
-            yield f"thermostat {name_of(given)}", thermostat, float(stage.timestep_fs * FEMTOSECOND)
+            yield f"thermostat {name_of(outer)}", thermostat, float(stage.timestep_fs * FEMTOSECOND)
 
 
 def _faults(name: str, function: Callable, arguments: tuple) -> list[str]:
@@ -111,7 +109,7 @@ def _kinetic_energy(system: System, state: State) -> float:
 
 def describe_compile_error(error: CompileError) -> str:
     """Where in the user's code a function cannot be compiled, and why."""
-    text = str(error)
+    text = re.sub(r"\x1b\[[\d;]*m", "", str(error))  # Numba's colours, where colorama is installed
     files = re.findall(r'File "(?!<)([^"]+)", line (\d+)', text)
     of_user = [(file, int(line)) for file, line in files if _is_of_user(file)]
     where = f" ({_quoted(*of_user[0])})" if of_user else ""

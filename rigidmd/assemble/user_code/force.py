@@ -51,13 +51,18 @@ class Force:
     It is called once for every new set of positions, between steps of the compiled loop; a
     `compiled_force` is faster.
 
-    name : in logs and messages; default: the name of the class
-    changes_momentum : which components of the total momentum it may change; False for forces
-        between molecules
-    tied_to_places : whether its energy depends on absolute positions, which excludes a barostat. If
-        False, its virial must be the last of the returned values
-    energy_noise : random error of its energies, kJ/mol, for the comparison with its forces at the
-        start of a run
+    Parameters
+    ----------
+    name
+        In logs and messages; default: the name of the class
+    changes_momentum
+        Which components of the total momentum it may change; False for forces between molecules
+    tied_to_places
+        Whether its energy depends on absolute positions, which excludes a barostat. If False, its
+        virial must be the last of the returned values
+    energy_noise
+        Random error of its energies, kJ/mol, for the comparison with its forces at the start of a
+        run
     """
 
     name: ClassVar[str | None] = None
@@ -157,35 +162,38 @@ class BoundForce:
             torque = np.einsum("nji,nj->ni", state.rotation, lab)
         return energy, total, torque, virial
 
-    def _parts(self, found: Any, most: int) -> list:
+    def _parts(self, returned: Any, largest: int) -> list:
         """Energy and three further values, None for omitted ones."""
-        if not isinstance(found, tuple) or not 2 <= len(found) <= most:
-            given = (
-                f"{len(found)} values" if isinstance(found, tuple) else f"{type(found).__name__}"
+        if not isinstance(returned, tuple) or not 2 <= len(returned) <= largest:
+            if isinstance(returned, tuple):
+                kind = f"{len(returned)} values"
+            else:
+                kind = f"{type(returned).__name__}"
+            optional = (
+                " and perhaps torques and a virial" if largest == 4 else " and perhaps a virial"
             )
-            more = " and perhaps torques and a virial" if most == 4 else " and perhaps a virial"
-            raise self._error(f"{given}; it must return a tuple of an energy, forces{more}")
+            raise self._error(f"{kind}; it must return a tuple of an energy, forces{optional}")
         try:
-            energy = float(found[0])
+            energy = float(returned[0])
         except (TypeError, ValueError):
-            raise self._error(f"{found[0]!r:.60} as its energy, not a number") from None
-        return [energy, *found[1:], *[None] * (4 - len(found))]
+            raise self._error(f"{returned[0]!r:.60} as its energy, not a number") from None
+        return [energy, *returned[1:], *[None] * (4 - len(returned))]
 
     def _fill(
         self,
         target: np.ndarray,
-        given: Any,
+        returned: Any,
         what: str,
         molecule: np.ndarray | None = None,
         unit: float = KJ_PER_MOL,
     ) -> None:
         """Copy given values times a unit to an array of the workspace; None is 0."""
-        if given is None:
+        if returned is None:
             target[:] = 0.0
             return
-        array = real_numbers(given)
+        array = real_numbers(returned)
         if array is None:
-            kind = "masked or complex values" if hasattr(given, "dtype") else f"{given!r:.60}"
+            kind = "masked or complex values" if hasattr(returned, "dtype") else f"{returned!r:.60}"
             raise self._error(f"{kind} as {what}, not real numbers of the shape {target.shape}")
         if array.shape != target.shape:
             raise self._error(f"{what} of the shape {array.shape}, not {target.shape}")
@@ -232,10 +240,10 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 def changes_momentum(term: Any) -> np.ndarray:
     """Components (3,) of the total momentum that a force may change. Raises ValueError."""
-    given = getattr(term, "changes_momentum", EVERY)
-    each = given if isinstance(given, tuple | list | np.ndarray) else (given,)
+    flags = getattr(term, "changes_momentum", EVERY)
+    each = flags if isinstance(flags, tuple | list | np.ndarray) else (flags,)
     if len(each) not in (1, 3) or not all(isinstance(one, bool | np.bool_) for one in each):
         raise ValueError(
-            f"changes_momentum is {given!r:.60}, must be three truth values, for x, y, z"
+            f"changes_momentum is {flags!r:.60}, must be three truth values, for x, y, z"
         )
-    return np.array(np.broadcast_to(given, 3), bool)
+    return np.array(np.broadcast_to(flags, 3), bool)

@@ -77,7 +77,12 @@ class PairLaw:
     formula_of_function: Formula | None = field(default=None, repr=False)
 
     def formula(self, cutoff: float) -> Formula:
-        """The formula that is compiled. Raises PairPotentialError."""
+        """The formula that is compiled.
+
+        Raises
+        ------
+        PairPotentialError
+        """
         try:
             if self.table is not None:
                 r, energy, force, name = self.table
@@ -93,16 +98,23 @@ class PairLaw:
         return not_none(self.formula_of_function)
 
     def bind(self, system: System) -> BoundPotential:
-        """The potential between the sites of a system. Raises PairPotentialError with all
-        errors."""
+        """The potential between the sites of a system.
+
+        Raises
+        ------
+        PairPotentialError
+            With all errors.
+        """
         forces = system.scene.forces
         cutoff = self.cutoff_A or system.cutoff
         check_cutoff(cutoff, system)
         name: TruncationName = self.truncation or forces.truncation
-        given = self.switch_start_A or (forces.switch_start_A if cutoff == system.cutoff else None)
+        switch_start = self.switch_start_A or (
+            forces.switch_start_A if cutoff == system.cutoff else None
+        )
         if self.switch_start_A is not None and "switch" not in name:
             raise PairPotentialError(f"switch_start_A would do nothing with truncation = {name!r}")
-        start = (given or default_switch_start(name, cutoff)) if "switch" in name else cutoff
+        start = (switch_start or default_switch_start(name, cutoff)) if "switch" in name else cutoff
         if not start <= cutoff:
             raise PairPotentialError(
                 f"switch_start_A = {start:g} is beyond the cutoff of {cutoff:g} Å"
@@ -212,27 +224,31 @@ class _SiteTypes:
         unknown = [
             name for name, sites in self._named.items() if not any(mask.any() for mask in sites)
         ]
-        there = f"; there are {', '.join(known)}"
-        faults = [f"no site is {name!r}{did_you_mean(name, known) or there}" for name in unknown]
+        known_names = f"; there are {', '.join(known)}"
+        faults = [
+            f"no site is {name!r}{did_you_mean(name, known) or known_names}" for name in unknown
+        ]
         self._needed = [
             name
             for name in formula.parameters
             if name not in potential.constants and not formula.shared
         ]
-        of_pairs = [("-".join(pair), given) for pair, given in potential.pairs.items()]
-        for where, given in [*(potential.of_sites or {}).items(), *of_pairs]:
-            faults += [f"{where}: there is no {name}" for name in self._needed if name not in given]
+        of_pairs = [("-".join(pair), parameters) for pair, parameters in potential.pairs.items()]
+        for where, parameters in [*(potential.of_sites or {}).items(), *of_pairs]:
+            faults += [
+                f"{where}: there is no {name}" for name in self._needed if name not in parameters
+            ]
             faults += [
                 f"{where}: {self._unknown(name)}"
-                for name in given
+                for name in parameters
                 if name not in formula.parameters
             ]
         if potential.of_sites == {} and not potential.pairs:
             faults += [f"there is no {name} among its parameters" for name in self._needed]
         # the formula may have the number of a constant in place of its name
         text = potential.energy if isinstance(potential.energy, str) else ""
-        there_too = {*formula.parameters, *re.findall(r"[^\W\d]\w*", text)}
-        faults += [self._unknown(name) for name in potential.constants if name not in there_too]
+        usable_names = {*formula.parameters, *re.findall(r"[^\W\d]\w*", text)}
+        faults += [self._unknown(name) for name in potential.constants if name not in usable_names]
         faults += [
             f"mixing: {self._unknown(name)}"
             for name in potential.mixing
@@ -268,24 +284,24 @@ class _SiteTypes:
     def _kind(self, k: int, m: Molecule, i: int) -> tuple | None:
         """Parameters of a site, and whether it is each site of `pairs`; None if the potential does
         not act on it."""
-        given = self._parameters(k, m, i)
+        parameters = self._parameters(k, m, i)
         sides = tuple(
             bool(self._named[name][k][i]) for pair in self._potential.pairs for name in pair
         )
-        acts = given is not None or any(sides)
-        return (None if given is None else tuple(sorted(given.items())), sides) if acts else None
+        acts = parameters is not None or any(sides)
+        if acts:
+            return None if parameters is None else tuple(sorted(parameters.items())), sides
+        return None
 
     def _parameters(self, k: int, m: Molecule, i: int) -> Parameters | None:
         potential = self._potential
         if potential.sites and not any(self._named[name][k][i] for name in potential.sites):
             return None
         if potential.of_sites is None and not self._formula.shared:
-            given = m.parameters[i]
-            return (
-                {name: given[name] for name in self._needed}
-                if all(name in given for name in self._needed)
-                else None
-            )
+            parameters = m.parameters[i]
+            if all(name in parameters for name in self._needed):
+                return {name: parameters[name] for name in self._needed}
+            return None
         if not potential.of_sites:
             return None if potential.pairs else {"scale": 1.0} if potential.of_sites is None else {}
         named = [name for name in potential.of_sites if self._named[name][k][i]]
@@ -299,31 +315,31 @@ class _SiteTypes:
 
     def pairs(self, faults: list[str]) -> Iterator[tuple[int, int, dict[str, float]]]:
         """Numbers i <= j of two types that interact, and the parameters between them."""
-        for i, (given, sides) in enumerate(self.all):
-            for j, (other, others) in enumerate(self.all[i:], i):
-                found = None
+        for i, (parameters, sides) in enumerate(self.all):
+            for j, (other_parameters, others) in enumerate(self.all[i:], i):
+                mixed = None
                 for n, values in enumerate(self._potential.pairs.values()):
                     if (sides[2 * n] and others[2 * n + 1]) or (sides[2 * n + 1] and others[2 * n]):
-                        found = ({"scale": 1.0} if self._formula.shared else {}) | dict(values)
-                if found is None and given is not None and other is not None:
-                    found = self._mixed(dict(given), dict(other), i, j, faults)
-                if found is not None:
-                    yield i, j, dict(self._potential.constants) | found
+                        mixed = ({"scale": 1.0} if self._formula.shared else {}) | dict(values)
+                if mixed is None and parameters is not None and other_parameters is not None:
+                    mixed = self._mixed(dict(parameters), dict(other_parameters), i, j, faults)
+                if mixed is not None:
+                    yield i, j, dict(self._potential.constants) | mixed
 
     def _mixed(
-        self, given: dict, other: dict, i: int, j: int, faults: list[str]
+        self, first: dict, second: dict, i: int, j: int, faults: list[str]
     ) -> dict[str, float] | None:
-        found = {}
-        for name, a in given.items():
-            b, usual = other[name], "arithmetic" if name.lower().startswith("sig") else "geometric"
+        mixed = {}
+        for name, a in first.items():
+            b, usual = second[name], "arithmetic" if name.lower().startswith("sig") else "geometric"
             if a == b:
-                found[name] = a
+                mixed[name] = a
             elif (rule := self._potential.mixing.get(name, usual)) == "arithmetic":
-                found[name] = (a + b) / 2
+                mixed[name] = (a + b) / 2
             elif rule == "geometric" and a * b >= 0:
-                found[name] = sqrt(a * b) * (-1.0 if a < 0 or b < 0 else 1.0)
+                mixed[name] = sqrt(a * b) * (-1.0 if a < 0 or b < 0 else 1.0)
             elif rule == "harmonic" and a + b != 0:
-                found[name] = 2 * a * b / (a + b)
+                mixed[name] = 2 * a * b / (a + b)
             else:
                 what = (
                     f"{name} of {self.example(i)} and {self.example(j)}, {a:g} and {b:g}, have no"
@@ -333,7 +349,7 @@ class _SiteTypes:
                     f"{what}: give {name} of that pair in pairs, or another rule in mixing"
                 )
                 return None
-        return found
+        return mixed
 
 
 def pair_law(
@@ -353,34 +369,46 @@ def pair_law(
 
     rigidmd.pair_law("A*exp(-B*r) - C/r**6", {"Ar": {"A": 1.6e6, "B": 4.4, "C": 6.2e3}})
 
-    energy : the energy in kJ/mol of the distance r in Å and of named parameters, as a text: + - * /
-        ** and exp, log, sqrt, sin, cos; its force is its derivative. Or a function f(p, r) that
-        gives (energy, -dE/dr), where p has the parameters; it may also have the arguments r2 (r²)
-        and inverse (1/r), and is compiled for vectors
-    parameters : site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a
+    Parameters
+    ----------
+    energy
+        The energy in kJ/mol of the distance r in Å and of named parameters, as a text: + - * / **
+        and exp, log, sqrt, sin, cos; its force is its derivative. Or a function f(p, r) that gives
+        (energy, -dE/dr), where p has the parameters; it may also have the arguments r2 (r²) and
+        inverse (1/r), and is compiled for vectors
+    parameters
+        Site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a
         dictionary, or the NamedTuple that a function expects. Or plain numbers, the same for all
         sites. Default: `parameters` of the sites in the models' files
-    table : instead of an energy, distances in Å, energies in kJ/mol and perhaps forces -dE/dr in
+    table
+        Instead of an energy, distances in Å, energies in kJ/mol and perhaps forces -dE/dr in
         kJ/mol/Å, which a spline interpolates; or a file with these columns. Nearer than the first
         distance the energy rises as r⁻¹²
-    sites : the only sites that it acts on
-    pairs : (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it
-        acts on them only
-    mixing : parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites;
-        default: arithmetic for names that begin with sig, else geometric
-    truncation, switch_start_A, cutoff_A : as in [forces] of the scene, which are the defaults
-    name : in the log and in messages
+    sites
+        The only sites that it acts on
+    pairs
+        (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it acts
+        on them only
+    mixing
+        Parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites; default:
+        arithmetic for names that begin with sig, else geometric
+    truncation, switch_start_A, cutoff_A
+        As in [forces] of the scene, which are the defaults
+    name
+        In the log and in messages
 
-    Raises ValueError.
+    Raises
+    ------
+    ValueError
     """
     if (energy is None) == (table is None):
         raise ValueError("needs an energy or a table")
     if truncation is not None and truncation not in TRUNCATIONS:
         hint = did_you_mean(truncation, TRUNCATIONS)
         raise ValueError(f"truncation is {truncation!r}{hint}; there are {', '.join(TRUNCATIONS)}")
-    for what, given in (("mixing", mixing), ("pairs", pairs)):
-        if given is not None and not isinstance(given, Mapping):
-            raise ValueError(f"{what} is {given!r:.60}, must be a dictionary")
+    for what, table_of_names in (("mixing", mixing), ("pairs", pairs)):
+        if table_of_names is not None and not isinstance(table_of_names, Mapping):
+            raise ValueError(f"{what} is {table_of_names!r:.60}, must be a dictionary")
     columns = read_columns(Path(table)) if isinstance(table, str | Path) else None
     if columns is None and table is not None:
         if not (isinstance(table, tuple | list) and len(table) in (2, 3)):
@@ -393,11 +421,11 @@ def pair_law(
     for parameter, rule in (mixing or {}).items():
         if rule not in RULES:
             raise ValueError(f"mixing of {parameter} is {rule!r}; there are {', '.join(RULES)}")
-    given = [*([] if parameters is None else [parameters]), *(pairs or {}).values()]
+    parameter_sets = [*([] if parameters is None else [parameters]), *(pairs or {}).values()]
     constants, of_sites, of_pairs = {}, {} if pairs else None, {}
     if parameters is not None:
         parameters = _mapping("parameters", parameters)
-        given[1:1] = parameters.values()
+        parameter_sets[1:1] = parameters.values()
         flat = [
             key for key, value in parameters.items() if isinstance(value, int | float | np.number)
         ]
@@ -409,11 +437,10 @@ def pair_law(
             )
             raise ValueError(f"{either}; {flat[0]} is a number, and {others} is not")
         constants = _numbers("parameters", parameters) if flat else {}
-        of_sites = (
-            {}
-            if flat
-            else {key: _numbers(f"parameters of {key}", x) for key, x in parameters.items()}
-        )
+        if flat:
+            of_sites = {}
+        else:
+            of_sites = {key: _numbers(f"parameters of {key}", x) for key, x in parameters.items()}
     for key, value in (pairs or {}).items():
         if not (
             isinstance(key, tuple) and len(key) == 2 and all(isinstance(one, str) for one in key)
@@ -426,15 +453,13 @@ def pair_law(
         ):
             raise ValueError(f"{key} is {value!r}, must be a number above 0")
     usual = "table" if table is not None else getattr(energy, "__name__", "pair_law")
-    kinds = [
-        type(value) for value in given if hasattr(value, "_asdict")
-    ]  # a NamedTuple that a function expects
+    # a NamedTuple that a function expects
+    kinds = [type(value) for value in parameter_sets if hasattr(value, "_asdict")]
     kind = kinds[-1] if kinds else None
-    formula = (
-        formula_of_function(energy, kind)
-        if energy is not None and not isinstance(energy, str)
-        else None
-    )
+    if energy is not None and not isinstance(energy, str):
+        formula = formula_of_function(energy, kind)
+    else:
+        formula = None
     return PairLaw(
         energy,
         columns,
@@ -451,27 +476,27 @@ def pair_law(
     )
 
 
-def _mapping(where: str, given: Any) -> Mapping[str, Any]:
+def _mapping(where: str, table: Any) -> Mapping[str, Any]:
     """A dictionary, or the fields of a NamedTuple. Raises ValueError."""
-    given = given._asdict() if hasattr(given, "_asdict") else given
-    if not isinstance(given, Mapping):
-        raise ValueError(f"{where}: {given!r:.60} is not a table of numbers")
-    return given
+    table = table._asdict() if hasattr(table, "_asdict") else table
+    if not isinstance(table, Mapping):
+        raise ValueError(f"{where}: {table!r:.60} is not a table of numbers")
+    return table
 
 
-def _numbers(where: str, given: Any) -> dict[str, float]:
+def _numbers(where: str, table: Any) -> dict[str, float]:
     """Parameters as a dictionary of finite numbers. Raises ValueError."""
-    given = _mapping(where, given)
-    for key, value in given.items():
+    table = _mapping(where, table)
+    for key, value in table.items():
         if (
             not isinstance(value, int | float | np.number)
             or isinstance(value, bool)
             or not isfinite(value)
         ):
             raise ValueError(f"{where}: {key} is {value!r}, must be a finite number")
-    if taken := [key for key in given if key in (DISTANCE, "pi")]:
+    if taken := [key for key in table if key in (DISTANCE, "pi")]:
         raise ValueError(
             f"{where}: {taken[0]} is the {'distance' if taken[0] == DISTANCE else 'number pi'};"
             " rename it"
         )
-    return {str(key): float(value) for key, value in given.items()}
+    return {str(key): float(value) for key, value in table.items()}

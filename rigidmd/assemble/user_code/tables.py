@@ -52,10 +52,8 @@ def read_columns(path: Path) -> Columns:
             )
     for number, words in lines:
         values = [float(word) if _is_number(word) else inf for word in words]
-        row, expected = (
-            dict(zip(names, values, strict=False)),
-            (len(names),) if names is not COLUMNS else (2, 3),
-        )
+        row = dict(zip(names, values, strict=False))
+        expected = (len(names),) if names is not COLUMNS else (2, 3)
         if len(words) not in ((len(rows[0]),) if rows else expected):
             must = f"must have the same columns in all lines: {', '.join(names)}"
             faults.append(f"line {number}: has {len(words)} numbers, {must}")
@@ -69,11 +67,10 @@ def read_columns(path: Path) -> Columns:
                 f"line {number}: {' '.join(words):.60} has {largest}: begin it at larger distances"
             )
         elif not row["r_A"] > (rows[-1]["r_A"] if rows else 0.0):
-            least = (
-                f"{rows[-1]['r_A']:g} Å of the row before; sort the rows by distance"
-                if rows
-                else "0"
-            )
+            if rows:
+                least = f"{rows[-1]['r_A']:g} Å of the row before; sort the rows by distance"
+            else:
+                least = "0"
             faults.append(f"line {number}: r_A = {row['r_A']:g} must be above {least}")
         else:
             rows.append(row)

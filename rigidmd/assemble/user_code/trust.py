@@ -16,21 +16,33 @@ _TRUSTED: set[str] = set()
 
 
 def trust(path: str | Path) -> None:
-    """Allow scenes to run a Python file with these contents, at any path. Raises SceneError. The
-    code can do anything that you can do: read it before. On the command line, --trust FILE does the
-    same."""
+    """Allow scenes to run a Python file with these contents, at any path. The code can do anything
+    that you can do: read it before. On the command line, --trust FILE does the same.
+
+    Raises
+    ------
+    SceneError
+    """
     _TRUSTED.add(digest_of(_source(Path(path), option("trust"))))
 
 
 def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
     """Raise SceneError for a trusted file that the scene does not run."""
-    named = [path for key, path in scene.inputs.items() if key.endswith(".module")]
-    contents = [_source(path, "forces.custom") for path in named]
-    for path in paths:
-        if _source(Path(path), option("trust")) not in contents:
-            files = f"it names {', '.join(map(str, named))}" if named else "it names none"
-            what = f"is not a file that [[forces.custom]] of {scene.source} names by module"
-            raise SceneError(option("trust"), [f"{path} {what}: {files}"])
+    for path in unused_files(scene, paths):
+        named = ", ".join(map(str, _modules(scene)))
+        files = f"it names {named}" if named else "it names none"
+        what = f"is not a file that [[forces.custom]] of {scene.source} names by module"
+        raise SceneError(option("trust"), [f"{path} {what}: {files}"])
+
+
+def unused_files(scene: Scene, paths: Iterable[str | Path]) -> list[str | Path]:
+    """The trusted files that a scene does not run."""
+    contents = [_source(path, "forces.custom") for path in _modules(scene)]
+    return [path for path in paths if _source(Path(path), option("trust")) not in contents]
+
+
+def _modules(scene: Scene) -> list[Path]:
+    return [path for key, path in scene.inputs.items() if key.endswith(".module")]
 
 
 def trusted_module(path: Path, key: str) -> ModuleType:

@@ -114,6 +114,8 @@ def _entry(rank: str, name: str, member: object) -> list[str]:
         signature = "(...)"
     kind = "class " if inspect.isclass(member) else ""
     text = html.escape(inspect.getdoc(member) or "")
+    text = re.sub(r"^(Parameters|Returns|Raises)\n-+$", r"<strong>\1</strong>", text, flags=re.M)
+    text = re.sub(r"^(`?\w[\w, `]*)\n(?=    )", _names_as_code, text, flags=re.M)
     text = re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
     signature = re.sub(r"rigidmd\.(?:\w+\.)*|'", "", signature)
     return [
@@ -125,6 +127,11 @@ def _entry(rank: str, name: str, member: object) -> list[str]:
         "",
         f'<div class="docstring">{text}</div>',
     ]
+
+
+def _names_as_code(names: re.Match) -> str:
+    """A line of names of a NumPy docstring, whose description follows."""
+    return f"<code>{names[1].replace('`', '')}</code>\n"
 
 
 def _live_page(name: str) -> Path:

@@ -47,14 +47,10 @@ from rigidmd.forces.terms import (
     NoForce,
     Setup,
     TermDispatcher,
-    checkpoint_arrays,
     compute_load_with_energies,
-    passes_of,
     restored,
-    with_capacity,
-    with_code,
+    trait,
     with_common_scratch,
-    workspace_of,
 )
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
@@ -174,9 +170,8 @@ class CpuEngine(Engine):
         workspaces = self._prepare(state)
         keep_time(state, dt)
         last = self._last
-        if (
-            state is not last.state and "steps" in self._dispatchers
-        ):  # its energies belong to another state
+        # its energies belong to another state
+        if state is not last.state and "steps" in self._dispatchers:
             self._dispatchers["steps"].table.tallies_valid[0] = 0
         if self.load is None:
             self.load = no_load(state)
@@ -227,9 +222,8 @@ class CpuEngine(Engine):
             model, state, load, workspaces, flows, gradient, dt, until, progress
         ):
             workspaces = self._handle_status(status, state)
-        return (
-            progress[LOADED] != 0
-        )  # also False after no step, because then no forces were evaluated
+        # also False after no step, because then no forces were evaluated
+        return progress[LOADED] != 0
 
     def _bind(self, objects: tuple, make: Callable[[], Any]) -> Any:
         """What `make` returns, which is kept while it is bound to the same objects."""
@@ -319,7 +313,7 @@ class CpuEngine(Engine):
     def memory(self) -> dict[str, np.ndarray] | None:
         """Neighbour lists as last built, forces at the present positions, and the memory of the
         barostat."""
-        owners = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
+        owners = self._checkpoint_arrays()
         if self.load is not None and self._last.is_current:
             owners[LOAD] = self.load._asdict()
         if (box := self._couplings.box) is not None:
@@ -332,53 +326,56 @@ class CpuEngine(Engine):
             for key, array in arrays.items()
         }
 
+    def _checkpoint_arrays(self) -> dict[str, dict[str, np.ndarray]]:
+        """Name of a term -> the arrays on which its next forces depend."""
+        workspaces = self.workspaces.items()
+        return {name: trait(workspace, "checkpoint_arrays")() for name, workspace in workspaces}
+
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         self._prepare(state)
-        kept: dict[str, dict[str, np.ndarray]] = {}
+        arrays_of: dict[str, dict[str, np.ndarray]] = {}
         for name, array in memory.items():
             owner, _, key = name.rpartition(".")
-            kept.setdefault(owner, {})[key] = array
-        if unknown := kept.keys() - {*self.names, LOAD, BOX, TRAJECTORY}:
+            arrays_of.setdefault(owner, {})[key] = array
+        if unknown := arrays_of.keys() - {*self.names, LOAD, BOX, TRAJECTORY}:
             raise ValueError(
                 f"an engine of {', '.join(self.names)} has no memory of"
                 f" {', '.join(sorted(unknown))}"
             )
-        self._recall_lists(state, kept)
-        self.load, self._last = no_load(state), LastAdvance(is_current=LOAD in kept)
+        self._recall_lists(state, arrays_of)
+        self.load, self._last = no_load(state), LastAdvance(is_current=LOAD in arrays_of)
         self._dispatchers.pop("steps", None)  # its energies belong to another state
         heat, box, trajectory = self._couplings
-        if LOAD in kept:
-            _copy_into(self.load, kept[LOAD])
-        if BOX in kept:
+        if LOAD in arrays_of:
+            _copy_into(self.load, arrays_of[LOAD])
+        if BOX in arrays_of:
             box = barostat_workspace(state)
-            _copy_into(box, kept[BOX])
+            _copy_into(box, arrays_of[BOX])
             if box.known[0] not in (0, 1) or not 0 <= box.counts[1] <= box.counts[0]:
                 raise ValueError("the numbers of tried and accepted moves of the box are invalid")
-        if TRAJECTORY in kept:
+        if TRAJECTORY in arrays_of:
             trajectory = trajectory_workspace(state)
-            _copy_into(trajectory, kept[TRAJECTORY])
+            _copy_into(trajectory, arrays_of[TRAJECTORY])
             ended, accepted = trajectory.sums[:2]
             if trajectory.known[0] not in (0, 1) or not 0 <= accepted <= ended:
                 raise ValueError("the numbers of ended and accepted trajectories are invalid")
         self._couplings = CouplingWorkspaces(heat, box, trajectory)
-        if LOAD in kept and not self._python_forces:
-            self._check_recalled(state, kept)
+        if LOAD in arrays_of and not self._python_forces:
+            self._check_recalled(state, arrays_of)
 
-    def _recall_lists(self, state: State, kept: dict[str, dict[str, np.ndarray]]) -> None:
+    def _recall_lists(self, state: State, arrays_of: dict[str, dict[str, np.ndarray]]) -> None:
         """Make new workspaces, with the neighbour lists that were kept: all of them or none."""
-        spaces, now = (
-            tuple(with_code(workspace) for workspace in self.new_workspaces(state)),
-            float(state.time[NOW]),
-        )
-        if kept.keys() & set(self.names):
+        spaces = _with_code(self.new_workspaces(state))
+        now = float(state.time[NOW])
+        if arrays_of.keys() & set(self.names):
             pairs = zip(self.names, spaces, strict=False)
             spaces = tuple(
-                restored(workspace, kept.get(name, {}), self._setup.skin, now)
+                restored(workspace, arrays_of.get(name, {}), self._setup.skin, now)
                 for name, workspace in pairs
             )
         self._workspaces = with_common_scratch(spaces)
 
-    def _check_recalled(self, state: State, kept: dict[str, dict[str, np.ndarray]]) -> None:
+    def _check_recalled(self, state: State, arrays_of: dict[str, dict[str, np.ndarray]]) -> None:
         """Raise ValueError unless the kept forces are those that the kept lists give at the
         state."""
         try:
@@ -386,45 +383,44 @@ class CpuEngine(Engine):
         except SimulationError as error:
             raise ValueError(f"forces cannot be evaluated at its state: {error}") from None
         rounding = ROUNDING[self._setup.dtype]
-        for name, found, there in zip(Load._fields, load, self.load or (), strict=True):
-            if np.abs(found - there).max(initial=0.0) > rounding * np.abs(found).max(initial=0.0):
+        for name, evaluated, recalled in zip(Load._fields, load, self.load or (), strict=True):
+            if np.abs(evaluated - recalled).max(initial=0.0) > rounding * np.abs(evaluated).max(
+                initial=0.0
+            ):
                 raise ValueError(f"its state has another {name} than was kept with it")
-        lists = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
+        lists = self._checkpoint_arrays()
         same = all(
-            np.array_equal(array, kept[name][key])
+            np.array_equal(array, arrays_of[name][key])
             for name, of in lists.items()
             for key, array in of.items()
         )
-        if BOX in kept or TRAJECTORY in kept:
+        if BOX in arrays_of or TRAJECTORY in arrays_of:
             terms = np.array([[tally.energy, *tally.virial.flat] for tally in tallies.values()])
             _, box, trajectory = self._couplings
             first = int(self._setup.needs_virials)  # a piston needs no energies
-            there = [box.tally[0, first:]] if box is not None and box.known[0] else []
-            there += (
+            totals = [box.tally[0, first:]] if box is not None and box.known[0] else []
+            totals += (
                 [trajectory.energies[:1]] if trajectory is not None and trajectory.known[0] else []
             )
-            for values in there:
-                found = terms.sum(0)[first : first + len(values)]
-                if (np.abs(found - values) > rounding * np.abs(terms).sum(0).max()).any():
+            for values in totals:
+                evaluated_total = terms.sum(0)[first : first + len(values)]
+                if (np.abs(evaluated_total - values) > rounding * np.abs(terms).sum(0).max()).any():
                     raise ValueError("its state has another energy or virial than was kept with it")
-            if (
-                not same
-            ):  # they were built for a trial box or the end of a trajectory that was rejected
-                self._recall_lists(state, kept)
+            # they were built for a trial box or the end of a trajectory that was rejected
+            if not same:
+                self._recall_lists(state, arrays_of)
         elif not same:
             raise ValueError("its neighbour lists are not those of its state")
 
     @property
     def moves(self) -> tuple[int, int]:
-        return (
-            (0, 0)
-            if (box := self._couplings.box) is None
-            else (int(box.counts[0]), int(box.counts[1]))
-        )
+        if (box := self._couplings.box) is None:
+            return 0, 0
+        return int(box.counts[0]), int(box.counts[1])
 
     @property
     def trajectories(self) -> np.ndarray | None:
-        return None if (kept := self._couplings.trajectory) is None else kept.sums.copy()
+        return None if (workspace := self._couplings.trajectory) is None else workspace.sums.copy()
 
     def rows_of_steps(self) -> Rows:
         """The rows of the forces of steps, bound to the state that `advance` has moved last."""
@@ -435,14 +431,14 @@ class CpuEngine(Engine):
         load, status = no_load(state), np.zeros(1, np.int64)
         into = Evaluation(state, load, np.zeros(TALLY_SIZE), status)
         workspaces = zip(self.names, self.new_workspaces(state), strict=False)
-        return {name: passes_of(workspace, into) for name, workspace in workspaces}
+        return {name: trait(workspace, "passes")(into) for name, workspace in workspaces}
 
     def new_workspaces(self, state: State) -> tuple[NamedTuple, ...]:
         """New workspaces for the cell of a state, without machine code. Their arrays show the
         memory needed."""
         setup = self._setup._replace(cell=state.cell)
         return with_common_scratch(
-            tuple(workspace_of(term, setup) for term in self.terms.values())
+            tuple(trait(term, "workspace")(setup) for term in self.terms.values())
         ) or (NoForce(),)
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
@@ -461,10 +457,8 @@ class CpuEngine(Engine):
             set_threads(usable_threads(self.threads))
         if self._workspaces is None:
             spaces = self.new_workspaces(state)
-            self._compile(
-                lambda: TermDispatcher(tuple(map(with_code, spaces)), USES["observations"])
-            )
-            self._workspaces = tuple(map(with_code, spaces))
+            self._compile(lambda: TermDispatcher(_with_code(spaces), USES["observations"]))
+            self._workspaces = _with_code(spaces)
         return self._workspaces
 
     def _compile(self, make: Callable[[], object]) -> None:
@@ -478,22 +472,28 @@ class CpuEngine(Engine):
         again."""
         workspaces = self._prepare(state)
         if status in (LIST_FULL, CELL_CHANGED):
-            enlarged = tuple(with_capacity(workspace, state.cell) for workspace in workspaces)
+            enlarged = tuple(trait(space, "with_capacity")(state.cell) for space in workspaces)
             workspaces = self._workspaces = with_common_scratch(enlarged)
         elif status == NOT_FINITE:
             raise NotFiniteError(state)
         elif status == BEHIND_WALL:
-            found = [
+            molecules_behind = [
                 workspace.behind(state)
                 for workspace in workspaces
                 if isinstance(workspace, LennardJonesWalls)
             ]
-            raise BehindWallError(*next(behind for behind in found if behind is not None))
+            raise BehindWallError(
+                *next(behind for behind in molecules_behind if behind is not None)
+            )
         elif status == NEEDS_PYTHON_FORCES:
             for name, workspace in zip(self.names, workspaces, strict=False):
                 if name in self._python_forces:
                     workspace.update(self._python_forces[name], state)  # type: ignore[attr-defined]  # of such terms
         return workspaces
+
+
+def _with_code(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple, ...]:
+    return tuple(trait(workspace, "with_code")() for workspace in workspaces)
 
 
 def _as_scheme(integrator: Scheme | Solver) -> Scheme:
@@ -510,17 +510,17 @@ def _are_same(objects: tuple, others: tuple) -> bool:
     )
 
 
-def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
+def _copy_into(arrays: NamedTuple, sources: dict[str, np.ndarray]) -> None:
     """Copy kept arrays into the arrays of a tuple. Raises ValueError if they do not fit."""
-    for name, array in kept.items():
-        there = getattr(arrays, name)
-        if (there.shape, there.dtype) != (array.shape, array.dtype):
+    for name, array in sources.items():
+        target = getattr(arrays, name)
+        if (target.shape, target.dtype) != (array.shape, array.dtype):
             raise ValueError(
-                f"{name} has the shape {array.shape}, not {there.shape}, or is of another type"
+                f"{name} has the shape {array.shape}, not {target.shape}, or is of another type"
             )
         if not np.isfinite(array).all():
             raise ValueError(f"{name} is not finite")
-        there[:] = array
+        target[:] = array
 
 
 class BehindWallError(SimulationError):

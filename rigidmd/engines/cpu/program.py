@@ -83,9 +83,8 @@ class Profile(NamedTuple):
     """Median times of a step and its rows, without energies."""
 
     step: float  # s
-    rows: list[
-        tuple[str, float]
-    ]  # text and s of each row of the forces; the last one is the rest of the step
+    #: Text and s of each row of the forces; the last one is the rest of the step
+    rows: list[tuple[str, float]]
 
 
 def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Profile:
@@ -114,9 +113,9 @@ def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Pr
             run_single_row(rows, k)
             times[k].append(time.perf_counter() - began)
     step = median(steps)
-    found = [(texts[k], median(spent)) for k, spent in times.items()]
-    rest = step - scheme.force_evaluations * sum(spent for _, spent in found)
-    return Profile(step, [*found, ("kicks, drifts, and all else", max(0.0, rest))])
+    times_of_passes = [(texts[k], median(spent)) for k, spent in times.items()]
+    remainder = step - scheme.force_evaluations * sum(spent for _, spent in times_of_passes)
+    return Profile(step, [*times_of_passes, ("kicks, drifts, and all else", max(0.0, remainder))])
 
 
 def describe_profile(profile: Profile) -> str:

@@ -177,7 +177,7 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
         gather_per_molecule([body.position_body[body.site < 0] for body in bodies], species),
         gather_per_molecule([body.mass[body.site < 0] for body in bodies], species),
     )
-    more, more_velocity = (
+    extra_positions, extra_velocities = (
         RigidBodies(system, extra).points(state) if len(extra.mass) else np.zeros((2, 0, 3))
     )
     width = DECIMALS + 5
@@ -186,8 +186,8 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
         m, added = system.species[k], bodies[k].extra
         count = len(m.masses)
         names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(added))]
-        positions = np.concatenate([at[s : s + count], more[e : e + added]])
-        velocities = np.concatenate([velocity[s : s + count], more_velocity[e : e + added]])
+        positions = np.concatenate([at[s : s + count], extra_positions[e : e + added]])
+        velocities = np.concatenate([velocity[s : s + count], extra_velocities[e : e + added]])
         for name, x, v in zip(names, positions, velocities, strict=True):
             residue = f"{(n + 1) % 100000:5d}{as_word(m.residue_names[0]):<5}"
             head = f"{residue}{name:>5}{(len(rows) + 1) % 100000:5d}"
@@ -276,12 +276,10 @@ def _settings(view: ForceFieldView, k: int) -> str:
     def every(interval: float) -> int:
         return max(1, round(interval * 1e3 / stage.timestep_fs))
 
-    keeps, interval = (
-        system.freedom_in(k).translation < 3 * len(system.model.species),
-        system.removes_momentum_every,
-    )
+    keeps = system.freedom_in(k).translation < 3 * len(system.model.species)
+    interval = system.removes_momentum_every
     integrator, _ = TRANSLATIONS.of("thermostat")[stage.thermostat]
-    found: dict[str, object] = {
+    settings: dict[str, object] = {
         "integrator": integrator,
         "dt": f"{stage.timestep_fs * 1e-3:.12g}",
         "nsteps": stage.steps,
@@ -307,38 +305,38 @@ def _settings(view: ForceFieldView, k: int) -> str:
         "ld-seed": (scene.seed * 1000 + k) % SEEDS,
     }
     if view.lennard_jones is not None:
-        found["vdw-modifier"] = TRANSLATIONS.of("forces.truncation")[view.truncation]
+        settings["vdw-modifier"] = TRANSLATIONS.of("forces.truncation")[view.truncation]
         if "switch" in view.truncation:
-            found["rvdw-switch"] = f"{(scene.forces.switch_start_A or 0.0) * NM:.12g}"
+            settings["rvdw-switch"] = f"{(scene.forces.switch_start_A or 0.0) * NM:.12g}"
     return "".join(
         f"{key:<24} = {value}\n"
-        for key, value in (found | _coulomb(view) | _couplings(stage)).items()
+        for key, value in (settings | _coulomb(view) | _couplings(stage)).items()
     )
 
 
 def _coulomb(view: ForceFieldView) -> dict[str, object]:
     law, mesh = view.coulomb, view.system.terms.get("coulomb_reciprocal")
-    found: dict[str, object] = {
+    settings: dict[str, object] = {
         "coulombtype": TRANSLATIONS.of("forces.electrostatics")[view.electrostatics]
     }
     if isinstance(law, ScreenedCoulomb) and isinstance(mesh, Pme):
-        found["coulomb-modifier"] = "Potential-shift" if law.shift else "None"
+        settings["coulomb-modifier"] = "Potential-shift" if law.shift else "None"
         # GROMACS needs one cutoff; rtol is that of alpha there
-        found["ewald-rtol"] = f"{float(erfc(law.alpha * view.system.cutoff)):.12g}"
-        found |= {f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)} | {
+        settings["ewald-rtol"] = f"{float(erfc(law.alpha * view.system.cutoff)):.12g}"
+        settings |= {f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)} | {
             "pme-order": mesh.order
         }
     elif isinstance(law, ReactionField):
         permittivity = view.system.scene.forces.reaction_field_permittivity
-        found["epsilon-rf"] = 0 if permittivity == inf else f"{permittivity:.12g}"
-    return found
+        settings["epsilon-rf"] = 0 if permittivity == inf else f"{permittivity:.12g}"
+    return settings
 
 
 def _couplings(stage: Stage) -> dict[str, object]:
     if not stage.has_thermostat:
         return {"tcoupl": "no", "pcoupl": "no"}
     first, last = stage.temperatures
-    found: dict[str, object] = {
+    settings: dict[str, object] = {
         "tcoupl": TRANSLATIONS.of("thermostat")[stage.thermostat][1],
         "pcoupl": "no",
         "tc-grps": "System",
@@ -346,21 +344,21 @@ def _couplings(stage: Stage) -> dict[str, object]:
         "tau-t": f"{stage.thermostat_time:.12g}",
     }
     if stage.thermostat_kind == "nose_hoover":
-        found["nh-chain-length"] = stage.nose_hoover_links
+        settings["nh-chain-length"] = stage.nose_hoover_links
     if first != last:
-        found |= {
+        settings |= {
             "annealing": "single",
             "annealing-npoints": 2,
             "annealing-time": f"0 {stage.duration:.12g}",
         }
-        found["annealing-temp"] = f"{first:.12g} {last:.12g}"
+        settings["annealing-temp"] = f"{first:.12g} {last:.12g}"
     if stage.has_barostat:
         pressure, count = stage.pressures[0], 1 if stage.pressure_coupling == "isotropic" else 2
-        found |= {
+        settings |= {
             "pcoupl": TRANSLATIONS.of("barostat")[stage.barostat],
             "pcoupltype": TRANSLATIONS.of("pressure_coupling")[stage.pressure_coupling],
             "tau-p": f"{stage.barostat_time:.12g}",
             "ref-p": " ".join(f"{value:.12g}" for value in (pressure[0], pressure[2])[:count]),
             "compressibility": " ".join([f"{stage.compressibility:.12g}"] * count),
         }
-    return found
+    return settings

@@ -31,7 +31,7 @@ from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError, StructureError
 from rigidmd.forces.ewald.corrections import background, self_energy
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.io.formats.lammps import dump_box
+from rigidmd.formats.lammps import dump_box
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, SplitRotor
 
 #: Begins a line with numbers, which also ends the output of a command.
@@ -79,13 +79,13 @@ class LammpsEngine(ExternalEngine):
         self._fixes = files.fixes(self._view, stage)
         self._bodies = RigidBodies(system)
         self._process = Process(command(ranks))
-        date, there = self._process.run_commands(
+        date, rank_count = self._process.run_commands(
             f'print "{NUMBERS} $(version) $(extract_setting(world_size))"'
         )
-        if there != ranks:
+        if rank_count != ranks:
             self.close()
             problem = (
-                f"LAMMPS has {there:.0f} ranks instead of {ranks}: the launcher belongs to"
+                f"LAMMPS has {rank_count:.0f} ranks instead of {ranks}: the launcher belongs to"
                 " another MPI"
             )
             raise EngineError(f"{problem}; put the mpirun of LAMMPS on the PATH, or use 1 rank")
@@ -151,9 +151,9 @@ class LammpsEngine(ExternalEngine):
             "run 0",
         )
         self._heat_offset = 0.0
-        given = state.copy()
-        self._receive(given)
-        self._heat_offset = float(state.energy_ledger[HEAT] - given.energy_ledger[HEAT])
+        received = state.copy()
+        self._receive(received)
+        self._heat_offset = float(state.energy_ledger[HEAT] - received.energy_ledger[HEAT])
         self._known_state = state.copy()
 
     def _receive(self, state: State) -> None:
@@ -164,29 +164,28 @@ class LammpsEngine(ExternalEngine):
             ["elong"] if view.has_ewald_sum else []
         )
         names = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]
-        figures = self._process.run_commands(
+        printed = self._process.run_commands(
             f"write_dump all custom {DUMP} {' '.join(COLUMNS)} modify sort id format float %.17g",
             f'print "{NUMBERS} {" ".join(f"$({name}:%.17g)" for name in names)}"',
         )
         cell, rows = read_dump(self._process.folder / DUMP)
-        if not (np.isfinite(rows).all() and np.isfinite(figures).all()):
+        if not (np.isfinite(rows).all() and np.isfinite(printed).all()):
             raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
         cell = cell if view.is_periodic else state.cell
         position = rows[:, 1:4] + (rows[:, 4:7] @ cell if view.is_periodic else 0.0)
-        found = self._bodies.state(state, position, rows[:, 7:10] * PER_PS, cell)
-        for mine, its in zip(state[:5], found[:5], strict=True):
+        received = self._bodies.state(state, position, rows[:, 7:10] * PER_PS, cell)
+        for mine, its in zip(state[:5], received[:5], strict=True):
             mine[:] = its
         n, force, virial = len(energies), rows[:, 10:13] * files.KCAL, np.zeros((3, 3))
-        if (
-            view.is_periodic
-        ):  # the symmetric part of the molecular virial, from the atomic virial as a pressure
-            xx, yy, zz, xy, xz, yz = np.array(figures[n : n + 6]) * files.ATMOSPHERE * state.volume
+        # the symmetric part of the molecular virial, from the atomic virial as a pressure
+        if view.is_periodic:
+            xx, yy, zz, xy, xz, yz = np.array(printed[n : n + 6]) * files.ATMOSPHERE * state.volume
             intramolecular = self._bodies.intramolecular_virial(position, force)
             virial = (
                 np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
                 - (intramolecular + intramolecular.T) / 2
             )
-        tallies = self._tallies(np.array(figures[:n]) * files.KCAL, virial, state.volume)
+        tallies = self._tallies(np.array(printed[:n]) * files.KCAL, virial, state.volume)
         self._evaluated = self._bodies.load(state, position, force), tallies
         # the conserved energy that LAMMPS' fix rigid prints is not conserved: for 512 SPC/E under
         # rigid/nvt it changed by 1 % in 0.6 ps, at 0.5 fs as at 2 fs
@@ -201,28 +200,26 @@ class LammpsEngine(ExternalEngine):
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
         view = self._view
         charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # with LAMMPS' constant
-        names, law = (
-            ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None)),
-            view.coulomb,
-        )
+        names = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None))
+        law = view.coulomb
         names += (
             ["coulomb_real", "coulomb_reciprocal"]
             if view.has_ewald_sum
             else ["coulomb"] * (law is not None)
         )
-        found = dict(zip(names, energy, strict=True))
+        energies = dict(zip(names, energy, strict=True))
         if isinstance(law, ScreenedCoulomb):
             even = background(float(charge.sum()) ** 2, law.alpha).strength / volume
-            found["coulomb_reciprocal"] -= self_energy(charge, law.alpha) + even
+            energies["coulomb_reciprocal"] -= self_energy(charge, law.alpha) + even
             if "coulomb_background" in view.system.terms:
-                found["coulomb_background"] = even
+                energies["coulomb_background"] = even
         elif isinstance(law, DampedShiftedForce):
-            found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(
+            energies["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(
                 charge @ charge
             )
         return {
             name: Tally(float(u), np.zeros((3, 3)) if k else virial)
-            for k, (name, u) in enumerate(found.items())
+            for k, (name, u) in enumerate(energies.items())
         }
 
 
@@ -248,10 +245,8 @@ class Process:
             raise EngineError(
                 f"LAMMPS cannot be started as {' '.join(arguments)}: {error.strerror}"
             ) from None
-        self._in, self._out = (
-            cast(IO[str], self._process.stdin),
-            cast(IO[str], self._process.stdout),
-        )
+        self._in = cast(IO[str], self._process.stdin)
+        self._out = cast(IO[str], self._process.stdout)
         self._end = weakref.finalize(
             self, _ended, self._process, [self._in, self._out], self._folder_handle
         )
@@ -272,11 +267,10 @@ class Process:
         messages = [line for line in output if "ERROR" in line] or [
             line for line in output if line
         ][-3:]
-        kind = (
-            SimulationError
-            if any(line.startswith("run ") and line != "run 0" for line in lines)
-            else EngineError
-        )
+        if any(line.startswith("run ") and line != "run 0" for line in lines):
+            kind = SimulationError
+        else:
+            kind = EngineError
         raise kind(f"LAMMPS stopped: {'; '.join(messages) or f'exit code {self._process.wait()}'}")
 
     def close(self) -> None:

@@ -257,11 +257,10 @@ def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
     coefficients = {
         (i, j): f"{_num(view.epsilon[i, j] / KCAL)} {_num(view.sigma[i, j])}" for i, j in pairs
     }
-    shifts = (
-        f"pair_modify pair {name} shift yes"
-        if view.truncation == "shift" and law.cutoff < inf
-        else ""
-    )
+    if view.truncation == "shift" and law.cutoff < inf:
+        shifts = f"pair_modify pair {name} shift yes"
+    else:
+        shifts = ""
     return PairStyle(name, arguments, coefficients, modify=shifts)
 
 
@@ -331,9 +330,8 @@ def fixes(view: ForceFieldView, k: int) -> list[str]:
         langevin = [f"fix {POINTS}_bath {POINTS} langevin {damping} {seed + 1} tally yes"]
     else:
         of_bodies, of_points = f"rigid/{kind}/small molecule", kind
-        if (
-            stage.has_thermostat
-        ):  # LAMMPS has the inverse of an angular frequency, a scene its period
+        # LAMMPS has the inverse of an angular frequency, a scene its period
+        if stage.has_thermostat:
             chain = f" temp {at} {_num(1e3 * stage.thermostat_time / (2 * pi))}"
             of_bodies, of_points = of_bodies + chain, of_points + chain
         if stage.has_barostat:

@@ -54,10 +54,8 @@ class OdeEngine(CpuEngine):
     _dense_output: Callable[[float], np.ndarray] | None = None
     _restart = False  # whether forces have changed, so that earlier steps are useless
     _steps = 0  # steps that DOP853 or Radau has taken
-    _stiff_steps, _other_steps = (
-        0,
-        0,
-    )  # consecutive steps at the limit of stability and not, as Hairer counts them
+    #: Consecutive steps at the limit of stability and not, as Hairer counts them
+    _stiff_steps, _other_steps = 0, 0
     is_stiff = False
 
     @property
@@ -144,12 +142,12 @@ class OdeEngine(CpuEngine):
             self.advance(repeated, integrator, dt, int(state.step[NOW]))
         except (SimulationError, ValueError) as error:
             raise ValueError(f"its solver does not reach its state: {error}") from None
-        for name, found, given in zip(State._fields, repeated, state, strict=True):
+        for name, recomputed, recorded in zip(State._fields, repeated, state, strict=True):
             if not np.allclose(
-                found,
-                given,
+                recomputed,
+                recorded,
                 rtol=1e-9,
-                atol=1e-9 * np.abs(given[np.isfinite(given)]).max(initial=0.0),
+                atol=1e-9 * np.abs(recorded[np.isfinite(recorded)]).max(initial=0.0),
             ):
                 raise ValueError(f"its state has another {name} than its variables")
         self.recall(state, memory)
@@ -171,7 +169,7 @@ class OdeEngine(CpuEngine):
             begun[:], y_begin[:] = (state.time[NOW], 0.0), y
             scales[:] = self._scales(solver, state, y)
             self._restart = False
-        kept, running = state.extra_variables.copy(), self._solver
+        variables_before, running = state.extra_variables.copy(), self._solver
         if running is None:
             if is_singular(form, y_begin, y_begin, 0.0):
                 raise SingularError(y_begin[1], begun[0])
@@ -193,10 +191,9 @@ class OdeEngine(CpuEngine):
                 problem = f"{solver.name} finds no step that keeps its tolerances ({limits})"
                 raise SimulationError(f"at t = {running.t:.6g}: {problem}")
             self._dense_output = running.dense_output()
-            if (
-                self.stop_requested()
-            ):  # restore the last observation: the rates have changed the state
-                state.extra_variables[:] = kept
+            # restore the last observation: the rates have changed the state
+            if self.stop_requested():
+                state.extra_variables[:] = variables_before
                 read(
                     form,
                     self.model,

@@ -74,13 +74,13 @@ class OpenmmEngine(ExternalEngine):
     ):
         mm = library()
         super().__init__(system, stage)
-        view, there = self._view, _platforms()
-        if platform not in there:
+        view, platforms = self._view, _platforms()
+        if platform not in platforms:
             known = "" if platform in PLATFORMS else f"; OpenMM knows {', '.join(PLATFORMS)}"
             cuda = "; pip install 'openmm[cuda12]' installs it" if platform == "CUDA" else ""
             raise EngineError(
                 f"OpenMM has no platform {platform!r} here: there are"
-                f" {', '.join(there)}{known}{cuda}"
+                f" {', '.join(platforms)}{known}{cuda}"
             )
         properties = properties_of(platform, precision, system.scene.threads)
         self.version = f"OpenMM {mm.__version__} on {platform}"
@@ -90,15 +90,19 @@ class OpenmmEngine(ExternalEngine):
         self._integrator = integrator_of(
             view, stage, TOLERANCES[properties.get("Precision", "double")]
         )
-        rest = mm.VerletIntegrator(0.001)
+        verlet = mm.VerletIntegrator(0.001)
         try:
             evaluated, moved = (
                 openmm_system(self._particles, system.state.cell, apart) for apart in (True, False)
             )
             for force in extra_forces(view, stage):
                 moved.addForce(force)
-            self._evaluating_context = mm.Context(evaluated, rest, there[platform], properties)
-            self._moving_context = mm.Context(moved, self._integrator, there[platform], properties)
+            self._evaluating_context = mm.Context(
+                evaluated, verlet, platforms[platform], properties
+            )
+            self._moving_context = mm.Context(
+                moved, self._integrator, platforms[platform], properties
+            )
         except mm.OpenMMException as error:
             raise EngineError(f"OpenMM cannot hold this system on {platform}: {error}") from None
         self._groups = {force.getForceGroup() for force in evaluated.getForces()}
@@ -147,11 +151,11 @@ class OpenmmEngine(ExternalEngine):
         }
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
-        kept = memory["context"]
+        checkpoint = memory["context"]
         self._known_state = None
-        if len(kept):
+        if len(checkpoint):
             try:
-                self._moving_context.loadCheckpoint(kept.tobytes())
+                self._moving_context.loadCheckpoint(checkpoint.tobytes())
             except library().OpenMMException as error:
                 raise ValueError(f"OpenMM cannot resume from its checkpoint: {error}") from None
             self._known_state, (self._heat_offset,) = state.copy(), memory["heat"].tolist()
@@ -184,20 +188,18 @@ class OpenmmEngine(ExternalEngine):
         velocity = had.getVelocities(asNumpy=True)._value[point] * ANGSTROM
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
-        cell = (
-            had.getPeriodicBoxVectors(asNumpy=True)._value * ANGSTROM
-            if self._stage.has_barostat
-            else state.cell
-        )
-        found = self._particles.bodies.state(state, position, velocity, cell)
-        if (
-            self._stage.has_barostat
-        ):  # OpenMM wraps molecules into the box whenever it changes the box
-            moved = found.position @ np.linalg.inv(cell) - state.position @ np.linalg.inv(
+        if self._stage.has_barostat:
+            cell = had.getPeriodicBoxVectors(asNumpy=True)._value * ANGSTROM
+        else:
+            cell = state.cell
+        received = self._particles.bodies.state(state, position, velocity, cell)
+        # OpenMM wraps molecules into the box whenever it changes the box
+        if self._stage.has_barostat:
+            moved = received.position @ np.linalg.inv(cell) - state.position @ np.linalg.inv(
                 state.cell
             )
-            found.position[:] -= np.rint(moved) @ cell
-        for mine, its in zip(state[:5], found[:5], strict=True):
+            received.position[:] -= np.rint(moved) @ cell
+        for mine, its in zip(state[:5], received[:5], strict=True):
             mine[:] = its
         state.energy_ledger[HEAT] = self._heat_offset + self._heat(state)
 
@@ -217,30 +219,29 @@ class OpenmmEngine(ExternalEngine):
         def energy(group: int) -> float:
             return _energy_of(self._evaluating_context, {group})
 
-        found = (
-            {"lennard_jones": energy(Group.LENNARD_JONES)}
-            if Group.LENNARD_JONES in self._groups
-            else {}
-        )
+        if Group.LENNARD_JONES in self._groups:
+            energies = {"lennard_jones": energy(Group.LENNARD_JONES)}
+        else:
+            energies = {}
         view, law = self._view, self._view.coulomb
         if isinstance(law, ScreenedCoulomb):
             alpha, charge = law.alpha, view.charge * COULOMB_CHARGE
             even = background(float(charge.sum()) ** 2, alpha).strength / state.volume
-            found["coulomb_real"] = energy(Group.COULOMB_PAIRS) - self._excluded_energy(
+            energies["coulomb_real"] = energy(Group.COULOMB_PAIRS) - self._excluded_energy(
                 state, alpha
             )
             if law.shift:
-                found["coulomb_real"] += energy(Group.STEP_COULOMB)
-            found["coulomb_reciprocal"] = (
+                energies["coulomb_real"] += energy(Group.STEP_COULOMB)
+            energies["coulomb_reciprocal"] = (
                 energy(Group.RECIPROCAL) - self_energy(charge, alpha) - even
             )
             if "coulomb_background" in view.system.terms:
-                found["coulomb_background"] = even
+                energies["coulomb_background"] = even
         elif law is not None:
-            found["coulomb"] = energy(Group.COULOMB_PAIRS)
+            energies["coulomb"] = energy(Group.COULOMB_PAIRS)
         return {
             name: Tally(float(u), np.zeros((3, 3)) if k else virial)
-            for k, (name, u) in enumerate(found.items())
+            for k, (name, u) in enumerate(energies.items())
         }
 
     def _excluded_energy(self, state: State, alpha: float) -> float:

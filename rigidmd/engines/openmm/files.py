@@ -65,7 +65,7 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
         rows.append(f"    {(stage.label, stage.steps, every, frame, file, others)!r},")
     names = {"system": SYSTEM, "state": STATE, "topology": TOPOLOGY, "kick": KICK, "moves": MOVES}
     values = {"title": in_comment(scene.in_short), "stages": "\n".join(rows), **names}
-    text[SCRIPT] = re.sub(f"{{({'|'.join(values)})}}", lambda found: values[found[1]], TEXT)
+    text[SCRIPT] = re.sub(f"{{({'|'.join(values)})}}", lambda match: values[match[1]], TEXT)
     for name, content in text.items():
         write_text(folder / name, content)
     with (
@@ -74,9 +74,10 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     ):
         from openmm import Vec3, app
 
+        # Å
         app.PDBFile.writeFile(
             _topology(particles), [Vec3(*row) for row in (position / NM).tolist()], file
-        )  # Å
+        )
     return [*text, TOPOLOGY]
 
 

@@ -57,8 +57,8 @@ def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
     )
     real_space = real_error(charges, law.alpha, law.cutoff, system.space.volume)
     error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - real_space**2, 0.0))
-    found = pme_grid_for(charges, law.alpha, cell_of(system.space), error, order)
-    return None if found is None else found[0]
+    grid_and_error = pme_grid_for(charges, law.alpha, cell_of(system.space), error, order)
+    return None if grid_and_error is None else grid_and_error[0]
 
 
 _INTEGRATOR, *_LIMITS = moves("OpenMM", "molecules")
@@ -183,9 +183,8 @@ class Layout(NamedTuple):
     point: np.ndarray  # (p,) particle of each mass point
     of_species: list[MassPoints]
     first: np.ndarray  # (n,) first particle of each molecule
-    local: list[
-        np.ndarray
-    ]  # for each species the particles of its mass points, counted from `first`
+    #: For each species the particles of its mass points, counted from `first`
+    local: list[np.ndarray]
 
     def positions(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Positions, Å, and velocities, Å/ps, of all particles (q, 3) at a state."""
@@ -220,10 +219,8 @@ def layout(view: ForceFieldView) -> Layout:
         at, of_particles = body.particles(len(m.masses))
         local.append(at)
         mass.append(np.zeros_like(of_particles) if is_frozen else of_particles)
-    count, sites = (
-        np.array([len(of_species) for of_species in mass])[species],
-        system.sites_per_molecule,
-    )
+    count = np.array([len(of_species) for of_species in mass])[species]
+    sites = system.sites_per_molecule
     first, molecule = np.cumsum(count) - count, np.repeat(np.arange(len(species)), count)
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
     points = Points(
@@ -293,7 +290,7 @@ def _openmm_virtual_site(points: list[int], weight: list[float], cross: float) -
 
 def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
     """The forces of a system with their groups."""
-    found, view = [], particles.view
+    forces, view = [], particles.view
     law, coulomb, plain = view.lennard_jones, view.coulomb, _builtin_lennard_jones(view)
     has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (
         coulomb is not None and coulomb.cutoff == inf
@@ -301,40 +298,38 @@ def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
     together = plain is not None and has_charge_force and not separate
     if law is not None and view.epsilon.any():
         if plain is None:
-            found.append((_custom_lennard_jones(particles), Group.LENNARD_JONES))
+            forces.append((_custom_lennard_jones(particles), Group.LENNARD_JONES))
         elif not together:
             force = _nonbonded(particles, law.cutoff, np.zeros_like(view.charge), plain)
-            found.append((force, Group.LENNARD_JONES))
+            forces.append((force, Group.LENNARD_JONES))
         if (
             view.is_periodic
             and isinstance(law.truncation, Unmodified)
             and view.truncation == "plain"
         ):
-            found.append((_custom_lennard_jones(particles, step=True), Group.STEP_LENNARD_JONES))
+            forces.append((_custom_lennard_jones(particles, step=True), Group.STEP_LENNARD_JONES))
     if coulomb is not None and has_charge_force:
         force = _nonbonded(particles, coulomb.cutoff, view.charge, plain if together else None)
-        found.append((force, Group.COULOMB_PAIRS))
+        forces.append((force, Group.COULOMB_PAIRS))
         if isinstance(coulomb, ScreenedCoulomb):
             force.setNonbondedMethod(force.PME)
             force.setPMEParameters(float(coulomb.alpha) / NM, *(grid_for(view, PME_ORDER) or ()))
             force.setReciprocalSpaceForceGroup(Group.RECIPROCAL)
             height = f"{-float(erfc(coulomb.alpha * coulomb.cutoff)) / coulomb.cutoff!r}"
-            found.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
+            forces.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     elif coulomb is not None and not isinstance(coulomb, ScreenedCoulomb):
-        found.append(
+        forces.append(
             (_custom_coulomb(particles, coulomb_formula(coulomb, 1.0)), Group.COULOMB_PAIRS)
         )
         is_plain = view.scene.forces.reaction_field_truncation == "plain"
         if view.is_periodic and is_plain and isinstance(coulomb, ReactionField):
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
-            found.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
+            forces.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     if (tail := view.system.tail) is not None:
-        energy, constant = (
-            float(tail.energy_volume) / KJ_PER_MOL * NM**3,
-            float(tail.constant) / KJ_PER_MOL,
-        )
-        found.append((library().CustomVolumeForce(f"{energy!r}/v+({constant!r})"), Group.TAIL))
-    return found
+        energy = float(tail.energy_volume) / KJ_PER_MOL * NM**3
+        constant = float(tail.constant) / KJ_PER_MOL
+        forces.append((library().CustomVolumeForce(f"{energy!r}/v+({constant!r})"), Group.TAIL))
+    return forces
 
 
 def _builtin_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
@@ -508,18 +503,18 @@ def extra_forces(view: ForceFieldView, k: int) -> list:
     """The forces of stage k in addition to its integrator: a barostat, and a remover of momentum
     that makes OpenMM subtract the degrees of freedom of the total momentum."""
     mm, stage, system = library(), view.system.scene.stages[k], view.system
-    found = []
+    forces = []
     if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int(
         (~view.frozen).sum()
     ):
-        found.append(mm.CMMotionRemover(NEVER))
+        forces.append(mm.CMMotionRemover(NEVER))
     if stage.has_barostat:
         barostat = mm.MonteCarloBarostat(
             stage.pressures[0][0], stage.temperatures[0], stage.moves_every
         )
         barostat.setRandomNumberSeed(_seed(view, k) % (SEEDS - 1) + 1)
-        found.append(barostat)
-    return found
+        forces.append(barostat)
+    return forces
 
 
 def _seed(view: ForceFieldView, k: int) -> int:

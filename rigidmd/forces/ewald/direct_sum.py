@@ -134,9 +134,8 @@ class KSpaceSums(NamedTuple):
 
 class EwaldSum(NamedTuple):
     smooth: Smooth
-    charge: (
-        np.ndarray
-    )  # (s,) in units where q²/r is an energy in u Å²/ps²; of dispersion c, where c²/r⁶ is
+    # (s,) in units where q²/r is an energy in u Å²/ps²; of dispersion c, where c²/r⁶ is
+    charge: np.ndarray
     sites: BodySites | CentralSites
     k_vectors: KVectors
 

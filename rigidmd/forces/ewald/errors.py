@@ -38,9 +38,8 @@ class Charges(NamedTuple):
 
     count: int  # charged sites
     square: float  # sum of q², e²
-    pairs: (
-        np.ndarray
-    )  # (p, 2) q_i q_j (e²), in both orders, and distance (Å) of pairs of sites inside molecules
+    # (p, 2) q_i q_j (e²), in both orders, and distance (Å) of pairs of sites inside molecules
+    pairs: np.ndarray
 
     def form(self, k: np.ndarray) -> np.ndarray:
         """Sum over molecules of |sum q exp(i k r)|², averaged over orientations, e²; k (1/Å) of any
@@ -228,9 +227,8 @@ def pme_error(
         twice[-1] = 1.0
     left = float((wrong * twice).sum()) / (volume * abs(np.linalg.det(proxy)))
     beyond = k_space_error(charges, alpha, k_cutoff_of_count(int(np.prod(grid)), volume), volume)
-    return float(
-        np.hypot(sqrt(charges.square / charges.count * max(left, 0.0)), beyond)
-    )  # rounding can be negative
+    # rounding can be negative
+    return float(np.hypot(sqrt(charges.square / charges.count * max(left, 0.0)), beyond))
 
 
 def fft_size(least: float) -> int:
@@ -293,8 +291,10 @@ def fastest_cutoff(
     charges: Charges, cell: np.ndarray, longest: float, error: float, filled: float
 ) -> float | None:
     """The real-space cutoff (Å), at most `longest`, with which PME is fastest if real and
-    reciprocal space each have this error; None if no cutoff reaches it. filled : see
-    `filled_fraction`"""
+    reciprocal space each have this error; None if no cutoff reaches it.
+
+    filled : see `filled_fraction`
+    """
     volume, cutoffs = abs(float(np.linalg.det(cell))), np.arange(SHORTEST_CUTOFF, longest, 0.5)
 
     @cache

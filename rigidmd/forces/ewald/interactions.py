@@ -72,9 +72,8 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
         return Settings(numbers, [])
     accuracy = forces.ewald_accuracy or ACCURACY
     filled = composition.filled
-    part = accuracy * sqrt(
-        filled / 2
-    )  # of the real-space and of the reciprocal error, at the mean density
+    # of the real-space and of the reciprocal error, at the mean density
+    part = accuracy * sqrt(filled / 2)
     free = (forces.ewald_cutoff_A, forces.ewald_alpha_per_A, forces.pme_order, forces.pme_grid) == (
         None,
     ) * 4

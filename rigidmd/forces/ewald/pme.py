@@ -80,9 +80,11 @@ class PmeMesh(NamedTuple):
     position: np.ndarray  # (s, 3)
     force: np.ndarray  # (s, 3)
     corner: np.ndarray  # (s, 3) int32 first grid point to which a site is spread
-    offset: (
-        np.ndarray
-    )  # (s, 4) position of a site minus corner minus 1/2, in grid cells; its charge
+    # (s, 4) position of a site minus corner minus 1/2, in grid cells; its charge
+    offset: np.ndarray
+    # (blocks, n_a) of the sites of a block: how many have their corner in a plane; then where in
+    # `order` the next one goes
+    next_of_plane: np.ndarray
     order: np.ndarray  # (s,) int32 sites sorted by the plane of their corner
     first: np.ndarray  # (n_a + 1,) plane p has sites order[first[p]] ... order[first[p + 1] - 1]
     grid: np.ndarray  # (n_a, n_b + order - 1, n_c + width) charges, then potential
@@ -131,6 +133,7 @@ class Pme(NamedTuple):
             force=np.zeros((s, 3)),
             corner=np.zeros((s, 3), np.int32),
             offset=np.zeros((s, 4), kind),
+            next_of_plane=np.zeros((blocks, grid[0]), np.int64),
             order=np.zeros(s, np.int32),
             first=np.zeros(grid[0] + 1, np.int64),
             grid=np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind),
@@ -179,7 +182,8 @@ class PmeWorkspace(NamedTuple):
                 (self.code, *content, into.state),
             ),
             Pass("positions in grid cells", _scale_positions, content, blocks),
-            Pass("sort sites by plane", _sort_sites, (*content, into.status)),
+            Pass("first site of each plane", _find_first_sites, (mesh, into.status)),
+            Pass("sort sites by plane", _sort_sites, (mesh,), blocks),
             Pass("charges on the grid, transform of planes", _spread_charges, content, blocks),
             Pass(
                 "transform across planes, times influence",
@@ -260,9 +264,10 @@ def _set_influence(arguments, block):
 
 @task(count_references=False)
 def _scale_positions(arguments, block):
-    """Positions of the sites of a block in grid cells."""
+    """Positions of the sites of a block in grid cells, and their number in each plane."""
     _smooth, charge, _spline, mesh = load_arguments(arguments)
     mesh.not_finite[block] = False
+    mesh.next_of_plane[block] = 0
     r, b = mesh.position, mesh.reciprocal
     for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
         for d in range(3):
@@ -275,29 +280,37 @@ def _scale_positions(arguments, block):
             mesh.offset[i, d] = x - corner - 0.5
             mesh.corner[i, d] = corner if corner < mesh.points[d] else 0
         mesh.offset[i, 3] = charge[i]
+        mesh.next_of_plane[block, mesh.corner[i, 0]] += 1
 
 
 @task(count_references=False)
-def _sort_sites(arguments, block):
-    """Sort sites by the plane of their corner, if all are on the grid; the sort is stable."""
-    _smooth, _charge, _spline, mesh, status = load_arguments(arguments)
+def _find_first_sites(arguments, block):
+    """Where the sites of each plane and block begin in the order by planes, if all are on the
+    grid."""
+    mesh, status = load_arguments(arguments)
     for b in range(len(mesh.not_finite)):
         if mesh.not_finite[b]:
             status[0] = NOT_FINITE
             return
-    first = mesh.first
-    first[:] = 0
-    for i in range(len(mesh.order)):
-        first[mesh.corner[i, 0] + 1] += 1
-    for plane in range(1, len(first)):
-        first[plane] += first[plane - 1]
-    for i in range(len(mesh.order)):
+    begin = 0
+    for plane in range(mesh.points[0]):
+        mesh.first[plane] = begin
+        for b in range(len(mesh.not_finite)):
+            count = mesh.next_of_plane[b, plane]
+            mesh.next_of_plane[b, plane] = begin
+            begin += count
+    mesh.first[mesh.points[0]] = begin
+
+
+@task(count_references=False)
+def _sort_sites(arguments, block):
+    """Enter the sites of a block into the order by planes; the sort is stable."""
+    (mesh,) = load_arguments(arguments)
+    following = mesh.next_of_plane[block]
+    for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
         plane = mesh.corner[i, 0]
-        mesh.order[first[plane]] = i
-        first[plane] += 1
-    for plane in range(len(first) - 1, 0, -1):
-        first[plane] = first[plane - 1]
-    first[0] = 0
+        mesh.order[following[plane]] = i
+        following[plane] += 1
 
 
 @chosen_by_type(inline=True, count_references=False)

@@ -41,23 +41,19 @@ class Clusters(NamedTuple):
     slot: np.ndarray  # (s,) int32 the slot of each site
     boxes: np.ndarray  # (s, 3) int32 number of edges by which a site is shifted into the brick
     origin: np.ndarray  # (4 clusters,) x, y, z, 0 of each cluster, in the box, Å
-    local: (
-        np.ndarray
-    )  # (3 slots,) positions relative to the origins, Å; scratch while sites are sorted
-    scratch: (
-        np.ndarray
-    )  # (3 slots,) memory of the next three, which are used only while a list is built
+    # (3 slots,) positions relative to the origins, Å; scratch while sites are sorted
+    local: np.ndarray
+    # (3 slots,) memory of the next three, which are used only while a list is built
+    scratch: np.ndarray
     order: np.ndarray  # (slots,) int32 the site in each slot
     group: np.ndarray  # (slots,) int32 group of the site in each slot
     half_square: np.ndarray  # (slots,) half the squares of `reference` as vectors, Å²
     reference: np.ndarray  # (3 slots,) the positions for which the sites were sorted, as `local`
     moved: np.ndarray  # (slots,) distance of each site from there, Å
-    largest_displacement: (
-        np.ndarray
-    )  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
-    extent: (
-        np.ndarray
-    )  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a block of molecules, Å
+    # (blocks,) the largest displacement, Å; infinite if it is too large for a list
+    largest_displacement: np.ndarray
+    # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a block of molecules, Å
+    extent: np.ndarray
 
 
 def clusters_of(sites: int, dtype: type) -> Clusters:
@@ -253,10 +249,11 @@ def set_origins(arguments, block):
     order, origin, reference = clusters.order, clusters.origin, clusters.reference
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
         base = _ahead_in_brick(clusters, cell, sites, state, order[width * c], lead)
+        # relative to the first site, so that float32 is accurate
         low, high = (
             (0.0, 0.0, 0.0),
             (0.0, 0.0, 0.0),
-        )  # relative to the first site, so that float32 is accurate
+        )
         for slot in range(width * c, width * (c + 1)):
             at = _ahead_in_brick(clusters, cell, sites, state, order[slot], lead)
             x, y, z = at[0] - base[0], at[1] - base[1], at[2] - base[2]

@@ -58,31 +58,24 @@ class PairList(NamedTuple):
     multiple: np.ndarray  # (IMAGES, 3) int32 edges a, b, c by which each image is displaced
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
     slack: np.ndarray  # (1,) the largest displacement of an image since the list was built, Å
-    row_end: (
-        np.ndarray
-    )  # (rows,) int32 end in entries[b] of row r (slots 2 r and 2 r + 1); row r + 1 begins there
-    beyond: (
-        np.ndarray
-    )  # (rows, SHELLS) uint8 number of entries at the end of a row that are beyond shell k
+    # (rows,) int32 end in entries[b] of row r (slots 2 r and 2 r + 1); row r + 1 begins there
+    row_end: np.ndarray
+    # (rows, SHELLS) uint8 number of entries at the end of a row that are beyond shell k
+    beyond: np.ndarray
     entries: np.ndarray  # (blocks, capacity) uint16
     masked_end: np.ndarray  # (rows,) int32 end of each row in masked[b]
-    masked: (
-        np.ndarray
-    )  # (blocks, capacity, 2) int32 entry; lanes that interact with each site, MASK_BITS bits each
+    # (blocks, capacity, 2) int32 entry; lanes that interact with each site, MASK_BITS bits each
+    masked: np.ndarray
     neighbor_end: np.ndarray  # (clusters,) int32
     neighbors: np.ndarray  # (blocks, capacity) int32
-    origin_vector: (
-        np.ndarray
-    )  # (blocks, 3 capacity) to the origin of c from a neighbour, Å; (blocks, 0) in float64
-    needed: (
-        np.ndarray
-    )  # (blocks, 5) capacity expected or needed: ENTRIES, MASKED, ... NEIGHBORS_OF_ONE
-    counters: (
-        np.ndarray
-    )  # (4,) valid (0 or 1), number of builds, status of the last update, number of images
-    times: (
-        np.ndarray
-    )  # (2,) time of the build, NaN before the first; lead time of the references; ps
+    # (blocks, 3 capacity) to the origin of c from a neighbour, Å; (blocks, 0) in float64
+    origin_vector: np.ndarray
+    # (blocks, 5) capacity expected or needed: ENTRIES, MASKED, ... NEIGHBORS_OF_ONE
+    needed: np.ndarray
+    # (4,) valid (0 or 1), number of builds, status of the last update, number of images
+    counters: np.ndarray
+    # (2,) time of the build, NaN before the first; lead time of the references; ps
+    times: np.ndarray
 
 
 @kernel(inline=True)
@@ -175,12 +168,10 @@ def _expected_neighbors(cell: np.ndarray, count: int, radius: float, size: float
         return 0.0
     cluster = volume / count
     edge = size * np.cbrt(cluster)
-    near = (
-        edge**3 + 6 * edge**2 * radius + 3 * pi * edge * radius**2 + 4 / 3 * pi * radius**3
-    )  # Steiner's formula
-    return (
-        min(0.42 * near / cluster, count / 2) + 1
-    )  # a sixth less than half: measured, cubes have corners
+    # Steiner's formula
+    near = edge**3 + 6 * edge**2 * radius + 3 * pi * edge * radius**2 + 4 / 3 * pi * radius**3
+    # a sixth less than half: measured, cubes have corners
+    return min(0.42 * near / cluster, count / 2) + 1
 
 
 def _expected_window(cell: np.ndarray, count: int, blocks: int, radius: float) -> int:
@@ -188,9 +179,8 @@ def _expected_window(cell: np.ndarray, count: int, blocks: int, radius: float) -
     volume = cell.diagonal().prod()
     if volume == inf or radius == inf:
         return 0
-    layers = (radius + 2 * np.cbrt(volume / count)) / cell[
-        0, 0
-    ]  # clusters are sorted along x first
+    # clusters are sorted along x first
+    layers = (radius + 2 * np.cbrt(volume / count)) / cell[0, 0]
     return min(count - count // blocks, ceil(count * min(layers, 0.5)))
 
 

@@ -61,24 +61,21 @@ from rigidmd.forces.terms import (
     WITH_VIRIALS,
     Evaluation,
     Setup,
+    trait,
 )
 
 
 class PairSums(NamedTuple):
-    forces: (
-        np.ndarray
-    )  # (3 slots,) on each site, from the rows of its block, then from all; as Clusters.local
-    forces_behind: (
-        np.ndarray
-    )  # (blocks, capacity) forces from the rows of a block on the clusters behind it
-    force_at_change: (
-        np.ndarray
-    )  # (blocks, 3 lanes) force on a row at the last change of image, see `_change_image`
+    # (3 slots,) on each site, from the rows of its block, then from all; as Clusters.local
+    forces: np.ndarray
+    # (blocks, capacity) forces from the rows of a block on the clusters behind it
+    forces_behind: np.ndarray
+    # (blocks, 3 lanes) force on a row at the last change of image, see `_change_image`
+    force_at_change: np.ndarray
     tallies: np.ndarray  # (blocks, 10)
     virial: np.ndarray  # see `virial_buffer`
-    arranged: (
-        np.ndarray
-    )  # (1,) the build of the list for which the numbers of the potential are in the slots
+    # (1,) the build of the list for which the numbers of the potential are in the slots
+    arranged: np.ndarray
 
 
 class PairForces(NamedTuple):
@@ -91,7 +88,7 @@ class PairForces(NamedTuple):
     @property
     def acts_on_charges(self) -> bool:
         """Whether its potential is an interaction of charges."""
-        return getattr(self.potential, "acts_on_charges", False)
+        return trait(self.potential, "acts_on_charges")
 
     def workspace(self, setup: Setup) -> "PairWorkspace":
         potential, sites = self.potential, self.sites

@@ -48,16 +48,13 @@ class Scratch(NamedTuple):
     high: np.ndarray  # (3,)
     # (capacity,) families of clusters near some clusters, as IMAGES * family + number of the image
     family: np.ndarray
-    candidate: (
-        np.ndarray
-    )  # (capacity + arity,) images of clusters that may be neighbours; finally the neighbours
+    # (capacity + arity,) images of clusters that may be neighbours; finally the neighbours
+    candidate: np.ndarray
     close: np.ndarray  # (capacity,) those of them that may need a mask
-    kind: (
-        np.ndarray
-    )  # ((capacity + 1) * rows,) uint8 kind of candidate n in row k of the cluster, at n * rows + k
-    kind_end: (
-        np.ndarray
-    )  # (rows, KINDS) uint32 entries of each kind, then the next index (unsigned: not tested)
+    # ((capacity + 1) * rows,) uint8 kind of candidate n in row k of the cluster, at n * rows + k
+    kind: np.ndarray
+    # (rows, KINDS) uint32 entries of each kind, then the next index (unsigned: not tested)
+    kind_end: np.ndarray
     sorted: np.ndarray  # (rows of a cluster, capacity) uint16 entries in the order of their kinds
     filled: np.ndarray  # (5,) of the block so far, see PairList.needed
 
@@ -311,9 +308,8 @@ def _find_kinds_of_candidate(pairs, c, kind, candidate, at):
     if pairs.cutoff < inf:
         distance = square_root(max(pairwise_minimum(nearest2), 0.0))
         scale = pairs.shells_per_A
-        shell = distance * (scale * (1 - ROUNDING)) + (
-            1 - pairs.cutoff * scale
-        )  # 1 to 2 in the first beyond
+        # 1 to 2 in the first beyond
+        shell = distance * (scale * (1 - ROUNDING)) + (1 - pairs.cutoff * scale)
         kinds = min(max(shell, 0.0), float(OUT_OF_REACH))
     store_even_lanes(kind, at, kinds)
     return mask_bits(kinds < float(OUT_OF_REACH)) != 0, mask_bits(nearest2 <= pairs.reach2) != 0
@@ -346,9 +342,8 @@ def _mark_entries_to_mask(pairs, c, kind, candidate, at):
             mates = mates | (group == clusters.group[width * other + lane])
         special = mask_bits(mates)
     for row in range(width // 2):
-        kind[at + row] = (
-            NEEDS_MASK if special >> 2 * row & 3 else kind[at + row]
-        )  # always written: no branch
+        # always written: no branch
+        kind[at + row] = NEEDS_MASK if special >> 2 * row & 3 else kind[at + row]
 
 
 @kernel(inline=True)
@@ -381,9 +376,8 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     if other == c:
         left_out |= (2 << (i - width * c)) - 1  # each pair once
     if other == len(clusters.origin) // 4 - 1:
-        left_out |= all_lanes ^ (
-            all_lanes >> (len(clusters.order) - len(pairs.group))
-        )  # slots without a site
+        # slots without a site
+        left_out |= all_lanes ^ (all_lanes >> (len(clusters.order) - len(pairs.group)))
     meets = all_lanes & ~left_out
     return meets if mask_bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
 

@@ -55,12 +55,10 @@ class BodySites(NamedTuple):
     first: np.ndarray  # (n + 1,) int32 molecule m has sites first[m] ... first[m + 1] - 1
     molecule: np.ndarray  # (s,) int32 molecule of each site
     kind: np.ndarray  # (n,) int32 index in offset_body of the first site of each molecule
-    offset_body: (
-        np.ndarray
-    )  # (rows, 3) from the centre of mass, body frame, Å; stored once for each species
-    inverse_inertia: (
-        np.ndarray
-    )  # (rows, 3) of the molecule of each row, 1/(u Å²); 0 if the moment is 0
+    # (rows, 3) from the centre of mass, body frame, Å; stored once for each species
+    offset_body: np.ndarray
+    # (rows, 3) of the molecule of each row, 1/(u Å²); 0 if the moment is 0
+    inverse_inertia: np.ndarray
 
     def offsets(self) -> np.ndarray:
         """Offsets (s, 3) of all sites, body frame, Å."""
@@ -108,7 +106,9 @@ def sites_of(
 
 def exclusion_groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
     """Exclusion group of each site (s,): the molecule, or one group for all frozen molecules. Sites
-    of a group do not interact. frozen (n,) : whether each molecule is frozen
+    of a group do not interact.
+
+    frozen (n,) : whether each molecule is frozen
     """
     if not frozen.any():
         return sites.molecule

@@ -211,9 +211,8 @@ def _find_images(pairs):
     cell, multiple = pairs.cell, pairs.multiple
     copy(cell, pairs.built)
     pairs.slack[0] = 0.0
-    radius = min(
-        pairs.cutoff + pairs.skin + _max_slack(pairs), _shortest(cell)
-    )  # rounding may exceed it
+    # rounding may exceed it
+    radius = min(pairs.cutoff + pairs.skin + _max_slack(pairs), _shortest(cell))
     multiple[0, 0] = multiple[0, 1] = multiple[0, 2] = 0
     found = 1
     for z in range(-1, 2):

@@ -36,9 +36,8 @@ class CustomPotential(NamedTuple):
     shared: tuple  # what a formula needs besides its parameters, the same for all kinds
     kind: np.ndarray  # (s,) kind of each site
     parameters: np.ndarray  # (parameters, kinds, kinds)
-    terms_of_kinds: (
-        np.ndarray
-    )  # (4, kinds, kinds) see truncation.truncation_terms; 0 without interaction
+    # (4, kinds, kinds) see truncation.truncation_terms; 0 without interaction
+    terms_of_kinds: np.ndarray
     interacts: np.ndarray  # (kinds, kinds) 1 or 0
 
     def for_slots(self, slots: int, dtype: type) -> "CustomOneKind | CustomManyKinds":
@@ -70,9 +69,8 @@ class CustomManyKinds(NamedTuple):
     formula: NamedTuple
     shared: tuple
     kind: np.ndarray  # (slots,)
-    table: (
-        np.ndarray
-    )  # (numbers kinds slots,) of a pair: whether it interacts, 4 truncation terms, parameters
+    # (numbers kinds slots,) of a pair: whether it interacts, 4 truncation terms, parameters
+    table: np.ndarray
     stride: int  # kinds slots
 
 
@@ -195,9 +193,8 @@ class Table(NamedTuple):
 
     first: float  # the least r², Å²
     per_step: float  # 1/(step of r²), 1/Å²
-    coefficients: (
-        np.ndarray
-    )  # (4 steps,) u Å²/ps²; of each step c0 ... c3, energy = sum of ck x^k, 0 <= x <= 1
+    # (4 steps,) u Å²/ps²; of each step c0 ... c3, energy = sum of ck x^k, 0 <= x <= 1
+    coefficients: np.ndarray
 
 
 class Tabulated(NamedTuple):

@@ -43,9 +43,8 @@ class Formula(NamedTuple):
 
     text: str  # for messages
     parameters: tuple[str, ...]  # names of the parameters of a pair of sites
-    numbers: Callable[
-        [Mapping[str, float]], tuple[float, ...]
-    ]  # the fields of `kind` from the parameters
+    # the fields of `kind` from the parameters
+    numbers: Callable[[Mapping[str, float]], tuple[float, ...]]
     radial: Callable[[Mapping[str, float]], Radial]  # of the parameters of a pair
     kind: type  # the NamedTuple class of the formula in compiled code
     shared: tuple = ()

@@ -91,9 +91,8 @@ class TabledScreening(NamedTuple):
     scale: float  # as in Screening
     energy: tuple[float, ...]
     density: float  # intervals per Å²
-    table: (
-        np.ndarray
-    )  # (TERMS INTERVALS,) float32, 1/Å³: coefficients of x^0 for all intervals, then of x^1, ...
+    # (TERMS INTERVALS,) float32, 1/Å³: coefficients of x^0 for all intervals, then of x^1, ...
+    table: np.ndarray
 
 
 def screening_of_lanes(

@@ -49,9 +49,8 @@ def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -
         u = sympy.Add(*(round(KJ_PER_MOL) * term for term in _terms(found, r)))
         hoisted, total = _hoisted(u, r)
         of: dict[sympy.Expr, sympy.Expr] = {}
-        force = sympy.Add(
-            *(-r * _derivative(term, r, of) for term in sympy.Add.make_args(total))
-        )  # force/r times r²
+        # force/r times r²
+        force = sympy.Add(*(-r * _derivative(term, r, of) for term in sympy.Add.make_args(total)))
         fields = sorted((total.free_symbols | force.free_symbols) - {r}, key=str)
         source = _source(energy, total, force, fields, r)
     except FormulaError:

@@ -161,18 +161,16 @@ def switch_correction_of(
     def over_square(x: np.ndarray) -> np.ndarray:
         square = truncation.cutoff**2 - truncation.start**2
         r = np.sqrt(truncation.start**2 + (x + 1) / 2 * square)
-        per_x = square / (
-            2 * (r + truncation.start) * (truncation.cutoff - truncation.start)
-        )  # t is per_x (x + 1)
+        # t is per_x (x + 1)
+        per_x = square / (2 * (r + truncation.start) * (truncation.cutoff - truncation.start))
         return per_x**2 * of_highest(per_x * (x + 1)) * r ** -(max(powers) + 2.0)
 
     x = np.linspace(-1, 1, 200)
     with np.errstate(all="ignore"):  # a switch that starts near 0 is too wide
         found = chebyshev.chebinterpolate(over_square, 2 * COEFFICIENTS[-1])
         largest = np.abs((x + 1) ** 2 * over_square(x)).max()
-    left_out = (
-        4 * np.abs(found[::-1]).cumsum()[::-1]
-    )  # at most, without this coefficient and those after it
+    # at most, without this coefficient and those after it
+    left_out = 4 * np.abs(found[::-1]).cumsum()[::-1]
     needed = int(np.argmax(left_out < CORRECTION_ERROR * largest))
     counts = [count for count in COEFFICIENTS if 0 < needed <= count]
     if not counts:

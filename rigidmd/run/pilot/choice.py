@@ -150,9 +150,8 @@ class _Search:
         self.target, self.error = target, error
         self.energy_walk: EnergyWalk | None = None
         self.time = system.span
-        self.slow_factor: dict[
-            str, float
-        ] = {}  # regular error in a longer pilot run over that in the short one
+        # regular error in a longer pilot run over that in the short one
+        self.slow_factor: dict[str, float] = {}
         self.measured: dict[str, Trial] = {}  # the last one of each integrator that has an error
         self._tried: dict[tuple[str, float, float | None], Trial] = {}
 
@@ -228,11 +227,10 @@ class _Search:
             else:
                 bad = trial.timestep
             if good is None:
-                step = (
-                    step / 2
-                    if trial.diverged
-                    else max(round_down(MARGIN * self.step_for(trial)), step / 4)
-                )
+                if trial.diverged:
+                    step = step / 2
+                else:
+                    step = max(round_down(MARGIN * self.step_for(trial)), step / 4)
                 continue
             step = min(MARGIN * self.step_for(good), longest)
             step = round_down(step if step < bad else sqrt(good.timestep * bad))
@@ -263,14 +261,13 @@ def choose(
     first = search.best()
     if first is None:
         least = min(search.measured.values(), key=lambda trial: getattr(trial, error), default=None)
-        reached = (
-            ""
-            if least is None
-            else (
+        if least is None:
+            reached = ""
+        else:
+            reached = (
                 f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g}"
                 f" {system.time_unit}"
             )
-        )
         raise SimulationError(
             f"no integrator keeps its error below {target:g} with any step tried{reached}"
         )
@@ -310,27 +307,31 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
     length = min(
         duration, LONG_PILOT_MAX * span, max(LONG_PILOT_MIN * span, LONG_PILOT_PART * duration)
     )
-    best, value, seen = first, search.expected(first), first
+    best, value, pilot_trial = first, search.expected(first), first
     for _ in range(CORRECTIONS):
-        if (found := search.best()) is None:
+        if (candidate := search.best()) is None:
             break
-        best, seen = found, search.trial(found.integrator, found.timestep, length)
+        best = candidate
+        pilot_trial = search.trial(candidate.integrator, candidate.timestep, length)
         name, step = best.integrator, best.timestep
-        if seen.diverged:
+        if pilot_trial.diverged:
             search.longest[name] = step / 2
             continue
         of_pilot = search.walk_square(name, step, length)
-        square = max(
-            seen.energy_rms**2, 2 * float(np.var(seen.energies))
-        )  # the error may not be 0 at the start
+        # the error may not be 0 at the start
+        square = max(pilot_trial.energy_rms**2, 2 * float(np.var(pilot_trial.energies)))
         value = sqrt(square + search.walk_square(name, step, duration) - of_pilot)
         if value <= (1 + SAFETY) / 2 * target:
             break
         regular = sqrt(max(square - of_pilot, best.energy_rms**2))
         slow = regular / (best.energy_rms or regular or 1.0)
         search.slow_factor[name] = max(1.2 * search.slow_factor.get(name, 1.0), slow)
-    pilot = seen.steps * seen.timestep * search.system.time_size
-    return best, value, f" (expected, from {seen.energy_rms:.1e} in a pilot of {pilot:.3g} ps)"
+    pilot = pilot_trial.steps * pilot_trial.timestep * search.system.time_size
+    return (
+        best,
+        value,
+        f" (expected, from {pilot_trial.energy_rms:.1e} in a pilot of {pilot:.3g} ps)",
+    )
 
 
 def round_down(step: float) -> float:

@@ -65,14 +65,16 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     """
     stage = system.scene.stages[k]
     target, steps = not_none(stage.bias_kT), {}
-    found, rate = stiffest_mode(system, state), mean_square_rate(system, state, k)
+    stiffest, rate = stiffest_mode(system, state), mean_square_rate(system, state, k)
     for integrator in BIAS:
         if integrator == "baoab" and not (
             stage.thermostat_is_open or stage.thermostat == "langevin"
         ):
             continue
         decided = _decided(stage, integrator, stage.timestep_fs)
-        stable = MAX_STABLE_FRACTION * stable_angle(decided.scheme) / found.rate if found else inf
+        stable = (
+            MAX_STABLE_FRACTION * stable_angle(decided.scheme) / stiffest.rate if stiffest else inf
+        )
         good = sqrt(target / (ALLOWANCE[integrator] * BIAS[integrator] * rate)) if rate > 0 else inf
         step = min(good, stable, stage.duration)
         steps[integrator] = round_down(step / FEMTOSECOND) if rate > 0 else stage.timestep_fs
@@ -106,8 +108,8 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
     fastest = (
         max(sum_ / n for sum_, n in zip(first, freedom, strict=True) if n) if freedom.total else 0.0
     )
-    if fastest == 0 and (found := stiffest_mode(system, state)) is not None:
-        fastest = found.rate**2  # the start is a minimum, where forces are 0
+    if fastest == 0 and (stiffest := stiffest_mode(system, state)) is not None:
+        fastest = stiffest.rate**2  # the start is a minimum, where forces are 0
     if not isfinite(fastest) or fastest <= 0:
         return 0.0
     dt = PILOT_STEP / sqrt(fastest)
@@ -168,12 +170,10 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
         update={"trajectory_steps": WARMING_STEPS}
     )
     now, _ = _acceptance(system, state, k, first)
-    found, rate, best = (
-        stiffest_mode(system, now),
-        mean_square_rate(system, now, k),
-        (0.0, stage, 0.0),
-    )
-    if found is None or rate == 0:
+    stiffest = stiffest_mode(system, now)
+    rate = mean_square_rate(system, now, k)
+    best = (0.0, stage, 0.0)
+    if stiffest is None or rate == 0:
         raise SimulationError(
             f"stages.{k}: nothing sets a step for integrator = 'auto'; name an integrator and a"
             " step"
@@ -181,7 +181,7 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
     for integrator in TRIED:
         for fraction in FRACTIONS:
             scheme = stage.with_integrator(integrator, 1.0).scheme
-            step = round_down(fraction * stable_angle(scheme) / found.rate / FEMTOSECOND)
+            step = round_down(fraction * stable_angle(scheme) / stiffest.rate / FEMTOSECOND)
             steps = stage.trajectory_steps or max(
                 1, round(RADIANS / sqrt(rate) / (step * FEMTOSECOND))
             )

@@ -106,9 +106,8 @@ def body_step_warnings(system: BodySystem) -> list[str]:
     """Warnings of a step that is unstable or inaccurate for the motion of a body at its start."""
     run, method = system.scene.run, system.method
     rate, angle = fastest_body_rate(system), stable_angle(method)
-    if (
-        not system.scene.watch.stable_step or rate == 0 or angle == inf
-    ):  # some solvers choose their own steps
+    # some solvers choose their own steps
+    if not system.scene.watch.stable_step or rate == 0 or angle == inf:
         return []
     moves = f"at its start the body swings or spins at {rate:.3g} rad/s"
     if run.timestep_s > angle / rate:

@@ -129,10 +129,10 @@ def _change(before: np.ndarray, after: np.ndarray) -> float:
 
 def _angular_momenta(state: State, mass: np.ndarray) -> np.ndarray:
     """Angular momenta (n, 3) of molecules about the origin, lab frame."""
-    whole = np.cross(state.position, mass[:, None] * state.velocity)
+    momenta = np.cross(state.position, mass[:, None] * state.velocity)
     if len(state.rotation):
-        whole += np.einsum("nij,nj->ni", state.rotation, state.angular_momentum_body)
-    return whole
+        momenta += np.einsum("nij,nj->ni", state.rotation, state.angular_momentum_body)
+    return momenta
 
 
 def body_trial_system(
@@ -162,44 +162,44 @@ def body_trial_system(
             )
             fits[name] = build_body(scene.model_copy(update={"run": changed}), applied)
         except SceneError as error:
+            # without advice
             reasons = (
                 re.split("[:;] use ", text.removeprefix("run: "))[0] for text in error.errors
-            )  # without advice
+            )
             refused[name] = "; ".join(reasons).replace(solver, "it")
     if not fits:
         build_body(scene, applied)  # raises the error
     system = fits["velocity_verlet"]
-    whole = min([span or run.duration_s, *system.breaks()])
+    duration = min([span or run.duration_s, *system.breaks()])
     engine, snapshots = system.engine(), [Snapshot(0.0, system.state)]
     state = engine.begin(system.state, system.method)
     for step in range(0, COARSE_STEPS, COARSE_STEPS // COARSE_SAMPLES):
         engine.advance(
-            state, system.method, whole / COARSE_STEPS, step + COARSE_STEPS // COARSE_SAMPLES
+            state, system.method, duration / COARSE_STEPS, step + COARSE_STEPS // COARSE_SAMPLES
         )
         snapshots.append(Snapshot(float(state.time[0]), state.copy()))
-    seen = motion(system, snapshots)
-    kinetic = float(np.abs(seen["kinetic"]).max()) or 1.0
+    columns = motion(system, snapshots)
+    kinetic = float(np.abs(columns["kinetic"]).max()) or 1.0
 
     def energy(engine, state) -> float:
         now = motion(system, [Snapshot(float(state.time[0]), state)])
         return float(now["energy"][0] - now["work"][0])
 
     def conserved_errors(state) -> dict[str, float]:
-        seen = motion(system, [snapshots[0], Snapshot(float(state.time[0]), state)])
+        columns_of_two = motion(system, [snapshots[0], Snapshot(float(state.time[0]), state)])
         return {
-            name: float(seen[f"{name}_error"][-1]) for name in seen.invariants if name != "energy"
+            name: float(columns_of_two[f"{name}_error"][-1])
+            for name in columns_of_two.invariants
+            if name != "energy"
         }
 
     methods = {}
     for name, fit in fits.items():
         scheme = (
-            scene.schemes[name] if name in scene.schemes else fit.method._replace(duration=whole)
+            scene.schemes[name] if name in scene.schemes else fit.method._replace(duration=duration)
         )
-        scheme = (
-            scheme
-            if isinstance(scheme, Solver) or scheme.exact_rotor
-            else scheme.with_rotor(run.rotor)
-        )
+        if not (isinstance(scheme, Solver) or scheme.exact_rotor):
+            scheme = scheme.with_rotor(run.rotor)
         methods[name] = Method(lambda _, fit=fit: fit.engine(), scheme)
     at_a_pole = system.rotates and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
     reference = max(
@@ -215,7 +215,7 @@ def body_trial_system(
         energy_note="",
         energy_size=kinetic,
         kinetic=kinetic,
-        span=whole,
+        span=duration,
         time_unit="s",
         time_size=1.0,
         length_unit="m",
@@ -230,7 +230,7 @@ def body_trial_system(
     speed = 0.0
     if system.rotates:  # of the body, and of the nutation by its wheels
         inertia, carried = system.moments(np.zeros(1))
-        spin = max(float(np.abs(seen[f"omega_body_{k}"]).max()) for k in (1, 2, 3))
+        spin = max(float(np.abs(columns[f"omega_body_{k}"]).max()) for k in (1, 2, 3))
         speed = max(spin, float(np.abs(carried).max() / inertia.max()))
     return trial_system, speed
 
@@ -251,10 +251,10 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
         if scheme.exact_rotor
         or scheme.order == 2  # the others need more forces, and are for bodies without that rotor
     }
-    found = choose(
+    choice = choose(
         trial_system, longest, stage.energy_error_kT, stage.trajectory_error, stage.duration
     )
-    return stage.with_integrator(found.integrator, found.timestep), found.reason
+    return stage.with_integrator(choice.integrator, choice.timestep), choice.reason
 
 
 #: Least fraction of a chosen step to which it is shortened to fit the interval of samples.
@@ -268,17 +268,17 @@ def choose_for_body(
     run = scene.run
     trial_system, _ = body_trial_system(scene, applied=applied)
     longest = {name: run.timestep_s for name in trial_system.methods if name in SCHEMES}
-    found = choose(trial_system, longest, run.energy_error, run.trajectory_error)
-    chosen, timestep = (
-        found.timestep,
-        _fit_step(found.timestep, run.duration_s, scene.output.interval_s),
-    )
+    choice = choose(trial_system, longest, run.energy_error, run.trajectory_error)
+    chosen = choice.timestep
+    timestep = _fit_step(choice.timestep, run.duration_s, scene.output.interval_s)
     fitted = (
         "" if timestep == chosen else f", shortened to {timestep:g} s to fit duration and samples"
     )
     none = {"energy_error": None, "trajectory_error": None}
-    changed = run.model_copy(update={"integrator": found.integrator, "timestep_s": timestep} | none)
-    reason = f"{found.integrator} at {chosen:g} s chosen{fitted}: {found.reason}"
+    changed = run.model_copy(
+        update={"integrator": choice.integrator, "timestep_s": timestep} | none
+    )
+    reason = f"{choice.integrator} at {chosen:g} s chosen{fitted}: {choice.reason}"
     return scene.model_copy(update={"run": changed}), reason
 
 

@@ -109,9 +109,8 @@ class Trial:
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
     orthogonality_error: float = np.nan
-    conserved_errors: dict[str, float] = field(
-        default_factory=dict
-    )  # largest relative ones, of other quantities
+    #: Largest relative ones, of other quantities
+    conserved_errors: dict[str, float] = field(default_factory=dict)
     tolerance: float | None = None  # of a method that chooses its steps
     failure: str = ""  # why it failed or diverged
     energies: list[float] = field(default_factory=list, repr=False)  # errors, from 0 at the start
@@ -153,9 +152,8 @@ class IntegratorAccuracy:
     trials: list[Trial]
     reference_steps: int
     reference_error: float  # of the reference, from a run with half as many steps
-    left_out: dict[str, str] = field(
-        default_factory=dict
-    )  # usual methods that were not tried -> reason
+    #: Usual methods that were not tried -> reason
+    left_out: dict[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<Precision of {self.trial_system.name}: {len(self.trials)} trials>"
@@ -171,11 +169,11 @@ class IntegratorAccuracy:
     def front(self, error: str) -> list[Trial]:
         """Trials that no other beats in both time and error (an attribute of `Trial`), fastest
         first."""
-        found: list[Trial] = []
+        fastest: list[Trial] = []
         for trial in sorted((t for t in self.trials if not t.diverged), key=lambda t: t.time):
-            if not found or getattr(trial, error) < getattr(found[-1], error):
-                found.append(trial)
-        return found
+            if not fastest or getattr(trial, error) < getattr(fastest[-1], error):
+                fastest.append(trial)
+        return fastest
 
     def time_for(self, integrator: str, error: str, target: float) -> "ReachedError | None":
         """Where an integrator reaches an error, between its trials; None if its shortest step is
@@ -201,13 +199,12 @@ class IntegratorAccuracy:
         longest = max(
             (STABLE_FRACTION if unstable else 1.0) * tried[0].timestep, tried[-1].timestep
         )
-        limit = (
-            ""
-            if step < longest
-            else "kept from its longest stable step"
-            if unstable
-            else "its longest step tried"
-        )
+        if step < longest:
+            limit = ""
+        elif unstable:
+            limit = "kept from its longest stable step"
+        else:
+            limit = "its longest step tried"
         step, up = float(min(step, longest)), tried[::-1]
         seconds = np.exp(
             np.interp(np.log(step), np.log([t.timestep for t in up]), np.log([t.time for t in up]))
@@ -238,8 +235,8 @@ def measure(
     extend : whether longer steps than the longest one of each integrator are tried, doubled until
         one fails
     """
-    most = max((trial.forces for trial in trials), default=0) or OBSERVATIONS * OBSERVATIONS
-    steps = 2 * -(-2 * most // system.methods[system.reference].force_evaluations)
+    most_forces = max((trial.forces for trial in trials), default=0) or OBSERVATIONS * OBSERVATIONS
+    steps = 2 * -(-2 * most_forces // system.methods[system.reference].force_evaluations)
     exact = final_state(system, steps)
     differences = state_difference(exact, final_state(system, steps // 2))
     result = IntegratorAccuracy(
@@ -250,19 +247,19 @@ def measure(
     if extend:
         result.trials = trials = _extended(system, trials, exact)
     good = [trial for trial in trials if not trial.diverged]
-    done, whole = 0.0, len(good) * repeats
+    done, total = 0.0, len(good) * repeats
     for _ in range(repeats):
         for trial in good:
             trial.seconds.append(time_span(system, trial))
             done += 1
-            progress(done / whole)
+            progress(done / total)
     return result
 
 
 def _extended(system: TrialSystem, trials: list[Trial], exact: State) -> list[Trial]:
     """The trials, and before those of each integrator trials with longer steps, doubled until one
     fails."""
-    found = []
+    extended = []
     for name, group in groupby(trials, key=lambda trial: trial.integrator):
         ladder = list(group)
         longest = max(ladder, key=lambda trial: trial.timestep)
@@ -270,8 +267,8 @@ def _extended(system: TrialSystem, trials: list[Trial], exact: State) -> list[Tr
             longest = trial_of(system, name, longest.steps // 2)
             measure_errors(system, longest, exact)
             ladder.insert(0, longest)
-        found += ladder
-    return found
+        extended += ladder
+    return extended
 
 
 def time_span(system: TrialSystem, trial: Trial) -> float:
@@ -343,11 +340,9 @@ def _begin_trial(system: TrialSystem, trial: Trial) -> tuple[Engine, State, Call
     """A new engine, a state at the start, and a function that advances it to a number of steps
     since the start."""
     method = system.methods[trial.integrator]
-    engine, scheme, dt = (
-        method.engine(trial.timestep),
-        method.scheme,
-        trial.timestep * system.time_size,
-    )
+    engine = method.engine(trial.timestep)
+    scheme = method.scheme
+    dt = trial.timestep * system.time_size
     if trial.tolerance is not None:
         scheme = scheme._replace(
             relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance

@@ -56,12 +56,10 @@ class AverageRun:
     timestep: float  # fs
     forces_per_ps: float
     seconds_per_ns: float | None = None
-    averages: dict[str, tuple[float, float]] = field(
-        default_factory=dict
-    )  # name -> mean, standard error
-    short: list[str] = field(
-        default_factory=list
-    )  # names of averages whose sampling is too short for an error
+    # name -> mean, standard error
+    averages: dict[str, tuple[float, float]] = field(default_factory=dict)
+    # names of averages whose sampling is too short for an error
+    short: list[str] = field(default_factory=list)
     failure: str = ""  # why there are none
 
     @property
@@ -216,9 +214,8 @@ def measure_averages(
         steps = timesteps or [ratio * stage.timestep_fs for ratio in LADDER_AROUND_SCENE]
         if found is not None and not timesteps:
             exact = [ratio * stable_angle(scheme) / found.rate / FEMTOSECOND for ratio in LADDER]
-            steps = [
-                round(step, 1 - floor(log10(step))) for step in exact
-            ]  # two digits, for tables and legends
+            # two digits, for tables and legends
+            steps = [round(step, 1 - floor(log10(step))) for step in exact]
         for step in sorted(set(steps)):
             run = AverageRun(
                 integrator, thermostat, step, scheme.force_evaluations / (step * FEMTOSECOND)

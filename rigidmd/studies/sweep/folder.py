@@ -5,12 +5,13 @@ import contextlib
 import hashlib
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict
 
 from rigidmd.core.files import writing
 from rigidmd.errors import OutputError, option
@@ -25,24 +26,18 @@ from rigidmd.io.folder import (
 )
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json
-from rigidmd.scene.validation import not_none
 
 MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
-STOP = "stop"  # while this file exists, points on other machines stop at their next observation
-FILES = (MANIFEST, TABLE, FIGURE, SCRIPT, STOP)
-SCHEMA = 1  # version of the format of the manifest
+FILES = (MANIFEST, TABLE, FIGURE, SCRIPT)
 State = Literal["waiting", "running", "finished", "interrupted", "failed"]
 SEED = "seed"  # the key whose values make replicas
 LONGEST = 120  # most letters of the name of a folder
-
-
-class ManifestVersion(BaseModel):
-    schema_: int = Field(alias="schema")
+STRICT = ConfigDict(strict=True, extra="forbid")
 
 
 @dataclass
 class SweepPoint:
-    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+    __pydantic_config__ = STRICT
 
     folder: str  # its name
     values: dict[str, Any]  # swept key -> value
@@ -52,13 +47,28 @@ class SweepPoint:
     message: str | None = None  # why it failed
     seconds: Bounded = 0.0  # run time of all attempts
 
+    def update_state(self, sweep: Path) -> None:
+        """Read the state from the folder of the point. A failed point keeps its state until it has
+        finished."""
+        folder = sweep / self.folder
+        with contextlib.suppress(OutputError):
+            summary = read_json(folder / SUMMARY, Summary) or Summary(interrupted=True)
+            is_same_run = self.ran_sha256 in (None, summary.scene_sha256)
+            if is_same_run and not summary.interrupted:
+                self.state, self.message = "finished", None
+                self.ran_sha256 = summary.scene_sha256
+                return
+        if self.state != "failed":
+            self.state = "interrupted" if (folder / MARKER).is_file() else "waiting"
+
 
 @dataclass
 class Manifest:
     """The scene, the keys and the points of a sweep."""
 
-    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+    __pydantic_config__ = STRICT
 
+    schema: Literal[1] = field(default=1, kw_only=True)  # version of the format
     name: str
     scene: str  # its file
     keys: dict[str, list[str]]  # swept key -> the keys that are set together with it, itself first
@@ -66,22 +76,43 @@ class Manifest:
     common: dict[str, Any]  # dotted key -> value of the scene, without the swept keys
     inputs: dict[str, str]  # dotted key -> SHA-256 of the files that all points read
     points: list[SweepPoint] = field(default_factory=list)
-    schema: int = SCHEMA
+    has_checkpoints: bool = True
+    folder: Path = field(default=Path(), init=False)  # is not in the file
 
-    def overrides(self, point: SweepPoint) -> dict[str, Any]:
-        """Dotted key -> value of a point, for `Scene.read`."""
-        return self.fixed | {
-            key: value for first, value in point.values.items() for key in self.keys[first]
-        }
+    def overrides(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Dotted key -> value, for `Scene.read`, at these values of the swept keys."""
+        swept = {key: value for first, value in values.items() for key in self.keys[first]}
+        return self.fixed | swept
+
+    def points_in(self, *states: State) -> list[SweepPoint]:
+        return [point for point in self.points if point.state in states]
+
+    @property
+    def unfinished(self) -> list[SweepPoint]:
+        return [point for point in self.points if point.state != "finished"]
 
     def combinations(self) -> list[tuple[dict[str, Any], list[SweepPoint]]]:
         """The values of all keys but `seed`, each with its points: its replicas, if the seed is
         swept."""
-        found: dict[str, tuple[dict[str, Any], list[SweepPoint]]] = {}
+        groups: dict[str, tuple[dict[str, Any], list[SweepPoint]]] = {}
         for point in self.points:
-            values = {key: value for key, value in point.values.items() if key != SEED}
-            found.setdefault(json.dumps(values), (values, []))[1].append(point)
-        return list(found.values())
+            values = without_seed(point.values)
+            groups.setdefault(json.dumps(values), (values, []))[1].append(point)
+        return list(groups.values())
+
+    def update_states(self) -> None:
+        for point in self.points:
+            point.update_state(self.folder)
+
+    def write(self) -> None:
+        """Write sweep.json as a whole. Raises OutputError."""
+        content = asdict(self)
+        del content["folder"]
+        write_json(self.folder / MANIFEST, content, indent=1)
+
+
+def without_seed(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if key != SEED}
 
 
 def is_sweep(folder: Path) -> bool:
@@ -89,79 +120,61 @@ def is_sweep(folder: Path) -> bool:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a sweep. Raises OutputError."""
-    path, remedy = folder / MANIFEST, f"; {option('force')} begins the sweep anew"
-    schema = read_json(path, ManifestVersion, remedy)
-    if schema is None:
+    """The manifest of a sweep, with the states that the folders of its points show. Raises
+    OutputError."""
+    remedy = f"; {option('force')} begins the sweep anew"
+    manifest = read_json(folder / MANIFEST, Manifest, remedy)
+    if manifest is None:
         raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
-    if schema.schema_ > SCHEMA:
-        versions = f"(version {schema.schema_} of the format; this one reads {SCHEMA})"
-        raise OutputError(f"{path}: was written by a later rigidmd {versions}")
-    found = not_none(read_json(path, Manifest, remedy))
-    names = [point.folder for point in found.points]
+    keys, points = manifest.keys, manifest.points
+    names = {point.folder for point in points if Path(point.folder).name == point.folder}
     problem = ""
-    if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len(
-        {*names}
-    ) < len(names):
+    if len(names - {"", ".", ".."}) < len(points):
         problem = "points with invalid names of folders"
-    if any(point.values.keys() != found.keys.keys() for point in found.points):
+    if any(point.values.keys() != keys.keys() for point in points):
         problem = "points without values of all keys"
-    if any(key not in together for key, together in found.keys.items()):
+    if any(key not in together for key, together in keys.items()):
         problem = "keys that are missing in their own groups"
     if problem:
+        path = folder / MANIFEST
         raise OutputError(f"{path} is not a valid manifest of a sweep: {problem}{remedy}")
     for name in names:
         check_inside(folder / name)
-    return found
-
-
-def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write sweep.json as a whole. Raises OutputError."""
-    write_json(folder / MANIFEST, asdict(manifest), indent=1)
+    manifest.folder = folder
+    manifest.update_states()
+    return manifest
 
 
 def clear_sweep(folder: Path, names: Iterable[str]) -> None:
     """Remove the files of a sweep, and the files of runs in folders of these names. Raises
     OutputError."""
-    for inner in [*(folder / name for name in names if Path(name).name == name), folder]:
-        if not inner.is_dir() or (inner.is_symlink() and inner != folder):
+    inner_folders = [folder / name for name in names if not (folder / name).is_symlink()]
+    for cleared in [*inner_folders, folder]:
+        if not cleared.is_dir():
             continue
-        with writing(inner, "cleared"):
-            for name in written_by_runs(inner):
-                for path in (inner / name, *offsets_of(inner / name)):
-                    path.unlink(missing_ok=True)
-            (inner / MARKER).unlink(missing_ok=True)
-            if inner != folder:
-                (inner / LOCK).unlink(missing_ok=True)
+        with writing(cleared, "cleared"):
+            for path in (cleared / name for name in written_by_runs(cleared)):
+                for written in (path, *offsets_of(path)):
+                    written.unlink(missing_ok=True)
+            (cleared / MARKER).unlink(missing_ok=True)
+            if cleared != folder:
+                (cleared / LOCK).unlink(missing_ok=True)
                 with contextlib.suppress(OSError):  # it holds other files
-                    inner.rmdir()
-
-
-def state_on_disk(folder: Path, point: SweepPoint) -> State:
-    """The state that the folder of a point shows: finished, interrupted, or waiting if nothing has
-    run there."""
-    inner = folder / point.folder
-    with contextlib.suppress(OutputError):
-        summary = read_json(inner / SUMMARY, Summary) or Summary(interrupted=True)
-        if not summary.interrupted and point.ran_sha256 in (None, summary.scene_sha256):
-            return "finished"
-    return "interrupted" if (inner / MARKER).is_file() else "waiting"
+                    cleared.rmdir()
 
 
 def short_keys(keys: Iterable[str]) -> dict[str, str]:
     """Key -> the shortest end that no other key has: temperature_K of stages.0.temperature_K."""
-    keys = list(keys)
-    found = {}
+    ends: dict[str, list[str]] = {}
     for key in keys:
         parts = key.split(".")
-        ends = (".".join(parts[-n:]) for n in range(1, len(parts) + 1))
-        alone = (
-            end
-            for end in ends
-            if not any(other != key and f".{other}".endswith(f".{end}") for other in keys)
-        )
-        found[key] = re.sub(r"[^\w.+\-]", "-", next(alone, key))
-    return found
+        ends[key] = [".".join(parts[k:]) for k in reversed(range(len(parts)))]
+    count = Counter(end for ends_of_key in ends.values() for end in ends_of_key)
+    short = {}
+    for key, ends_of_key in ends.items():
+        unique = next((end for end in ends_of_key if count[end] == 1), key)
+        short[key] = re.sub(r"[^\w.+\-]", "-", unique)
+    return short
 
 
 def value_name(value: Any) -> str:
@@ -174,27 +187,22 @@ def value_name(value: Any) -> str:
             return str(int(value))
         case int() | float():
             return repr(value)
-        case list() | tuple() if all(isinstance(one, int | float) for one in value):
+        case list() | tuple() if all(isinstance(number, int | float) for number in value):
             return "x".join(map(value_name, value))
     plain = re.sub(r"[^\w.+\-]", "-", str(value)).lstrip(".")
     if plain == value and len(plain) <= LONGEST // 3:
         return plain
-    return f"{plain[: LONGEST // 3]}-{hashlib.sha256(repr(value).encode()).hexdigest()[:6]}"
+    return f"{plain[: LONGEST // 3]}-{_short_digest(repr(value), 6)}"
+
+
+def _short_digest(text: str, length: int) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:length]
 
 
 def point_name(values: Mapping[str, Any], short: Mapping[str, str]) -> str:
     """The name of a point's folder: temperature_K=280_seed=1."""
     name = "_".join(f"{short[key]}={value_name(value)}" for key, value in values.items())
-    return (
-        name
-        if len(name) <= LONGEST
-        else f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-    )
-
-
-def combination_folder(folder: Path, values: Mapping[str, Any], short: Mapping[str, str]) -> Path:
-    """The folder of what the replicas of a combination of values have together."""
-    return folder / point_name(values, short) if values else folder
+    return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{_short_digest(name, 8)}"
 
 
 def describe_values(values: Mapping[str, Any], short: Mapping[str, str]) -> str:

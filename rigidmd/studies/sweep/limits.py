@@ -2,6 +2,7 @@
 .html."""
 
 import csv
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,19 +13,30 @@ from rigidmd.analysis.files import read_table
 from rigidmd.core.statistics import format_signed
 from rigidmd.engines.samples import COLUMNS
 from rigidmd.errors import SceneError
-from rigidmd.figures.style import INK, curve_style, open_axis, panel_grid, write_figure
+from rigidmd.figures.style import curve_style, write_figure
 from rigidmd.io.folder import SCENE, add_to_folder
-from rigidmd.io.write import Column, Table, nine_digits, with_error
+from rigidmd.io.write import Table, nine_digits
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, Together, extrapolate, means_of_runs
-from rigidmd.studies.sweep.folder import Manifest, combination_folder, describe_values, short_keys
-from rigidmd.studies.sweep.plan import update_state
-from rigidmd.studies.sweep.table import DRIFT, MAIN, SHORT, Measured, key_columns, table_of
+from rigidmd.studies.sweep.figure import draw_table
+from rigidmd.studies.sweep.folder import Manifest, describe_values, point_name, short_keys
+from rigidmd.studies.sweep.table import (
+    DRIFT,
+    MAIN,
+    SHORT,
+    Measured,
+    SweepRow,
+    key_cells,
+    report_of,
+    table_of,
+)
+from rigidmd.studies.sweep.table import Table as SweepTable
 from rigidmd.view.page import code, items, page, plain, section, table, wide, write_page
 
 OPTION = "--extrapolate"
 FILES = ("extrapolation.csv", "extrapolation.png", "extrapolation.html")
-MOST_PANELS, ACROSS = 12, 3
+MOST_PANELS = 12
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class Limit(NamedTuple):
@@ -39,8 +51,15 @@ class Limit(NamedTuple):
 
     def bias(self, step: float) -> tuple[float, float] | None:
         """Mean at a step less limit, with its error; None without a mean there."""
-        point = next((point for point in self.points if point.timestep == step), None)
-        return None if point is None else self.fit.bias(point)
+        return next((self.fit.bias(at) for at in self.points if at.timestep == step), None)
+
+    @property
+    def title(self) -> str:
+        return SHORT.get(self.quantity, self.quantity)
+
+    @property
+    def label(self) -> str:
+        return describe_values(self.values, short_keys(self.values))
 
 
 class Limits(NamedTuple):
@@ -54,68 +73,54 @@ class Limits(NamedTuple):
         return sorted({point.timestep for limit in self.limits for point in limit.points})
 
     @property
-    def title(self) -> str:
-        raised = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-        powers = dict.fromkeys(
-            f"dt{str(limit.fit.order).translate(raised)} ({limit.method})" for limit in self.limits
-        )
-        return f"averages at a step of 0, from errors of order {', '.join(powers)} in {self.key}"
+    def keys(self) -> list[str]:
+        return [*self.limits[0].values] if self.limits else []
 
-    def columns(self) -> list[Column]:
-        """The values of the other keys."""
-        return key_columns(self.limits[0].values) if self.limits else []
+    @property
+    def title(self) -> str:
+        orders = [(str(limit.fit.order).translate(RAISED), limit.method) for limit in self.limits]
+        powers = dict.fromkeys(f"dt{order} ({method})" for order, method in orders)
+        return f"averages at a step of 0, from errors of order {', '.join(powers)} in {self.key}"
 
     def as_text(self) -> Table:
         """For readers: limits, chi² over its degrees of freedom, the longest step of the fit, and
         biases."""
-        short = short_keys(self.limits[0].values) if self.limits else {}
-        found = [column._replace(header=short[column.header]) for column in self.columns()]
-        found += [
-            Column("average", lambda limit: SHORT.get(limit.quantity, limit.quantity)),
-            Column("limit", lambda limit: limit.fit.describe_limit()),
-            Column(
-                "chi²/dof",
-                lambda limit: (
-                    f"{limit.fit.chi2:.2g}/{limit.fit.freedom}" if limit.fit.freedom else None
-                ),
-            ),
-            Column("to (fs)", lambda limit: f"{limit.fit.longest:g}"),
-        ]
-        for step in self.steps:
+        short = short_keys(self.keys)
+        lines = []
+        for limit in self.limits:
+            fit = limit.fit
+            line = {short[key]: cell for key, cell in key_cells(limit.values).items()}
+            line["average"] = limit.title
+            line["limit"] = fit.describe_limit()
+            line["chi²/dof"] = f"{fit.chi2:.2g}/{fit.freedom}" if fit.freedom else None
+            line["to (fs)"] = f"{fit.longest:g}"
+            for step in self.steps:
+                bias = limit.bias(step)
+                line[f"bias at {step:g} fs"] = None if bias is None else format_signed(*bias)
+            lines.append(line)
+        return report_of(lines)
 
-            def bias(limit, step=step):
-                return (at := limit.bias(step)) and format_signed(*at)
-
-            found.append(Column(f"bias at {step:g} fs", bias))
-        return Table(found, self.limits)
-
-    def as_columns(self) -> Table:
-        """The table of extrapolation.csv."""
-
-        def digits(pair):
-            return pair and list(map(nine_digits, pair))
-
-        found = [*self.columns(), Column("average", lambda limit: limit.quantity)]
-        found += [
-            Column("integrator", lambda limit: limit.method),
-            Column("order", lambda limit: limit.fit.order),
-        ]
-        found += with_error(
-            "limit", lambda limit: digits((limit.fit.limit, limit.fit.limit_error)), "limit error"
-        )
-        found += [
-            Column(
-                "chi2", lambda limit: nine_digits(limit.fit.chi2) if limit.fit.freedom else None
-            ),
-            Column("degrees of freedom", lambda limit: limit.fit.freedom),
-            Column("longest step in fit (fs)", lambda limit: limit.fit.longest),
-        ]
-        for step in self.steps:
-            name = f"bias at {step:g} fs"
-            found += with_error(
-                name, lambda limit, step=step: digits(limit.bias(step)), f"{name} error"
-            )
-        return Table(found, self.limits)
+    def lines(self) -> list[dict[str, Any]]:
+        """The lines of extrapolation.csv."""
+        lines = []
+        for limit in self.limits:
+            fit = limit.fit
+            line = key_cells(limit.values)
+            line["average"] = limit.quantity
+            line["integrator"] = limit.method
+            line["order"] = fit.order
+            line["limit"] = nine_digits(fit.limit)
+            line["limit error"] = nine_digits(fit.limit_error)
+            line["chi2"] = nine_digits(fit.chi2) if fit.freedom else None
+            line["degrees of freedom"] = fit.freedom
+            line["longest step in fit (fs)"] = fit.longest
+            for step in self.steps:
+                name = f"bias at {step:g} fs"
+                bias, error = limit.bias(step) or (None, None)
+                line[name] = nine_digits(bias)
+                line[f"{name} error"] = nine_digits(error)
+            lines.append(line)
+        return lines
 
 
 def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
@@ -124,109 +129,88 @@ def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
     key : that key, or one that varies together with it; scene : of one of the points
     """
     first = next((first for first, together in manifest.keys.items() if key in together), None)
-    parts = key.split(".")
     stages = scene.stages if isinstance(scene, MolecularScene) else ()
-    named = [
-        k for k, stage in enumerate(stages) if len(parts) == 3 and parts[1] in (str(k), stage.label)
-    ]
-    last = max((k for k, stage in enumerate(stages) if not stage.is_minimisation), default=None)
-    problem = ""
+    last = max((k for k, stage in enumerate(stages) if not stage.is_minimisation), default=0)
+    label = stages[last].label if stages else ""
+    usual = f"stages.{last}.timestep_fs"
+    if first is not None and key in (usual, f"stages.{label}.timestep_fs"):
+        return first, last
     if first is None:
-        problem = (
-            "is not varied; this sweep varies"
-            f" {', '.join(k for keys in manifest.keys.values() for k in keys)}"
-        )
-    elif parts[0] != "stages" or parts[-1] != "timestep_fs" or not named:
+        varied = ", ".join(key for keys in manifest.keys.values() for key in keys)
+        problem = f"is not varied; this sweep varies {varied}"
+    elif key.startswith("stages.") and key.endswith(".timestep_fs"):
+        problem = f"is not the step of the stage whose averages are taken, the last one, {label}"
+    else:
         problem = "is not the time step of a stage of molecules"
-    elif last not in named:
-        problem = (
-            "is not the step of the stage whose averages are taken, the last one,"
-            f" {stages[last or 0].label}"
-        )
-    if problem or first is None:
-        advice = (
-            f"--set stages.{last or 0}.timestep_fs=1,2,4 {OPTION} stages.{last or 0}.timestep_fs"
-        )
-        raise SceneError(OPTION, [f"{key} {problem}; give it a key such as {advice}"])
-    return first, named[-1]
+    advice = f"give it a key such as --set {usual}=1,2,4 {OPTION} {usual}"
+    raise SceneError(OPTION, [f"{key} {problem}; {advice}"])
 
 
 @dataclass
-class _Group:
-    """Averages of the combinations that differ in the step alone."""
+class _Average:
+    """An average of the combinations that differ in the step alone."""
 
     values: dict[str, Any]  # of the other keys
+    quantity: str
     integrator: str
     order: int
-    #: Average -> step (fs) -> its value and error of each run.
-    runs: dict[str, dict[float, list[Measured]]] = field(default_factory=dict)
-    #: Average -> step -> its value of the runs together.
-    together: dict[str, dict[float, Together]] = field(default_factory=dict)
+    #: Step (fs) -> value and error of each run; -> value of the runs together.
+    runs: dict[float, list[Measured]] = field(default_factory=dict)
+    together: dict[float, Together] = field(default_factory=dict)
 
-    def names(self) -> list[str]:
-        return list(dict.fromkeys([*self.runs, *self.together]))
-
-    def steps(self, name: str) -> set[float]:
-        """The steps at which an average has a value."""
-        return self.runs.get(name, {}).keys() | self.together.get(name, {}).keys()
-
-    def is_constant(self, name: str) -> bool:
-        values = {value for found in self.runs.get(name, {}).values() for value, _ in found}
-        return len(values | {found.value for found in self.together.get(name, {}).values()}) == 1
-
-    def means(self, name: str) -> list[MeanAtStep]:
-        return means_of_runs(self.runs.get(name, {}), self.together.get(name, {}))
+    @property
+    def is_constant(self) -> bool:
+        values = {value for measured in self.runs.values() for value, _ in measured}
+        return len(values | {result.value for result in self.together.values()}) == 1
 
 
-def extrapolate_sweep(folder: Path, manifest: Manifest, key: str) -> Limits:
+def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
     """Extrapolate all averages of the logs of a sweep, and the values of analyses, to a step of 0.
 
     Values of analyses are those of replicas together, where they have been analysed together, else
     of single runs. Raises SceneError if the key is not a swept time step, OutputError.
     """
-    for point in manifest.points:
-        update_state(folder, point)
     limits, missing = [], []
-    for title, group in _groups(folder, manifest, key).items():
-        for column in group.names():
-            if column == DRIFT or group.is_constant(column):
-                continue
-            name = f"{title}: {column}" if title else column
-            if len(group.steps(column)) < 2:
-                missing.append(f"{name}: has values at one step only")
-            elif points := group.means(column):
-                fit = extrapolate(points, order=group.order)
-                limits.append(Limit(group.values, group.integrator, column, points, fit))
-            else:
-                missing.append(f"{name}: the runs are too short and too few for an error")
+    for average in _averages(manifest, key):
+        if average.quantity == DRIFT or average.is_constant:
+            continue
+        title = describe_values(average.values, short_keys(manifest.keys))
+        name = f"{title}: {average.quantity}" if title else average.quantity
+        points = means_of_runs(average.runs, average.together)
+        if len(average.runs) < 2:
+            missing.append(f"{name}: has values at one step only")
+        elif points:
+            fit = extrapolate(points, order=average.order)
+            limits.append(Limit(average.values, average.integrator, average.quantity, points, fit))
+        else:
+            missing.append(f"{name}: the runs are too short and too few for an error")
     return Limits(manifest.name, key, limits, missing)
 
 
-def _groups(folder: Path, manifest: Manifest, key: str) -> dict[str, _Group]:
-    """The averages of a sweep by a description of the values of the keys other than the step and
-    the seed."""
-    short, groups = short_keys(manifest.keys), {}
-    for row, (_, points) in zip(
-        table_of(folder, manifest, True).rows, manifest.combinations(), strict=True
-    ):
+def _averages(manifest: Manifest, key: str) -> Iterator[_Average]:
+    averages: dict[tuple[str, str], _Average] = {}
+    short = short_keys(manifest.keys)
+    rows = table_of(manifest, with_analyses=True).rows
+    for row, (_, points) in zip(rows, manifest.combinations(), strict=True):
         if not row.runs:
             continue
         point = next(point for point in points if point.state == "finished")
-        scene = Scene.read(folder / point.folder / SCENE)
+        scene = Scene.read(manifest.folder / point.folder / SCENE)
         first, k = step_key(manifest, key, scene)
         stage = scene.stages[k]  # pyright: ignore[reportAttributeAccessIssue]  (it has stages)
-        others = {name: value for name, value in row.values.items() if name != first}
-        group = _Group(others, stage.integrator, stage.scheme.order)
-        group = groups.setdefault(describe_values(others, short), group)
         step = float(row.values[first])
-        for column in dict.fromkeys(column for run in row.runs.values() for column in run):
-            found = [run[column] for run in row.runs.values() if column in run]
-            group.runs.setdefault(column, {})[step] = found
+        others = {name: value for name, value in row.values.items() if name != first}
+        together = {}
         if len(points) > 1:
-            where = combination_folder(folder, row.values, short)
-            for column, value in _values_together(where).items():
-                group.together.setdefault(column, {})[step] = value
-    return groups
+            together = _values_together(manifest.folder / point_name(row.values, short))
+        measured = {column: None for run in row.runs.values() for column in run}
+        for column in measured | together:
+            average = _Average(others, column, stage.integrator, stage.scheme.order)
+            average = averages.setdefault((describe_values(others, short), column), average)
+            average.runs[step] = [run[column] for run in row.runs.values() if column in run]
+            if column in together:
+                average.together[step] = together[column]
+    yield from averages.values()
 
 
 def _values_together(folder: Path) -> dict[str, Together]:
@@ -240,75 +224,60 @@ def _values_together(folder: Path) -> dict[str, Together]:
     }
 
 
-def write_limits(folder: Path, found: Limits, command: str) -> list[str]:
+def write_limits(folder: Path, limits: Limits, command: str) -> list[str]:
     """Write table, figure and page of limits; the names of the files. Raises OutputError."""
-    if not found.limits:
+    if not limits.limits:
         return []
     add_to_folder(folder, FILES)
-    found.as_columns().write(folder / FILES[0], csv.QUOTE_NONNUMERIC)
-    write_figure(folder / FILES[1], lambda: _figure(found), f"{found.name}: {found.title}")
-    write_page(folder / FILES[2], lambda: _page(found, command))
+    report_of(limits.lines()).write(folder / FILES[0], csv.QUOTE_NONNUMERIC)
+    write_figure(folder / FILES[1], lambda: _figure(limits), f"{limits.name}: {limits.title}")
+    write_page(folder / FILES[2], lambda: _page(limits, command))
     return [name for name in FILES if (folder / name).is_file()]
 
 
-def _page(found: Limits, command: str) -> str:
+def _page(limits: Limits, command: str) -> str:
     note = "mean = limit + slope · dt^order, up to the longest step that chi² allows (column `to`)"
-    drawn = "means over the time step, and their limits"
-    return page(
-        f"{found.name}: averages at a step of 0",
-        [
-            f'<p class="faint">{plain(found.title)}</p>',
-            section(
-                "Limits and biases", table(*found.as_text().shown()), items([note, *found.missing])
-            ),
-            section("Means against the time step", wide(_figure(found), "extrapolation", drawn)),
-            section("How to repeat it", code(command)),
-        ],
-    )
+    rows = table(*limits.as_text().shown())
+    drawn = wide(_figure(limits), "extrapolation", "means over the time step, and their limits")
+    sections = [
+        f'<p class="faint">{plain(limits.title)}</p>',
+        section("Limits and biases", rows, items([note, *limits.missing])),
+        section("Means against the time step", drawn),
+        section("How to repeat it", code(command)),
+    ]
+    return page(f"{limits.name}: averages at a step of 0", sections)
 
 
-def _figure(found: Limits):
+def _figure(limits: Limits):
     """A panel for each of the main averages: means with error bars, the fit, and the limit with its
     error at 0."""
-    of_log = {column.header for column in COLUMNS.values()}
+    of_log = [column.header for column in COLUMNS.values()]
 
-    def rank(name):
+    def rank(name: str) -> int:
         return MAIN.index(name) if name in MAIN else len(MAIN) + (name in of_log)
 
-    shown = sorted(dict.fromkeys(limit.quantity for limit in found.limits), key=rank)[:MOST_PANELS]
-    figure, axes = panel_grid(len(shown), ACROSS, 3.7, 2.8, 0.5)
-    short = short_keys(found.limits[0].values)
-    labels = list(dict.fromkeys(describe_values(limit.values, short) for limit in found.limits))
-    handles = {}
-    for axis, name in zip(axes, shown, strict=True):
-        for limit in (limit for limit in found.limits if limit.quantity == name):
-            label, fit = describe_values(limit.values, short), limit.fit
-            style = curve_style(labels.index(label)) | {
-                "ls": "none",
-                "ms": 4,
-                "capsize": 2.5,
-                "elinewidth": 0.9,
-            }
-            steps, means, errors = zip(*(point[1:] for point in limit.points), strict=True)
-            handles[label] = axis.errorbar(steps, means, errors, **style)
-            axis.errorbar([0], [fit.limit], [fit.limit_error], mfc="none", clip_on=False, **style)
-            at = np.linspace(0, fit.longest, 60)
-            slope = fit.slopes[""][0] if fit.slopes else 0.0
-            axis.plot(at, fit.limit + slope * at**fit.order, color=style["color"], lw=0.9)
-        axis.set_title(SHORT.get(name, name), loc="left", fontsize=9, color=INK)
-        axis.set_xlim(left=0)
-        axis.ticklabel_format(axis="y", useOffset=False)
-        open_axis(axis, labelsize=8)
-    for axis in axes[-ACROSS:]:
-        axis.set_xlabel("time step, fs", fontsize=9, color=INK)
-    if len(labels) > 1:
-        figure.legend(
-            handles.values(),
-            handles.keys(),
-            frameon=False,
-            fontsize=8,
-            loc="outside lower left",
-            ncols=3,
-            labelcolor=INK,
-        )
+    quantities = dict.fromkeys(limit.quantity for limit in limits.limits)
+    shown = sorted(quantities, key=rank)[:MOST_PANELS]
+    rows: dict[tuple[str, float], SweepRow] = {}
+    for limit in limits.limits:
+        for point in limit.points:
+            row = SweepRow({limits.key: point.timestep} | limit.values, {None: {}})
+            row = rows.setdefault((limit.label, point.timestep), row)
+            row.runs[None][limit.quantity] = point.mean, point.error
+    means = SweepTable(Path(), [limits.key, *limits.keys], list(rows.values()), shown)
+    figure = draw_table(means, shown, connected=False)
+    labels = list(dict.fromkeys(limit.label for limit in limits.limits))
+    for limit in limits.limits:
+        if limit.quantity in shown:
+            axis = figure.axes[shown.index(limit.quantity)]
+            _draw_limit(axis, limit.fit, curve_style(labels.index(limit.label)))
     return figure
+
+
+def _draw_limit(axis: Any, fit: BiasFit, style: dict[str, Any]) -> None:
+    bars = {"ls": "none", "ms": 4, "capsize": 2.5, "mfc": "none", "clip_on": False}
+    axis.errorbar([0], [fit.limit], [fit.limit_error], **style | bars)
+    step = np.linspace(0, fit.longest, 60)
+    slope = fit.slopes[""][0] if fit.slopes else 0.0
+    axis.plot(step, fit.limit + slope * step**fit.order, color=style["color"], lw=0.9)
+    axis.set_xlim(left=0)

@@ -5,7 +5,7 @@ import csv
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_frames
 from rigidmd.analysis.mean_force import NAME as MEAN_FORCE
@@ -16,21 +16,23 @@ from rigidmd.analysis.runs import Runs, as_runs
 from rigidmd.core.files import writing
 from rigidmd.errors import OutputError, RigidMDError
 from rigidmd.io.folder import add_to_folder
-from rigidmd.io.write import Column, Table, nine_digits, with_error
 from rigidmd.run.record import read_record
+from rigidmd.studies.sweep.figure import write_analyses_figure
 from rigidmd.studies.sweep.folder import (
-    SEED,
     Manifest,
-    combination_folder,
     describe_values,
+    point_name,
     read_manifest,
     short_keys,
-    state_on_disk,
 )
-from rigidmd.studies.sweep.table import SweepRow, key_columns, write_analyses_figure
+from rigidmd.studies.sweep.table import SweepRow, Table, measured_values, report_of
 from rigidmd.studies.sweep.windows import is_of_windows, write_mean_force
 
 ANALYSES = "analysis.csv"
+WINDOWS = "all windows"  # title of the combination of all windows of a restrained distance
+
+Progress = Callable[[float, str], object]
+Analyse = Callable[..., AnalysisOutput]
 
 
 class Combination(NamedTuple):
@@ -40,7 +42,6 @@ class Combination(NamedTuple):
     """
 
     title: str
-    values: dict[str, Any]
     runs: int
     results: list[AnalysisResult]
     failed: dict[str, str]
@@ -52,7 +53,7 @@ def analyse_sweep(
     names: list[str],
     start: float | None,
     viscosity: float | None,
-    progress: Callable[..., object],
+    progress: Progress,
     figures: str = FIGURES[0],
 ) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
@@ -62,147 +63,86 @@ def analyse_sweep(
     progress, figures : see `analyse_folder`
     """
     manifest = read_manifest(folder)
-    ready = {
-        point.folder for point in manifest.points if state_on_disk(folder, point) == "finished"
-    }
-    if not ready:
+    finished = manifest.points_in("finished")
+    if not finished:
         raise OutputError(
             f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` continues it"
         )
-    wants_mean_force = MEAN_FORCE in names or (not names and is_of_windows(manifest))
-    if names == [MEAN_FORCE]:
-        return [_mean_force(folder, manifest, ready, figures)]
-    names = [name for name in names if name != MEAN_FORCE]
-    selected(names)
-    short, found, seen = short_keys(manifest.keys), [], 0
+    combinations = []
+    if names != [MEAN_FORCE]:
+        others = [name for name in names if name != MEAN_FORCE]
+        selected(others)
+        analyse = partial(analyse_frames, names=others, viscosity=viscosity, figures=figures)
+        combinations = _analyse_combinations(manifest, start, analyse, progress)
+    if MEAN_FORCE in names or (not names and is_of_windows(manifest)):
+        result, files = write_mean_force(manifest, figures)
+        combinations.append(Combination(WINDOWS, len(finished), [result], {}, files))
+    if not any(combination.results for combination in combinations):
+        reasons = [reason for each in combinations for reason in each.failed.values()]
+        raise OutputError(
+            f"{folder}: no point can be analysed: {'; '.join(dict.fromkeys(reasons))}"
+        )
+    return combinations
+
+
+def _analyse_combinations(
+    manifest: Manifest, start: float | None, analyse: Analyse, progress: Progress
+) -> list[Combination]:
+    """Analyse the replicas of each combination, and write the table of all."""
+    short = short_keys(manifest.keys)
+    combinations = []
+    table = Table(manifest.folder, [], [], [], together=manifest.keys)
+    begun, count = 0, len(manifest.points)
     for values, points in manifest.combinations():
-        finished = [point.folder for point in points if point.folder in ready]
-        if not finished:
+        folders = [manifest.folder / point.folder for point in points if point.state == "finished"]
+        if not folders:
             continue
-        where = combination_folder(folder, values, short)
-        title = describe_values(values, short)
-        request = _Request(names, start, viscosity, figures)
+        together = manifest.folder / point_name(values, short)
 
-        def show(part, name, seen=seen):
-            return progress((seen + part) / len(ready), name)
+        def show(part: float, name: str, begun: int = begun) -> None:
+            progress((begun + part) / count, name)
 
-        found.append(_combine(folder, where, title, values, finished, request, show))
-        seen += len(finished)
-    if wants_mean_force:
-        found.append(_mean_force(folder, manifest, ready, figures))
-    if not any(combination.results for combination in found):
-        reasons = dict.fromkeys(
-            reason for combination in found for reason in combination.failed.values()
-        )
-        raise OutputError(f"{folder}: no point can be analysed: {'; '.join(reasons)}")
-    _write_table(
-        folder, manifest, [combination for combination in found if combination.title != WINDOWS]
-    )
-    return found
+        runs, output = _analyse_replicas(folders, together, start, analyse, show)
+        combinations.append(Combination(describe_values(values, short), runs, *output[1:]))
+        measured = measured_values(output.results)
+        table.rows.append(SweepRow(values, {None: measured}, runs))
+        table.columns += [header for header in measured if header not in table.columns]
+        begun += len(points)
+    table.keys[:] = table.rows[0].values
+    if table.columns:
+        add_to_folder(manifest.folder, [ANALYSES])
+        report_of(table.lines()).write(manifest.folder / ANALYSES, csv.QUOTE_NONNUMERIC)
+    if table.keys and len(table) > 1:
+        write_analyses_figure(table, manifest.name)
+    return combinations
 
 
-#: Title of the combination of all windows of a restrained distance.
-WINDOWS = "all windows"
-
-
-def _mean_force(folder: Path, manifest: Manifest, ready: set[str], figures: str) -> Combination:
-    """The potential of mean force of all windows, as the combination of all points."""
-    points = [point for point in manifest.points if point.folder in ready]
-    result, files = write_mean_force(folder, manifest, points, figures)
-    return Combination(WINDOWS, {}, len(points), [result], {}, files)
-
-
-class _Request(NamedTuple):
-    """See `analyse_folder`."""
-
-    names: list[str]
-    start: float | None
-    viscosity: float | None
-    figures: str
-
-
-def _combine(
-    folder: Path,
-    where: Path,
-    title: str,
-    values: dict[str, Any],
-    points: list[str],
-    request: _Request,
-    progress: Callable[[float, str], object],
-) -> Combination:
+def _analyse_replicas(
+    folders: list[Path], together: Path, start: float | None, analyse: Analyse, progress: Progress
+) -> tuple[int, AnalysisOutput]:
     """Analyses of each run of a combination, written into its folder; and of all of them together,
-    written into the folder `where` if there are several. What fails of one run or of one analysis
-    does not end the others."""
+    written into another folder if there are several. What fails of one run or of one analysis does
+    not end the others. Returns the number of runs too."""
     members: list[RigidFrames] = []
-    outputs: list[AnalysisOutput] = []
     failed: dict[str, str] = {}
-    names, start, viscosity, figures = request
+    output = AnalysisOutput({}, [], {}, [])
 
-    def show_part(k: int, of: str, part: float, name: str) -> None:
-        progress((k + part) / (len(points) + 1), f"{of}{name}")
+    def show(part: float, of: str, k: int, label: str) -> None:
+        progress(k + part, f"{label} {of}")
 
-    for k, point in enumerate(points):
-        show = partial(show_part, k, f"{point} ")
+    for k, folder in enumerate(folders):
         try:
-            frames = frames_of_folder(read_record(folder / point), start)
-            outputs.append(
-                analyse_frames(folder / point, as_runs(frames), names, viscosity, show, figures)
-            )
+            frames = frames_of_folder(read_record(folder), start)
+            shown = partial(show, k=k, label=folder.name)
+            output = analyse(folder, as_runs(frames), progress=shown)
         except RigidMDError as error:
-            failed[point] = str(error)
+            failed[folder.name] = str(error)
             continue
-        members.append(_thinned(frames, MOST_NUMBERS // len(points)))
-    if len(members) < 2:
-        (done,) = outputs or [AnalysisOutput({}, [], {}, [])]
-        return Combination(
-            title, values, len(members), done.results, failed | done.failed, done.files
-        )
-    with writing(where, "made"):
-        where.mkdir(exist_ok=True)
-    show = partial(show_part, len(points), "all runs: ")
-    done = analyse_frames(where, Runs(tuple(members)), names, viscosity, show, figures)
-    return Combination(title, values, len(members), done.results, failed | done.failed, done.files)
-
-
-def _thinned(frames: RigidFrames, most: int) -> RigidFrames:
-    """Evenly spaced frames with a largest number of numbers in their arrays."""
-    every = -(-frames.size // most)
-    return frames if every == 1 else frames[::every].copied()
-
-
-def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> None:
-    """analysis.csv: a line for each combination, its values with their errors; analysis.png: values
-    against a key."""
-    values = {
-        combination.title: {
-            (result.name, v.header): v for result in combination.results for v in result.values
-        }
-        for combination in found
-    }
-    columns = [*key_columns(found[0].values), Column("runs", lambda combination: combination.runs)]
-    for title in dict.fromkeys(
-        title for of_combination in values.values() for title in of_combination
-    ):
-
-        def measured(combination: Combination, title: tuple = title) -> list[float | None] | None:
-            value = values[combination.title].get(title)
-            return value and [nine_digits(value.value), nine_digits(value.error)]
-
-        columns += with_error(title[1], measured, f"{title[1]} error")
-    add_to_folder(folder, [ANALYSES])
-    Table(columns, found).write(folder / ANALYSES, csv.QUOTE_NONNUMERIC)
-    rows = [
-        SweepRow(
-            combination.values,
-            {
-                None: {
-                    header: (v.value, v.error)
-                    for (_, header), v in of.items()
-                    if v.value is not None
-                }
-            },
-        )
-        for combination, of in zip(found, values.values(), strict=True)
-    ]
-    if manifest.keys.keys() - {SEED} and len(rows) > 1:
-        write_analyses_figure(folder, manifest, rows)
+        every = -(-frames.size * len(folders) // MOST_NUMBERS)
+        members.append(frames if every == 1 else frames[::every].copied())
+    if len(members) > 1:
+        with writing(together, "made"):
+            together.mkdir(exist_ok=True)
+        shown = partial(show, k=len(folders) - 1, label="all runs:")
+        output = analyse(together, Runs(tuple(members)), progress=shown)
+    return len(members), output._replace(failed=failed | output.failed)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.io.formats.atoms import Atoms, Frame
+from rigidmd.formats.atoms import Atoms, Frame
 
 #: The system of a run, of a package above. All have `state`, `sites` with arrays `name`, `element`,
 #: `mass`, `molecule`, `residue_names`, `site_positions(state, wrapped)`, `site_velocities(state)`.
@@ -28,9 +28,8 @@ Encode = Callable[[Frame, int], bytes]
 class Format(NamedTuple):
     """A file format. What it cannot do is None or False."""
 
-    extensions: tuple[
-        str, ...
-    ]  # in lower case; the first is written. None if it is known by its content only
+    #: In lower case; the first is written. None if it is known by its content only
+    extensions: tuple[str, ...]
     name: str = ""  # in messages; default: its extensions
 
     # As a structure. For each structure in a text `read` returns a function that returns its atoms;
@@ -94,12 +93,10 @@ BY_EXTENSION: dict[str, Format] = {}
 BY_CONTENT: list[Format] = []
 #: Default names of files of a run, of the topology of a body, with bonds, and of the `ase.Atoms` of
 #: a scene.
-TRAJECTORY, TOPOLOGY, BODY_TOPOLOGY, STRUCTURE = (
-    "trajectory.xtc",
-    "topology.gro",
-    "topology.pdb",
-    "atoms.xyz",
-)
+TRAJECTORY = "trajectory.xtc"
+TOPOLOGY = "topology.gro"
+BODY_TOPOLOGY = "topology.pdb"
+STRUCTURE = "atoms.xyz"
 
 
 def register(form: Format) -> None:

@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.io.formats import Format, System, register
-from rigidmd.io.formats.atoms import SAME_MASS, Atoms, Frame, names_of_types, structure_error
-from rigidmd.io.formats.bonds import charges, connections
-from rigidmd.io.formats.cells import make_whole
-from rigidmd.io.formats.frame_file import FrameFile
-from rigidmd.io.formats.through_mdanalysis import index_of
+from rigidmd.formats import Format, System, register
+from rigidmd.formats.atoms import SAME_MASS, Atoms, Frame, names_of_types, structure_error
+from rigidmd.formats.bonds import charges, connections
+from rigidmd.formats.cells import make_whole
+from rigidmd.formats.frame_file import FrameFile
+from rigidmd.formats.through_mdanalysis import index_of
 from rigidmd.mechanics.rotation import from_quaternion, to_quaternion
 
 #: Distance, Å, between particles at one position.
@@ -40,9 +40,8 @@ class Particles(NamedTuple):
     cell: np.ndarray | None  # (3, 3) rows a, b, c
     label: list[str]  # (N,) names of types
     body: np.ndarray  # (N,) number of the body; of the particle itself without a body
-    owner: (
-        np.ndarray
-    )  # (N,) index of the central particle of the body; of the particle itself without one
+    #: (N,) index of the central particle of the body; of the particle itself without one
+    owner: np.ndarray
     position: np.ndarray  # (N, 3) lab frame, molecules whole
     orientation: np.ndarray  # (N, 4) wxyz, normalised
     velocity: np.ndarray | None  # (N, 3)
@@ -107,8 +106,8 @@ class GsdReader:
         self._file.close()
 
     def size(self, frame: int) -> int:
-        found = self._chunk(frame, "particles/N")
-        return 0 if found is None else int(found.flat[0])
+        count = self._chunk(frame, "particles/N")
+        return 0 if count is None else int(count.flat[0])
 
     def read(self, frame: int) -> Particles:
         """A frame, 0 for the first."""
@@ -163,10 +162,15 @@ class GsdReader:
         )
 
     def frame(self, k: int) -> Frame:
-        found = self.read(k)
-        where = found.position[found.sites]
+        snapshot = self.read(k)
+        where = snapshot.position[snapshot.sites]
         return Frame(
-            found.time, where, found.cell, found.site_velocities(), found.rotation(), found.step
+            snapshot.time,
+            where,
+            snapshot.cell,
+            snapshot.site_velocities(),
+            snapshot.rotation(),
+            snapshot.step,
         )
 
     @property
@@ -186,14 +190,14 @@ class GsdReader:
         self, frame: int, n: int, name: str, width: tuple[int, ...], default: Any
     ) -> np.ndarray:
         """A property of all particles (n, *width)."""
-        found = self._chunk(frame, f"particles/{name}")
-        if found is None:
+        values = self._chunk(frame, f"particles/{name}")
+        if values is None:
             return np.broadcast_to(np.asarray(default), (n, *width))
-        if found.shape != (n, *width):
+        if values.shape != (n, *width):
             raise ValueError(
-                f"frame {frame + 1}: particles/{name} is of {found.shape}, must be {(n, *width)}"
+                f"frame {frame + 1}: particles/{name} is of {values.shape}, must be {(n, *width)}"
             )
-        return found
+        return values
 
 
 def _owners(body: np.ndarray, position: np.ndarray, inertia: np.ndarray) -> np.ndarray:
@@ -327,11 +331,10 @@ class GsdFile(FrameFile):
 
         system, sites = self._system, self._constituent
         owner, n = system.sites.molecule[sites], len(state.position)
-        orientation = (
-            to_quaternion(state.rotation)
-            if len(state.rotation)
-            else np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-        )
+        if len(state.rotation):
+            orientation = to_quaternion(state.rotation)
+        else:
+            orientation = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
         position = np.vstack(
             [
                 system.centres(state, self._wrapped),
@@ -341,26 +344,29 @@ class GsdFile(FrameFile):
         image = np.zeros(position.shape)
         if np.isfinite(state.cell).all():
             image = np.floor(np.linalg.solve(state.cell.T, position.T).T)
-            position = (
-                position - (image + 0.5) @ state.cell
-            )  # in the box that is centred at the origin
-        found = {
+            # in the box that is centred at the origin
+            position = position - (image + 0.5) @ state.cell
+        properties = {
             "position": position,
             "image": image,
             "orientation": np.vstack([orientation, orientation[owner]]),
         }
         if self._velocities:
-            found["velocity"] = np.vstack([state.velocity, system.site_velocities(state)[sites]])
-            found["angmom"] = np.zeros((n + len(sites), 4))
+            properties["velocity"] = np.vstack(
+                [state.velocity, system.site_velocities(state)[sites]]
+            )
+            properties["angmom"] = np.zeros((n + len(sites), 4))
             if len(state.rotation):
-                found["angmom"][:n] = momentum_quaternion(orientation, state.angular_momentum_body)
+                properties["angmom"][:n] = momentum_quaternion(
+                    orientation, state.angular_momentum_body
+                )
         frame: Any = gsd.hoomd.Frame()
         frame.configuration.step = step
         frame.configuration.dimensions = 3
         frame.configuration.box = np.array(box_of(state.cell), np.float32)
         frame.log[TIME] = np.array([time])
         frame.particles.N, frame.bonds.N = len(position), len(self._bonds)
-        for name, values in found.items():
+        for name, values in properties.items():
             # in the type of the file, because the library compares it with the first frame and
             # leaves equal chunks out
             setattr(
@@ -395,11 +401,11 @@ def _labels(system: System) -> np.ndarray:
             kinds[m.name, name].add(tuple(kind))
 
     def labels(m: Any) -> np.ndarray:
-        found = []
+        labels_of_sites = []
         for name, site in zip(names_of(m), m.site_names, strict=True):
             in_species = f"{m.name}.{name if len(kinds[m.name, name]) == 1 else site}"
-            found.append(name if len(kinds[name]) == 1 else in_species)
-        return np.array(found, object)
+            labels_of_sites.append(name if len(kinds[name]) == 1 else in_species)
+        return np.array(labels_of_sites, object)
 
     return system.of_sites(labels)
 
@@ -407,27 +413,29 @@ def _labels(system: System) -> np.ndarray:
 def read_frame(path: Path, frame: int, atom_types: dict[str, str] | None = None) -> Atoms:
     try:
         with contextlib.closing(GsdReader(path)) as reader:
-            found = reader.read(index_of(reader.count, frame))
+            snapshot = reader.read(index_of(reader.count, frame))
     except (OSError, ValueError) as error:
         raise structure_error(path, f"cannot be read as a trajectory: {error}") from None
-    sites = found.sites
-    types = [found.label[site] for site in sites]
+    sites = snapshot.sites
+    types = [snapshot.label[site] for site in sites]
     names = {label: label.rsplit(".", 1)[-1] for label in types}  # a type may be species.name
     # a body is named by the type of its central particle
     is_named = np.isin(
-        np.arange(len(found.body)), found.body[sites][found.owner[sites] == found.body[sites]]
+        np.arange(len(snapshot.body)),
+        snapshot.body[sites][snapshot.owner[sites] == snapshot.body[sites]],
     )
     residue = [
-        (int(body) + 1, found.label[body] if is_named[body] else "") for body in found.body[sites]
+        (int(body) + 1, snapshot.label[body] if is_named[body] else "")
+        for body in snapshot.body[sites]
     ]
     return Atoms(
         names_of_types(path, types, [], names, atom_types),
         [""] * len(types),
         residue,
-        found.position[sites],
-        found.site_velocities(),
-        found.cell,
-        found.site_masses if atom_types is None else None,
+        snapshot.position[sites],
+        snapshot.site_velocities(),
+        snapshot.cell,
+        snapshot.site_masses if atom_types is None else None,
     )
 
 

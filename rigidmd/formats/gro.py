@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Format, register
-from rigidmd.io.formats.atoms import Atoms, numbers, structure_error, unexpected
+from rigidmd.formats import Format, register
+from rigidmd.formats.atoms import Atoms, numbers, structure_error, unexpected
 
 
 def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
@@ -28,9 +28,9 @@ def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
             continue
         box = first + 2 + count
         if box >= len(lines):
-            found = f"{max(0, len(lines) - first - 3)} are there: truncated?"
+            reason = f"{max(0, len(lines) - first - 3)} are there: truncated?"
             raise structure_error(
-                path, f"line {first + 2} promises {count} atoms and a box, {found}"
+                path, f"line {first + 2} promises {count} atoms and a box, {reason}"
             )
         what = "the box, 3 or 9 numbers (is the number of atoms right?)"
         edges = numbers(path, box + 1, lines[box].split(), what)
@@ -59,13 +59,13 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
             " right?)"
         )
         position[k - first - 2] = numbers(path, k + 1, values[:3], what)
-        given = [v for v in values[3:] if v]
-        if len(given) == 3:
-            found = numbers(path, k + 1, given, "three velocities")
-            if not np.isfinite(found).all():
+        words = [v for v in values[3:] if v]
+        if len(words) == 3:
+            components = numbers(path, k + 1, words, "three velocities")
+            if not np.isfinite(components).all():
                 owner = f"line {k + 1}: atom {k - first - 1}"
                 raise structure_error(path, f"{owner} has a velocity that is not a finite number")
-            velocity[k - first - 2] = found
+            velocity[k - first - 2] = components
         names.append(line[10:15].strip())
         residue.append((parse_whole_number(line[:5].strip()), line[5:10].strip()))
     xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]

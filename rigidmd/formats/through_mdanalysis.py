@@ -24,8 +24,8 @@ import numpy as np
 
 from rigidmd.core.process import ignore_warnings, python_process
 from rigidmd.core.state import edges_and_angles
-from rigidmd.io.formats import Encode, Format, System, register
-from rigidmd.io.formats.atoms import Frame, structure_error
+from rigidmd.formats import Encode, Format, System, register
+from rigidmd.formats.atoms import Frame, structure_error
 
 
 def dimensions(cell: np.ndarray | None) -> list[float] | None:
@@ -73,11 +73,9 @@ class FrameFiles:
     def __init__(
         self, system: System, velocities: bool, name: str, options: dict[str, Any] | None = None
     ):
-        self._universe, self._name, self._options = (
-            universe_of(system, velocities),
-            name,
-            options or {},
-        )
+        self._universe = universe_of(system, velocities)
+        self._name = name
+        self._options = options or {}
         self.sites: int = len(system.sites.name)
 
     def content(
@@ -131,17 +129,16 @@ def read_in_process(
             check=False,
         )
         if ended.returncode < 0 or not target.is_file():
-            reason = (
-                "its reader crashed"
-                if ended.returncode < 0
-                else ended.stderr.decode(errors="replace")[-300:]
-            )
+            if ended.returncode < 0:
+                reason = "its reader crashed"
+            else:
+                reason = ended.stderr.decode(errors="replace")[-300:]
             raise structure_error(path, f"cannot be read as a trajectory: {reason}. Is it damaged?")
         with np.load(target, allow_pickle=False) as data:
-            found = dict(data)
-    if "error" in found:
-        raise structure_error(path, f"cannot be read as a trajectory: {found['error']}")
-    return found
+            arrays = dict(data)
+    if "error" in arrays:
+        raise structure_error(path, f"cannot be read as a trajectory: {arrays['error']}")
+    return arrays
 
 
 def main() -> None:
@@ -151,10 +148,10 @@ def main() -> None:
     warnings.simplefilter("ignore")
     try:
         arrays = pickle.loads(bytes.fromhex(read))(path, int(frame), int(atoms))
-        found = {name: values.astype(float) for name, values in arrays.items()}
+        contents = {name: values.astype(float) for name, values in arrays.items()}
     except Exception as error:  # many types, from OSError to MemoryError
-        found = {"error": np.array(" ".join(str(error).split()) or type(error).__name__)}
-    np.savez(target, **found)  # pyright: ignore[reportArgumentType]
+        contents = {"error": np.array(" ".join(str(error).split()) or type(error).__name__)}
+    np.savez(target, **contents)  # pyright: ignore[reportArgumentType]
 
 
 def index_of(count: int, frame: int) -> int:
@@ -232,14 +229,14 @@ def arrays_of_xdr(name: str, path: str, frame: int, atoms: int) -> dict[str, np.
     with getattr(library, name)(path) as file:
         _check(file.n_atoms, atoms)
         file.seek(k := index_of(len(file), frame))
-        found = file.read()
-        if not getattr(found, "hasx", True):
+        xdr_frame = file.read()
+        if not getattr(xdr_frame, "hasx", True):
             raise ValueError(f"frame {k + 1} has no positions")
-        arrays = {"position": found.x * NM}
-        if getattr(found, "hasv", False):
-            arrays["velocity"] = found.v * NM
-        if found.box.any():
-            arrays["cell"] = found.box * NM
+        arrays = {"position": xdr_frame.x * NM}
+        if getattr(xdr_frame, "hasv", False):
+            arrays["velocity"] = xdr_frame.v * NM
+        if xdr_frame.box.any():
+            arrays["cell"] = xdr_frame.box * NM
     return arrays
 
 
@@ -250,18 +247,18 @@ def arrays_of_reader(name: str, path: str, frame: int, atoms: int) -> dict[str, 
     reader_class: Any = get_reader_for(path, name)
     with reader_class(path) as reader:
         _check(reader.n_atoms, atoms)
-        found = reader[index_of(reader.n_frames, frame)]
-        arrays = {"position": found.positions}
-        if found.has_velocities:
-            arrays["velocity"] = found.velocities
-        if found.dimensions is not None:
-            arrays["cell"] = found.triclinic_dimensions
+        timestep = reader[index_of(reader.n_frames, frame)]
+        arrays = {"position": timestep.positions}
+        if timestep.has_velocities:
+            arrays["velocity"] = timestep.velocities
+        if timestep.dimensions is not None:
+            arrays["cell"] = timestep.triclinic_dimensions
     return arrays
 
 
-def _check(there: int, wanted: int) -> None:
-    if there != wanted:
-        raise ValueError(f"it has {there} atoms, the file with their names {wanted}")
+def _check(count: int, expected: int) -> None:
+    if count != expected:
+        raise ValueError(f"it has {count} atoms, the file with their names {expected}")
 
 
 register(

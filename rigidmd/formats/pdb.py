@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.io.formats import Encode, Format, System, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Encode, Format, System, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
     Frame,
@@ -19,8 +19,8 @@ from rigidmd.io.formats.atoms import (
     structure_error,
     unexpected,
 )
-from rigidmd.io.formats.cells import cell_of
-from rigidmd.io.formats.through_mdanalysis import FrameFiles, dimensions
+from rigidmd.formats.cells import cell_of
+from rigidmd.formats.through_mdanalysis import FrameFiles, dimensions
 
 #: Columns of the edges and angles in CRYST1.
 CRYST1 = (6, 15, 24, 33, 40, 47, 54)
@@ -36,11 +36,10 @@ def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The models of a .pdb, each with the last CRYST1 before it."""
     models, body, cell, notes = [], [], None, []
     ends = next((line for line in reversed(lines) if line.strip()), "")
-    cut = (
-        ["it ends with an atom, without END: is it truncated?"]
-        if ends.startswith(("ATOM", "HETATM"))
-        else []
-    )
+    if ends.startswith(("ATOM", "HETATM")):
+        cut = ["it ends with an atom, without END: is it truncated?"]
+    else:
+        cut = []
     for number, line in enumerate([*lines, "END"], 1):
         if line.startswith("CRYST1"):
             cell, notes = _cryst1(number, line)
@@ -120,18 +119,22 @@ def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[flo
     serial = re.match(r"(?:ATOM  |HETATM)(\d*)", line)
     moved = max(0, len(serial[1]) - 5) if serial else 0
     straight = line[:11] + line[11 + moved :]
-    found = BEYOND.match(line, 26 + moved)
+    coordinates = BEYOND.match(line, 26 + moved)
     joined = any(
         not line[a - 1 : a].isspace() and line[a : a + 1].isalnum() for a in (30, 38, 46, 54)
     )
-    if not found and not joined:
+    if not coordinates and not joined:
         with contextlib.suppress(ValueError):
             return line, 54, [float(field) for field in fields]
-    if not (found := found or FREE.match(line, 26 + moved)):
+    if not (coordinates := coordinates or FREE.match(line, 26 + moved)):
         raise unexpected(
             path, number, "an atom of a .pdb with coordinates in columns 31 to 54", line[26:60]
         )
-    return straight, found.end(), numbers(path, number, list(found.groups()), "three coordinates")
+    return (
+        straight,
+        coordinates.end(),
+        numbers(path, number, list(coordinates.groups()), "three coordinates"),
+    )
 
 
 def encoder(system: System, interval: float, velocities: bool) -> Encode:

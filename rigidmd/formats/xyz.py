@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Encode, Format, System, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Encode, Format, System, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
     Frame,
@@ -18,8 +18,8 @@ from rigidmd.io.formats.atoms import (
     unexpected,
     without_fortran,
 )
-from rigidmd.io.formats.through_ase import NAMES, from_ase, read_by_ase
-from rigidmd.io.formats.through_mdanalysis import FrameFiles
+from rigidmd.formats.through_ase import NAMES, from_ase, read_by_ase
+from rigidmd.formats.through_mdanalysis import FrameFiles
 
 
 def read_xyz(
@@ -36,11 +36,10 @@ def read_xyz(
         clean += [lines[at], re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", lines[at + 1])]
         properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
         column, place, width = _columns(properties[1]) if properties else (0, 1, 4)
-        what = (
-            f"{width} columns, {properties[1]}"
-            if properties
-            else "an atom of an .xyz: name, x, y, z"
-        )
+        if properties:
+            what = f"{width} columns, {properties[1]}"
+        else:
+            what = "an atom of an .xyz: name, x, y, z"
         lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
         if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (
             3,
@@ -90,11 +89,11 @@ def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
 def _columns(properties: str) -> tuple[int | None, int | None, int]:
     """Columns of species and positions, or None, and their number: 0, 1 and 4 for
     `species:S:1:pos:R:3`."""
-    words, column, found = properties.split(":"), 0, {}
+    words, column, column_of = properties.split(":"), 0, {}
     for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
-        found["species" if name.lower() == "symbols" else name.lower()] = column
+        column_of["species" if name.lower() == "symbols" else name.lower()] = column
         column += 1 if (columns := parse_whole_number(width)) is None else columns
-    return found.get("species"), found.get("pos"), column
+    return column_of.get("species"), column_of.get("pos"), column
 
 
 def encoder(system: System, interval: float, velocities: bool) -> Encode:

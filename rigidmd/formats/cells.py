@@ -79,17 +79,17 @@ def same_lattice(cell: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
     """Whether two cells (3, 3) describe one lattice, to a fraction of the largest component of the
     second."""
     basis = basis_of(cell, other)
-    whole = round(abs(np.linalg.det(basis))) == 1
-    return whole and bool(np.abs(basis @ other - cell).max() <= tolerance * np.abs(other).max())
+    equal_volume = round(abs(np.linalg.det(basis))) == 1
+    return equal_volume and bool(
+        np.abs(basis @ other - cell).max() <= tolerance * np.abs(other).max()
+    )
 
 
 def describe_cell(cell: np.ndarray) -> str:
     """Lengths and angles of a cell (3, 3)."""
-    found = edges_and_angles(cell)
-    lengths, angles = (
-        ", ".join(f"{x:.4f}" for x in found[:3]),
-        ", ".join(f"{x:.4g}" for x in found[3:]),
-    )
+    parameters = edges_and_angles(cell)
+    lengths = ", ".join(f"{x:.4f}" for x in parameters[:3])
+    angles = ", ".join(f"{x:.4g}" for x in parameters[3:])
     return f"edges {lengths} Å, angles {angles}°"
 
 
@@ -113,13 +113,13 @@ def least_skewed_cell(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     c_z), and the rotation (3, 3) to its standard orientation: the given cell with reduced tilts,
     unless another one allows a much longer cutoff. The choice does not depend on the rounding of
     numbers in files."""
-    given = reduced_cell(cell)
+    reduced = reduced_cell(cell)
     bases = _short_bases(cell)
     standard = np.abs(np.linalg.qr(np.swapaxes(bases @ cell, 1, 2), mode="r"))  # columns a, b, c
     heights = standard.diagonal(axis1=1, axis2=2)
     height = heights.min(axis=1)
-    if height.max() <= CUTOFF_GAIN * np.diag(given).min():
-        return given, np.eye(3)
+    if height.max() <= CUTOFF_GAIN * np.diag(reduced).min():
+        return reduced, np.eye(3)
     # of those that are equally high, without large tilts, and with the fewest changes
     tilt = (standard / heights[:, :, None])[:, [0, 0, 1], [1, 2, 2]].max(axis=1)
     changes = np.abs(bases - np.eye(3, dtype=int)).sum(axis=(1, 2))
@@ -138,17 +138,16 @@ def _short_bases(cell: np.ndarray) -> np.ndarray:
     from ase.geometry import minkowski_reduce
 
     edges, reduced = minkowski_reduce(cell)
-    factors = np.array(
-        [v for v in product((-2, -1, 0, 1, 2), repeat=3) if v > (0, 0, 0)]
-    )  # without -v
+    # without -v
+    factors = np.array([v for v in product((-2, -1, 0, 1, 2), repeat=3) if v > (0, 0, 0)])
     vectors = factors @ np.asarray(reduced)
     longest = np.linalg.norm(edges, axis=1).max()
     vectors = vectors[np.linalg.norm(vectors @ cell, axis=1) <= (1 + SAME_HEIGHT) * longest]
     vectors *= np.sign(vectors[np.arange(len(vectors)), (vectors != 0).argmax(axis=1)])[:, None]
     i, j, k = np.array(list(permutations(range(len(vectors)), 3))).T
     volume = (np.cross(vectors[i], vectors[j]) * vectors[k]).sum(axis=1)
-    whole = np.abs(volume) == 1
-    bases = np.stack([vectors[of[whole]] for of in (i, j, k)], axis=1)
+    is_basis = np.abs(volume) == 1
+    bases = np.stack([vectors[of[is_basis]] for of in (i, j, k)], axis=1)
     signs = np.array([s for s in product((1, -1), repeat=3)])
     bases = (bases[:, None] * signs[:, :, None]).reshape(-1, 3, 3)
     return bases[np.linalg.det(bases) > 0]
@@ -171,9 +170,8 @@ def cell_of(parameters: list[float]) -> np.ndarray | None:
         and (angles > 0).all()
         and (angles < 180).all()
     ):
-        with contextlib.suppress(
-            AssertionError
-        ):  # raised by ASE if three edges cannot form the angles
+        # raised by ASE if three edges cannot form the angles
+        with contextlib.suppress(AssertionError):
             return cellpar_to_cell([*edges, *angles])
     return None
 
@@ -208,7 +206,7 @@ def make_whole(points: np.ndarray, cell: np.ndarray | None, reach: np.ndarray) -
     count, size, _ = points.shape
     if cell is None or size == 1:
         return points
-    whole, molecule = points.copy(), np.arange(count)
+    unwrapped, molecule = points.copy(), np.arange(count)
     outside = np.ones((count, size), bool)
     distance = np.full((count, size), np.inf)  # of an atom outside from the tree
     newest = np.zeros(count, int)
@@ -223,11 +221,11 @@ def make_whole(points: np.ndarray, cell: np.ndarray | None, reach: np.ndarray) -
         rank = np.where(bonded, length / np.where(bonded, longest, 1.0), 1.0 + length)
         closer = outside & (rank < distance)
         distance[closer] = rank[closer]
-        whole[closer] = (whole[molecule, newest][:, None] + steps)[closer]
+        unwrapped[closer] = (unwrapped[molecule, newest][:, None] + steps)[closer]
         if (distance[outside] <= 1.0).all():  # each is bonded to an atom of the tree
             break
         newest = np.where(outside, distance, np.inf).argmin(axis=1)
-    return whole
+    return unwrapped
 
 
 def pairs_within(

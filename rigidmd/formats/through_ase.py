@@ -19,8 +19,8 @@ import numpy as np
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NOW, State
 from rigidmd.errors import StructureError
-from rigidmd.io.formats import Format, System, extensions, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Format, System, extensions, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     MASSLESS_NAME,
     Atoms,
@@ -28,7 +28,7 @@ from rigidmd.io.formats.atoms import (
     is_element,
     structure_error,
 )
-from rigidmd.io.formats.frame_file import FrameFile
+from rigidmd.formats.frame_file import FrameFile
 from rigidmd.units import ENERGY_UNITS
 
 if TYPE_CHECKING:
@@ -54,13 +54,13 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
 
     try:
         with ignore_warnings():
-            found = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
+            frames = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
     except ase.io.formats.UnknownFileTypeError:
         known = " ".join(extensions(lambda form: form.read or form.reader))
         raise structure_error(path, f"its format is unknown to ASE; there are {known}") from None
     except Exception as error:  # ASE's readers raise many types, from ImportError to IndexError
         raise structure_error(path, _reason(error)) from None
-    return [atoms for atoms in found if len(atoms)]
+    return [atoms for atoms in frames if len(atoms)]
 
 
 def _reason(error: Exception) -> str:
@@ -115,13 +115,12 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
     symbols, notes = atoms.get_chemical_symbols(), []
     if names is None and (stored := atoms.arrays.get(NAMES)) is not None:
         names = [str(name) for name in stored]
-        symbols = [
-            "" if symbol == "X" else symbol for symbol in symbols
-        ]  # united atoms have names only
+        # united atoms have names only
+        symbols = ["" if symbol == "X" else symbol for symbol in symbols]
     elif names is None and DL_POLY_NAMES in atoms.arrays:
         names = [
-            symbol + str(rest)
-            for symbol, rest in zip(symbols, atoms.arrays[DL_POLY_NAMES], strict=True)
+            symbol + str(number)
+            for symbol, number in zip(symbols, atoms.arrays[DL_POLY_NAMES], strict=True)
         ]
         symbols = [""] * len(atoms)  # ASE takes the first letters, N for NA
     if residue is None:
@@ -136,7 +135,7 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
     ):
         raise structure_error(path, f"some of its sites have the occupancy {', '.join(invalid)}")
     if partial_sites := sorted(f"{e} {x:g}" for e, x in occupied if x < 1):
-        found = (
+        disorder = (
             f"some of its sites are occupied only partly ({', '.join(partial_sites)}): the crystal"
             " is disordered"
         )
@@ -145,7 +144,7 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
             " ones)"
         )
         raise structure_error(
-            path, f"{found}, so that molecules are unknown. Give one arrangement of it, {hint}"
+            path, f"{disorder}, so that molecules are unknown. Give one arrangement of it, {hint}"
         )
     velocity = atoms.get_velocities() * ASE_VELOCITY if atoms.has("momenta") else None
     if velocity is not None and not np.isfinite(velocity).all():
@@ -212,7 +211,7 @@ def atoms_of_sites(
         "H" if e in HEAVY_HYDROGEN else e if is_element(e) else "X" for e in sites.element[atom]
     ]
     boxed = cell is not None and bool(np.isfinite(cell).all())
-    found = ase.Atoms(
+    atoms = ase.Atoms(
         symbols,
         positions=np.asarray(positions, float)[atom],
         masses=sites.mass[atom],
@@ -221,22 +220,20 @@ def atoms_of_sites(
         info={"time_ps": time},
     )
     if velocities is not None:
-        found.set_velocities(np.asarray(velocities, float)[atom] / ASE_VELOCITY)
+        atoms.set_velocities(np.asarray(velocities, float)[atom] / ASE_VELOCITY)
     of_atom = sites.molecule[atom]
-    found.set_array(NAMES, sites.name[atom].astype(str))
-    found.set_array(RESIDUE_NAMES, system.residue_names[of_atom].astype(str))
-    found.set_array(RESIDUE_NUMBERS, system.residue_number[of_atom].astype(int))
-    return found
+    atoms.set_array(NAMES, sites.name[atom].astype(str))
+    atoms.set_array(RESIDUE_NAMES, system.residue_names[of_atom].astype(str))
+    atoms.set_array(RESIDUE_NUMBERS, system.residue_number[of_atom].astype(int))
+    return atoms
 
 
 TAG = "ASE-Trajectory"
 #: Additional arrays: indices of the atoms among the sites (first frame), positions and velocities
 #: of the other sites.
-ATOMS, MASSLESS, MASSLESS_VELOCITY = (
-    "rigidmd_atoms",
-    "rigidmd_massless",
-    "rigidmd_massless_velocity",
-)
+ATOMS = "rigidmd_atoms"
+MASSLESS = "rigidmd_massless"
+MASSLESS_VELOCITY = "rigidmd_massless_velocity"
 #: Bytes of the head of a file: magic number, tag, version, number of items, offset of their table.
 HEAD = 48
 #: What the library raises for damaged files.
@@ -274,16 +271,11 @@ class TrajReader:
             if self._file.get_tag() != TAG:
                 raise ValueError("not a trajectory of ASE")
             self.count = len(self._file)
-            self._atoms = (
-                self._array(self._file, ATOMS, (-1,), np.int64)
-                if self.count
-                else np.zeros(0, np.int64)
-            )
-            self._mass = (
-                self._array(self._file, "masses", (len(self._atoms),))
-                if self.count
-                else np.zeros(0)
-            )
+            self._atoms = np.zeros(0, np.int64)
+            self._mass = np.zeros(0)
+            if self.count:
+                self._atoms = self._array(self._file, ATOMS, (-1,), np.int64)
+                self._mass = self._array(self._file, "masses", (len(self._atoms),))
             self.sites = len(self._atoms)
             if self.count and MASSLESS in self._file:
                 self.sites += len(self._array(self._file, MASSLESS, (-1, 3)))
@@ -307,11 +299,11 @@ class TrajReader:
             if cell.shape != (3, 3):
                 raise ValueError("it is damaged: a cell is not of shape (3, 3)")
             n, m = len(self._atoms), self.sites - len(self._atoms)
-            wanted = {"positions": n, "momenta": n, MASSLESS: m, MASSLESS_VELOCITY: m}
-            there = {name for name in wanted if name == "positions" or name in item}
+            sizes = {"positions": n, "momenta": n, MASSLESS: m, MASSLESS_VELOCITY: m}
+            present = {name for name in sizes if name == "positions" or name in item}
             arrays = [
-                self._array(item, name, (size, 3)) if name in there else None
-                for name, size in wanted.items()
+                self._array(item, name, (size, 3)) if name in present else None
+                for name, size in sizes.items()
             ]
             return Stored._make(
                 [*arrays, cell if cell.any() else None, float(info["time_ps"]), int(info["step"])]
@@ -320,45 +312,45 @@ class TrajReader:
             raise ValueError(f"frame {k + 1} is damaged: {error}") from None
 
     def frame(self, k: int) -> Frame:
-        found = self.read(k)
-        positions, velocities = self._joined(found.positions, found.massless), None
-        if found.momenta is not None:
+        stored = self.read(k)
+        positions, velocities = self._joined(stored.positions, stored.massless), None
+        if stored.momenta is not None:
             velocities = self._joined(
-                found.momenta / self._mass[:, None] * ASE_VELOCITY, found.massless_velocity
+                stored.momenta / self._mass[:, None] * ASE_VELOCITY, stored.massless_velocity
             )
-        return Frame(found.time, positions, found.cell, velocities, step=found.step)
+        return Frame(stored.time, positions, stored.cell, velocities, step=stored.step)
 
     def _joined(self, of_atoms: np.ndarray, others: np.ndarray | None) -> np.ndarray:
-        found = np.empty((self.sites, 3))
-        found[self._atoms] = of_atoms
+        of_sites = np.empty((self.sites, 3))
+        of_sites[self._atoms] = of_atoms
         if others is not None:
-            found[np.setdiff1d(np.arange(self.sites), self._atoms)] = others
-        return found
+            of_sites[np.setdiff1d(np.arange(self.sites), self._atoms)] = others
+        return of_sites
 
     def _array(
         self, item: Any, name: str, shape: tuple[int, ...], kind: type = np.float64
     ) -> np.ndarray:
         """An array of an item with this type and shape (-1: any length)."""
         try:
-            there = item.proxy(name)
-            fits = len(shape) == there.ndim and all(
-                n in (-1, m) for n, m in zip(shape, there.shape, strict=False)
+            stored = item.proxy(name)
+            fits = len(shape) == stored.ndim and all(
+                n in (-1, m) for n, m in zip(shape, stored.shape, strict=False)
             )
             if (
-                there.dtype != kind
+                stored.dtype != kind
                 or not fits
-                or there.offset < 0
-                or there.offset + there.nbytes > self._size
+                or stored.offset < 0
+                or stored.offset + stored.nbytes > self._size
             ):
                 raise ValueError(f"it is damaged: {name} has the wrong type, shape or offset")
-            found = np.array(there.read())
+            array = np.array(stored.read())
         except (AssertionError, *DAMAGE):
             raise ValueError(
                 f"it is damaged, or not a trajectory of rigidmd: it has no {name}"
             ) from None
-        if kind is np.float64 and not np.isfinite(found).all():
+        if kind is np.float64 and not np.isfinite(array).all():
             raise ValueError(f"it is damaged: {name} has values that are not finite")
-        return found
+        return array
 
 
 class TrajFile(FrameFile):

@@ -12,16 +12,16 @@ import numpy as np
 from rigidmd.core.files import LostFileError, atomic_file, create_empty_file, unreadable_reason
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
-from rigidmd.io.formats import System
+from rigidmd.formats import System
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
     """Device and number of a file; None without a file."""
     try:
-        found = path.lstat()
+        status = path.lstat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 class FrameFile:
@@ -39,9 +39,8 @@ class FrameFile:
     _frame: Callable[[State, float, int], Any]  # the frame of a state, as `_append` takes it
     _append: Callable[[Any, Any], None]  # (file, frame)
     _arrays: Callable[[Any], Iterable[np.ndarray]]  # of a frame, for the checksum
-    _stored_frames: Callable[
-        [int], Iterator[Any]
-    ]  # the first of the file; raises as `_kept_frames` catches
+    #: The first of the file; raises as `_kept_frames` catches
+    _stored_frames: Callable[[int], Iterator[Any]]
 
     def __init__(
         self,

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Format, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Format, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     MASSLESS_NAME,
     Atoms,
@@ -19,8 +19,8 @@ from rigidmd.io.formats.atoms import (
     is_element,
     structure_error,
 )
-from rigidmd.io.formats.cells import cell_of, describe_cell
-from rigidmd.io.formats.crystal import (
+from rigidmd.formats.cells import cell_of, describe_cell
+from rigidmd.formats.crystal import (
     IDENTITY,
     NoSymmetry,
     Setting,
@@ -162,9 +162,8 @@ def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
     position = _coordinates(path, sites, names, "fract" if is_fractional else "cartn")
     if cell is None and is_fractional:
         raise structure_error(path, f"has no cell: {CELL[0]} to {CELL[-1]} are missing")
-    if cell is None or (
-        not is_fractional and np.allclose(cell, np.eye(3))
-    ):  # the placeholder of the PDB
+    # the placeholder of the PDB
+    if cell is None or (not is_fractional and np.allclose(cell, np.eye(3))):
         return Atoms(names, elements, residue, position, cell=cell)
     if not is_fractional:
         position = _to_fractional(block, position, cell)
@@ -173,17 +172,17 @@ def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
         element or element_of(name) or name for name, element in zip(names, elements, strict=True)
     ]
     try:
-        whole = unit_cell(position, kinds, _radii(kinds), operations, cell)
+        contents = unit_cell(position, kinds, _radii(kinds), operations, cell)
     except NoSymmetry as error:
         reason = "its atoms are disordered, or have another symmetry than it states"
         raise structure_error(path, f"{error} in the cell: {reason}{_as_read(notes)}") from None
-    owner = whole.owner
-    notes += _contents(block, kinds, whole, cell, len(operations))
+    owner = contents.owner
+    notes += _contents(block, kinds, contents, cell, len(operations))
     return Atoms(
         [names[k] for k in owner],
         [elements[k] for k in owner],
         [residue[k] for k in owner] if len(operations) == 1 else [()] * len(owner),
-        whole.fractional @ cell,
+        contents.fractional @ cell,
         cell=cell,
         notes=notes,
     )
@@ -272,15 +271,15 @@ def _check_order(path: Path, sites: AtomSites) -> None:
         raise structure_error(
             path, f"has alternate locations {', '.join(alternatives)}; keep one of them"
         )
-    given = sites.column("occupancy")
-    occupancies = [(1.0, 0.0) if text is None else number_of(text) for text in given]
+    texts = sites.column("occupancy")
+    occupancies = [(1.0, 0.0) if text is None else number_of(text) for text in texts]
     if sites.has("cartn_x") and not any(value for value, _ in occupancies):
         return  # as OpenMM writes them
     names = sites.names()[0]
     if wrong := sorted(
         {
             f"{text}"
-            for text, (x, _) in zip(given, occupancies, strict=True)
+            for text, (x, _) in zip(texts, occupancies, strict=True)
             if not 0 <= x <= 2 - FULL
         }
     ):
@@ -297,9 +296,9 @@ def _check_order(path: Path, sites: AtomSites) -> None:
         listed = ", ".join(partial_sites[:MOST_LISTED]) + (
             ", ..." if len(partial_sites) > MOST_LISTED else ""
         )
-        found = f"some of its sites are occupied only partly ({listed})"
+        disorder = f"some of its sites are occupied only partly ({listed})"
     elif len(groups) > 1 or any(group.startswith("-") for group in groups):
-        found = f"its atoms are in disorder groups {', '.join(groups)}"
+        disorder = f"its atoms are in disorder groups {', '.join(groups)}"
     else:
         return
     hint = (
@@ -307,7 +306,7 @@ def _check_order(path: Path, sites: AtomSites) -> None:
         " ones)"
     )
     consequence = "so that molecules are unknown. Give one arrangement of it"
-    raise structure_error(path, f"{found}: the crystal is disordered, {consequence}, {hint}")
+    raise structure_error(path, f"{disorder}: the crystal is disordered, {consequence}, {hint}")
 
 
 def _coordinates(path: Path, sites: AtomSites, names: list[str], axes: str) -> np.ndarray:
@@ -315,9 +314,9 @@ def _coordinates(path: Path, sites: AtomSites, names: list[str], axes: str) -> n
     columns = [sites.column(f"{axes}_{x}") for x in "xyz"]
     position = np.array([[number_of(text)[0] for text in column] for column in columns]).T
     if len(bad := np.flatnonzero(np.isnan(position).any(axis=1))):
-        found = " ".join(str(column[bad[0]]) for column in columns)
+        words = " ".join(str(column[bad[0]]) for column in columns)
         raise structure_error(
-            path, f"atom {names[bad[0]]} has no position, expected three numbers, found {found}"
+            path, f"atom {names[bad[0]]} has no position, expected three numbers, found {words}"
         )
     return position.reshape(-1, 3)
 
@@ -471,13 +470,13 @@ def _tabulated(block: Block) -> Iterator[Statement]:
 
 
 def _contents(
-    block: Block, kinds: list[str], whole: UnitCell, cell: np.ndarray, order: int
+    block: Block, kinds: list[str], contents: UnitCell, cell: np.ndarray, order: int
 ) -> list[str]:
     """Notes on the numbers of atoms and the density of the unit cell, compared with what the file
     states."""
     from ase.data import atomic_masses, atomic_numbers
 
-    count = Counter(kinds[k] for k in whole.owner)
+    count = Counter(kinds[k] for k in contents.owner)
     massive = {kind: n for kind, n in count.items() if is_element(kind) or kind in HEAVY_HYDROGEN}
     mass = sum(
         n * (HEAVY_HYDROGEN[e] if e in HEAVY_HYDROGEN else atomic_masses[atomic_numbers[e]])
@@ -487,17 +486,17 @@ def _contents(
     density = mass / volume / GRAM_PER_CM3
     notes = []
     if order > 1:
-        found = " ".join(f"{kind}{n}" for kind, n in sorted(count.items()))
+        composition = " ".join(f"{kind}{n}" for kind, n in sorted(count.items()))
         origin = (
-            f"{len(kinds)} atom{'s' * (len(kinds) > 1)} in the file, {whole.special} on special"
+            f"{len(kinds)} atom{'s' * (len(kinds) > 1)} in the file, {contents.special} on special"
             " positions"
         )
         notes.append(
-            f"its cell of {volume:.5g} Å³ holds {found}, {density:.4g} g/cm³, from {origin}"
+            f"its cell of {volume:.5g} Å³ holds {composition}, {density:.4g} g/cm³, from {origin}"
         )
-    if whole.copies:
+    if contents.copies:
         notes.append(
-            f"{whole.copies} atoms of the file are images of others by symmetry and count once"
+            f"{contents.copies} atoms of the file are images of others by symmetry and count once"
         )
     stated = number_of(block.first("_exptl_crystal_density_diffrn"))[0]
     if stated > 0 and abs(density - stated) > SAME_DENSITY * stated:
@@ -512,16 +511,18 @@ def _contents(
         and units > 0
         and not any(massive == {e: n * z for e, n in formula.items()} for z in multiples)
     ):
-        wanted = " ".join(f"{element}{n * units:g}" for element, n in sorted(formula.items()))
-        there = " ".join(f"{element}{n}" for element, n in sorted(massive.items()))
-        notes.append(f"its formula and Z are {wanted} in the cell, but its atoms make {there}")
+        expected = " ".join(f"{element}{n * units:g}" for element, n in sorted(formula.items()))
+        present = " ".join(f"{element}{n}" for element, n in sorted(massive.items()))
+        notes.append(f"its formula and Z are {expected} in the cell, but its atoms make {present}")
     return notes
 
 
 def _formula(text: str) -> dict[str, float]:
     """Numbers of atoms in a formula such as C6 H6; empty if it is unreadable."""
     words = [re.fullmatch(r"([A-Z][a-z]?)(\d*\.?\d*)", word) for word in text.split()]
-    return {word[1]: float(word[2] or 1) for word in words if word} if all(words) else {}
+    if not all(words):
+        return {}
+    return {word[1]: float(word[2] or 1) for word in words if word}
 
 
 register(

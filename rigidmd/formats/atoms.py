@@ -12,10 +12,11 @@ from rigidmd.core.toml import parse_whole_number
 from rigidmd.errors import StructureError
 
 SAME_MASS = 0.01  # relative difference of the masses of one element
+# u, AME2020; ASE has no symbols for them
 HEAVY_HYDROGEN = {
     "D": 2.014101777844,
     "T": 3.01604928132,
-}  # u, AME2020; ASE has no symbols for them
+}
 #: Names of ions in CHARMM's force fields that do not begin with their elements.
 CHARMM_IONS = {
     "SOD": "Na",
@@ -39,12 +40,10 @@ class Atoms(NamedTuple):
     """The n atoms of a file, in Å, ps and u."""
 
     names: list[str]
-    elements: list[
-        str
-    ]  # "" if the format has only names; X for massless sites, D and T for heavy hydrogen
-    residue: list[
-        tuple
-    ]  # (number or None, name, ...), differs between neighbours; () without residues
+    #: "" if the format has only names; X for massless sites, D and T for heavy hydrogen
+    elements: list[str]
+    #: (number or None, name, ...), differs between neighbours; () without residues
+    residue: list[tuple]
     position: np.ndarray  # (n, 3) Å
     velocity: np.ndarray | None = None  # (n, 3) Å/ps; rows of NaN for atoms without one
     cell: np.ndarray | None = None  # (3, 3), rows a, b, c, Å
@@ -68,10 +67,10 @@ def element_of(name: str, vocabulary: frozenset[str] = frozenset()) -> str:
         and is_element(two)
     ):
         return two
-    found = next((e for e in (two, one) if e in vocabulary), "")
-    if not found and MASSLESS_NAME.fullmatch(name):
+    element = next((e for e in (two, one) if e in vocabulary), "")
+    if not element and MASSLESS_NAME.fullmatch(name):
         return "X"
-    return found or next((e for e in (one, two) if is_element(e) or e in HEAVY_HYDROGEN), "")
+    return element or next((e for e in (one, two) if is_element(e) or e in HEAVY_HYDROGEN), "")
 
 
 def is_element(symbol: str) -> bool:
@@ -107,21 +106,21 @@ def names_of_types(
     if atom_types is None:
         return [names.get(kind, kind) for kind in types]
     present = sorted({*types, *listed}, key=lambda kind: (parse_whole_number(kind) or 0, kind))
-    given = {
+    key_of_type = {
         kind: next((key for key in (kind, names.get(kind)) if key in atom_types), None)
         for kind in present
     }
     errors = []
-    if unknown := [key for key in atom_types if key not in given.values()]:
+    if unknown := [key for key in atom_types if key not in key_of_type.values()]:
         errors.append(
             f"structure.atom_types: unknown type {', '.join(unknown)}; there are"
             f" {', '.join(present)}"
         )
-    if unnamed := [kind for kind, key in given.items() if key is None]:
+    if unnamed := [kind for kind, key in key_of_type.items() if key is None]:
         errors.append(f"structure.atom_types has no name for type {', '.join(unnamed)}")
     if errors:
         raise StructureError(str(path), errors)
-    return [atom_types[given[kind] or kind] for kind in types]
+    return [atom_types[key_of_type[kind] or kind] for kind in types]
 
 
 class Frame(NamedTuple):
@@ -176,8 +175,8 @@ def table(path: Path, rows: list[tuple[int, list[str]]], what: str) -> np.ndarra
     try:
         return np.array([words for _, words in rows], float) if rows else np.zeros((0, 3))
     except ValueError:
-        found = [numbers(path, line, words, what) for line, words in rows]
-        for (line, words), values in zip(rows, found, strict=True):
-            if len(values) != len(found[0]) or not values:
+        rows_of_numbers = [numbers(path, line, words, what) for line, words in rows]
+        for (line, words), values in zip(rows, rows_of_numbers, strict=True):
+            if len(values) != len(rows_of_numbers[0]) or not values:
                 raise unexpected(path, line, what, " ".join(words)) from None
-        return np.array(found)
+        return np.array(rows_of_numbers)

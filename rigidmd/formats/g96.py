@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Format, register
-from rigidmd.io.formats.atoms import Atoms, numbers, structure_error, unexpected
+from rigidmd.formats import Format, register
+from rigidmd.formats.atoms import Atoms, numbers, structure_error, unexpected
 
 #: Columns before the coordinates: number and name of the residue, name and number of the atom.
 HEAD = 24
@@ -49,9 +49,9 @@ def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atom
     if named is None:
         raise structure_error(path, "has no block POSITION, and so no names of atoms")
     position, velocity = (_vectors(path, frame, blocks) for blocks in (POSITIONS, VELOCITIES))
-    for what, found in (("positions", position), ("velocities", velocity)):
-        if len(found) not in (0, len(named)):
-            raise structure_error(path, f"has {len(found)} {what} of {len(named)} atoms")
+    for what, vectors in (("positions", position), ("velocities", velocity)):
+        if len(vectors) not in (0, len(named)):
+            raise structure_error(path, f"has {len(vectors)} {what} of {len(named)} atoms")
     names, residue = [], []
     for number, line in named:
         words = line[:HEAD].split()

@@ -49,11 +49,9 @@ def connections(system: Any, massless: bool = False) -> np.ndarray:
 
 def charges(system: Any) -> np.ndarray:
     """Charges (s,) of all sites, e; 0 for a single body."""
-    return (
-        system.of_sites(lambda m: m.charges)
-        if hasattr(system, "species")
-        else np.zeros(len(system.points))
-    )
+    if hasattr(system, "species"):
+        return system.of_sites(lambda m: m.charges)
+    return np.zeros(len(system.points))
 
 
 def shortest_links(points: np.ndarray) -> np.ndarray:
@@ -124,18 +122,16 @@ def bonds(m: Any) -> list[tuple[int, int]]:
     nearest atoms."""
     from scipy.spatial.distance import cdist
 
-    x, atoms, massless = (
-        m.positions_body,
-        np.flatnonzero(m.masses > 0),
-        np.flatnonzero(m.masses == 0),
-    )
+    x = m.positions_body
+    atoms = np.flatnonzero(m.masses > 0)
+    massless = np.flatnonzero(m.masses == 0)
     radius = SLACK * np.array([COVALENT.get(m.elements[i], 0.0) for i in atoms])
     bonded = cdist(x[atoms], x[atoms]) <= radius[:, None] + radius
     bonded[tuple(shortest_links(x[atoms]).T)] = True
     pairs = atoms[np.argwhere(np.triu(bonded | bonded.T, 1))].tolist()
-    found = sorted((i, j) if m.masses[i] >= m.masses[j] else (j, i) for i, j in pairs)
+    links = sorted((i, j) if m.masses[i] >= m.masses[j] else (j, i) for i, j in pairs)
     nearest = atoms[cdist(x[massless], x[atoms]).round(9).argmin(axis=1)]
-    return [*found, *zip(nearest.tolist(), massless.tolist(), strict=True)]
+    return [*links, *zip(nearest.tolist(), massless.tolist(), strict=True)]
 
 
 def distance(m: Any, i: int, j: int) -> float:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rigidmd.io.formats.cells import pairs_within
+from rigidmd.formats.cells import pairs_within
 
 if TYPE_CHECKING:
     import gemmi
@@ -138,8 +138,8 @@ def settings_of_system(system: str) -> list[Setting]:
     """Settings of a crystal system; hexagonal, trigonal and rhombohedral ones are not distinguished
     in files."""
     alike = ("hexagonal", "trigonal", "rhombohedral")
-    wanted = alike if system.lower() in alike else (system.lower(),)
-    return settings_where(lambda entry: entry.system in wanted)
+    systems = alike if system.lower() in alike else (system.lower(),)
+    return settings_where(lambda entry: entry.system in systems)
 
 
 def settings_of_code(code: str) -> list[Setting]:
@@ -174,16 +174,15 @@ def settings_of_name(name: str) -> list[Setting]:
         attempts.append((" ".join(words[:-1]), SUFFIXES[words[-1].upper()]))
     for symbol, code in attempts:
         for key in (_key(symbol), _short(_key(symbol))):
-            if found := [
+            if settings := [
                 entry.setting
                 for entry in _table()
                 if key in entry.keys and (not code or code in entry.codes)
             ]:
-                return found
+                return settings
     symbol, code = attempts[0]
-    group = gemmi.find_spacegroup_by_name(
-        symbol
-    )  # other symbols of the same setting: H 3, F d 3 m, C m c e
+    # other symbols of the same setting: H 3, F d 3 m, C m c e
+    group = gemmi.find_spacegroup_by_name(symbol)
     if group is None:
         return []
     return settings_where(
@@ -248,8 +247,8 @@ def unit_cell(
             raise NoSymmetry(f"atoms {one + 1} and {other + 1} are {length:.2g} Å apart")
         if one not in copies:
             copies.add(other)
-    kept = ~np.isin(owner, list(copies))
-    return UnitCell(owner[kept], images[kept], special, len(copies))
+    is_unique = ~np.isin(owner, list(copies))
+    return UnitCell(owner[is_unique], images[is_unique], special, len(copies))
 
 
 def _images(

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Format, register
-from rigidmd.io.formats.atoms import (
+from rigidmd.formats import Format, register
+from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
     atom_count,
@@ -24,7 +24,7 @@ from rigidmd.io.formats.atoms import (
     table,
     unexpected,
 )
-from rigidmd.io.formats.through_ase import ASE_VELOCITY
+from rigidmd.formats.through_ase import ASE_VELOCITY
 
 #: Columns of the section Atoms by atom style. Three image numbers may follow. a, b, c are columns
 #: that are not used.
@@ -82,22 +82,24 @@ def read_data(
             styles[section], rows = comment.strip(), sections.setdefault(section, [])
         elif words:
             rows.append(Row(number, words, comment.strip()))
-    found = [row for row in head if row.words[1:] == ["atoms"]]
-    if not found:
+    counts = [row for row in head if row.words[1:] == ["atoms"]]
+    if not counts:
         raise structure_error(
             path, "has no line with the number of atoms before its sections, such as '3 atoms'"
         )
     rows = sections.get("Atoms", [])
-    count = atom_count(path, found[0].line, found[0].words[0], len(rows))
+    count = atom_count(path, counts[0].line, counts[0].words[0], len(rows))
     if count != len(rows):
         raise structure_error(
-            path, f"line {found[0].line} promises {count} atoms, the section Atoms has {len(rows)}"
+            path, f"line {counts[0].line} promises {count} atoms, the section Atoms has {len(rows)}"
         )
-    return (
-        [partial(_data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types)]
-        if rows
-        else []
-    )
+    if rows:
+        return [
+            partial(
+                _data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types
+            )
+        ]
+    return []
 
 
 def _data_atoms(
@@ -120,9 +122,9 @@ def _data_atoms(
     declared = next((row.words[0] for row in head if row.words[1:] == ["atom", "types"]), "0")
     numbered = range(1, 1 + min(parse_whole_number(declared) or 0, len(rows)))
     column = _columns(path, style, rows, {*mass_of, *labels, *number_of, *map(str, numbered)})
-    width, whole = len(column), [column[name] for name in ("id", "mol") if name in column]
+    width, whole_columns = len(column), [column[name] for name in ("id", "mol") if name in column]
     for line, words, _ in rows:
-        if len(words) < width or any(parse_whole_number(words[k]) is None for k in whole):
+        if len(words) < width or any(parse_whole_number(words[k]) is None for k in whole_columns):
             raise unexpected(path, line, f"an atom ({' '.join(column)})", " ".join(words))
     rows = sorted(rows, key=lambda row: parse_whole_number(row.words[column["id"]]) or 0)
     cell = _box(path, head)
@@ -151,7 +153,7 @@ def _data_atoms(
             path, f"has no section Masses, and its atom types are unknown: {hint}"
         )
     element = {kind: element_of_mass(mass) for kind, mass in mass_of.items()}
-    found = Atoms(
+    atoms = Atoms(
         names_of_types(path, types, [*mass_of], names, atom_types),
         [element.get(kind, "") for kind in types],
         _residues([row.words[column["mol"]] for row in rows] if "mol" in column else [])
@@ -163,10 +165,10 @@ def _data_atoms(
     moving = {row.words[0]: (row.line, row.words[1:4]) for row in sections.get("Velocities", [])}
     velocity = None
     if moving:
-        given = [moving.get(row.words[column["id"]], (0, ["nan"] * 3)) for row in rows]
-        velocity = table(path, given, "an atom and its three velocities")
+        words_of_atoms = [moving.get(row.words[column["id"]], (0, ["nan"] * 3)) for row in rows]
+        velocity = table(path, words_of_atoms, "an atom and its three velocities")
     return _in_our_units(
-        found, velocity, title, "its first line does not name its units ('units = real')"
+        atoms, velocity, title, "its first line does not name its units ('units = real')"
     )
 
 
@@ -202,15 +204,16 @@ def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[s
 
 def _fits(columns: list[str], rows: list[Row], known: set[str]) -> bool:
     """Whether all rows can have these columns, and three image numbers or nothing after them."""
-    kind, whole = (
-        columns.index("type"),
-        [k for k, name in enumerate(columns) if name in ("id", "mol")],
-    )
+    kind = columns.index("type")
+    whole_columns = [k for k, name in enumerate(columns) if name in ("id", "mol")]
     for row in rows:
         words, images = row.words, [word.lstrip("+-") for word in row.words[len(columns) :]]
         if len(words) < len(columns) or len(images) not in (0, 3):
             return False
-        if any(parse_whole_number(word) is None for word in (*images, *(words[k] for k in whole))):
+        if any(
+            parse_whole_number(word) is None
+            for word in (*images, *(words[k] for k in whole_columns))
+        ):
             return False
         if words[kind] not in known and not words[kind][0].isalpha():
             return False
@@ -245,27 +248,27 @@ def _box(path: Path, head: list[Row]) -> np.ndarray | None:
 
 def _residues(numbers_of: Iterable[str]) -> list[tuple]:
     """Residues from molecule numbers. Empty if all are 0, which stands for no molecules."""
-    found = [parse_whole_number(number) for number in numbers_of]
-    return [(number, "") for number in found] if any(found) else []
+    numbers_read = [parse_whole_number(number) for number in numbers_of]
+    return [(number, "") for number in numbers_read] if any(numbers_read) else []
 
 
-def _in_our_units(found: Atoms, velocity: np.ndarray | None, title: str, unknown: str) -> Atoms:
+def _in_our_units(atoms: Atoms, velocity: np.ndarray | None, title: str, unknown: str) -> Atoms:
     """Atoms in Å, ps and u. If the title names no units, lengths are in Å and velocities are not
     used."""
     from ase.calculators.lammps import convert
 
     if (units := UNITS.search(title)) is None:
-        more = [] if velocity is None else [f"{unknown}: its velocities are not used"]
-        return found._replace(notes=[*found.notes, *more])
+        unit_notes = [] if velocity is None else [f"{unknown}: its velocities are not used"]
+        return atoms._replace(notes=[*atoms.notes, *unit_notes])
 
     def converted(values, quantity):
         return None if values is None else convert(values, quantity, units[1], "ASE")
 
     speed = converted(velocity, "velocity")
-    return found._replace(
-        position=converted(found.position, "distance"),
-        cell=converted(found.cell, "distance"),
-        masses=converted(found.masses, "mass"),
+    return atoms._replace(
+        position=converted(atoms.position, "distance"),
+        cell=converted(atoms.cell, "distance"),
+        masses=converted(atoms.masses, "mass"),
         velocity=None
         if speed is None
         else np.where(np.isfinite(speed), speed * ASE_VELOCITY, np.nan),
@@ -327,13 +330,13 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
     begin = at["BOX BOUNDS"]
     bounds = [(first + k + 1, lines[k].split()) for k in range(begin + 1, begin + 4)]
     low, cell = dump_box(path, lines[begin].split()[3:], bounds)
-    there = next((names for names in COORDINATES if set(names) <= set(columns)), None)
-    if there is None:
+    coordinates = next((names for names in COORDINATES if set(names) <= set(columns)), None)
+    if coordinates is None:
         raise structure_error(
             path, f"line {first + atoms + 1}: has no columns of coordinates, x y z or xs ys zs"
         )
-    position = of(*there)
-    if there[0].startswith("xs"):
+    position = of(*coordinates)
+    if coordinates[0].startswith("xs"):
         position = low + position @ cell
     flags, notes = re.findall(r"(?<=\s)[pfsm]{2}(?=\s|$)", lines[begin]), []
     if not all("p" in flag for flag in flags):
@@ -345,7 +348,7 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
         name: texts(name) for name in ("type", "element", *LABELS) if name in columns
     }
     names, elements = _dump_names(path, first + atoms + 1, columns_of_names, masses, atom_types)
-    found = Atoms(
+    frame_atoms = Atoms(
         names,
         elements,
         _residues(texts("mol") if "mol" in columns else []) or [()] * count,
@@ -357,7 +360,10 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
     )
     velocity = of("vx", "vy", "vz") if {"vx", "vy", "vz"} <= set(columns) else None
     return _in_our_units(
-        found, velocity, f"units {units}", "it does not name its units (dump_modify units yes)"
+        frame_atoms,
+        velocity,
+        f"units {units}",
+        "it does not name its units (dump_modify units yes)",
     )
 
 
@@ -374,12 +380,11 @@ def _dump_names(
     labelled = next((columns[name] for name in LABELS if name in columns), named)
     types = columns.get("type", labelled)
     if not types and masses is None:
-        wanted = f"type, {', '.join(LABELS)}, element or mass"
-        raise structure_error(path, f"line {line}: has no column that names its atoms: {wanted}")
+        expected = f"type, {', '.join(LABELS)}, element or mass"
+        raise structure_error(path, f"line {line}: has no column that names its atoms: {expected}")
     if atom_types is not None:
-        return names_of_types(
-            path, types, [], dict(zip(types, labelled, strict=False)), atom_types
-        ), [""] * len(types)
+        labels = dict(zip(types, labelled, strict=False))
+        return names_of_types(path, types, [], labels, atom_types), [""] * len(types)
     elements = [e if is_element(e) or e in HEAVY_HYDROGEN else "" for e in named]
     if not elements and masses is not None:
         element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}

@@ -1,0 +1,30 @@
+"""The public names of rigidmd, and the modules that have them."""
+
+from . import analysis as analysis
+from . import view as view
+from .assemble.scenes import atoms_of as atoms_of
+from .assemble.scenes import resolve as resolve
+from .assemble.scenes import scene_from_atoms as scene_from_atoms
+from .assemble.user_code.force import Force as Force
+from .assemble.user_code.pair_potential import PairLaw as PairLaw
+from .assemble.user_code.pair_potential import pair_law as pair_law
+from .assemble.user_code.trust import trust as trust
+from .dynamics.user_kernels import compiled_force as compiled_force
+from .dynamics.user_kernels import compiled_thermostat as compiled_thermostat
+from .run import Every as Every
+from .run import Moment as Moment
+from .run import Observer as Observer
+from .run import Results as Results
+from .run import Simulation as Simulation
+from .run import run_together as run_together
+from .scene import BodyScene as BodyScene
+from .scene import MolecularScene as MolecularScene
+from .scene import Scene as Scene
+from .scene.integrators import integrator as integrator
+from .studies.normal_modes import normal_modes as normal_modes
+from .studies.stored_runs import read_run as read_run
+from .studies.sweep.sweeping import sweep as sweep
+from .studies.sweep.windows import pmf as pmf
+from .view.plots import LivePlot as LivePlot
+
+__version__: str
