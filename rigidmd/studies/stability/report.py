@@ -1,8 +1,9 @@
-"""The report of `rigidmd stability`: a table for the terminal, stability.csv and a page."""
+"""The report of `rigidmd stability`: verdict and table for the terminal, stability.csv, a page."""
 
 import html
 import platform
 from collections import Counter
+from collections.abc import Callable
 from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,8 @@ from rigidmd.studies.stability.cases import (
     REPORTED,
     RIGHT,
     UNDETECTED,
-    Case,
 )
-from rigidmd.studies.stability.runner import FAILURES, CaseResult, TrialResult
+from rigidmd.studies.stability.runner import FAILURES, TrialResult
 from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table
 
 #: Meaning of each verdict, and how it is shown.
@@ -33,156 +33,139 @@ VERDICTS = {
     CRASH: ("an exception that is not an error of rigidmd", BAD),
 }
 FILES = ("stability.csv", "stability.html")
-HEADERS = (
-    "case",
-    "integrator",
-    "runs",
-    "verdicts",
-    "largest error",
-    "of allowed",
-    "longest step",
-    "beyond",
-    "seconds",
-)
+HEADERS = "case,integrator,runs,verdicts,largest error,of allowed,longest step,beyond,seconds"
 COLUMNS = (
-    "case",
-    "group",
-    "kind",
-    "setting",
-    "integrator",
-    "step",
-    "step_unit",
-    "error",
-    "allowed",
-    "conserved_error",
-    "verdict",
-    "expected",
-    "beyond",
-    "seconds",
-    "message",
+    "case,group,kind,setting,integrator,step,step_unit,error,allowed,conserved_error,verdict,"
+    "expected,beyond,seconds,message"
+)
+BOUND_TEXT = (
+    f"The longest step is that at which conserved quantities stay within {BOUND:g} of the kinetic"
+    " energy."
 )
 MESSAGES = 3  # messages of a case at most
+Results = list[TrialResult]
 
 
-def rows_of(results: list[CaseResult]) -> list[list[str]]:
-    """A row for each case and integrator."""
-    parts = [part for result in results for part in result.by_integrator.items()]
-    return [_row(integrator, part) for integrator, part in parts]
+def summary(results: Results, verbose: bool = False) -> list[str]:
+    """The verdict, failures, the table, and the warnings if it is verbose."""
+    lines = [*conclusions(results), "", table_text(results)]
+    if verbose:
+        lines += [f"{result.name}: {text}" for result in results for text in result.warnings]
+    return lines
 
 
-def _row(integrator: str, part: CaseResult) -> list[str]:
-    finished = [run for run in part.runs if isfinite(run.outcome.error)]
-    worst = max(finished, key=_relative_error, default=None)
-    seconds = sum(result.outcome.seconds for result in part.results)
-    return [
-        part.case.name,
-        integrator or "-",
-        str(len(part.runs)),
-        ", ".join(f"{count} {verdict}" for verdict, count in counts_of([part]).items()),
-        format_cell(worst.outcome.error) if worst else "-",
-        format_cell(worst.allowed) if worst else "-",
-        *_limit_cells(part),
-        f"{seconds:.1f}",
-    ]
+def conclusions(results: Results) -> list[str]:
+    """The verdict and the total, and sentences on failures and unexpected verdicts."""
+    failures = [result.failure for result in results if result.failure]
+    unexpected = [_unexpected(result) for result in results if result.is_unexpected]
+    counts = verdict_counts(results)
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
+    runs, cases = sum(counts.values()), len({result.case.name for result in results})
+    warnings = sum(len(result.warnings) for result in results)
+    total = (
+        f"{'failed' if failures else 'passed'}: {cases} cases, {runs} runs: {verdicts};"
+        f" {len(results) - runs} longest steps bisected; {warnings} warnings"
+        f"{', which -v lists' if warnings else ''}"
+    )
+    return [total, *failures, *filter(None, unexpected)]
 
 
-def _relative_error(run: TrialResult) -> float:
-    if run.allowed > 0:
-        return run.outcome.error / run.allowed
-    return inf if run.outcome.error else 0.0
+def _unexpected(result: TrialResult) -> str:
+    if result.verdict in FAILURES:
+        return ""
+    message = f" ({result.outcome.message})" if result.outcome.message else ""
+    expected = " or ".join(result.trial.expected)
+    return f"{result.name}: {result.verdict}, expected {expected}{message}"
 
 
-def _limit_cells(part: CaseResult) -> tuple[str, str]:
-    """The least of the longest steps of all settings, and how longer ones fail."""
-    if not part.limits:
-        return "-", "-"
-    least = min(part.limits, key=lambda limit: limit.longest)
-    is_limited = least.longest < inf
-    step = format_cell(least.longest) if is_limited else f"> {format_cell(least.tried)}"
-    return f"{step} {part.case.step_unit}", least.beyond or "-"
-
-
-def counts_of(results: list[CaseResult]) -> dict[str, int]:
+def verdict_counts(results: Results) -> dict[str, int]:
     """Numbers of runs by their verdicts, in the order of VERDICTS."""
-    counts = Counter(run.verdict for result in results for run in result.runs)
+    counts = Counter(result.verdict for result in results)
     return {verdict: counts[verdict] for verdict in VERDICTS if counts[verdict]}
 
 
-def table_text(results: list[CaseResult]) -> str:
-    return columns_text([HEADERS, *rows_of(results)], left=(0, 1, 3, 7))
+def grouped(results: Results, key: Callable[[TrialResult], Any]) -> list[Results]:
+    groups: dict[Any, Results] = {}
+    for result in results:
+        groups.setdefault(key(result), []).append(result)
+    return list(groups.values())
 
 
-def conclusions(results: list[CaseResult]) -> list[str]:
-    """Sentences on failures, unexpected verdicts and the total."""
-    failures = [failure for result in results for failure in result.failures]
-    unexpected = [
-        f"{result.case.name}, {_unexpected(run)}"
-        for result in results
-        for run in result.runs
-        if not run.is_expected and run.verdict not in FAILURES
+def table_text(results: Results) -> str:
+    return columns_text([HEADERS.split(","), *rows_of(results)], left=(0, 1, 3, 7))
+
+
+def rows_of(results: Results) -> list[list[str]]:
+    """A row for each case and integrator."""
+    return [_row(group) for group in grouped(results, lambda r: (r.case.name, r.integrator))]
+
+
+def _row(results: Results) -> list[str]:
+    counts = verdict_counts(results)
+    finished = [result for result in results if isfinite(result.outcome.error)]
+    worst = max(finished, key=_relative_error, default=None)
+    case = results[0].case
+    return [
+        case.name,
+        results[0].integrator or "-",
+        str(sum(counts.values())),
+        ", ".join(f"{count} {verdict}" for verdict, count in counts.items()),
+        format_cell(worst and worst.outcome.error),
+        format_cell(worst and worst.allowed),
+        *_limit_cells(results, case.step_unit),
+        f"{sum(result.seconds for result in results):.1f}",
     ]
-    counts = counts_of(results)
-    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
-    limits = sum(len(result.limits) for result in results)
-    runs = f"{len(results)} cases, {sum(counts.values())} runs: {verdicts}"
-    return [*failures, *unexpected, f"{runs}; {limits} longest steps bisected"]
 
 
-def _unexpected(run: TrialResult) -> str:
-    trial, message = run.trial, run.outcome.message
-    expected = " or ".join(trial.expected)
-    sentence = f"{trial.setting} {run.integrator}: {run.verdict}, expected {expected}"
-    return f"{sentence} ({message})" if message else sentence
+def _relative_error(result: TrialResult) -> float:
+    if result.allowed > 0:
+        return result.outcome.error / result.allowed
+    return inf if result.outcome.error else 0.0
 
 
-def write_stability(folder: Path, results: list[CaseResult], command: str) -> list[Path]:
-    rows = [
-        _csv_row(result.case, each)
-        for result in results
-        for each in sorted(result.results, key=lambda each: each.limit is not None)
-    ]
-    write_csv(folder / FILES[0], [COLUMNS, *rows])
+def _limit_cells(results: Results, unit: str) -> tuple[str, str]:
+    """The least of the longest steps of all settings, and how longer ones fail."""
+    limits = [result.limit for result in results if result.limit is not None]
+    if not limits:
+        return "-", "-"
+    least = min(limits, key=lambda limit: limit.longest)
+    is_limited = least.longest < inf
+    step = format_cell(least.longest) if is_limited else f"> {format_cell(least.tried)}"
+    return f"{step} {unit}", least.beyond or "-"
+
+
+def write_stability(folder: Path, results: Results, command: str) -> list[Path]:
+    write_csv(folder / FILES[0], [COLUMNS.split(","), *map(_csv_row, results)])
     write_text(folder / FILES[1], stability_page(results, command))
     return [folder / name for name in FILES]
 
 
-def _csv_row(case: Case, result: TrialResult) -> list[Any]:
-    trial, outcome, limit = result.trial, result.outcome, result.limit
-    row = [
-        case.name,
-        case.group,
-        "run" if limit is None else "longest step",
-        trial.setting,
-        result.integrator,
-        trial.step if limit is None else limit.longest,
-        case.step_unit,
-        outcome.error,
-        result.allowed,
-        outcome.reported_error,
-        result.verdict,
-        " or ".join(trial.expected),
-        "" if limit is None else limit.beyond,
-        outcome.seconds,
-        outcome.message or outcome.crash or outcome.remark if limit is None else limit.message,
-    ]
+def _csv_row(result: TrialResult) -> list[Any]:
+    case, trial, outcome, limit = result.case, result.trial, result.outcome, result.limit
+    row = [case.name, case.group, "run" if limit is None else "longest step", trial.setting]
+    row += [result.integrator, trial.step if limit is None else limit.longest, case.step_unit]
+    if limit is None:
+        expected = " or ".join(trial.expected)
+        row += [outcome.error, result.allowed, outcome.reported_error, result.verdict, expected]
+        message = outcome.message or outcome.crash or outcome.remark
+        row += ["", result.seconds, message]
+    else:
+        row += [""] * 5 + [limit.beyond, result.seconds, limit.message]
     return ["" if isinstance(cell, float) and isnan(cell) else cell for cell in row]
 
 
-def stability_page(results: list[CaseResult], command: str) -> str:
-    names = [plain(result.case.name) for result in results]
+def stability_page(results: Results, command: str) -> str:
+    cases = grouped(results, lambda result: result.case.name)
+    names = [plain(group[0].case.name) for group in cases]
     links = {name: Raw(f'<a href="#case-{name}">{name}</a>') for name in names}
     meanings = [[Raw(_badge(verdict)), meaning] for verdict, (meaning, _) in VERDICTS.items()]
-    bound = (
-        f"The longest step is that at which conserved quantities stay within {BOUND:g} of the"
-        " kinetic energy."
-    )
-    all_cases = table(HEADERS, rows_of(results), marked=links)
+    all_cases = table(HEADERS.split(","), rows_of(results), marked=links)
     machine = platform.processor() or platform.machine()
     parts = [
         items(conclusions(results)),
         table([], meanings, words=True),
-        section("All cases", all_cases, f"<p>{html.escape(bound)}</p>"),
-        *map(_case_section, results),
+        section("All cases", all_cases, f"<p>{BOUND_TEXT}</p>"),
+        *map(_case_section, cases),
         section("How to repeat it", code(f"{command}    # on {machine}")),
     ]
     return page("Stability", parts)
@@ -193,16 +176,18 @@ def _badge(verdict: str, count: str = "") -> str:
     return f'<span class="badge {VERDICTS[verdict][1]}">{text}</span>'
 
 
-def _case_section(result: CaseResult) -> str:
-    case, outcomes = result.case, [(run.integrator, run.outcome) for run in result.runs]
-    badges = " ".join(_badge(*count) for count in counts_of([result]).items())
-    remarks = {f"{integrator}: {o.remark}" for integrator, o in outcomes if o.remark}
-    messages = dict.fromkeys(o.message for _, o in outcomes if o.message)
+def _case_section(results: Results) -> str:
+    case = results[0].case
+    badges = " ".join(
+        _badge(verdict, str(count)) for verdict, count in verdict_counts(results).items()
+    )
+    remarks = [f"{r.name}: {r.outcome.remark}" for r in results if r.outcome.remark]
+    messages = dict.fromkeys(r.outcome.message for r in results if r.outcome.message)
     codes = [Raw(f"<code>{plain(message)}</code>") for message in list(messages)[:MESSAGES]]
     errors = f"; errors: {plain(case.error_title)}" if case.error_title else ""
     return section(
         case.name,
         f"<p>{plain(case.sentence)}{errors}. {badges}</p>",
-        items([*sorted(remarks), *codes]),
+        items([*remarks, *codes]),
         anchor=f"case-{case.name}",
     )
