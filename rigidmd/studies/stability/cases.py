@@ -95,7 +95,7 @@ class Case(NamedTuple):
 
 
 def _layered(common: Tables, row: Tables, quick: bool) -> Tables:
-    """The keys of a row, with those of the layers above it."""
+    """The keys of a row, after the keys of the layers above it."""
     like = (common | row).get("like")
     keys: Tables = {"scene": {}}
     for layer in (TABLES["defaults"], TABLES["shared"].get(like, {}), common, row):
@@ -126,7 +126,7 @@ def _sites(molecule: str) -> Tables:
     lists = [value if isinstance(value, list) else [value] * count for value in columns.values()]
     sites = [dict(zip(columns, values, strict=True)) for values in zip(*lists, strict=True)]
     return {
-        "name": "chain",
+        "name": "bent",
         "sites": [{key: value for key, value in site.items() if value != ""} for site in sites],
     }
 

@@ -191,8 +191,8 @@ def system_of(trial: Trial) -> System:
 
 
 def conserved_error(trial: Trial, results: Results) -> float:
-    """Largest error of conserved quantities, relative; of molecules: that of the energy, relative
-    to the scale of the trial."""
+    """Largest error of conserved quantities, relative; for molecules the error of the energy,
+    relative to the scale of the trial."""
     if "largest_relative_error" in results.summary:
         orthogonality = results.summary["largest_orthogonality_error"] or 0.0
         return max([*results.summary["largest_relative_error"].values(), orthogonality])
