@@ -7,31 +7,33 @@ import pytest
 
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
+from rigidmd.studies.stability import cases
 from rigidmd.studies.stability.cases import (
+    BUILDERS,
     CASES,
     CRASH,
     REFUSED,
     REPORTED,
     RIGHT,
     UNDETECTED,
-    CaseResult,
+    Case,
     Outcome,
-    failure,
-    longest_step,
+    Trial,
 )
-from rigidmd.studies.stability.report import conclusions, run_cases, selected_cases, table_text
+from rigidmd.studies.stability.report import conclusions, table_text
+from rigidmd.studies.stability.runner import TrialResult, failure, longest_step, run_cases
 
-NAMES = [case.name for case in selected_cases(None)]
+CASE = Case("made_up", 1, "A case", [])
 
 
-def check(result: CaseResult) -> None:
+def check(results: list[TrialResult]) -> None:
     """No undetected error, everything as expected, something measured."""
-    said = "\n".join(conclusions([result]))
-    assert result.failures == [], said
-    assert [(t.setting, t.family, t.verdict) for t in result.unexpected] == [], said
-    assert result.runs
-    assert all(limit.longest > 0 for limit in result.limits)
-    assert all(line in table_text([result]) for line in result.families if line)
+    sentences = "\n".join(conclusions(results))
+    assert [result.failure for result in results if result.failure] == [], sentences
+    assert [result.name for result in results if result.is_unexpected] == [], sentences
+    assert any(result.verdict for result in results)
+    assert all(result.limit.longest > 0 for result in results if result.limit is not None)
+    assert all(result.integrator in table_text(results) for result in results)
 
 
 #: Cases whose scenes nothing else compiles.
@@ -50,25 +52,20 @@ APART = (
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(case.name, marks=[pytest.mark.soak] if case.name in APART else [])
-        for case in selected_cases(None)
-    ],
+    [pytest.param(name, marks=[pytest.mark.soak] if name in APART else []) for name in CASES],
 )
 def test_quick(name):
-    (result,) = run_cases([name], quick=True)
-    check(result)
+    check(list(run_cases([name], quick=True)))
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("name", [case.name for case in selected_cases(None)])
+@pytest.mark.parametrize("name", CASES)
 def test_whole(name):
-    (result,) = run_cases([name])
-    check(result)
+    check(list(run_cases([name])))
 
 
 def test_every_group_of_the_list_has_a_case():
-    assert {case.group for case in selected_cases(None)} == set(range(1, 15))
+    assert {case.group for case in CASES.values()} == set(range(1, 15))
 
 
 @pytest.mark.parametrize(
@@ -84,11 +81,22 @@ def test_every_group_of_the_list_has_a_case():
     ],
 )
 def test_verdicts(outcome, verdict):
-    result = CaseResult("made_up", 1, "A case")
-    result.add("once", outcome, 1e-6)
-    assert result.runs[0].verdict == verdict
-    assert bool(result.failures) == (verdict in (UNDETECTED, CRASH))
-    assert (result.unexpected == []) == (verdict == RIGHT)
+    result = TrialResult(CASE, Trial("once", allowed=1e-6), "pefrl", outcome)
+    assert result.verdict == verdict
+    assert bool(result.failure) == (verdict in (UNDETECTED, CRASH))
+    assert result.is_unexpected == (verdict != RIGHT)
+
+
+def test_a_scene_that_must_be_refused_has_no_right_answer():
+    trial = Trial("once", allowed=1e-6, expected=(REFUSED,))
+    assert TrialResult(CASE, trial, "pefrl", Outcome(0.0, 0.0)).verdict == UNDETECTED
+    assert not TrialResult(CASE, trial, "pefrl", Outcome(message="no mass")).is_unexpected
+
+
+def test_an_integrator_has_its_allowed_error():
+    trial = Trial("once", allowed=1e-6, allowed_of={"pefrl": 1e-3}, rounding=1e-7)
+    assert TrialResult(CASE, trial, "pefrl", Outcome()).allowed == pytest.approx(1.0001e-3)
+    assert TrialResult(CASE, trial, "srkn_4", Outcome()).allowed == pytest.approx(1.1e-6)
 
 
 @pytest.mark.parametrize(
@@ -116,20 +124,52 @@ def test_a_step_that_never_fails_and_one_that_never_holds():
 
 
 def test_an_undetected_error_beyond_the_step_limit_is_a_failure():
-    result = CaseResult("made_up", 1, "A case")
     limit = longest_step(
         lambda step: Outcome(reported_error=1e-4 if step < 1 else 5e-4), 0.1, bound=2e-4
     )
-    result.limits.append(limit)
     assert limit.beyond == UNDETECTED
-    assert result.failures
+    result = TrialResult(CASE, Trial("once", is_bisected=True), "pefrl", Outcome(), limit)
+    assert result.failure.startswith("made_up, once pefrl, steps beyond 0.9")
+    assert conclusions([result])[0].startswith("failed: 1 cases, 0 runs")
+
+
+def test_rows_have_the_keys_of_their_layers():
+    case = Case(
+        "made_up",
+        1,
+        "A case",
+        common={"setting": "{:.0e} m", "scene": {"a": ["x", "2 + 0.5 x"], "b": 1}, "steps": 5},
+        rows=[
+            {"values": [1.0, 2.0], "quick": {"values": [4.0], "steps": 3}},
+            {"scene": {"b": {"c": "3e2 x"}}, "values": [2.0], "bisect": [False, True]},
+        ],
+    )
+    whole, quick = list(case.trials(False)), list(case.trials(True))
+    assert [trial.setting for trial in whole] == ["1e+00 m", "2e+00 m", "2e+00 m", "2e+00 m"]
+    assert [trial.is_bisected for trial in whole] == [False, False, False, True]
+    assert whole[1].scene == {"a": [2.0, 3.0], "b": 1}
+    assert whole[2].scene == {"a": [2.0, 3.0], "b": {"c": 600.0}}
+    assert [trial.steps for trial in whole] == [5, 5, 5, 5]
+    assert [(trial.setting, trial.steps) for trial in quick[:2]] == [("4e+00 m", 3), ("2e+00 m", 5)]
+    assert len(whole[0].integrators) == 5 and len(quick[0].integrators) == 3
+
+
+def test_molecules_of_the_table_are_sites():
+    (water,) = cases.insert([{"molecule": "tip4p", "count": 2}], 1.0)
+    assert water["count"] == 2
+    assert [site["name"] for site in water["sites"]] == ["OW", "HW1", "HW2", "MW"]
+    assert sum(site.get("charge_e", 0.0) for site in water["sites"]) == pytest.approx(0.0)
+    assert "sigma_A" in water["sites"][0] and "sigma_A" not in water["sites"][1]
+    assert cases.insert({"molecule": "bent_by_x"}, 0.25)["sites"][1]["position_A"][1] == 0.25
 
 
 def test_the_command_writes_its_files_and_does_not_overwrite(tmp_path, capsys):
     arguments = ["stability", "--quick", "--case", "inertia_scale", "-o", str(tmp_path / "out")]
     assert main(arguments) == 0
-    said = capsys.readouterr().out
-    assert "inertia_scale" in said and "1 cases, 6 runs: 6 right" in said
+    printed = capsys.readouterr()
+    assert printed.out.startswith("passed: 1 cases, 6 runs: 6 right;")
+    assert "warning:" not in printed.err
+    assert "\ninertia_scale  velocity_verlet, exact rotor " in printed.out
     with (tmp_path / "out" / "stability.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 6
@@ -147,13 +187,38 @@ def test_the_command_writes_its_files_and_does_not_overwrite(tmp_path, capsys):
     assert main([*arguments, "--force"]) == 0
 
 
-def test_an_undetected_error_is_exit_code_1(tmp_path, capsys, monkeypatch):
-    def lie(find, quick):
-        find.add("always", Outcome(1.0, 0.0), 1e-3)
+@pytest.fixture
+def liar(monkeypatch):
+    """A case whose answer is wrong, with a warning of its run."""
 
-    monkeypatch.setitem(CASES, "liar", CaseResult("liar", 1, "Says nothing", run=lie))
+    def lie(trial, integrator, warn, step):
+        warn("the moon is full")
+        return Outcome(1.0, 0.0)
+
+    def build(trial, x):
+        yield trial._replace(run=lie)
+
+    monkeypatch.setitem(BUILDERS, "lie", build)
+    row = {"setting": "always", "build": "lie", "allowed": 1e-3, "integrators": ["pefrl"]}
+    monkeypatch.setitem(CASES, "liar", Case("liar", 1, "Is never right", [row]))
+
+
+def test_an_undetected_error_is_exit_code_1(tmp_path, capsys, liar):
     assert main(["stability", "--case", "liar", "-o", str(tmp_path / "out")]) == 1
-    assert "liar, always: undetected" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("failed: 1 cases, 1 runs: 1 undetected;")
+    assert lines[0].endswith("; 1 warnings, which -v lists")
+    assert lines[1] == "liar, always pefrl: undetected"
+
+
+def test_warnings_follow_the_answer_and_only_where_they_are_wanted(tmp_path, capsys, liar):
+    arguments = ["stability", "--case", "liar", "-o", str(tmp_path / "out")]
+    main(arguments)
+    assert "moon" not in "".join(capsys.readouterr())
+    main([*arguments, "--force", "-v"])
+    printed = capsys.readouterr()
+    assert "moon" not in printed.err
+    assert printed.out.index("failed: ") < printed.out.index("liar, always pefrl: the moon is full")
 
 
 def test_an_unknown_case_gets_a_suggestion(tmp_path, capsys):

@@ -13,18 +13,14 @@ from rigidmd.commands.arguments import Options, argument, command, output_folder
     "rigidmd stability --quick --case near_linear --case water_steps",
     argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes"),
     argument("--case", action="append", metavar="NAME", help="only this case; may be repeated"),
+    argument("-v", "--verbose", action="store_true", help="list the warnings of the runs"),
     *output_folder("runs/stability"),
     scene="stability",
     writes=True,
 )
 def _stability(options: Options) -> int:
-    from rigidmd.studies.stability.report import (
-        FILES,
-        conclusions,
-        run_cases,
-        table_text,
-        write_stability,
-    )
+    from rigidmd.studies.stability.report import FILES, summary, write_stability
+    from rigidmd.studies.stability.runner import run_cases
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
     results = write_study(
@@ -33,7 +29,7 @@ def _stability(options: Options) -> int:
         FILES,
         "",
         lambda progress: list(run_cases(options.case, options.quick, progress)),
-        lambda results: [table_text(results), "", *conclusions(results)],
+        lambda results: summary(results, options.verbose),
         write_stability,
     )
-    return FAILED if any(result.failures for result in results) else 0
+    return FAILED if any(result.failure for result in results) else 0

@@ -1,1 +1,3 @@
-"""`rigidmd stability`: a test suite of extreme cases for the engine, each a scene made in code."""
+"""Named ways to try to break the engine, each compared with a known answer."""
+
+from rigidmd.studies.stability import bodies, molecules  # noqa: F401  (register builders)

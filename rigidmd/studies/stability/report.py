@@ -1,226 +1,193 @@
-"""`rigidmd stability`: runs named cases, each compared with a known answer; stability.csv and a
-page."""
+"""The report of `rigidmd stability`: verdict and table for the terminal, stability.csv, a page."""
 
 import html
 import platform
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
 from math import inf, isfinite, isnan
 from pathlib import Path
+from typing import Any
 
 from rigidmd.core.files import write_text
-from rigidmd.errors import SceneError
 from rigidmd.io.write import columns_text, format_cell, write_csv
-from rigidmd.scene.validation import did_you_mean
-from rigidmd.studies.stability import bodies, molecules, water  # noqa: F401  (cases)
-from rigidmd.studies.stability.cases import BOUND, CASES, CRASH, UNDETECTED, VERDICTS, CaseResult
+from rigidmd.studies.stability.cases import (
+    BOUND,
+    CRASH,
+    REFUSED,
+    REPORTED,
+    RIGHT,
+    UNDETECTED,
+)
+from rigidmd.studies.stability.runner import FAILURES, TrialResult
 from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table
 
+#: Meaning of each verdict, and how it is shown.
+VERDICTS = {
+    RIGHT: ("the answer is right within the error stated", GOOD),
+    REFUSED: ("an error message of rigidmd describes what is wrong", GOOD),
+    REPORTED: (
+        "the answer is wrong, the run finished, and the diagnostics that it reports show it",
+        DOUBTFUL,
+    ),
+    UNDETECTED: ("the answer is wrong and nothing shows it", BAD),
+    CRASH: ("an exception that is not an error of rigidmd", BAD),
+}
 FILES = ("stability.csv", "stability.html")
-HEADERS = (
-    "case",
-    "integrator",
-    "runs",
-    "verdicts",
-    "largest error",
-    "of allowed",
-    "longest step",
-    "beyond",
-    "seconds",
+HEADERS = "case,integrator,runs,verdicts,largest error,of allowed,longest step,beyond,seconds"
+COLUMNS = (
+    "case,group,kind,setting,integrator,step,step_unit,error,allowed,conserved_error,verdict,"
+    "expected,beyond,seconds,message"
 )
-KINDS = dict(zip(VERDICTS, (GOOD, GOOD, DOUBTFUL, BAD, BAD), strict=True))  # how a verdict is shown
+BOUND_TEXT = (
+    f"The longest step is that at which conserved quantities stay within {BOUND:g} of the kinetic"
+    " energy."
+)
 MESSAGES = 3  # messages of a case at most
+Results = list[TrialResult]
 
 
-def selected_cases(names: list[str] | None) -> list[CaseResult]:
-    """The cases of these names, or all. Raises SceneError with a suggestion."""
-    if unknown := [name for name in names or [] if name not in CASES]:
-        known = f"(known: {', '.join(CASES)})"
-        raise SceneError(
-            "--case",
-            [f"unknown case {name!r}{did_you_mean(name, CASES)} {known}" for name in unknown],
-        )
-    return sorted((CASES[name] for name in names or CASES), key=lambda case: case.group)
+def summary(results: Results, verbose: bool = False) -> list[str]:
+    """The verdict, failures, the table, and the warnings if it is verbose."""
+    lines = [*conclusions(results), "", table_text(results)]
+    if verbose:
+        lines += [f"{result.name}: {text}" for result in results for text in result.warnings]
+    return lines
 
 
-def run_cases(
-    names: list[str] | None = None,
-    quick: bool = False,
-    progress: Callable[..., object] = lambda *_: None,
-) -> Iterator[CaseResult]:
-    """Yield the results of the named cases (default: all) in order. progress(fraction done, name) :
-    before each"""
-    cases = selected_cases(names)
-    for k, case in enumerate(cases):
-        progress(k / len(cases), case.name)
-        result = replace(case, runs=[], limits=[], notes=[])
-        case.run(result, quick)
-        yield result
-
-
-def _row(result: CaseResult, family: str) -> list[str]:
-    runs = [t for t in result.runs if t.family == family]
-    limits = [limit for limit in result.limits if limit.family == family]
-    verdicts = Counter(t.verdict for t in runs)
-
-    # the worst of the finished runs, relative to the allowed error
-    def relative(t):
-        return t.outcome.error / t.allowed if t.allowed > 0 else t.outcome.error and inf
-
-    worst = max((t for t in runs if isfinite(t.outcome.error)), key=relative, default=None)
-    # the least of its limits if there are several settings
-    least = min(limits, key=lambda limit: limit.longest, default=None)
-    seconds = sum(t.outcome.seconds for t in runs) + sum(limit.seconds for limit in limits)
-    longest = "-"
-    if least:
-        limit = least.longest if least.longest < inf else least.tried
-        longest = f"{'' if least.longest < inf else '> '}{format_cell(limit)} {result.step_unit}"
-    return [
-        result.name,
-        family or "-",
-        str(len(runs)),
-        ", ".join(f"{verdicts[v]} {v}" for v in VERDICTS if verdicts[v]),
-        format_cell(worst.outcome.error) if worst else "-",
-        format_cell(worst.allowed) if worst else "-",
-        longest,
-        (least.beyond or "-") if least else "-",
-        f"{seconds:.1f}",
-    ]
-
-
-def table_text(results: list[CaseResult]) -> str:
-    return columns_text([HEADERS, *rows_of(results)], left=(0, 1, 3, 7))
-
-
-def rows_of(results: list[CaseResult]) -> list[list[str]]:
-    """A row for each case and integrator."""
-    return [_row(result, family) for result in results for family in result.families]
-
-
-def conclusions(results: list[CaseResult]) -> list[str]:
-    """Sentences on failures, unexpected verdicts and the total."""
-    failures = [line for result in results for line in result.failures]
-    unexpected = [
-        f"{f.name}, {t.setting} {t.family}: {t.verdict}, expected {' or '.join(t.expected)}"
-        + (f" ({t.outcome.message})" if t.outcome.message else "")
-        for f in results
-        for t in f.unexpected
-        if t.verdict not in (UNDETECTED, CRASH)
-    ]
-    counts = Counter(t.verdict for result in results for t in result.runs)
-    total = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
-    limits = sum(len(result.limits) for result in results)
+def conclusions(results: Results) -> list[str]:
+    """The verdict and the total, and sentences on failures and unexpected verdicts."""
+    failures = [result.failure for result in results if result.failure]
+    unexpected = [_unexpected(result) for result in results if result.is_unexpected]
+    counts = verdict_counts(results)
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
+    runs, cases = sum(counts.values()), len({result.case.name for result in results})
+    warnings = sum(len(result.warnings) for result in results)
     total = (
-        f"{len(results)} cases, {sum(counts.values())} runs: {total}; {limits} longest steps"
-        " bisected"
+        f"{'failed' if failures else 'passed'}: {cases} cases, {runs} runs: {verdicts};"
+        f" {len(results) - runs} longest steps bisected; {warnings} warnings"
+        f"{', which -v lists' if warnings else ''}"
     )
-    return [*failures, *unexpected, total]
+    return [total, *failures, *filter(None, unexpected)]
 
 
-def write_stability(folder: Path, results: list[CaseResult], command: str) -> list[Path]:
-    titles = [
-        "case",
-        "group",
-        "kind",
-        "setting",
-        "integrator",
-        "step",
-        "step_unit",
-        "error",
-        "allowed",
-        "conserved_error",
-        "verdict",
-        "expected",
-        "beyond",
-        "seconds",
-        "message",
+def _unexpected(result: TrialResult) -> str:
+    if result.verdict in FAILURES:
+        return ""
+    message = f" ({result.outcome.message})" if result.outcome.message else ""
+    expected = " or ".join(result.trial.expected)
+    return f"{result.name}: {result.verdict}, expected {expected}{message}"
+
+
+def verdict_counts(results: Results) -> dict[str, int]:
+    """Numbers of runs by their verdicts, in the order of VERDICTS."""
+    counts = Counter(result.verdict for result in results)
+    return {verdict: counts[verdict] for verdict in VERDICTS if counts[verdict]}
+
+
+def grouped(results: Results, key: Callable[[TrialResult], Any]) -> list[Results]:
+    groups: dict[Any, Results] = {}
+    for result in results:
+        groups.setdefault(key(result), []).append(result)
+    return list(groups.values())
+
+
+def table_text(results: Results) -> str:
+    return columns_text([HEADERS.split(","), *rows_of(results)], left=(0, 1, 3, 7))
+
+
+def rows_of(results: Results) -> list[list[str]]:
+    """A row for each case and integrator."""
+    return [_row(group) for group in grouped(results, lambda r: (r.case.name, r.integrator))]
+
+
+def _row(results: Results) -> list[str]:
+    counts = verdict_counts(results)
+    finished = [result for result in results if isfinite(result.outcome.error)]
+    worst = max(finished, key=_relative_error, default=None)
+    case = results[0].case
+    return [
+        case.name,
+        results[0].integrator or "-",
+        str(sum(counts.values())),
+        ", ".join(f"{count} {verdict}" for verdict, count in counts.items()),
+        format_cell(worst and worst.outcome.error),
+        format_cell(worst and worst.allowed),
+        *_limit_cells(results, case.step_unit),
+        f"{sum(result.seconds for result in results):.1f}",
     ]
-    lines: list[list] = []
-    for of in results:
-        begin, unit = [of.name, of.group], of.step_unit
-        lines += [
-            [
-                *begin,
-                "run",
-                t.setting,
-                t.family,
-                t.step,
-                unit,
-                t.outcome.error,
-                t.allowed,
-                t.outcome.reported_error,
-                t.verdict,
-                " or ".join(t.expected),
-                "",
-                t.outcome.seconds,
-                t.outcome.message or t.outcome.crash,
-            ]
-            for t in of.runs
-        ]
-        lines += [
-            [
-                *begin,
-                "longest step",
-                limit.setting,
-                limit.family,
-                limit.longest,
-                unit,
-                *[""] * 5,
-                limit.beyond,
-                limit.seconds,
-                limit.message,
-            ]
-            for limit in of.limits
-        ]
-    cells = [["" if isinstance(x, float) and isnan(x) else x for x in line] for line in lines]
-    write_csv(folder / FILES[0], [titles, *cells])
+
+
+def _relative_error(result: TrialResult) -> float:
+    if result.allowed > 0:
+        return result.outcome.error / result.allowed
+    return inf if result.outcome.error else 0.0
+
+
+def _limit_cells(results: Results, unit: str) -> tuple[str, str]:
+    """The least of the longest steps of all settings, and how longer ones fail."""
+    limits = [result.limit for result in results if result.limit is not None]
+    if not limits:
+        return "-", "-"
+    least = min(limits, key=lambda limit: limit.longest)
+    is_limited = least.longest < inf
+    step = format_cell(least.longest) if is_limited else f"> {format_cell(least.tried)}"
+    return f"{step} {unit}", least.beyond or "-"
+
+
+def write_stability(folder: Path, results: Results, command: str) -> list[Path]:
+    write_csv(folder / FILES[0], [COLUMNS.split(","), *map(_csv_row, results)])
     write_text(folder / FILES[1], stability_page(results, command))
     return [folder / name for name in FILES]
 
 
-def stability_page(results: list[CaseResult], command: str) -> str:
-    links = {f.name: Raw(f'<a href="#case-{plain(f.name)}">{plain(f.name)}</a>') for f in results}
-    meanings = [[Raw(_badge(verdict)), meaning] for verdict, meaning in VERDICTS.items()]
-    bound = (
-        f"The longest step is that at which conserved quantities stay within {BOUND:g} of the"
-        " kinetic energy."
-    )
+def _csv_row(result: TrialResult) -> list[Any]:
+    case, trial, outcome, limit = result.case, result.trial, result.outcome, result.limit
+    row = [case.name, case.group, "run" if limit is None else "longest step", trial.setting]
+    row += [result.integrator, trial.step if limit is None else limit.longest, case.step_unit]
+    if limit is None:
+        expected = " or ".join(trial.expected)
+        row += [outcome.error, result.allowed, outcome.reported_error, result.verdict, expected]
+        message = outcome.message or outcome.crash or outcome.remark
+        row += ["", result.seconds, message]
+    else:
+        row += [""] * 5 + [limit.beyond, result.seconds, limit.message]
+    return ["" if isinstance(cell, float) and isnan(cell) else cell for cell in row]
+
+
+def stability_page(results: Results, command: str) -> str:
+    cases = grouped(results, lambda result: result.case.name)
+    names = [plain(group[0].case.name) for group in cases]
+    links = {name: Raw(f'<a href="#case-{name}">{name}</a>') for name in names}
+    meanings = [[Raw(_badge(verdict)), meaning] for verdict, (meaning, _) in VERDICTS.items()]
+    all_cases = table(HEADERS.split(","), rows_of(results), marked=links)
+    machine = platform.processor() or platform.machine()
     parts = [
         items(conclusions(results)),
         table([], meanings, words=True),
-        section(
-            "All cases",
-            table(HEADERS, rows_of(results), marked=links),
-            f"<p>{html.escape(bound)}</p>",
-        ),
-        *map(_case, results),
-        section(
-            "How to repeat it",
-            code(f"{command}    # on {platform.processor() or platform.machine()}"),
-        ),
+        section("All cases", all_cases, f"<p>{BOUND_TEXT}</p>"),
+        *map(_case_section, cases),
+        section("How to repeat it", code(f"{command}    # on {machine}")),
     ]
     return page("Stability", parts)
 
 
 def _badge(verdict: str, count: str = "") -> str:
-    return (
-        f'<span class="badge {KINDS[verdict]}">{html.escape(f"{count} {verdict}".strip())}</span>'
+    text = html.escape(f"{count} {verdict}".strip())
+    return f'<span class="badge {VERDICTS[verdict][1]}">{text}</span>'
+
+
+def _case_section(results: Results) -> str:
+    case = results[0].case
+    badges = " ".join(
+        _badge(verdict, str(count)) for verdict, count in verdict_counts(results).items()
     )
-
-
-def _case(result: CaseResult) -> str:
-    counts = Counter(t.verdict for t in result.runs)
-    badges = " ".join(_badge(v, str(counts[v])) for v in VERDICTS if counts[v])
-    messages = dict.fromkeys(t.outcome.message for t in result.runs if t.outcome.message)
-    notes = [
-        *result.notes,
-        *(Raw(f"<code>{plain(message)}</code>") for message in list(messages)[:MESSAGES]),
-    ]
-    error = f"; errors: {plain(result.error_title)}" if result.error_title else ""
+    remarks = [f"{r.name}: {r.outcome.remark}" for r in results if r.outcome.remark]
+    messages = dict.fromkeys(r.outcome.message for r in results if r.outcome.message)
+    codes = [Raw(f"<code>{plain(message)}</code>") for message in list(messages)[:MESSAGES]]
+    errors = f"; errors: {plain(case.error_title)}" if case.error_title else ""
     return section(
-        result.name,
-        f"<p>{plain(result.sentence)}{error}. {badges}</p>",
-        items(notes),
-        anchor=f"case-{result.name}",
+        case.name,
+        f"<p>{plain(case.sentence)}{errors}. {badges}</p>",
+        items([*remarks, *codes]),
+        anchor=f"case-{case.name}",
     )
