@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
@@ -16,6 +16,7 @@ from rigidmd.analysis.registry import analysis_order, is_built_in, selected
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.analysis.runs import Runs, as_runs
+from rigidmd.core.toml import Json
 from rigidmd.errors import OutputError
 from rigidmd.figures.style import write_figure
 from rigidmd.io.folder import add_to_folder, written_by_runs
@@ -29,7 +30,7 @@ FIGURES = ("png", "svg", "pdf")  # types of files of figures
 
 def write_results(
     folder: Path,
-    frames_used: dict[str, Any],
+    frames_used: Json,
     results: list[AnalysisResult],
     failed: dict[str, str],
     figures: str = FIGURES[0],
@@ -175,7 +176,7 @@ READING = 0.25  # fraction of the progress for reading frames
 class AnalysisOutput(NamedTuple):
     """failed : analysis -> why it has failed; frames_used : for analysis.json"""
 
-    frames_used: dict[str, Any]  # stage, times (ps) from which and to which, number, notes
+    frames_used: Json  # stage, times (ps) from which and to which, number, notes
     results: list[AnalysisResult]
     failed: dict[str, str]
     files: list[Path]

@@ -11,6 +11,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+from rigidmd.core.toml import Json
 from rigidmd.errors import SettingError
 
 #: Held while settings of the process change temporarily, and while a run compiles, which changes
@@ -58,7 +59,7 @@ def without_local_settings() -> Iterator[None]:
         os.path.exists = exists
 
 
-def python_process(*arguments: str) -> dict[str, Any]:
+def python_process(*arguments: str) -> Json:
     """Arguments of `subprocess.Popen` for a process of Python with the search path of this one.
 
     The process does not import from the working directory (`-P`), where a file of others may be

@@ -18,10 +18,13 @@ LARGEST = 4_000_000
 DEEPEST = 32  # levels of nested tables and lists; scenes need six
 LEAST_WHOLE, LARGEST_WHOLE = -(2**63), 2**63 - 1  # whole numbers in TOML have 64 bits
 
+#: A table of TOML or JSON: texts, numbers, lists and tables by their keys.
+Json = dict[str, Any]
+
 _LONG_KEY = re.compile(rf"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST}}}")
 
 
-def read_toml(path: Path, error_class: type[InputError]) -> tuple[dict[str, Any], str]:
+def read_toml(path: Path, error_class: type[InputError]) -> tuple[Json, str]:
     """The tables of a file, and its text. Raises `error_class`."""
     try:
         if reason := unreadable_reason(path, LARGEST):
@@ -36,7 +39,7 @@ def read_toml(path: Path, error_class: type[InputError]) -> tuple[dict[str, Any]
         raise error_class(str(path), [describe_toml_error(error, text)]) from None
 
 
-def parse_toml(text: str) -> dict[str, Any]:
+def parse_toml(text: str) -> Json:
     """The tables of a text. Raises TOMLDecodeError, also for depths and numbers that `tomllib`
     cannot read."""
     if long := _LONG_KEY.search(text):
@@ -113,7 +116,7 @@ def shorten_text(text: str, most: int = 80) -> str:
     return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"
 
 
-def shorten_repr(value: Any) -> str:
+def shorten_repr(value: object) -> str:
     """repr of a value, without its middle if it is long."""
     try:
         return shorten_text(repr(value))

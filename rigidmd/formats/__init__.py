@@ -123,12 +123,12 @@ def has_types(path: str | Path) -> bool:
     return form is None or form.has_types
 
 
-def extensions(wanted: Callable[[Format], Any]) -> tuple[str, ...]:
+def extensions(wanted: Callable[[Format], object]) -> tuple[str, ...]:
     """Sorted extensions of the formats for which `wanted` is true."""
     return tuple(sorted(name for name, form in BY_EXTENSION.items() if wanted(form)))
 
 
-def written(wanted: Callable[[Format], Any]) -> tuple[str, ...]:
+def written(wanted: Callable[[Format], object]) -> tuple[str, ...]:
     """For each of these formats only the extension that is written."""
     return tuple(name for name in extensions(wanted) if name == BY_EXTENSION[name].extensions[0])
 

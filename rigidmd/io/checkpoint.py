@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.files import atomic_file, sync_file, unreadable_reason
+from rigidmd.core.toml import Json
 from rigidmd.errors import CheckpointError, option
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 
@@ -24,7 +25,7 @@ FORMER_JSON = "told"
 
 
 class Checkpoint(NamedTuple):
-    values: dict[str, Any]  # numbers, strings, lists and dictionaries of them
+    values: Json  # numbers, strings, lists and dictionaries of them
     arrays: dict[str, np.ndarray]
 
     def of(self, owner: str) -> "Checkpoint":

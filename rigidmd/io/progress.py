@@ -8,6 +8,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from rigidmd.core.toml import Json
+
 #: Seconds between two lines.
 PAUSE = 30.0
 
@@ -28,7 +30,7 @@ class DisplayArea:
     def __init__(self):
         self._handle: Any = None
 
-    def show(self, bundle: dict[str, Any], metadata: dict[str, Any] | None = None) -> None:
+    def show(self, bundle: Json, metadata: Json | None = None) -> None:
         if self._handle is None:
             from IPython.display import DisplayHandle
 

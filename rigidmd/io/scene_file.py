@@ -10,7 +10,7 @@ from typing import Any
 import tomli_w
 
 from rigidmd.core.files import atomic_file, write_text
-from rigidmd.core.toml import plain_values
+from rigidmd.core.toml import Json, plain_values
 from rigidmd.formats import STRUCTURE
 from rigidmd.io.folder import SCENE
 from rigidmd.scene import MolecularScene, Scene
@@ -72,7 +72,7 @@ def write_model(path: Path, model: MoleculeFile) -> None:
     write_text(path, "\n".join([*([TO_FILL_IN] if idle else []), *tables, ""]))
 
 
-def _lines(table: dict[str, Any]) -> str:
+def _lines(table: Json) -> str:
     return "\n".join(f"{key} = {_value(value)}" for key, value in table.items())
 
 

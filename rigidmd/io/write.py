@@ -37,12 +37,14 @@ def check_target(
         )
 
 
-def write_json(path: Path, data: Any, **options: Any) -> None:
+def write_json(path: Path, data: object, **options: Any) -> None:
     """Write data, with the options of `json.dumps`. Raises OutputError, as all writers here do."""
     write_text(path, json.dumps(data, **options) + "\n")
 
 
-def write_csv(path: Path, rows: Iterable[Sequence[Any]], quoting: Any = csv.QUOTE_MINIMAL) -> None:
+def write_csv(
+    path: Path, rows: Iterable[Sequence[object]], quoting: Any = csv.QUOTE_MINIMAL
+) -> None:
     stream = io.StringIO(newline="")
     csv.writer(stream, quoting=quoting, lineterminator="\n").writerows(rows)
     write_text(path, stream.getvalue())

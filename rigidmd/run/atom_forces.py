@@ -17,6 +17,7 @@ from scipy.spatial.distance import cdist
 
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NOW, State
+from rigidmd.core.toml import Json
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.observables import observe
 from rigidmd.engines.system import System
@@ -149,7 +150,7 @@ def ase_results(
     state: State,
     form: Form = "gradient",
     atoms: np.ndarray | None = None,
-) -> dict[str, Any]:
+) -> Json:
     """Energy (eV), forces (a, 3) on the sites with mass (eV/Å) and, in a box, stress (6,) (eV/Å³)
     as ASE has them.
 

@@ -13,6 +13,7 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.time_step import stable_angle
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, State
+from rigidmd.core.toml import Json
 from rigidmd.engines.body_motion import Motion, Snapshot, energies, is_balanced, motion
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.protocol import NotFiniteError
@@ -355,7 +356,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
     def samples(self) -> Motion:
         return motion(self.system, self._sampler.snapshots)
 
-    def summary(self, samples: Motion, preparing: float, wall: float) -> dict[str, Any]:
+    def summary(self, samples: Motion, preparing: float, wall: float) -> Json:
         steps = sum(segment.steps for segment in self._segments)
         computing, interrupted = sum(self.record.position.computing), self.simulation.is_interrupted
         summary = summarise_body(

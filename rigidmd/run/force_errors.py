@@ -10,6 +10,7 @@ import numpy as np
 
 from rigidmd.assemble.build import build
 from rigidmd.core.state import Load, State
+from rigidmd.core.toml import Json
 from rigidmd.dynamics.barostats import COMPONENTS
 from rigidmd.dynamics.model import mobile
 from rigidmd.engines.system import System
@@ -41,7 +42,7 @@ REFERENCE_ERROR = 1e-3
 MIN_REFERENCE_ERROR = 1e-12  # e²/Å²; float64 has no more digits
 
 
-def coulomb_errors(system: System, state: State, size: float = 1.0) -> dict[str, Any]:
+def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
     """Errors of a system's Ewald sums at a state, of forces on sites and of the energy, compared
     with a more accurate sum: the entry `accuracy` of `rigidmd energy`, with energies in a unit of
     `size` u Å²/ps². Raises SceneError if it has no Ewald sums."""

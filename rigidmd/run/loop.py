@@ -6,9 +6,8 @@ import os
 import signal
 import time as clock
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from inspect import GEN_CLOSED, GEN_CREATED, GEN_RUNNING, getgeneratorstate
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,7 +66,12 @@ class RunLoop:
     drive : advances it; the run pauses in between, and then holds its folder and its files
     advanced : steps of the last call of `drive`
     results : of the run, after its end
+
+    What comes next is a method: _open, _begin or _reenter, then for each segment _enter, _prepare,
+    _advance from one observation to the next, _leave, and at the end _finish.
     """
+
+    _schedule: ObservationSchedule  # of the present segment
 
     def __init__(
         self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None
@@ -86,20 +90,23 @@ class RunLoop:
         self._error: Exception | None = None  # of an observer
         self._failed_before: list[Observer] = []
         self._bar, self._progress = progress_of(0.0, "", False), False
-        self._until = 0.0  # the step at which the run pauses
         self._wall = 0.0  # seconds before the time since which it runs
         self._since = clock.perf_counter()
+        self._preparing = 0.0  # seconds
         self._observers: dict[str, Observer] = {}
-        self._course = self._run()
+        # The position is what comes next, here, and what checkpoints have of it: the segment in
+        # `RunRecord.position`, and the step in the state.
+        self._next: Callable[[], None] = self._open
+        self._until = 0.0  # the step at which the run pauses
+        self._shown: list[bool] | None = None  # observers called after the last steps
+        self._pace = inf  # seconds per step
+        # locks and files, which remain open while the run pauses
+        self._opened = contextlib.ExitStack()
+        self.is_running = False  # whether the run advances now: an observer may check
+        self.has_ended = False
 
-    @property
-    def is_running(self) -> bool:
-        """Whether the run advances now: an observer may check."""
-        return getgeneratorstate(self._course) == GEN_RUNNING
-
-    @property
-    def has_ended(self) -> bool:
-        return getgeneratorstate(self._course) == GEN_CLOSED
+    def __del__(self) -> None:
+        self._opened.close()
 
     @property
     def is_complete(self) -> bool:
@@ -116,8 +123,9 @@ class RunLoop:
                 stack.enter_context(
                     signal_handler(self._simulation.ask_for_checkpoint, signal.SIGUSR1)
                 )
-            if getgeneratorstate(self._course) == GEN_CREATED:
-                next(self._course)
+            if self._next == self._open:
+                with self._running():
+                    self._open()
             part, total = self._part, sum(self._part.durations())
             before = int(part.state.step[NOW])
             self._until = before + steps
@@ -127,97 +135,119 @@ class RunLoop:
             )
             stack.enter_context(self._bar).skip(float(part.state.time[NOW]))
             self._since = clock.perf_counter()
-            next(self._course, None)
+            with self._running():
+                self._continue()
             self._wall += clock.perf_counter() - self._since
         if steps < inf and self.signal is not None:
             signal.raise_signal(self.signal)
         self.advanced = int(part.state.step[NOW]) - before
 
-    def _run(self) -> Generator[None]:
-        """The run. It pauses before its first step, and whenever step `_until` is reached."""
+    @contextlib.contextmanager
+    def _running(self) -> Iterator[None]:
+        """Context in which the run advances. It ends by an error or `_finish`, and then closes its
+        files."""
+        self.is_running = True
+        try:
+            with self._opened as opened:
+                yield
+                if not self.has_ended:
+                    self._opened = opened.pop_all()
+        except BaseException:
+            self.has_ended = True
+            raise
+        finally:
+            self.is_running = False
+
+    def _open(self) -> None:
+        """Do everything before the first step: the folder, the checkpoint, compilation. All checks
+        come before the first change of a file."""
         simulation, part = self._simulation, self._part
-        with contextlib.ExitStack() as stack:
-            checkpoint, stays = None, False
-            if self._folder is not None:
-                lock = FolderLock(self._folder)
-                stack.callback(self._if_not_forked, lock.release)
-                lock.take()
-                if self._resumes:
-                    checkpoint, stays = self._read_checkpoint(self._folder)
-            part.reset()
-            began, input_sha256 = clock.perf_counter(), resume.input_digests(simulation.scene)
-            scene, changed = resume.plain(simulation.scene), None
-            if checkpoint is not None:
-                with resume.as_checkpoint_errors(self._folder):
-                    kind = part.record_type
-                    part.record = kind(
-                        **resume.restored(checkpoint.of(RECORD), kind.types(), part.scene.rows)
-                    )
-                    part.restore(checkpoint)
-                    part.check_position()
-                    changed = resume.describe_changes(checkpoint.values["with"])
-            part.record.scene, part.record.inputs = scene, input_sha256
-            self._observers = _observers_by_name(part.default_observers(), simulation.observers)
-            observers = list(self._observers.values())
-            names = [name for observer in observers for name in observer.files()]
-            names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self.checkpoints.writes else [])]
-            if self._folder is not None and stays:
-                run_folder.check_names(self._folder, names)
-            elif self._folder is not None:
-                source = simulation.scene.path(Path(simulation.scene.source).name)
-                inputs = [
-                    *simulation.scene.inputs.values(),
-                    *([source] if source.is_file() else []),
-                ]
-                run_folder.check_folder(self._folder, self._force, inputs, names)
-            if checkpoint is None:
-                for warning in part.system.warnings:
-                    simulation.note(warning)
-                # of several runs one compiles, and the others read its cache
-                with interruptible(), PROCESS_LOCK, compiling_announced(self._announce_compiling):
-                    part.prepare()
-            preparing = clock.perf_counter() - began
-            for observer in observers:
-                stack.push(partial(self._close, observer))
-            if checkpoint is not None:  # all checks come before the first change of a file
-                with resume.as_checkpoint_errors(self._folder):
-                    for name, observer in self._observers.items():
-                        if name.startswith(USER) and name not in checkpoint.values["of"]:
-                            observer.begin(simulation)
-                        else:
-                            observer.resume(simulation, checkpoint.of(name))
-                if changed is not None:
-                    simulation.note(changed)
-                simulation.announce(f"continuing from step {part.state.step[NOW]}")
-            if self._folder is not None and stays:
-                run_folder.add_to_folder(self._folder, names)
-                with writing(self._folder):
-                    (self._folder / SUMMARY).unlink(missing_ok=True)
-            elif self._folder is not None:
-                run_folder.make_folder(self._folder, names, lock)
-            self.has_begun = True
-            yield
-            for observer in observers:
-                if checkpoint is None:
-                    observer.begin(simulation)
+        checkpoint, stays, changed = None, False, None
+        if self._folder is not None:
+            lock = FolderLock(self._folder)
+            self._opened.callback(self._if_not_forked, lock.release)
+            lock.take()
+            if self._resumes:
+                checkpoint, stays = self._read_checkpoint(self._folder)
+        part.reset()
+        began, input_sha256 = clock.perf_counter(), resume.input_digests(simulation.scene)
+        scene = resume.plain(simulation.scene)
+        if checkpoint is not None:
+            with resume.as_checkpoint_errors(self._folder):
+                kind = part.record_type
+                part.record = kind(
+                    **resume.restored(checkpoint.of(RECORD), kind.types(), part.scene.rows)
+                )
+                part.restore(checkpoint)
+                part.check_position()
+                changed = resume.describe_changes(checkpoint.values["with"])
+        part.record.scene, part.record.inputs = scene, input_sha256
+        self._observers = _observers_by_name(part.default_observers(), simulation.observers)
+        names = [name for observer in self._observers.values() for name in observer.files()]
+        names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self.checkpoints.writes else [])]
+        if self._folder is not None and stays:
+            run_folder.check_names(self._folder, names)
+        elif self._folder is not None:
+            source = simulation.scene.path(Path(simulation.scene.source).name)
+            inputs = [*simulation.scene.inputs.values(), *([source] if source.is_file() else [])]
+            run_folder.check_folder(self._folder, self._force, inputs, names)
+        if checkpoint is None:
+            for warning in part.system.warnings:
+                simulation.note(warning)
+            # of several runs one compiles, and the others read its cache
+            with interruptible(), PROCESS_LOCK, compiling_announced(self._announce_compiling):
+                part.prepare()
+        self._preparing = clock.perf_counter() - began
+        for observer in self._observers.values():
+            self._opened.push(partial(self._close, observer))
+        if checkpoint is not None:
+            self._resume_observers(checkpoint)
+            if changed is not None:
+                simulation.note(changed)
+            simulation.announce(f"continuing from step {part.state.step[NOW]}")
+        if self._folder is not None and stays:
+            run_folder.add_to_folder(self._folder, names)
+            with writing(self._folder):
+                (self._folder / SUMMARY).unlink(missing_ok=True)
+        elif self._folder is not None:
+            run_folder.make_folder(self._folder, names, lock)
+        self.has_begun = True
+        self._next = self._begin if checkpoint is None else self._reenter
+
+    def _resume_observers(self, checkpoint: Checkpoint) -> None:
+        with resume.as_checkpoint_errors(self._folder):
+            for name, observer in self._observers.items():
+                if name.startswith(USER) and name not in checkpoint.values["of"]:
+                    observer.begin(self._simulation)
                 else:
-                    observer.cut()
-            try:
-                yield from self._run_segments(checkpoint is not None)
-                while self._until < inf and self.signal is None and self._error is None:
-                    yield  # `run` or `close` completes the run
-                self._finish(preparing, self._wall + clock.perf_counter() - self._since)
-            except (SimulationError, OutputError) as error:
-                self._check_process()
-                raise self._failed(error) from None
-            except (
-                Exception
-            ) as error:  # of a user force, or of an observer, after which all files are complete
-                if error is not self._error and os.getpid() == self.process:
-                    for observer in observers:
-                        with contextlib.suppress(Exception):  # the first error is the one to report
-                            observer.failed(simulation)
-                raise
+                    observer.resume(self._simulation, checkpoint.of(name))
+
+    @property
+    def _pauses(self) -> bool:
+        """Whether the run waits for the next call of `drive`, by `Simulation.step`, `run` or
+        `close`."""
+        if self._next == self._advance:
+            return int(self._part.state.step[NOW]) >= self._until and not self.interrupted
+        waits = self._until < inf and self.signal is None and self._error is None
+        return self._next == self._finish and waits
+
+    def _continue(self) -> None:
+        """Do what comes next until the run pauses or ends."""
+        if self._next in (self._begin, self._reenter):
+            self._next()
+        try:
+            while not (self.has_ended or self._pauses):
+                self._next()
+        except (SimulationError, OutputError) as error:
+            self._check_process()
+            raise self._failed(error) from None
+        # of a user force, or of an observer, after which all files are complete
+        except Exception as error:
+            if error is not self._error and os.getpid() == self.process:
+                for observer in self._observers.values():
+                    with contextlib.suppress(Exception):  # the first error is the one to report
+                        observer.failed(self._simulation)
+            raise
 
     def _announce_compiling(self) -> None:
         self._simulation.announce(f"compiling ({describe_cache()})")
@@ -229,7 +259,7 @@ class RunLoop:
             function()
 
     def _close(
-        self, observer: Observer, kind: Any, error: BaseException | None, trace: Any
+        self, observer: Observer, kind: object, error: BaseException | None, trace: object
     ) -> None:
         """Close the files of an observer; of two errors the earlier one is reported."""
         with contextlib.suppress(*([] if error is None else [OutputError])):
@@ -242,19 +272,19 @@ class RunLoop:
                 " began it"
             )
 
-    def _finish(self, preparing: float, wall: float) -> None:
-        """Make the results, with all files written; times as in `RunPart.summary`. Raises
-        OutputError."""
+    def _finish(self) -> None:
+        """Make the results, with all files written. Raises OutputError."""
         simulation, part, notes = self._simulation, self._part, self._part.record.notes
         self._note_lost_files()
         results = Results(part.system, part.state, part.samples())
         results.interrupted = self.interrupted
         results.signal = self.signal
         results.out_of_time = self.out_of_time
+        wall = self._wall + clock.perf_counter() - self._since
         made_by = resume.provenance(
             simulation.scene, part.threads, part.record.inputs, part.engine_version
         )
-        results.summary = made_by | part.summary(results.samples, preparing, wall)
+        results.summary = made_by | part.summary(results.samples, self._preparing, wall)
         for draws in (False, True):  # results first, pictures after
             noted = len(notes)
             for observer in self._observers.values():
@@ -269,6 +299,7 @@ class RunLoop:
                     files[-1], results.summary, indent=2, ensure_ascii=False, allow_nan=False
                 )
         results.files, self.results = files, results
+        self.has_ended = True
         if self._error is not None:
             raise self._error
 
@@ -355,74 +386,103 @@ class RunLoop:
         position = record.position.segment, int(part.state.step[NOW]), record.position.seconds > 0
         self.checkpoints.write_once(Checkpoint(data, arrays), position)
 
-    def _run_segments(self, resumed: bool) -> Generator[None]:
-        """Advance through all segments, or from the position of a checkpoint on; pause at step
-        `_until`."""
-        part, position, observers = self._part, self._part.record.position, self._observers.values()
-        for k in range(position.segment, len(part.durations())):
-            if resumed:
-                part.segment = segment = part.reenter_segment(k)
-            else:
-                part.segment = segment = part.enter_segment(k)
-                position.segment = k
-                position.first = int(part.state.step[NOW])
-                position.seconds = 0.0
-                if k == 0:
-                    self._notify(0, [observer.interval is not None for observer in observers])
-                    self._checkpoint()
-            done, resumed = int(part.state.step[NOW]) - position.first, False
-            schedule = ObservationSchedule(observers, segment)
-            if segment.action is not None:
-                began = clock.perf_counter()
-                segment.action(self._progress)
-                position.seconds = clock.perf_counter() - began
-                due = [observer.interval is not None or observer.ends for observer in observers]
-                self._notify(0, due)
-            shown, pace = None, inf
-            self._bar.unpause()
-            while done < segment.steps and not self.interrupted:
-                to = min(schedule.next_observation(done), self._until - position.first)
-                together = segment.together
-                if pace > 0:  # the first step alone, as it may be slow
-                    to = min(to, done + max(1, int(SEGMENT_SECONDS / pace)))
-                to = done + -int((done - to) // together) * together
-                before, shown = shown, schedule.due(to)
-                with_energies = any(
-                    each.reads_energies for each, now in zip(observers, shown, strict=True) if now
-                )
-                began = clock.perf_counter()
-                try:
-                    part.engine.advance(
-                        part.state, segment.method, segment.dt, position.first + to, with_energies
-                    )
-                except Halted:
-                    shown = before
-                    break
-                seconds = clock.perf_counter() - began
-                pace = seconds / (to - done)
-                position.seconds += seconds
-                if not part.is_finite():
-                    raise NotFiniteError(part.state)
-                advance, done = segment.dt * (to - done), to
-                self._notify(done, shown)
-                self._bar.update(advance)
-                if not self.must_end() and done < segment.steps and self.checkpoints.is_due:
-                    self._checkpoint()
-                while position.first + done >= self._until and not self.interrupted:
-                    yield
-            if not (segment.action is not None and self.interrupted):
-                self._checkpoint()
-            # only a run that stops here calls these observers
-            if done < segment.steps and shown is not None:
-                due = [
-                    observer.ends and not is_shown
-                    for observer, is_shown in zip(observers, shown, strict=True)
-                ]
-                self._notify(done, due)
-            position.time += done * segment.dt
-            position.computing.append(position.seconds)
-            if self.interrupted:
-                break
+    def _begin(self) -> None:
+        """Begin the first files."""
+        for observer in self._observers.values():
+            observer.begin(self._simulation)
+        self._next = self._enter
+
+    def _reenter(self) -> None:
+        """Resume in the segment of a checkpoint."""
+        for observer in self._observers.values():
+            observer.cut()
+        self._next = self._prepare
+        part = self._part
+        part.segment = part.reenter_segment(part.record.position.segment)
+
+    def _enter(self) -> None:
+        """Enter the first segment, or the next one."""
+        part, position = self._part, self._part.record.position
+        k = len(position.computing)
+        part.segment = part.enter_segment(k)
+        position.segment = k
+        position.first = int(part.state.step[NOW])
+        position.seconds = 0.0
+        if k == 0:
+            self._notify(0, [each.interval is not None for each in self._observers.values()])
+            self._checkpoint()
+        self._next = self._prepare
+
+    def _prepare(self) -> None:
+        """Take the action of a segment, if it has one, before its steps."""
+        segment, observers = self._part.segment, self._observers.values()
+        self._schedule = ObservationSchedule(observers, segment)
+        if segment.action is not None:
+            began = clock.perf_counter()
+            segment.action(self._progress)
+            self._part.record.position.seconds = clock.perf_counter() - began
+            self._notify(0, [each.interval is not None or each.ends for each in observers])
+        self._shown, self._pace = None, inf
+        self._bar.unpause()
+        self._next = self._advance
+
+    def _advance(self) -> None:
+        """Advance to the next observation, or for about `SEGMENT_SECONDS`."""
+        part, segment, position = self._part, self._part.segment, self._part.record.position
+        done = self._done
+        if done >= segment.steps or self.interrupted:
+            self._next = self._leave
+            return
+        to = min(self._schedule.next_observation(done), self._until - position.first)
+        if self._pace > 0:  # the first step alone, as it may be slow
+            to = min(to, done + max(1, int(SEGMENT_SECONDS / self._pace)))
+        to = done + -int((done - to) // segment.together) * segment.together
+        shown = self._schedule.due(to)
+        with_energies = any(
+            each.reads_energies
+            for each, now in zip(self._observers.values(), shown, strict=True)
+            if now
+        )
+        began = clock.perf_counter()
+        try:
+            part.engine.advance(
+                part.state, segment.method, segment.dt, position.first + to, with_energies
+            )
+        except Halted:
+            self._next = self._leave
+            return
+        seconds = clock.perf_counter() - began
+        self._shown, self._pace = shown, seconds / (to - done)
+        position.seconds += seconds
+        if not part.is_finite():
+            raise NotFiniteError(part.state)
+        self._notify(to, shown)
+        self._bar.update(segment.dt * (to - done))
+        if not self.must_end() and to < segment.steps and self.checkpoints.is_due:
+            self._checkpoint()
+
+    def _leave(self) -> None:
+        """Leave a segment, with a checkpoint."""
+        segment, position = self._part.segment, self._part.record.position
+        done, shown = self._done, self._shown
+        if not (segment.action is not None and self.interrupted):
+            self._checkpoint()
+        # only a run that stops here calls these observers
+        if done < segment.steps and shown is not None:
+            due = [
+                observer.ends and not is_shown
+                for observer, is_shown in zip(self._observers.values(), shown, strict=True)
+            ]
+            self._notify(done, due)
+        position.time += done * segment.dt
+        position.computing.append(position.seconds)
+        is_last = len(position.computing) == len(self._part.durations())
+        self._next = self._finish if is_last or self.interrupted else self._enter
+
+    @property
+    def _done(self) -> int:
+        """Steps since the start of the present segment."""
+        return int(self._part.state.step[NOW]) - self._part.record.position.first
 
     def _notify(self, done: int, due: Sequence[bool]) -> None:
         """Call the observers that are due after `done` steps of the present segment."""
@@ -435,7 +495,7 @@ class RunLoop:
         self._check_process()
 
     def _call_observer(
-        self, observer: Observer, method: Callable[..., None], *arguments: Any
+        self, observer: Observer, method: Callable[..., None], *arguments: object
     ) -> None:
         """Call a method of an observer, unless the observer has failed before. Its error ends the
         run, which raises it when all files are complete; an error of a figure becomes a note. `see`

@@ -16,6 +16,7 @@ from rigidmd.assemble.user_code.compiled import check_compiled_code
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, REMOVED, State, state_of
+from rigidmd.core.toml import Json
 from rigidmd.dynamics.model import remove_momentum
 from rigidmd.dynamics.observables import largest_values
 from rigidmd.engines.observables import Observation, describe_quantities, observe
@@ -495,7 +496,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     def samples(self) -> Samples:
         return self._sampler.samples
 
-    def summary(self, samples: Samples, preparing: float, wall: float) -> dict[str, Any]:
+    def summary(self, samples: Samples, preparing: float, wall: float) -> Json:
         self.record.moves[self.record.position.segment] = self.engine.moves or (0, 0)
         return summarise(
             self.system,

@@ -151,7 +151,7 @@ class Observer:
         return ""
 
 
-def as_observer(value: Any) -> Observer:
+def as_observer(value: object) -> Observer:
     """An observer, or one that calls an object with `see` and `interval` (or `steps`, `ends`),
     which may also have any of the other methods and attributes of `Observer` but `remembers`.
     Raises TypeError."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW, ORIGIN, State
+from rigidmd.core.toml import Json
 from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.protocol import Engine
@@ -116,7 +117,7 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         """What the observers have sampled."""
 
     @abstractmethod
-    def summary(self, samples: SamplesT, preparing: float, wall: float) -> dict[str, Any]:
+    def summary(self, samples: SamplesT, preparing: float, wall: float) -> Json:
         """The summary of the run.
 
         preparing : seconds of compiling and removal of overlaps
@@ -125,7 +126,7 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
 
     @staticmethod
     @abstractmethod
-    def summary_text(summary: dict[str, Any], known: Any) -> str:
+    def summary_text(summary: Json, known: Any) -> str:
         """The summary as text, without the notes in `known`."""
 
     @abstractmethod
@@ -133,7 +134,7 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         """An error in full: what was seen, the likely cause, what to try."""
 
     @abstractmethod
-    def start_energy(self, *arguments: Any, **options: Any) -> dict[str, Any]:
+    def start_energy(self, *arguments: Any, **options: Any) -> Json:
         """Energies and forces at the start."""
 
     def take_threads(self, count: int) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.core.state import State
+from rigidmd.core.toml import Json
 from rigidmd.engines import samples
 from rigidmd.engines.body_motion import Snapshot, motion
 from rigidmd.engines.body_system import BodySystem
@@ -39,7 +40,7 @@ class Record:
     folder: Path
     scene: MolecularScene | BodyScene
     system: Any  # a `System`, or a `BodySystem` for a body
-    summary: dict[str, Any] | None
+    summary: Json | None
     columns: dict[str, np.ndarray]
     missing: list[str]
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from rigidmd.core.display import Displayed
 from rigidmd.core.state import State
+from rigidmd.core.toml import Json
 from rigidmd.errors import OutputError
 from rigidmd.formats import BY_EXTENSION
 
@@ -48,7 +49,7 @@ class Results(Displayed):
     system: "System | BodySystem"
     _state: State | None
     samples: "Samples | Motion"
-    summary: dict[str, Any] = field(default_factory=dict)
+    summary: Json = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     interrupted: bool = False
     signal: int | None = None

@@ -19,7 +19,7 @@ from rigidmd.compile.machine import CODE_SETTINGS, PROCESSOR, PROCESSOR_FEATURES
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.core.state_file import array_errors
-from rigidmd.core.toml import shorten_text
+from rigidmd.core.toml import Json, shorten_text
 from rigidmd.errors import CheckpointError, SceneError, option
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import elsewhere
@@ -48,7 +48,7 @@ NOT_COMPARED = (
 )
 
 
-def computed_with() -> dict[str, Any]:
+def computed_with() -> Json:
     """Everything besides the scene that may change the bits of a result, as JSON values."""
     settings = " ".join(
         f"{name}={os.environ[name]}" for name in CODE_SETTINGS if name in os.environ
@@ -64,9 +64,7 @@ def computed_with() -> dict[str, Any]:
     }
 
 
-def provenance(
-    scene: Scene, threads: int, inputs: Mapping[str, str], engine: str
-) -> dict[str, Any]:
+def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: str) -> Json:
     """The first part of summary.json: `computed_with`, and the input.
 
     inputs : `input_digests` at the start; engine : the program that computed the motion
@@ -108,19 +106,19 @@ def input_digests(scene: Scene, file_digest: Callable[[Path], str] = file_digest
     }
 
 
-def plain(scene: BaseModel) -> dict[str, Any]:
+def plain(scene: BaseModel) -> Json:
     """A scene, or a part of one, as JSON values."""
     return scene.model_dump(mode="json", exclude_none=True)
 
 
-def keys_of(scene: Mapping[str, Any], excluded: Iterable[str]) -> dict[str, Any]:
+def keys_of(scene: Mapping[str, object], excluded: Iterable[str]) -> Json:
     """Dotted key -> value of a `plain` scene, without the keys and tables in `excluded`."""
     left_out = tuple(f"{key}." for key in excluded)
     return {key: value for key, value in _flat(scene).items() if not f"{key}.".startswith(left_out)}
 
 
 def differences(
-    first: Mapping[str, Any], second: Mapping[str, Any], left_out: Any = "left out"
+    first: Mapping[str, object], second: Mapping[str, object], left_out: object = "left out"
 ) -> dict[str, tuple]:
     """Key -> both values, where two dictionaries differ."""
     pairs = {
@@ -137,7 +135,7 @@ def describe_differences(values: Mapping[str, tuple[Any, Any]], files: Iterable[
     return changes + [f"the file of {key} has changed" for key in files]
 
 
-def _flat(data: Any, name: str = "") -> dict[str, Any]:
+def _flat(data: Any, name: str = "") -> Json:
     """Dotted key -> value of nested tables, without None."""
     if isinstance(data, list) and any(isinstance(value, Mapping) for value in data):
         data = dict(enumerate(data))
@@ -158,7 +156,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def check_same_scene(
-    scene: Scene, before: Mapping[str, Any], inputs: Mapping[str, str], steps: int
+    scene: Scene, before: Mapping[str, object], inputs: Mapping[str, str], steps: int
 ) -> None:
     """Raise CheckpointError unless a resolved scene can continue a run of the scene `before` after
     some steps. The last stage of molecules may be longer or shorter than before, but not shorter
@@ -180,7 +178,7 @@ def check_same_scene(
         )
 
 
-def describe_changes(before: Mapping[str, Any]) -> str | None:
+def describe_changes(before: Mapping[str, object]) -> str | None:
     """A sentence if the run so far was computed with other versions or on another processor; None
     otherwise."""
     changed = [
@@ -242,7 +240,7 @@ def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
 
 def restored(
     kept: Checkpoint, types: Mapping[str, Any], rows: Mapping[str, Scheme] | None = None
-) -> dict[str, Any]:
+) -> Json:
     """The attributes of `stored`, validated. rows : see `Scene.rows`. Raises ValueError or
     KeyError."""
     arrays: dict[str, Any] = {
@@ -292,13 +290,13 @@ class RunRecord:
     follow the annotations.
     """
 
-    scene: dict[str, Any] = field(default_factory=dict)  # as JSON values
+    scene: Json = field(default_factory=dict)  # as JSON values
     inputs: dict[str, str] = field(default_factory=dict)  # key -> SHA-256
     notes: list[str] = field(default_factory=list)  # warnings
     position: RunPosition = field(default_factory=RunPosition)
 
     @classmethod
-    def types(cls) -> dict[str, Any]:
+    def types(cls) -> Json:
         """Field -> its type."""
         return get_type_hints(cls, include_extras=True)
 

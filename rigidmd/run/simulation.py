@@ -30,6 +30,7 @@ import numpy as np
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.display import Displayed
 from rigidmd.core.state import State
+from rigidmd.core.toml import Json
 from rigidmd.errors import RigidMDError, RigidMDWarning, SceneError
 from rigidmd.io import folder as run_folder
 from rigidmd.io.progress import DisplayArea, announce, is_shown
@@ -213,7 +214,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._summary_line}>"
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> object:
         what = (
             "a Simulation has compiled code and open files, and can be neither copied nor pickled"
         )
@@ -383,7 +384,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """Set the number of threads. Results do not depend on it; a single body always has one."""
         self._before_run().take_threads(count)
 
-    def start_energy(self, *unit: Any, **options: Any) -> dict[str, Any]:
+    def start_energy(self, *unit: Any, **options: Any) -> Json:
         """Energies and forces at the start; for the arguments see `MolecularRun.start_energy`, a
         body has none."""
         return self._before_run().start_energy(*unit, **options)

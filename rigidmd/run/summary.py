@@ -4,12 +4,13 @@ and its notes."""
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from math import isnan, sqrt
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rigidmd.core.state import REMOVED, State
 from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean_and_error, slope
+from rigidmd.core.toml import Json
 from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import (
@@ -448,7 +449,7 @@ def _finite_or_none(value: float) -> float | None:
     return None if isnan(value) else float(value)
 
 
-def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
+def minimum_figures(found: Minimum, molecules: int) -> Json:
     """The values of a minimum with units in their keys. Pressures are without the kinetic part;
     None without a box."""
     pressure = None if found.pressure is None else np.array(found.pressure) / BAR

@@ -1,7 +1,5 @@
 """Scenes: `Scene.read(path)` returns the scene of molecules or of a single body."""
 
-from typing import Any
-
 from pydantic import BaseModel
 from pydantic.json_schema import (
     GenerateJsonSchema,
@@ -10,6 +8,7 @@ from pydantic.json_schema import (
     models_json_schema,
 )
 
+from rigidmd.core.toml import Json
 from rigidmd.scene.base import Scene, parse_override
 from rigidmd.scene.body import BodyScene
 from rigidmd.scene.models import available_models
@@ -18,7 +17,7 @@ from rigidmd.scene.molecules import MolecularScene
 __all__ = ["BodyScene", "MolecularScene", "Scene", "parse_override", "schema"]
 
 
-def schema() -> dict[str, Any]:
+def schema() -> Json:
     """The JSON schema of scene files: `BodyScene` for a file with a table [body], else
     `MolecularScene`."""
     kinds: list[tuple[type[BaseModel], JsonSchemaMode]] = [

@@ -25,6 +25,7 @@ from rigidmd.core.plain_text import did_you_mean, similar_names, suggestion
 from rigidmd.core.shipped import examples
 from rigidmd.core.toml import (
     DEEPEST,
+    Json,
     TOMLDecodeError,
     impossible_values,
     parse_toml,
@@ -158,25 +159,21 @@ class Scene(Section, Displayed):
         return self._embedded_files
 
     @classmethod
-    def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
+    def contradictions(cls, data: Json, text: str) -> list[str]:
         """Messages on tables that contradict each other, found even if single tables are
         invalid."""
         return []
 
     @overload
     @classmethod
-    def read(
-        cls: type[AnyScene], path: PathName, overrides: dict[str, Any] | None = None
-    ) -> AnyScene: ...
+    def read(cls: type[AnyScene], path: PathName, overrides: Json | None = None) -> AnyScene: ...
     @overload
     @classmethod
     def read(
-        cls, path: PathName, overrides: dict[str, Any] | None = None
+        cls, path: PathName, overrides: Json | None = None
     ) -> "MolecularScene | BodyScene": ...
     @classmethod
-    def read(
-        cls, path: PathName, overrides: dict[str, Any] | None = None
-    ) -> "MolecularScene | BodyScene":
+    def read(cls, path: PathName, overrides: Json | None = None) -> "MolecularScene | BodyScene":
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}.
 
         An override of None removes the key. Files named in the scene must lie in its folder or
@@ -196,9 +193,9 @@ class Scene(Section, Displayed):
     @classmethod
     def from_dict(
         cls: type[AnyScene],
-        data: dict[str, Any],
+        data: Json,
         folder: PathName = ".",
-        overrides: dict[str, Any] | None = None,
+        overrides: Json | None = None,
         source: str = "scene",
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
@@ -207,9 +204,9 @@ class Scene(Section, Displayed):
     @classmethod
     def from_dict(
         cls,
-        data: dict[str, Any],
+        data: Json,
         folder: PathName = ".",
-        overrides: dict[str, Any] | None = None,
+        overrides: Json | None = None,
         source: str = "scene",
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
@@ -217,9 +214,9 @@ class Scene(Section, Displayed):
     @classmethod
     def from_dict(
         cls,
-        data: dict[str, Any],
+        data: Json,
         folder: PathName = ".",
-        overrides: dict[str, Any] | None = None,
+        overrides: Json | None = None,
         source: str = "scene",
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
@@ -295,7 +292,7 @@ class Scene(Section, Displayed):
         return scene
 
 
-def read_tables(path: Path) -> tuple[dict[str, Any], str]:
+def read_tables(path: Path) -> tuple[Json, str]:
     """The tables of a scene file, and its text. Raises SceneError, which suggests shipped scenes of
     similar names."""
     fault = unreadable_reason(path)
@@ -367,7 +364,7 @@ def _working_directory() -> Path:
         return Path()
 
 
-def with_absolute_paths(data: Mapping[str, Any], folder: PathName = "") -> dict[str, Any]:
+def with_absolute_paths(data: Mapping[str, Any], folder: PathName = "") -> Json:
     """A copy of the tables of a scene in which every path, relative to a folder, is absolute.
 
     folder : default: the working directory
@@ -413,7 +410,7 @@ def _similar_files(path: Path, suffix: str = "") -> str:
     return suggestion([other.name for other in neighbours if other.stem in stems])
 
 
-def file_name(wanted: Callable[[Format], Any]) -> AfterValidator:
+def file_name(wanted: Callable[[Format], object]) -> AfterValidator:
     """Annotation of a plain file name with an extension that is written of the formats for which
     `wanted` is true."""
 
@@ -466,7 +463,7 @@ def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
     return "".join(f"; {setting(key)} removes it" for key in removable)
 
 
-def _has_key(data: Any, key: str) -> bool:
+def _has_key(data: object, key: str) -> bool:
     """Whether nested tables have a dotted key that is not a table."""
     for part in key.split("."):
         if not isinstance(data, dict) or part not in data:
@@ -475,7 +472,7 @@ def _has_key(data: Any, key: str) -> bool:
     return not isinstance(data, dict)
 
 
-def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
+def override(data: dict, key: str, value: object) -> tuple[str, list[str]]:
     """Set one dotted key in nested tables and lists in place; None removes it. Returns the key,
     with numbers for names of entries of lists, and error messages."""
     *parents, last = key.split(".", DEEPEST + 1)
@@ -541,7 +538,7 @@ def parse_override(text: str) -> tuple[str, Any]:
         return key.strip(), value.strip()
 
 
-def format_override(key: str, value: Any) -> str:
+def format_override(key: str, value: object) -> str:
     """KEY=VALUE of the command line, which `parse_override` reads as this value."""
     return f"{key}={_format_toml(value)}"
 

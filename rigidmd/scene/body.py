@@ -18,6 +18,7 @@ from rigidmd.core.integrators import (
     Rotor,
     auto_errors,
 )
+from rigidmd.core.toml import Json
 from rigidmd.formats import BODY_TOPOLOGY, TRAJECTORY
 from rigidmd.mechanics.inertia import (
     COMPONENTS_PER_DIMENSION,
@@ -510,7 +511,7 @@ class BodyScene(Scene):
         return f"{self.name}: one body{pinned}; {run.duration_s:g} s{how}, {run.integrator}"
 
     @classmethod
-    def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
+    def contradictions(cls, data: Json, text: str) -> list[str]:
         messages: list[tuple[list, str]] = []
         tables = {key: value for key, value in data.items() if isinstance(value, dict)}
         body, start, fluid = (tables.get(key, {}) for key in ("body", "start", "fluid"))

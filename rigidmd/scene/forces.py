@@ -263,7 +263,7 @@ class Forces(Section):
             yield "ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given"
 
     @property
-    def _not_summable(self) -> tuple[tuple[str, Any], ...]:
+    def _not_summable(self) -> tuple[tuple[str, object], ...]:
         """Messages on keys that exclude a sum of dispersion, and whether they are set."""
         grid = self.dispersion_order or self.dispersion_grid
         return (

@@ -17,7 +17,7 @@ from rigidmd.core.integrators import (
     measured_order,
     split,
 )
-from rigidmd.core.toml import plain_values
+from rigidmd.core.toml import Json, plain_values
 from rigidmd.errors import SceneError
 from rigidmd.scene.validation import Line, Section, exact_names, validation_messages
 
@@ -145,7 +145,7 @@ def integrator(
     return name
 
 
-def with_registered_rows(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Scheme]]:
+def with_registered_rows(data: Json) -> tuple[Json, dict[str, Scheme]]:
     """Tables of a scene with those registered rows that it names and does not have; and its names
     of rows, each with a scheme that stands for an invalid row, so that only the row is an error."""
     tables, stages = (

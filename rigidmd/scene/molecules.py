@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
 from pydantic import Field, PrivateAttr, Strict
 
 from rigidmd.core.plain_text import distinct
+from rigidmd.core.toml import Json
 from rigidmd.errors import SceneError, option
 from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
@@ -32,8 +33,8 @@ from rigidmd.scene.validation import (
 class UserCode(NamedTuple):
     """Forces and a thermostat, from which `rigidmd.assemble.user_code` makes terms."""
 
-    forces: tuple[Any, ...] = ()
-    thermostat: Any = None
+    forces: tuple[object, ...] = ()
+    thermostat: object = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -42,7 +43,7 @@ class UserCode(NamedTuple):
         return (*distinct(map(name_of, self.forces)), *thermostat)
 
 
-def name_of(thing: Any) -> str:
+def name_of(thing: object) -> str:
     """The attribute `name` of an object, else the name of its class in snake_case."""
     named = getattr(thing, "name", None)
     if isinstance(named, str) and named:
@@ -152,17 +153,17 @@ class Settings(TypedDict, total=False):
     seed: int
     precision: Literal["auto", "double", "mixed"]
     threads: int
-    engine: dict[str, Any]
-    structure: dict[str, Any]
-    box: dict[str, Any]
-    forces: dict[str, Any]
-    fields: dict[str, Any]
-    start: dict[str, Any]
-    integrators: list[dict[str, Any]]
-    stages: list[dict[str, Any]]
-    run: dict[str, Any]
-    output: dict[str, Any]
-    watch: dict[str, Any]
+    engine: Json
+    structure: Json
+    box: Json
+    forces: Json
+    fields: Json
+    start: Json
+    integrators: list[Json]
+    stages: list[Json]
+    run: Json
+    output: Json
+    watch: Json
 
 
 class MolecularScene(Scene):
@@ -201,7 +202,7 @@ class MolecularScene(Scene):
         return self._user_code
 
     def with_user_code(
-        self, forces: Sequence[Any] = (), thermostat: Any = None
+        self, forces: Sequence[Any] = (), thermostat: object = None
     ) -> "MolecularScene":
         """The same scene with forces and a thermostat from Python, see `Simulation`.
 

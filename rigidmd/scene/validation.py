@@ -24,7 +24,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 
 from rigidmd.core.plain_text import did_you_mean, plain_letters
-from rigidmd.core.toml import line_of, shorten_repr, shorten_text, values_in
+from rigidmd.core.toml import Json, line_of, shorten_repr, shorten_text, values_in
 from rigidmd.errors import MOST_SHOWN, option
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
@@ -43,7 +43,7 @@ FOREIGN_KEYS = Path(__file__).with_name("foreign_keys.toml")
 MOST_TABLES = 1000
 
 
-def _add_docstrings(schema: dict[str, Any], kind: type[BaseModel]) -> None:
+def _add_docstrings(schema: Json, kind: type[BaseModel]) -> None:
     """Describe keys in a JSON schema by their docstrings. The option `use_attribute_docstrings` of
     pydantic parses all sources at each import instead, which took a quarter of the time to read a
     scene."""
