@@ -294,6 +294,8 @@ def _start_potential(scene: Path) -> float:
         ),
         (["engine.platform=CUDA"], "platform would do nothing with engine.name = 'lammps'"),
         (["engine.ranks=0"], "engine.ranks"),
+        (["engine.ranks=1000"], "engine.ranks: 1000 ranks for "),
+        ([f"engine.ranks={2**31}"], "some would have nothing to move; use fewer"),
         (["engine.nam=lammps"], "engine.nam: unknown key"),
     ],
 )

@@ -4,6 +4,7 @@ warning."""
 import numpy as np
 import pytest
 from scenes import GOOD
+from schema_scenes import FIELDS, IONS
 from support import MOLECULES, ROOT, small_scene
 
 import rigidmd
@@ -158,12 +159,27 @@ def test_water_at_25_kelvin():
     assert build(small_scene({"spce": 20}, 20.0, stages=stages)).warnings == []
 
 
-@pytest.mark.parametrize("cutoff", [1e-9, 0.9])
+@pytest.mark.parametrize("cutoff", [1e-3, 0.9])
 def test_a_cutoff_within_the_molecules_is_refused(cutoff):
     with pytest.raises(SceneError, match=r"forces.cutoff_A is .* touch at 3.8\d Å"):
         build(small_scene({"argon": 20}, 25.0, forces={"cutoff_A": cutoff}))
     with pytest.raises(SceneError, match=r"forces.cutoff_A is 10 Å, .* touch at"):
         build(of_sites(ARGON | {"sigma_A": 1e6}))
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (FIELDS, "forces.cutoff_A"),
+        (IONS, "forces.ewald_cutoff_A"),
+        (IONS, "forces.custom.0.cutoff_A"),
+        (FIELDS, "fields.walls.0.cutoff_A"),
+    ],
+)
+def test_a_cutoff_whose_reciprocal_overflows_in_single_precision_is_refused(text, key, tmp_path):
+    (tmp_path / "scene.toml").write_text(text)
+    with pytest.raises(SceneError, match=f"{key}: is 1e-30, must not be less than 0.001"):
+        Scene.read(tmp_path / "scene.toml", {key: 1e-30})
 
 
 def test_a_cutoff_below_contact_has_no_tail_correction():

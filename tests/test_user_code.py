@@ -1312,6 +1312,34 @@ def test_what_a_potential_has_at_its_cutoff_is_told(scene, words):
     assert words is None or words in warnings[0]
 
 
+class Well(NamedTuple):
+    k: float
+    r0: float
+
+
+def umbrella(p: Well, r):
+    return 0.5 * p.k * (r - p.r0) ** 2, p.k * (p.r0 - r)
+
+
+@pytest.mark.parametrize("function", [umbrella, numba.njit(umbrella)], ids=["python", "numba"])
+@pytest.mark.parametrize(
+    ("truncation", "words"),
+    [("plain", "umbrella is 121 kJ/mol (49 kT at 298 K)"), ("shift", "its force is -44 kJ/mol/Å")],
+)
+def test_what_a_function_has_at_its_cutoff_is_told(function, truncation, words):
+    """A law from a function is checked like a text; one that vanishes at its cutoff has no
+    warning."""
+    scene = small_scene(
+        {"argon": 4}, 20.0, stages=[{"ensemble": "nvt", "temperature_K": 298, "duration_ps": 0.004}]
+    )
+    parameters = {"AR": Well(8.0, 3.5)}
+    law = rigidmd.pair_law(function, parameters, truncation=truncation, cutoff_A=9.0)
+    (warning,) = build(scene.with_user_code([law])).warnings
+    assert words in warning
+    ends = rigidmd.pair_law(lennard_jones, {"AR": Pair(1.0, 3.4)}, cutoff_A=9.0)
+    assert build(scene.with_user_code([ends])).warnings == []
+
+
 def lennard_jones_rows(step=0.02, without=(0.0, 0.0), factor=1.0):
     r = np.arange(2.6, 9.3, step)
     r = r[(r <= without[0]) | (r >= without[1])]

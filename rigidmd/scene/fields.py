@@ -8,7 +8,15 @@ from pydantic import Field, Strict, field_validator
 
 from rigidmd.scene.forces import ELECTROSTATICS
 from rigidmd.scene.species import Numbers, spans
-from rigidmd.scene.validation import MOST_TABLES, NonNegative, Number, Positive, Section, Vector
+from rigidmd.scene.validation import (
+    MOST_TABLES,
+    Cutoff,
+    NonNegative,
+    Number,
+    Positive,
+    Section,
+    Vector,
+)
 
 if TYPE_CHECKING:
     from rigidmd.scene.molecules import MolecularScene
@@ -40,7 +48,7 @@ class Walls(Section):
     """Diameter of lj93"""
     epsilon_kJ_mol: Positive | None = None
     """Strength of lj93; the well is 1.054 times as deep"""
-    cutoff_A: Positive | None = None
+    cutoff_A: Cutoff | None = None
     """Cutoff distance of lj93; its energy is shifted to 0 there. Default: none"""
     stiffness_kJ_mol_A2: Positive | None = None
     """Stiffness of harmonic"""

@@ -11,6 +11,7 @@ from rigidmd.scene.models import Mixing
 from rigidmd.scene.validation import (
     MOST_TABLES,
     Count,
+    Cutoff,
     Flag,
     Line,
     NonNegative,
@@ -120,7 +121,7 @@ class CustomForce(Section):
     that begin with sig, else geometric"""
     truncation: Truncation | None = None
     """With an energy: its cutoff scheme; default: forces.truncation"""
-    cutoff_A: Positive | None = None
+    cutoff_A: Cutoff | None = None
     """With an energy: its cutoff; default: forces.cutoff_A"""
     switch_start_A: Positive | None = None
     """With an energy: where a switch begins; default: forces.switch_start_A"""
@@ -146,7 +147,7 @@ class CustomForce(Section):
 class Forces(Section):
     """Forces between sites of different molecules."""
 
-    cutoff_A: Positive | None = None
+    cutoff_A: Cutoff | None = None
     """Cutoff between sites; default: 9 Å in a periodic box, none without a box"""
     truncation: Truncation = "shift"
     """Cutoff scheme of Lennard-Jones forces; smooth_switch suits integrators of order 4 and more,
@@ -197,7 +198,7 @@ class Forces(Section):
     """With ewald and pme: rms error of the force on a site, relative to the force between two
     charges e at 1 Å; sets the keys below; default: 5e-5, somewhat better than the defaults of
     GROMACS and OpenMM"""
-    ewald_cutoff_A: Positive | None = None
+    ewald_cutoff_A: Cutoff | None = None
     """With ewald and pme: cutoff of the real-space part. Default: with pme the one that makes a
     step fastest, by a model of its cost, else cutoff_A"""
     ewald_alpha_per_A: Positive | None = None

@@ -30,6 +30,8 @@ from rigidmd.errors import MOST_SHOWN, option
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
+#: A cutoff, Å. Powers of the reciprocals of much smaller ones overflow in single precision.
+Cutoff = Annotated[float, Strict(), Field(ge=1e-3, allow_inf_nan=False)]
 Count = Annotated[int, Strict(), Field(gt=0)]
 Flag = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]

@@ -112,6 +112,10 @@ TRANSLATIONS = Translations(
                 view.has_barostat and view.is_body.any() and (~view.is_body & ~view.frozen).any()
             ),
         ),
+        Limit(
+            "engine.ranks: {}, some would have nothing to move; use fewer",
+            lambda view: _ranks_without_molecules(view),
+        ),
     ),
     stage_limits=(
         *_LIMITS,
@@ -121,6 +125,11 @@ TRANSLATIONS = Translations(
         ),
     ),
 )
+
+
+def _ranks_without_molecules(view: ForceFieldView) -> str:
+    ranks, molecules = view.scene.engine.options.get("ranks", 1), len(view.system.model.species)
+    return f"{ranks} ranks for {molecules} molecules" if ranks > molecules else ""
 
 
 class PairStyle(NamedTuple):
