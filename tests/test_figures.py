@@ -20,7 +20,8 @@ from rigidmd.core.integrators import SCHEMES
 from rigidmd.engines.samples import NUMBERS, Sample, Samples
 from rigidmd.figures.picture import Picture
 from rigidmd.figures.run import energy_figure
-from rigidmd.figures.style import AT_ONCE, save_figure, shown_range
+from rigidmd.figures.save import AT_ONCE, save_figure
+from rigidmd.figures.style import shown_range
 from rigidmd.run.pilot.trial_systems import COMPARATORS, body_trial_system
 from rigidmd.run.pilot.trials import IntegratorAccuracy, Trial
 from rigidmd.scene import Scene
