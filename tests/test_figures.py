@@ -58,7 +58,7 @@ def test_no_figure_is_written_past_this():
     written = [
         path.name for path in (ROOT / "rigidmd").rglob("*.py") if ".savefig(" in path.read_text()
     ]
-    assert written == ["style.py"]
+    assert written == ["save.py"]
 
 
 def test_every_figure_shows_names_as_they_are_written():
