@@ -20,7 +20,8 @@ from rigidmd.core.integrators import SCHEMES
 from rigidmd.engines.samples import NUMBERS, Sample, Samples
 from rigidmd.figures.picture import Picture
 from rigidmd.figures.run import energy_figure
-from rigidmd.figures.style import AT_ONCE, save_figure, shown_range
+from rigidmd.figures.save import AT_ONCE, save_figure
+from rigidmd.figures.style import shown_range
 from rigidmd.run.trial_systems import COMPARATORS, body_trial_system
 from rigidmd.run.trials import Trial
 from rigidmd.scene import Scene
@@ -58,7 +59,7 @@ def test_no_figure_is_written_past_this():
     written = [
         path.name for path in (ROOT / "rigidmd").rglob("*.py") if ".savefig(" in path.read_text()
     ]
-    assert written == ["style.py"]
+    assert written == ["save.py"]
 
 
 def test_every_figure_shows_names_as_they_are_written():

@@ -18,7 +18,7 @@ from rigidmd.commands.cli import main
 from rigidmd.core.shipped import NOTEBOOKS
 from rigidmd.core.shipped import examples as examples_in
 from rigidmd.errors import RigidMDWarning
-from rigidmd.figures.style import save_figure
+from rigidmd.figures.save import save_figure
 from rigidmd.io import progress
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

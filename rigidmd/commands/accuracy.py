@@ -87,10 +87,10 @@ def _accuracy(options: Options) -> int:
             averages_report.FILES,
             "compiling, and running what comes before the last stage",
             lambda progress: measure_averages(scene, integrators, timesteps, sample, progress),
-            lambda found: [
-                averages_report.table_text(found),
+            lambda biases: [
+                averages_report.table_text(biases),
                 "",
-                *averages_report.bias_conclusions(found),
+                *averages_report.bias_conclusions(biases),
             ],
             averages_report.write_averages,
         )
@@ -104,7 +104,7 @@ def _accuracy(options: Options) -> int:
         accuracy.FILES,
         "compiling and running the reference",
         lambda progress: accuracy.measure_accuracy(scene, *settings, progress),
-        lambda found: [*accuracy.recommendations(found), "", accuracy.table_text(found)],
+        lambda errors: [*accuracy.recommendations(errors), "", accuracy.table_text(errors)],
         accuracy.write_accuracy,
     )
     return 0

@@ -97,9 +97,9 @@ def _analyse(options: Options) -> int:
     with progress_bar() as progress:
         folder, request = Path(options.folder), (options.only, options.start, options.viscosity)
         if is_sweep(folder):
-            found = analyse_sweep(folder, *request, progress, options.figures)
+            analysed = analyse_sweep(folder, *request, progress, options.figures)
             progress(1.0, "")
-            for of in found:
+            for of in analysed:
                 runs = f"{of.runs} run{'s' if of.runs > 1 else ''}"
                 files = (
                     f"{len(of.files)} files in {of.files[0].parent}" if of.files else "no results"
@@ -111,7 +111,7 @@ def _analyse(options: Options) -> int:
             if options.extrapolate is not None:
                 names = print_limits(read_manifest(folder), options.extrapolate)
                 print(f"\n  files in {folder}: {', '.join(names)}")
-            return FAILED if options.only and any(of.failed for of in found) else 0
+            return FAILED if options.only and any(of.failed for of in analysed) else 0
         if mean_force.NAME in options.only:
             raise OutputError(
                 f"pmf needs a sweep over the distance of a restraint, and {folder} is the folder of"

@@ -54,7 +54,7 @@ def argument(*names: str, **settings: Any) -> Argument:
     return lambda parser: parser.add_argument(*names, **settings)
 
 
-def number(kind: type, least: float, most: float, description: str) -> Callable[[str], Any]:
+def number(kind: type, lowest: float, highest: float, description: str) -> Callable[[str], Any]:
     """A reader for argparse of int or float numbers in a range."""
 
     def read(text: str) -> Any:
@@ -62,7 +62,7 @@ def number(kind: type, least: float, most: float, description: str) -> Callable[
             value = kind(text) if kind is float or text.isdigit() else nan
         except ValueError:
             value = nan
-        if not least <= value <= most:
+        if not lowest <= value <= highest:
             raise argparse.ArgumentTypeError(f"{text!r} is not {description}")
         return value
 
@@ -71,19 +71,19 @@ def number(kind: type, least: float, most: float, description: str) -> Callable[
 
 def time_ps(text: str) -> float:
     """Picoseconds in a time such as 200ps."""
-    found = re.fullmatch(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) ?(fs|ps|ns|us)", text)
-    if found is None or float(found[1]) == inf:
+    match = re.fullmatch(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) ?(fs|ps|ns|us)", text)
+    if match is None or float(match[1]) == inf:
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a time with a unit, such as 200ps or 1.5ns"
         )
-    return float(found[1]) * {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6}[found[2]]
+    return float(match[1]) * {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6}[match[2]]
 
 
 def seconds(text: str) -> float:
     """Seconds in H:MM:SS, MM:SS or D-H:MM:SS."""
-    found = re.fullmatch(r"(?:(?:(\d+)-)?(\d+):)?(\d+):(\d\d)", text)
+    match = re.fullmatch(r"(?:(?:(\d+)-)?(\d+):)?(\d+):(\d\d)", text)
     days, hours, minutes, rest = (
-        float(part or 0) for part in (found.groups() if found else [inf] * 4)
+        float(part or 0) for part in (match.groups() if match else [inf] * 4)
     )
     found_seconds = 86400 * days + 3600 * hours + 60 * minutes + rest
     if found_seconds == inf:
@@ -209,12 +209,12 @@ def write_study(
     check_folder(folder, force, names=files)
     with FolderLock(folder) as lock:
         with progress_bar(begins) as progress:
-            found = measure(progress)
-        print(*describe(found), sep="\n")
+            result = measure(progress)
+        print(*describe(result), sep="\n")
         make_folder(folder, files, lock)
-        written = write(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))
+        written = write(folder, result, shlex.join(["rigidmd", *sys.argv[1:]]))
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
-    return found
+    return result
 
 
 def print_page(path: Path, notes: list[str]) -> None:

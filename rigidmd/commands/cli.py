@@ -153,8 +153,8 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for found in iter_modules(package.__path__):
-        import_module(f"{package.__name__}.{found.name}")
+    for module in iter_modules(package.__path__):
+        import_module(f"{package.__name__}.{module.name}")
     for name, command in sorted(COMMANDS.items(), key=lambda item: item[1].position):
         description, epilog = (
             command.about[0].upper() + command.about[1:] + ".",

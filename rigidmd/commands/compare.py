@@ -19,6 +19,10 @@ from rigidmd.commands.arguments import Options, argument, command
 def _compare(options: Options) -> int:
     from rigidmd.studies.compare import compare, describe_run_comparison
 
-    found = compare(Path(options.first), Path(options.second))
-    print(json.dumps(found.to_json(), indent=2) if options.json else describe_run_comparison(found))
-    return 0 if found.same else FAILED
+    comparison = compare(Path(options.first), Path(options.second))
+    print(
+        json.dumps(comparison.to_json(), indent=2)
+        if options.json
+        else describe_run_comparison(comparison)
+    )
+    return 0 if comparison.same else FAILED

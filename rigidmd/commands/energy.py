@@ -38,37 +38,39 @@ def _energy(options: Options) -> int:
                 scene.source,
                 [f"--unit {options.unit} is for molecules; the energy of a body is in J"],
             )
-        found, unit = Simulation(scene).start_energy(), "J"
+        energies, unit = Simulation(scene).start_energy(), "J"
     else:
         unit = options.unit or "kJ/mol"
-        found = Simulation(scene).start_energy(ENERGY_UNITS[unit], unit, options.accuracy)
+        energies = Simulation(scene).start_energy(ENERGY_UNITS[unit], unit, options.accuracy)
     if options.json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(energies, indent=2))
     elif isinstance(scene, BodyScene):
-        _print_body(scene.name, found)
+        _print_body(scene.name, energies)
     else:
-        _print_molecules(scene.name, found, unit)
+        _print_molecules(scene.name, energies, unit)
     return 0
 
 
-def _print_molecules(name: str, found: dict[str, Any], unit: str) -> None:
-    steps = found["overlap_removal_steps"]
+def _print_molecules(name: str, energies: dict[str, Any], unit: str) -> None:
+    steps = energies["overlap_removal_steps"]
     removal = f", after {steps} steps of overlap removal" if steps else ""
-    print(f"{name}: energies of the start, {found['molecules']} molecules{removal}")
-    for note in found["notes"]:
+    print(f"{name}: energies of the start, {energies['molecules']} molecules{removal}")
+    for note in energies["notes"]:
         print(f"  {note}")
-    rows = [(term.replace("_", " "), value, unit) for term, value in found["components"].items()]
-    rows += [(key, found[key], unit) for key in ("potential", "kinetic", "virial")]
-    if (lattice_energy := found["lattice_energy_per_molecule"]) is None:
-        rows += [("per molecule", found["potential_per_molecule"], f"{unit}, potential")]
+    rows = [(term.replace("_", " "), value, unit) for term, value in energies["components"].items()]
+    rows += [(key, energies[key], unit) for key in ("potential", "kinetic", "virial")]
+    if (lattice_energy := energies["lattice_energy_per_molecule"]) is None:
+        rows += [("per molecule", energies["potential_per_molecule"], f"{unit}, potential")]
     else:
         rows += [("lattice energy", lattice_energy, f"{unit} per molecule")]
-    rows += [] if found["pressure_bar"] is None else [("pressure", found["pressure_bar"], "bar")]
-    where = f"{unit}/Å on molecule {found['largest_force_molecule']}"
-    _print_rows([*rows, ("largest force", found["largest_force_per_A"], where)], ">22.10g")
-    for key, text in found["meaning"].items():
+    rows += (
+        [] if energies["pressure_bar"] is None else [("pressure", energies["pressure_bar"], "bar")]
+    )
+    where = f"{unit}/Å on molecule {energies['largest_force_molecule']}"
+    _print_rows([*rows, ("largest force", energies["largest_force_per_A"], where)], ">22.10g")
+    for key, text in energies["meaning"].items():
         print(f"  {key.replace('_', ' ')}: {text}")
-    if error := found.get("accuracy"):
+    if error := energies.get("accuracy"):
         print(f"Coulomb forces on sites, compared with {error['reference']}")
         relative = f"{error['relative']:.2g} of it, {error['in_e2_per_A2']:.2g} e²/Å²"
         rows = [
@@ -80,15 +82,17 @@ def _print_molecules(name: str, found: dict[str, Any], unit: str) -> None:
         _print_rows([*rows, ("error of the energy", error["energy_error"], unit)], ">22.4g")
 
 
-def _print_body(name: str, found: dict[str, Any]) -> None:
+def _print_body(name: str, energies: dict[str, Any]) -> None:
     print(f"{name}: energy of the start")
-    _print_rows([(key, found[key], "J") for key in ("kinetic", "potential", "energy")], ">22.15g")
+    _print_rows(
+        [(key, energies[key], "J") for key in ("kinetic", "potential", "energy")], ">22.15g"
+    )
     for key, what, unit in (
         ("force_N", "force (lab)", "N"),
         ("torque_body_N_m", "torque (body)", "N m"),
     ):
-        if found[key] is not None:
-            print(f"  {what:<22}{' '.join(f'{x:>22.15g}' for x in found[key])} {unit}")
+        if energies[key] is not None:
+            print(f"  {what:<22}{' '.join(f'{x:>22.15g}' for x in energies[key])} {unit}")
 
 
 def _print_rows(rows: list[tuple[str, float, str]], form: str) -> None:

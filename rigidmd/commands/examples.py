@@ -15,9 +15,9 @@ def _examples(options: Options) -> int:
         "scripts, which extend it": examples(SCRIPTS),
     }
     width = max(len(example.name) for example in scenes)
-    for title, found in kinds.items():
+    for title, shipped in kinds.items():
         print(f"{title}:")
-        for example in found:
+        for example in shipped:
             print(f"  {example.name:<{width}}  {example.about}")
         print()
     print("`rigidmd new NAME` copies one into the working directory")

@@ -30,10 +30,10 @@ def _help(options: Options) -> int:
         "chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` describes a"
         " command):"
     )
-    for folder, found in contents().items():
+    for folder, pages in contents().items():
         lines = [
             fill(f"  {name:<14}  {about}", 120, subsequent_indent=" " * 18)
-            for name, about in found.items()
+            for name, about in pages.items()
         ]
         print(f"\n{folder}", *lines, sep="\n")
     return 0

@@ -57,9 +57,9 @@ def _models(options: Options) -> int:
     if options.geometry is not None:
         return _write_model(options)
     if options.parameters is not None or options.custom_name is not None:
-        given = "--parameters" if options.parameters is not None else "--name"
+        option = "--parameters" if options.parameters is not None else "--name"
         raise MoleculeError(
-            "models", [f"{given} belongs to --from FILE, which writes a custom model"]
+            "models", [f"{option} belongs to --from FILE, which writes a custom model"]
         )
     draws = options.draw or options.output is not None
     if options.model is None:
@@ -68,19 +68,19 @@ def _models(options: Options) -> int:
         print(models_table([load_model(name) for name in available_models()]))
         print("\n`rigidmd models NAME` shows one in full; --draw draws it")
         return 0
-    found = (
+    molecule = (
         read_molecule(Path(options.model))
         if options.model.endswith(".toml")
         else load_model(options.model)
     )
-    for warning in molecule_warnings(found) if options.model.endswith(".toml") else ():
+    for warning in molecule_warnings(molecule) if options.model.endswith(".toml") else ():
         warn(warning)
     if not draws:
-        print(molecule_text(found))
+        print(molecule_text(molecule))
         return 0
     path = Path(options.output or f"{Path(options.model).stem}.png")
-    write_molecule_figure(path, found, options.force)
-    print(f"{found.name} is drawn in {path}")
+    write_molecule_figure(path, molecule, options.force)
+    print(f"{molecule.name} is drawn in {path}")
     return 0
 
 
@@ -105,13 +105,13 @@ def _write_model(options: Options) -> int:
         raise MoleculeError(
             "models", [f"--from writes a model; draw it afterwards: rigidmd models {path} --draw"]
         )
-    file, found, notes = model_from_geometry(geometry, parameters, options.custom_name)
+    file, molecule, notes = model_from_geometry(geometry, parameters, options.custom_name)
     check_target(
         path, (".toml",), options.force, "model", [geometry, *([parameters] if parameters else [])]
     )
     write_model(path, file)
-    print(f"{path}: {found.name}, {found.description}; {file.source}")
-    for note in [*notes, *molecule_warnings(found)]:
+    print(f"{path}: {molecule.name}, {molecule.description}; {file.source}")
+    for note in [*notes, *molecule_warnings(molecule)]:
         warn(note)
     print("next:")
     print(f"  rigidmd models {shlex.quote(str(path))}    shows it; --draw draws it")

@@ -60,11 +60,11 @@ def _modes(options: Options) -> int:
     scene, begin = read_scene(options), perf_counter()
     names = (FILE, *(animation_files(scene) if options.animate else []))
 
-    def write(folder: Path, found: "NormalModes", command: str) -> list[Path]:
-        found.table().write(folder / FILE)
-        if not options.animate or not found.is_vibration(options.animate):
+    def write(folder: Path, modes: "NormalModes", command: str) -> list[Path]:
+        modes.table().write(folder / FILE)
+        if not options.animate or not modes.is_vibration(options.animate):
             return [folder / FILE]
-        write_animation(folder, found, options.animate)
+        write_animation(folder, modes, options.animate)
         return [folder / name for name in names]
 
     def compute(progress: Callable[[float], object]) -> "NormalModes":
@@ -77,9 +77,9 @@ def _modes(options: Options) -> int:
             progress=progress,
         )
 
-    def describe(found: "NormalModes") -> Iterator[str]:
-        yield from _describe(found)
-        if options.animate and not found.is_vibration(options.animate):
+    def describe(modes: "NormalModes") -> Iterator[str]:
+        yield from _describe(modes)
+        if options.animate and not modes.is_vibration(options.animate):
             yield f"  mode {options.animate} is a zero mode, which has no animation"
         yield f"  {perf_counter() - begin:.3g} s"
 
@@ -90,36 +90,36 @@ def _modes(options: Options) -> int:
         names,
         "minimising",
         compute,
-        lambda found: list(describe(found)),
+        lambda modes: list(describe(modes)),
         write,
     )
     return 0
 
 
-def _describe(found: "NormalModes") -> Iterator[str]:
-    table, at, total, last = found.table(), found.wavenumber, found.total, len(found.rate) - 1
+def _describe(modes: "NormalModes") -> Iterator[str]:
+    table, at, total, last = modes.table(), modes.wavenumber, modes.total, len(modes.rate) - 1
     unstable, warm, is_whole = (
-        at[found.rate < 0],
-        found.temperature,
-        len(at) == len(found.coordinates.index),
+        at[modes.rate < 0],
+        modes.temperature,
+        len(at) == len(modes.coordinates.index),
     )
     point = "a saddle point" if len(unstable) else "a minimum"
     yield (
-        f"{found.system.scene.name}: normal modes at {point} of the energy, {found.energy:.8g}"
+        f"{modes.system.scene.name}: normal modes at {point} of the energy, {modes.energy:.8g}"
         " kJ/mol"
     )
-    why = f" ({found.ended})" if found.ended else ""
+    why = f" ({modes.ended})" if modes.ended else ""
     yield (
-        f"  largest force {found.force:.1e} kJ/(mol Å), largest torque {found.torque:.1e}"
+        f"  largest force {modes.force:.1e} kJ/(mol Å), largest torque {modes.torque:.1e}"
         f" kJ/mol{why}"
     )
-    if found.cells:
+    if modes.cells:
         yield (
-            f"  modes at the Gamma point: equal displacements in all {found.cells} unit cells,"
+            f"  modes at the Gamma point: equal displacements in all {modes.cells} unit cells,"
             " intensities of one"
         )
     yield (
-        f"  {len(at)} of {total} modes: {(found.rate == 0).sum()} zero modes, {len(unstable)}"
+        f"  {len(at)} of {total} modes: {(modes.rate == 0).sum()} zero modes, {len(unstable)}"
         " unstable modes"
     )
     if len(unstable):
@@ -128,21 +128,21 @@ def _describe(found: "NormalModes") -> Iterator[str]:
             " and repeat"
         )
     for kind in ("translation", "libration"):
-        if len(of := [x for k, x in enumerate(at) if x > 0 and found.kind(k) == kind]):
+        if len(of := [x for k, x in enumerate(at) if x > 0 and modes.kind(k) == kind]):
             yield f"  {kind}s: {len(of)}, from {of[0]:.4g} to {of[-1]:.4g} cm⁻¹"
     if is_whole:
-        yield f"  zero-point energy of the rigid model {found.free_energy(0):.6g} kJ/mol"
+        yield f"  zero-point energy of the rigid model {modes.free_energy(0):.6g} kJ/mol"
     if is_whole and warm:
-        quantum, classical = found.free_energy(warm), found.free_energy(warm, quantum=False)
+        quantum, classical = modes.free_energy(warm), modes.free_energy(warm, quantum=False)
         yield (
             f"  free energy of the vibrations at {warm:g} K: {quantum:.6g} kJ/mol, classical"
             f" {classical:.6g} kJ/mol"
         )
-    if not found.cells:  # of the whole crystal other modes may be faster
+    if not modes.cells:  # of the whole crystal other modes may be faster
         _, kind, *_, part, _, where = table.values(last)
         mode = f"mode {total}: {kind} of {part:.3g} molecules, largest in {where}"
         yield (
-            f"  longest stable step of velocity Verlet {found.longest_step_fs:.3g} fs, set by"
+            f"  longest stable step of velocity Verlet {modes.longest_step_fs:.3g} fs, set by"
             f" {mode}"
         )
     shown = [k for k in table.rows if k < ROWS or k > last - ROWS]

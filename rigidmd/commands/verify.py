@@ -42,6 +42,6 @@ def _verify(options: Options) -> int:
         for key, value in runnable()[options.engine].precise.items():
             setattr(options, key, getattr(options, key) or value)
         scene = read_scene(options)
-    found = verify(scene)
-    print(json.dumps(found.to_json(), indent=2) if options.json else found.description())
-    return 0 if found.agrees else FAILED
+    comparison = verify(scene)
+    print(json.dumps(comparison.to_json(), indent=2) if options.json else comparison.description())
+    return 0 if comparison.agrees else FAILED

@@ -301,13 +301,13 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
     size = -(-len(columns["time"]) // 300)
     for color, (label, error) in zip(COLORS, errors.items(), strict=False):
         largest = np.fmax.reduceat(error, np.arange(0, len(error), size))
-        most = f"at most {np.nanmax(error):.1e}" if np.nanmax(error) > 0 else "exactly 0"
+        bound = f"at most {np.nanmax(error):.1e}" if np.nanmax(error) > 0 else "exactly 0"
         axis.plot(
             columns["time"][::size],
             np.maximum(largest, FLOOR),
             color=color,
             lw=1.0,
-            label=f"{label}: {most}",
+            label=f"{label}: {bound}",
         )
     axis.axhline(np.finfo(float).eps, color=FAINT, lw=0.8, ls=":")
     axis.set_yscale("log")
@@ -373,9 +373,10 @@ def _shade(
         normal = (base + depth[..., None] * view[2]) * weight
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-300)
         tint = 0.38 - 0.28 * np.clip(normal @ light, 0, 1)[..., None]
-        seen = (b * b >= a * c) & (depth > nearest + 1e-6 * half.max())
-        image[seen, :3], image[seen, 3] = (1 - tint * (1 - np.array(to_rgb(color))))[seen], 1.0
-        nearest[seen] = depth[seen]
+        visible = (b * b >= a * c) & (depth > nearest + 1e-6 * half.max())
+        image[visible, :3] = (1 - tint * (1 - np.array(to_rgb(color))))[visible]
+        image[visible, 3] = 1.0
+        nearest[visible] = depth[visible]
         axis.plot(*view[:2] @ (semi * circle(view[2] / semi)).T, color=color, lw=0.8, alpha=0.6)
     axis.imshow(
         image, origin="lower", extent=(x[0], x[-1], y[0], y[-1]), interpolation="bilinear", zorder=0

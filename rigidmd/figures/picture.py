@@ -9,7 +9,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from rigidmd.figures.style import save_figure, settings
+from rigidmd.figures.save import save_figure, settings
 
 #: Dots per inch of a figure in a notebook, drawn twice as fine for sharp screens.
 DPI = 80

@@ -1,25 +1,21 @@
-"""Functions for all figures: writing, settings, styles of curves, thinning of long series, views of
-3D objects."""
+"""Functions for all figures: new figures and their files, styles of curves, thinning of long
+series, views of 3D objects."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rigidmd.core.files import atomic_file
-from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.errors import RigidMDError, RigidMDWarning
+from rigidmd.figures.save import save_figure, settings
 
 if TYPE_CHECKING:
     from rigidmd.figures.picture import Picture
 
-#: Most points of a curve that are drawn at once. The renderer fails on 200,000 points across a
-#: figure.
-AT_ONCE = 5000
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 COLORS = (
     "#2b6f9e",
@@ -46,30 +42,6 @@ def curve_style(k: int) -> dict:
     return {"color": COLORS[color], "ls": (0, dashes) if dashes else "-", "marker": marker}
 
 
-class InPieces:
-    """A path effect of Matplotlib that draws a path in pieces, each from the end of the previous
-    one. The pieces of Matplotlib, `agg.path.chunksize`, omit the last point of each, and thus two
-    sides of the path."""
-
-    def draw_path(self, renderer, gc, path, affine, rgbFace=None):
-        sides = len(path.vertices) - 1
-        # of equal length: a short level one would be snapped to whole pixels
-        pieces = -(-sides // (AT_ONCE - 1))
-        for first, last in pairwise(sides * k // pieces for k in range(pieces + 1)):
-            piece = type(path)(path.vertices[first : last + 1])
-            piece.simplify_threshold = path.simplify_threshold
-            renderer.draw_path(gc, piece, affine, rgbFace)
-
-
-@contextmanager
-def settings(changed: dict) -> Iterator[None]:
-    """Context with other settings of Matplotlib, which has one set of them for all threads."""
-    from matplotlib import rc_context
-
-    with PROCESS_LOCK, rc_context(changed):
-        yield
-
-
 @contextmanager
 def drawing(path: Path) -> Iterator[None]:
     """Context in which an error of drawing becomes a warning, as results do not depend on pictures.
@@ -81,19 +53,6 @@ def drawing(path: Path) -> Iterator[None]:
     except Exception as error:  # Matplotlib raises many types
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         warnings.warn(f"{path} cannot be drawn: {reason}", RigidMDWarning, stacklevel=2)
-
-
-def save_figure(figure, target, **options) -> None:
-    """`figure.savefig`, with curves of any number of points."""
-    axes = list(figure.axes)
-    while axes:  # not figure.findobj, which makes all ticks
-        axis = axes.pop()
-        axes += axis.child_axes
-        for line in axis.lines:
-            if len(line.get_xdata()) > AT_ONCE:
-                line.set_path_effects([InPieces()])
-    with settings({"agg.path.chunksize": 0}):
-        figure.savefig(target, **options)
 
 
 def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
@@ -162,10 +121,10 @@ def thin_series(
         return time, values
     starts = np.arange(0, len(time) // size * size, size)
     parts = values[: len(starts) * size].reshape(-1, size)
-    kept = np.unique(
+    extremes = np.unique(
         np.concatenate([starts + parts.argmin(1), starts + parts.argmax(1), [0, len(time) - 1]])
     )
-    return time[kept], values[kept]
+    return time[extremes], values[extremes]
 
 
 def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | None:
@@ -181,15 +140,15 @@ def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | 
     return low - 0.05 * (high - low), high + 0.05 * (high - low)
 
 
-def thin_path(path: np.ndarray, most: int) -> np.ndarray:
-    """Indices of at most about `most` points of a path (n, d), evenly along its length, with its
-    ends."""
-    if len(path) <= most:
+def thin_path(path: np.ndarray, max_points: int) -> np.ndarray:
+    """Indices of at most about `max_points` points of a path (n, d), evenly along its length,
+    with its ends."""
+    if len(path) <= max_points:
         return np.arange(len(path))
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
     if way[-1] == 0:
         return np.array([0, len(path) - 1])
-    marks = np.searchsorted(way, np.linspace(0, way[-1], most))
+    marks = np.searchsorted(way, np.linspace(0, way[-1], max_points))
     return np.unique(np.concatenate([marks.clip(0, len(path) - 1), [0, len(path) - 1]]))
 
 

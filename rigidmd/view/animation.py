@@ -30,8 +30,8 @@ MOST_FRAMES = 2000
 
 def ffmpeg() -> str | None:
     """The program that writes .mp4, on the path or in the package imageio-ffmpeg, or None."""
-    if found := shutil.which("ffmpeg"):
-        return found
+    if program := shutil.which("ffmpeg"):
+        return program
     with contextlib.suppress(
         ImportError, RuntimeError
     ):  # RuntimeError: the package without its program
@@ -126,7 +126,7 @@ def _draw_panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:
     still = new_figure(*figure.get_size_inches(), layout=None, dpi=figure.dpi)
     canvas = FigureCanvasAgg(still)
     panels = plots.panels(record)[:PANELS]
-    found = []
+    cursors = []
     for k, panel in enumerate(panels):
         height = 0.94 / len(panels)
         axis = still.add_axes(
@@ -139,7 +139,7 @@ def _draw_panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:
         cursor = Line2D(
             [0, 0], axis.get_position().intervaly, color=WARM, lw=1.2, transform=figure.transFigure
         )
-        found.append((figure.add_artist(cursor), axis))
+        cursors.append((figure.add_artist(cursor), axis))
     canvas.draw()
     figure.figimage(np.asarray(canvas.buffer_rgba()), zorder=-1)
-    return found
+    return cursors

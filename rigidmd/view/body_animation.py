@@ -70,7 +70,7 @@ class BodyAnimation:
 
     def __init__(self, record: Record):
         self._record = record
-        system, seen, count = record.system, record.columns, len(record.time)
+        system, columns, count = record.system, record.columns, len(record.time)
         stride = -(-count // MOST_SAMPLES)
         rows = np.arange(0, count, stride)
         self.time = record.time[rows]
@@ -81,10 +81,10 @@ class BodyAnimation:
         self.notes.append(f"The body is drawn as {mesh.about}.")
 
         def of(*names: str) -> np.ndarray:
-            return np.stack([seen[name][rows] for name in names], axis=-1)
+            return np.stack([columns[name][rows] for name in names], axis=-1)
 
         position = of("x", "y", "z") if system.translates else np.zeros((len(rows), 3))
-        turns = system.rotates and "qw" in seen
+        turns = system.rotates and "qw" in columns
         self.axis = drawn_axis(system)
         middle = (position.max(0) + position.min(0)) / 2
         extent = float(np.linalg.norm(position - middle, axis=1).max())
@@ -103,7 +103,8 @@ class BodyAnimation:
         else:
             self.unit, self.position = 1.08 * radius, np.zeros_like(position)
             turned = [
-                sum(seen[f"q{i}{j + 1}"][rows] * self.axis[j] for j in range(3)) for i in (1, 2, 3)
+                sum(columns[f"q{i}{j + 1}"][rows] * self.axis[j] for j in range(3))
+                for i in (1, 2, 3)
             ]
             path = radius / self.unit * np.stack(turned, axis=-1)
         self.sphere = 0.0 if moves else radius / self.unit
@@ -114,12 +115,12 @@ class BodyAnimation:
         self.path, self.when = path[shown], self.time[shown]
         self.vectors, self.largest = {}, {}
         for name, (key, size, *_) in VECTORS.items():
-            if turns and f"{key}_x" in seen:
-                found = of(f"{key}_x", f"{key}_y", f"{key}_z")
-                longest = float(np.linalg.norm(found, axis=1).max())
+            if turns and f"{key}_x" in columns:
+                values = of(f"{key}_x", f"{key}_y", f"{key}_z")
+                longest = float(np.linalg.norm(values, axis=1).max())
                 if longest > 0:
                     scale = VECTOR_LENGTH[not moves] * (self.sphere or 1.0) / longest
-                    self.vectors[name], self.largest[name] = scale * found, f"{longest:.4g} {size}"
+                    self.vectors[name], self.largest[name] = scale * values, f"{longest:.4g} {size}"
         gravity = np.array(
             system.scene.gravity.acceleration_m_s2 if system.scene.gravity else np.zeros(3), float
         )
@@ -220,11 +221,11 @@ class BodyAnimation:
         from matplotlib.collections import PolyCollection
 
         # right, up, towards the eye
-        seen = (self.mesh.vertices @ rotation.T + origin) @ self._view.T
+        projected = (self.mesh.vertices @ rotation.T + origin) @ self._view.T
         light = np.array([-0.5, 0.65, 0.55])
         shown = []
         for face, painted in zip(self.mesh.faces, self.mesh.painted, strict=True):
-            corners = seen[face]
+            corners = projected[face]
             normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
             if normal[2] > 0:
                 lit = 0.62 + 0.38 * max(0.0, float(normal @ light) / np.linalg.norm(normal))
@@ -319,8 +320,8 @@ class BodyAnimation:
             "azimuth": self.azimuth,
         }
         chips = [
-            (VECTORS[name][2], f"{VECTORS[name][3]}, at most {most}")
-            for name, most in self.largest.items()
+            (VECTORS[name][2], f"{VECTORS[name][3]}, at most {largest}")
+            for name, largest in self.largest.items()
         ]
         chips += [] if self.gravity is None else [("var(--ink)", "gravity g")]
         trace = (

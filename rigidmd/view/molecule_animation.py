@@ -36,21 +36,21 @@ def chemiscope_script() -> str:
         ) from None
 
 
-def frames_of(record: Record, most: int) -> Frames:
+def frames_of(record: Record, max_frames: int) -> Frames:
     """Frames of the trajectory of a run of molecules, each molecule whole and inside the box.
     Raises OutputError if distances within molecules are not as in the molecules of this run."""
     path, sites = record.trajectory, record.system.sites
-    found = read_frames(path, len(sites.molecule), most)
+    frames = read_frames(path, len(sites.molecule), max_frames)
     pairs = np.flatnonzero(sites.molecule[1:] == sites.molecule[:-1])
-    wanted, seen = (
+    expected, actual = (
         np.linalg.norm(at[pairs + 1] - at[pairs], axis=1)
-        for at in (sites.offset_body, found.positions[0])
+        for at in (sites.offset_body, frames.positions[0])
     )
-    if np.abs(wanted - seen).max(initial=0.0) > MAX_DEVIATION:
+    if np.abs(expected - actual).max(initial=0.0) > MAX_DEVIATION:
         raise OutputError(
             f"{path} is not the trajectory of this run: its molecules have other shapes"
         )
-    return inside(found, sites)
+    return inside(frames, sites)
 
 
 def inside(frames: Frames, sites: Sites) -> Frames:
@@ -111,14 +111,14 @@ class MoleculeAnimation:
         ]
         self._radius, self._view = np.array(radii), camera(EYE, UP)
         self._color = np.array([to_rgb(COLOURS.get(e, OTHER)) for e in self._elements])
-        cells, seen = self._frames.cells, self._frames.positions
+        cells, points = self._frames.cells, self._frames.positions
         self._corners = (
             None
             if cells is None
             else np.array(list(product((0, 1), repeat=3))) @ cells @ self._view.T
         )
-        seen = (seen @ self._view.T if self._corners is None else self._corners).reshape(-1, 3)
-        low, high = seen.min(0), seen.max(0)
+        points = (points @ self._view.T if self._corners is None else self._corners).reshape(-1, 3)
+        low, high = points.min(0), points.max(0)
         half = (high - low) / 2
         half[:2] = half[:2].max()  # the picture is square
         half = 1.08 * half + 1.0
@@ -150,9 +150,9 @@ class MoleculeAnimation:
         axes.set(
             xlim=(self._low[0], self._high[0]), ylim=(self._low[1], self._high[1]), aspect="equal"
         )
-        seen = frames.positions[k, self._shown] @ self._view.T  # right, up, towards the eye
-        order = seen[:, 2].argsort()
-        near = (seen[order, 2] - self._low[2]) / (self._high[2] - self._low[2])
+        projected = frames.positions[k, self._shown] @ self._view.T  # right, up, towards the eye
+        order = projected[:, 2].argsort()
+        near = (projected[order, 2] - self._low[2]) / (self._high[2] - self._low[2])
         haze = (HAZE * (1 - near.clip(0, 1)))[:, None, None]
         color, radius = self._color[order][:, None], self._radius[order][:, None]
         size, lift, white = np.array(DISCS).T  # of the discs (m, d) of m atoms
@@ -161,8 +161,9 @@ class MoleculeAnimation:
             + (1 - color) * np.maximum(white, 0)[:, None]
         )
         widths = (2 * size * radius).ravel()
+        centres = projected[order, None, :2] + (lift * radius)[..., None] * LIGHT
         style = {
-            "offsets": (seen[order, None, :2] + (lift * radius)[..., None] * LIGHT).reshape(-1, 2),
+            "offsets": centres.reshape(-1, 2),
             "facecolors": (tint * (1 - haze) + haze).reshape(-1, 3).clip(0, 1),
             "edgecolors": "none",
             "zorder": 2,

@@ -38,8 +38,10 @@ def models_table(molecules: list[Molecule]) -> str:
 
 def short_source(m: Molecule) -> str:
     """Authors and year."""
-    found = re.match(r".*?\b(?:19|20)\d\d\b", m.source)
-    authors, year = (found[0][:-4].strip(), found[0][-4:]) if found else (m.source, "")
+    year_match = re.match(r".*?\b(?:19|20)\d\d\b", m.source)
+    authors, year = (
+        (year_match[0][:-4].strip(), year_match[0][-4:]) if year_match else (m.source, "")
+    )
     names = re.split(r", | & ", authors)
     return f"{names[0]} et al. {year}" if len(names) > 2 else f"{authors} {year}"
 
@@ -108,8 +110,8 @@ def _geometry(m: Molecule) -> list[str]:
                 angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v))
                 angles[f"{kind[a]}-{kind[corner]}-{kind[b]} {angle:.2f}°"] += 1
     return [
-        ", ".join(w if n == 1 else f"{w} ({n})" for w, n in found.items())
-        for found in (lengths, angles)
+        ", ".join(w if n == 1 else f"{w} ({n})" for w, n in counts.items())
+        for counts in (lengths, angles)
     ]
 
 
@@ -149,14 +151,14 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
 
     check_target(path, EXTENSIONS, force, "figure")
     view = _view(m)
-    seen: Any = m.positions_body @ view.T  # right, up, towards the viewer
+    projected: Any = m.positions_body @ view.T  # right, up, towards the viewer
     covalent = np.array([COVALENT.get(element, 0.0) for element in m.elements])
     radius: Any = np.maximum(
         LEAST, np.where(covalent > 0, OF_COVALENT * covalent, OF_DIAMETER * m.sigma)
     )
     radius[m.masses == 0] = LEAST / 2
     reach = np.maximum(radius, np.where(m.epsilon > 0, m.sigma / 2, 0.0))
-    half = float(1.12 * (np.abs(seen[:, :2]).max(axis=1) + reach).max())
+    half = float(1.12 * (np.abs(projected[:, :2]).max(axis=1) + reach).max())
     figure = new_figure(INCHES, INCHES * 1.12, layout=None)
     axes = figure.add_axes(
         (0.02, 0.02, 0.96, 0.96 / 1.12), aspect="equal", xlim=(-half, half), ylim=(-half, half)
@@ -165,14 +167,16 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     for i in np.flatnonzero(m.epsilon > 0).tolist():
         colour = COLOURS.get(m.elements[i], OTHER) if m.elements[i] != "H" else OTHER
         dashed = {"lw": 0.8, "ls": (0, (4, 3)), "zorder": 1}
-        axes.add_patch(Circle(seen[i, :2], m.sigma[i] / 2, fc=colour, alpha=0.07, lw=0, zorder=1))
         axes.add_patch(
-            Circle(seen[i, :2], m.sigma[i] / 2, fill=False, ec=colour, alpha=0.45, **dashed)
+            Circle(projected[i, :2], m.sigma[i] / 2, fc=colour, alpha=0.07, lw=0, zorder=1)
         )
-    bonded = _links(axes, m, seen, radius)
-    for i in np.argsort(seen[:, 2], kind="stable"):
-        _sphere(axes, m, i, seen[i], radius[i])
-    _labels(axes, m, seen[:, :2], radius, half, _principal_axes(axes, m, view, half) + bonded)
+        axes.add_patch(
+            Circle(projected[i, :2], m.sigma[i] / 2, fill=False, ec=colour, alpha=0.45, **dashed)
+        )
+    bonded = _links(axes, m, projected, radius)
+    for i in np.argsort(projected[:, 2], kind="stable"):
+        _sphere(axes, m, i, projected[i], radius[i])
+    _labels(axes, m, projected[:, :2], radius, half, _principal_axes(axes, m, view, half) + bonded)
     length = 1.0 if half > 1.6 else 0.5
     draw_scale(axes, length - 0.96 * half, -0.95 * half, length, f"{length:g} Å", FONT)
     title, plain = m.title or m.name, {"color": INK, "va": "top", "parse_math": False}
@@ -186,7 +190,7 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
         ("discs: Lennard-Jones diameters", (m.epsilon > 0).any()),
         ("diamonds: massless sites", (m.masses == 0).any()),
     ]
-    lines.append("; ".join(text for text, there in legend if there))
+    lines.append("; ".join(text for text, is_drawn in legend if is_drawn))
     figure.text(0.03, 0.942, "\n".join(lines), fontsize=FONT, linespacing=1.35, **plain)
     save_files(figure, path.with_suffix(""), [path.suffix[1:]])
 
@@ -201,15 +205,19 @@ def _view(m: Molecule) -> np.ndarray:
     return np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]]) @ about_up
 
 
-def _links(axes, m: Molecule, seen: np.ndarray, radius: np.ndarray) -> list[tuple]:
+def _links(axes, m: Molecule, projected: np.ndarray, radius: np.ndarray) -> list[tuple]:
     """Draw bonds between the surfaces of spheres. Returns points that labels must not cover."""
     taken = []
     for i, j in bonds(m):
         if m.masses[j] == 0:
-            axes.plot(*seen[[i, j], :2].T, color=FAINT, lw=1.0, zorder=_order(seen[j, 2]) - 0.01)
+            axes.plot(
+                *projected[[i, j], :2].T, color=FAINT, lw=1.0, zorder=_order(projected[j, 2]) - 0.01
+            )
             continue
-        along = (seen[j] - seen[i]) / np.linalg.norm(seen[j] - seen[i])
-        ends = np.array([seen[i] + 0.9 * radius[i] * along, seen[j] - 0.9 * radius[j] * along])
+        along = (projected[j] - projected[i]) / np.linalg.norm(projected[j] - projected[i])
+        ends = np.array(
+            [projected[i] + 0.9 * radius[i] * along, projected[j] - 0.9 * radius[j] * along]
+        )
         for colour, width in (("#8f949b", 7.0), ("#c9cdd2", 4.0)):
             axes.plot(
                 *ends[:, :2].T,
@@ -227,26 +235,30 @@ def _order(depth: float) -> float:
     return 5.0 + np.tanh(depth / 5.0)
 
 
-def _sphere(axes, m: Molecule, i: int, seen: Any, radius: float) -> None:
+def _sphere(axes, m: Molecule, i: int, projected: Any, radius: float) -> None:
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Circle, RegularPolygon
 
     if m.masses[i] == 0:
         axes.add_patch(
-            RegularPolygon(seen[:2], 4, radius=radius, fc="white", ec=COOL, lw=1.5, zorder=6.5)
+            RegularPolygon(projected[:2], 4, radius=radius, fc="white", ec=COOL, lw=1.5, zorder=6.5)
         )
         return
-    base, steps, order = np.array(to_rgb(COLOURS.get(m.elements[i], OTHER))), 24, _order(seen[2])
+    base, steps, order = (
+        np.array(to_rgb(COLOURS.get(m.elements[i], OTHER))),
+        24,
+        _order(projected[2]),
+    )
     for k in range(steps):
         fraction = k / (steps - 1)  # from the dark rim to the light spot
         colour = np.clip(
             base * (0.72 + 0.33 * fraction) + 0.55 * max(0.0, fraction - 0.45) ** 2, 0, 1
         )
-        x, y = seen[:2] + fraction * np.array([-0.32 * radius, 0.36 * radius])
+        x, y = projected[:2] + fraction * np.array([-0.32 * radius, 0.36 * radius])
         axes.add_patch(
             Circle((x, y), radius * (1 - 0.93 * fraction), fc=colour, lw=0, zorder=order)
         )
-    axes.add_patch(Circle(seen[:2], radius, fill=False, ec=0.55 * base, lw=0.8, zorder=order))
+    axes.add_patch(Circle(projected[:2], radius, fill=False, ec=0.55 * base, lw=0.8, zorder=order))
 
 
 def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tuple]:

@@ -334,18 +334,18 @@ def show(results: Results) -> "StructureWidget | AnimationPage":
     return cast("StructureWidget", shown)
 
 
-def _frames(results: Results, system: System, most: int) -> Frames:
-    """At most `most` frames, from the files of a run or from memory."""
+def _frames(results: Results, system: System, max_frames: int) -> Frames:
+    """At most `max_frames` frames, from the files of a run or from memory."""
     if not system.scene.output.trajectory or not results._frames:
         raise ValueError("this run has no frames (output.trajectory = false)")
     if results.files:
         record = record_of(system, results.samples, results.summary, [])
         try:
-            return frames_of(replace(record, folder=results.files[0].parent), most)
+            return frames_of(replace(record, folder=results.files[0].parent), max_frames)
         except OutputError as error:
             raise ValueError(str(error)) from None
     count = len(results._frames)
-    stride = max(1, -(-count // most))
+    stride = max(1, -(-count // max_frames))
     chosen = results._frames[::stride]
     frames = Frames(
         time=np.array([frame.time for frame in chosen]),

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rigidmd.core.files import write_text
+from rigidmd.figures.save import save_figure, settings
 from rigidmd.figures.style import (
     COOL,
     FAINT,
@@ -16,8 +17,6 @@ from rigidmd.figures.style import (
     WARM,
     curve_style,
     drawing,
-    save_figure,
-    settings,
 )
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
@@ -102,8 +101,8 @@ class Raw(str):
 
 def _cell(value: object) -> str:
     text = plain(value)
-    seen = re.sub(r"<[^>]*>", "", text) if isinstance(value, Raw) else str(value)
-    return f'<td class="wrap">{text}</td>' if len(seen) > 40 else f"<td>{text}</td>"
+    visible = re.sub(r"<[^>]*>", "", text) if isinstance(value, Raw) else str(value)
+    return f'<td class="wrap">{text}</td>' if len(visible) > 40 else f"<td>{text}</td>"
 
 
 def plain(value: object) -> str:
@@ -121,8 +120,8 @@ def chips(names: Iterable[str]) -> dict[str, Raw]:
 
 
 def items(lines: Iterable[object]) -> str:
-    found = "".join(f"<li>{plain(line)}</li>\n" for line in lines)
-    return f"<ul>\n{found}</ul>" if found else ""
+    entries = "".join(f"<li>{plain(line)}</li>\n" for line in lines)
+    return f"<ul>\n{entries}</ul>" if entries else ""
 
 
 def notes(lines: Iterable[str]) -> str:
@@ -143,13 +142,13 @@ def figure(drawn, salt: str, about: str) -> str:
         axis.patch.set_visible(False)
     with settings({"svg.fonttype": "none", "svg.hashsalt": salt}):
         save_figure(drawn, stream, format="svg", metadata={"Date": None, "Creator": None})
-    found = stream.getvalue()
-    found = found[found.index("<svg") :].replace(
+    text = stream.getvalue()
+    svg = text[text.index("<svg") :].replace(
         "<svg", f'<svg role="img" aria-label="{html.escape(about)}"', 1
     )
     for color, name in ((INK, "ink"), (FAINT, "faint"), (COOL, "cool"), (WARM, "warm")):
-        found = found.replace(color, f"var(--{name})")
-    return found
+        svg = svg.replace(color, f"var(--{name})")
+    return svg
 
 
 def wide(drawn, salt: str, about: str) -> str:

@@ -48,18 +48,20 @@ class Panel(NamedTuple):
 
 
 def panels(record: Record) -> list[Panel]:
-    found = _body_panels(record) if record.is_body else _molecular_panels(record)
-    return [panel for panel in found if panel.curves]
+    all_panels = _body_panels(record) if record.is_body else _molecular_panels(record)
+    return [panel for panel in all_panels if panel.curves]
 
 
 def _molecular_panels(record: Record) -> list[Panel]:
-    seen, n, shown = record.columns, len(record.system.model.species), record.moving
+    columns, n, shown = record.columns, len(record.system.model.species), record.moving
 
     def curves(per: int = 1, **labels: str) -> list[tuple[str, np.ndarray]]:
-        there = [name for name in labels if name in seen and np.isfinite(seen[name][shown]).any()]
-        return [(labels[name], seen[name] / per) for name in there]
+        recorded = [
+            name for name in labels if name in columns and np.isfinite(columns[name][shown]).any()
+        ]
+        return [(labels[name], columns[name] / per) for name in recorded]
 
-    found = [
+    panel_list = [
         Panel(
             "temperature (K)",
             curves(temperature_translation="translation", temperature_rotation="rotation"),
@@ -70,42 +72,44 @@ def _molecular_panels(record: Record) -> list[Panel]:
         ),
         Panel("pressure (bar)", curves(pressure_bar="")),
     ]
-    if "density" in seen and np.ptp(np.nan_to_num(seen["density"])) > 0:
-        found.append(Panel("density (g/cm³)", curves(density="")))
-        found.append(Panel("edges of the box (Å)", curves(a="a", b="b", c="c")))
-    return found
+    if "density" in columns and np.ptp(np.nan_to_num(columns["density"])) > 0:
+        panel_list.append(Panel("density (g/cm³)", curves(density="")))
+        panel_list.append(Panel("edges of the box (Å)", curves(a="a", b="b", c="c")))
+    return panel_list
 
 
 def _body_panels(record: Record) -> list[Panel]:
-    seen = record.columns
-    found = []
-    if "theta" in seen:
-        found.append(Panel("θ (°)", [("", np.degrees(seen["theta"]))]))
+    columns = record.columns
+    panel_list = []
+    if "theta" in columns:
+        panel_list.append(Panel("θ (°)", [("", np.degrees(columns["theta"]))]))
         for name, key in (
             ("φ", "phi"),
             ("ψ", "psi"),
         ):  # one panel each: precession is much slower than spin
-            angle = np.unwrap(seen[key])
+            angle = np.unwrap(columns[key])
             unit, size = ("turns", 2 * np.pi) if np.ptp(angle) > 2 * np.pi else ("°", np.pi / 180)
-            found.append(Panel(f"{name} ({unit})", [("", angle / size)]))
-        omega = [("ω" + "₁₂₃"[k], seen[f"omega_body_{k + 1}"]) for k in range(3)]
-        found.append(Panel("ω along the body's axes (rad/s)", omega))
-    if "x" in seen and any(np.ptp(seen[k]) > 0 for k in "xyz") and record.system.translates:
-        found.append(Panel("centre of mass (m)", [(k, seen[k]) for k in "xyz"]))
-    parts = [(name, seen[name]) for name in ("kinetic", "potential", "energy") if name in seen]
-    found.append(Panel("energies (J)", parts))
+            panel_list.append(Panel(f"{name} ({unit})", [("", angle / size)]))
+        omega = [("ω" + "₁₂₃"[k], columns[f"omega_body_{k + 1}"]) for k in range(3)]
+        panel_list.append(Panel("ω along the body's axes (rad/s)", omega))
+    if "x" in columns and any(np.ptp(columns[k]) > 0 for k in "xyz") and record.system.translates:
+        panel_list.append(Panel("centre of mass (m)", [(k, columns[k]) for k in "xyz"]))
+    parts = [
+        (name, columns[name]) for name in ("kinetic", "potential", "energy") if name in columns
+    ]
+    panel_list.append(Panel("energies (J)", parts))
     known = [
         name
-        for name, values in seen.items()
+        for name, values in columns.items()
         if name.endswith("_error") and np.isfinite(values).any()
     ]
     errors = [
-        (name.removesuffix("_error"), np.maximum(np.abs(seen[name]), FLOOR)) for name in known
+        (name.removesuffix("_error"), np.maximum(np.abs(columns[name]), FLOOR)) for name in known
     ]
-    found.append(
+    panel_list.append(
         Panel(f"relative errors of what is conserved (0 is drawn at {FLOOR:.0e})", errors, log=True)
     )
-    return found
+    return panel_list
 
 
 def plots_part(record: Record) -> str:

@@ -148,10 +148,10 @@ def _body_table(record: Record) -> str:
     of_invariants = BODY["energy_error"].names + BODY["L_error"].names
     errors = [name.removesuffix("_error") for name in record.columns if name in of_invariants]
     time = ("time", f"{record.time[-1]:g} s, {len(record.time)} samples")
-    found = motion_figures(record.columns, errors) | {
+    numbers = motion_figures(record.columns, errors) | {
         "rates": (record.summary or {}).get("rates", {})
     }
-    return table([], [time, *body_rows(found)], words=True)
+    return table([], [time, *body_rows(numbers)], words=True)
 
 
 def _margins(record: Record) -> str:
