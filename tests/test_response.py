@@ -327,3 +327,97 @@ def test_what_gives_no_response_functions_is_refused(stage, sections, words):
         frames = replace(frames, cell=np.full_like(frames.cell, np.inf))
     with pytest.raises(OutputError, match=words):
         response(frames)
+
+
+# liquids, minutes each
+
+SEEDS, PRESSURE, DENSITY = 24, 500.0, 0.7  # of compressed nitrogen at 150 K: bar, g/cm³
+
+
+def compressed_nitrogen(seed, ensemble, pressure=PRESSURE):
+    """Results of 48 molecules in 100 ps after 10 ps."""
+    stage = STAGES[ensemble] | {"timestep_fs": 4.0, "integrator": "baoab"}
+    stage["thermostat"] = "velocity_rescaling"
+    if ensemble == "npt":
+        stage |= {"pressure_bar": pressure, "barostat_time_ps": 0.4}
+        stage |= {"compressibility_per_bar": 3e-4}
+    scene = {
+        "seed": seed,
+        "box": {"density_g_cm3": DENSITY},
+        "molecules": [{"model": "nitrogen", "count": 48}],
+        "forces": {"cutoff_A": 6.0},
+        "start": {"temperature_K": T},
+        "stages": [stage | {"duration_ps": duration} for duration in (10.0, 100.0)],
+        "output": {"log_interval_ps": 0.05, "trajectory_interval_ps": 10.0, "figures": False},
+    }
+    return Simulation(Scene.from_dict(scene)).run(progress=False)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("ensemble", ["nvt", "npt"])
+def test_errors_are_those_of_the_scatter_over_seeds(ensemble):
+    """The truth is that of all runs together."""
+    runs = [compressed_nitrogen(seed, ensemble) for seed in range(SEEDS)]
+    each = [rigidmd.analysis.response(results) for results in runs]
+    together = rigidmd.analysis.response(runs)
+    print(together)
+    for truth in together.values:
+        values = [found.value(truth.name) for found in each]
+        values = [value for value in values if value.value is not None]
+        pulls = np.array([(value.value - truth.value) / value.error for value in values])
+        rms = np.sqrt(np.mean(pulls**2))
+        print(f"{truth.name}: {rms:.2f} of {len(pulls)}, largest {np.abs(pulls).max():.1f}")
+        assert len(pulls) > 0.8 * SEEDS and 0.65 < rms < 1.45, truth.name
+        scatter = np.std([value.value for value in values], ddof=1) / np.sqrt(len(values))
+        assert 0.6 < truth.error / scatter < 1.7, truth.name
+
+
+@pytest.mark.soak
+def test_the_compressibility_is_the_difference_of_two_pressures():
+    low, high = 400.0, 600.0
+    runs = [compressed_nitrogen(seed, "npt") for seed in range(SEEDS // 2)]
+    kappa = rigidmd.analysis.response(runs).value("kappa_T")
+    densities = {
+        pressure: [
+            np.mean(compressed_nitrogen(seed, "npt", pressure)["density"][200:])
+            for seed in range(SEEDS // 2)
+        ]
+        for pressure in (low, high)
+    }
+    logs = {pressure: np.log(values) for pressure, values in densities.items()}
+    by_density = 1e6 * (logs[high].mean() - logs[low].mean()) / (high - low)
+    error = 1e6 * np.hypot(*(stats.sem(values) for values in logs.values())) / (high - low)
+    print(kappa, "| by the densities at two pressures:", by_density, "±", error)
+    assert abs(kappa.value - by_density) < 3 * np.hypot(kappa.error, error)
+    assert error < 0.1 * by_density
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    ("model", "published"),  # Vega & Abascal 2011, Phys. Chem. Chem. Phys. 13, 19663
+    [("tip4p2005", {"kappa_T": 46.5, "alpha_p": 0.28, "c_p": 88.3})],
+)
+def test_water_has_the_published_responses(model, published):
+    stage = {
+        "ensemble": "npt",
+        "temperature_K": 298.15,
+        "pressure_bar": 1.0,
+        "timestep_fs": 4.0,
+        "integrator": "baoab",
+        "thermostat": "velocity_rescaling",
+    }
+    scene = {
+        "box": {"density_g_cm3": 0.997},
+        "molecules": [{"model": model, "count": 216}],
+        "forces": {"cutoff_A": 8.5},
+        "precision": "mixed",
+        "start": {"temperature_K": 298.15},
+        "stages": [stage | {"duration_ps": duration} for duration in (20.0, 400.0)],
+        "output": {"trajectory_interval_ps": 10.0, "figures": False},
+    }
+    found = rigidmd.analysis.response(Simulation(Scene.from_dict(scene)).run(progress=False))
+    print(found)
+    for name, value in published.items():
+        measured = found.value(name)
+        assert measured.value is not None, measured
+        assert abs(measured.value - value) < 3 * measured.error + 0.02 * value, measured
