@@ -169,7 +169,7 @@ def response(runs: Runs) -> AnalysisResult:
     gamma_V = (dp/dT)_V; in npt also c_p, the compressibility kappa_T and the thermal expansion
     alpha_p.
 
-    Heat capacities are classical. The error of one run is that of the series of what each sample
+    Heat capacities are classical. The error of one run is from the series of what each sample
     changes in a value to first order. Raises OutputError.
     """
     _check_conditions(runs)
@@ -228,7 +228,7 @@ def _check_conditions(runs: Runs) -> None:
 def _why_no_pressure(runs: Runs) -> str:
     """Why the run has no pressure that follows from its energy; empty if it has one."""
     if not runs.has_box:
-        return "there is no box"
+        return "the run has no periodic box"
     names = ", ".join(runs.system.position_dependent)
     return f"the pressure does not contain {names}" if names else ""
 
