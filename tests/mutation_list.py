@@ -403,4 +403,28 @@ RINGS = [
         '(2 * pi / 3 if axis == forces.ewald_slab else 0.0 for axis in "xyz")',
         ("test_slabs.py::test_charges_in_a_slab_do_not_depend_on_the_vacuum[z-molecules1]",),
     ),
+    Mutation(
+        "D6",
+        "responses: the total momentum that a run keeps at zero is missing in the heat capacity",
+        "analysis/built_in/thermodynamics.py",
+        "0.5 * BOLTZMANN * (3 * count + freedom.rotation)",
+        "0.5 * BOLTZMANN * freedom.total",
+        ("test_response.py::test_an_ideal_gas_at_constant_volume_has_its_responses",),
+    ),
+    Mutation(
+        "D7",
+        "responses: what the subtraction of means hides is not added",
+        "analysis/built_in/thermodynamics.py",
+        "covariances.T + self.hidden / fraction",
+        "covariances.T + 0 * self.hidden / fraction",
+        ("test_response.py::test_a_mean_that_is_subtracted_hides_nothing",),
+    ),
+    Mutation(
+        "D8",
+        "responses: fluctuations at constant energy are those of the canonical ensemble",
+        "analysis/built_in/thermodynamics.py",
+        "factor = 1 / (1 - BOLTZMANN * of.xx / matter.counted)",
+        "factor = 1 / (1 + BOLTZMANN * of.xx / matter.counted)",
+        ("test_response.py::test_constant_energy_has_the_responses_of_the_canonical_ensemble",),
+    ),
 ]

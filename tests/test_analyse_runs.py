@@ -94,6 +94,7 @@ BUILT_IN = [
     "orientation",
     "spectrum",
     "dielectric",
+    "response",
     "viscosity",
     "surface_tension",
 ]
