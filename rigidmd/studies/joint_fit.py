@@ -67,6 +67,11 @@ def slope_name(quantity: str) -> str:
     return f"slope of {quantity}"
 
 
+def size_name(quantity: str) -> str:
+    """The sum of the sizes of the parts of a slope, which may cancel."""
+    return f"size of the slope of {quantity}"
+
+
 #: Mean kinetic energy where the thermostat acts, less that of the set temperature.
 BALANCE = "kinetic energy less that of the thermostat"
 #: Mean of (ω dt)² over the degrees of freedom. Times NEXT_TERM it is the fraction of a bias that
@@ -199,8 +204,10 @@ def _evaluate(blocks: np.ndarray, at: Conditions, has_barostat: bool) -> dict[st
         direct = -with_squares[k] / 24
         if name == POTENTIAL:
             direct += at.thermal_energy * mean.squares / at.count / 12
-        shift = direct + with_enthalpy[k] * hotter - with_volume[k] * denser
-        found[slope_name(name)] = float(shift / at.thermal_energy * FEMTOSECOND**2)
+        parts = np.array([direct, with_enthalpy[k] * hotter, -with_volume[k] * denser])
+        parts *= FEMTOSECOND**2 / at.thermal_energy
+        found[slope_name(name)] = float(parts.sum())
+        found[size_name(name)] = float(np.abs(parts).sum())
     set_energy = at.freedom * at.thermal_energy / 2
     found[MEAN_SQUARE] = float(at.step**2 * mean.squares / at.freedom / at.thermal_energy)
     found[BALANCE] = float(mean.kinetic + at.correction * at.step**2 * mean.squares - set_energy)
@@ -259,10 +266,10 @@ def fit_jointly(runs: Mapping[float, Sequence[RunResults]]) -> JointLimits:
     for other in slopes[1:] or slopes:
         together = list(dict.fromkeys([slopes[0], other]))
         used = [*together, *map(slope_name, together), BALANCE]
-        squares = [point.mean for point in points[MEAN_SQUARE]]
+        correlation = _correlation(runs, used)
         steps = [
-            _Step(of_step, square, _correlation(runs, used))
-            for square, *of_step in zip(squares, *(points[name] for name in used), strict=True)
+            _Step([points[name][k] for name in used], correlation, _next_terms(points, together, k))
+            for k in range(len(points[BALANCE]))
         ]
         fits = _fit_with_slopes(steps)
         for name, fit in zip(together, fits, strict=True):
@@ -307,12 +314,19 @@ def _correlation(runs: Mapping[float, Sequence[RunResults]], names: list[str]) -
     return total / np.outer(size, size)
 
 
+def _next_terms(points: Mapping[str, list[MeanAtStep]], names: list[str], k: int) -> np.ndarray:
+    """What terms of higher order may change in means and in slopes at step k."""
+    sizes = np.array([points[size_name(name)][k].mean for name in names])
+    square = points[MEAN_SQUARE][k]
+    return NEXT_TERM * square.mean * np.concatenate([square.timestep**2 * sizes, sizes])
+
+
 class _Step(NamedTuple):
     """Data of a step: means, then as many slopes, then what is 0 at any step."""
 
     points: list[MeanAtStep]
-    mean_square: float  # of (ω dt)²
     correlation: np.ndarray
+    next_terms: np.ndarray  # sizes of terms of higher order, of means and slopes
 
     @property
     def step(self) -> float:
@@ -330,10 +344,8 @@ class _Step(NamedTuple):
         design = np.block([[unit, self.step**2 * unit], [zero, unit]])
         errors = np.array([point.error for point in self.points])
         values = np.array([point.mean for point in self.points])
-        slopes = values[self.size : 2 * self.size]
-        next_terms = np.concatenate([self.step**2 * slopes, slopes, np.zeros(len(rest))])
         covariance = self.correlation * np.outer(errors, errors)
-        covariance += np.diag((NEXT_TERM * self.mean_square * next_terms) ** 2)
+        covariance += np.diag(np.append(self.next_terms, np.zeros(len(rest))) ** 2)
         whiten = np.linalg.inv(np.linalg.cholesky(covariance))
         return whiten @ np.vstack([design, rest]), whiten @ values
 
