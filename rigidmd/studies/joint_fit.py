@@ -72,8 +72,8 @@ def size_name(quantity: str) -> str:
     return f"size of the slope of {quantity}"
 
 
-#: Mean kinetic energy where the thermostat acts, less that of the set temperature.
-BALANCE = "kinetic energy less that of the thermostat"
+#: Mean kinetic energy where the thermostat acts, less its value at the set temperature.
+BALANCE = "kinetic energy less its set value"
 #: Mean of (ω dt)² over the degrees of freedom. Times NEXT_TERM it is the fraction of a bias that
 #: its next term is taken to be: 1/4 in harmonic motions of one frequency, more where frequencies
 #: differ. In nitrogen at 90 K it was 1.4 ± 0.9, at (ω dt)² = 0.14.
