@@ -38,7 +38,7 @@ from rigidmd.studies.sweep.figure import axis_label
 from rigidmd.studies.sweep.folder import point_name, read_manifest, short_keys, value_name
 from rigidmd.studies.sweep.plan import Axis, parse_axis, settings
 from rigidmd.studies.sweep.points import format_walltime, wait_for_folder
-from rigidmd.studies.sweep.table import SweepRow, summarise_run
+from rigidmd.studies.sweep.table import POTENTIAL, SweepRow, summarise_run
 from rigidmd.studies.sweep.table import Table as SweepTable
 
 ARGON = """
@@ -372,6 +372,7 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
         "averages at a step of 0, from errors of order dt² (velocity_verlet) in stages.0.timestep_fs"
         in said
     )
+    assert "no joint fit: temperature_K=90: it is for nvt and npt, and the stage is nve" in said
     assert "sweep.png, extrapolation.csv, extrapolation.png, extrapolation.html" in said
     with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
         rows = {(row["start.temperature_K"], row["average"]): row for row in csv.DictReader(file)}
@@ -388,6 +389,31 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
         assert float(row["limit error"]) > 0
     assert "<svg" in (folder / "extrapolation.html").read_text("utf-8")
     assert (folder / "extrapolation.png").stat().st_size > 10_000
+
+
+def test_energy_at_a_step_of_zero_has_a_joint_fit(argon, tmp_path, capsys):
+    """Beside the independent one, with a smaller error, and with the heat capacity."""
+    folder = tmp_path / "steps"
+    stage = {"ensemble": "nvt", "temperature_K": 110.0, "duration_ps": 20.0}
+    fixed = {f"stages.0.{key}": value for key, value in stage.items()}
+    axes = sweeping.axes_of({STEP: [10, 20], "seed": [1, 2]} | fixed)
+    run_here(argon, axes, folder, step=STEP)
+    assert (
+        cli.main(["sweep", str(argon), "-o", str(folder), "--collect", "--extrapolate", STEP]) == 0
+    )
+    said = capsys.readouterr().out
+    assert re.search(
+        r"U per molecule \(kJ/mol\) +independent .*\n(.*\n)*U per molecule.* joint ", said
+    )
+    assert re.search(r"c_v \(J/\(mol K\)\) +fluctuations +\d", said)
+    with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
+        rows = {(row["average"], row["fit"]): row for row in csv.DictReader(file)}
+    joint, alone = (rows[POTENTIAL, kind] for kind in ("joint", "independent"))
+    assert 0 < float(joint["limit error"]) < 0.5 * float(alone["limit error"])
+    apart = float(joint["limit"]) - float(alone["limit"])
+    assert abs(apart) < 3 * float(alone["limit error"])
+    assert float(joint["bias at 20 fs"]) == pytest.approx(4 * float(joint["bias at 10 fs"]))
+    assert 12 < float(rows["c_v (J/(mol K))", "fluctuations"]["limit"]) < 30
 
 
 def test_values_of_replicas_together_are_extrapolated(argon, tmp_path):

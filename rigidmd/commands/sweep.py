@@ -260,6 +260,8 @@ def print_limits(manifest: "Manifest", step: str) -> list[str]:
         print(f"\n{limits.title}\n{limits.as_text().text(range(len(limits.keys) + 1))}")
     for line in limits.missing:
         print(f"  no limit: {line}")
+    for line in limits.not_joint:
+        print(f"  no joint fit: {line}")
     return write_limits(manifest.folder, limits, shlex.join(["rigidmd", *sys.argv[1:]]))
 
 

@@ -155,6 +155,8 @@ def observe(
         pressure_yz=yz,
         conserved=conserved,
         stage=stage or 0,
+        force_squares=sums.force / energy_unit,
+        torque_squares=sums.torque / energy_unit,
         user_energies=(
             *(components[name] / energy_unit for name in system.user_terms),
             *(term.distance_in(state) for term in system.distances.values()),

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
+from math import nan
 from operator import attrgetter
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
@@ -97,6 +98,12 @@ class Sample(NamedTuple):
         float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")
     ]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
+    force_squares: Annotated[
+        float, Column("F^2/m (kJ/mole/ps^2)", "kJ/mol/ps²", "sum of F²/m of all molecules")
+    ] = nan
+    torque_squares: Annotated[
+        float, Column("n^2/I (kJ/mole/ps^2)", "kJ/mol/ps²", "the same of torques n")
+    ] = nan
     # of user-defined forces, kJ/mol; then distances, Å, and OF_TRAJECTORIES
     user_energies: tuple[float, ...] = ()
 
@@ -119,6 +126,8 @@ NOT_AVERAGED = {
     "heat",
     "work",
     "conserved",
+    "force_squares",
+    "torque_squares",
 }
 
 

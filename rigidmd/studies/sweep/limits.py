@@ -12,12 +12,14 @@ import numpy as np
 from rigidmd.analysis.files import read_table
 from rigidmd.core.statistics import format_signed
 from rigidmd.engines.samples import COLUMNS
-from rigidmd.errors import SceneError
+from rigidmd.errors import RigidMDError, SceneError
 from rigidmd.figures.style import curve_style, write_figure
 from rigidmd.io.folder import SCENE, add_to_folder
 from rigidmd.io.write import Table, nine_digits
+from rigidmd.run.record import read_record
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, Together, extrapolate, means_of_runs
+from rigidmd.studies.joint_fit import RunResults, fit_jointly, results_of_run
 from rigidmd.studies.sweep.figure import draw_table
 from rigidmd.studies.sweep.folder import Manifest, describe_values, point_name, short_keys
 from rigidmd.studies.sweep.table import (
@@ -37,6 +39,9 @@ OPTION = "--extrapolate"
 FILES = ("extrapolation.csv", "extrapolation.png", "extrapolation.html")
 MOST_PANELS = 12
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+#: Kinds of limits: of each average by itself; of energy and volume together, with the slopes that
+#: fluctuations predict; of responses, which fluctuations give.
+INDEPENDENT, JOINT, FLUCTUATIONS = "independent", "joint", "fluctuations"
 
 
 class Limit(NamedTuple):
@@ -48,9 +53,14 @@ class Limit(NamedTuple):
     quantity: str  # with its unit
     points: list[MeanAtStep]
     fit: BiasFit
+    kind: str = INDEPENDENT
 
     def bias(self, step: float) -> tuple[float, float] | None:
-        """Mean at a step less limit, with its error; None without a mean there."""
+        """Mean at a step less limit, with its error; that of a joint fit by its slope. None without
+        a mean there."""
+        if self.kind == JOINT:
+            slope, error = self.fit.slopes[""]
+            return slope * step**2, error * step**2
         return next((self.fit.bias(at) for at in self.points if at.timestep == step), None)
 
     @property
@@ -67,6 +77,7 @@ class Limits(NamedTuple):
     key: str
     limits: list[Limit]
     missing: list[str]  # sentences on what has no limit
+    not_joint: list[str]  # on what has no joint fit
 
     @property
     def steps(self) -> list[float]:
@@ -91,6 +102,8 @@ class Limits(NamedTuple):
             fit = limit.fit
             line = {short[key]: cell for key, cell in key_cells(limit.values).items()}
             line["average"] = limit.title
+            if any(limit.kind == JOINT for limit in self.limits):
+                line["fit"] = limit.kind
             line["limit"] = fit.describe_limit()
             line["chi²/dof"] = f"{fit.chi2:.2g}/{fit.freedom}" if fit.freedom else None
             line["to (fs)"] = f"{fit.longest:g}"
@@ -107,6 +120,7 @@ class Limits(NamedTuple):
             fit = limit.fit
             line = key_cells(limit.values)
             line["average"] = limit.quantity
+            line["fit"] = limit.kind
             line["integrator"] = limit.method
             line["order"] = fit.order
             line["limit"] = nine_digits(fit.limit)
@@ -184,7 +198,52 @@ def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
             limits.append(Limit(average.values, average.integrator, average.quantity, points, fit))
         else:
             missing.append(f"{name}: the runs are too short and too few for an error")
-    return Limits(manifest.name, key, limits, missing)
+    joint, not_joint = _joint_limits(manifest, key)
+    return Limits(manifest.name, key, limits + joint, missing, not_joint)
+
+
+@dataclass
+class _Combination:
+    """Results of the runs that differ in the step and the seed alone, by the step (fs)."""
+
+    values: dict[str, Any]
+    integrator: str = ""
+    runs: dict[float, list[RunResults]] = field(default_factory=dict)
+
+
+def _joint_limits(manifest: Manifest, key: str) -> tuple[list[Limit], list[str]]:
+    """Limits of joint fits and of responses, and sentences on what has none."""
+    combinations: dict[str, _Combination] = {}
+    reasons: dict[str, None] = {}
+    short = short_keys(manifest.keys)
+    for values, points in manifest.combinations():
+        for point in points:
+            if point.state != "finished":
+                continue
+            try:
+                record = read_record(manifest.folder / point.folder)
+                found = results_of_run(record)
+            except RigidMDError:  # the table of the sweep names it
+                continue
+            first, k = step_key(manifest, key, record.scene)
+            others = {name: value for name, value in values.items() if name != first}
+            title = describe_values(others, short)
+            if isinstance(found, str):
+                reasons[f"{title}: {found}" if title else found] = None
+                continue
+            combination = combinations.setdefault(title, _Combination(others))
+            combination.integrator = record.scene.stages[k].integrator
+            combination.runs.setdefault(float(values[first]), []).append(found)
+    limits = []
+    for title, combination in combinations.items():
+        fits = fit_jointly(combination.runs)
+        common = combination.values, combination.integrator
+        for kind, by_quantity in ((JOINT, fits.joint), (FLUCTUATIONS, fits.responses)):
+            limits += [Limit(*common, name, *fit, kind) for name, fit in by_quantity.items()]
+        if not fits.joint:
+            reason = "the runs are too short and too few for an error"
+            reasons[f"{title}: {reason}" if title else reason] = None
+    return limits, list(reasons)
 
 
 def _averages(manifest: Manifest, key: str) -> Iterator[_Average]:
@@ -241,7 +300,7 @@ def _page(limits: Limits, command: str) -> str:
     drawn = wide(_figure(limits), "extrapolation", "means over the time step, and their limits")
     sections = [
         f'<p class="faint">{plain(limits.title)}</p>',
-        section("Limits and biases", rows, items([note, *limits.missing])),
+        section("Limits and biases", rows, items([note, *limits.missing, *limits.not_joint])),
         section("Means against the time step", drawn),
         section("How to repeat it", code(command)),
     ]
@@ -256,18 +315,19 @@ def _figure(limits: Limits):
     def rank(name: str) -> int:
         return MAIN.index(name) if name in MAIN else len(MAIN) + (name in of_log)
 
-    quantities = dict.fromkeys(limit.quantity for limit in limits.limits)
+    independent = [limit for limit in limits.limits if limit.kind == INDEPENDENT]
+    quantities = dict.fromkeys(limit.quantity for limit in independent)
     shown = sorted(quantities, key=rank)[:MOST_PANELS]
     rows: dict[tuple[str, float], SweepRow] = {}
-    for limit in limits.limits:
+    for limit in independent:
         for point in limit.points:
             row = SweepRow({limits.key: point.timestep} | limit.values, {None: {}})
             row = rows.setdefault((limit.label, point.timestep), row)
             row.runs[None][limit.quantity] = point.mean, point.error
     means = SweepTable(Path(), [limits.key, *limits.keys], list(rows.values()), shown)
     figure = draw_table(means, shown, connected=False)
-    labels = list(dict.fromkeys(limit.label for limit in limits.limits))
-    for limit in limits.limits:
+    labels = list(dict.fromkeys(limit.label for limit in independent))
+    for limit in independent:
         if limit.quantity in shown:
             axis = figure.axes[shown.index(limit.quantity)]
             _draw_limit(axis, limit.fit, curve_style(labels.index(limit.label)))

@@ -1,0 +1,291 @@
+"""Energy and volume at a step of 0 together: `studies/joint_fit.py`."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from rigidmd import Scene, Simulation
+from rigidmd.run.record import read_record
+from rigidmd.studies.extrapolation import extrapolate
+from rigidmd.studies.joint_fit import (
+    BAR_NM3,
+    DENSITY,
+    GAS_CONSTANT,
+    MEAN_SQUARE,
+    POTENTIAL,
+    VOLUME,
+    Conditions,
+    RunResults,
+    fit_jointly,
+    results_of_run,
+    results_of_samples,
+    slope_name,
+    why_not,
+)
+
+COUNT, FREEDOM, TEMPERATURE, PRESSURE = 50, 247, 120.0, 400.0
+THERMAL = GAS_CONSTANT * TEMPERATURE
+STEPS = (6.0, 10.0, 14.0)
+#: Of potential energy per molecule, volume, density, kinetic energy, and of sums of squares.
+MEANS = np.array([-5.0, 3.0, 0.8, FREEDOM * THERMAL / 2, 9000.0, 5000.0])
+SIZES = np.array([0.1, 0.1, -0.1 * 0.8 / 3, 11.0, 900.0, 500.0])
+CORRELATIONS = np.array(
+    [
+        [1.0, 0.6, 0.6, 0.4, 0.3, 0.3],
+        [0.6, 1.0, 1.0, 0.1, -0.2, -0.2],
+        [0.6, 1.0, 1.0, 0.1, -0.2, -0.2],
+        [0.4, 0.1, 0.1, 1.0, 0.2, 0.2],
+        [0.3, -0.2, -0.2, 0.2, 1.0, 0.9],
+        [0.3, -0.2, -0.2, 0.2, 0.9, 1.0],
+    ]
+)
+
+
+def conditions(step, has_barostat, correction=0.0, reads_kinetic=True):
+    """step : fs"""
+    pressure = PRESSURE * BAR_NM3 if has_barostat else 0.0
+    common = TEMPERATURE, pressure, COUNT, COUNT, FREEDOM, 2 * COUNT
+    return Conditions(1e-3 * step, *common, correction, reads_kinetic)
+
+
+def slopes(at, has_barostat):
+    """d<A>/d(dt²) of U per molecule, V and the density by the formulas of the theory chapter, per
+    fs²."""
+    covariance = CORRELATIONS * np.outer(SIZES, SIZES)
+    squares, of_forces, volume = MEANS[4], MEANS[5], MEANS[1]
+    heating = squares * (1 / 12 - at.correction) / (FREEDOM * THERMAL / 2)
+    if at.reads_kinetic:
+        compression = of_forces / 12 / volume
+    else:
+        compression = (COUNT * THERMAL * heating + of_forces / 36) / volume
+    found = []
+    for k in range(3):
+        enthalpy = COUNT * covariance[k, 0] + at.pressure * covariance[k, 1]
+        shift = enthalpy * heating - covariance[k, 4] / 24
+        shift += squares * THERMAL / 12 / COUNT if k == 0 else 0.0
+        shift -= covariance[k, 1] * compression if has_barostat else 0.0
+        found.append(1e-6 * shift / THERMAL)
+    return np.array(found)
+
+
+def sampled(rng, step, has_barostat, samples, correction=0.0, reads_kinetic=True):
+    """Series (6, samples) of a Gaussian process with the biases that the formulas give."""
+    at = conditions(step, has_barostat, correction, reads_kinetic)
+    values, vectors = np.linalg.eigh(CORRELATIONS)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    keep, warm = 0.8, 50
+    noise = np.sqrt(1 - keep**2) * rng.standard_normal((samples + warm, 6))
+    series = lfilter([1.0], [1.0, -keep], noise, axis=0)[warm:]
+    means = MEANS.copy()
+    means[:3] += slopes(at, has_barostat) * step**2
+    means[3] -= correction * at.step**2 * MEANS[4]
+    values = means[:, None] + SIZES[:, None] * (series @ root.T).T
+    if not has_barostat:
+        values[1:3] = 0.0
+    return results_of_samples(values, at, has_barostat)
+
+
+@pytest.mark.parametrize(
+    ("has_barostat", "correction", "reads_kinetic", "steps", "replicas"),
+    [
+        (True, 0.0, True, STEPS, 4),
+        (True, 1 / 8, False, STEPS[:2], 5),
+        (False, 0.0, False, STEPS, 4),
+        (False, 1 / 8, False, STEPS[:2], 6),
+    ],
+)
+def test_pulls_of_joint_limits_have_unit_width(
+    has_barostat, correction, reads_kinetic, steps, replicas
+):
+    """(limit - truth)/error of limits, with the errors of independent fits or smaller ones; slopes
+    and responses are those of the process."""
+    rng, truth = (
+        np.random.default_rng(7),
+        dict(zip((POTENTIAL, VOLUME, DENSITY), MEANS, strict=False)),
+    )
+    pulls, ratios, of_slopes, responses = {}, {}, [], {}
+    expected = slopes(conditions(10.0, has_barostat, correction, reads_kinetic), has_barostat)
+    for _ in range(30):
+        runs = {
+            step: [
+                sampled(rng, step, has_barostat, 400, correction, reads_kinetic)
+                for _ in range(replicas)
+            ]
+            for step in steps
+        }
+        found = fit_jointly(runs)
+        assert [*found.joint] == [*truth][: 3 if has_barostat else 1]
+        for name, (points, fit) in found.joint.items():
+            pulls.setdefault(name, []).append((fit.limit - truth[name]) / fit.limit_error)
+            alone = extrapolate(points)
+            if alone.longest == fit.longest:
+                ratios.setdefault(name, []).append(fit.limit_error / alone.limit_error)
+        slope, error = found.joint[POTENTIAL][1].slopes[""]
+        of_slopes.append((slope - expected[0]) / error)
+        for name, (_, fit) in found.responses.items():
+            responses.setdefault(name, []).append(fit.limit)
+    for name, values in pulls.items():
+        print(name, np.mean(values), np.std(values), np.mean(ratios[name]), np.max(ratios[name]))
+        assert abs(np.mean(values)) < 0.4, name
+        assert 0.7 < np.std(values) < 1.35, name
+        assert max(ratios[name]) <= 1, name
+        assert np.mean(ratios[name]) < 0.8, name
+    assert 0.7 < np.sqrt(np.mean(np.square(of_slopes))) < 1.4
+    for name, value in responses_of_process(has_barostat).items():
+        error = np.std(responses[name]) / np.sqrt(len(responses[name]))
+        assert abs(np.mean(responses[name]) - value) < 4 * error, name
+        assert error < 0.2 * value, name
+
+
+def responses_of_process(has_barostat):
+    covariance = CORRELATIONS * np.outer(SIZES, SIZES)
+    weights = np.array([COUNT, PRESSURE * BAR_NM3 if has_barostat else 0.0])
+    enthalpy = covariance[:2, :2] @ weights  # covariances with it
+    momenta = 0.5 * GAS_CONSTANT * (3 * COUNT + 2 * COUNT)
+    capacity = 1e3 * (momenta + weights @ enthalpy / THERMAL / TEMPERATURE) / COUNT
+    if not has_barostat:
+        return {"c_v (J/(mol K))": capacity}
+    return {
+        "c_p (J/(mol K))": capacity,
+        "kappa_T (1/bar)": covariance[1, 1] / THERMAL / MEANS[1] * BAR_NM3,
+        "alpha_p (1/K)": enthalpy[1] / THERMAL / TEMPERATURE / MEANS[1],
+    }
+
+
+@pytest.mark.parametrize(("correction", "bias"), [(0.0, 1 / 8), (1 / 8, 0.0)])
+def test_springs_have_the_bias_of_theory(correction, bias):
+    """Molecules on springs, of one frequency, as velocity Verlet and BAOAB sample them: the bias
+    of U is (ω dt)²/8 and 0 kT per degree of freedom."""
+    rng, steps, runs = np.random.default_rng(11), (5.0, 10.0, 20.0), {}
+    omega = 20.0  # rad/ps
+    for step in steps:
+        x = (1e-3 * step * omega) ** 2
+        hotter = 1 / (1 - x / 4) if correction == 0.0 else 1.0  # positions
+        potential = 0.5 * THERMAL * hotter * rng.chisquare(FREEDOM, 4000)
+        kinetic = 0.5 * THERMAL * hotter * (1 - x / 4) * rng.chisquare(FREEDOM, 4000)
+        squares = 2 * omega**2 * potential
+        nothing = np.zeros(4000)
+        series = [potential / COUNT, nothing, nothing, kinetic, squares, squares]
+        at = conditions(step, False, correction)
+        runs[step] = [results_of_samples(np.array(series), at, False)]
+        assert runs[step][0].values[MEAN_SQUARE] == pytest.approx(x, rel=0.06)
+        expected = bias * omega**2 * 1e-6 * FREEDOM * THERMAL / COUNT
+        slope, error = (
+            getattr(runs[step][0], kind)[slope_name(POTENTIAL)] for kind in ("values", "errors")
+        )
+        next_term = 0.5 * x * omega**2 / 8 * 1e-6 * FREEDOM * THERMAL / COUNT
+        assert abs(slope - expected) < 4 * error + next_term
+        assert error < 0.1 * omega**2 / 8 * 1e-6 * FREEDOM * THERMAL / COUNT
+    _, fit = fit_jointly(runs).joint[POTENTIAL]
+    assert abs(fit.limit - 0.5 * THERMAL * FREEDOM / COUNT) < 4 * fit.limit_error
+
+
+def stage_of(**keys):
+    scene = {
+        "box": {"lengths_A": 30.0},
+        "molecules": [{"model": "argon", "count": 4}],
+        "start": {"temperature_K": 90.0},
+        "stages": [{"duration_ps": 1.0, "timestep_fs": 5.0} | keys],
+    }
+    return Scene.from_dict(scene).stages[0]
+
+
+NVT = {"ensemble": "nvt", "temperature_K": 90.0}
+NPT = {"ensemble": "npt", "temperature_K": 90.0, "pressure_bar": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("keys", "reason"),
+    [
+        (NVT, ""),
+        (NVT | {"integrator": "baoab"}, ""),
+        (NPT, ""),
+        (NPT | {"barostat": "monte_carlo"}, ""),
+        ({}, "it is for nvt and npt, and the stage is nve"),
+        (NVT | {"temperature_K": [90.0, 100.0]}, "temperature or pressure change"),
+        (NVT | {"thermostat": "hybrid_monte_carlo"}, "has no error of the step"),
+        (NVT | {"integrator": "position_verlet"}, "the integrator is position_verlet"),
+        (NVT | {"integrator": "srkn_4"}, "the integrator is srkn_4"),
+        (NPT | {"pressure_coupling": "anisotropic"}, "not 'isotropic'"),
+    ],
+)
+def test_stages_without_a_joint_fit_have_a_reason(keys, reason):
+    found = why_not(stage_of(**keys))
+    assert reason in found
+    assert bool(found) is bool(reason)
+
+
+def test_a_log_without_squares_of_forces_has_a_reason(tmp_path):
+    scene = {
+        "box": {"lengths_A": 30.0},
+        "molecules": [{"model": "argon", "count": 4}],
+        "start": {"temperature_K": 90.0},
+        "stages": [NVT | {"duration_ps": 1.0, "timestep_fs": 10.0}],
+        "output": {"figures": False},
+    }
+    Simulation(Scene.from_dict(scene), tmp_path / "run").run(progress=False)
+    record = read_record(tmp_path / "run")
+    assert isinstance(results_of_run(record), RunResults)
+    del record.columns["force_squares"]
+    assert "the log has no F^2/m (kJ/mole/ps^2)" in results_of_run(record)
+
+
+def test_runs_that_are_too_short_have_no_limit():
+    rng = np.random.default_rng(2)
+    for samples in (5, 15):
+        runs = {step: [sampled(rng, step, False, samples)] for step in STEPS}
+        assert fit_jointly(runs) == ({}, {})
+
+
+@pytest.mark.soak
+def test_limits_of_nitrogen(tmp_path):
+    """Twenty times four runs of 80 ps at three steps: pulls, and the mean of the limits against
+    runs at a short step."""
+    found = {}
+    for repetition in range(20):
+        runs = {
+            step: [nitrogen(tmp_path, step, 80.0, 100 * repetition + 10 * k + 1) for k in range(4)]
+            for step in (16.0, 24.0, 32.0)
+        }
+        for name, (points, fit) in fit_jointly(runs).joint.items():
+            alone = extrapolate(points)
+            found.setdefault(name, []).append((*fit[:2], *alone[:2], fit.longest == alone.longest))
+    short = [nitrogen(tmp_path, 8.0, 1000.0, 5000 + k) for k in range(4)]
+    for name, results in found.items():
+        limits, errors, alone, errors_alone, same_steps = np.array(results).T
+        pulls = (limits - limits.mean()) / errors
+        values = np.array([run.values[name] for run in short])
+        truth = values.mean() - 64.0 * np.mean([run.values[slope_name(name)] for run in short])
+        error = np.hypot(values.std(ddof=1) / 2, limits.std(ddof=1) / np.sqrt(20))
+        print(
+            f"{name}: pulls {pulls.std(ddof=1):.2f}; mean {limits.mean():.5g}, alone"
+            f" {alone.mean():.5g}, at 8 fs {truth:.5g} ± {error:.2g}; errors"
+            f" {errors.mean():.2g}, alone {errors_alone.mean():.2g}"
+        )
+        assert 0.7 < pulls.std(ddof=1) < 1.4, name
+        smaller = errors < errors_alone
+        assert smaller[same_steps == 1].all(), name
+        assert smaller.mean() > 0.7, name
+        assert abs(limits.mean() - truth) < 3.5 * error, name
+
+
+def nitrogen(folder, step, duration, seed):
+    """Results of 32 molecules of nitrogen at 90 K and 500 bar."""
+    at = {"temperature_K": 90.0, "timestep_fs": step}
+    scene = {
+        "seed": seed,
+        "box": {"density_g_cm3": 0.85},
+        "molecules": [{"model": "nitrogen", "count": 32}],
+        "forces": {"cutoff_A": 5.5},
+        "start": {"temperature_K": 90.0},
+        "stages": [
+            at
+            | {"ensemble": "npt", "pressure_bar": 500.0, "barostat": "monte_carlo"}
+            | {"duration_ps": time}
+            for time in (10.0, duration)
+        ],
+        "output": {"log_interval_ps": 0.096, "figures": False, "trajectory": False},
+    }
+    where = folder / f"{step:g}_{seed}"
+    Simulation(Scene.from_dict(scene), where).run(progress=False)
+    return results_of_run(read_record(where))
