@@ -145,6 +145,29 @@ class Scheme(_SchemeFields):
         return tuple(flow.fraction for flow in self.flows if flow.kind == DRIFT)
 
     @property
+    def kinetic_correction(self) -> float:
+        """The number c in the kinetic energy K + c dt² (sum F²/m + sum n²/I) of temperatures and
+        pressures, with K at the ends of steps.
+
+        With a thermostat it is the mean kinetic energy where the thermostat acts, without one that
+        without an error of order dt². See "Temperatures" in the theory chapter `errors`.
+        """
+        kinds = [flow.kind for flow in self.flows]
+        if END_TRAJECTORY in kinds:
+            return 0.0  # trajectories that are accepted or rejected have no error of the step
+        first = len(kinds) - kinds[::-1].index(THERMOSTAT) if THERMOSTAT in kinds else 0
+        drifted = kicked = lever = 0.0  # from the end of the step backwards
+        moment = 0.0
+        for flow in reversed(self.flows[first:]):
+            if flow.kind == DRIFT:
+                drifted += flow.fraction
+            elif flow.kind == KICK:
+                kicked += flow.fraction
+                lever += flow.fraction * drifted
+                moment += flow.fraction * drifted * (1 - drifted)
+        return kicked**2 / 2 - lever if first else (1 / 6 - moment) / 2
+
+    @property
     def has_gradient(self) -> bool:
         return any(flow.gradient for flow in self.flows)
 

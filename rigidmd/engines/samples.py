@@ -27,9 +27,6 @@ class Column(NamedTuple):
     about: str
 
 
-UNBIASED = "without the error of the step (velocity Verlet only)"
-
-
 class Sample(NamedTuple):
     """One line of the log, in its units. NaN for what does not exist: pressure without a box, T_rot
     of points."""
@@ -55,12 +52,6 @@ class Sample(NamedTuple):
         float, Column("T_trans (K)", "K", "temperature of translation")
     ]
     temperature_rotation: Annotated[float, Column("T_rot (K)", "K", "temperature of rotation")]
-    temperature_translation_unbiased: Annotated[
-        float, Column("T_trans unbiased (K)", "K", f"T_trans {UNBIASED}")
-    ]
-    temperature_rotation_unbiased: Annotated[
-        float, Column("T_rot unbiased (K)", "K", f"T_rot {UNBIASED}")
-    ]
     pressure_bar: Annotated[
         float, Column("Pressure (bar)", "bar", "molecular pressure, tail correction included")
     ]

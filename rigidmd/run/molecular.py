@@ -422,9 +422,10 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         """The observation at a moment. The drift of its stage is counted from the last sample
         before the stage."""
         stage = self.scene.stages[moment.stage]
-        is_verlet = stage.integrator == "velocity_verlet" and not (
-            stage.is_minimisation or stage.is_hybrid
-        )
+        correction = 0.0
+        if not (stage.is_minimisation or stage.is_auto):
+            step = stage.timestep_fs * FEMTOSECOND
+            correction = self._integrator(moment.stage).kinetic_correction * step**2
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
         trajectories = tuple(nan for name in self.system.more_columns if name in OF_TRAJECTORIES)
@@ -446,7 +447,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             moved=True,
             trajectories=trajectories,
             origin=self._sampler.origin(moment.stage) if conserves else nan,
-            verlet_step=stage.timestep_fs * FEMTOSECOND if is_verlet else nan,
+            correction=correction,
         )
 
     def observe_now(self) -> Observation:
