@@ -155,17 +155,29 @@ class Scheme(_SchemeFields):
         kinds = [flow.kind for flow in self.flows]
         if END_TRAJECTORY in kinds:
             return 0.0  # trajectories that are accepted or rejected have no error of the step
-        first = len(kinds) - kinds[::-1].index(THERMOSTAT) if THERMOSTAT in kinds else 0
+        if THERMOSTAT not in kinds:
+            return self.shadow_correction
+        last = len(kinds) - kinds[::-1].index(THERMOSTAT)
         drifted = kicked = lever = 0.0  # from the end of the step backwards
-        moment = 0.0
-        for flow in reversed(self.flows[first:]):
+        for flow in reversed(self.flows[last:]):
             if flow.kind == DRIFT:
                 drifted += flow.fraction
             elif flow.kind == KICK:
                 kicked += flow.fraction
                 lever += flow.fraction * drifted
+        return kicked**2 / 2 - lever
+
+    @property
+    def shadow_correction(self) -> float:
+        """Like `kinetic_correction`, for the temperature of the shadow Hamiltonian; 0 from order 4
+        on."""
+        drifted = moment = 0.0
+        for flow in self.flows:
+            if flow.kind == DRIFT:
+                drifted += flow.fraction
+            elif flow.kind == KICK:
                 moment += flow.fraction * drifted * (1 - drifted)
-        return kicked**2 / 2 - lever if first else (1 / 6 - moment) / 2
+        return (1 / 6 - moment) / 2
 
     @property
     def has_gradient(self) -> bool:

@@ -52,7 +52,7 @@ def ramp_value(ramp, state):
 
 class VelocityRescaling(NamedTuple):
     """Stochastic velocity rescaling (Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101)
-    of all momenta, translational and rotational, by one factor: see the theory chapter
+    by two thermostats, one of translation and one of rotation: see the theory chapter
     `sampling`."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²

@@ -166,10 +166,7 @@ def equipartition(result: CaseResult, quick: bool) -> None:
 
     def gap(results: Results) -> float:
         late = len(results["time"]) // 5
-        series = (
-            results[f"temperature_{motion}_unbiased"][late:]
-            for motion in ("rotation", "translation")
-        )
+        series = (results[f"temperature_{motion}"][late:] for motion in ("rotation", "translation"))
         (rotation, its_error), (translation, error) = (
             map(not_none, mean_and_error(values)) for values in series
         )
