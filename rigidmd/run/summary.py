@@ -260,8 +260,8 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
             f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot"
             f" {rotating.mean():.4g} K, a difference of {abs(gap):.2g} ± {error:.1g} K that"
             " sampling does not explain: timestep_fs is too long, or translation and rotation"
-            " exchange energy too slowly in this stage. Try a shorter step, or run longer before means are"
-            " taken"
+            " exchange energy too slowly in this stage. Try a shorter step, or run longer before"
+            " means are taken"
         )
     return notes
 
