@@ -545,7 +545,7 @@ def test_two_engines_agree_by_the_size_of_each_quantity(density, gap, agrees):
     )
 
 
-def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **made):
+def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=1, **made):
     """The summary of made-up samples of one stage: values (n,) of columns; others are still or
     noise."""
     rng, n = np.random.default_rng(seed), len(next(iter(made.values())))
