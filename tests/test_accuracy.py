@@ -968,12 +968,13 @@ def test_methods_and_steps_that_are_averaged_by_default(monkeypatch):
     monkeypatch.setattr(averages, "_sample", lambda *_: None)
     found = measure_averages(springs(thermostat="nose_hoover", friction_translation_per_ps=None))
     assert list(dict.fromkeys((run.integrator, run.thermostat) for run in found.runs)) == [
-        ("velocity_verlet", "nose_hoover"),
+        ("baoab", "nose_hoover"),
+        ("baoab", "velocity_rescaling"),
         ("baoab", "langevin"),
         ("velocity_verlet", "velocity_rescaling"),
     ]
     longest = 2e3 * np.sqrt(39.948 / SPRING)
-    steps = [run.timestep for run in found.runs if run.integrator == "baoab"]
+    steps = [run.timestep for run in found.runs if run.thermostat == "langevin"]
     assert steps == pytest.approx([share * longest for share in averages.LADDER], rel=0.05)
 
 

@@ -142,9 +142,9 @@ class Averages:
 
 #: Measured besides the method of the stage when no methods are given.
 DEFAULT_METHODS = (
+    "baoab+velocity_rescaling",
     "baoab+langevin",
     "velocity_verlet+velocity_rescaling",
-    "velocity_verlet+nose_hoover",
 )
 LADDER = (0.15, 0.3, 0.45, 0.6, 0.75)  # time steps, in units of the longest stable step
 #: Time steps, in units of the scene's, where the longest stable step is unknown.
