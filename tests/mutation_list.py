@@ -230,13 +230,13 @@ RINGS = [
     ),
     Mutation(
         "B13",
-        "unbiased temperatures: dt²/8 for dt²/12",
-        "engines/observables.py",
-        "    correction = verlet_step**2 / 12",
-        "    correction = verlet_step**2 / 8",
+        "temperatures at constant energy: the error of the step twice",
+        "core/integrators.py",
+        "        return (1 / 6 - moment) / 2",
+        "        return 1 / 6 - moment",
         (
-            "test_wiring.py"
-            "::test_unbiased_temperatures_are_those_of_the_kinetic_energies_and_a_twelfth_of_the_forces",
+            "test_thermostats.py::test_kinetic_energies_are_corrected_by_the_scheme",
+            "test_accuracy.py::test_the_step_takes_from_the_kinetic_energy_at_its_ends",
         ),
     ),
     Mutation(

@@ -184,9 +184,7 @@ def gas(count, thermostat, box_for, samples=800, steps=30):
     system = build(scene)
     pressure = (count + 1) * THERMAL / system.state.volume
     asked = Pressure((pressure,) * 3 + (0.0,) * 3, (pressure,) * 3 + (0.0,) * 3, 1.0)
-    bath = VelocityRescaling(
-        constant_ramp(THERMAL), 0.05, system.freedom.total, key_of(1, THERMOSTAT)
-    )
+    bath = VelocityRescaling(constant_ramp(THERMAL), 0.05, *system.freedom, key_of(1, THERMOSTAT))
     if thermostat == "langevin":
         bath = Langevin(constant_ramp(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
     row = VERLET.with_thermostat(bath).with_barostat(box_for(asked, pressure), 2)

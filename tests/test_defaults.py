@@ -262,7 +262,7 @@ def precision_of(**stage) -> tuple[str, str]:
 @pytest.mark.parametrize(
     ("stage", "precision", "reason"),
     [
-        ({}, "mixed", "velocity_verlet at 2 fs, about 1e-02 of the forces, is 3,2"),
+        ({}, "mixed", "baoab at 2 fs, about 1e-02 of the forces, is 3,2"),
         (
             {"timestep_fs": 0.1},
             "double",
@@ -316,7 +316,7 @@ def test_a_run_says_its_precision_and_energy_is_in_double(tmp_path):
     simulation = Simulation(scene())
     summary = simulation.run().summary
     assert summary["precision"] == "mixed"
-    assert summary["precision_reason"].startswith("mixed: the error of velocity_verlet at 2 fs")
+    assert summary["precision_reason"].startswith("mixed: the error of baoab at 2 fs")
     energy = Simulation(scene()).start_energy(KJ_PER_MOL, "kJ/mol")
     exact = Simulation(scene(precision="double")).start_energy(KJ_PER_MOL, "kJ/mol")
     assert energy["components"] == exact["components"]

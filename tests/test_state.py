@@ -27,7 +27,7 @@ def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
     system, engine, state = built({"spce": 5, "argon": 2}, 20.0, 1)
     row = VERLET.with_thermostat(
         VelocityRescaling(
-            constant_ramp(BOLTZMANN * 300), 0.1, system.freedom.total, key_of(1, THERMOSTAT)
+            constant_ramp(BOLTZMANN * 300), 0.1, *system.freedom, key_of(1, THERMOSTAT)
         )
     )
     move(engine, state, row, 0.001, 7)
@@ -46,7 +46,7 @@ def test_another_engine_goes_on_where_the_state_is(tmp_path, steps):
     system, _, start = built({"argon": 2}, 30.0, 2)
     row = VERLET.with_thermostat(
         VelocityRescaling(
-            constant_ramp(BOLTZMANN * 100), 0.05, system.freedom.total, key_of(1, THERMOSTAT)
+            constant_ramp(BOLTZMANN * 100), 0.05, *system.freedom, key_of(1, THERMOSTAT)
         )
     )
     whole = start.copy()

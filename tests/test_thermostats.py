@@ -12,7 +12,8 @@ import rigidmd
 from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.assemble.stage_description import describe_stage
 from rigidmd.compile import implements, kernel
-from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
+from rigidmd.core.integrators import DRIFT, KICK, SCHEMES, WITH_THERMOSTAT, Flow, Scheme
+from rigidmd.core.integrators import THERMOSTAT as THERMOSTAT_FLOW
 from rigidmd.core.state import HEAT
 from rigidmd.dynamics import barostats, thermostats
 from rigidmd.dynamics.noise import BATCH, THERMOSTAT, key_of
@@ -217,6 +218,65 @@ def test_a_ramp_goes_from_its_begin_to_its_end():
         assert moving.mean() / THERMAL == pytest.approx(1 + part, abs=0.05)
 
 
+MIDDLE = Scheme(
+    "two kicks on either side of the thermostat",
+    (
+        Flow(KICK, 0.2),
+        Flow(DRIFT, 0.4),
+        Flow(KICK, 0.3),
+        Flow(DRIFT, 0.1),
+        Flow(THERMOSTAT_FLOW, 1.0),
+        Flow(DRIFT, 0.1),
+        Flow(KICK, 0.3),
+        Flow(DRIFT, 0.4),
+        Flow(KICK, 0.2),
+    ),
+    order=2,
+    exact_rotor=False,
+    source="made for this test",
+)
+
+
+def oscillation(flows, h):
+    """Matrix of flows of an oscillator of mass 1 and force -x for (x, v)."""
+    matrix = np.eye(2)
+    for flow in flows:
+        if flow.kind == DRIFT:
+            matrix = np.array([[1, flow.fraction * h], [0, 1]]) @ matrix
+        elif flow.kind == KICK:
+            strength = flow.fraction * h * (1 - flow.gradient * h * h)
+            matrix = np.array([[1, 0], [-strength, 1]]) @ matrix
+    return matrix
+
+
+@pytest.mark.parametrize("scheme", [*SCHEMES.values(), BAOAB, MIDDLE], ids=lambda row: row.name)
+def test_kinetic_energies_are_corrected_by_the_scheme(scheme):
+    """Twice the corrected kinetic energy of an oscillator is the mean of v² where the thermostat acts,
+    and without a thermostat the temperature of the shadow Hamiltonian w' J, with J the area of its
+    ellipse over 2 pi; both with an error of order h⁴."""
+    for h in (0.2, 0.1):
+        step = oscillation(scheme.flows, h)
+        ratio = np.sqrt(-step[1, 0] / step[0, 1])  # of the ellipse v² + ratio² x² = 2
+        squares = np.diag([1 / ratio**2, 1.0])
+        kinds = [flow.kind for flow in scheme.flows]
+        if THERMOSTAT_FLOW in kinds:
+            to = oscillation(scheme.flows[: kinds.index(THERMOSTAT_FLOW)], h)
+            exact = (to @ squares @ to.T)[1, 1]
+        else:
+            exact = np.arccos(step.trace() / 2) / h / ratio
+        corrected = squares[1, 1] + 2 * scheme.kinetic_correction * h**2 * squares[0, 0]
+        assert abs(corrected - exact) < h**4
+
+
+@pytest.mark.parametrize("halved", [True, False])
+def test_kinetic_energies_at_the_ends_are_those_of_a_thermostat_there(halved):
+    scheme = VERLET.with_thermostat((), halved=halved)
+    assert scheme.kinetic_correction == 0
+    assert BAOAB.with_thermostat(()).kinetic_correction == 1 / 8
+    assert scheme.shadow_correction == pytest.approx(1 / 12)
+    assert VERLET.with_trajectories((), 5).kinetic_correction == 0
+
+
 def test_degrees_of_freedom_follow_the_thermostat():
     heat = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.004}
     stirred = heat | {"thermostat": "langevin", "friction_translation_per_ps": 200.0}
@@ -227,7 +287,8 @@ def test_degrees_of_freedom_follow_the_thermostat():
     simulation = Simulation(scene)
     system = simulation.system
     assert [system.freedom_in(k).total for k in range(3)] == [120, 117, 117]
-    assert integrator_of_stage(system, 1).thermostat.degrees_of_freedom == 117
+    thermostat = integrator_of_stage(system, 1).thermostat
+    assert (thermostat.freedom_translation, thermostat.freedom_rotation) == (57, 60)
     results = simulation.run()
     own = results["stage"] == 0
     mass = system.model.mass[system.model.species].sum()

@@ -1333,10 +1333,10 @@ def test_what_a_function_has_at_its_cutoff_is_told(function, truncation, words):
         {"argon": 4}, 20.0, stages=[{"ensemble": "nvt", "temperature_K": 298, "duration_ps": 0.004}]
     )
     parameters = {"AR": Well(8.0, 3.5)}
-    law = rigidmd.pair_law(function, parameters, truncation=truncation, cutoff_A=9.0)
+    law = rigidmd.pair_potential(function, parameters, truncation=truncation, cutoff_A=9.0)
     (warning,) = build(scene.with_user_code([law])).warnings
     assert words in warning
-    ends = rigidmd.pair_law(lennard_jones, {"AR": Pair(1.0, 3.4)}, cutoff_A=9.0)
+    ends = rigidmd.pair_potential(lennard_jones, {"AR": Pair(1.0, 3.4)}, cutoff_A=9.0)
     assert build(scene.with_user_code([ends])).warnings == []
 
 

@@ -80,7 +80,8 @@ def test_chains_count_the_degrees_of_freedom_of_their_motion():
 
 def test_velocity_rescaling_counts_both_motions():
     bath = thermostat_of(system_of(NVT | {"thermostat_time_ps": 0.3}), 0)
-    assert (bath.time_constant, bath.degrees_of_freedom) == (0.3, TRANSLATION - 3 + ROTATION)
+    freedom = bath.freedom_translation, bath.freedom_rotation
+    assert (bath.time_constant, freedom) == (0.3, (TRANSLATION - 3, ROTATION))
     assert bath.thermal_energy == TEMPERATURES
 
 
@@ -361,12 +362,12 @@ def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
     assert taken == pytest.approx(np.sum((mass @ before) ** 2) / (2 * mass.sum()))
 
 
-# temperatures without the error of the step
+# temperatures and pressures where a thermostat acts, or without the error of the step
 
 
-def test_unbiased_temperatures_are_those_of_the_kinetic_energies_and_a_twelfth_of_the_forces():
-    """2K/(f k) of K + dt²/12 (sum F²/m), and of K + dt²/12 (sum n²/I), over the axes that have
-    inertia."""
+def test_temperatures_and_pressures_have_the_corrected_kinetic_energy():
+    """2K/(f k) of K + c (sum F²/m), and of K + c (sum n²/I) over the axes that have inertia; the
+    pressure tensor of sum m V V + 2 c sum F F/m."""
     system = system_of({"duration_ps": 0.1})
     state, mass = pushed(system)
     rng, dt = np.random.default_rng(3), 0.02
@@ -374,7 +375,10 @@ def test_unbiased_temperatures_are_those_of_the_kinetic_energies_and_a_twelfth_o
     state.angular_momentum_body[:] = rng.standard_normal(inertia.shape) * np.sqrt(
         inertia * 300 * KELVIN
     )
-    found = observe(system, system.engine(), state, verlet_step=dt)
+    found, at_ends = (
+        observe(system, system.engine(), state, correction=correction)
+        for correction in (dt**2 / 12, 0.0)
+    )
     over = np.divide(1.0, inertia, out=np.zeros_like(inertia), where=inertia > 0)
     moving = 0.5 * mass @ (state.velocity**2).sum(axis=1)
     turning = 0.5 * (state.angular_momentum_body**2 * over).sum()
@@ -382,11 +386,16 @@ def test_unbiased_temperatures_are_those_of_the_kinetic_energies_and_a_twelfth_o
     more_turning = dt**2 / 12 * (found.load.torque_body**2 * over).sum()
     assert min(more / moving, more_turning / turning) > 1e-4  # what is tested is seen
     f, g = TRANSLATION - 3, ROTATION
-    assert found.temperature_translation == pytest.approx(2 * moving / (f * KELVIN))
-    assert found.temperature_rotation == pytest.approx(2 * turning / (g * KELVIN))
+    assert at_ends.temperature_translation == pytest.approx(2 * moving / (f * KELVIN))
+    assert at_ends.temperature_rotation == pytest.approx(2 * turning / (g * KELVIN))
     # the difference alone, to its own digits
-    gained = found.temperature_translation_unbiased - found.temperature_translation
-    gained_turning = found.temperature_rotation_unbiased - found.temperature_rotation
+    gained = found.temperature_translation - at_ends.temperature_translation
+    gained_turning = found.temperature_rotation - at_ends.temperature_rotation
     assert gained == pytest.approx(2 * more / (f * KELVIN), rel=1e-6)
     assert gained_turning == pytest.approx(2 * more_turning / (g * KELVIN), rel=1e-6)
-    assert found.temperature == pytest.approx(2 * (moving + turning) / ((f + g) * KELVIN))
+    both = moving + turning + more + more_turning
+    assert found.temperature == pytest.approx(2 * both / ((f + g) * KELVIN))
+    assert found.kinetic == at_ends.kinetic and found.conserved == at_ends.conserved
+    squares = np.einsum("ni,nj->ij", found.load.force, found.load.force / mass[:, None])
+    gained_tensor = found.pressure_tensor_bar - at_ends.pressure_tensor_bar
+    assert gained_tensor == pytest.approx(dt**2 / 6 * squares / state.volume / BAR, rel=1e-6)

@@ -150,6 +150,41 @@ class Scheme(_SchemeFields):
         return tuple(flow.fraction for flow in self.flows if flow.kind == DRIFT)
 
     @property
+    def kinetic_correction(self) -> float:
+        """The number c in the kinetic energy K + c dt² (sum F²/m + sum n²/I) of temperatures and
+        pressures, with K at the ends of steps.
+
+        With a thermostat it is the mean kinetic energy where the thermostat acts, without one that
+        without an error of order dt². See "Temperatures" in the theory chapter `errors`.
+        """
+        kinds = [flow.kind for flow in self.flows]
+        if END_TRAJECTORY in kinds:
+            return 0.0  # trajectories that are accepted or rejected have no error of the step
+        if THERMOSTAT not in kinds:
+            return self.shadow_correction
+        last = len(kinds) - kinds[::-1].index(THERMOSTAT)
+        drifted = kicked = lever = 0.0  # from the end of the step backwards
+        for flow in reversed(self.flows[last:]):
+            if flow.kind == DRIFT:
+                drifted += flow.fraction
+            elif flow.kind == KICK:
+                kicked += flow.fraction
+                lever += flow.fraction * drifted
+        return kicked**2 / 2 - lever
+
+    @property
+    def shadow_correction(self) -> float:
+        """Like `kinetic_correction`, for the temperature of the shadow Hamiltonian; 0 from order 4
+        on."""
+        drifted = moment = 0.0
+        for flow in self.flows:
+            if flow.kind == DRIFT:
+                drifted += flow.fraction
+            elif flow.kind == KICK:
+                moment += flow.fraction * drifted * (1 - drifted)
+        return (1 / 6 - moment) / 2
+
+    @property
     def has_gradient(self) -> bool:
         return any(flow.gradient for flow in self.flows)
 

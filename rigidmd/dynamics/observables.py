@@ -15,15 +15,20 @@ class StateSums(NamedTuple):
 
     translation: float  # sum m V²
     rotation: float  # sum L . I^-1 L
-    force: float  # sum F²/m
     torque: float  # sum n . I^-1 n
     momentum: np.ndarray  # (3,) sum m V
-    flow: np.ndarray  # (3, 3) sum m V (x) V
+    momentum_flux: np.ndarray  # (3, 3) sum m V (x) V
+    force_squares: np.ndarray  # (3, 3) sum F (x) F/m
     orthogonality_error: float  # largest entry of |Q^T Q - 1|; NaN if one is
+
+    @property
+    def force(self) -> float:
+        """Sum F²/m."""
+        return float(self.force_squares.trace())
 
 
 #: Number of the numbers in `StateSums`.
-SUM_COUNT = 17
+SUM_COUNT = 18
 
 
 class LargestValues(NamedTuple):
@@ -70,7 +75,7 @@ def _largest(values):
 
 
 def sums_of_state(model: Model, state: State, load: Load = EXAMPLE[1]) -> StateSums:
-    """Sums over a state and the load on it; without a load `force` and `torque` are 0."""
+    """Sums over a state and the load on it; without a load those of forces and torques are 0."""
     sums = np.zeros(SUM_COUNT)
     fill_sums(
         model.species,
@@ -89,26 +94,31 @@ def sums_of_state(model: Model, state: State, load: Load = EXAMPLE[1]) -> StateS
 
 def unpack_sums(sums: np.ndarray) -> StateSums:
     """The sums from the numbers of `fill_sums`."""
-    translation, rotation, force, torque, orthogonality_error = sums[:5].tolist()
-    vectors = sums[5:].copy()
+    rotation, torque, orthogonality_error = sums[:3].tolist()
+    flux, squares = sums[[FLUX, SQUARES]]
     return StateSums(
-        translation,
-        rotation,
-        force,
-        torque,
-        vectors[:3],
-        vectors[3:].reshape(3, 3),
-        orthogonality_error,
+        translation=float(flux.trace()),
+        rotation=rotation,
+        torque=torque,
+        momentum=sums[3:6].copy(),
+        momentum_flux=flux,
+        force_squares=squares,
+        orthogonality_error=orthogonality_error,
     )
+
+
+#: Positions of symmetric tensors in the numbers of `fill_sums`: xx, yy, zz, xy, xz, yz.
+_TENSOR = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+FLUX, SQUARES = 6 + _TENSOR, 12 + _TENSOR
 
 
 @kernel(from_python=True)
 def fill_sums(
     species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found
 ):
-    """Write the numbers (SUM_COUNT,) of `StateSums`; orthogonality is the fifth, then come momentum
-    and flow."""
-    px = py = pz = xx = yy = zz = xy = xz = yz = turning = pushed = twisted = worst = 0.0
+    """Write the numbers (SUM_COUNT,) of `StateSums`: rotation, torque, orthogonality, momentum, the
+    momentum flux and the squares of forces."""
+    px = py = pz = xx = yy = zz = xy = xz = yz = turning = twisted = worst = 0.0
     for m in range(len(velocity)):
         m_i = mass[species[m]]
         x, y, z = velocity[m, 0], velocity[m, 1], velocity[m, 2]
@@ -121,10 +131,19 @@ def fill_sums(
         xy += m_i * x * y
         xz += m_i * x * z
         yz += m_i * y * z
+    found[3], found[4], found[5] = px, py, pz
+    found[6], found[7], found[8], found[9], found[10], found[11] = xx, yy, zz, xy, xz, yz
+    xx = yy = zz = xy = xz = yz = 0.0
     for m in range(len(force)):
-        pushed += inverse_mass[species[m]] * (
-            force[m, 0] ** 2 + force[m, 1] ** 2 + force[m, 2] ** 2
-        )
+        weight = inverse_mass[species[m]]
+        x, y, z = force[m, 0], force[m, 1], force[m, 2]
+        xx += weight * x * x
+        yy += weight * y * y
+        zz += weight * z * z
+        xy += weight * x * y
+        xz += weight * x * z
+        yz += weight * y * z
+    found[12], found[13], found[14], found[15], found[16], found[17] = xx, yy, zz, xy, xz, yz
     for m in range(len(angular)):
         for k in range(3):
             turning += inverse_inertia[species[m], k] * angular[m, k] ** 2
@@ -139,8 +158,4 @@ def fill_sums(
                     entry += rotation[m, i, j] * rotation[m, i, k]
                 if not abs(entry) <= worst and worst == worst:  # NaN is kept
                     worst = abs(entry)
-    found[0], found[1], found[2], found[3], found[4] = xx + yy + zz, turning, pushed, twisted, worst
-    found[5], found[6], found[7] = px, py, pz
-    found[8], found[9], found[10] = xx, xy, xz
-    found[11], found[12], found[13] = xy, yy, yz
-    found[14], found[15], found[16] = xz, yz, zz
+    found[0], found[1], found[2] = turning, twisted, worst

@@ -52,12 +52,13 @@ def ramp_value(ramp, state):
 
 class VelocityRescaling(NamedTuple):
     """Stochastic velocity rescaling (Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101)
-    of all momenta, translational and rotational, by one factor: see the theory chapter
+    by two thermostats, one of translation and one of rotation: see the theory chapter
     `sampling`."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     time_constant: float  # ps; infinite: no effect
-    degrees_of_freedom: int
+    freedom_translation: int
+    freedom_rotation: int
     key: Key
 
     halved = False  # one flow after each step, not half of it before and half after
@@ -115,7 +116,7 @@ class NoseHoover(NamedTuple):
 #: the degrees of freedom and the key of its random numbers.
 THERMOSTATS = {
     "velocity_rescaling": lambda stage, thermal, freedom, key: VelocityRescaling(
-        thermal, stage.thermostat_time, freedom.total, key
+        thermal, stage.thermostat_time, freedom.translation, freedom.rotation, key
     ),
     "langevin": lambda stage, thermal, freedom, key: Langevin(thermal, *stage.frictions, key),
     "nose_hoover": lambda stage, thermal, freedom, key: NoseHoover(
@@ -183,18 +184,24 @@ def _apply_rescaling(thermostat, model, code, state, workspace, h, draw):
     if thermostat.time_constant == inf:
         return
     moving, turning = kinetic_energies_of(model, code, state, workspace)
-    kinetic = moving + turning
-    freedom = thermostat.degrees_of_freedom
-    if kinetic == 0.0 or freedom == 0:
-        return
-    # eq. A7: one Gaussian, and the sum of the squares of the others as one number
+    factors = np.ones(2)
+    step = state.step[NOW]
     c = exp(-h / thermostat.time_constant)
-    noise = 0.5 * ramp_value(thermostat.thermal_energy, state) * (1 - c) / kinetic
-    gauss, _ = normals(thermostat.key, draw, 0, state.step[NOW])
-    others = chi_square(thermostat.key, draw + 1, 0, state.step[NOW], freedom - 1)
-    scale2 = c + noise * (gauss * gauss + others) + 2 * gauss * sqrt(c * noise)
-    state.energy_ledger[HEAT] += (scale2 - 1) * kinetic
-    scale_momenta(code, state, sqrt(scale2), sqrt(scale2))
+    thermal = 0.5 * ramp_value(thermostat.thermal_energy, state) * (1 - c)
+    energies = (moving, turning)
+    freedoms = (thermostat.freedom_translation, thermostat.freedom_rotation)
+    for k in range(2):
+        kinetic, freedom = energies[k], freedoms[k]
+        if kinetic == 0.0 or freedom == 0:
+            continue
+        # eq. A7: one Gaussian, and the sum of the squares of the others as one number
+        noise = thermal / kinetic
+        gauss, _ = normals(thermostat.key, draw, k, step)
+        others = chi_square(thermostat.key, draw + 1, k, step, freedom - 1)
+        square = c + noise * (gauss * gauss + others) + 2 * gauss * sqrt(c * noise)
+        state.energy_ledger[HEAT] += (square - 1) * kinetic
+        factors[k] = sqrt(square)
+    scale_momenta(code, state, factors[0], factors[1])
 
 
 @implements(apply_thermostat, (Langevin, Andersen, HybridMonteCarlo))

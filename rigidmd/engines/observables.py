@@ -68,7 +68,8 @@ def observe(
     *,
     time: float | None = None,
     origin: float | None = None,
-    verlet_step: float = nan,
+    correction: float = 0.0,
+    shadow_correction: float = 0.0,
     moved: bool = False,
     energy_unit: float = KJ_PER_MOL,
     trajectories: tuple[float, ...] = (),
@@ -81,8 +82,9 @@ def observe(
     time : ps, by default of the state
     origin : conserved energy at the start of the stage, from which its drift is counted; by default
         the present one
-    verlet_step : time step (ps) if the state comes from velocity Verlet, for unbiased temperatures
-    (docs/theory/errors.md)
+    correction : of the kinetic energy in temperatures and pressures, for each (ps²) of the squares
+        of forces and torques, see `Scheme.kinetic_correction`
+    shadow_correction : the same, of `Scheme.shadow_correction`
     moved : whether the engine has just moved this state, so that it may have its forces and
         energies already
     energy_unit : unit of all energies, u Å²/ps²
@@ -104,10 +106,12 @@ def observe(
     sums = engine.sums(state, load) or sums_of_state(system.model, state, load)
     translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
     potential, kinetic = sum(components.values()), translation + rotation
-    correction = verlet_step**2 / 12
+    translation_corrected = translation + correction * sums.force
+    rotation_corrected = rotation + correction * sums.torque
+    flux = sums.momentum_flux + 2 * correction * sums.force_squares
     freedom = system.freedom if stage is None else system.freedom_in(stage)
     if boxed := volume < inf:
-        pressure = (sums.flow + (virial + virial.T) / 2) / volume + (
+        pressure = (flux + (virial + virial.T) / 2) / volume + (
             system.constant_pressure + tail_pressure
         ) * UNIT
         a, b, c, alpha, beta, gamma = edges_and_angles(state.cell)
@@ -123,17 +127,14 @@ def observe(
         potential=potential / energy_unit,
         kinetic=kinetic / energy_unit,
         energy=energy,
-        temperature=_temperature(kinetic, freedom.total),
+        temperature=_temperature(translation_corrected + rotation_corrected, freedom.total),
         volume=volume * 1e-3 if boxed else nan,
         density=system.mass / volume / GRAM_PER_CM3 if boxed else nan,
         stage_name=system.scene.stages[stage or 0].label,
-        temperature_translation=_temperature(translation, freedom.translation),
-        temperature_rotation=_temperature(rotation, freedom.rotation),
-        temperature_translation_unbiased=_temperature(
-            translation + correction * sums.force, freedom.translation
-        ),
-        temperature_rotation_unbiased=_temperature(
-            rotation + correction * sums.torque, freedom.rotation
+        temperature_translation=_temperature(translation_corrected, freedom.translation),
+        temperature_rotation=_temperature(rotation_corrected, freedom.rotation),
+        shadow_temperature=_temperature(
+            kinetic + shadow_correction * (sums.force + sums.torque), freedom.total
         ),
         pressure_bar=float(pressure.trace()) / (3 * BAR),
         drift=conserved - (conserved if origin is None else origin),

@@ -28,9 +28,6 @@ class Column(NamedTuple):
     about: str
 
 
-UNBIASED = "without the error of the step (velocity Verlet only)"
-
-
 class Sample(NamedTuple):
     """One line of the log, in its units. NaN for what does not exist: pressure without a box, T_rot
     of points."""
@@ -56,11 +53,8 @@ class Sample(NamedTuple):
         float, Column("T_trans (K)", "K", "temperature of translation")
     ]
     temperature_rotation: Annotated[float, Column("T_rot (K)", "K", "temperature of rotation")]
-    temperature_translation_unbiased: Annotated[
-        float, Column("T_trans unbiased (K)", "K", f"T_trans {UNBIASED}")
-    ]
-    temperature_rotation_unbiased: Annotated[
-        float, Column("T_rot unbiased (K)", "K", f"T_rot {UNBIASED}")
+    shadow_temperature: Annotated[
+        float, Column("", "K", "temperature of all motion in the shadow Hamiltonian of the step")
     ]
     pressure_bar: Annotated[
         float, Column("Pressure (bar)", "bar", "molecular pressure, tail correction included")

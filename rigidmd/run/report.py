@@ -191,8 +191,6 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         rows.append(("temperature", value + _set_point(stage["set_temperature_K"], "K")))
         if stage["temperature_rotation_K"] is not None:
             rows.append(("", _temperatures(stage, "")))
-        if parts := _temperatures(stage, "_unbiased"):
-            rows.append(("", f"{parts} corrected for the time step"))
         if (scatter := stage.get("temperature_scatter_K")) is not None:
             off = stage["temperature_K"] - stage["temperature_before_K"]
             before = stage["temperature_before_K"]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.build import integrator_of_stage
 from rigidmd.core.state import REMOVED, State
 from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean_and_error, slope
 from rigidmd.core.toml import Json
@@ -41,7 +42,8 @@ MIN_SAMPLES, STANDARD_ERRORS = 20, 4.0
 DRIFT_LIMIT, DRIFT_SUM_LIMIT = 0.1, 1e-3
 #: Smallest fraction of accepted trajectories of hybrid Monte Carlo without a note.
 LEAST_ACCEPTANCE = 0.2
-#: Error of the temperature by the step, and difference of T_trans and T_rot, as fractions.
+#: Largest error of the temperature by the step, and difference of T_trans and T_rot, without a
+#: note, as fractions of the temperature.
 HEATING_LIMIT, DIFFERENCE_LIMIT = 0.01, 0.01
 #: Largest fraction of T_trans in a common drift of all molecules without a note. Where the total
 #: momentum is thermal: its largest kinetic energy in kT, which one run in two million exceeds.
@@ -246,37 +248,9 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         )
     if not stage.has_thermostat:
         return notes
-    moving, rotating = pair = [of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS]
-    unbiased = [of_stage[f"temperature_{motion}_unbiased"][half:] for motion in MOTIONS]
-    corrected = ""
-    if any(np.isfinite(values).all() for values in unbiased):
-        (moving, rotating), corrected = unbiased, " without the error of the step"
-        both = zip(unbiased, (freedom.translation, freedom.rotation), strict=True)
-        right = (
-            sum((values * count for values, count in both if count), np.zeros(len(temperature)))
-            / freedom.total
-        )
-        heat, error = mean_and_error(right - temperature)
-        if (
-            heat is not None
-            and error is not None
-            and abs(heat) > max(HEATING_LIMIT * level, STANDARD_ERRORS * error)
-        ):
-            parts = [
-                f"{name} {v.mean():.4g}"
-                for name, v in zip(("T_trans", "T_rot"), pair, strict=True)
-                if v[0] > 0
-            ]
-            shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heat))
-            notes.append(
-                f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules"
-                f" {abs(heat):.2g} K too {'hot' if heat > 0 else 'cold'}: their"
-                f" temperature{corrected} is"
-                f" {format_with_error(float(right.mean()), mean_and_error(right)[1])} K; at the"
-                f" steps it is {level:.4g} K, {', '.join(parts)}, which the thermostat controls."
-                f" Try timestep_fs = {shorter:.1g}, or integrator = 'baoab' with thermostat ="
-                " 'langevin', whose positions have hardly such an error"
-            )
+    if integrator_of_stage(system, k).kinetic_correction == 0 and not stage.is_hybrid:
+        notes += _note_on_heating(stage, k, temperature, of_stage["shadow_temperature"][half:])
+    moving, rotating = (of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS)
     gap, error = mean_and_error(moving - rotating)
     if (
         gap is not None
@@ -285,12 +259,36 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     ):
         notes.append(
             f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot"
-            f" {rotating.mean():.4g} K{corrected}, a difference of {abs(gap):.2g} ± {error:.1g} K"
-            " that sampling does not explain: timestep_fs is too long, or translation and rotation"
+            f" {rotating.mean():.4g} K, a difference of {abs(gap):.2g} ± {error:.1g} K that"
+            " sampling does not explain: timestep_fs is too long, or translation and rotation"
             " exchange energy too slowly in this stage. Try a shorter step, or run longer before"
             " means are taken"
         )
     return notes
+
+
+def _note_on_heating(
+    stage: Stage, k: int, temperature: np.ndarray, shadow: np.ndarray
+) -> list[str]:
+    """A note if a thermostat at the ends of steps leaves the molecules at another temperature.
+
+    temperature, shadow : (t,) at the ends of steps, and of the shadow Hamiltonian
+    """
+    excess, error = mean_and_error(shadow - temperature)
+    if excess is None or error is None:
+        return []
+    level = float(temperature.mean())
+    if abs(excess) <= max(HEATING_LIMIT * level, STANDARD_ERRORS * error):
+        return []
+    shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(excess))
+    mean = format_with_error(float(shadow.mean()), mean_and_error(shadow)[1])
+    return [
+        f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules"
+        f" {abs(excess):.2g} K too {'hot' if excess > 0 else 'cold'}: they move and rotate as at"
+        f" {mean} K, while the thermostat controls the momenta at the ends of steps,"
+        f" {level:.4g} K. Try timestep_fs = {shorter:.1g}, or integrator = 'baoab', the default,"
+        " whose positions have hardly such an error"
+    ]
 
 
 def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list[str]:

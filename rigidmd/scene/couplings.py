@@ -79,7 +79,7 @@ def _interval(stage: Any) -> float:
 DEFAULT_THERMOSTAT = "velocity_rescaling"
 THERMOSTATS = {
     "velocity_rescaling": Coupling(
-        "stochastic, by Bussi et al.",
+        "stochastic, one of translation and one of rotation, by Bussi et al.",
         "Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101",
         {"thermostat_time_ps": 0.1},
     ),
@@ -157,7 +157,7 @@ class ThermostatKeys(Section):
     thermostat: Annotated[str, NameIn(THERMOSTATS)] | None = Field(
         default=None,
         description="; ".join(f"{name}: {kind.summary}" for name, kind in THERMOSTATS.items())
-        + f". Default: langevin with baoab, else {DEFAULT_THERMOSTAT}",
+        + f". Default: {DEFAULT_THERMOSTAT}",
     )
     thermostat_time_ps: Positive | None = None
     """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or

@@ -38,7 +38,6 @@ class AveragedQuantity(NamedTuple):
     exact: float | None = None  # the limit where it is known
     bias_unit: str = ""  # of reported biases, `unit` when empty
     bias_size: float = 1.0  # of one such unit, in `unit`
-    only: str = ""  # the integrator that has it, where not all do
     is_main: bool = (
         True  # whether it is printed and drawn; all are in accuracy.csv and accuracy.json
     )
@@ -96,7 +95,7 @@ class Averages:
 
     def point(self, run: AverageRun, quantity: AveragedQuantity) -> MeanAtStep | None:
         """The mean of a run, or None."""
-        if quantity.name not in run.averages or (quantity.only and quantity.only != run.integrator):
+        if quantity.name not in run.averages:
             return None
         return MeanAtStep(run.method, run.timestep, *run.averages[quantity.name])
 
@@ -143,9 +142,9 @@ class Averages:
 
 #: Measured besides the method of the stage when no methods are given.
 DEFAULT_METHODS = (
+    "baoab+velocity_rescaling",
     "baoab+langevin",
     "velocity_verlet+velocity_rescaling",
-    "velocity_verlet+nose_hoover",
 )
 LADDER = (0.15, 0.3, 0.45, 0.6, 0.75)  # time steps, in units of the longest stable step
 #: Time steps, in units of the scene's, where the longest stable step is unknown.
@@ -239,12 +238,11 @@ def measure_averages(
     of_u = "kT per degree of freedom"
     quantities = [AveragedQuantity("U", "kJ/mol", unit, bias_unit=of_u, bias_size=unit, of=of_u)]
     exact = stage.temperatures[0]
-    for name, n in (("T_trans", freedom.translation), ("T_rot", freedom.rotation)):
-        if n:
-            unbiased = AveragedQuantity(
-                f"{name} unbiased", "K", exact, exact, only="velocity_verlet"
-            )
-            quantities += [AveragedQuantity(name, "K", exact, exact), unbiased]
+    quantities += [
+        AveragedQuantity(name, "K", exact, exact)
+        for name, n in (("T_trans", freedom.translation), ("T_rot", freedom.rotation))
+        if n
+    ]
     if stage.ensemble == "npt":
         quantities.append(AveragedQuantity("density", "g/cm³", nan))
     elif state.volume < np.inf:
@@ -252,9 +250,11 @@ def measure_averages(
             AveragedQuantity("pressure", "bar", count * thermal / state.volume / BAR, of="N kT/V")
         )
     runs = [run for _, run in plan]
-    for column in COLUMNS.values():  # where it varies
-        if any(run.averages.get(column.header, (0.0, 0.0))[1] > 0 for run in runs):
-            quantities.append(AveragedQuantity(column.header, column.unit, nan, is_main=False))
+    quantities += [
+        AveragedQuantity(column.header, column.unit, nan, is_main=False)
+        for column in COLUMNS.values()
+        if any(run.averages.get(column.header, (0.0, 0.0))[1] > 0 for run in runs)  # it varies
+    ]
     return Averages(
         scene.name,
         stage.label,
@@ -371,8 +371,6 @@ def _sample(
         "U": results["potential"] / count,
         "T_trans": results["temperature_translation"],
         "T_rot": results["temperature_rotation"],
-        "T_trans unbiased": results["temperature_translation_unbiased"],
-        "T_rot unbiased": results["temperature_rotation_unbiased"],
         "pressure": results["pressure_bar"],
         "density": results["density"],
     }

@@ -120,7 +120,7 @@ def equipartition(trial: Trial, step: float) -> Trials:
 
     def error(results: Results) -> float:
         late = len(results["time"]) // 5
-        columns = [f"temperature_{motion}_unbiased" for motion in ("rotation", "translation")]
+        columns = [f"temperature_{motion}" for motion in ("rotation", "translation")]
         averages = [mean_and_error(results[column][late:]) for column in columns]
         (rotation, its_error), (translation, error) = (map(not_none, pair) for pair in averages)
         return abs(rotation - translation) / hypot(its_error, error)
