@@ -1327,7 +1327,7 @@ def umbrella(p: Well, r):
     [("plain", "umbrella is 121 kJ/mol (49 kT at 298 K)"), ("shift", "its force is -44 kJ/mol/Å")],
 )
 def test_what_a_function_has_at_its_cutoff_is_told(function, truncation, words):
-    """A law from a function is checked like a text; one that vanishes at its cutoff has no
+    """A potential from a function is checked like a text; one that vanishes at its cutoff has no
     warning."""
     scene = small_scene(
         {"argon": 4}, 20.0, stages=[{"ensemble": "nvt", "temperature_K": 298, "duration_ps": 0.004}]

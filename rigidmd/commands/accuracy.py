@@ -49,9 +49,8 @@ from rigidmd.commands.arguments import (
             "molecules only: measure the bias of averages instead, by samples of the last stage"
             " under its thermostat (nvt, npt) with every integrator at every step. --integrators"
             " then accepts names with a thermostat, baoab+langevin (default: the method of the"
-            " stage, baoab+velocity_rescaling, baoab+langevin,"
-            " velocity_verlet+velocity_rescaling), and --timesteps default to fractions of the longest"
-            " stable one"
+            " stage, baoab+velocity_rescaling, baoab+langevin, velocity_verlet+velocity_rescaling),"
+            " and --timesteps default to fractions of the longest stable one"
         ),
     ),
     argument(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.build import integrator_of_stage
 from rigidmd.core.state import REMOVED, State
 from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean_and_error, slope
 from rigidmd.core.toml import Json
@@ -248,6 +247,8 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         )
     if not stage.has_thermostat:
         return notes
+    from rigidmd.assemble.build import integrator_of_stage  # not for single bodies
+
     if integrator_of_stage(system, k).kinetic_correction == 0 and not stage.is_hybrid:
         notes += _note_on_heating(stage, k, temperature, of_stage["shadow_temperature"][half:])
     moving, rotating = (of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS)
