@@ -367,7 +367,8 @@ def test_errors_are_those_of_the_scatter_over_seeds(ensemble):
         pulls = np.array([(value.value - truth.value) / value.error for value in values])
         rms = np.sqrt(np.mean(pulls**2))
         print(f"{truth.name}: {rms:.2f} of {len(pulls)}, largest {np.abs(pulls).max():.1f}")
-        assert len(pulls) > 0.8 * SEEDS and 0.65 < rms < 1.45, truth.name
+        # of nearly white noise it is 0.8, and of 24 pulls it has an error of 0.12
+        assert len(pulls) > 0.8 * SEEDS and 0.5 < rms < 1.4, truth.name
         scatter = np.std([value.value for value in values], ddof=1) / np.sqrt(len(values))
         assert 0.6 < truth.error / scatter < 1.7, truth.name
 
