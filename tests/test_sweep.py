@@ -372,7 +372,7 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
         "averages at a step of 0, from errors of order dt² (velocity_verlet) in stages.0.timestep_fs"
         in said
     )
-    assert "no joint fit: temperature_K=90: it is for nvt and npt, and the stage is nve" in said
+    assert re.search(r"no joint fit: temperature_K = 90: it is for nvt and npt, .* is nve", said)
     assert "sweep.png, extrapolation.csv, extrapolation.png, extrapolation.html" in said
     with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
         rows = {(row["start.temperature_K"], row["average"]): row for row in csv.DictReader(file)}
@@ -394,17 +394,17 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
 def test_energy_at_a_step_of_zero_has_a_joint_fit(argon, tmp_path, capsys):
     """Beside the independent one, with a smaller error, and with the heat capacity."""
     folder = tmp_path / "steps"
-    stage = {"ensemble": "nvt", "temperature_K": 110.0, "duration_ps": 20.0}
+    stage = {"ensemble": "nvt", "temperature_K": 150.0, "duration_ps": 60.0}
     fixed = {f"stages.0.{key}": value for key, value in stage.items()}
+    fixed["box.lengths_A"] = 17.0
     axes = sweeping.axes_of({STEP: [10, 20], "seed": [1, 2]} | fixed)
     run_here(argon, axes, folder, step=STEP)
     assert (
         cli.main(["sweep", str(argon), "-o", str(folder), "--collect", "--extrapolate", STEP]) == 0
     )
     said = capsys.readouterr().out
-    assert re.search(
-        r"U per molecule \(kJ/mol\) +independent .*\n(.*\n)*U per molecule.* joint ", said
-    )
+    for kind in ("independent", "joint"):
+        assert re.search(rf"U per molecule \(kJ/mol\) +{kind} ", said)
     assert re.search(r"c_v \(J/\(mol K\)\) +fluctuations +\d", said)
     with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
         rows = {(row["average"], row["fit"]): row for row in csv.DictReader(file)}
