@@ -42,7 +42,7 @@ from rigidmd.run.molecular import MolecularRecord, MolecularRun
 from rigidmd.run.report import summary_text
 from rigidmd.run.summary import summarise
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 
 @pytest.mark.filterwarnings(
@@ -773,10 +773,11 @@ def test_a_thermostat_at_the_ends_of_steps_that_leaves_another_temperature_has_a
     excess, integrator, n, words
 ):
     noise = np.random.default_rng(1).standard_normal(n)
+    per_square = 2 / 12 * (4 * FEMTOSECOND) ** 2 / (6 * 40 - 3) / BOLTZMANN * KJ_PER_MOL
     notes = noted(
         KEPT | {"integrator": integrator},
         temperature=300 + noise,
-        shadow_temperature=300 + excess + noise,
+        force_squares=(excess + noise / 10) / per_square,
     )
     assert len(notes) == bool(words)
     for note in notes:

@@ -69,7 +69,6 @@ def observe(
     time: float | None = None,
     origin: float | None = None,
     correction: float = 0.0,
-    shadow_correction: float = 0.0,
     moved: bool = False,
     energy_unit: float = KJ_PER_MOL,
     trajectories: tuple[float, ...] = (),
@@ -84,7 +83,6 @@ def observe(
         the present one
     correction : of the kinetic energy in temperatures and pressures, for each (ps²) of the squares
         of forces and torques, see `Scheme.kinetic_correction`
-    shadow_correction : the same, of `Scheme.shadow_correction`
     moved : whether the engine has just moved this state, so that it may have its forces and
         energies already
     energy_unit : unit of all energies, u Å²/ps²
@@ -133,9 +131,6 @@ def observe(
         stage_name=system.scene.stages[stage or 0].label,
         temperature_translation=_temperature(translation_corrected, freedom.translation),
         temperature_rotation=_temperature(rotation_corrected, freedom.rotation),
-        shadow_temperature=_temperature(
-            kinetic + shadow_correction * (sums.force + sums.torque), freedom.total
-        ),
         pressure_bar=float(pressure.trace()) / (3 * BAR),
         drift=conserved - (conserved if origin is None else origin),
         momentum=hypot(*sums.momentum.tolist()),

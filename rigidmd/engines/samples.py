@@ -53,9 +53,6 @@ class Sample(NamedTuple):
         float, Column("T_trans (K)", "K", "temperature of translation")
     ]
     temperature_rotation: Annotated[float, Column("T_rot (K)", "K", "temperature of rotation")]
-    shadow_temperature: Annotated[
-        float, Column("", "K", "temperature of all motion in the shadow Hamiltonian of the step")
-    ]
     pressure_bar: Annotated[
         float, Column("Pressure (bar)", "bar", "molecular pressure, tail correction included")
     ]

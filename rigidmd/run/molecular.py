@@ -419,14 +419,12 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         """The observation at a moment. The drift of its stage is counted from the last sample
         before the stage."""
         stage = self.scene.stages[moment.stage]
-        correction = shadow_correction = 0.0
+        correction = 0.0
         # other programs give the velocities where their thermostats act
         is_given = stage.has_thermostat and self.scene.engine.is_external
         if not (stage.is_minimisation or stage.is_auto or is_given):
-            scheme = self._integrator(moment.stage)
-            square = (stage.timestep_fs * FEMTOSECOND) ** 2
-            correction = scheme.kinetic_correction * square
-            shadow_correction = scheme.shadow_correction * square
+            step = stage.timestep_fs * FEMTOSECOND
+            correction = self._integrator(moment.stage).kinetic_correction * step**2
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
         trajectories = tuple(nan for name in self.system.more_columns if name in OF_TRAJECTORIES)
@@ -449,7 +447,6 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             trajectories=trajectories,
             origin=self._sampler.origin(moment.stage) if conserves else nan,
             correction=correction,
-            shadow_correction=shadow_correction,
         )
 
     def observe_now(self) -> Observation:

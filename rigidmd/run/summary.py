@@ -249,8 +249,12 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         return notes
     from rigidmd.assemble.build import integrator_of_stage  # not for single bodies
 
-    if integrator_of_stage(system, k).kinetic_correction == 0 and not stage.is_hybrid:
-        notes += _note_on_heating(stage, k, temperature, of_stage["shadow_temperature"][half:])
+    scheme = integrator_of_stage(system, k)
+    if scheme.kinetic_correction == 0 and not stage.is_hybrid:
+        squares = (of_stage["force_squares"] + of_stage["torque_squares"])[half:]
+        step = stage.timestep_fs * FEMTOSECOND
+        per_square = 2 * scheme.shadow_correction * step**2 * KJ_PER_MOL / BOLTZMANN
+        notes += _note_on_heating(stage, k, temperature, per_square / freedom.total * squares)
     moving, rotating = (of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS)
     gap, error = mean_and_error(moving - rotating)
     if (
@@ -269,23 +273,25 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
 
 
 def _note_on_heating(
-    stage: Stage, k: int, temperature: np.ndarray, shadow: np.ndarray
+    stage: Stage, k: int, temperature: np.ndarray, excess: np.ndarray
 ) -> list[str]:
     """A note if a thermostat at the ends of steps leaves the molecules at another temperature.
 
-    temperature, shadow : (t,) at the ends of steps, and of the shadow Hamiltonian
+    temperature : (t,) at the ends of steps
+    excess : (t,) of the temperature of the shadow Hamiltonian over it
     """
-    excess, error = mean_and_error(shadow - temperature)
-    if excess is None or error is None:
+    heating, error = mean_and_error(excess)
+    if heating is None or error is None:
         return []
     level = float(temperature.mean())
-    if abs(excess) <= max(HEATING_LIMIT * level, STANDARD_ERRORS * error):
+    if abs(heating) <= max(HEATING_LIMIT * level, STANDARD_ERRORS * error):
         return []
-    shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(excess))
+    shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heating))
+    shadow = temperature + excess
     mean = format_with_error(float(shadow.mean()), mean_and_error(shadow)[1])
     return [
         f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules"
-        f" {abs(excess):.2g} K too {'hot' if excess > 0 else 'cold'}: they move and rotate as at"
+        f" {abs(heating):.2g} K too {'hot' if heating > 0 else 'cold'}: they move and rotate as at"
         f" {mean} K, while the thermostat controls the momenta at the ends of steps,"
         f" {level:.4g} K. Try timestep_fs = {shorter:.1g}, or integrator = 'baoab', the default,"
         " whose positions have hardly such an error"

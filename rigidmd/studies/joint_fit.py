@@ -84,7 +84,7 @@ NEXT_TERM = 1.0
 def kinetic_correction(scheme: Scheme) -> float:
     """The number c in K + c dt² (sum F²/m + sum n²/I), the mean kinetic energy where the thermostat
     acts, with K at the ends of steps."""
-    return 1 / 8 if scheme.has_thermostat else 0.0
+    return scheme.with_thermostat(()).kinetic_correction
 
 
 def why_not(stage: Stage) -> str:
@@ -217,14 +217,15 @@ def _evaluate(blocks: np.ndarray, at: Conditions, has_barostat: bool) -> dict[st
 def _heating(mean: _Samples, at: Conditions) -> float:
     """(T' - T)/T over dt², with the temperature T' of the shadow Hamiltonian; 1/ps²."""
     set_energy = at.freedom * at.thermal_energy / 2
-    return mean.squares * (1 / 12 - at.correction) / set_energy
+    return float(mean.squares * (1 / 12 - at.correction) / set_energy)
 
 
 def _compression(mean: _Samples, at: Conditions, hotter: float) -> float:
     """p' - p over dt², kJ/mol/nm³/ps², where the barostat holds the pressure p."""
     if at.reads_kinetic:
-        return mean.of_forces / 12 / mean.volume
-    return (at.moving * at.thermal_energy * hotter + mean.of_forces / 36) / mean.volume
+        return float(mean.of_forces / 12 / mean.volume)
+    moving = at.moving * at.thermal_energy * hotter
+    return float((moving + mean.of_forces / 36) / mean.volume)
 
 
 def _responses(
@@ -358,8 +359,9 @@ def _fit_with_slopes(steps: Sequence[_Step]) -> list[BiasFit]:
         chi2, freedom = of_all[0].chi2, of_all[0].freedom
         if chi2 <= freedom + 2 * sqrt(2 * freedom):
             return of_all
-    factor = sqrt(chi2 / freedom)
-    return [fit._replace(limit_error=factor * fit.limit_error) for fit in fits[-1]]
+    last = fits[-1]
+    factor = sqrt(last[0].chi2 / last[0].freedom)
+    return [fit._replace(limit_error=factor * fit.limit_error) for fit in last]
 
 
 def _fit_steps(steps: Sequence[_Step]) -> list[BiasFit]:

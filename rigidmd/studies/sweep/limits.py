@@ -232,7 +232,8 @@ def _joint_limits(manifest: Manifest, key: str) -> tuple[list[Limit], list[str]]
                 reasons[f"{title}: {found}" if title else found] = None
                 continue
             combination = combinations.setdefault(title, _Combination(others))
-            combination.integrator = record.scene.stages[k].integrator
+            stage = record.scene.stages[k]  # pyright: ignore[reportAttributeAccessIssue]  (it has them)
+            combination.integrator = stage.integrator
             combination.runs.setdefault(float(values[first]), []).append(found)
     limits = []
     for title, combination in combinations.items():
