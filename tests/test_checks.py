@@ -286,7 +286,7 @@ def test_bodies_that_are_all_but_linear_go_on(spread):
     assert np.ptp(results["energy"]) < 0.01 * results["kinetic"].max()
 
 
-@pytest.mark.parametrize(("timestep", "wrong"), [(11.0, True), (2.0, False)])
+@pytest.mark.parametrize(("timestep", "wrong"), [(9.0, True), (2.0, False)])
 def test_a_thermostat_cannot_hide_a_step_that_is_too_long(timestep, wrong):
     """It takes out in every step what the step has added, so that the temperature of all motion
     looks right."""
@@ -308,7 +308,6 @@ def test_a_thermostat_cannot_hide_a_step_that_is_too_long(timestep, wrong):
     results = Simulation(scene).run()
     told = " ".join(note for note in results.summary["notes"] if note.startswith("stages.1"))
     assert ("the conserved energy drifts by" in told) == wrong
-    assert ("T_trans is" in told) == wrong
 
 
 def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):

@@ -67,6 +67,7 @@ def test_results_are_what_the_log_says(tmp_path):
 def test_the_record_and_its_table_name_the_same_units():
     said = {
         "kJ/mol": "(kJ/mole)",
+        "kJ/mol/ps²": "(kJ/mole/ps^2)",
         "K": "(K)",
         "bar": "(bar)",
         "ps": "(ps)",
