@@ -77,7 +77,7 @@ EXTENDED = {
         )
     ),
     "test_dynamics.py": ("adding_an_integrator_*",),
-    "test_engine_settings.py": ("adding_an_engine_takes_a_folder_and_a_line",),
+    "test_engine_settings.py": ("adding_an_engine_takes_a_folder_and_a_file",),
     "test_ewald.py": (
         "lennard_jones_and_real_space_end_apart*",
         "total_does_not_depend_on_how_it_is_split*",

@@ -105,7 +105,7 @@ def test_pulls_of_joint_limits_have_unit_width(
     )
     pulls, ratios, of_slopes, responses = {}, {}, [], {}
     expected = slopes(conditions(10.0, has_barostat, correction, reads_kinetic), has_barostat)
-    for _ in range(30):
+    for _ in range(60):
         runs = {
             step: [
                 sampled(rng, step, has_barostat, 400, correction, reads_kinetic)

@@ -132,7 +132,7 @@ def test_check_prints_the_program_of_each_stage(tmp_path, capsys, monkeypatch):
     assert main(["new", "water"]) == 0
     assert main(["check", "water.toml", "--program"]) == 0
     printed = capsys.readouterr().out
-    assert "program of a step of stages.1 (equilibration, velocity_verlet)" in printed
+    assert "program of a step of stages.1 (equilibration, baoab)" in printed
     assert "program of a step of stages.2 (production, velocity_verlet)" in printed
     assert "stages.0" not in printed.partition("program of a step")[2]
     assert "lennard_jones: update the neighbour list" in printed

@@ -45,6 +45,8 @@ class Coupling(NamedTuple):
     shapes: tuple[str, ...] = get_args(Shapes)
     in_verlet_steps: bool = False
     title: str = ""
+    #: For a barostat: whether it reads the momenta at the ends of steps, or only a temperature.
+    reads_momenta: bool = False
 
     def values(self, stage: Any) -> Values:
         """The values of its keys in a stage."""
@@ -130,6 +132,7 @@ BAROSTATS = {
         {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": _interval},
         ("npt",),
         relaxes_in_moves=True,
+        reads_momenta=True,
     ),
     "monte_carlo": Coupling(
         "random changes of the volume",
@@ -147,6 +150,7 @@ BAROSTATS = {
         in_verlet_steps=True,
         title="a piston",
         oscillates=True,
+        reads_momenta=True,
     ),
 }
 

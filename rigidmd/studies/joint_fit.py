@@ -16,6 +16,7 @@ from rigidmd.core.statistics import inefficiency, mean_and_error
 from rigidmd.dynamics.model import mobile
 from rigidmd.engines.samples import IN_LOGS
 from rigidmd.run.record import Record
+from rigidmd.scene.couplings import BAROSTATS
 from rigidmd.scene.stage import Stage
 from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, extrapolate, means_of_runs
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
@@ -30,9 +31,6 @@ BAR_NM3 = 1e3 * BAR / KJ_PER_MOL  # kJ/mol
 BLOCKS = 10
 #: Least number of independent samples of a run whose fluctuations count.
 LEAST_SAMPLES = 20.0
-#: Whether the barostat reads the kinetic energy at the ends of steps, or moves by a set
-#: temperature.
-READS_KINETIC = {"cell_rescaling": True, "monte_carlo": False}
 
 
 class Conditions(NamedTuple):
@@ -95,12 +93,10 @@ def why_not(stage: Stage) -> str:
         return f"it is for nvt and npt, and the stage is {stage.ensemble}"
     if stage.ramps:
         return "temperature or pressure change during the stage"
-    if stage.thermostat_kind == "hybrid_monte_carlo":
+    if stage.is_hybrid:
         return "hybrid_monte_carlo has no error of the step"
     if moving[0] != moving[-1] or moving[0] != (KICK, 0.5) or abs(drifts - 1) > 1e-12:
         return f"it is for velocity_verlet and baoab, and the integrator is {stage.integrator}"
-    if stage.has_barostat and stage.barostat_kind not in READS_KINETIC:
-        return f"the barostat is {stage.barostat_kind}, not one of {', '.join(READS_KINETIC)}"
     if stage.has_barostat and stage.pressure_coupling not in (None, "isotropic"):
         return f"pressure_coupling is {stage.pressure_coupling!r}, not 'isotropic'"
     return ""
@@ -139,7 +135,7 @@ def _conditions(record: Record, stage: Stage) -> Conditions:
         freedom.total,
         freedom.rotation,
         kinetic_correction(stage.scheme),
-        READS_KINETIC.get(stage.barostat_kind, False),
+        stage.has_barostat and BAROSTATS[stage.barostat_kind].reads_momenta,
     )
 
 
