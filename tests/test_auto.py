@@ -240,6 +240,12 @@ def test_the_error_of_a_top_is_what_was_asked_for(target):
     assert simulation.scene.run.integrator == results.summary["integrator"] != "auto"
 
 
+def test_an_error_of_the_trajectory_below_rounding_is_refused():
+    changes = {"run.integrator": "auto", "run.trajectory_error": 1e-13}
+    with pytest.raises(SceneError, match="trajectory_error: is 1e-13, must not be less than 1e-12"):
+        Scene.read(TOP, changes)
+
+
 @pytest.mark.soak
 def test_what_cannot_be_kept_is_said(capsys, tmp_path):
     command = [

@@ -60,6 +60,7 @@ from rigidmd.scene.validation import (
     Number,
     Positive,
     Section,
+    TrajectoryError,
     Vector,
     location_of,
     not_none,
@@ -379,7 +380,7 @@ class Run(MovedByScheme):
     energy_error: Positive | None = None
     """With auto: rms error of the energy over the run, as a fraction of the largest kinetic
     energy"""
-    trajectory_error: Positive | None = None
+    trajectory_error: TrajectoryError | None = None
     """With auto: largest error of Q at the end; for a point the error of X in m"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow; default: the flow that the integrator needs"""

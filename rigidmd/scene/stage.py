@@ -19,7 +19,14 @@ from rigidmd.scene.couplings import (
     Values,
 )
 from rigidmd.scene.integrators import MovedByScheme
-from rigidmd.scene.validation import Count, NameIn, Positive, Section, ShortName
+from rigidmd.scene.validation import (
+    Count,
+    NameIn,
+    Positive,
+    Section,
+    ShortName,
+    TrajectoryError,
+)
 from rigidmd.units import FEMTOSECOND
 
 MOST_STEPS = 1e12
@@ -106,7 +113,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     energy_error_kT: Positive | None = None
     """With auto: rms error of the energy over the whole stage, as pilot runs predict it, in kT per
     degree of freedom"""
-    trajectory_error: Positive | None = None
+    trajectory_error: TrajectoryError | None = None
     """With auto: largest error of Q (for points of X in Å) at the end of the pilot run of ten
     radians of libration"""
     bias_kT: Positive | None = None

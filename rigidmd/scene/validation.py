@@ -32,6 +32,8 @@ Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
 #: A cutoff, Å. Powers of the reciprocals of much smaller ones overflow in single precision.
 Cutoff = Annotated[float, Strict(), Field(ge=1e-3, allow_inf_nan=False)]
+#: An error of Q that rounding allows pilot runs to find.
+TrajectoryError = Annotated[float, Strict(), Field(ge=1e-12, allow_inf_nan=False)]
 Count = Annotated[int, Strict(), Field(gt=0)]
 Flag = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]
