@@ -205,6 +205,7 @@ def test_a_run_is_one_like_any_other(ranks, scene, tmp_path, capsys):
     said = capsys.readouterr().out
     assert f"computed by LAMMPS on {ranks} rank" in said
     assert "stages.0: thermostat nose_hoover, because lammps has no velocity_rescaling" in said
+    assert "the integrator that lammps has with nose_hoover, instead of baoab" in said
     record = read_record(folder)
     assert list(record.columns["step"]) == [0, 5, 10, 15, 20, 30, 40, 50, 60]
     drift = record.columns["drift"]

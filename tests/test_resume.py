@@ -26,6 +26,7 @@ from support import ROOT, contents, same_after_stops, small_scene, stopped_at
 
 from rigidmd.commands import cli
 from rigidmd.core.files import AppendedFile
+from rigidmd.engines.samples import NUMBERS
 from rigidmd.errors import CheckpointError, OutputError, RigidMDWarning, SimulationError
 from rigidmd.io import checkpoint
 from rigidmd.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
@@ -1201,3 +1202,9 @@ def test_the_duration_of_a_ramp_stays(ramp, tmp_path):
     Simulation(scene(0.004, **level), tmp_path / "level").run()
     longer = Simulation(scene(0.008, **level), tmp_path / "level", resume=True).run()
     assert longer["time"][-1] == pytest.approx(0.008)
+
+
+def test_a_checkpoint_of_other_columns_has_another_schema():
+    """The table of samples has no names: a change of the columns needs a new number here and there."""
+    digest = hashlib.sha256(" ".join(NUMBERS).encode()).hexdigest()[:8]
+    assert (checkpoint.SCHEMA, digest) == (5, "d0fdadad")

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from rigidmd.assemble.plausibility import shortest_contact
-from rigidmd.core.integrators import RK4, SOLVERS
+from rigidmd.core.integrators import RK4, SOLVERS, WITH_THERMOSTAT
 from rigidmd.forces.neighbors.space import Triclinic, longest_gaps
 from rigidmd.forces.parts import Composition, Grid, Settings
 from rigidmd.forces.potentials.truncation import default_switch_start
@@ -54,6 +54,12 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
             why = f"because {program.name} has no velocity_rescaling"
             notes.append(f"stages.{k}: thermostat {program.thermostat}, {why}")
             defaults["thermostat"] = program.thermostat
+        kind = defaults.get("thermostat", stage.thermostat_kind)
+        if stage.integrator in WITH_THERMOSTAT and kind != "langevin":
+            notes.append(
+                f"stages.{k}: the integrator that {program.name} has with {kind}, instead of"
+                f" {stage.integrator}"
+            )
         if stage.ensemble == "npt" and stage.barostat is None:
             defaults["barostat"] = program.barostat
         stages.append(stage.model_copy(update=defaults))

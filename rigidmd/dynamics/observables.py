@@ -118,32 +118,15 @@ def fill_sums(
 ):
     """Write the numbers (SUM_COUNT,) of `StateSums`: rotation, torque, orthogonality, momentum, the
     momentum flux and the squares of forces."""
-    px = py = pz = xx = yy = zz = xy = xz = yz = turning = twisted = worst = 0.0
+    px = py = pz = turning = twisted = worst = 0.0
     for m in range(len(velocity)):
         m_i = mass[species[m]]
-        x, y, z = velocity[m, 0], velocity[m, 1], velocity[m, 2]
-        px += m_i * x
-        py += m_i * y
-        pz += m_i * z
-        xx += m_i * x * x
-        yy += m_i * y * y
-        zz += m_i * z * z
-        xy += m_i * x * y
-        xz += m_i * x * z
-        yz += m_i * y * z
+        px += m_i * velocity[m, 0]
+        py += m_i * velocity[m, 1]
+        pz += m_i * velocity[m, 2]
     found[3], found[4], found[5] = px, py, pz
-    found[6], found[7], found[8], found[9], found[10], found[11] = xx, yy, zz, xy, xz, yz
-    xx = yy = zz = xy = xz = yz = 0.0
-    for m in range(len(force)):
-        weight = inverse_mass[species[m]]
-        x, y, z = force[m, 0], force[m, 1], force[m, 2]
-        xx += weight * x * x
-        yy += weight * y * y
-        zz += weight * z * z
-        xy += weight * x * y
-        xz += weight * x * z
-        yz += weight * y * z
-    found[12], found[13], found[14], found[15], found[16], found[17] = xx, yy, zz, xy, xz, yz
+    _fill_squares(species, mass, velocity, found, 6)
+    _fill_squares(species, inverse_mass, force, found, 12)
     for m in range(len(angular)):
         for k in range(3):
             turning += inverse_inertia[species[m], k] * angular[m, k] ** 2
@@ -159,3 +142,20 @@ def fill_sums(
                 if not abs(entry) <= worst and worst == worst:  # NaN is kept
                     worst = abs(entry)
     found[0], found[1], found[2] = turning, twisted, worst
+
+
+@kernel
+def _fill_squares(species, weights, vectors, found, at):
+    """Write the sum of weight v (x) v over molecules into found[at : at + 6]."""
+    xx = yy = zz = xy = xz = yz = 0.0
+    for m in range(len(vectors)):
+        weight = weights[species[m]]
+        x, y, z = vectors[m, 0], vectors[m, 1], vectors[m, 2]
+        xx += weight * x * x
+        yy += weight * y * y
+        zz += weight * z * z
+        xy += weight * x * y
+        xz += weight * x * z
+        yz += weight * y * z
+    found[at], found[at + 1], found[at + 2] = xx, yy, zz
+    found[at + 3], found[at + 4], found[at + 5] = xy, xz, yz

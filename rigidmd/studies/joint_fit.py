@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.analysis.rigid_frames import production_samples
-from rigidmd.core.integrators import DRIFT, KICK, Scheme
+from rigidmd.core.integrators import DRIFT, KICK
 from rigidmd.core.statistics import inefficiency, mean_and_error
 from rigidmd.dynamics.model import mobile
 from rigidmd.engines.samples import IN_LOGS
@@ -43,7 +43,7 @@ class Conditions(NamedTuple):
     moving: int  # of molecules that are not frozen
     freedom: int
     rotation: int  # degrees of freedom of rotation
-    correction: float  # see `kinetic_correction`
+    correction: float  # see `Scheme.kinetic_correction`
     reads_kinetic: bool
 
     @property
@@ -77,12 +77,6 @@ BALANCE = "kinetic energy less its set value"
 #: differ. In nitrogen at 90 K it was 1.4 ± 0.9, at (ω dt)² = 0.14.
 MEAN_SQUARE = "(ω dt)²"
 NEXT_TERM = 1.0
-
-
-def kinetic_correction(scheme: Scheme) -> float:
-    """The number c in K + c dt² (sum F²/m + sum n²/I), the mean kinetic energy where the thermostat
-    acts, with K at the ends of steps."""
-    return scheme.with_thermostat(()).kinetic_correction
 
 
 def why_not(stage: Stage) -> str:
@@ -134,7 +128,7 @@ def _conditions(record: Record, stage: Stage) -> Conditions:
         int(mobile(system.model).sum()),
         freedom.total,
         freedom.rotation,
-        kinetic_correction(stage.scheme),
+        stage.scheme.with_thermostat(()).kinetic_correction,
         stage.has_barostat and BAROSTATS[stage.barostat_kind].reads_momenta,
     )
 
