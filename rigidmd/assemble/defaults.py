@@ -45,12 +45,7 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
     notes, stages = [f"computed by {scene.engine.title}"], []
     for k, stage in enumerate(scene.stages):
         defaults = {}
-        if (
-            program.thermostat
-            and stage.has_thermostat
-            and stage.thermostat is None
-            and not stage.thermostat_is_open
-        ):
+        if program.thermostat and stage.has_thermostat and stage.thermostat is None:
             why = f"because {program.name} has no velocity_rescaling"
             notes.append(f"stages.{k}: thermostat {program.thermostat}, {why}")
             defaults["thermostat"] = program.thermostat
