@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rigidmd.assemble.defaults import with_momentum_removal
+from rigidmd.assemble.user_code.body_pairs import BodyPairPotential, bind_body_pairs
 from rigidmd.assemble.user_code.compiled import describe_compile_error
 from rigidmd.assemble.user_code.cutoffs import check_cutoff
 from rigidmd.assemble.user_code.force import (
@@ -183,6 +184,8 @@ def bind(force: Any, system: System, name: str) -> BoundTerm:
     SceneError."""
     if isinstance(force, PairPotential):
         return bind_pair_potential(force, system)
+    if isinstance(force, BodyPairPotential):
+        return bind_body_pairs(force, system)
     if isinstance(force, Force):
         return bind_force(force, system, name)
     return _bind_term(force, system)
