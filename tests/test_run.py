@@ -52,8 +52,9 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 def test_every_system_runs_a_few_steps(path, tmp_path):
     assert path.read_text().startswith("# ")
     scene = Scene.read(path)
-    moving = [k for k, stage in enumerate(scene.stages) if not stage.is_minimisation]
-    short = {f"stages.{k}.duration_ps": 8 * scene.stages[k].timestep_fs / 1000 for k in moving} | {
+    stages = rigidmd.resolve(scene).stages
+    moving = [k for k, stage in enumerate(stages) if not stage.is_minimisation]
+    short = {f"stages.{k}.duration_ps": 8 * stages[k].step for k in moving} | {
         "output.log_interval_ps": 0.004,
         "output.trajectory_interval_ps": 0.008,
     }
