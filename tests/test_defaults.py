@@ -14,7 +14,14 @@ from support import ROOT
 from rigidmd import Scene, Simulation, resolve
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
-from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, error_of_step, stable_angle, step_error
+from rigidmd.assemble.time_step import (
+    MARGIN,
+    MIXED_ERROR,
+    error_of_step,
+    stable_angle,
+    step_error,
+    step_warnings,
+)
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.errors import SceneError
@@ -342,6 +349,16 @@ def test_the_error_of_a_step_is_that_of_the_frequency(name):
         abs((followed / angle) ** 2 - 1), rel=1e-6, abs=1e-12
     )
     assert step_error(scheme, 1.01 * stable_angle(scheme)) == inf
+    for small in (1e-1, 1e-3, 1e-8, 1e-300):  # not the rounding error of the trace
+        assert step_error(scheme, small) <= small**2 / 10
+    assert step_error(scheme, 0.0) == 0.0
+
+
+def test_check_ends_for_a_step_far_below_rounding():
+    row = {"name": "mine", "steps": [0.6, -0.2, 0.6], "order": 2}
+    stage = {"duration_ps": 0.004, "timestep_fs": 1e-9, "integrator": "mine"}
+    found = scene(stages=[stage], integrators=[row], start={"temperature_K": 300})
+    assert "times shorter than mine needs" in "".join(step_warnings(found))
 
 
 def test_the_error_of_velocity_verlet_is_known():

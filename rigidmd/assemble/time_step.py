@@ -48,6 +48,8 @@ DIGITS = (5.0, 4.0, 2.5, 2.0, 1.0)
 #: Largest error of a step, as a fraction of the forces, without a warning: 6 fs for water with
 #: velocity Verlet. What is advised instead has half of it.
 INACCURATE = 0.1
+#: Below this w dt the error of a step is extrapolated by the order of the scheme.
+SMALL_ANGLE = 0.03
 #: A step that is this many times shorter than the longest stable one is probably in another unit.
 NEEDLESS = 1000
 #: precision = "auto" is mixed where the error of the time step is at least this many times that of
@@ -85,8 +87,11 @@ def step_error(scheme: Scheme, angle: float) -> float:
     Infinite for an unstable step."""
     if angle >= stable_angle(scheme):
         return inf
+    small = min(SMALL_ANGLE, stable_angle(scheme) / 4)
+    if angle < small:  # rounding of the trace would be most of it
+        return step_error(scheme, small) * (angle / small) ** scheme.order
     followed = np.arccos(np.clip(_trace(scheme, np.array([angle**2]))[0] / 2, -1, 1))
-    return abs(float(followed / angle) ** 2 - 1) if angle > 0 else 0.0
+    return abs(float(followed / angle) ** 2 - 1)
 
 
 def error_of_step(

@@ -74,8 +74,9 @@ class RunSettings(Section):
 
     remove_momentum_interval_ps: Interval | Literal[False] | None = None
     """Time between removals of the total momentum; false for never. Default: 1 ps with pme, whose
-    forces do not add up to zero exactly, else never. The energy removed counts as heat, as with a
-    thermostat"""
+    forces do not add up to zero exactly, and with a thermostat that scales all velocities, which
+    can make rounding errors of the momentum grow; else never. The energy removed counts as heat, as
+    with a thermostat"""
 
 
 class Output(Section):
