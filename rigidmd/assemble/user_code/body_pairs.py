@@ -12,6 +12,8 @@ from rigidmd.assemble.user_code.cutoffs import PairPotentialError, check_cutoff
 from rigidmd.assemble.user_code.force import BoundTerm
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.engines.system import System
+from rigidmd.scene.forces import BodyForce
+from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
     from rigidmd.forces.poses.formulas import PoseFormula
@@ -64,14 +66,15 @@ def body_pair_potential(
     Parameters
     ----------
     function
-        function(r, a, b) or function(r, a, b, p, q) with r the vector (3,) in Å from the reference
-        point of the first body to that of the second, a and b their rotation matrices (3, 3), body
-        to lab, and p and q their parameters. It gives the energy in kJ/mol; force and torques are
-        derived from it, so that it may have arithmetic and functions of NumPy such as numpy.exp and
-        numpy.where, but no branches. Or it gives a tuple of the energy, the force (3,) on the
-        second body in kJ/mol/Å, and the torques (3,) on the first and on the second body in kJ/mol,
-        along the axes of the lab. Exchanging both bodies must not change the energy, unless their
-        species differ: then the one that is first in the scene is a
+        function(r, a, b) or function(r, a, b, p, q). r is the vector (3,) in Å from the reference
+        point of the first body to that of the second. a and b are their rotation matrices (3, 3)
+        from the coordinates of the models' files to the lab, p and q their parameters. It gives the
+        energy in kJ/mol. Force and torques are derived from it, so that it may have arithmetic and
+        functions of NumPy such as numpy.exp and numpy.where, but no branches. Or it gives a tuple
+        of the energy, the force (3,) on the second body in kJ/mol/Å, and the torques (3,) on the
+        first and on the second body in kJ/mol, along the axes of the lab. An exchange of both
+        bodies must not change the energy. If their species differ, the one that is first in the
+        scene is a
     parameters
         Species -> numbers by name, the attributes of p and q. It acts on these species
     species
@@ -79,9 +82,10 @@ def body_pair_potential(
     pairs
         (species, species) -> parameters of the pair, in place of those of p and q
     axis
-        A principal axis of the bodies: a and b are then unit vectors (3,) along it
+        An axis of the models' files: a and b are then unit vectors (3,) along it
     references
-        Species -> reference point from the centre of mass, body frame, Å; default: (0, 0, 0)
+        Species -> reference point in the coordinates of its model's file, Å; default: the centre of
+        mass
     truncation
         switch: from `switch_start_A` the energy is switched to 0 at the cutoff, with two continuous
         derivatives; plain: it jumps
@@ -125,6 +129,27 @@ def body_pair_potential(
     )
 
 
+def potential_of_scene(entry: BodyForce) -> BodyPairPotential:
+    """The potential of one of [[forces.bodies]] without a module. Raises ValueError."""
+    from rigidmd.forces.poses.shipped import function_of_text, shipped_function
+
+    if entry.potential is not None:
+        function = shipped_function(entry.potential, entry.options, entry.parameters)
+    else:
+        function = function_of_text(not_none(entry.energy), entry.mixing)
+    return body_pair_potential(
+        function,
+        entry.parameters,
+        pairs={pair.species: pair.parameters for pair in entry.pairs},
+        axis=entry.axis,
+        references=entry.references,
+        truncation=entry.truncation,
+        cutoff_A=entry.cutoff_A,
+        switch_start_A=entry.switch_start_A,
+        name=entry.label,
+    )
+
+
 def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
     """The potential between the bodies of a system.
 
@@ -155,12 +180,18 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
     kind = of_species[system.model.species]
     body = np.arange(len(kind))
     frozen = (system.model.inverse_mass == 0)[system.model.species]
-    references = [potential.references.get(name, (0.0, 0.0, 0.0)) for name in kinds]
+    models = {m.name: m for m in system.species}
+    references = [
+        (np.array(potential.references.get(name, models[name].centre)) - models[name].centre)
+        @ models[name].axes
+        for name in kinds
+    ]
     term = BodyPairs(
         formula=formula.kind(),
         kind=kind,
         group=np.where(frozen, len(body), body),
         reference=np.array(references, float).reshape(-1, 3),
+        frame=np.ascontiguousarray([models[name].axes.T for name in kinds]),
         parameters=rows,
         interacts=np.ones((len(kinds), len(kinds)), bool),
         switch_start=float(start),

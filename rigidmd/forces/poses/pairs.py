@@ -33,6 +33,7 @@ class BodyPairs(NamedTuple):
     kind: np.ndarray  # (n,) int64 kind of each body; -1 for one that takes no part
     group: np.ndarray  # (n,) int64 bodies of one group do not interact
     reference: np.ndarray  # (kinds, 3) reference point from the centre of mass, body frame, Å
+    frame: np.ndarray  # (kinds, 3, 3) from the coordinates of the model's file to the body frame
     parameters: np.ndarray  # (kinds, kinds, parameters) of the first kind with the second
     interacts: np.ndarray  # (kinds, kinds) bool
     switch_start: float  # Å, where the energy begins to be switched to 0; `cutoff` for a jump
@@ -45,6 +46,7 @@ class BodyPairs(NamedTuple):
         pairs = BodyPairList(
             skin=min(setup.skin, LONGEST_SKIN * self.cutoff),
             point=np.zeros((n, 3)),
+            pose=np.zeros((n, 3, 3)),
             built=np.zeros((n, 3)),
             built_cell=np.zeros((3, 3)),
             bin=np.zeros(n, np.int64),
@@ -70,6 +72,7 @@ class BodyPairList(NamedTuple):
 
     skin: float  # Å
     point: np.ndarray  # (n, 3) reference points, lab frame, Å
+    pose: np.ndarray  # (n, 3, 3) from the coordinates of the model's file to the lab
     built: np.ndarray  # (n, 3) those for which the list was built
     built_cell: np.ndarray  # (3, 3)
     bin: np.ndarray  # (n,) of each body
@@ -143,6 +146,11 @@ def _place_points(arguments, block):
         if kind >= 0:
             offset = work.term.reference[kind]
             x, y, z = lab_vector(state.rotation[m], offset[0], offset[1], offset[2])
+            frame = work.term.frame[kind]
+            for k in range(3):
+                column = lab_vector(state.rotation[m], frame[0, k], frame[1, k], frame[2, k])
+                for i in range(3):
+                    work.pairs.pose[m, i, k] = column[i]
         work.pairs.point[m, 0] = state.position[m, 0] + x
         work.pairs.point[m, 1] = state.position[m, 1] + y
         work.pairs.point[m, 2] = state.position[m, 2] + z
@@ -402,9 +410,13 @@ def _switch(term, r):
 
 @task()
 def _add_pairs(arguments, block):
-    """The pairs of a block: forces and torques into its loads, energy and virial into its
-    tally."""
     work, state, tallies = load_arguments(arguments)
+    _pairs_of_block(work, state, tallies, block)
+
+
+@kernel(inline=True)
+def _pairs_of_block(work, state, tallies, block):
+    """Forces and torques into the loads of a block, energy and virial into its tally."""
     term, pairs, cell = work.term, work.pairs, state.cell
     load, entries, point = work.loads[block], pairs.entries[block], pairs.point
     first, last = _rows_of_block(len(term.kind), block)
@@ -437,8 +449,8 @@ def _add_pairs(arguments, block):
                 term.formula,
                 term.parameters[term.kind[one], term.kind[other]],
                 (x, y, z),
-                state.rotation[one],
-                state.rotation[other],
+                pairs.pose[one],
+                pairs.pose[other],
             )
             factor, change = _switch(term, r)
             along = change * energy / r
