@@ -4,7 +4,6 @@ give force and torques themselves."""
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,8 +49,7 @@ def formula_of_poses(
     ]
     poses = matrices if axis is None else [matrix[:, AXES.index(axis)] for matrix in matrices]
     of_kinds = [
-        SimpleNamespace(**{key: graph.leaf(f"{body}.{key}") for key in parameters})
-        for body in ("p", "q")
+        _Parameters({key: graph.leaf(f"{body}.{key}") for key in parameters}) for body in ("p", "q")
     ]
     returned = _called(function, name, [r, *poses], of_kinds)
     if isinstance(returned, tuple):
@@ -69,6 +67,19 @@ def formula_of_poses(
         return hoisted.values(values)
 
     return PoseFormula(module.Formula, numbers, len(lines), not isinstance(returned, tuple))
+
+
+class _Parameters:
+    """The parameters of a body, as attributes."""
+
+    def __init__(self, leaves: Mapping[str, Traced]):
+        self._leaves = leaves
+
+    def __getattr__(self, name: str) -> Traced:
+        if name not in self._leaves:
+            known = ", ".join(self._leaves) or "none"
+            raise TraceError(f"no species has the parameter {name}; there are {known}")
+        return self._leaves[name]
 
 
 def _called(function: Callable, name: str, poses: list, of_kinds: list) -> Any:
@@ -116,7 +127,7 @@ def _cross(u: Sequence[Any], v: Sequence[Any]) -> list[Any]:
 
 def _given(name: str, returned: tuple) -> list[Any]:
     """The same of a function that returns energy, force on the second body, and both torques."""
-    shapes = [np.shape(value) for value in returned]
+    shapes = [np.asarray(value, object).shape for value in returned]
     if shapes != [(), (3,), (3,), (3,)]:
         raise TraceError(
             f"{name} returned a tuple of the shapes {shapes}, must return an energy, or a tuple of"

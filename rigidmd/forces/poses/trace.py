@@ -59,6 +59,23 @@ class Graph:
         return self._nodes[key]
 
 
+def _operators(kind: str) -> tuple[Callable, Callable]:
+    """The methods of an operator, with the node as the first and as the second operand. NumPy
+    applies them to the entries of arrays."""
+
+    def first(self: "Traced", other: Any):
+        if isinstance(other, np.ndarray):
+            return NotImplemented
+        return self.graph.node(kind, self, self._other(other))
+
+    def second(self: "Traced", other: Any):
+        if isinstance(other, np.ndarray):
+            return NotImplemented
+        return self.graph.node(kind, self._other(other), self)
+
+    return first, second
+
+
 class Traced:
     """A node: a number, or a condition, of a traced function."""
 
@@ -80,29 +97,10 @@ class Traced:
             return value
         return self.graph.constant(float(value))
 
-    def __add__(self, other: Any):
-        return self.graph.node("add", self, self._other(other))
-
-    def __radd__(self, other: Any):
-        return self._other(other) + self
-
-    def __sub__(self, other: Any):
-        return self.graph.node("subtract", self, self._other(other))
-
-    def __rsub__(self, other: Any):
-        return self._other(other) - self
-
-    def __mul__(self, other: Any):
-        return self.graph.node("multiply", self, self._other(other))
-
-    def __rmul__(self, other: Any):
-        return self._other(other) * self
-
-    def __truediv__(self, other: Any):
-        return self.graph.node("divide", self, self._other(other))
-
-    def __rtruediv__(self, other: Any):
-        return self._other(other) / self
+    __add__, __radd__ = _operators("add")
+    __sub__, __rsub__ = _operators("subtract")
+    __mul__, __rmul__ = _operators("multiply")
+    __truediv__, __rtruediv__ = _operators("divide")
 
     def __neg__(self):
         return self.graph.node("negative", self)
@@ -114,6 +112,8 @@ class Traced:
         return self.absolute()
 
     def __pow__(self, exponent: Any):
+        if isinstance(exponent, np.ndarray):
+            return NotImplemented
         known = self._other(exponent)
         if known.number is None:
             return (known * self.log()).exp()
@@ -122,12 +122,7 @@ class Traced:
     def __rpow__(self, base: Any):
         return self._other(base) ** self
 
-    def __lt__(self, other: Any):
-        return self.graph.node("less", self, self._other(other))
-
-    def __gt__(self, other: Any):
-        return self.graph.node("less", self._other(other), self)
-
+    __lt__, __gt__ = _operators("less")
     __le__, __ge__ = __lt__, __gt__
 
     def __bool__(self):
