@@ -154,7 +154,7 @@ class SpeciesPair(Section):
     species: tuple[str, str]
     """Names of the two species"""
     parameters: dict[str, Number] = Field(default={}, max_length=MOST_TABLES)
-    """Parameters by name, in place of those of the species"""
+    """Parameters by name, which replace the parameters of both species"""
 
 
 class BodyForce(Section):
@@ -162,7 +162,7 @@ class BodyForce(Section):
     orientations."""
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)] | None = None
-    """Name in the log; default: that of the potential; with `module` also the name of the object in
+    """Name in the log; default: the name of the potential; with `module` also the name of the object in
     it"""
     potential: Literal["gay_berne", "dipole", "quadrupole", "patch"] | None = None
     """gay_berne: ellipsoids; dipole, quadrupole: at a point; patch: spheres with an attractive

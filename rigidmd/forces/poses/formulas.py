@@ -58,7 +58,7 @@ def formula_of_poses(
         outputs = _derived(name, returned, r, matrices)
     names = [f"{body}.{key}" for body in ("p", "q") for key in parameters]
     hoisted = Hoisted(outputs, names)
-    lines, texts = code_of(outputs, hoisted.places)
+    lines, texts = code_of(outputs, hoisted.positions)
     module = module_of(_source(name, lines, texts).encode(), f"<potential {name}>")
 
     def numbers(first: Mapping[str, float], second: Mapping[str, float]) -> list[float]:

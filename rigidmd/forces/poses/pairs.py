@@ -3,7 +3,7 @@ term, its neighbour list and its loop.
 
 A formula is a NamedTuple class with an `@implements(pair_slopes)`, which `formulas` writes. Each
 pair is listed once. Every row of the list is sorted, so that sums do not depend on when it was
-built, and its bits need no place in checkpoints.
+built, and its bits are not stored in checkpoints.
 """
 
 from math import floor, inf, sqrt
@@ -77,7 +77,7 @@ class BodyPairList(NamedTuple):
     built_cell: np.ndarray  # (3, 3)
     bin: np.ndarray  # (n,) of each body
     order: np.ndarray  # (n,) bodies by their bins
-    bin_first: np.ndarray  # (n + 2,) first place in `order` of each bin
+    bin_first: np.ndarray  # (n + 2,) first index in `order` of each bin
     bins: np.ndarray  # (3,) numbers of bins along the edges
     end: np.ndarray  # (n,)
     entries: np.ndarray  # (blocks, capacity)
@@ -99,7 +99,7 @@ class BodyPairsWorkspace(NamedTuple):
             Pass("reference points of bodies", _place_points, (self, into.state), blocks),
             Pass("whether the list is valid", _sort_points, (self, into.state, into.status)),
             Pass("pairs of bodies, if it is not", _list_pairs, (self, into.state), BLOCKS),
-            Pass("whether they have a place", _finish_list, (self, into.status)),
+            Pass("whether they fit in memory", _finish_list, (self, into.status)),
             Pass("forces of pairs of bodies", _add_pairs, plain, BLOCKS, FORCES_ONLY),
             Pass("forces and energies of pairs of bodies", _add_pairs, tallied, BLOCKS, TALLIED),
             Pass("sum forces on bodies", _sum_loads, (self, into.state, into.load), blocks),
@@ -343,8 +343,11 @@ def _list_pairs(arguments, block):
         for dx in range(-1 if bins[0] > 2 else 0, 2 if bins[0] > 1 else 1):
             for dy in range(-1 if bins[1] > 2 else 0, 2 if bins[1] > 1 else 1):
                 for dz in range(-1 if bins[2] > 2 else 0, 2 if bins[2] > 1 else 1):
-                    other = _beside(x, dx, bins[0], periodic), _beside(y, dy, bins[1], periodic)
-                    layer = _beside(z, dz, bins[2], periodic)
+                    other = (
+                        _neighbour_bin(x, dx, bins[0], periodic),
+                        _neighbour_bin(y, dy, bins[1], periodic),
+                    )
+                    layer = _neighbour_bin(z, dz, bins[2], periodic)
                     if kind < 0 or other[0] < 0 or other[1] < 0 or layer < 0:
                         continue
                     there = (other[0] * bins[1] + other[1]) * bins[2] + layer
@@ -375,8 +378,8 @@ def _list_pairs(arguments, block):
 
 
 @kernel(inline=True)
-def _beside(at, step, count, periodic):
-    """The bin beside one; -1 for none. Two bins are each other's neighbour once."""
+def _neighbour_bin(at, step, count, periodic):
+    """The neighbour of a bin; -1 for none. Two bins are each other's neighbour once."""
     other = at + step
     if periodic or count == 2:
         return other % count

@@ -351,14 +351,14 @@ def slopes_of(output: Traced, leaves: Sequence[Traced]) -> list[Any]:
             continue
         if node.kind == "where":
             condition, yes, no = node.parts
-            shares = [(yes, _where(condition, above, 0.0)), (no, _where(condition, 0.0, above))]
+            terms = [(yes, _where(condition, above, 0.0)), (no, _where(condition, 0.0, above))]
         else:
             factors = _SLOPES[node.kind](node, *node.inner)
-            shares = [
+            terms = [
                 (part, above * factor) for part, factor in zip(node.inner, factors, strict=True)
             ]
-        for part, share in shares:
-            slope[part.index] = slope.get(part.index, 0.0) + share
+        for part, term in terms:
+            slope[part.index] = slope.get(part.index, 0.0) + term
     return [slope.get(leaf.index, 0.0) for leaf in leaves]
 
 
@@ -376,14 +376,14 @@ def _in_order(outputs: Sequence[Traced], known: Container[int] = ()) -> list[Tra
 
 
 def code_of(
-    outputs: Sequence[Any], places: dict[int, str] | None = None
+    outputs: Sequence[Any], known: dict[int, str] | None = None
 ) -> tuple[list[str], list[str]]:
     """Lines that compute the nodes, and the text of each output, a node or a number.
 
-    places : text of the nodes that are not computed here
+    known : text of the nodes that are not computed here
     """
     nodes = [output for output in outputs if isinstance(output, Traced)]
-    names: dict[int, str] = dict(places or {})
+    names: dict[int, str] = dict(known or {})
     lines: list[str] = []
     for node in _in_order(nodes, names):
         if node.index in names:
@@ -437,7 +437,7 @@ class Hoisted:
             node.index: node for node in used if node.index in fixed and node.kind != "constant"
         }
         self._nodes = list(read.values())
-        self.places = {node.index: f"p[{k}]" for k, node in enumerate(self._nodes)}
+        self.positions = {node.index: f"p[{k}]" for k, node in enumerate(self._nodes)}
 
     def values(self, parameters: dict[str, float]) -> list[float]:
         """The numbers of a pair of kinds, from its parameters by name. Raises TraceError."""
