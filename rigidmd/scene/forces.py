@@ -162,8 +162,8 @@ class BodyForce(Section):
     orientations."""
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)] | None = None
-    """Name in the log; default: the name of the potential; with `module` also the name of the object in
-    it"""
+    """Name in the log; default: the name of the potential; with `module` also the name of the
+    object in it"""
     potential: Literal["gay_berne", "dipole", "quadrupole", "patch"] | None = None
     """gay_berne: ellipsoids; dipole, quadrupole: at a point; patch: spheres with an attractive
     patch"""

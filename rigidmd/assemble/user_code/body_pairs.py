@@ -69,12 +69,12 @@ def body_pair_potential(
         function(r, a, b) or function(r, a, b, p, q). r is the vector (3,) in Å between the
         reference points, from the first body to the second. a and b are their rotation matrices
         (3, 3) from the coordinates of the models' files to the lab, p and q their parameters. It
-        gives the energy in kJ/mol. Force and torques are derived from it, so that it may have arithmetic and
-        functions of NumPy such as numpy.exp and numpy.where, but no branches. Or it gives a tuple
-        of the energy, the force (3,) on the second body in kJ/mol/Å, and the torques (3,) on the
-        first and on the second body in kJ/mol, along the axes of the lab. An exchange of both
-        bodies must not change the energy. If their species differ, the one that is first in the
-        scene is a
+        gives the energy in kJ/mol. Force and torques are derived from it, so that it may have
+        arithmetic and functions of NumPy such as numpy.exp and numpy.where, but no branches. Or it
+        gives a tuple of the energy, the force (3,) on the second body in kJ/mol/Å, and the torques
+        (3,) on the first and on the second body in kJ/mol, along the axes of the lab. An exchange
+        of both bodies must not change the energy. If their species differ, the one that is first in
+        the scene is a
     parameters
         Species -> numbers by name, the attributes of p and q. It acts on these species
     species
