@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 Parameters = Mapping[str, float]
 Vector = tuple[float, float, float]
+#: In the log, for a function whose name says nothing or names a column.
+DEFAULT_NAME, UNNAMED = "body_pairs", ("", "<lambda>", "energy")
 #: The switch begins at this fraction of the cutoff.
 SWITCH_START = 0.9
 
@@ -125,7 +127,7 @@ def body_pair_potential(
         truncation=truncation,
         cutoff_A=cutoff_A,
         switch_start_A=switch_start_A,
-        name=name or ("body_pairs" if called in ("", "<lambda>") else called),
+        name=name or (DEFAULT_NAME if called in UNNAMED else called),
     )
 
 
