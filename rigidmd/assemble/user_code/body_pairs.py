@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Parameters = Mapping[str, float]
 Vector = tuple[float, float, float]
-#: In the log, for a function whose name says nothing or names a column.
+#: In the log, for a function without a name, or with the name of a column.
 DEFAULT_NAME, UNNAMED = "body_pairs", ("", "<lambda>", "energy")
 #: The switch begins at this fraction of the cutoff.
 SWITCH_START = 0.9
