@@ -83,7 +83,7 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
         return 0.0
     dt = PILOT_STEP / sqrt(fastest)
     if (motion := fastest_motion(system.species, max(stage.temperatures))) is not None:
-        dt = min(dt, motion.time)  # molecules that are apart at the start may collide
+        dt = min(dt, motion.time)  # molecules beyond their cutoff may collide later
     # Langevin's thermostat at a fifth of that rate brings any start to the temperature in the first
     # half of the run
     heat = {
