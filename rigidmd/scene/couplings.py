@@ -83,7 +83,7 @@ THERMOSTATS = {
     "velocity_rescaling": Coupling(
         "stochastic, one of translation and one of rotation, by Bussi et al.",
         "Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101",
-        {"thermostat_time_ps": 0.1},
+        {"thermostat_time_ps": 0.05},
     ),
     "langevin": Coupling(
         "friction and noise",
@@ -113,9 +113,7 @@ THERMOSTATS = {
         " step",
         "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216",
         {
-            "trajectory_steps": lambda stage: max(
-                1, round(TRAJECTORY_PS * 1000 / stage.timestep_fs)
-            ),
+            "trajectory_steps": lambda stage: max(1, round(TRAJECTORY_PS / stage.step)),
             "momentum_refreshment": 1.0,
         },
         on_molecules=True,
@@ -164,7 +162,7 @@ class ThermostatKeys(Section):
         + f". Default: {DEFAULT_THERMOSTAT}",
     )
     thermostat_time_ps: Positive | None = None
-    """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or
+    """Time constant of velocity_rescaling (default: 0.05 ps), period of nose_hoover (0.5 ps), or
     mean time between two collisions of a molecule with andersen (1 ps)"""
     friction_translation_per_ps: Positive | None = None
     """Friction of langevin on translation; default: 1"""
