@@ -194,35 +194,21 @@ def test_the_figure_of_a_run_has_one_time_axis_and_stages_that_can_be_read(stage
     assert all(frame.contains(*corner) for box in boxes for corner in box.corners())
     titles = [axis.get_title(loc="left").replace("\n", " ") for axis in drifts]
     assert [title.split(":")[0] for title in titles] == [STAGES[k] for k in (1, 2, 3, 5)]
-    assert all("drift +0.1\N{NO-BREAK SPACE}±" in title for title in titles)
-
-
-def boxes_of_texts(figure):
-    """The boxes of all texts of a figure, by text."""
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    figure.draw(renderer)
-    texts = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
-    found = {}
-    for text in texts:
-        box = text.get_window_extent(renderer)
-        found.setdefault((text.get_text(), tuple(box.bounds)), box)
-    return found
+    assert all("drift +0.1" in title for title in titles)
 
 
 def test_texts_of_energies_are_inside_the_figure_and_do_not_overlap(staged):
     figure = energy_figure(*staged)
-    boxes = {name: box for (name, _), box in boxes_of_texts(figure).items()}
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw(renderer)
+    words = [text for text in figure.findobj(Text) if any(map(str.isalpha, text.get_text()))]
+    boxes = {text.get_text(): text.get_window_extent(renderer) for text in words}
+    assert len(boxes) > 10
     for box in boxes.values():
-        assert box.x0 >= 0
-        assert box.y0 >= 0
+        assert min(box.x0, box.y0) >= 0
         assert box.x1 <= figure.bbox.x1
         assert box.y1 <= figure.bbox.y1
-    words = {name: box for name, box in boxes.items() if any(map(str.isalpha, name))}
-    assert not [
-        (one, other)
-        for (one, box), (other, second) in combinations(words.items(), 2)
-        if box.overlaps(second)
-    ]
+    assert not [pair for pair in combinations(boxes, 2) if boxes[pair[0]].overlaps(boxes[pair[1]])]
 
 
 def test_each_stage_has_its_drift_on_its_own_scale(staged):

@@ -160,15 +160,15 @@ def test_scenes_and_results_show_tables_and_a_figure(tmp_path):
     water = Scene.read(ROOT / "systems" / "water.toml")._repr_html_()
     for part in (
         "216 spce: asymmetric, planar",
-        "0.997 g/cm³",
-        "particle mesh Ewald",
+        "0.9970 g/cm³",
+        "coulomb reciprocal: pme",
         "production: 20000 steps of 1 fs = 20 ps",
     ):
         assert part in water
     body = Scene.read(TOP)._repr_html_()
     for part in (
         "symmetric, pinned, 0.15 kg",
-        "0.000306, 0.000306, 0.00012 kg m²",
+        "0.000306 0.000306 0.00012 kg m²",
         "gravity",
         "kahan_li_8",
     ):

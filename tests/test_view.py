@@ -42,6 +42,7 @@ in_browser = pytest.mark.skipif(
 )
 SHORT_WATER = {
     "stages.equilibration.duration_ps": 0.02,
+    "stages.equilibration.timestep_fs": 2.0,
     "stages.production.duration_ps": 0.02,
     "output.trajectory_interval_ps": 0.01,
     "output.log_interval_ps": 0.004,

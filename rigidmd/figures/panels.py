@@ -74,7 +74,7 @@ class Timeline(NamedTuple):
     time: np.ndarray  # (t,)
     stage: np.ndarray  # (t,) indices
     unit: str
-    names: Sequence[str] = ()  # of the stages
+    names: tuple[str, ...] = ()  # of the stages
 
     @property
     def starts(self) -> list[tuple[float, str]]:
@@ -96,7 +96,8 @@ def timeline(system: System | BodySystem, columns: Mapping[str, np.ndarray]) -> 
         return Timeline(np.ones(len(time), bool), time, np.zeros(len(time), int), "s")
     stages, stage = system.scene.stages, columns["stage"].astype(int)
     shown = moving(stages, stage)
-    return Timeline(shown, time[shown], stage[shown], "ps", [stage.label for stage in stages])
+    names = tuple(stage.label for stage in stages)
+    return Timeline(shown, time[shown], stage[shown], "ps", names)
 
 
 def panels(system: System | BodySystem, columns: Mapping[str, np.ndarray]) -> list[Panel]:
@@ -110,7 +111,7 @@ def molecular_panels(system: System, columns: Mapping[str, np.ndarray]) -> list[
     count = len(system.model.species)
     shown = moving(system.scene.stages, columns["stage"])
 
-    def panel(title: str, per: int = 1, **labels: str) -> list[Panel]:
+    def panel(title: str, labels: dict[str, str], per: int = 1) -> list[Panel]:
         curves = [
             (label, columns[name] / per)
             for name, label in labels.items()
@@ -120,13 +121,13 @@ def molecular_panels(system: System, columns: Mapping[str, np.ndarray]) -> list[
 
     per_molecule = "(kJ/mol per molecule)"
     temperatures = {"temperature_translation": "translation", "temperature_rotation": "rotation"}
-    found = panel("temperature (K)", **temperatures)
-    found += panel(f"potential energy {per_molecule}", count, potential="")
-    found += panel(f"conserved energy since its stage began {per_molecule}", count, drift="")
-    found += panel("pressure (bar)", pressure_bar="")
+    found = panel("temperature (K)", temperatures)
+    found += panel(f"potential energy {per_molecule}", {"potential": ""}, count)
+    found += panel(f"conserved energy since its stage began {per_molecule}", {"drift": ""}, count)
+    found += panel("pressure (bar)", {"pressure_bar": ""})
     if "density" in columns and np.ptp(np.nan_to_num(columns["density"])) > 0:
-        found += panel("density (g/cm³)", density="")
-        found += panel("edges of the box (Å)", a="a", b="b", c="c")
+        found += panel("density (g/cm³)", {"density": ""})
+        found += panel("edges of the box (Å)", {edge: edge for edge in "abc"})
     return found
 
 

@@ -3,6 +3,7 @@ slow to import."""
 
 import io
 from collections.abc import Iterator
+from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.artist import Artist
@@ -44,10 +45,11 @@ class Picture(Figure):
     def data(self, kind: str, dpi: float, hashsalt: str = "rigidmd", **settings: str) -> bytes:
         """The bytes of a file of this type, which are the same for the same figure. settings : of
         an .svg"""
-        stream, options = io.BytesIO(), {"dpi": dpi}
+        stream = io.BytesIO()
+        options: dict[str, Any] = {"dpi": dpi}
         if kind == "svg":
             options = {"dpi": SVG_DPI, "metadata": {"Date": None, "Creator": None}}
-        changed = {f"svg.{name}": value for name, value in settings.items()}
+        changed: dict[Any, str] = {f"svg.{name}": value for name, value in settings.items()}
         # Matplotlib has one set of settings for all threads
         with PROCESS_LOCK, rc_context(changed | {"svg.hashsalt": hashsalt}):
             self.savefig(stream, format=kind, **options)

@@ -18,6 +18,7 @@ from rigidmd.errors import OutputError
 from rigidmd.figures.panels import draw_rows, panels, timeline
 from rigidmd.figures.style import COLORS, INK, WARM, new_figure
 from rigidmd.run.record import Record, read_record
+from rigidmd.scene.validation import not_none
 from rigidmd.view.run_page import animation_of
 
 EXTENSIONS = (".mp4", ".gif")
@@ -146,9 +147,11 @@ def _write_gif(path: Path, frames: Iterator[np.ndarray], most: float) -> None:
     colors = Image.fromarray(some).quantize(GIF_COLORS).getpalette()
     palette = Image.new("P", (1, 1))
     palette.putpalette(
-        bytes(colors or ()) + bytes.fromhex("".join((*COLORS, "#ffffff")).replace("#", ""))
+        bytes(colors or ()) + bytes.fromhex("".join(COLORS).replace("#", "") + "ffffff")
     )
-    quantized = [Image.fromarray(x).quantize(palette=palette, dither=0) for x in pictures]
+    quantized = [
+        Image.fromarray(x).quantize(palette=palette, dither=Image.Dither.NONE) for x in pictures
+    ]
     for step in GIF_STEPS:
         first, *others = quantized[::step]
         options = {"duration": round(1000 * step / RATE[".gif"]), "loop": 0, "optimize": True}
@@ -165,6 +168,6 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray]) -> None:
     command = [str(ffmpeg()), "-loglevel", "error", "-y", *source, "-i", "-", *target]
     with subprocess.Popen(command, stdin=subprocess.PIPE) as program:
         for frame in chain([first], frames):
-            program.stdin.write(frame.tobytes())
+            not_none(program.stdin).write(frame.tobytes())
     if program.returncode:
         raise OSError(f"ffmpeg ended with exit code {program.returncode}")

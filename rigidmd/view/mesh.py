@@ -183,7 +183,7 @@ def _cut(mesh: Mesh) -> Mesh:
     """The same surface with its faces of four corners in 16 pieces. Faces are drawn from the
     furthest to the nearest, which is right where solids meet only if they are short."""
     order = sorted(range(len(mesh.faces)), key=lambda k: len(mesh.faces[k]) == 4)
-    faces, painted = ([values[k] for k in order] for values in (mesh.faces, mesh.painted))
+    faces, painted = [mesh.faces[k] for k in order], [mesh.painted[k] for k in order]
     count = sum(len(face) == 4 for face in faces)
     corners = mesh.vertices[faces[-count:]]
     for _ in range(2):

@@ -222,7 +222,7 @@ def _bonds(view: View, m: Molecule, radius: np.ndarray) -> list[np.ndarray]:
         for color, width in (("#8f949b", 7.0), ("#c9cdd2", 4.0)):
             style = {"color": color, "lw": width, "solid_capstyle": "butt"}
             view.axis.plot(*flat.T, **style, zorder=order)
-        taken += [*np.linspace(*flat, 12)]
+        taken += [*np.linspace(flat[0], flat[1], 12)]
     return taken
 
 

@@ -10,6 +10,7 @@ import json
 import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -153,9 +154,8 @@ def _margins(record: Record) -> str:
     """Time steps compared with the longest stable ones."""
     summary, rows = record.summary or {}, []
     unit = "s" if record.is_body else "fs"
-    stages = (
-        [{"name": record.scene.name} | summary] if record.is_body else summary.get("stages", ())
-    )
+    whole: list[dict[str, Any]] = [{"name": record.scene.name} | summary]
+    stages = whole if record.is_body else summary.get("stages", ())
     for stage in stages:
         step, stable = stage.get(f"timestep_{unit}"), stage.get(f"stable_timestep_{unit}")
         if step and stable:
