@@ -56,12 +56,12 @@ class Panel(NamedTuple):
         return max(1, int(width / (0.45 + LETTER * longest)))
 
     def head(self, width: float) -> tuple[list[str], int]:
-        """Lines of the title above an axis of this width, and the number of those of the legend."""
+        """Lines of the title above an axis of this width, and the number of rows of the legend."""
         labels = sum(bool(label) for label, _ in self.curves)
         rows = -(-labels // self.columns(width)) if labels > 1 else 0
         return wrap(self.title, int(width / LETTER)), rows
 
-    def room(self, width: float) -> float:
+    def margin_above(self, width: float) -> float:
         """Inches above an axis of this width."""
         lines, rows = self.head(width)
         return LINE * (len(lines) + rows) + 0.12
@@ -243,7 +243,8 @@ def draw_rows(
     size = np.tile(figure.get_size_inches(), 2)
     widths = [(right - left) / len(row) - LEFT - RIGHT for row in rows]
     heads = [
-        max(panel.room(width) for _, panel in row) for row, width in zip(rows, widths, strict=True)
+        max(panel.margin_above(width) for _, panel in row)
+        for row, width in zip(rows, widths, strict=True)
     ]
     # numbers below the last row, and below rows whose axes end elsewhere
     feet = [GAP if len(row) == 1 else NUMBERS for row in rows[:-1]] + [FOOT]
@@ -299,9 +300,9 @@ def _label_stages(axis: Any, starts: Sequence[tuple[float, str]], width: float) 
         if row == MOST_ROWS:
             continue
         ends[row : row + 1] = [begin + length]
-        place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "va": "top"}
+        where = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "va": "top"}
         offset, side = (-4, "right") if before else (4, "left")
         text = {"fontsize": 8, "color": FAINT, "ha": side}
-        axis.annotate(label, (start, 1), (offset, -2 - 10 * row), **place, **text)
+        axis.annotate(label, (start, 1), (offset, -2 - 10 * row), **where, **text)
     low, high = axis.get_ylim()
     axis.set_ylim(low, high + 0.1 * len(ends) * (high - low))

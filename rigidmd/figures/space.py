@@ -227,8 +227,8 @@ class View:
         """Draw a bar of this length with its label in the lower right corner."""
         x, y = self.centre + 0.95 * self.half * [1, -1]
         self.axis.plot([x - length, x], [y, y], color=INK, lw=2, solid_capstyle="butt", zorder=4)
-        place = {"textcoords": "offset points", "ha": "right", "va": "bottom"}
-        self.axis.annotate(label, (x, y), (0, 3), color=INK, fontsize=10, zorder=4, **place)
+        where = {"textcoords": "offset points", "ha": "right", "va": "bottom"}
+        self.axis.annotate(label, (x, y), (0, 3), color=INK, fontsize=10, zorder=4, **where)
 
     def box(self, corners: np.ndarray) -> None:
         """Draw the edges of a box of eight corners (8, 3) in binary order; those at the furthest

@@ -15,6 +15,8 @@ from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
 
 #: Corners of a circle; least thickness of a body, as a fraction of its reach.
 CIRCLE_CORNERS, MIN_THICKNESS = 24, 0.02
+#: Longest side of a face of joined solids, as a fraction of the body's reach.
+LONGEST_FACE = 0.15
 #: Edges of a cuboid in half axes of the ellipsoid of the same inertia; thickness of a stem in its
 #: length.
 CUBOID_EDGES, STEM_THICKNESS = (12 / 5) ** 0.5, 0.06
@@ -180,22 +182,29 @@ def _joined(parts: list[Mesh], about: str) -> Mesh:
 
 
 def _cut(mesh: Mesh) -> Mesh:
-    """The same surface with its faces of four corners in 16 pieces. Faces are drawn from the
-    furthest to the nearest, which is right where solids meet only if they are short."""
-    order = sorted(range(len(mesh.faces)), key=lambda k: len(mesh.faces[k]) == 4)
-    faces, painted = [mesh.faces[k] for k in order], [mesh.painted[k] for k in order]
-    count = sum(len(face) == 4 for face in faces)
-    corners = mesh.vertices[faces[-count:]]
-    for _ in range(2):
-        middles = (corners + np.roll(corners, -1, axis=1)) / 2
-        centre = np.broadcast_to(corners.mean(axis=1, keepdims=True), corners.shape)
-        pieces = [corners, middles, centre, np.roll(middles, 1, axis=1)]
-        corners = np.stack(pieces, axis=2).reshape(-1, 4, 3)
-    vertices, places = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    faces[-count:] = (len(mesh.vertices) + places.reshape(-1, 4)).tolist()
-    painted[-count:] = np.repeat(painted[-count:], 16).tolist()
-    vertices = np.vstack([mesh.vertices, vertices])
-    return mesh._replace(vertices=vertices, faces=faces, painted=painted)
+    """The same surface with long faces of four corners in pieces. Faces are drawn from the furthest
+    to the nearest, which is right where solids meet only if they are short."""
+    longest = LONGEST_FACE * mesh.reach
+    vertices, faces, painted = [*mesh.vertices], [], []
+    for face, color in zip(mesh.faces, mesh.painted, strict=True):
+        corners = mesh.vertices[face]
+        sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+        along, across = (max(1, int(np.ceil(max(sides[k::2]) / longest))) for k in (0, 1))
+        if len(face) != 4 or along * across == 1:
+            faces.append(face)
+            painted.append(color)
+            continue
+        u, v = np.meshgrid(
+            np.linspace(0, 1, along + 1), np.linspace(0, 1, across + 1), indexing="ij"
+        )
+        weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=-1)
+        first, row = len(vertices), across + 1
+        vertices += [*(weights @ corners).reshape(-1, 3)]
+        for i, j in product(range(along), range(across)):
+            corner = first + row * i + j
+            faces.append([corner, corner + row, corner + row + 1, corner + 1])
+            painted.append(color)
+    return mesh._replace(vertices=np.array(vertices), faces=faces, painted=painted)
 
 
 def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:

@@ -243,7 +243,7 @@ def _axes(view: View, m: Molecule) -> list[np.ndarray]:
 
 
 def _labels(view: View, m: Molecule, radius: np.ndarray, taken: list[np.ndarray]) -> None:
-    """Draw names and charges at the first free place, from outward on."""
+    """Draw names and charges at the first free position, from outward on."""
     centres, half = view.flat(m.positions_body), view.half.max()
     height = FONT * 1.25 / 72 * 2 * half / (INCHES * 0.96)
     points, inner = np.array(taken).reshape(-1, 2), 0.8 * radius[:, None]

@@ -159,7 +159,7 @@ def show(results: Results) -> AnimationPage:
     Raises
     ------
     ImportError
-        Of molecules, without chemiscope.
+        For molecules, without chemiscope.
     ValueError
         Without a trajectory.
     """

@@ -77,9 +77,9 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
     """The parts of the page, as HTML. animation : HTML with the plots"""
     lines = describe(record.scene, user_code=False).splitlines()  # the output of `rigidmd check`
     known = {line.strip() for line in lines}
-    said = [note for note in (record.summary or {}).get("notes", ()) if note not in known]
+    warnings = [note for note in (record.summary or {}).get("notes", ()) if note not in known]
     yield f'<p class="faint">{html.escape(record.scene.in_short)}</p>'
-    yield notes([*record.missing, *said])
+    yield notes([*record.missing, *warnings])
     yield animation
     if record.is_body:
         yield section("Results", _body_table(record))

@@ -337,7 +337,10 @@ def write_accuracy(folder: Path, measured: IntegratorAccuracy, command: str) -> 
 def _label_steps(axis, points: list[tuple[float, float, float]], unit: str) -> None:
     """Label points (time, error, step) in this order, each that is far enough from those labelled
     before."""
-    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    left, right = axis.get_xlim()
+    left *= (left / right) ** LABEL[0]  # space for the label of the first point
+    axis.set_xlim(left, right)
+    low, high = axis.get_ylim()
     size = np.array([np.log(right / left), np.log(high / low)])
     labelled = np.empty((0, 2))
     for time, error, step in points:
