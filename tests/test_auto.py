@@ -305,7 +305,9 @@ def test_check_says_that_it_is_open(capsys):
         "--set",
         "stages.production.energy_error_kT=1e-4",
     ]
-    assert main(["check", water, *more, "--set", "stages.production.timestep_fs=2.0"]) == 0
+    assert main(["check", water, *more]) == 2
+    assert "timestep_fs" in capsys.readouterr().err
+    assert main(["check", water, *more, "--set", "stages.production.timestep_fs="]) == 0
     assert (
         "integrator and step chosen at its start for an error of 0.0001 kT"
         in capsys.readouterr().out
@@ -419,3 +421,18 @@ def test_a_chosen_step_of_a_body_fits_its_duration_and_samples(
     assert found == pytest.approx(wanted, rel=1e-12)
     assert round(duration / found) * found == pytest.approx(duration, rel=1e-12)
     assert found <= timestep * (1 + 1e-9)
+
+
+def test_the_step_of_a_dilute_gas_resolves_collisions():
+    """Argon atoms beyond their cutoff at the start hardly interact: the mean frequency is that of
+    no collision."""
+    stage = {
+        "ensemble": "nvt",
+        "temperature_K": 90.0,
+        "duration_ps": 1.0,
+        "integrator": "auto",
+        "bias_kT": 1e-2,
+    }
+    gas = {"stages": [stage], "forces": {"cutoff_A": 6.2}}
+    found = Simulation(small_scene({"argon": 27}, 19.0, **gas), warn=str).run()
+    assert 2 <= found.summary["stages"][0]["timestep_fs"] < 60

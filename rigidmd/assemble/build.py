@@ -134,7 +134,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
             raise SceneError(
                 scene.source, [missing_user_code(scene.from_python, scene.user_code.names)]
             )
-        if scene.forces.custom or scene.from_python:
+        if scene.forces.added or scene.from_python:
             from rigidmd.assemble.user_code.binding import with_user_code
 
             system = with_user_code(system)

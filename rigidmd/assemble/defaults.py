@@ -175,7 +175,7 @@ def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
         return "forces.lennard_jones is false"
     if forces.dispersion != "cutoff":
         return f"forces.dispersion = {forces.dispersion!r} sums over all images"
-    if forces.custom or scene.user_code.forces:
+    if forces.added or scene.user_code.forces:
         return "a user's potential may end at its cutoff or fall too slowly for one"
     if scene.engine.is_external and any(stage.has_barostat for stage in scene.stages):
         return f"the barostat of {scene.engine.name} does not include it"

@@ -152,7 +152,7 @@ def _bias_per_error(stage: Stage) -> float:
 def _default_step(scene: MolecularScene, stage: Stage, fastest: FastMotion | None) -> float:
     """The default time step of a stage, fs: a round number that divides its intervals, if there is
     one between the longest allowed step and half of it."""
-    if fastest is None or scene.forces.custom or scene.from_python:
+    if fastest is None or scene.forces.added or scene.from_python:
         return USUAL_STEP
     error = DEFAULT_ERROR
     if stage.has_thermostat and not (stage.is_hybrid or scene.engine.is_external):

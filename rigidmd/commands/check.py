@@ -86,7 +86,7 @@ def _print_profile(scene: Any) -> None:
     stages = [
         k for k, stage in enumerate(scene.stages) if not stage.is_minimisation and not stage.is_auto
     ]
-    if not stages or scene.forces.custom:
+    if not stages or scene.forces.added:
         problem = "--profile needs a stage with a time step, and forces that are not user-defined"
         raise SceneError(scene.source, [problem])
     simulation = Simulation(scene)

@@ -23,6 +23,7 @@ from rigidmd.engines.samples import (
 )
 from rigidmd.engines.system import System
 from rigidmd.run.body_rates import body_rates
+from rigidmd.scene.couplings import THERMOSTATS
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
@@ -327,9 +328,9 @@ def drift_of_thermostats(system: System, of_stage: Samples, k: int) -> tuple[flo
     See "Temperatures" in the theory chapter `errors`.
     """
     stage, freedom = system.scene.stages[k], system.freedom_in(k)
-    if stage.thermostat_kind != "velocity_rescaling" or not (
-        stage.has_thermostat and freedom.translation and freedom.rotation
-    ):
+    if not (stage.has_thermostat and freedom.translation and freedom.rotation):
+        return 0.0, 0.0
+    if not THERMOSTATS[stage.thermostat_kind].by_motion:
         return 0.0, 0.0
     from rigidmd.assemble.build import integrator_of_stage  # not for single bodies
 

@@ -34,6 +34,9 @@ class Coupling(NamedTuple):
     #: the values of its keys.
     on_molecules: bool = False
     in_trajectories: bool = False  # whether steps are accepted or rejected together
+    #: Whether translation and rotation each have a thermostat, which relaxes their kinetic energy
+    #: to its mean in the time constant.
+    by_motion: bool = False
     time: Callable[[Values], float] = lambda values: values["thermostat_time_ps"]
     description: Callable[[Values], str] = lambda values: f"{values['thermostat_time_ps']:g} ps"
     #: Whether its time constant is the period of an oscillation, which steps have to resolve, or
@@ -84,6 +87,7 @@ THERMOSTATS = {
         "stochastic, one of translation and one of rotation, by Bussi et al.",
         "Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101",
         {"thermostat_time_ps": 0.05},
+        by_motion=True,
     ),
     "langevin": Coupling(
         "friction and noise",

@@ -274,8 +274,8 @@ class MolecularScene(Scene):
         names["structure.topology"] = self.topology
         for k, species in enumerate(self.molecules):
             names |= {f"molecules.{k}.{key}": getattr(species, key) for key in SPECIES_FILES}
-        for k, force in enumerate(self.forces.custom):
-            names |= {f"forces.custom.{k}.{key}": getattr(force, key) for key in FORCE_FILES}
+        for where, force in self.forces.added.items():
+            names |= {f"{where}.{key}": getattr(force, key, None) for key in FORCE_FILES}
         return {key: self.path(name) for key, name in names.items() if name is not None}
 
     @property

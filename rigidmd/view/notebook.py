@@ -44,7 +44,7 @@ STYLE = read_asset("notebook.css")
 def scene_html(scene: Scene) -> str:
     kind = "one rigid body" if isinstance(scene, BodyScene) else "rigid molecules"
     try:
-        text = code(describe(cast("MolecularScene | BodyScene", scene)))
+        text = code(describe(cast("MolecularScene | BodyScene", scene), user_code=False))
     except InputError as error:
         text = f"<p>{html.escape(scene.in_short)}</p>{items(error.errors)}"
     return framed(scene.name, kind, text)

@@ -8,7 +8,7 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from rigidmd.assemble.build import integrator_of_stage
-from rigidmd.assemble.time_step import stable_angle
+from rigidmd.assemble.time_step import fastest_motion, stable_angle
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, State
 from rigidmd.dynamics.hybrid_monte_carlo import CHANCES, ENDED
@@ -28,6 +28,9 @@ UNBIASED, BIAS = "baoab", 1 / 24
 #: Step and length of the pilot run, in radians of the faster mean motion, translation or rotation;
 #: its samples.
 PILOT_STEP, PILOT_RADIANS, PILOT_SAMPLES = 0.15, 50.0, 25
+#: Where the mean (w t)² of the fastest motion of a liquid, of time t, is below this, molecules
+#: collide seldom: the stiffest motion is then the one in a collision, as fast as in a liquid.
+GAS = 0.01
 #: Longest step, as a fraction of the longest stable step: beyond it higher orders than dt² matter.
 MAX_STABLE_FRACTION = 0.5
 
@@ -47,6 +50,9 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     decided = stage.with_integrator(UNBIASED, stage.step_fs)
     if rate > 0:
         stable = stable_angle(decided.scheme) / stiffest.rate if stiffest else inf
+        fastest = fastest_motion(system.species, max(stage.temperatures))
+        if fastest is not None and rate * fastest.time**2 < GAS:
+            stable = min(stable, fastest.longest_step(decided))
         longest = min(sqrt(target / (BIAS * rate)), MAX_STABLE_FRACTION * stable, stage.duration)
         decided = stage.with_integrator(UNBIASED, round_down(longest / FEMTOSECOND))
     return decided.with_defaults, (
@@ -76,6 +82,8 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
     if not isfinite(fastest) or fastest <= 0:
         return 0.0
     dt = PILOT_STEP / sqrt(fastest)
+    if (motion := fastest_motion(system.species, max(stage.temperatures))) is not None:
+        dt = min(dt, motion.time)  # molecules beyond their cutoff may collide later
     # Langevin's thermostat at a fifth of that rate brings any start to the temperature in the first
     # half of the run
     heat = {
