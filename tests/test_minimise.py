@@ -19,6 +19,7 @@ from rigidmd.core.state import NOW, State, state_of
 from rigidmd.dynamics.model import mobile
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
+from rigidmd.figures.panels import panels
 from rigidmd.io.trajectory import read_frames
 from rigidmd.run import Every, Simulation
 from rigidmd.run import minimise as minimise_module
@@ -30,7 +31,6 @@ from rigidmd.scene import Scene
 from rigidmd.scene.models import load_model
 from rigidmd.studies.accuracy.accuracy import measure_accuracy
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
-from rigidmd.view.plots import panels
 from rigidmd.view.run_page import write_report
 
 MIXTURE = {"argon": 4, "nitrogen": 4, "spce": 6}
@@ -726,7 +726,7 @@ def test_a_minimum_alone_has_one_frame(tmp_path):
     assert u.atoms.positions == pytest.approx(results.state.position, abs=6e-3)
     write_report(tmp_path / "out", tmp_path / "report.html")
     record = read_record(tmp_path / "out")
-    assert panels(record) == []
+    assert panels(record.system, record.columns) == []
     assert not record.moving.any()
 
 

@@ -272,7 +272,7 @@ HOVER = {
     "results.universe()": "Universe",
     "results.state": "State",
     "rigidmd.view.plot(results)": "Picture",
-    "rigidmd.view.show(results)": "StructureWidget | AnimationPage",
+    "rigidmd.view.show(results)": "AnimationPage",
     "results.atoms()": "Atoms",
     "results.atoms(slice(3))": "list[Atoms]",
     'rigidmd.scene_from_atoms(results.atoms(), ["spce"], seed=3)': "MolecularScene",

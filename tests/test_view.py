@@ -22,9 +22,12 @@ from rigidmd.commands import cli
 from rigidmd.formats.bonds import connections
 from rigidmd.mechanics.inertia import SOLIDS, shifted_inertia, solid
 from rigidmd.run.record import read_record
+from rigidmd.view import animation as film
 from rigidmd.view import molecule_animation
 from rigidmd.view.animation import write_film
 from rigidmd.view.mesh import UNITS, mesh_of
+from rigidmd.view.plots import plots_part
+from rigidmd.view.run_page import write_report
 
 CHROMIUM = next(
     (
@@ -39,6 +42,7 @@ in_browser = pytest.mark.skipif(
 )
 SHORT_WATER = {
     "stages.equilibration.duration_ps": 0.02,
+    "stages.equilibration.timestep_fs": 2.0,
     "stages.production.duration_ps": 0.02,
     "output.trajectory_interval_ps": 0.01,
     "output.log_interval_ps": 0.004,
@@ -319,9 +323,43 @@ def test_a_film_moves(kind, request, tmp_path, capsys):
     assert "0.3 s of animation" in capsys.readouterr().out
 
 
-def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
-    from rigidmd.view import animation as film
+def test_a_gif_is_small(top, tmp_path):
+    """By default: the page of a run that shows it loads in a moment."""
+    path, _ = write_film(top, tmp_path / "film.gif", 3.0)
+    assert len(frames_in(path)) == 38
+    assert path.stat().st_size < 200_000  # 10 s are below 500 kB
 
+
+def test_a_gif_that_is_too_large_has_fewer_frames(top, tmp_path, monkeypatch):
+    monkeypatch.setattr(film, "GIF_BYTES", 20_000)
+    path, _ = write_film(top, tmp_path / "film.gif", 0.5)
+    with Image.open(path) as picture:
+        assert picture.n_frames == 2
+        assert picture.info["duration"] == 240  # as long as with all six
+
+
+def test_gifs_of_the_documentation_are_small():
+    gifs = [*(ROOT / "rigidmd" / "docs").rglob("*.gif")]
+    assert gifs
+    assert {path.name: path.stat().st_size for path in gifs if path.stat().st_size > 500_000} == {}
+
+
+@pytest.mark.parametrize("run", ["top", "water"])
+def test_time_axes_of_plots_are_aligned(run, request):
+    text = plots_part(read_record(request.getfixturevalue(run)))
+    boxes = re.findall(r'data-box="(\S+) (\S+) (\S+) (\S+)"', text)
+    assert len(boxes) >= 4
+    assert len({box[:2] for box in boxes}) == 1  # their left and right ends
+    assert all(0 < float(top) < float(bottom) < 1 for _, _, top, bottom in boxes)
+
+
+def test_notes_that_a_page_has_elsewhere_are_no_warnings(water, tmp_path):
+    write_report(water, tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text("utf-8")
+    assert text.count("pme: alpha") == 1  # in the description of the system
+
+
+def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(film.shutil, "which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # not installed
     assert film.default_name() == "film.gif"

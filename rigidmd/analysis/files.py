@@ -87,7 +87,8 @@ def write_results(
         write_csv(folder / f"{curve.file}.csv", [list(columns), *lines], csv.QUOTE_NONNUMERIC)
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
     for curve in curves:
-        write_figure(folder / f"{curve.file}.{figures}", partial(curve_figure, curve))
+        title = f"{folder.absolute().name}: {curve.file.replace('_', ' ')}"
+        write_figure(folder / f"{curve.file}.{figures}", partial(curve_figure, curve), title)
         for other in (
             {f"{curve.file}.{kind}" for kind in FIGURES} & owner.keys() & {*marked} - new.keys()
         ):

@@ -1,7 +1,7 @@
 """`rigidmd accuracy`: the errors and run times of integrators at several time steps, from the start
 of a scene; as a table, recommendations, accuracy.csv, .png and a self-contained page."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from math import inf
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
 from rigidmd.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
-from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
+from rigidmd.view.page import chips, code, items, section, table, wide, write_page
 
 #: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body
 #: also solvers.
@@ -147,6 +147,7 @@ def _method_name(name: str, scene: MolecularScene | BodyScene) -> str:
 
 
 FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")
+LABEL = (0.14, 0.045)  # width and height of the label of a step, as fractions of an axis
 DOUBTFUL = 0.2  # spread of repeated timings that causes a warning
 
 
@@ -329,21 +330,24 @@ def write_accuracy(folder: Path, measured: IntegratorAccuracy, command: str) -> 
     trial_table(measured).write(folder / FILES[0])
     title = f"{measured.trial_system.name}: error against run time"
     write_figure(folder / FILES[1], lambda: accuracy_figure(measured), title)
-    write_page(folder / FILES[2], lambda: accuracy_page(measured, command))
+    write_page(folder / FILES[2], title, _page_parts(measured, command))
     return [folder / name for name in FILES if (folder / name).is_file()]
 
 
-def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
-    """Label points (time, error, step) in this order, each that is far enough from the one labelled
+def _label_steps(axis, points: list[tuple[float, float, float]], unit: str) -> None:
+    """Label points (time, error, step) in this order, each that is far enough from those labelled
     before."""
-    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    left, right = axis.get_xlim()
+    left *= (left / right) ** LABEL[0]  # space for the label of the first point
+    axis.set_xlim(left, right)
+    low, high = axis.get_ylim()
     size = np.array([np.log(right / left), np.log(high / low)])
-    before = np.full(2, np.inf)
+    labelled = np.empty((0, 2))
     for time, error, step in points:
         at = np.log([time, error]) / size
-        if (np.abs(at - before) > [0.06, 0.04]).any():
+        if (np.abs(at - labelled) > LABEL).any(axis=1).all():
             axis.annotate(
-                f"{step:.2g}",
+                f"{step:.2g} {unit}",
                 (time, error),
                 xytext=(-6, -6),
                 textcoords="offset points",
@@ -352,7 +356,7 @@ def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
                 ha="right",
                 va="top",
             )
-            before = at
+            labelled = np.vstack([labelled, at])
 
 
 def accuracy_figure(measured: IntegratorAccuracy):
@@ -392,12 +396,13 @@ def accuracy_figure(measured: IntegratorAccuracy):
             "mfc": "none",
             "mec": INK,
             "mew": 0.8,
-            "label": f"best, with its step ({s.time_unit})",
+            "label": "best, with its step",
         }
         axis.loglog(
             [t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring
         )
-        _label_steps(axis, [(t.time / s.span, getattr(t, error), t.timestep) for t in front])
+        points = [(t.time / s.span, getattr(t, error), t.timestep) for t in front]
+        _label_steps(axis, points, s.time_unit)
         axis.set_title(title, loc="left", fontsize=9, color=INK)
         open_axis(axis, which="both")
         label_minor_ticks(axis.xaxis)
@@ -406,11 +411,10 @@ def accuracy_figure(measured: IntegratorAccuracy):
     left.axhline(measured.reference_error, color=FAINT, lw=0.8, ls=":")
     left.annotate(
         "error of the reference",
-        (1, measured.reference_error),
+        (0.01, measured.reference_error),
         xycoords=("axes fraction", "data"),
         fontsize=8,
         color=FAINT,
-        ha="right",
         va="bottom",
     )
     right.legend(
@@ -424,25 +428,17 @@ def accuracy_figure(measured: IntegratorAccuracy):
     return figure
 
 
-def accuracy_page(measured: IntegratorAccuracy, command: str) -> str:
-    colored = chips(list(dict.fromkeys(t.integrator for t in measured.trials)))
+def _page_parts(measured: IntegratorAccuracy, command: str) -> Iterator[str]:
+    colored = chips(dict.fromkeys(t.integrator for t in measured.trials))
     titles = [
-        f"for, over {_span(measured)}",
-        "the cheapest is",
+        f"error over {_span(measured)}",
+        "least run time",
         "gain",
         "as fast within the spread of the timings",
     ]
-    parts = [
-        section(
-            "Recommendations",
-            table(titles, cheapest(measured), words=True),
-            items(remarks(measured)),
-        ),
-        section(
-            "Error against run time",
-            wide(accuracy_figure(measured), "accuracy", "log error over log run time"),
-        ),
-        section("All trials", table(*trial_table(measured).shown(), marked=colored)),
-        section("How to repeat it", code(command)),
-    ]
-    return page(f"{measured.trial_system.name}: error against run time", parts)
+    advice = table(titles, cheapest(measured), words=True)
+    drawn = wide(accuracy_figure(measured), "accuracy", "log error over log run time")
+    yield section("Recommendations", advice, items(remarks(measured)))
+    yield section("Error against run time", drawn)
+    yield section("All trials", table(*trial_table(measured).shown(), marked=colored))
+    yield section("How to repeat it", code(command))

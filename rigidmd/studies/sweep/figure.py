@@ -148,7 +148,8 @@ def draw_table(table: Table, columns: list[str], connected: bool = True):
     rows = [row for row in table.rows if row.runs]
     numbers = [key for key in table.keys if all(_is_number(row.values[key]) for row in rows)]
     key = [*numbers, *table.keys, SEED][0]
-    figure, axes = _panels([SHORT.get(column, column) for column in columns])
+    titles = [SHORT.get(column, column).replace("kJ/mole", "kJ/mol") for column in columns]
+    figure, axes = _panels(titles)
     if key == SEED:
         for axis, column in zip(axes, columns, strict=True):
             _draw_band(axis, *rows[0][column])
