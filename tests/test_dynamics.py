@@ -72,7 +72,7 @@ def test_the_energy_error_is_of_order_two(liquid):
 @pytest.mark.parametrize(
     ("name", "steps", "margin"),
     [
-        ("velocity_verlet", 32, 0.1),
+        pytest.param("velocity_verlet", 32, 0.1, marks=pytest.mark.soak),
         ("chin_4a", 16, 0.2),
         pytest.param("srkn_4", 10, 0.2, marks=pytest.mark.soak),
         pytest.param("srkn_6", 10, 0.3, marks=pytest.mark.soak),
