@@ -22,7 +22,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import FORTY_WATERS, MINIMISE, NPH, NPT, NVE, NVT, forty_waters
-from support import ROOT, contents, same_after_stops, small_scene, stopped_at
+from stops import contents, same_after_stops, stopped_at
+from support import ROOT, small_scene
 
 from rigidmd.commands import cli
 from rigidmd.core.files import AppendedFile

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 import pytest
 from MDAnalysis.lib.formats.libmdaxdr import XTCFile
-from support import MOLECULES, ROOT, built, observe, rigidmd_command, shaken, small_scene
+from support import MOLECULES, ROOT, built, observe, shaken, small_scene
 
 import rigidmd
 from rigidmd.assemble.build import build, integrator_of_stage
@@ -1557,7 +1557,9 @@ def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys):
 
 
 def test_version():
-    assert rigidmd_command("--version").stdout.strip() == f"rigidmd {rigidmd.__version__}"
+    command = [sys.executable, "-m", "rigidmd", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.stdout.strip() == f"rigidmd {rigidmd.__version__}"
 
 
 def test_output_goes_to_runs_by_default(tmp_path, monkeypatch, capsys):

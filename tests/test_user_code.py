@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from scenes import GOOD
 from scipy.integrate import quad
-from support import ROOT, built, same_after_stops, shaken, small_scene
+from stops import same_after_stops
+from support import ROOT, built, shaken, small_scene
 
 import rigidmd
 from rigidmd.assemble.build import build
