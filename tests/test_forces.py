@@ -9,7 +9,7 @@ from reference import Oracle
 from support import built, move, observe, small_scene
 
 from rigidmd.assemble.build import build
-from rigidmd.compile import kernel
+from rigidmd.compile import Program, kernel
 from rigidmd.compile.simd import lane_count
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import no_load
@@ -563,6 +563,22 @@ def test_forces_have_the_same_bits_with_their_energies_and_without(name, precisi
         load, _ = engine.evaluate(state)
         assert np.array_equal(load.force, engine.load.force)
         assert np.array_equal(load.torque_body, engine.load.torque_body)
+
+
+def test_states_of_one_size_are_evaluated_without_binding_arrays_again(monkeypatch):
+    system, engine, state = built({"spce": 8, "argon": 4}, 18.5, 1)
+    other = state.copy()
+    other.position[:] += 0.3 * np.random.default_rng(2).standard_normal(other.position.shape)
+    before = state.copy()
+    expected = [system.engine().evaluate(each)[0] for each in (state, other)]
+    engine.evaluate(state)
+    monkeypatch.setattr(Program, "bind", None)
+    for each, exact in ((other, expected[1]), (state.copy(), expected[0])):
+        load, _ = engine.evaluate(each)
+        scale = np.abs(exact.force).max()
+        assert load.force == pytest.approx(exact.force, abs=1e-12 * scale)
+        assert load.torque_body == pytest.approx(exact.torque_body, abs=1e-12 * scale)
+    assert all(np.array_equal(one, kept) for one, kept in zip(state, before, strict=True))
 
 
 def test_the_list_is_rebuilt_for_moves_and_for_turns():
