@@ -167,7 +167,7 @@ def test_each_molecule_of_a_universe_is_one_fragment(tmp_path, model, sites, kep
     assert np.isfinite(found["eps_mean"])
 
 
-@pytest.mark.parametrize(("ending", "frame"), zip(EVERY_ENDING, cycle((1, -1)), strict=False))
+@pytest.mark.parametrize(("ending", "frame"), list(zip(EVERY_ENDING, cycle((1, -1)), strict=False)))
 def test_united_atoms_of_own_trajectories(tmp_path, ending, frame):
     """Sites with mass and no element, and sites with neither, are found by their names in every
     format."""
