@@ -363,7 +363,7 @@ def test_mixed_precision_says_what_its_forces_lose():
 
 def test_only_what_keeps_its_order_is_tried():
     wheel = Scene.read(ROOT / "systems" / "satellite_wheel.toml")
-    found = measure_accuracy(wheel, span=1.0, repeats=1)
+    found = measure_accuracy(wheel, span=5.0, repeats=1)
     names = {trial.integrator for trial in found.trials}
     assert "suzuki_4" in names
     assert "srkn_6" not in names

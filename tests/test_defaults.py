@@ -357,7 +357,7 @@ def test_the_error_of_velocity_verlet_is_known():
     )
 
 
-@pytest.mark.parametrize("edge", [40.0, 100.0])
+@pytest.mark.parametrize("edge", [40.0, 200.0])
 def test_a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid(edge, capsys):
     """The mean density of the box would allow errors that a droplet or a pair of molecules in a gas
     does not have."""

@@ -189,7 +189,7 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
 @pytest.mark.parametrize("ending", [".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb"])
 def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
     output = {"trajectory": f"t{ending}", "trajectory_interval_ps": 0.01, "figures": False}
-    scene = small_scene({"spce": 8}, 15.0, stages=[{"duration_ps": 0.03}], output=output)
+    scene = small_scene({"spce": 8}, 20.0, stages=[{"duration_ps": 0.03}], output=output)
     results = Simulation(scene, tmp_path / "run").run()
     frames = molecule_animation.frames_of(read_record(tmp_path / "run"), 100)
     assert frames.time == pytest.approx([0, 0.01, 0.02, 0.03], abs=1e-6)
