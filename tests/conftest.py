@@ -14,7 +14,7 @@ os.environ.setdefault("RIGIDMD_COMPILERS", "1")
 # 15 % of its time.
 gc.set_threshold(50_000, 20, 20)
 
-pytest.register_assert_rewrite("support")
+pytest.register_assert_rewrite("support", "stops")
 from hooks import (  # noqa: E402, F401
     pytest_collection_modifyitems,
     pytest_collectreport,

@@ -667,6 +667,7 @@ def main() -> int:
     """Run cases until the time is up; 1 if something was found."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--minutes", type=float, default=1.0, help="how long (default: 1)")
+    parser.add_argument("--cases", type=int, help="so many cases, however long they take")
     parser.add_argument(
         "--seed", type=int, help="only the case of this seed, with each of its actions"
     )
@@ -680,6 +681,8 @@ def main() -> int:
         "--keep", type=Path, metavar="FOLDER", help="keep the files of the last case there"
     )
     options = parser.parse_args()
+    if options.seed is not None:
+        options.cases = 1
     began, cases, actions, failures = time.monotonic(), 0, Counter[str](), 0
     seed = (
         options.seed
@@ -708,7 +711,8 @@ def main() -> int:
                 print(*story, case.said, found, f"replay: {replay} {seed}", sep="\n", flush=True)
             cases, seed = cases + 1, seed + 1
             actions += case.actions
-            if options.seed is not None or time.monotonic() - began > 60 * options.minutes:
+            is_over = time.monotonic() - began > 60 * options.minutes
+            if cases == options.cases or (options.cases is None and is_over):
                 break
     hours = (time.monotonic() - began) / 3600
     print(f"{cases} cases in {hours:.3f} hours; {failures} failures")

@@ -1,17 +1,11 @@
 """Helpers that several test files use. What a test tests it imports from its module."""
 
-import os
-import re
 import shutil
-import signal
 import subprocess
-import sys
-import zlib
 from pathlib import Path
 
 import numpy as np
 
-import rigidmd
 from rigidmd import BodyScene, Scene
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.assemble.build import build
@@ -131,60 +125,7 @@ def springs(**stage) -> Scene:
     )
 
 
-# runs: other programs, stops
-
-
-def rigidmd_command(*arguments, **options) -> subprocess.CompletedProcess:
-    """The command line, in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "rigidmd", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        **options,
-    )
-
-
-#: Loads modules of rigidmd from other files, in a process that has not imported rigidmd.
-OTHER_MODULES = """
-import importlib.util, sys
-class Other:
-    modules = {modules!r}
-    @classmethod
-    def find_spec(cls, name, path=None, target=None):
-        return importlib.util.spec_from_file_location(name, cls.modules[name]) if name in cls.modules else None
-sys.meta_path.insert(0, Other)
-sys.path.insert(0, {tests!r})
-"""
-
-
-def run_with_files(folder: Path, files: dict[str, str], script: str) -> str:
-    """What a script prints in a process in which the package has these files, new ones or others of
-    the same name. Classes of terms are named by the text, because compiled code is found by their
-    names."""
-    found = {}
-    for k, (name, text) in enumerate(files.items()):
-        for term in re.findall(
-            r"^class (\w+)\(NamedTuple\)", "" if (ROOT / "rigidmd" / name).exists() else text, re.M
-        ):
-            text = re.sub(rf"\b{term}\b", f"{term}_{zlib.crc32(text.encode()):x}", text)
-        path = folder / f"{k}_{Path(name).name}"
-        path.write_text(text)
-        found["rigidmd." + name.removesuffix(".py").replace("/", ".")] = str(path)
-    prelude = OTHER_MODULES.format(modules=found, tests=str(ROOT / "tests"))
-    done = subprocess.run(
-        [sys.executable, "-c", prelude + script], capture_output=True, text=True, cwd=folder
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
-
-
-def edited(name: str, *changes: tuple[str, str]) -> str:
-    """The text of a file of the package with some changes; each old text must be there once."""
-    text = (ROOT / "rigidmd" / name).read_text()
-    for old, new in changes:
-        assert text.count(old) == 1, f"{name}: {old!r} is there {text.count(old)} times"
-        text = text.replace(old, new)
-    return text
+# other programs
 
 
 def gmx(folder: Path, *arguments, text: str = "") -> str:
@@ -199,59 +140,6 @@ def gmx(folder: Path, *arguments, text: str = "") -> str:
     )
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-1500:]
     return done.stdout
-
-
-def stopped_at(steps: set[int]) -> "rigidmd.Every":
-    """An observer that sends SIGTERM to this process after some of the steps of a run."""
-
-    def stop(moment):
-        if moment.step in steps:
-            steps.discard(moment.step)
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    return rigidmd.Every(0.001, stop)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """The files of a run that have to be the same to the bit."""
-    names = [
-        path.name
-        for path in folder.iterdir()
-        if path.name.startswith(("trajectory", "log", "topology", "motion", "pressure_tensor"))
-    ]
-    found = {name: (folder / name).read_bytes() for name in names}
-    if (folder / "final.npz").exists():
-        with np.load(folder / "final.npz") as data:
-            found |= {name: data[name].tobytes() for name in data.files}
-    return found
-
-
-def same_after_stops(data: dict, steps: list[int], folder: Path) -> None:
-    """Run once without a stop, once with stops after these steps, each time with another number of
-    threads."""
-    observers = rigidmd.Every(
-        0.001, lambda moment: None
-    )  # observes at the same steps as those that stop
-    rigidmd.Simulation(
-        Scene.from_dict(data | {"threads": 1}), folder / "whole", observers=observers
-    ).run()
-    left, runs = set(steps), 0
-    while True:
-        simulation = rigidmd.Simulation(
-            Scene.from_dict(data | {"threads": 1 + runs % 2}),
-            folder / "parts",
-            observers=stopped_at(left),
-            resume=True,
-        )
-        results = simulation.run()
-        runs += 1
-        if not results.interrupted:
-            break
-        assert results.signal == signal.SIGTERM
-    assert runs == len(steps) + 1
-    whole, parts = contents(folder / "whole"), contents(folder / "parts")
-    assert whole.keys() == parts.keys() and len(whole) > 3
-    assert [name for name in whole if whole[name] != parts[name]] == []
 
 
 # made-up frames

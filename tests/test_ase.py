@@ -19,7 +19,8 @@ from ase.constraints import FixAtoms, FixBondLengths
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from scenes import FORTY_WATERS, forty_waters
-from support import ROOT, contents, same_after_stops, small_scene, stopped_at
+from stops import contents, same_after_stops, stopped_at
+from support import ROOT, small_scene
 
 import rigidmd
 from rigidmd import BodyScene, MolecularScene, Scene, Simulation

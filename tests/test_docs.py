@@ -199,14 +199,12 @@ class Reader:
                 source = (ROOT / script).read_text()
                 assert all(a in source for a in arguments if a.startswith("--")), words
             case ["python", script]:
-                # Terms of one's own name their classes in the cache, and would leave an index
-                # nobody else can read
-                own = {
-                    "RIGIDMD_CACHE": "cache",
-                    "PYTHONPATH": str(Path(rigidmd.__file__).parents[1]),
-                }
+                package = {"PYTHONPATH": str(Path(rigidmd.__file__).parents[1])}
                 done = subprocess.run(
-                    [sys.executable, script], env=os.environ | own, capture_output=True, text=True
+                    [sys.executable, script],
+                    env=os.environ | package,
+                    capture_output=True,
+                    text=True,
                 )
                 assert done.returncode == 0, done.stderr
             case ["pip", "install", what]:

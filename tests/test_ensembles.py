@@ -10,6 +10,7 @@ import io
 import re
 import shutil
 import warnings
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -231,10 +232,14 @@ def equipartition_judged(course: Course, temperature: float) -> float:
     return float(np.nanmax(found))
 
 
-@pytest.mark.parametrize("thermostat", THERMOSTATS)
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[] if name == "nitrogen" else pytest.mark.soak) for name in LIQUIDS],
+    ("name", "thermostat"),
+    [
+        pytest.param(
+            *which, marks=[] if which == ("nitrogen", "velocity_rescaling") else pytest.mark.soak
+        )
+        for which in product(LIQUIDS, THERMOSTATS)
+    ],
 )
 def test_kinetic_energies_are_those_of_the_temperature(name, thermostat):
     """Distribution of the kinetic energies of translation and rotation of each species, and

@@ -7,7 +7,8 @@ from math import inf, pi, sqrt
 
 import numpy as np
 import pytest
-from support import edited, move, observe, run_with_files, small_scene
+from changed_package import edited, run_with_files
+from support import move, observe, small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe

@@ -31,7 +31,7 @@ from rigidmd.errors import UNPRINTABLE, CheckpointError
 from rigidmd.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 
 SECONDS, BYTES = 5.0, 2e9  # of computing, that an input may take
-FEW, MANY = 38, 1250  # inputs of each of the eight tests, in CI and in the soak tier
+FEW, MANY = 20, 1250  # inputs of each of the eight tests, in CI and in the soak tier
 
 WATER = """
 seed = 3

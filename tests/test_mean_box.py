@@ -4,7 +4,8 @@ stops, error messages."""
 import numpy as np
 import pytest
 from scipy.stats import t as student
-from support import same_after_stops, small_scene
+from stops import same_after_stops
+from support import small_scene
 
 from rigidmd.commands import cli
 from rigidmd.errors import SceneError

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import BODIES, ROOT, contents, small_scene
+from stops import contents
+from support import BODIES, ROOT, small_scene
 
 import rigidmd
 from rigidmd.engines.observables import Observation

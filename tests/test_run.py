@@ -16,7 +16,7 @@ import numba
 import numpy as np
 import pytest
 from MDAnalysis.lib.formats.libmdaxdr import XTCFile
-from support import MOLECULES, ROOT, built, observe, rigidmd_command, shaken, small_scene
+from support import MOLECULES, ROOT, built, observe, shaken, small_scene
 
 import rigidmd
 from rigidmd.assemble.build import build, integrator_of_stage
@@ -1567,40 +1567,24 @@ def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys):
 
 
 def test_version():
-    assert rigidmd_command("--version").stdout.strip() == f"rigidmd {rigidmd.__version__}"
+    command = [sys.executable, "-m", "rigidmd", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.stdout.strip() == f"rigidmd {rigidmd.__version__}"
 
 
-def test_output_goes_to_runs_by_default(tmp_path):
-    short = ["--set", "stages.0.duration_ps=0.01", "--set", "stages.1.duration_ps=0.01"]
-    done = rigidmd_command(
-        "run",
-        ROOT / "systems" / "argon.toml",
-        *short,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert done.returncode == 0, done.stderr
+def test_output_goes_to_runs_by_default(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    changes = ("stages.0.duration_ps=0.01", "stages.1.duration_ps=0.01", "output.figures=false")
+    command = ["run", str(ROOT / "systems" / "argon.toml")]
+    command += [part for change in changes for part in ("--set", change)]
+    assert main(command) == 0
     assert (tmp_path / "runs" / "argon" / "summary.json").exists()
-    assert "argon: 500 argon; 500 bodies, 500 sites, 1497 degrees of freedom" in done.stdout
-    assert "summary.json" in done.stdout
-    again = rigidmd_command(
-        "run",
-        ROOT / "systems" / "argon.toml",
-        *short,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert again.returncode == 2
-    assert "--force" in again.stderr
-    forced = rigidmd_command(
-        "run",
-        ROOT / "systems" / "argon.toml",
-        *short,
-        "--force",
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert forced.returncode == 0
+    printed = capsys.readouterr().out
+    assert "argon: 500 argon; 500 bodies, 500 sites, 1497 degrees of freedom" in printed
+    assert "summary.json" in printed
+    assert main(command) == 2
+    assert "--force" in capsys.readouterr().err
+    assert main([*command, "--force"]) == 0
 
 
 NPT = {"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0}

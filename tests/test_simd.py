@@ -356,8 +356,8 @@ def test_no_pair_is_missed_in_a_long_run():
     energies of all pairs."""
     system = build(small_scene({"spce": 400}, 23.0, forces=W1, start={"temperature_K": 600.0}))
     engine, state = system.engine(), system.state.copy()
-    for round in range(60):
-        move(engine, state, SCHEMES["velocity_verlet"], 0.001, 7)
+    for round in range(30):
+        move(engine, state, SCHEMES["velocity_verlet"], 0.001, 14)
         load, tallies = engine.evaluate(state)
         fresh, _ = system.engine().evaluate(state)
         assert load.force == pytest.approx(fresh.force, abs=1e-11 * np.abs(fresh.force).max())

@@ -3,6 +3,7 @@ a clear message."""
 
 import shutil
 import sys
+from itertools import cycle
 from pathlib import Path
 
 import ase.io
@@ -166,8 +167,7 @@ def test_each_molecule_of_a_universe_is_one_fragment(tmp_path, model, sites, kep
     assert np.isfinite(found["eps_mean"])
 
 
-@pytest.mark.parametrize("ending", EVERY_ENDING)
-@pytest.mark.parametrize("frame", [1, -1])
+@pytest.mark.parametrize(("ending", "frame"), list(zip(EVERY_ENDING, cycle((1, -1)), strict=False)))
 def test_united_atoms_of_own_trajectories(tmp_path, ending, frame):
     """Sites with mass and no element, and sites with neither, are found by their names in every
     format."""

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from PIL import Image, ImageSequence
-from support import ROOT
+from support import ROOT, small_scene
 
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.body import build_body
@@ -46,6 +46,7 @@ SHORT_WATER = {
     "stages.production.duration_ps": 0.02,
     "output.trajectory_interval_ps": 0.01,
     "output.log_interval_ps": 0.004,
+    "output.figures": False,
 }
 
 
@@ -191,8 +192,9 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
 
 @pytest.mark.parametrize("ending", [".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb"])
 def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
-    more = SHORT_WATER | {"output.trajectory": f"t{ending}", "stages.production.duration_ps": 0.01}
-    results = Simulation(Scene.read(ROOT / "systems" / "water.toml", more), tmp_path / "run").run()
+    output = {"trajectory": f"t{ending}", "trajectory_interval_ps": 0.01, "figures": False}
+    scene = small_scene({"spce": 8}, 20.0, stages=[{"duration_ps": 0.03}], output=output)
+    results = Simulation(scene, tmp_path / "run").run()
     frames = molecule_animation.frames_of(read_record(tmp_path / "run"), 100)
     assert frames.time == pytest.approx([0, 0.01, 0.02, 0.03], abs=1e-6)
     assert frames.cells[-1] == pytest.approx(results.state.cell, abs=1e-3)

@@ -233,14 +233,16 @@ class TermDispatcher:
         elsewhere = np.zeros_like(rows.arguments)
         self.table = TermTable(rows, elsewhere, self._rates.rows, self._tallies, valid, self._power)
         self._bound_to: tuple = ()
-        self._load: Load | None = None
+        self._copy_and_load: tuple[State, Load] | None = None
 
-    def load_for(self, state: State) -> Load:
-        """An array for the forces on the bodies of a state, which the next call may return
-        again."""
-        if self._load is None or len(self._load.force) != len(state.velocity):
-            self._load = no_load(state)
-        return self._load
+    def copy_and_load(self, state: State) -> tuple[State, Load]:
+        """A copy of a state, and arrays for its forces. The next call returns the same arrays for
+        the next state of this size: the table stays bound to them."""
+        if self._copy_and_load is None or _shapes(self._copy_and_load[0]) != _shapes(state):
+            self._copy_and_load = state.copy(), no_load(state)
+        for target, source in zip(self._copy_and_load[0], state, strict=True):
+            target[:] = source
+        return self._copy_and_load
 
     def _passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
         passes: list[Pass] = []
@@ -274,6 +276,10 @@ class TermDispatcher:
                 self._program.bind(self._passes(workspaces, state, other), self.table.elsewhere)
             self._bound_to = bound_to
         return self.table
+
+
+def _shapes(state: State) -> list[tuple[int, ...]]:
+    return [array.shape for array in state]
 
 
 @kernel(from_python=True)

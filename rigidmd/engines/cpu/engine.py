@@ -263,8 +263,8 @@ class CpuEngine(Engine):
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         workspaces = self._prepare(state)
         dispatcher = self._dispatcher("observations", workspaces)
-        load = dispatcher.load_for(state)
-        while status := compute_load_with_energies(dispatcher.bind(workspaces, state, load), *load):
+        copy, load = dispatcher.copy_and_load(state)
+        while status := compute_load_with_energies(dispatcher.bind(workspaces, copy, load), *load):
             workspaces = self._handle_status(status, state)
         return self._copies(load, dispatcher)
 
