@@ -1,5 +1,5 @@
-"""Energies of a trial molecule in a system, by the forces of the system: for insertion and for
-second virial coefficients."""
+"""Energies of a trial molecule in a system, by the forces of the system, of which second virial
+coefficients are made."""
 
 from dataclasses import replace
 from math import inf
@@ -26,6 +26,7 @@ from rigidmd.forces.parts import Grid, SystemParts
 from rigidmd.forces.terms import trait
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene.models import Molecule, load_model, read_molecule
+from rigidmd.scene.molecules import missing_user_code
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 #: Two molecules overlap where the energy of two of their sites, without charges, is at least the
@@ -178,6 +179,9 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
     for _ in added:
         state = _with_trial(state, np.zeros(3), np.eye(3), rotates=bool(inertia.any()))
     scene = system.scene
+    if scene.from_python != scene.user_code.names:
+        missing = missing_user_code(scene.from_python, scene.user_code.names)
+        raise SceneError(scene.source, [missing])
     if scene.forces.electrostatics is None:  # only the trial molecule has charges
         forces = scene.forces.model_copy(update={"electrostatics": "none"})
         scene = scene.model_copy(update={"forces": forces})
