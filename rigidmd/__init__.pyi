@@ -5,6 +5,8 @@ from . import view as view
 from .assemble.scenes import atoms_of as atoms_of
 from .assemble.scenes import resolve as resolve
 from .assemble.scenes import scene_from_atoms as scene_from_atoms
+from .assemble.user_code.body_pairs import BodyPairPotential as BodyPairPotential
+from .assemble.user_code.body_pairs import body_pair_potential as body_pair_potential
 from .assemble.user_code.force import Force as Force
 from .assemble.user_code.pair_potential import PairPotential as PairPotential
 from .assemble.user_code.pair_potential import pair_law as pair_law

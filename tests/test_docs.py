@@ -306,7 +306,10 @@ def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsy
         part = section("Columns of log.csv" if path.name == "log.csv" else "Columns of motion.csv")
         named = set(re.findall(r"`([^`]+)`", part))
         scene = tomllib.loads((path.parent / "scene.toml").read_text())
-        own = {f"{entry['name']} (kJ/mole)" for entry in scene.get("forces", {}).get("custom", ())}
+        tables = scene.get("forces", {})
+        names = [entry["name"] for entry in tables.get("custom", ())]
+        names += [entry.get("name", entry.get("potential")) for entry in tables.get("bodies", ())]
+        own = {f"{name} (kJ/mole)" for name in names}
         header = ["NAME (kJ/mole)" if column in own else column for column in header]
         assert {_first_of_its_kind(column) for column in header} <= named
 

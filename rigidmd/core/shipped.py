@@ -35,6 +35,7 @@ SECTIONS = {
         "electrostatics",
         "structures",
         "tables",
+        "body_pairs",
         "slab",
         "analysis",
         "transport",

@@ -59,7 +59,7 @@ LONGEST_NAME = 100
 LONGEST_FILE_NAME = 200
 #: Keys that name a file.
 FILE_KEYS = re.compile(
-    r"(structure|(molecules|forces\.custom)\.[^.]+)\.(file|topology|parameters|module|table)"
+    r"(structure|(molecules|forces\.(custom|bodies))\.[^.]+)\.(file|topology|parameters|module|table)"
 )
 #: Programs whose input files have these names.
 FOREIGN_INPUTS = {

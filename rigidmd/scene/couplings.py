@@ -34,6 +34,9 @@ class Coupling(NamedTuple):
     #: the values of its keys.
     on_molecules: bool = False
     in_trajectories: bool = False  # whether steps are accepted or rejected together
+    #: Whether translation and rotation each have a thermostat, which relaxes their kinetic energy
+    #: to its mean in the time constant.
+    by_motion: bool = False
     time: Callable[[Values], float] = lambda values: values["thermostat_time_ps"]
     description: Callable[[Values], str] = lambda values: f"{values['thermostat_time_ps']:g} ps"
     #: Whether its time constant is the period of an oscillation, which steps have to resolve, or
@@ -83,7 +86,8 @@ THERMOSTATS = {
     "velocity_rescaling": Coupling(
         "stochastic, one of translation and one of rotation, by Bussi et al.",
         "Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101",
-        {"thermostat_time_ps": 0.1},
+        {"thermostat_time_ps": 0.05},
+        by_motion=True,
     ),
     "langevin": Coupling(
         "friction and noise",
@@ -113,9 +117,7 @@ THERMOSTATS = {
         " step",
         "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216",
         {
-            "trajectory_steps": lambda stage: max(
-                1, round(TRAJECTORY_PS * 1000 / stage.timestep_fs)
-            ),
+            "trajectory_steps": lambda stage: max(1, round(TRAJECTORY_PS / stage.step)),
             "momentum_refreshment": 1.0,
         },
         on_molecules=True,
@@ -164,7 +166,7 @@ class ThermostatKeys(Section):
         + f". Default: {DEFAULT_THERMOSTAT}",
     )
     thermostat_time_ps: Positive | None = None
-    """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or
+    """Time constant of velocity_rescaling (default: 0.05 ps), period of nose_hoover (0.5 ps), or
     mean time between two collisions of a molecule with andersen (1 ps)"""
     friction_translation_per_ps: Positive | None = None
     """Friction of langevin on translation; default: 1"""

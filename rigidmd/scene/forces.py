@@ -126,6 +126,10 @@ class CustomForce(Section):
     switch_start_A: Positive | None = None
     """With an energy: where a switch begins; default: forces.switch_start_A"""
 
+    @property
+    def label(self) -> str:
+        return self.name
+
     def _errors(self):
         if sum(source is not None for source in (self.module, self.energy, self.table)) != 1:
             kinds = (
@@ -142,6 +146,80 @@ class CustomForce(Section):
                 )
             if not self.module.endswith(".py"):
                 yield f"module = {shorten_repr(self.module)} must be a Python file (.py)"
+
+
+class SpeciesPair(Section):
+    """Parameters of a potential of two bodies for two species."""
+
+    species: tuple[str, str]
+    """Names of the two species"""
+    parameters: dict[str, Number] = Field(default={}, max_length=MOST_TABLES)
+    """Parameters by name, which replace the parameters of both species"""
+
+
+class BodyForce(Section):
+    """A potential of two bodies: a function of the vector between them and of their
+    orientations."""
+
+    name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)] | None = None
+    """Name in the log; default: the name of the potential; with `module` also the name of the
+    object in it"""
+    potential: Literal["gay_berne", "dipole", "quadrupole", "patch"] | None = None
+    """gay_berne: ellipsoids; dipole, quadrupole: at a point; patch: spheres with an attractive
+    patch"""
+    energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
+    """Instead of a potential: the energy (kJ/mol) as a function of the distance r (Å), of the
+    cosines a_r and b_r of the angles of the axes of the first and the second body with the vector
+    from the first to the second, of the cosine a_b of the angle between the axes, and of named
+    parameters"""
+    module: Line | None = None
+    """Instead of a potential: Python file in the folder of the scene with a
+    `rigidmd.body_pair_potential`. Its code runs only with --trust FILE"""
+    parameters: dict[str, dict[str, Number]] = Field(default={}, max_length=MOST_TABLES)
+    """Species -> parameters by name; it acts on these species"""
+    pairs: tuple[SpeciesPair, ...] = Field(default=(), max_length=MOST_TABLES)
+    """Parameters of particular pairs of species"""
+    mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(
+        default={}, max_length=MOST_TABLES
+    )
+    """With an energy: the mean of each parameter for unlike species; default: arithmetic for names
+    that begin with sig, else geometric"""
+    options: dict[str, Number] = Field(default={}, max_length=MOST_TABLES)
+    """gay_berne: upsilon (default: 1), mu (2), gamma (1); dipole: reaction_field_A, the radius of a
+    conductor's reaction field (default: none)"""
+    axis: Literal["x", "y", "z"] = "z"
+    """Axis of the bodies, in the coordinates of the models' files"""
+    references: dict[str, tuple[Number, Number, Number]] = Field(default={}, max_length=MOST_TABLES)
+    """Species -> the point of the body between which distances count, in the coordinates of the
+    model's file, Å; default: the centre of mass"""
+    truncation: Literal["switch", "plain"] = "switch"
+    """switch: from switch_start_A the energy is switched to 0 at the cutoff; plain: it jumps"""
+    cutoff_A: Cutoff | None = None
+    """Cutoff between the points; default: forces.cutoff_A"""
+    switch_start_A: Positive | None = None
+    """Where the switch begins; default: 0.9 of the cutoff"""
+
+    def _errors(self):
+        sources = [self.potential, self.energy, self.module]
+        if sum(source is not None for source in sources) != 1:
+            yield "give one of potential, energy and module"
+        if self.module is not None and self.name is None:
+            yield "name is missing: with a module it is the name of the object in it"
+        given = {
+            "mixing": self.energy is None and self.mixing,
+            "options": self.potential is None and self.options,
+        }
+        if self.module is not None:
+            keys = ("parameters", "pairs", "references", "cutoff_A", "switch_start_A")
+            given |= {key: getattr(self, key) for key in keys}
+        if idle := [key for key, value in given.items() if value]:
+            yield f"{', '.join(idle)} would do nothing here"
+        if self.truncation == "plain" and self.switch_start_A is not None:
+            yield "switch_start_A would do nothing with truncation = 'plain'"
+
+    @property
+    def label(self) -> str:
+        return self.name or self.potential or "body_pairs"
 
 
 class Forces(Section):
@@ -164,6 +242,8 @@ class Forces(Section):
     """Lennard-Jones parameters of particular pairs, in place of the mixing rule"""
     custom: tuple[CustomForce, ...] = Field(default=(), max_length=MOST_TABLES)
     """Custom forces"""
+    bodies: tuple[BodyForce, ...] = Field(default=(), max_length=MOST_TABLES)
+    """Potentials of two bodies"""
     tail_correction: Flag | None = None
     """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it,
     `virial` does not. Default: true in a periodic box that the molecules fill evenly; false with
@@ -228,6 +308,16 @@ class Forces(Section):
     tilt is more than half an edge, because an equivalent cell then replaces it"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.9
     """Extra radius of the neighbour list; affects only the speed"""
+
+    @property
+    def added(self) -> dict[str, CustomForce | BodyForce]:
+        """The tables of custom forces and of potentials of two bodies, by their keys."""
+        tables = {"custom": self.custom, "bodies": self.bodies}
+        return {
+            f"forces.{key}.{k}": entry
+            for key, entries in tables.items()
+            for k, entry in enumerate(entries)
+        }
 
     def _errors(self):
         if (

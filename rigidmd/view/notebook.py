@@ -185,8 +185,9 @@ def _molecular_rows(scene: MolecularScene) -> Iterable[TableRow]:
     acting += [COULOMB[forces.electrostatics]] if any(m.charges.any() for m in species) else []
     acting += [f"cutoff {forces.cutoff_A:g} Å"] if forces.cutoff_A and acting else []
     yield "forces", ", ".join(acting) or "none of the models"
-    for force in forces.custom:
-        yield USER_FORCES, f"{force.name}: {force.energy or force.module}"
+    for force in forces.added.values():
+        text = force.energy or force.module or getattr(force, "potential", None)
+        yield USER_FORCES, f"{force.label}: {text}"
     for name in type(scene.fields).model_fields:
         if getattr(scene.fields, name):
             yield "fields", name.replace("_", " ")
