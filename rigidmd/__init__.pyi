@@ -28,6 +28,7 @@ from .studies.normal_modes import normal_modes as normal_modes
 from .studies.stored_runs import read_run as read_run
 from .studies.sweep.sweeping import sweep as sweep
 from .studies.sweep.windows import pmf as pmf
+from .studies.virial import second_virial as second_virial
 from .view.plots import LivePlot as LivePlot
 
 __version__: str
