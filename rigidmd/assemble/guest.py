@@ -208,7 +208,7 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
         python_forces={},
         user_terms={},
     )
-    return with_user_code(made) if scene.forces.custom or scene.from_python else made
+    return with_user_code(made) if scene.forces.added or scene.from_python else made
 
 
 def _grid_of(system: System) -> Grid | None:
