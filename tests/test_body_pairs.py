@@ -10,7 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import bits_with, same_after_stops
+from stops import same_after_stops
+from support import bits_with
 
 import rigidmd
 from rigidmd import Scene, Simulation
