@@ -449,7 +449,7 @@ def test_a_step_that_is_too_long_is_told_before_the_first_one(tmp_path):
     assert len(warnings) == 1
     assert "stages.0: timestep_fs = 30 is longer than what is stable" in warnings[0]
     assert warnings[0] in results.summary["notes"]
-    assert warnings[0] not in simulation.conclusion(results)  # it was printed before
+    assert warnings[0] not in simulation._conclusion(results)  # it was printed before
     written = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert 5 < written["stages"][0]["stable_timestep_fs"] < 30
 

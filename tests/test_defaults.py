@@ -87,7 +87,7 @@ def test_keys_that_do_nothing_are_refused(edge, forces, message):
 
 def test_without_a_box_all_pairs_of_charges_act_whatever_the_cutoff():
     simulation = Simulation(scene(None, forces={"cutoff_A": 4.0}))
-    found = simulation.start_energy(KJ_PER_MOL, "kJ/mol")["components"]
+    found = simulation._start_energy(KJ_PER_MOL, "kJ/mol")["components"]
     system = simulation.system
     position, charge = (
         system.site_positions(simulation.state),

@@ -423,7 +423,7 @@ def test_nist_spce_in_a_monoclinic_cell_that_leans_by_half_an_edge(reference, tm
         ewald_k_radius_per_A=radius,
     )
     simulation = Simulation(scene)
-    found = simulation.start_energy(BOLTZMANN, "K")
+    found = simulation._start_energy(BOLTZMANN, "K")
     assert any("1884 k-vectors" in note for note in found["notes"])
     assert set(found["components"]) == set(MONOCLINIC)
     for name, printed in MONOCLINIC.items():
@@ -1123,7 +1123,7 @@ def test_what_energy_says_of_its_figures():
             {}, None, molecules=molecules, box={"lengths_A": [13.0, 14.0, 15.0]}, forces=forces
         )
         simulation = Simulation(scene)
-        found = simulation.start_energy(KJ_PER_MOL, "kJ/mol")
+        found = simulation._start_energy(KJ_PER_MOL, "kJ/mol")
         said, system = found["meaning"], simulation.system
         law = system.terms["coulomb_real"].potential
         assert ("(sum of q)² of each molecule" in said["coulomb_self"]) == (net > 0)

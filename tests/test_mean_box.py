@@ -189,4 +189,4 @@ def test_a_scene_that_begins_with_a_minimisation_settles_before_any_sample():
     simulation = Simulation(
         small_scene({"argon": 40}, 20.0, stages=stages, start={"temperature_K": 90.0})
     )
-    assert np.isfinite(simulation.settle().position).all()
+    assert np.isfinite(simulation._settle().position).all()

@@ -676,7 +676,7 @@ def test_a_field_that_is_added_to_the_record_survives_a_stop(kind, tmp_path, mon
     left, reached = {stop}, []
 
     def count(moment):
-        record = simulation.part.record
+        record = simulation._part.record
         record.seen += 1
         reached.append(record.seen)
         if kind == "molecules":
@@ -694,7 +694,7 @@ def test_a_field_that_is_added_to_the_record_survives_a_stop(kind, tmp_path, mon
         assert simulation.run().interrupted != resume
     assert reached == list(range(1, len(reached) + 1)) and len(reached) > 10
     if kind == "molecules":
-        record = simulation.part.record
+        record = simulation._part.record
         assert list(record.names.values()) == [[f"at {10 * k}"] for k in range(len(reached))]
         assert record.squares.tolist() == [k**2 for k in range(len(reached))]
         assert len(record.tables) == len(reached) and record.tables[

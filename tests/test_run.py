@@ -341,7 +341,7 @@ def test_intervals_that_are_not_whole_steps_are_noted():
     ]
     run = Simulation(scene, warn=str)
     for note in scene.rounded_times():
-        assert note in run.introduction()
+        assert note in run._introduction()
         assert note in describe(scene)
     results = run.run()
     assert set(scene.rounded_times()) <= set(results.summary["notes"])
@@ -363,7 +363,7 @@ def test_one_point_molecule_runs_under_every_thermostat(thermostat):
     results = run.run()
     moves = thermostat in ("langevin", "andersen")
     assert results.summary["degrees_of_freedom"] == (3 if moves else 0)
-    assert f"{3 if moves else 0} degrees of freedom" in run.introduction()
+    assert f"{3 if moves else 0} degrees of freedom" in run._introduction()
     assert any("no temperature is defined" in note for note in results.summary["notes"]) != moves
     told = results.summary["stages"][0]["temperature_K"]
     assert told > 0 if moves else told is None
@@ -1718,7 +1718,7 @@ def test_the_lists_of_the_start_serve_the_first_stage(monkeypatch):
     simulation = Simulation(small_scene({"argon": 20}, 25.0, stages=stages))
     simulation.start_from(simulation.state)
     made.clear()
-    simulation.part.reset()
+    simulation._part.reset()
     simulation.run()
     used = [engine for engine in made if engine.workspaces]
     assert len(used) == 2

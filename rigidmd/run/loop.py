@@ -77,7 +77,7 @@ class RunLoop:
         self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None
     ):
         self._simulation, self._folder = simulation, simulation.folder
-        self._part: RunPart[Any, Any, Any] = simulation.part
+        self._part: RunPart[Any, Any, Any] = simulation._part
         self._force, self._resumes = force, resumes
         self.checkpoints = CheckpointSchedule(
             simulation.folder, simulation.scene.output.checkpoint_minutes, deadline
@@ -121,7 +121,7 @@ class RunLoop:
         with contextlib.ExitStack() as stack:
             if hasattr(signal, "SIGUSR1"):
                 stack.enter_context(
-                    signal_handler(self._simulation.ask_for_checkpoint, signal.SIGUSR1)
+                    signal_handler(self._simulation._ask_for_checkpoint, signal.SIGUSR1)
                 )
             if self._next == self._open:
                 with self._running():
@@ -131,7 +131,7 @@ class RunLoop:
             self._until = before + steps
             stack.enter_context(signal_handler(self._stop_by_signal, *stop_signals()))
             self._bar = progress_of(
-                total, part.time_unit, progress if total > 0 else False, self._simulation.spot
+                total, part.time_unit, progress if total > 0 else False, self._simulation._spot
             )
             stack.enter_context(self._bar).skip(float(part.state.time[NOW]))
             self._since = clock.perf_counter()
@@ -182,7 +182,7 @@ class RunLoop:
                 part.check_position()
                 changed = resume.describe_changes(checkpoint.values["with"])
         part.record.scene, part.record.inputs = scene, input_sha256
-        self._observers = _observers_by_name(part.default_observers(), simulation.observers)
+        self._observers = _observers_by_name(part.default_observers(), simulation._observers)
         names = [name for observer in self._observers.values() for name in observer.files()]
         names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self.checkpoints.writes else [])]
         if self._folder is not None and stays:
@@ -193,7 +193,7 @@ class RunLoop:
             run_folder.check_folder(self._folder, self._force, inputs, names)
         if checkpoint is None:
             for warning in part.system.warnings:
-                simulation.note(warning)
+                simulation._note(warning)
             # of several runs one compiles, and the others read its cache
             with interruptible(), PROCESS_LOCK, compiling_announced(self._announce_compiling):
                 part.prepare()
@@ -203,8 +203,8 @@ class RunLoop:
         if checkpoint is not None:
             self._resume_observers(checkpoint)
             if changed is not None:
-                simulation.note(changed)
-            simulation.announce(f"continuing from step {part.state.step[NOW]}")
+                simulation._note(changed)
+            simulation._announce(f"continuing from step {part.state.step[NOW]}")
         if self._folder is not None and stays:
             run_folder.add_to_folder(self._folder, names)
             with writing(self._folder):
@@ -250,7 +250,7 @@ class RunLoop:
             raise
 
     def _announce_compiling(self) -> None:
-        self._simulation.announce(f"compiling ({describe_cache()})")
+        self._simulation._announce(f"compiling ({describe_cache()})")
 
     def _if_not_forked(self, function: Callable[[], object]) -> None:
         """Call a function unless this is a forked process: files and locks belong to the process
@@ -311,7 +311,7 @@ class RunLoop:
                 try:
                     observer.check_file()
                 except LostFileError as error:
-                    self._simulation.note(str(error))
+                    self._simulation._note(str(error))
 
     @np.errstate(over="ignore", invalid="ignore")
     def _failed(self, error: SimulationError | OutputError) -> RigidMDError:
@@ -344,13 +344,13 @@ class RunLoop:
         """The checkpoint to resume from, None if the run has to begin, and whether the files of the
         folder stay."""
         if run_folder.is_empty(folder) or run_folder.never_began(folder):
-            self._simulation.announce(f"{folder} holds no run yet: beginning it")
+            self._simulation._announce(f"{folder} holds no run yet: beginning it")
             return None, not run_folder.is_empty(folder)
         for path in folder.iterdir():
             run_folder.check_inside(path)
         checkpoint, problems = latest(folder)
         for problem in problems:
-            self._simulation.warn(f"{problem}. The checkpoint before it is used")
+            self._simulation._warn(f"{problem}. The checkpoint before it is used")
         return checkpoint, True
 
     def _checkpoint(self) -> None:
@@ -511,12 +511,12 @@ class RunLoop:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
             name = type(observer).__name__
             if observer.draws:
-                self._simulation.note(
+                self._simulation._note(
                     f"{', '.join(observer.files()) or name} cannot be drawn: {reason}"
                 )
                 return
             part = self._part
-            self._simulation.note(
+            self._simulation._note(
                 f"{name} failed at {part.state.time[NOW]:g} {part.time_unit}: {reason}"
             )
             self.interrupted, self._error = True, self._error or error

@@ -47,7 +47,7 @@ class Moment:
     """
 
     def __init__(self, run: "Simulation", step: int, time: float, stage: int):
-        self._run, self._state = run, run.part.state
+        self._run, self._state = run, run._part.state
         self.step, self.time, self.stage = step, time, stage
 
     def __repr__(self) -> str:
@@ -62,7 +62,7 @@ class Moment:
     def observation(self) -> Any:
         """Evaluated at its first use, for all observers: an `Observation` of molecules, in the
         units of the log, or the `Pose` of a body, in SI units."""
-        return self._run.part.observe(self)
+        return self._run._part.observe(self)
 
     @property
     def sample(self) -> "Sample":
@@ -231,7 +231,7 @@ class SceneFile(Observer):
 
     def cut(self) -> None:
         if self._run.folder is not None:
-            self._run.write_scene(self._run.folder)
+            self._run._write_scene(self._run.folder)
 
     def end(self, run: "Simulation", results: "Results") -> None:
         results.files.append(run.path(SCENE))
@@ -296,8 +296,10 @@ class Frames(GrowingFile):
         )
 
         if self.kept is None:
-            write_topology(run.path(self._names[0]), run.system, run.part.state, self._wrapped)
-        elif self.kept[-1:] != [len(self._frames)] or (self.times > run.part.state.time[NOW]).any():
+            write_topology(run.path(self._names[0]), run.system, run._part.state, self._wrapped)
+        elif (
+            self.kept[-1:] != [len(self._frames)] or (self.times > run._part.state.time[NOW]).any()
+        ):
             raise ValueError("the times of its frames are not those of a run")
         path = run.path(self._names[1])
         self._file = open_trajectory(
@@ -305,7 +307,7 @@ class Frames(GrowingFile):
         )
 
     def see(self, moment: Moment) -> None:
-        system, state = self._run.system, self._run.part.state
+        system, state = self._run.system, self._run._part.state
         if self._file is not None:
             self._file.write(state, moment.time, moment.step)
             self._frames.append(Frame(moment.time))

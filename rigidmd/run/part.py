@@ -129,6 +129,11 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
     def summary_text(summary: Json, known: Any) -> str:
         """The summary as text, without the notes in `known`."""
 
+    @staticmethod
+    @abstractmethod
+    def short_summary(summary: Json, known: Any) -> str:
+        """The main results as text, without the notes in `known`."""
+
     @abstractmethod
     def explain(self, error: SimulationError) -> str:
         """An error in full: what was seen, the likely cause, what to try."""

@@ -102,9 +102,6 @@ def integrator(
 ) -> str:
     """Make a row of coefficients an integrator, and return its name, which scenes then accept.
 
-    rigidmd.integrator("ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth
-    1990")
-
     Fractions sum to 1 and read the same from both ends. A scene that names the row keeps its
     coefficients in its table [[integrators]], so that its file and the folder of its run are
     complete.
@@ -121,6 +118,12 @@ def integrator(
     Raises
     ------
     SceneError
+
+    Examples
+    --------
+        rigidmd.integrator(
+            "ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth 1990"
+        )
     """
     values = {
         "name": name,

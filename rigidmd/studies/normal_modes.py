@@ -211,9 +211,6 @@ def normal_modes(
     """Normal modes about the minimum next to the start of a scene, or next to the present state of
     a simulation.
 
-    modes = rigidmd.normal_modes(rigidmd.Scene.read("water_dimer.toml"))
-    print(modes.wavenumber, modes.free_energy(300.0), modes.longest_step_fs)
-
     A minimisation comes first, to the rounding of forces and torques and at constant cell.
 
     Parameters
@@ -237,6 +234,11 @@ def normal_modes(
         unit cell.
     SimulationError
         If a minimum is required and not found.
+
+    Examples
+    --------
+        modes = rigidmd.normal_modes(rigidmd.Scene.read("water_dimer.toml"))
+        print(modes.wavenumber, modes.free_energy(300.0), modes.longest_step_fs)
     """
     simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
     if isinstance(simulation.scene, BodyScene):
@@ -244,7 +246,7 @@ def normal_modes(
             simulation.scene.source, ["normal modes are of molecules, and this is a single body"]
         )
     state, system = (
-        (simulation.state if simulation is scene else simulation.settle()).copy(),
+        (simulation.state if simulation is scene else simulation._settle()).copy(),
         simulation.system,
     )
     numbers = _numbers(Coordinates(system, state), count, gamma)

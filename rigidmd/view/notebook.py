@@ -77,7 +77,7 @@ def simulation_html(simulation: Simulation) -> str:
     user_terms: dict[str, str] = getattr(simulation.system, "user_terms", {})
     rows += [(USER_FORCES, f"{name}: {words}") for name, words in user_terms.items()]
     rows += [("threads", str(simulation.threads)), ("writes to", where)]
-    if names := [type(observer).__name__ for observer in simulation.observers]:
+    if names := [type(observer).__name__ for observer in simulation._observers]:
         rows.append(("observers", ", ".join(names)))
     return framed(simulation.scene.name, "ready to run: run() does it", _table(rows))
 

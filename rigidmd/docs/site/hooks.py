@@ -1,12 +1,10 @@
 """Hooks of MkDocs for the site: pages made from other files, live pages, and equations."""
 
 import html
-import inspect
 import re
 import subprocess
 import sys
 import tempfile
-from importlib import import_module
 from os.path import normpath
 from pathlib import Path
 
@@ -28,7 +26,6 @@ LIVE = {
         "output.trajectory_interval_ps=0.1",
     ),
 }
-API = ("rigidmd", "rigidmd.view", "rigidmd.analysis", "rigidmd.ase", "rigidmd.errors")
 CSS = """math {
   font-family: "Latin Modern Math", "STIX Two Math", "Cambria Math", "DejaVu Math TeX Gyre", math;
 }
@@ -67,71 +64,12 @@ def on_files(files, config):
         f" {', '.join(live)}.\n"
     )
     files.append(File.generated(config, "index.md", content=front))
-    files.append(File.generated(config, "reference/api.md", content=_api()))
     files.append(File.generated(config, "site.css", content=CSS))
     for name in LIVE:
         files.append(
             File.generated(config, f"live/{name}.html", abs_src_path=str(_live_page(name)))
         )
     return files
-
-
-def _api() -> str:
-    """A page with every public name of the Python interface."""
-    lines = [
-        "# Python interface",
-        "",
-        "Every public class and function, from the docstrings of the package.",
-        "",
-    ]
-    for module in map(import_module, API):
-        lines += [f"## {module.__name__}", "", (module.__doc__ or "").partition("\n")[0], ""]
-        for name, member in (
-            (name, getattr(module, name)) for name in sorted(getattr(module, "__all__", ()))
-        ):
-            if not callable(member):
-                continue
-            lines += [*_entry("###", name, member), ""]
-            methods = (
-                vars(member).items()
-                if inspect.isclass(member) and not issubclass(member, Exception)
-                else ()
-            )
-            for method, found in methods:
-                if not method.startswith(("_", "model_")) and (
-                    callable(found) or isinstance(found, property)
-                ):
-                    lines += [*_entry("####", f"{name}.{method}", found), ""]
-    return "\n".join(lines)
-
-
-def _entry(rank: str, name: str, member: object) -> list[str]:
-    """Heading, signature and docstring of a class, function or property."""
-    function = getattr(member, "__func__", member)
-    try:
-        signature = "" if isinstance(member, property) else str(inspect.signature(function))
-    except ValueError:
-        signature = "(...)"
-    kind = "class " if inspect.isclass(member) else ""
-    text = html.escape(inspect.getdoc(member) or "")
-    text = re.sub(r"^(Parameters|Returns|Raises)\n-+$", r"<strong>\1</strong>", text, flags=re.M)
-    text = re.sub(r"^(`?\w[\w, `]*)\n(?=    )", _names_as_code, text, flags=re.M)
-    text = re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
-    signature = re.sub(r"rigidmd\.(?:\w+\.)*|'", "", signature)
-    return [
-        f"{rank} {name}",
-        "",
-        "```python",
-        f"{kind}{name}{signature}",
-        "```",
-        "",
-        f'<div class="docstring">{text}</div>',
-    ]
-
-
-def _names_as_code(names: re.Match) -> str:
-    """A line of names of a NumPy docstring, whose description follows."""
-    return f"<code>{names[1].replace('`', '')}</code>\n"
 
 
 def _live_page(name: str) -> Path:

@@ -282,7 +282,7 @@ def start_of_last_stage(scene: MolecularScene) -> tuple[Simulation, State]:
             simulation.system, results.state, cast(Samples, results.samples), len(scene.stages) - 1
         )
         return simulation, results.state
-    simulation.start()
+    simulation._start()
     return simulation, simulation.state.copy()
 
 
