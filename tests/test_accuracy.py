@@ -35,6 +35,7 @@ from rigidmd.studies.accuracy.averages import (
     measure_averages,
 )
 from rigidmd.studies.accuracy.measurement import IntegratorAccuracy, measure, time_span
+from rigidmd.studies.accuracy.orders import convergence, order_table
 from rigidmd.studies.extrapolation import MeanAtStep, Together, extrapolate, means_of_runs
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -1015,3 +1016,24 @@ def test_orders_cost_and_temperatures_of_512_waters():
     for step in (4.0, 2.0):
         gap, error = mean_and_error(at_constant_energy(scene, "velocity_verlet", step, 40.0)[0])
         assert abs(gap) < 2.5 * error
+
+
+def test_the_output_of_accuracy_begins_with_the_answer_and_marks_floors():
+    steps = [8e-3, 4e-3, 2e-3, 1e-3]
+    second = [("velocity_verlet", h, (1.0, 1.0, 1.0), 1e3 * h**2) for h in steps]
+    fourth = [("srkn_4", h, (2.0, 2.0, 2.0), max(1e6 * h**4, 1.1e-5)) for h in steps]
+    found = made(*second, *fourth)
+    lines = accuracy.describe_accuracy(found)
+    assert lines[2].startswith("target error")
+    orders = {row[0]: row[1:4] for row in order_table(found).shown()[1]}
+    assert orders == {"velocity_verlet": ["2", "2.0", "2.0"], "srkn_4": ["4", "4.0", "4.0"]}
+    floor = convergence(found, "srkn_4", "energy_rms").floor
+    assert [trial.timestep for trial in floor] == [1e-3]
+    assert convergence(found, "velocity_verlet", "energy_rms").floor == []
+    (marked,) = (line for line in "\n".join(lines).splitlines() if line.count("1.1e-05*") == 2)
+    assert marked.startswith("srkn_4") and "0.001" in marked
+
+
+def test_a_single_step_has_no_measured_order():
+    found = made(("velocity_verlet", 1e-3, (1.0, 1.0, 1.0), 1e-3))
+    assert convergence(found, "velocity_verlet", "energy_rms").order is None

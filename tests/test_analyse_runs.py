@@ -111,7 +111,7 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     ]
     assert left_out == ["interfaces", "viscosity", "surface_tension"]
     assert (
-        "viscosity: skipped: a viscosity needs at least 20 ps of the pressure tensor; there are 0.2 ps"
+        "viscosity: a viscosity needs at least 20 ps of the pressure tensor; there are 0.2 ps"
         in text
     )
     files = [name for entry in found.values() for name in entry["files"]]
@@ -618,7 +618,7 @@ def spins(frames):
 def test_a_function_of_ones_own_is_found_by_name(copy, capsys):
     (copy.parent / "own.py").write_text(OWN)
     trust = ["--trust", str(copy.parent / "own.py"), "--from", "0.02ps"]
-    assert cli.main(["analyse", str(copy), *trust, "--only", "height,spins"]) == 0
+    assert cli.main(["analyse", str(copy), *trust, "-v", "--only", "height,spins"]) == 0
     entries = json.loads((copy / "analysis.json").read_text())["analyses"]
     assert entries["height"]["about"] == "mean height of the centres (A)"
     columns, history = table(copy / "height.csv"), frames_of_folder(read_record(copy), 0.02)

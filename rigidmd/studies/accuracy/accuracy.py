@@ -18,7 +18,7 @@ from rigidmd.figures.style import (
     open_axis,
     write_figure,
 )
-from rigidmd.io.write import Column, Table
+from rigidmd.io.write import Column, Table, columns_text
 from rigidmd.run.force_errors import single_precision_errors
 from rigidmd.run.trial_systems import (
     COMPARATORS,
@@ -31,6 +31,7 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
 from rigidmd.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
+from rigidmd.studies.accuracy.orders import FLOOR_MARK, order_table, with_marks
 from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
 
 #: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body
@@ -193,6 +194,24 @@ def trial_table(measured: IntegratorAccuracy) -> Table:
 def table_text(measured: IntegratorAccuracy) -> str:
     text = "errors of Q, X, the energy (rms, drift over the span) and other conserved quantities\n"
     return text + trial_table(measured).text()
+
+
+def describe_accuracy(measured: IntegratorAccuracy, verbose: bool = False) -> list[str]:
+    """The answer first: the fastest integrator for each error, measured orders, all trials, and
+    remarks."""
+    fastest = [("target error", "fastest integrator", f"compared with {COMMON}")]
+    for error, best, faster, _ in cheapest(measured):
+        gain, _, _ = faster.partition(f" than {COMMON}")
+        fastest.append((error.removeprefix("an "), best, gain))
+    marked = with_marks(measured, trial_table(measured))
+    lines = [f"{measured.trial_system.name}, {_span(measured)}", ""]
+    if len(fastest) > 1:
+        lines += [columns_text(fastest, left=(0, 1, 2)), ""]
+    lines += [order_table(measured).text(), "", marked.text()]
+    lines.append(f"{FLOOR_MARK} at the floor: a shorter step does not reduce this error")
+    if verbose:
+        return [*lines, "", *recommendations(measured)]
+    return [*lines, "", *remarks(measured)]
 
 
 def recommendations(measured: IntegratorAccuracy) -> list[str]:

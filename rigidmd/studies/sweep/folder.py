@@ -177,6 +177,36 @@ def short_keys(keys: Iterable[str]) -> dict[str, str]:
     return short
 
 
+#: Last parts of keys -> units on axes.
+UNITS = {
+    "K": "K",
+    "fs": "fs",
+    "ps": "ps",
+    "A": "Å",
+    "bar": "bar",
+    "g_cm3": "g/cm³",
+    "nm": "nm",
+    "s": "s",
+    "kg": "kg",
+    "m": "m",
+    "kJ_mol": "kJ/mol",
+    "V_per_nm": "V/nm",
+    "per_ps": "1/ps",
+    "deg": "°",
+    "u": "u",
+    "rad": "rad",
+}
+
+
+def readable_key(key: str) -> str:
+    """A key with its unit, for readers: "temperature of stages.0 (K)"."""
+    *table, name = key.split(".")
+    end = max((end for end in UNITS if name.endswith(f"_{end}")), key=len, default="")
+    label = name.removesuffix(f"_{end}").replace("_", " ")
+    label += f" of {'.'.join(table)}" if table else ""
+    return label + (f" ({UNITS[end]})" if end else "")
+
+
 def value_name(value: Any) -> str:
     """A value in the name of a folder: letters, digits and . + - only; equal values have equal
     names."""
