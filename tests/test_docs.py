@@ -45,7 +45,7 @@ from rigidmd.assemble.describe import describe
 from rigidmd.commands import cli
 from rigidmd.commands.arguments import read_scene
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
-from rigidmd.core.shipped import CHAPTERS, DOCS, find_example
+from rigidmd.core.shipped import CHAPTERS, DOCS, GUIDES, SECTIONS, find_example
 from rigidmd.errors import SceneError
 from rigidmd.formats import BY_EXTENSION
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
@@ -471,11 +471,38 @@ def test_links_and_pictures_are_there(document):
             assert anchor in slugs(target), f"{document.name}: {link}"
 
 
-def test_readme_is_a_first_page_and_leads_to_every_chapter():
+def contents_text() -> str:
+    """The page start/contents.md, from the titles and first lines of all pages."""
+    lines = ["# All pages", "", "The pages of this documentation, with the subject of each."]
+    groups = {
+        folder.capitalize(): names for folder, names in SECTIONS.items() if folder != "guides"
+    }
+    ordered = {}
+    for title, names in groups.items():
+        ordered[title] = names
+        if title == "Tutorials":
+            ordered |= {f"Guides: {group.lower()}": names for group, names in GUIDES.items()}
+    for title, names in ordered.items():
+        lines += ["", f"## {title}", ""]
+        for name in names:
+            if name == "contents":
+                continue
+            heading, _, about, *_ = PAGES[name].read_text(encoding="utf-8").splitlines()
+            path = Path(os.path.relpath(PAGES[name], PAGES["contents"].parent)).as_posix()
+            lines.append(f"- [{heading.removeprefix('# ')}]({path}): {about[0].lower()}{about[1:]}")
+    return "\n".join(lines) + "\n"
+
+
+def test_readme_is_a_first_page_and_leads_to_the_list_of_all():
     text = README.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 130
-    for path in PAGES.values():
-        assert f"({path.relative_to(ROOT)})" in text
+    assert max(map(len, text.splitlines())) <= 100
+    assert f"({PAGES['contents'].relative_to(ROOT)})" in text
+
+
+def test_the_list_of_pages_has_their_titles_and_subjects():
+    """`python tests/test_docs.py` writes it."""
+    assert PAGES["contents"].read_text(encoding="utf-8") == contents_text()
 
 
 def test_author_and_version_are_the_same_wherever_they_are_said():
@@ -483,9 +510,10 @@ def test_author_and_version_are_the_same_wherever_they_are_said():
     version, (author,) = project["version"], project["authors"]
     text = README.read_text(encoding="utf-8")
     assert f"{author['name']}, *rigidmd" in text
-    assert f"{{{{{author['name']}}}}}" in text
     assert f"version {version}," in text
-    assert f"version = {{{version}}}" in text
+    citation = PAGES["contributing"].read_text(encoding="utf-8")
+    assert f"{{{{{author['name']}}}}}" in citation
+    assert f"version = {{{version}}}" in citation
     assert f"\n## {version}" in PAGES["changelog"].read_text(encoding="utf-8")
     zenodo = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
     found = [zenodo[key] for key in ("version", "keywords", "license", "creators")]
@@ -524,7 +552,10 @@ def test_help_lists_and_prints_the_chapters(capsys):
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("commandes", "did you mean commands?"), ("qqq", "there are installation, why, top, water")],
+    [
+        ("commandes", "did you mean commands?"),
+        ("qqq", "there are five_minutes, installation, why, contents, top, water"),
+    ],
 )
 def test_a_chapter_that_is_not_there(name, expected, capsys):
     assert cli.main(["help", name]) == 2
@@ -584,6 +615,7 @@ def test_the_page_of_models_has_the_tables_of_their_files():
 if __name__ == "__main__":
     text = PAGES["models"].read_text(encoding="utf-8")
     PAGES["models"].write_text(text[: text.index("## Water")] + models_tables(), encoding="utf-8")
+    PAGES["contents"].write_text(contents_text(), encoding="utf-8")
 
 
 def test_the_page_of_the_collection_is_written_from_its_data(monkeypatch):
