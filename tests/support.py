@@ -39,13 +39,19 @@ SPRING = 30_000.0
 
 def pinned(tables: dict) -> dict:
     """Tables of a scene of molecules with a reaction field, one truncation for all forces, no tail
-    correction and double precision, unless they say otherwise: one set of kernels for most tests.
-    The defaults of users have tests of their own."""
+    correction, double precision and steps of 2 fs, unless they say otherwise: one set of kernels
+    for most tests. The defaults of users have tests of their own."""
     forces = {"electrostatics": "reaction_field", "tail_correction": False, "truncation": "switch"}
     forces |= tables.get("forces", {})
     if forces["electrostatics"] == "reaction_field":
         forces = {"reaction_field_truncation": forces["truncation"]} | forces
-    return {"precision": "double"} | tables | {"forces": forces}
+    stages = [
+        stage
+        if stage.get("ensemble") == "minimise" or stage.get("integrator") == "auto"
+        else {"timestep_fs": 2.0} | stage
+        for stage in tables.get("stages", [])
+    ]
+    return {"precision": "double"} | tables | {"forces": forces, "stages": stages}
 
 
 def small_scene(counts: dict[str, int], edge: float | None, folder=".", **sections) -> Scene:

@@ -836,7 +836,7 @@ def test_an_override_with_nothing_removes_the_key(tmp_path):
     )
     assert read("forces=").forces.skin_A == 1.9
     assert [stage.timestep_fs for stage in read("stages.0=").stages] == [4]
-    assert read("stages.1.timestep_fs=").stages[1].timestep_fs == 2.0
+    assert read("stages.1.timestep_fs=").stages[1].timestep_fs is None
     with pytest.raises(
         SceneError, match=r"stages.0.name: is ''"
     ):  # an empty text is a value, here a wrong one

@@ -52,8 +52,9 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 def test_every_system_runs_a_few_steps(path, tmp_path):
     assert path.read_text().startswith("# ")
     scene = Scene.read(path)
-    moving = [k for k, stage in enumerate(scene.stages) if not stage.is_minimisation]
-    short = {f"stages.{k}.duration_ps": 8 * scene.stages[k].timestep_fs / 1000 for k in moving} | {
+    stages = rigidmd.resolve(scene).stages
+    moving = [k for k, stage in enumerate(stages) if not stage.is_minimisation]
+    short = {f"stages.{k}.duration_ps": 8 * stages[k].step for k in moving} | {
         "output.log_interval_ps": 0.004,
         "output.trajectory_interval_ps": 0.008,
     }
@@ -892,6 +893,15 @@ def test_when_total_momentum_is_taken_out():
         is False
     )
     assert rigidmd.resolve(small_scene({"argon": 3}, None)).run.remove_momentum_interval_ps is False
+    nvt = {"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 1.0}
+    for thermostat, removed in [
+        ("velocity_rescaling", 1.0),
+        ("nose_hoover", 1.0),
+        ("langevin", False),
+        ("andersen", False),
+    ]:
+        scene = small_scene({"argon": 20}, 25.0, stages=[nvt | {"thermostat": thermostat}])
+        assert rigidmd.resolve(scene).run.remove_momentum_interval_ps == removed
     with pytest.raises(SceneError, match="total momentum is not conserved with frozen molecules"):
         small_scene({}, 25.0, molecules=frozen, run={"remove_momentum_interval_ps": 0.1})
     text = describe(argon(run={"remove_momentum_interval_ps": 0.2}))

@@ -14,7 +14,6 @@ from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import not_none
-from rigidmd.units import FEMTOSECOND
 
 #: Bytes per molecule and site of a system while it is built; measured per site: 310 of argon, 500
 #: of nitrogen, 640 of SPC/E, 690 of TIP4P.
@@ -85,10 +84,7 @@ def _samples(scene: MolecularScene) -> tuple[float, float]:
     at its end."""
     output = scene.output
     lines, frames = (  # at the interval and at the ends of stages
-        sum(
-            2 + s.duration / (every if s.is_auto else max(every, s.timestep_fs * FEMTOSECOND))
-            for s in scene.stages
-        )
+        sum(2 + s.duration / (every if s.is_auto else max(every, s.step)) for s in scene.stages)
         for every in (output.log_interval_ps, output.trajectory_interval_ps)
     )
     return lines, BYTES_PER_LOG_LINE * lines + BYTES_PER_FRAME * (

@@ -204,7 +204,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         deepest = max((m.epsilon.max() for m in system.species), default=0.0)
         thermal = BOLTZMANN * (scene.start.temperature_K or 0.0) or deepest
         if system.from_lattice and not first.is_minimisation and thermal > 0:
-            dt = first.timestep_fs * FEMTOSECOND
+            dt = first.step
             removal = self.record.removal = remove_overlaps(
                 system, self.engine, self.state, thermal, dt
             )
@@ -295,7 +295,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         self._compile_stage(k)
 
     def reenter_segment(self, k: int) -> Segment:
-        stage, step = self.scene.stages[k], self.scene.stages[k].timestep_fs * FEMTOSECOND
+        stage, step = self.scene.stages[k], self.scene.stages[k].step
         for force in self.system.python_forces.values():
             force.may_diverge = stage.is_hybrid
         if stage.is_minimisation:
@@ -371,9 +371,9 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         if mode is None:
             return
         stable = self.record.stable[k] = stable_angle(stage.scheme) / mode.rate
-        if stage.timestep_fs * FEMTOSECOND > stable:
+        if stage.step > stable:
             self.simulation._note(
-                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable:"
+                f"stages.{k}: timestep_fs = {stage.step_fs:g} is longer than what is stable:"
                 " the stiffest motion at its start, of"
                 f" {checks.molecule_label(self.system, mode.molecule)}, has a period of"
                 f" {2 * np.pi / mode.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows"
@@ -387,9 +387,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
         self.simulation._announce("choosing integrator and step by pilot runs")
         decided, reason = choose_for_stage(self.system, self.state, k)
-        self.record.choices[k] = (
-            f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
-        )
+        self.record.choices[k] = f"{decided.integrator} at {decided.step_fs:g} fs chosen: {reason}"
         stages = self.record.stages
         self._set_stages((*stages[:k], decided, *stages[k + 1 :]))
         for sentence in self.scene.rounded_times([k]):
@@ -424,7 +422,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         # other programs give the velocities where their thermostats act
         is_given = stage.has_thermostat and self.scene.engine.is_external
         if not (stage.is_minimisation or stage.is_auto or is_given):
-            step = stage.timestep_fs * FEMTOSECOND
+            step = stage.step
             correction = self._integrator(moment.stage).kinetic_correction * step**2
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy

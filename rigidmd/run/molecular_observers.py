@@ -15,7 +15,7 @@ from rigidmd.io.run_files import TENSOR_FILE, Log, TensorFile, tensor_row
 from rigidmd.run import checks
 from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.scene.stage import Stage
-from rigidmd.units import FEMTOSECOND, KJ_PER_MOL
+from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
     from rigidmd.run.results import Results
@@ -72,7 +72,7 @@ class PressureTensor(GrowingFile):
 def _check_next_step(run: "Simulation", check: checks.StepCheck, load: Load, stage: Stage) -> None:
     """Raise the failed check of the next step of a stage, if the stage has steps."""
     if not stage.is_minimisation:
-        dt = stage.timestep_fs * FEMTOSECOND
+        dt = stage.step
         if problem := check.failed_check(
             run._part.state, load, stage.scheme, dt, run.engine.extent(run._part.state)
         ):
@@ -176,10 +176,7 @@ class StepWatch(Observer):
         self._run, self._check = run, check
         interval, stages = run.scene.output.log_interval_ps, run.scene.stages
         moving = [stage for stage in stages if not stage.is_minimisation]
-        of_samples = [
-            inf if stage.is_auto else interval / (stage.timestep_fs * FEMTOSECOND)
-            for stage in moving
-        ]
+        of_samples = [inf if stage.is_auto else interval / stage.step for stage in moving]
         every = checks.check_interval(run.system)
         # samples come at least as often
         self.steps = every if max(of_samples, default=0.0) > every else None

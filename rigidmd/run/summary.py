@@ -243,7 +243,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
             f"stages.{k}: in its second half the conserved energy drifts by {rate:+.2g} ±"
             f" {error:.1g} kT/ns per degree of freedom, as from a step that is too long or forces"
             f" that jump at the cutoff{hides}. Try a shorter timestep_fs than"
-            f" {stage.timestep_fs:g}{smooth}"
+            f" {stage.step_fs:g}{smooth}"
         )
     if not stage.has_thermostat:
         return notes
@@ -252,7 +252,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     scheme = integrator_of_stage(system, k)
     if scheme.kinetic_correction == 0 and not stage.is_hybrid:
         squares = (of_stage["force_squares"] + of_stage["torque_squares"])[half:]
-        step = stage.timestep_fs * FEMTOSECOND
+        step = stage.step
         per_square = 2 * scheme.shadow_correction * step**2 * KJ_PER_MOL / BOLTZMANN
         notes += _note_on_heating(stage, k, temperature, per_square / freedom.total * squares)
     moving, rotating = (of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS)
@@ -286,11 +286,11 @@ def _note_on_heating(
     level = float(temperature.mean())
     if abs(heating) <= max(HEATING_LIMIT * level, STANDARD_ERRORS * error):
         return []
-    shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heating))
+    shorter = stage.step_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heating))
     shadow = temperature + excess
     mean = format_with_error(float(shadow.mean()), mean_and_error(shadow)[1])
     return [
-        f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules"
+        f"stages.{k}: the step of {stage.step_fs:g} fs leaves the molecules"
         f" {abs(heating):.2g} K too {'hot' if heating > 0 else 'cold'}: they move and rotate as at"
         f" {mean} K, while the thermostat controls the momenta at the ends of steps,"
         f" {level:.4g} K. Try timestep_fs = {shorter:.1g}, or integrator = 'baoab', the default,"
@@ -313,7 +313,7 @@ def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list
     return [
         f"stages.{k}: {where}{accepted:.1%} of the trajectories were accepted: positions hardly"
         " change and the errors of the means are too small. Try a shorter timestep_fs than"
-        f" {stage.timestep_fs:g}, an integrator of higher order such as 'srkn_4', or integrator ="
+        f" {stage.step_fs:g}, an integrator of higher order such as 'srkn_4', or integrator ="
         " 'auto'"
     ]
 
@@ -357,7 +357,7 @@ def stage_summary(
     temperatures = _means(steady, TEMPERATURES)
     potential = mean_and_error(steady["potential"] / n)
     pressure = mean_and_error(steady["pressure_bar"])
-    spread, duration = float(of_stage["kinetic"].std()), steps * stage.timestep_fs * FEMTOSECOND
+    spread, duration = float(of_stage["kinetic"].std()), steps * stage.step
     thermal = (
         BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total
     )
@@ -366,12 +366,12 @@ def stage_summary(
         "name": stage.label,
         "ensemble": stage.ensemble,
         "integrator": stage.integrator,
-        "timestep_fs": stage.timestep_fs,
+        "timestep_fs": stage.step_fs,
         "steps": steps,
         "duration_ps": duration,
         "computing_s": computing,
         "steps_per_s": speed,
-        "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
+        "ns_per_day": speed * stage.step_fs * 1e-6 * 86400 if speed else None,
         "means_over": describe_equilibrated(of_stage, stage, first.time),
         "equilibrated_from_ps": begin if len(time) >= LEAST_SAMPLES else None,
         "set_temperature_K": stage.temperature_K,

@@ -113,9 +113,7 @@ THERMOSTATS = {
         " step",
         "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216",
         {
-            "trajectory_steps": lambda stage: max(
-                1, round(TRAJECTORY_PS * 1000 / stage.timestep_fs)
-            ),
+            "trajectory_steps": lambda stage: max(1, round(TRAJECTORY_PS / stage.step)),
             "momentum_refreshment": 1.0,
         },
         on_molecules=True,

@@ -303,9 +303,8 @@ def field_errors(scene: "MolecularScene") -> Iterator[str]:
         inf if fields.electric_frequency_per_ps is None else 1000 / fields.electric_frequency_per_ps
     )
     for k, stage in enumerate(scene.stages):
-        if not (stage.is_auto or stage.is_minimisation) and period < 2 * stage.timestep_fs:
+        if not (stage.is_auto or stage.is_minimisation) and period < 2 * stage.step_fs:
             what = (
-                f"less than two steps of stages.{k} ({stage.timestep_fs:g} fs), which cannot"
-                " follow it"
+                f"less than two steps of stages.{k} ({stage.step_fs:g} fs), which cannot follow it"
             )
             yield f"fields.electric_frequency_per_ps: a period of {period:.3g} fs is {what}"

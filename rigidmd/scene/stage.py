@@ -79,6 +79,10 @@ OTHER_INTEGRATORS = {
 }
 
 
+#: Step with which pilot runs begin, and the default for molecules without a known fast motion, fs.
+USUAL_STEP = 2.0
+
+
 class Timing(Section):
     """The first keys of a stage."""
 
@@ -91,8 +95,11 @@ class Timing(Section):
     enthalpy"""
     duration_ps: Positive | None = Field(default=None, validate_default=True)
     """Duration; required except with minimise"""
-    timestep_fs: Positive = 2.0
-    """Time step"""
+    timestep_fs: Positive | None = None
+    """Time step. Default: one of 1, 2, 2.5, 4, 5, 10 fs and their tenths, from the fastest motion
+    of the molecules and the temperature. With baoab it is the longest whose bias of U stays below
+    0.002 kT per degree of freedom, 4 fs for water at 300 K; at constant energy it is half as long.
+    `rigidmd check` prints it"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
     """Temperature of the thermostat; two for a linear change over the stage, [300, 240]"""
     volume: Literal["mean"] | None = None
@@ -210,12 +217,11 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             yield from auto_errors(self.integrator, targets, step_keys)
         if self.bias_kT is not None and not self.has_thermostat:
             yield f"bias_kT is for averages at a temperature, and {self.ensemble} has no thermostat"
-        if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
+        if not self.duration / self.step < MOST_STEPS:
             yield f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps"
-        if self.duration * 1000 < 0.5 * self.timestep_fs and not self.is_minimisation:
+        if self.duration < 0.5 * self.step and not self.is_minimisation:
             yield (
-                f"duration_ps = {self.duration_ps:g} is less than one step of"
-                f" {self.timestep_fs:g} fs"
+                f"duration_ps = {self.duration_ps:g} is less than one step of {self.step_fs:g} fs"
             )
 
     @property
@@ -305,7 +311,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         """Messages on time constants that are too short for the steps of the stage."""
         if self.is_auto or self.is_minimisation:
             return
-        step = self.timestep_fs * FEMTOSECOND
+        step = self.step
         least = pi * step
         thermostat = THERMOSTATS.get(self.thermostat_kind)
         barostat = BAROSTATS.get(self.barostat_kind)
@@ -327,6 +333,16 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             )
 
     @property
+    def step_fs(self) -> float:
+        """Time step, fs; the usual one until `assemble.time_step` or a pilot run has set it."""
+        return self.timestep_fs or USUAL_STEP
+
+    @property
+    def step(self) -> float:
+        """Time step, ps."""
+        return self.step_fs * FEMTOSECOND
+
+    @property
     def steps(self) -> int:
         return self.steps_of(self.duration) if self.duration else 0
 
@@ -334,7 +350,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         """The nearest number of steps to an interval (ps), at least one step or trajectory; at most
         `MOST_STEPS`, which no stage has."""
         together = self.steps_together
-        steps = min(interval * 1000 / self.timestep_fs, MOST_STEPS)
+        steps = min(interval / self.step, MOST_STEPS)
         return max(1, round(steps / together)) * together
 
     @property
@@ -353,7 +369,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         """The friction (1/ps) that draws the momenta of hybrid Monte Carlo anew in one step;
         infinite for all of it."""
         kept_fraction = 1 - self.momentum_refreshment
-        return -log(kept_fraction) / (2 * self.timestep_fs * FEMTOSECOND) if kept_fraction else inf
+        return -log(kept_fraction) / (2 * self.step) if kept_fraction else inf
 
     @property
     def duration(self) -> float:
@@ -364,14 +380,6 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def is_minimisation(self) -> bool:
         return self.ensemble == "minimise"
 
-    @property
-    def thermostat_is_open(self) -> bool:
-        """Whether the thermostat is chosen with the integrator: bias_kT is given, and no key of a
-        thermostat."""
-        return (
-            self.bias_kT is not None and self.thermostat is None and self.thermostat_time_ps is None
-        )
-
     def with_integrator(self, integrator: str, timestep_fs: float) -> "Stage":
         """This stage with the integrator and step that pilot runs have chosen."""
         changes = {"integrator": integrator, "timestep_fs": timestep_fs}
@@ -381,7 +389,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def with_defaults(self) -> "Stage":
         """This stage with the defaults of all keys that it uses."""
         defaults: dict[str, Any] = {}
-        if self.has_thermostat and not self.thermostat_is_open:
+        if self.has_thermostat:
             defaults |= {"thermostat": self.thermostat_kind} | self.thermostat_values
         if self.has_barostat:
             named = {"barostat": self.barostat_kind} if self.ensemble == "npt" else {}

@@ -121,7 +121,7 @@ def _conditions(record: Record, stage: Stage) -> Conditions:
     system = record.system
     freedom = system.freedom_in(system.scene.stages.index(stage))
     return Conditions(
-        stage.timestep_fs * FEMTOSECOND,
+        stage.step,
         stage.temperatures[0],
         stage.pressures[0][0] * BAR_NM3 if stage.has_barostat else 0.0,
         len(system.model.species),

@@ -50,7 +50,7 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
     SimulationError."""
     stage = system.scene.stages[k]
     natural = natural_time(system, state)
-    step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.timestep_fs
+    step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.step_fs
     span = PILOT_SPAN * natural if natural else SPAN_PS
     if stage.energy_error_kT:
         span = min(span, max(PILOT_PART * stage.duration, LEAST_SPAN / PILOT_SPAN * span))

@@ -103,7 +103,8 @@ def measure_accuracy(
         simulation, state = start_of_last_stage(scene)
         trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
         trial_system.rounding = single_precision_errors(simulation.system, state)
-        base = last.timestep_fs / (last.row.force_evaluations if last.has_scheme else 1)
+        evaluations = last.row.force_evaluations if last.has_scheme else 1
+        base = simulation.scene.stages[-1].step_fs / evaluations
     if refused := [name for name in integrators if name not in trial_system.methods]:
         reasons = [
             f"{name} does not suit this scene: {trial_system.refused[name]}" for name in refused

@@ -210,7 +210,9 @@ def measure_averages(
     plan: list[tuple[Stage, AverageRun]] = []
     for integrator, thermostat in pairs:
         scheme = schemes[integrator]
-        steps = timesteps or [ratio * stage.timestep_fs for ratio in LADDER_AROUND_SCENE]
+        steps = timesteps or [
+            ratio * simulation.scene.stages[-1].step_fs for ratio in LADDER_AROUND_SCENE
+        ]
         if stiffest is not None and not timesteps:
             exact = [ratio * stable_angle(scheme) / stiffest.rate / FEMTOSECOND for ratio in LADDER]
             # two digits, for tables and legends
