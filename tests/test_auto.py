@@ -270,21 +270,24 @@ def test_what_cannot_be_kept_is_said(capsys, tmp_path):
             "integrator = 'auto' needs one of energy_error_kT, trajectory_error",
         ),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "trajectory_error": 1e-3}, "needs one of"),
-        ({"energy_error_kT": 1e-3}, "energy_error_kT would do nothing without integrator = 'auto'"),
+        (
+            {"energy_error_kT": 1e-3},
+            "energy_error_kT would have no effect without integrator = 'auto'",
+        ),
         (
             {"integrator": "auto", "energy_error_kT": 1e-3, "timestep_fs": 1.0},
-            "timestep_fs would do nothing with",
+            "timestep_fs would have no effect with",
         ),
         (
             {"integrator": "auto", "energy_error_kT": 1e-3, "rotor": "split"},
-            "rotor would do nothing with",
+            "rotor would have no effect with",
         ),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "bias_kT": 1e-3}, "needs one of"),
         (
             {"integrator": "auto", "bias_kT": 1e-3},
             "bias_kT is for averages at a temperature, and nve has no thermostat",
         ),
-        ({"bias_kT": 1e-3}, "bias_kT would do nothing without integrator = 'auto'"),
+        ({"bias_kT": 1e-3}, "bias_kT would have no effect without integrator = 'auto'"),
     ],
 )
 def test_contradictions_are_refused(stage, fault):

@@ -217,7 +217,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         (
             "timestep_fs = 1",
             "temperature_K = 300",
-            ["temperature_K would do nothing in an nve stage"],
+            ["temperature_K would have no effect in an nve stage"],
         ),
         ("temperature_K = 300", "temperature_K = -1", ["start.temperature_K", "-1"]),
         ("[start]\ntemperature_K = 300", "", ["start.temperature_K is missing"]),
@@ -253,7 +253,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         (
             "[start]",
             '[forces]\ntruncation = "shift"\nswitch_start_A = 5\n[start]',
-            ["would do nothing with truncation = 'shift'"],
+            ["would have no effect with truncation = 'shift'"],
         ),
         ("[start]", "[forces]\nskin_A = 1e300\n[start]", ["forces.skin_A", "not be more than 100"]),
         ("count = 20", "count = 10000000000000", ["not enough memory"]),
@@ -291,7 +291,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         (
             "count = 20",
             'count = 20\nparameters = "p.toml"',
-            ["line 4: molecules.0: parameters would do nothing"],
+            ["line 4: molecules.0: parameters would have no effect"],
         ),
         (
             "lengths_A = 20.0",

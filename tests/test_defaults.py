@@ -62,12 +62,12 @@ def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
         (
             13.0,
             {"reaction_field_permittivity": 78.0},
-            "would do nothing with electrostatics = 'pme' .the default.",
+            "would have no effect with electrostatics = 'pme' .the default.",
         ),
         (
             None,
             {"ewald_accuracy": 1e-4},
-            "ewald_accuracy would do nothing with electrostatics = 'coulomb' .the default",
+            "ewald_accuracy would have no effect with electrostatics = 'coulomb' .the default",
         ),
         (
             13.0,
@@ -83,7 +83,7 @@ def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
         (
             13.0,
             {"electrostatics": "pme", "reaction_field_truncation": "switch"},
-            "reaction_field_truncation would do",
+            "reaction_field_truncation would have no effect",
         ),
     ],
 )

@@ -357,7 +357,7 @@ def test_energy_is_conserved(barostat):
         ),
         ({"dispersion": "pme", "lennard_jones": False}, "lennard_jones is false"),
         ({"dispersion": "ewald", "dispersion_order": 5}, "belong to 'pme'"),
-        ({"dispersion_accuracy": 1e-4}, "would do nothing with dispersion = 'cutoff'"),
+        ({"dispersion_accuracy": 1e-4}, "would have no effect with dispersion = 'cutoff'"),
         (
             {"dispersion": "pme", "custom": [{"name": "a", "energy": "1/r^9"}]},
             "custom forces have no such sum",

@@ -449,7 +449,7 @@ def test_a_platform_with_one_precision_has_no_other():
             )
     with pytest.raises(
         SceneError,
-        match=r"precision would do nothing with engine.name = 'lammps'; it is for openmm",
+        match=r"precision would have no effect with engine.name = 'lammps'; it is for openmm",
     ):
         small_scene({"argon": 2}, 20.0, engine={"name": "lammps", "precision": "mixed"})
 
@@ -588,7 +588,9 @@ def test_adding_an_engine_takes_a_folder_and_a_file(tmp_path):
         in refused.stderr
     )
     refused = run("check", scene, "--engine", "lammps", "--tilt", "3")
-    assert "tilt would do nothing with engine.name = 'lammps'; it is for mirror" in refused.stderr
+    assert (
+        "tilt would have no effect with engine.name = 'lammps'; it is for mirror" in refused.stderr
+    )
     assert run("export", scene, "--to", "mirror", "-o", "exported").returncode == 0
     assert (tmp_path / "exported" / "mirror.txt").read_text() == "1 kinds"
     schema = run("schema").stdout

@@ -1326,25 +1326,25 @@ def test_liquid_spce_is_the_published_one():
     [
         (
             {"ewald_accuracy": 1e-3},
-            "ewald_accuracy would do nothing with electrostatics = 'reaction_field'",
+            "ewald_accuracy would have no effect with electrostatics = 'reaction_field'",
         ),
         (
             {"electrostatics": "pme", "ewald_k_max": 5},
-            "ewald_k_max would do nothing with electrostatics = 'pme'",
+            "ewald_k_max would have no effect with electrostatics = 'pme'",
         ),
-        ({"electrostatics": "ewald", "pme_order": 4}, "pme_order would do nothing"),
-        ({"electrostatics": "pme", "damping_per_A": 0.1}, "damping_per_A would do nothing"),
+        ({"electrostatics": "ewald", "pme_order": 4}, "pme_order would have no effect"),
+        ({"electrostatics": "pme", "damping_per_A": 0.1}, "damping_per_A would have no effect"),
         (
             {"electrostatics": "ewald", "reaction_field_permittivity": 80.0},
-            "reaction_field_permittivity would do nothing",
+            "reaction_field_permittivity would have no effect",
         ),
         (
             {"ewald_truncation": "plain"},
-            "ewald_truncation would do nothing with electrostatics = 'reaction_field'",
+            "ewald_truncation would have no effect with electrostatics = 'reaction_field'",
         ),
         (
             {"electrostatics": "damped_shifted_force", "ewald_truncation": "shift"},
-            "ewald_truncation would do nothing",
+            "ewald_truncation would have no effect",
         ),
         (
             {"electrostatics": "pme", "ewald_truncation": "switch"},
@@ -1372,7 +1372,7 @@ def test_liquid_spce_is_the_published_one():
                 "ewald_alpha_per_A": 0.3,
                 "ewald_accuracy": 1e-4,
             },
-            "ewald_accuracy would do nothing: alpha",
+            "ewald_accuracy would have no effect: alpha",
         ),
         ({"electrostatics": "pme", "pme_order": 9}, "pme_order: is 9, must not be more than 8"),
         (

@@ -593,12 +593,12 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         (
             {"electric_frequency_per_ps": 1.0},
             {},
-            "electric_frequency_per_ps would do nothing without electric_V_per_nm",
+            "electric_frequency_per_ps would have no effect without electric_V_per_nm",
         ),
         (
             {"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_phase_deg": 90.0},
             {},
-            "electric_phase_deg would do nothing without electric_frequency_per_ps",
+            "electric_phase_deg would have no effect without electric_frequency_per_ps",
         ),
         (
             {"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_frequency_per_ps": 300.0},
@@ -608,7 +608,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         (
             {"electric_V_per_nm": [0.0, 0.0, 1.0]},
             {"molecules": [{"model": "argon", "count": 3}]},
-            "fields.electric_V_per_nm would do nothing: no molecule that moves has a charge",
+            "fields.electric_V_per_nm would have no effect: no molecule that moves has a charge",
         ),
         (
             {"electric_V_per_nm": [0.0, 1.0]},
@@ -633,7 +633,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         (
             {"walls": [LJ | {"stiffness_kJ_mol_A2": 1.0}]},
             {},
-            "fields.walls.0: stiffness_kJ_mol_A2 would do nothing with kind = 'lj93'",
+            "fields.walls.0: stiffness_kJ_mol_A2 would have no effect with kind = 'lj93'",
         ),
         (
             {"walls": [{key: LJ[key] for key in ("axis", "kind", "positions_A")}]},
@@ -691,7 +691,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         (
             {"restraints": [{"stiffness_kJ_mol_A2": [0.0, 0.0, 0.0]}]},
             {},
-            "stiffness_kJ_mol_A2: is 0: it would do nothing",
+            "stiffness_kJ_mol_A2: is 0: it would have no effect",
         ),
         (
             {"restraints": [HELD | {"molecules": "3-1"}]},
@@ -1012,12 +1012,12 @@ def test_a_restrained_distance_in_a_run():
         (PAIR | {"between": [2, 2]}, "between: a molecule is named twice"),
         (PAIR | {"between": [[1, 2], [2, 3]]}, "between: a molecule is named twice"),
         (PAIR | {"distance_A": None}, "between needs distance_A"),
-        (PAIR | {"between": None}, "distance_A would do nothing without between"),
+        (PAIR | {"between": None}, "distance_A would have no effect without between"),
         (
             PAIR | {"stiffness_kJ_mol_A2": [1.0, 1.0, 2.0]},
             "stiffness_kJ_mol_A2 has one number for a distance",
         ),
-        (PAIR | {"position_A": [1.0, 1.0, 2.0]}, "position_A would do nothing with between"),
+        (PAIR | {"position_A": [1.0, 1.0, 2.0]}, "position_A would have no effect with between"),
         (PAIR | {"distance_A": 9.5}, "may come near half the smallest height of the box, 10 Å"),
         (
             PAIR | {"distance_A": 8.0, "stiffness_kJ_mol_A2": 0.01},

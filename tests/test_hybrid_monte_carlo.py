@@ -150,11 +150,11 @@ def test_auto_chooses_step_and_length():
     ("changes", "message"),
     [
         ({"integrator": "baoab"}, "baoab contains a thermostat of its own"),
-        ({"integrator": "auto", "bias_kT": 0.01}, "bias_kT would do nothing"),
+        ({"integrator": "auto", "bias_kT": 0.01}, "bias_kT would have no effect"),
         ({"momentum_refreshment": 0.0}, "momentum_refreshment"),
         (
             {"thermostat": "langevin", "trajectory_steps": 10},
-            "trajectory_steps would do nothing with langevin",
+            "trajectory_steps would have no effect with langevin",
         ),
         ({"trajectory_steps": 0}, "trajectory_steps"),
     ],

@@ -293,7 +293,7 @@ def _start_potential(scene: Path) -> float:
             ["stages.0.ensemble=npt", "stages.0.pressure_bar=1", "stages.0.barostat=monte_carlo"],
             "has its own for rigid",
         ),
-        (["engine.platform=CUDA"], "platform would do nothing with engine.name = 'lammps'"),
+        (["engine.platform=CUDA"], "platform would have no effect with engine.name = 'lammps'"),
         (["engine.ranks=0"], "engine.ranks"),
         (["engine.ranks=1000"], "engine.ranks: 1000 ranks for "),
         ([f"engine.ranks={2**31}"], "some would have nothing to move; use fewer"),

@@ -154,7 +154,7 @@ def test_the_start_of_the_last_stage_is_in_the_mean_box():
             [NPT | {"pressure_bar": [1.0, 500.0]}, MEAN],
             r"stages.1.volume .*; stages.0 is npt, and its set point changes",
         ),
-        ([NPT | {"volume": "mean"}], "volume would do nothing in an npt stage"),
+        ([NPT | {"volume": "mean"}], "volume would have no effect in an npt stage"),
         ([NPT, MEAN | {"volume": "last"}], "volume"),
     ],
 )

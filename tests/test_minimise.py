@@ -466,19 +466,19 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
 @pytest.mark.parametrize(
     ("stages", "more", "expected"),
     [
-        ([stage_of(duration_ps=1.0)], {}, "duration_ps would do nothing in a minimise stage"),
-        ([stage_of(timestep_fs=1.0)], {}, "timestep_fs would do nothing"),
-        ([stage_of(temperature_K=300.0)], {}, "temperature_K would do nothing"),
-        ([stage_of(integrator="srkn_6")], {}, "integrator would do nothing"),
+        ([stage_of(duration_ps=1.0)], {}, "duration_ps would have no effect in a minimise stage"),
+        ([stage_of(timestep_fs=1.0)], {}, "timestep_fs would have no effect"),
+        ([stage_of(temperature_K=300.0)], {}, "temperature_K would have no effect"),
+        ([stage_of(integrator="srkn_6")], {}, "integrator would have no effect"),
         (
             [stage_of(pressure_coupling="flexible")],
             {},
-            "would do nothing in a minimise stage without pressure_bar",
+            "would have no effect in a minimise stage without pressure_bar",
         ),
         (
             [stage_of(pressure_limit_bar=2.0)],
             {},
-            "would do nothing in a minimise stage without pressure_bar",
+            "would have no effect in a minimise stage without pressure_bar",
         ),
         ([stage_of(pressure_bar=(1.0, 2.0))], {}, "one pressure, not one that changes"),
         ([stage_of(pressure_bar=(1.0, 2.0, 3.0))], {}, "pressure_coupling = 'anisotropic'"),
@@ -487,7 +487,7 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
         (
             [{"duration_ps": 1.0, "force_limit_kJ_mol_A": 0.2}],
             {},
-            "force_limit_kJ_mol_A would do nothing in an nve stage",
+            "force_limit_kJ_mol_A would have no effect in an nve stage",
         ),
         ([{"ensemble": "nve"}], {}, r"stages.0.duration_ps: is missing"),
         (

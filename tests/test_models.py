@@ -671,7 +671,7 @@ def test_copied_files_do_not_rename_a_species(named, own):
             ('parameters = "aromatic.toml"', ""),
             "a geometry file needs sites, or a file of parameters",
         ),
-        (('file = "benzene.xyz"', 'model = "spce"'), "parameters would do nothing"),
+        (('file = "benzene.xyz"', 'model = "spce"'), "parameters would have no effect"),
         (
             ('"aromatic.toml"', '"aromatic.toml"\nsites = [{ name = "S" }]'),
             "sites: S is not an atom of it",

@@ -495,7 +495,7 @@ def test_who_interacts_with_which_parameters():
                 "k/r**9", pairs={("AR", "KR"): {"k": 1.0}, ("KR", "AR"): {"k": 2.0}}
             )
         )
-    with pytest.raises(SceneError, match="switch_start_A would do nothing"):
+    with pytest.raises(SceneError, match="switch_start_A would have no effect"):
         numbers(rigidmd.pair_potential("k/r**9", both, truncation="shift", switch_start_A=7.0))
     with pytest.raises(SceneError, match=r"longer than half"):
         numbers(rigidmd.pair_potential("k/r**9", {"k": 1.0}, cutoff_A=13.0))
@@ -972,7 +972,7 @@ def test_a_file_of_code_runs_only_where_it_is_trusted(tmp_path, monkeypatch, cap
         ("def f(:", {"name": "x"}, "line 1 raised SyntaxError"),
         (MINE, {"name": "tarp"}, "has no tarp; did you mean .*trap"),
         (MINE, {"name": "trap"}, r"trap\(...\) raised TypeError"),
-        (MINE, {"name": "ready", "parameters": {"k": 1.0}}, "parameters would do nothing"),
+        (MINE, {"name": "ready", "parameters": {"k": 1.0}}, "parameters would have no effect"),
         ("x = 3", {"name": "x"}, "3 is not a force"),
     ],
 )
@@ -991,7 +991,10 @@ def test_a_file_that_is_no_use_is_told(text, entry, word, tmp_path):
     [
         ({"name": "x"}, "give a module"),
         ({"name": "x", "module": "m.py", "energy": "1/r"}, "give a module"),
-        ({"name": "x", "module": "m.py", "sites": ["A"]}, "sites would do nothing with a module"),
+        (
+            {"name": "x", "module": "m.py", "sites": ["A"]},
+            "sites would have no effect with a module",
+        ),
         ({"name": "x", "module": "m.txt"}, "must be a Python file"),
         ({"name": "x", "module": "../m.py"}, "outside the scene's folder"),
         ({"name": "x y", "energy": "1/r"}, "name"),

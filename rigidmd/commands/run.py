@@ -17,7 +17,7 @@ from rigidmd.commands.arguments import (
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import SceneError
 
-#: Options of a run that begins or continues.
+#: Options of a run that starts or continues.
 DURATION = (
     argument(
         "--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)"

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from rigidmd.run.simulation import Simulation
 
 
-#: Most evaluations of forces between two checks, and most samples.
+#: Maximum number of evaluations of forces between two checks, and most samples.
 EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 1_000_000, 512
 
 

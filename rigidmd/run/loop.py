@@ -1,4 +1,4 @@
-"""The loop of a run: it begins or resumes, jumps from one observation to the next, and ends with
+"""The loop of a run: it starts or resumes, jumps from one observation to the next, and ends with
 all files."""
 
 import contextlib
@@ -61,7 +61,7 @@ def _observers_by_name(
 
 
 class RunLoop:
-    """A run of a simulation, from its beginning to its end.
+    """A run of a simulation, from its starting to its end.
 
     drive : advances it; the run pauses in between, and then holds its folder and its files
     advanced : steps of the last call of `drive`
@@ -71,7 +71,7 @@ class RunLoop:
     _advance from one observation to the next, _leave, and at the end _finish.
     """
 
-    _schedule: ObservationSchedule  # of the present segment
+    _schedule: ObservationSchedule  # of the current segment
 
     def __init__(
         self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None
@@ -304,7 +304,7 @@ class RunLoop:
             raise self._error
 
     def _note_lost_files(self) -> None:
-        """Note which files another program removed, replaced or changed; the run has no more to
+        """Note which files another program removed, replaced or changed. The run has no more to
         write to them."""
         for observer in self._observers.values():
             if isinstance(observer, GrowingFile):
@@ -341,7 +341,7 @@ class RunLoop:
         return "".join(observer.failed(self._simulation) for observer in self._observers.values())
 
     def _read_checkpoint(self, folder: Path) -> tuple[Checkpoint | None, bool]:
-        """The checkpoint to resume from, None if the run has to begin, and whether the files of the
+        """The checkpoint to resume from, None if the run has to start, and whether the files of the
         folder stay."""
         if run_folder.is_empty(folder) or run_folder.never_began(folder):
             self._simulation._announce(f"{folder} holds no run yet: beginning it")
@@ -481,11 +481,11 @@ class RunLoop:
 
     @property
     def _done(self) -> int:
-        """Steps since the start of the present segment."""
+        """Steps since the start of the current segment."""
         return int(self._part.state.step[NOW]) - self._part.record.position.first
 
     def _notify(self, done: int, due: Sequence[bool]) -> None:
-        """Call the observers that are due after `done` steps of the present segment."""
+        """Call the observers that are due after `done` steps of the current segment."""
         position = self._part.record.position
         time = position.time + done * self._part.segment.dt
         moment = Moment(self._simulation, position.first + done, time, position.segment)
@@ -498,7 +498,7 @@ class RunLoop:
         self, observer: Observer, method: Callable[..., None], *arguments: object
     ) -> None:
         """Call a method of an observer, unless the observer has failed before. Its error ends the
-        run, which raises it when all files are complete; an error of a figure becomes a note. `see`
+        run, which raises it when all files are complete. An error of a figure becomes a note. `see`
         may raise the errors of this package."""
         if observer in self._failed_before:
             return

@@ -137,7 +137,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     def reset(self) -> None:
         super().reset()
-        self._is_sampled = False  # whether `_sampler` belongs to the present state
+        self._is_sampled = False  # whether `_sampler` belongs to the current state
         self._set_stages(self._start.scene.stages)  # an earlier run may have chosen an integrator
         self.engine = self.system.engine()
         self.state = self.system.state.copy()
@@ -245,7 +245,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             self.system.engine().advance(self._state_for(method).copy(), method, 0.0, 0)
 
     def _state_for(self, method: Scheme | Solver) -> State:
-        """The present state, without copies, with the additional variables of an integrator."""
+        """The current state, without copies, with the additional variables of an integrator."""
         return self.state._replace(extra_variables=self.engine.variables(self.state, method))
 
     def _engine_of(self, k: int) -> Engine:
@@ -337,7 +337,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return segment
 
     def _minimise(self, progress: bool | None) -> None:
-        """Run the present stage, a minimisation, with a warning if it does not converge."""
+        """Run the current stage, a minimisation, with a warning if it does not converge."""
         k = self.record.position.segment
         stage = self.scene.stages[k]
         with progress_of(
@@ -381,7 +381,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             )
 
     def _choose(self, k: int) -> None:
-        """Choose integrator and step of a stage by pilot runs from the present state, and set them
+        """Choose integrator and step of a stage by pilot runs from the current state, and set them
         in the scene."""
         from rigidmd.run.pilot.stages import choose_for_stage
 

@@ -1,9 +1,9 @@
 """Observers are called between the steps of a run. They read its state and never change it.
 
 An observer is any object with an `interval` and a method `see`; `Observer` has all other methods,
-which do nothing. `see` is called every `interval` of time, counted in steps of each segment, or
+which have no effect. `see` is called every `interval` of time, counted in steps of each segment, or
 every `steps` steps, independent of the interval of results, and with `ends` also at the last moment
-of every segment. A time at which a minimisation begins has two states: with `once` only the second
+of every segment. A time at which a minimisation starts has two states: with `once` only the second
 is observed. No observer depends on another: data that several need belong to the moment or run.
 """
 
@@ -83,7 +83,7 @@ def above_zero(interval: float, name: str) -> float:
 
 
 class Observer:
-    """Base class; its methods do nothing.
+    """Base class. Its methods have no effect.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class Observer:
         """Called instead of `begin` when a run is resumed: restore the data of `memory`, and check
         files unchanged.
 
-        The run is refused if this raises KeyError, TypeError, ValueError or OutputError.
+        The run is rejected if this raises KeyError, TypeError, ValueError or OutputError.
         """
         for name, value in restored(kept, self.remembers).items():
             setattr(self, name, value)

@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 SystemT = TypeVar("SystemT")
 SceneT = TypeVar("SceneT")
 
-#: Simulations that have begun and not ended, which are closed when the interpreter exits.
+#: Simulations that have started and not ended, which are closed when the interpreter exits.
 _BEGUN: "weakref.WeakSet[Simulation]" = weakref.WeakSet()
 
 
@@ -207,7 +207,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         self._spot = DisplayArea()
         self._progress: bool | None = None
         self._issued: list[str] = []  # warnings by this process
-        self._loop: RunLoop | None = None  # the run, after it has begun and before it has ended
+        self._loop: RunLoop | None = None  # the run, after it has started and before it has ended
         self._earlier: run_folder.RunMark | None = (
             None  # of the last run by this object in the folder
         )
@@ -261,7 +261,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
     @property
     def engine(self) -> "Engine":
-        """The present engine."""
+        """The current engine."""
         return self._part.engine
 
     @property
@@ -271,16 +271,16 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
     @property
     def state(self) -> State:
-        """The present state, read-only: the next step changes it, a copy stays as it is.
+        """The current state, read-only: the next step changes it, a copy stays as it is.
 
         For molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in
-        SI units. Runs begin from another state by `start_from`.
+        SI units. Runs start from another state by `start_from`.
         """
         return self._part.state.read_only
 
     @property
     def observation(self) -> "Observation | Pose":
-        """Observables of the present state, before, within and after a run; each use evaluates the
+        """Observables of the current state, before, within and after a run. Each use evaluates the
         forces.
 
         An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log; the `Pose` of a body,
@@ -295,13 +295,13 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
     @property
     def energy(self) -> float:
-        """Potential plus kinetic energy of the present state, kJ/mol, for a body J; `observation`
+        """Potential plus kinetic energy of the current state, kJ/mol, for a body J; `observation`
         has both."""
         return self._part.energy_now()
 
     @property
     def forces(self) -> np.ndarray:
-        """Forces (n, 3) on the centres of mass at the present state, lab frame, kJ/mol/Å; on a body
+        """Forces (n, 3) on the centres of mass at the current state, lab frame, kJ/mol/Å; on a body
         (1, 3) in N, empty if it is pinned."""
         return self._part.forces_now()
 
@@ -358,14 +358,14 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         return cast("MolecularRun", part)
 
     def start_from(self, state: State) -> None:
-        """Let runs of molecules begin at the given positions and momenta, without removal of
+        """Let runs of molecules start at the given positions and momenta, without removal of
         overlaps.
 
         Parameters
         ----------
         state
             A state of as many molecules in the same order, in the units of `state`, such as
-            `results.state`. Time and step begin at 0. Raises StructureError for a state that this
+            `results.state`. Time and step start at 0. Raises StructureError for a state that this
             scene cannot have, TypeError for anything else.
         """
         self._molecules().start_from(state)
@@ -383,7 +383,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         return self._molecules().settle()
 
     def atoms(self) -> "ase.Atoms":
-        """The present state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers
+        """The current state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers
         may call it."""
         return self._molecules(begun=True).atoms()
 
@@ -397,11 +397,11 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         self._part.reset()
 
     def _take_threads(self, count: int) -> None:
-        """Set the number of threads. Results do not depend on it; a single body always has one."""
+        """Set the number of threads. Results do not depend on it. A single body always has one."""
         self._before_run().take_threads(count)
 
     def _start_energy(self, *unit: Any, **options: Any) -> Json:
-        """Energies and forces at the start; for the arguments see `MolecularRun.start_energy`, a
+        """Energies and forces at the start. For the arguments see `MolecularRun.start_energy`, a
         body has none."""
         return self._before_run().start_energy(*unit, **options)
 
@@ -412,7 +412,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         After the end of a run, a call repeats it; in a folder it replaces the files of that run. A
         run in a folder that was interrupted is continued from its last checkpoint. Without a folder
-        there is none, and it begins anew.
+        there is none, and it starts again.
 
         Parameters
         ----------
@@ -441,7 +441,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """Advance by a number of steps, as `run` does. Returns the number done: fewer at the end of
         the scene, then 0.
 
-        The first call begins the run: it compiles and writes the first files. A minimisation is
+        The first call starts the run: it compiles and writes the first files. A minimisation is
         done with the next step after it. `run` or `close` completes the run. A signal such as
         Ctrl-C ends the run with all files, and is raised then.
 
@@ -455,7 +455,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         return self._drive(count, False).advanced
 
     def close(self) -> None:
-        """End a run that `step` has begun, with all files, as `stop` ends it: it can be resumed.
+        """End a run that `step` has started, with all files, as `stop` ends it: it can be resumed.
         The end of a `with` block does this, and so does the end of Python."""
         if (
             self._loop is not None
@@ -506,7 +506,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         return self._loop is not None and self._loop.interrupted
 
     def _drive(self, steps: float, progress: bool | None) -> RunLoop:
-        """Let the run advance by at most this number of steps, or to its end. A new one begins
+        """Let the run advance by at most this number of steps, or to its end. A new one starts
         after its end."""
         if self._loop is None:
             self._issued = []
@@ -606,7 +606,7 @@ def run_together(
         while running:
             _, running = wait(running, POLL_INTERVAL)
             if received:
-                stop_all()  # repeatedly: a run that was just beginning may have missed it
+                stop_all()  # repeatedly: a run that was just starting may have missed it
     failed = {
         k: error for k, future in enumerate(futures, 1) if (error := future.exception()) is not None
     }

@@ -1,4 +1,4 @@
-"""Integrators of users as rows of coefficients, in the tables [[integrators]] of a scene or by
+"""Integrators of users as scheme, in the tables [[integrators]] of a scene or by
 `integrator`."""
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ ORDER_TOLERANCE = 0.5
 
 
 class IntegratorRow(Section):
-    """An integrator as a row of coefficients, for stages and for `rigidmd accuracy`."""
+    """An integrator as a scheme, for stages and for `rigidmd accuracy`."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$", max_length=60)]
     """Name for stages, [run] of a body and --integrators"""

@@ -90,7 +90,7 @@ ShortName = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]+$"
 
 
 class NameIn:
-    """Annotation of a text that is a name in a table, which is read anew at each validation. Its
+    """Annotation of a text that is a name in a table, which is read again at each validation. Its
     JSON schema lists the
     names. in_scene : whether names in the context of the validation are known too"""
 

@@ -70,7 +70,7 @@ class Coordinates:
 
     The order is: shifts sqrt(m) X along x, y, z of molecule 1, of molecule 2, ...; then rotations
     sqrt(I_k) theta_k about the principal axes 1, 2, 3 of molecule 1, of molecule 2, ...; those that
-    do not move are left out.
+    do not move are omitted.
 
     scale : (d,) length of a move of `Enthalpy`, Å, for a unit of q
     index : (d,) of each coordinate among all shifts (3 n) and then all rotations (3 n)
@@ -358,7 +358,7 @@ def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, 
 
 def _stiffness(enthalpy: Enthalpy, system: System, state: State) -> float:
     """The force, kJ/(mol Å), with which the stiffest motion opposes a displacement by the smallest
-    diameter; at least the deepest well over this diameter, as far from each other molecules hardly
+    diameter; at least the deepest well over this diameter, as far from each other molecules barely
     attract. Raises SimulationError."""
     fastest = stiffest_mode(system, state, enthalpy.engine) if enthalpy.free.any() else None
     if fastest is None:

@@ -74,7 +74,7 @@ def _results_of(record: Record) -> Results:
 
 
 def _state_of(record: Record) -> tuple[State | None, str]:
-    """The final state of a run, or the state of its last checkpoint; if there is none, None and
+    """The final state of a run, or the state of its last checkpoint. If there is none, None and
     why."""
     path, start = record.folder / FINAL, record.system.state
     try:

@@ -241,7 +241,7 @@ def _errors_over_blocks(
     frames: np.ndarray, conclude: Callable[[np.ndarray], np.ndarray], samples: float
 ) -> Measured:
     """Two estimates of the standard errors of what follows from the mean of frames (f, ...): the
-    scatter of blocks of frames, whose means are noisy, and that of leaving out one block after
+    scatter of blocks of frames, whose means are noisy, and that of omitting one block after
     another, which sees few of the jumps.
 
     samples : frames for each independent one

@@ -91,7 +91,7 @@ def _custom(scene: MolecularScene, entry: CustomForce, key: str) -> Any:
             raise ValueError(f"{entry.name}(...) raised {describe_error(error)}") from error
     elif entry.parameters:
         raise ValueError(
-            f"parameters would do nothing: {entry.name} is an object, which is not called"
+            f"parameters would have no effect: {entry.name} is an object, which is not called"
         )
     return made
 

@@ -101,7 +101,7 @@ class Force:
         """(energy in kJ/mol, forces (n, 3) on centres of mass in kJ/mol/Å, torques (n, 3) in
         kJ/mol, body frame).
 
-        Torques may be left out. A fourth value is the molecular virial (3, 3), kJ/mol.
+        Torques may be omitted. A fourth value is the molecular virial (3, 3), kJ/mol.
         """
         raise NotImplementedError
 

@@ -165,7 +165,7 @@ def _number_of_k_vectors(forces: Any, radius: float | None, volume: float) -> fl
 
 
 def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | None]:
-    """Errors of real space and of k-space (e²/Å², see `ewald.errors`), and the k-vectors; with PME
+    """Errors of real space and of k-space (e²/Å², see `ewald.errors`), and the k-vectors. With PME
     these are only for the interactions of frozen molecules, and None without any. Raises
     SceneError."""
     forces, volume, cell = parts.scene.forces, parts.space.volume, cell_of(parts.space)

@@ -59,13 +59,13 @@ def measure_accuracy(
     """Error against run time of integrators at time steps, on the start of a scene. Raises
     SceneError.
 
-    integrators : names; default: the scene's and those that suit it; the others are in `left_out`.
+    integrators : names; default: the scene's and those that suit it. The others are in `left_out`.
         rk4, dop853 and radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion
         or _euler_angles sets another
     timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost
         around the scene's
     span : ps or s
-    progress : called with the fraction that is done; at 0, after all arguments have been checked
+    progress : called with the fraction that is done. At 0, after all arguments have been checked
 
     Molecules start where the last stage starts, after the earlier stages have run; no thermostat
     acts.
@@ -237,7 +237,7 @@ def _span(measured: IntegratorAccuracy) -> str:
 
 
 def remarks(measured: IntegratorAccuracy) -> list[str]:
-    """Sentences on the reference, the longest stable steps, what failed or was left out, and the
+    """Sentences on the reference, the longest stable steps, what failed or was omitted, and the
     timings."""
     s = measured.trial_system
     lines = [

@@ -79,7 +79,7 @@ def order_table(measured: IntegratorAccuracy) -> Table:
 
 
 def _order_of(method: Method) -> str | None:
-    """The order of a scheme; a solver that chooses its steps has none."""
+    """The order of a scheme. A solver that chooses its steps has none."""
     adapts = not isinstance(method.scheme, Scheme) and method.scheme.name != RK4
     return None if adapts else str(method.order)
 

@@ -273,7 +273,7 @@ def digest_of(scene: Scene, file_digest: Callable[[Path], str] = file_digest) ->
 
 
 def order_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
-    """The axes in the order of the sweep in a folder; a single value of a key that it varies is one
+    """The axes in the order of the sweep in a folder. A single value of a key that it varies is one
     more value."""
     if not is_sweep(folder):
         return axes
