@@ -385,7 +385,7 @@ def test_steps_suit_what_is_fast_in_a_body():
     compass = measure_accuracy(
         Scene.read(ROOT / "systems" / "gyrocompass.toml"), ["kahan_li_6"], span=60.0, repeats=1
     )
-    # the wheel's nutation, 20 rad/s, sets the steps, not the Earth's turning
+    # the wheel's nutation, 20 rad/s, sets the steps, not the Earth's rotating
     assert not any(trial.diverged for trial in compass.trials[-3:])
     assert compass.trials[-1].rotation_error < 1e-6
 
@@ -541,7 +541,7 @@ def test_the_formulation_of_the_scene_is_the_one_measured():
 
 @pytest.fixture
 def planned(monkeypatch):
-    """(names tried, what was left out) by default on a scene; nothing is run."""
+    """(names tried, what was omitted) by default on a scene; nothing is run."""
     monkeypatch.setattr(
         accuracy,
         "measure",
@@ -654,7 +654,7 @@ def test_errors_of_a_limit_and_of_biases_are_those_of_repeated_measurements():
             for point in zip(steps, 2 + b * steps**2 + n, errors, strict=True)
         ]
         fit = extrapolate(points)
-        if fit.longest == 4:  # of what was not left out by chance
+        if fit.longest == 4:  # of what was not omitted by chance
             limits.append((fit.limit, fit.limit_error))
             biases.append([fit.bias(point) for point in points])
     assert len(limits) > 1700
@@ -748,7 +748,7 @@ def test_the_step_of_a_bias_that_is_not_seen_allows_for_its_error(slope, error, 
             6.0,
             1.0,
             4.0,
-        ),  # the longest step has more than dt², and is left out
+        ),  # the longest step has more than dt², and is omitted
     ],
 )
 def test_pulls_of_limits_have_unit_width(steps, runs, more, errors, longest):
@@ -881,7 +881,7 @@ def test_what_is_said_of_averages_follows_from_them(oscillators):
 
 
 def test_averages_leave_out_what_comes_before_equilibrium():
-    """A fifth of the time sampled comes before it: the means are those of the same run without its
+    """A fifth of the time sampled comes before it: the means are the values of the same run without its
     first part."""
     (run,) = measure_averages(springs(), ["baoab"], [10.0], sample=2.0).runs
     again = springs(integrator="baoab", timestep_fs=10.0, duration_ps=2.4)

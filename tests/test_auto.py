@@ -1,4 +1,4 @@
-"""integrator = "auto": what is chosen keeps the error asked for, is written down, and repeats."""
+"""integrator = "auto": what is chosen keeps the error requested, is written down, and repeats."""
 
 import re
 from math import comb
@@ -23,7 +23,7 @@ TOP = ROOT / "systems" / "heavy_top_3.toml"
 
 
 def liquid(**last):
-    """27 waters, warmed up, then 0.3 ps of NVE as told."""
+    """27 waters, warmed up, then 0.3 ps of NVE as given."""
     stages = [
         {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.5},
         {"duration_ps": 0.3} | last,
@@ -54,7 +54,7 @@ def test_the_energy_error_asked_for_is_kept_with_fewer_forces_than_verlet_needs(
     assert energy_error(results) < 1e-5
     said = float(re.search(r"In the [\d.]+ ps that ran it was (\S+)", stage["choice"])[1])
     assert said == pytest.approx(energy_error(results), rel=0.3)
-    # the scene that was written says what was chosen, and repeats the run to the bit
+    # the scene that was written states what was chosen, and repeats the run to the bit
     again = Scene.read(tmp_path / "a" / "scene.toml")
     assert again.stages[1].integrator == stage["integrator"]
     assert again.stages[1].timestep_fs == stage["timestep_fs"]
@@ -110,7 +110,7 @@ def test_a_crude_error_is_kept_crudely():
     assert "chosen: error of the energy" in coarse["choice"]
     assert "over 0.3 ps for a target of 0.003 (expected, from" in coarse["choice"]
     assert "ps that ran it was" in coarse["choice"]
-    second = simulation.run().summary["stages"][1]  # a simulation chooses anew, and the same
+    second = simulation.run().summary["stages"][1]  # a simulation chooses again, and the same
     assert (second["integrator"], second["timestep_fs"]) == (
         coarse["integrator"],
         coarse["timestep_fs"],
@@ -334,7 +334,7 @@ def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
     ],
 )
 def test_the_bias_asked_for_sets_the_step(thermostat, tmp_path):
-    """Of oscillators w is known: the pilot finds it to the error of its sampling, some per cent."""
+    """For oscillators w is known: the pilot finds it to the error of its sampling, some per cent."""
     stage = {"integrator": "auto", "bias_kT": 1e-3, "thermostat": thermostat, "duration_ps": 0.2}
     if thermostat != "langevin":
         stage["friction_translation_per_ps"] = None

@@ -1,4 +1,4 @@
-"""Bad input: each gets one message that says what, where and what to do; no traceback, nothing
+"""Bad input: each gets one message that states what, where and what to do; no traceback, nothing
 half-written."""
 
 import json

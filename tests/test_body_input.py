@@ -1,4 +1,4 @@
-"""Scenes of a body that cannot be what their author meant: each fault one clear message, all at
+"""Scenes of a body that cannot be what their author meant: each error one clear message, all at
 once."""
 
 import pytest

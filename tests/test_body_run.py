@@ -261,7 +261,7 @@ def test_resolved_scenes_are_scenes(path, tmp_path):
 @pytest.mark.parametrize("integrator", ["rk4", "dop853"])
 @pytest.mark.parametrize("name", ["heavy_top_3", "dropped_stone"])
 def test_resolved_scenes_hold_what_a_solver_needs(name, integrator, tmp_path):
-    """And no formulation of a point, which does not turn."""
+    """And no formulation of a point, which does not rotate."""
     scene = Scene.read(ROOT / "systems" / f"{name}.toml", {"run.integrator": integrator})
     resolved = rigidmd.resolve(scene)
     assert rigidmd.resolve(resolved) == resolved

@@ -1,4 +1,4 @@
-"""The door to Numba: what we assume of it beyond its promises, addresses and their types, the
+"""The interface to Numba: what we assume of it beyond its promises, addresses and their types, the
 cache, and the rules that sources keep."""
 
 import ast
@@ -660,7 +660,7 @@ files.untrusted_reason = of_another
 def test_code_behind_a_link_in_the_cache_is_not_used(kept, tmp_path):
     shutil.copytree(kept / "cache", tmp_path / "cache")
     (tmp_path / "cache").rename(tmp_path / "other")
-    (tmp_path / "cache").symlink_to(tmp_path / "other")  # the user's own choice of a folder
+    (tmp_path / "cache").symlink_to(tmp_path / "other")  # the user's choice of a folder
     assert compiled_in(tmp_path / "cache", kept) == ("42 1", "")
     kernels = folders_of(tmp_path / "other", ".nbi")[1]
     kernels.rename(tmp_path / "elsewhere")

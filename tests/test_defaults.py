@@ -34,7 +34,7 @@ NVT = {"ensemble": "nvt", "temperature_K": 298.15, "duration_ps": 0.02}
 
 
 def scene(edge: float | None = 13.0, **tables) -> Scene:
-    """64 waters with nothing but what a user has to say."""
+    """64 waters with nothing but what a user has to state."""
     box = {"lengths_A": edge} if edge else {"lengths_A": 13.0, "periodic": False}
     forces = {"cutoff_A": 6.0} if edge else {}
     return Scene.from_dict(
@@ -158,7 +158,7 @@ def positions_file(path, position, edges) -> str:
         ((5, 5, 5), (20.0, 20.0, 60.0), False),  # a slab
         ((5, 5, 5), (60.0, 60.0, 60.0), False),  # a droplet
         ((5, 5, 15), (20.0, 20.0, 60.0), True),
-        ((2, 2, 2), (20.0, 20.0, 20.0), True),  # few molecules are far apart, and even
+        ((2, 2, 2), (20.0, 20.0, 20.0), True),  # few molecules are far from each other, and even
     ],
 )
 def test_a_tail_correction_is_for_boxes_that_molecules_fill(lattice, edges, expected, tmp_path):
@@ -531,7 +531,7 @@ def test_a_run_keeps_its_default_step_and_check_tells_its_error(tmp_path, capsys
     )
     assert main(["check", str(path)]) == 0
     out = capsys.readouterr().out
-    error = "error of the step: spce rotates about its lightest axis as if forces were wrong by"
+    error = "time-step error: spce rotates about its lightest axis as if forces were wrong by"
     assert "0: nvt: 5 steps of 4 fs = 0.02 ps, baoab" in out
     assert f"{error} 4 %; bias of U about 0.002 kT per degree of freedom" in out
     assert "1: nve: 10 steps of 2 fs = 0.02 ps, velocity_verlet" in out

@@ -1,7 +1,7 @@
 """README and the chapters: every command and snippet in them runs, every key and column is in the
 manual, no link is dead.
 
-A comment before a block tells this file how to treat it:
+A comment before a block shows this file how to treat it:
 
     <!-- test: file NAME -->       the block is the file NAME, which later commands use
     <!-- test: with OPTIONS -->    OPTIONS are added to each `rigidmd run`, `accuracy` and `sweep` of the block, and those
@@ -76,12 +76,12 @@ MINIMAL = {
 
 
 class Block(NamedTuple):
-    """A fenced block, or the indented lines that README begins with."""
+    """A fenced block, or the indented lines that README starts with."""
 
     line: int  # of its first line of text
     language: str
     text: str
-    told: str  # what the comment before it tells this test
+    told: str  # what the comment before it shows this test
 
 
 def blocks_of(document: Path) -> list[Block]:
@@ -109,7 +109,7 @@ def blocks_of(document: Path) -> list[Block]:
 
 
 def commands_of(text: str) -> list[list[str]]:
-    """The words of each command of a shell block, comments left out."""
+    """The words of each command of a shell block, comments omitted."""
     joined = text.replace("\\\n", " ")
     return [
         shlex.split(part, comments=True)
@@ -139,7 +139,7 @@ def pattern_of(quoted: str, like: bool) -> re.Pattern:
 
 
 class Reader:
-    """Does what a document tells its reader to do, in the working directory."""
+    """Does what a document shows its reader to do, in the working directory."""
 
     def __init__(self, monkeypatch, capsys):
         self.monkeypatch, self.capsys = monkeypatch, capsys
@@ -199,7 +199,7 @@ class Reader:
                 source = (ROOT / script).read_text()
                 assert all(a in source for a in arguments if a.startswith("--")), words
             case ["python", script]:
-                # Terms of one's own name their classes in the cache, and would leave an index
+                # Terms of user-defined name their classes in the cache, and would leave an index
                 # nobody else can read
                 own = {
                     "RIGIDMD_CACHE": "cache",
@@ -439,7 +439,7 @@ def test_every_key_of_a_scene_is_in_the_manual_with_its_default(kind):
             else ""
             for key, field in model.model_fields.items()
             if not _models_in(field.annotation)
-            or "Literal" in str(field.annotation)  # a table, or a text in its place
+            or "Literal" in str(field.annotation)  # a table, or a text in its position
         }
         for key in REFUSED.get(heading, ()):
             wanted.pop(key)

@@ -145,7 +145,7 @@ def test_gromacs_has_lengths_in_nm(tmp_path):
 
 
 def test_gromacs_places_a_site_off_the_plane_of_its_masses(tmp_path):
-    """Of a lone pair of TIP5P: r = r_i + a r_ij + b r_ik + c r_ij x r_ik, c in 1/nm."""
+    """For a lone pair of TIP5P: r = r_i + a r_ij + b r_ik + c r_ij x r_ik, c in 1/nm."""
     own = drawn(NVT, counts={"tip5p": 20})
     write_gromacs(tmp_path, own, own.system.state)
     block = (tmp_path / "topol.top").read_text().split("[ virtual_sites3 ]\n")[1].split("\n\n")[0]

@@ -50,7 +50,7 @@ DUMBBELL = [
 
 
 def alone(counts, fields, box=None, **sections):
-    """The system, engine, and start, turned anew, of molecules of these sites that only fields act
+    """The system, engine, and start, rotated again, of molecules of these sites that only fields act
     on."""
     kinds = {
         "kite": KITE,
@@ -196,7 +196,7 @@ def test_a_dipole_turns_towards_the_field():
     size = np.linalg.norm(mu) * ELEMENTARY_CHARGE * AVOGADRO * 1e-2  # e Å times 1 V/nm
     assert np.linalg.norm(mu) / DEBYE == pytest.approx(2.351, abs=1e-3)
     for theta in (0.0, 0.4, pi / 2, pi):
-        # a turn that carries mu into the xz plane, theta from z
+        # a rotation that carries mu into the xz plane, theta from z
         axis = np.cross(mu, [0, 0, 1.0])
         upright = from_vector(
             (axis / np.linalg.norm(axis) * np.arccos(mu[2] / np.linalg.norm(mu)))[None]
@@ -293,7 +293,7 @@ RUNS = {
 
 
 def conserved_along(kind, scheme, dt):
-    """Energy less books after every step (u Å²/ps²), and how far the kinetic energy ranges."""
+    """Energy less ledger after every step (u Å²/ps²), and how far the kinetic energy ranges."""
     counts, fields, span, _ = RUNS[kind]
     system, engine, state = alone(counts, fields)
     draw_momenta(system.model, state, 300.0, np.random.default_rng(3))
@@ -321,8 +321,8 @@ def test_energy_less_work_is_conserved_to_the_order_of_the_scheme(kind, name):
 
 
 def test_a_field_that_oscillates_does_work_that_is_booked():
-    """Without the books the energy is not conserved at all; and a charge at rest gains what E0²/2 m
-    w² says."""
+    """Without the ledger the energy is not conserved at all; and a charge at rest gains what E0²/2 m
+    w² states."""
     counts, fields, span, dt = RUNS["oscillating"]
     system, engine, state = alone(counts, fields)
     before = observe(system, engine, state).energy
@@ -470,7 +470,7 @@ def test_threads_change_no_bit():
         move(engine, state, VERLET, 0.0005, 5)
         found.append((*state, observe(system, engine, state).potential))
     assert all(np.array_equal(a, b) for a, b in zip(*found, strict=True))
-    assert found[0][7].any()  # the books
+    assert found[0][7].any()  # the ledger
 
 
 def test_a_start_from_nothing_stands_between_walls():

@@ -40,7 +40,7 @@ def marginal_standard_error(values):
 
 
 def samples_per_independent_one(values):
-    """By the initial monotone sequence of pairs of correlations, whose mean is that of the samples;
+    """By the initial monotone sequence of pairs of correlations, whose mean is the value of the samples;
     by direct sums."""
     n, x = len(values), values - values.mean()
     correlation = [float(x[: n - k] @ x[k:] / (x @ x)) for k in range(n)]

@@ -103,7 +103,7 @@ def test_observers_see_the_units_of_the_log():
         assert reading.momentum.shape == (3,)
         assert reading.sample.momentum == pytest.approx(np.linalg.norm(reading.momentum))
         assert reading.sample.pressure_xy == reading.pressure_tensor_bar[0, 1]
-    # forces are the slopes of the energy that is told
+    # forces are the slopes of the energy that is given
     system, engine, state = simulation.system, simulation.engine, simulation.state.copy()
     energy = []
     for shift in (1e-4, -1e-4):
@@ -280,7 +280,7 @@ HOVER = {
 
 
 def pyright(project):
-    """What pyright says of the project in a folder: its report as a dictionary."""
+    """What pyright states of the project in a folder: its report as a dictionary."""
     command = [
         sys.executable,
         "-m",
@@ -303,7 +303,7 @@ def pyright(project):
 
 
 def findings_in_script(folder, text):
-    """What pyright says of a script, the tutorial and the chapter about it: (severity, line,
+    """What pyright states of a script, the tutorial and the chapter about it: (severity, line,
     message) of each finding."""
     cells = json.loads((ROOT / "systems" / "notebooks" / "tutorial.ipynb").read_text())["cells"]
     chapter = (ROOT / "rigidmd" / "docs" / "tutorials" / "notebook.md").read_text()
@@ -672,7 +672,7 @@ def test_a_simulation_cannot_be_pickled_or_copied():
 
 
 def test_messages_name_arguments_of_python_not_options(tmp_path):
-    """Of overrides, sweeps and code that is not trusted."""
+    """For overrides, sweeps and code that is not trusted."""
     path = tmp_path / "argon.toml"
     path.write_text((ROOT / "systems" / "argon.toml").read_text())
     (tmp_path / "spring.py").write_text("x = 3\n")

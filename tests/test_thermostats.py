@@ -128,7 +128,7 @@ def test_collisions_come_after_their_mean_time():
 
 @pytest.fixture(scope="module")
 def liquid():
-    """27 waters and 5 nitrogens, relieved, with momenta: system, state."""
+    """27 waters and 5 nitrogens without overlaps, with momenta: system, state."""
     system, engine, state = built(
         {"spce": 27, "nitrogen": 5},
         12.0,
@@ -295,7 +295,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
     assert results["momentum"][own][-1] ** 2 / (2 * mass) > KJ_PER_MOL
     assert (
         results["momentum"][~own].max() < 1e-9
-    )  # taken out before the stage that conserves it, and booked
+    )  # taken out before the stage that conserves it, and accounted for
     assert np.abs(np.diff(results["conserved"])).max() < 0.05  # kJ/mol
 
 

@@ -1,4 +1,4 @@
-"""Threads: that each block is done once, whoever asks, and that those who wait leave their cores to
+"""Threads: that each block is done once, and that threads that wait leave their cores to
 others."""
 
 import os
@@ -303,7 +303,7 @@ def test_what_cannot_run_together_is_refused(twice, jobs, word):
 
 @task()
 def _meet(task_arguments, block):
-    """Wait until the other of two blocks has begun, or for so many looks; note whether it has."""
+    """Wait until the other of two blocks has begun, or for this many observations; note whether it has."""
     at, most = load_arguments(task_arguments)
     _write(at, block, 1)
     looks = 0

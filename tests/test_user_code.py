@@ -1,4 +1,4 @@
-"""Doors: forces, pair potentials and thermostats of users, from Python and from scenes; functions of
+"""User code: forces, pair potentials and thermostats of users, from Python and from scenes; functions of
 vectors."""
 
 import functools
@@ -119,7 +119,9 @@ def test_functions_of_vectors_at_the_ends_of_their_range():
         assert out[16:32] == pytest.approx(np.log(x), rel=1e-15, nan_ok=True)
         powers = np.where(x < 0, np.nan, np.abs(x) ** y)  # of a negative number: no number
         assert out[32:48] == pytest.approx(powers, rel=1e-15, nan_ok=True)
-    assert np.isnan(out[48:80].reshape(2, 16)[:, [7, 15]]).all()  # a sine of 1e14 would say nothing
+    assert np.isnan(
+        out[48:80].reshape(2, 16)[:, [7, 15]]
+    ).all()  # a sine of 1e14 would state nothing
 
 
 # --- formulas -------------------------------------------------------------------------------------
@@ -384,7 +386,7 @@ def test_the_tail_of_a_potential_is_that_of_the_built_in_one(name):
 
 
 def same_as_built_in(counts, tolerance=1e-13, potential=None, **forces):
-    """A potential equals the built-in Lennard-Jones of the same models, with mixing and ending."""
+    """A potential equals the built-in Lennard-Jones of the same models, with mixing and truncation."""
     scene = small_scene(counts, 25.0, forces={"electrostatics": "none", **forces})
     system, engine, state = built(
         counts, 25.0, spread=0.0, forces={"electrostatics": "none", **forces}
@@ -585,7 +587,7 @@ def test_a_table_in_a_file_is_the_potential_that_it_lists(with_forces, tmp_path)
 
 
 def test_a_table_ends_in_a_wall(tmp_path):
-    """Nearer than the first row, value and slope are those of the first row, and the energy rises
+    """Nearer than the first row, value and slope are the values of the first row, and the energy rises
     as r⁻¹²."""
     write_argon_table(tmp_path / "argon.csv", first=3.1)
     potential = rigidmd.pair_potential(table=str(tmp_path / "argon.csv"))
@@ -774,11 +776,11 @@ def test_a_run_with_forces_from_python_is_repeated_by_python_only(tmp_path, caps
     results = rigidmd.Simulation(scene.with_end(0.04), folder, forces=[Spring()], resume=True).run()
     assert np.array_equal(results.state.position, whole.state.position)
     assert np.array_equal(results["spring"], whole["spring"])
-    assert main(["report", str(folder)]) == 0  # what has ended can be looked at without the code
+    assert main(["report", str(folder)]) == 0  # what has ended can be observed without the code
 
 
 class Faulty(rigidmd.Force):
-    """Goes wrong in the way that it is told, once some molecule has moved."""
+    """Goes wrong in the way that it is given, once some molecule has moved."""
 
     def __init__(self, way):
         self.way, self.seen = way, None
@@ -1251,7 +1253,7 @@ def test_langevin_function_of_dipoles_in_a_field_in_python():
     assert energy.mean() / 200 == pytest.approx(-mu * mean, rel=0.01)
 
 
-# --- what is lost at a cutoff, and tables that say too little -------------------------------------
+# --- what is lost at a cutoff, and tables that state too little -------------------------------------
 
 
 UMBRELLA = {"name": "umbrella", "energy": "0.5*k*(r - r0)**2", "sites": ["AR"]}

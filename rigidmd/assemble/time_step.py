@@ -208,9 +208,9 @@ def describe_step(scene: MolecularScene, species: list[Molecule], k: int) -> str
         return ""
     error = step_error(stage.scheme, stage.step / fastest.time)
     if error == inf:
-        return "error of the step: unstable"
+        return "time-step error: unstable"
     text = (
-        f"error of the step: {fastest.molecule} {fastest.does} as if forces were wrong by"
+        f"time-step error: {fastest.molecule} {fastest.does} as if forces were wrong by"
         f" {100 * error:.1g} %"
     )
     if stage.is_hybrid:

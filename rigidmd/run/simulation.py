@@ -111,7 +111,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     observers
         user-defined, called between steps: `Every`, `LivePlot`, any object with `interval` and
         `see(moment)`
-    say
+    `say`
         Called with a sentence before something slow (compiling, pilot runs). Default: printed with
         the progress
     warn

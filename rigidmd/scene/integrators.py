@@ -100,7 +100,7 @@ def integrator(
     gradients: Sequence[float] | None = None,
     source: str = "",
 ) -> str:
-    """Make a row of coefficients an integrator, and return its name, which scenes then accept.
+    """Register coefficients as an integrator, and return its name, which scenes then accept.
 
     Fractions sum to 1 and read the same from both ends. A scene that names the row keeps its
     coefficients in its table [[integrators]], so that its file and the folder of its run are

@@ -115,7 +115,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     )
     """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift; auto: the
     scheme and step that keep the requested error with the fewest force evaluations. Default: baoab
-    with nvt and npt, whose averages have hardly an error of the step, except with
+    with nvt and npt, whose averages have almost no time-step error, except with
     hybrid_monte_carlo, which corrects it; else velocity_verlet"""
     energy_error_kT: Positive | None = None
     """With auto: rms error of the energy over the whole stage, as pilot runs predict it, in kT per
@@ -211,9 +211,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             if set_keys := [key for key, target in targets.items() if target is not None]:
                 kind = self.thermostat_kind
                 yield (
-                    f"{', '.join(set_keys)} would have no effect: averages of {kind} have no error"
-                    " of"
-                    " the step"
+                    f"{', '.join(set_keys)} would have no effect: averages of {kind} have no"
+                    " time-step error"
                 )
         else:
             yield from auto_errors(self.integrator, targets, step_keys)

@@ -130,7 +130,7 @@ def means_of_runs(
     runs : step (fs) -> value and error of each of its runs
     together : step -> value of its runs together, used instead of the mean of their values
 
-    The errors of single runs give the ratios of the errors of the steps. Their common size is from
+    The errors of single runs give the ratios of the time-step errors. Their common size is from
     the scatter of the runs about the means of their steps if that has at least `LEAST_FREEDOM`
     degrees of freedom, else as it is. Values of runs together need no errors of single runs.
     """

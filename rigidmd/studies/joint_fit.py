@@ -88,7 +88,7 @@ def why_not(stage: Stage) -> str:
     if stage.ramps:
         return "temperature or pressure change during the stage"
     if stage.is_hybrid:
-        return "hybrid_monte_carlo has no error of the step"
+        return "hybrid_monte_carlo has no time-step error"
     if moving[0] != moving[-1] or moving[0] != (KICK, 0.5) or abs(drifts - 1) > 1e-12:
         return f"it is for velocity_verlet and baoab, and the integrator is {stage.integrator}"
     if stage.has_barostat and stage.pressure_coupling not in (None, "isotropic"):

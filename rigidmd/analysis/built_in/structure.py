@@ -278,7 +278,7 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
     Parameters
     ----------
     name
-        Of a site, an element or a species; default: the centres of all molecules
+        A site, an element or a species; default: the centres of all molecules
     largest
         Largest wave vector, 1/Å
 

@@ -122,7 +122,7 @@ def is_sweep(folder: Path) -> bool:
 def read_manifest(folder: Path) -> Manifest:
     """The manifest of a sweep, with the states that the folders of its points show. Raises
     OutputError."""
-    remedy = f"; {option('force')} begins the sweep anew"
+    remedy = f"; {option('force')} starts the sweep again"
     manifest = read_json(folder / MANIFEST, Manifest, remedy)
     if manifest is None:
         raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")

@@ -302,7 +302,7 @@ def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> None:
         if problems := _differences_between(earlier, fresh):
             raise OutputError(
                 f"{folder} holds a sweep of another scene: {'; '.join(problems[:MOST_SHOWN])}."
-                f" {option('force')} begins it anew, {elsewhere()}"
+                f" {option('force')} starts it again, {elsewhere()}"
             )
         names = {point.folder for point in earlier.points}
         new = [point for point in fresh.points if point.folder not in names]
