@@ -427,7 +427,7 @@ def test_every_key_of_a_scene_is_in_the_manual_with_its_default(kind):
     for heading, model in tables_of(kind):
         if kind is BodyScene and heading in ("Top level", "`[[integrators]]`"):
             continue  # the same as for molecules
-        title = f"{heading} of a body" if kind is BodyScene and heading in shared else heading
+        title = f"{heading} (single body)" if kind is BodyScene and heading in shared else heading
         said = {}
         for row in re.findall(r"^\| (`[a-z].*?) \| (.*?) ?\| ", section(title), re.MULTILINE):
             said |= {key: row[1].strip() for key in re.findall(r"`(\w+)`", row[0])}

@@ -307,7 +307,7 @@ def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
         assert cli.main(["sweep", str(argon), *changes, "-o", str(copied)]) == 2
         said = capsys.readouterr().err
         assert expected in said
-        assert "--force begins it anew" in said
+        assert "--force starts it again" in said
     assert (copied / "temperature_K=90_seed=1" / "log.csv").exists()
 
 
