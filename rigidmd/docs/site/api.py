@@ -74,7 +74,7 @@ def _members(name: str, kind: object) -> list[str]:
     parts = []
     for member, value in vars(kind).items():
         is_shown = inspect.isfunction(value) or isinstance(value, DESCRIPTORS)
-        if is_shown and not member.startswith(("_", "model_")):
+        if is_shown and not member.startswith(("_", "model_")) and inspect.getdoc(value):
             parts += _entry("####", f"{name}.{member}", value)
     return parts
 
@@ -85,6 +85,8 @@ def _entry(rank: str, name: str, member: object) -> list[str]:
     doc = inspect.getdoc(member) or ""
     if isinstance(member, functools.cached_property):
         doc = inspect.getdoc(member.func) or ""
+    if isinstance(member, PROPERTIES):
+        return [f"{rank} `{name}`", "*property*", *_docstring(doc)]
     return [
         f"{rank} `{name}`",
         f"```python\n{kind}{name}{_signature(member)}\n```",
@@ -95,7 +97,7 @@ def _entry(rank: str, name: str, member: object) -> list[str]:
 def _signature(member: object) -> str:
     """The signature without the names of modules, with a line for each argument if it is long."""
     is_class = inspect.isclass(member)
-    if isinstance(member, PROPERTIES) or (is_class and issubclass(member, Exception)):
+    if is_class and issubclass(member, Exception):
         return ""
     function = getattr(member, "__func__", member)
     try:
