@@ -27,7 +27,7 @@ from support import ROOT  # noqa: E402
 
 @pytest.fixture(scope="session")
 def reference() -> Path:
-    """Outside data: RIGIDMD_REFERENCE, or ../shared/reference beside the project."""
+    """Outside data: RIGIDMD_REFERENCE, or ../shared/reference next to the project."""
     folder = Path(os.environ.get("RIGIDMD_REFERENCE", ROOT.parent / "shared" / "reference"))
     if not folder.is_dir():
         pytest.skip(f"no outside reference data at {folder} (RIGIDMD_REFERENCE names it)")

@@ -23,7 +23,7 @@ SYSTEMS = sorted((ROOT / "systems").glob("*.toml"))
 BODIES = [path for path in SYSTEMS if isinstance(Scene.read(path), BodyScene)]
 MOLECULES = [path for path in SYSTEMS if path not in BODIES]
 
-#: Argon atoms on springs, so far apart that nothing else acts on them: m w² in u/ps², and w dt = 1
+#: Argon atoms on springs, so far from each other that nothing else acts on them: m w² in u/ps², and w dt = 1
 #: at 36 fs.
 SPRING = 30_000.0
 
@@ -33,7 +33,7 @@ SPRING = 30_000.0
 
 def pinned(tables: dict) -> dict:
     """Tables of a scene of molecules with a reaction field, one truncation for all forces, no tail
-    correction, double precision and steps of 2 fs, unless they say otherwise: one set of kernels
+    correction, double precision and steps of 2 fs, unless they state otherwise: one set of kernels
     for most tests. The defaults of users have tests of their own."""
     forces = {"electrostatics": "reaction_field", "tail_correction": False, "truncation": "switch"}
     forces |= tables.get("forces", {})
@@ -65,7 +65,7 @@ def system_of(counts, edge=40.0, cutoff=5.0, **sections) -> System:
 
 
 def shaken(system: System, seed: int, spread: float = 0.4) -> tuple[System, Engine, State]:
-    """A system, its engine, and its start with molecules shaken off the lattice and turned anew."""
+    """A system, its engine, and its start with molecules shaken off the lattice and rotated again."""
     rng = np.random.default_rng(seed)
     state = system.state.copy()
     state.position[:] += spread * rng.standard_normal(state.position.shape)
@@ -75,7 +75,7 @@ def shaken(system: System, seed: int, spread: float = 0.4) -> tuple[System, Engi
 
 
 def bits_with(threads: int, system: System, state: State) -> tuple:
-    """All bits of forces, torques, energies and virials of a state, computed by so many threads."""
+    """All bits of forces, torques, energies and virials of a state, computed by this many threads."""
     engine = system.engine()
     engine.threads = threads
     load, tallies = engine.evaluate(state)
@@ -94,20 +94,20 @@ def observe(system: System, engine: Engine, state: State, **options):
 
 
 def move(engine: Engine, state: State, scheme: Scheme, dt: float, steps: int) -> None:
-    """Take so many more steps, in place."""
+    """Take this many more steps, in place."""
     engine.advance(state, scheme, dt, int(state.step[NOW]) + steps)
 
 
 @kernel(from_python=True)
 def spin(rotor, rotation, angular_momentum, h: float, steps: int) -> None:
-    """Turn the first molecule without torque, in place."""
+    """Rotation the first molecule without torque, in place."""
     for _ in range(steps):
         rotate(rotor, 0, rotation, angular_momentum, 0, h)
 
 
 def springs(**stage) -> Scene:
     """64 argon atoms, each an isotropic oscillator, under Langevin's thermostat at 300 K unless the
-    stage says otherwise."""
+    stage states otherwise."""
     whole = {
         "ensemble": "nvt",
         "temperature_K": 300.0,

@@ -1,4 +1,4 @@
-"""integrator = "auto": what is chosen keeps the error asked for, is written down, and repeats."""
+"""integrator = "auto": what is chosen keeps the error requested, is written down, and repeats."""
 
 import re
 from math import comb
@@ -23,7 +23,7 @@ TOP = ROOT / "systems" / "heavy_top_3.toml"
 
 
 def liquid(**last):
-    """27 waters, warmed up, then 0.3 ps of NVE as told."""
+    """27 waters, warmed up, then 0.3 ps of NVE as given."""
     stages = [
         {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.5},
         {"duration_ps": 0.3} | last,
@@ -54,7 +54,7 @@ def test_the_energy_error_asked_for_is_kept_with_fewer_forces_than_verlet_needs(
     assert energy_error(results) < 1e-5
     said = float(re.search(r"In the [\d.]+ ps that ran it was (\S+)", stage["choice"])[1])
     assert said == pytest.approx(energy_error(results), rel=0.3)
-    # the scene that was written says what was chosen, and repeats the run to the bit
+    # the scene that was written states what was chosen, and repeats the run to the bit
     again = Scene.read(tmp_path / "a" / "scene.toml")
     assert again.stages[1].integrator == stage["integrator"]
     assert again.stages[1].timestep_fs == stage["timestep_fs"]
@@ -110,7 +110,7 @@ def test_a_crude_error_is_kept_crudely():
     assert "chosen: error of the energy" in coarse["choice"]
     assert "over 0.3 ps for a target of 0.003 (expected, from" in coarse["choice"]
     assert "ps that ran it was" in coarse["choice"]
-    second = simulation.run().summary["stages"][1]  # a simulation chooses anew, and the same
+    second = simulation.run().summary["stages"][1]  # a simulation chooses again, and the same
     assert (second["integrator"], second["timestep_fs"]) == (
         coarse["integrator"],
         coarse["timestep_fs"],
@@ -270,21 +270,24 @@ def test_what_cannot_be_kept_is_said(capsys, tmp_path):
             "integrator = 'auto' needs one of energy_error_kT, trajectory_error",
         ),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "trajectory_error": 1e-3}, "needs one of"),
-        ({"energy_error_kT": 1e-3}, "energy_error_kT would do nothing without integrator = 'auto'"),
+        (
+            {"energy_error_kT": 1e-3},
+            "energy_error_kT would have no effect without integrator = 'auto'",
+        ),
         (
             {"integrator": "auto", "energy_error_kT": 1e-3, "timestep_fs": 1.0},
-            "timestep_fs would do nothing with",
+            "timestep_fs would have no effect with",
         ),
         (
             {"integrator": "auto", "energy_error_kT": 1e-3, "rotor": "split"},
-            "rotor would do nothing with",
+            "rotor would have no effect with",
         ),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "bias_kT": 1e-3}, "needs one of"),
         (
             {"integrator": "auto", "bias_kT": 1e-3},
             "bias_kT is for averages at a temperature, and nve has no thermostat",
         ),
-        ({"bias_kT": 1e-3}, "bias_kT would do nothing without integrator = 'auto'"),
+        ({"bias_kT": 1e-3}, "bias_kT would have no effect without integrator = 'auto'"),
     ],
 )
 def test_contradictions_are_refused(stage, fault):
@@ -333,7 +336,7 @@ def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
     ],
 )
 def test_the_bias_asked_for_sets_the_step(thermostat, tmp_path):
-    """Of oscillators w is known: the pilot finds it to the error of its sampling, some per cent."""
+    """For oscillators w is known: the pilot finds it to the error of its sampling, some per cent."""
     stage = {"integrator": "auto", "bias_kT": 1e-3, "thermostat": thermostat, "duration_ps": 0.2}
     if thermostat != "langevin":
         stage["friction_translation_per_ps"] = None

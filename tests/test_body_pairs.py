@@ -509,10 +509,10 @@ def test_a_text_has_the_same_energy_as_its_function():
         ({"energy": "k/r"}, "no species has the parameter k"),
         (GAY_BERNE | {"cutoff_A": 30.0}, "longer than half an edge of the box"),
         (GAY_BERNE | {"options": {"nu": 1.0}}, r"options: gay_berne has no nu; there are upsilon"),
-        (GAY_BERNE | {"truncation": "plain", "switch_start_A": 9.0}, "would do nothing"),
+        (GAY_BERNE | {"truncation": "plain", "switch_start_A": 9.0}, "would have no effect"),
         (
             {"module": "own.py", "name": "own", "parameters": {"rod": {"k": 1.0}}},
-            "parameters would do nothing here",
+            "parameters would have no effect here",
         ),
     ],
 )

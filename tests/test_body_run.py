@@ -261,7 +261,7 @@ def test_resolved_scenes_are_scenes(path, tmp_path):
 @pytest.mark.parametrize("integrator", ["rk4", "dop853"])
 @pytest.mark.parametrize("name", ["heavy_top_3", "dropped_stone"])
 def test_resolved_scenes_hold_what_a_solver_needs(name, integrator, tmp_path):
-    """And no formulation of a point, which does not turn."""
+    """And no formulation of a point, which does not rotate."""
     scene = Scene.read(ROOT / "systems" / f"{name}.toml", {"run.integrator": integrator})
     resolved = rigidmd.resolve(scene)
     assert rigidmd.resolve(resolved) == resolved
@@ -290,7 +290,7 @@ def test_a_run_says_what_is_wrong_with_it():
         {"output.trajectory": False, "run.integrator": "velocity_verlet", "run.timestep_s": 0.06},
     )
     simulation = Simulation(scene)
-    said = simulation.introduction() + simulation.conclusion(simulation.run())
+    said = simulation._introduction() + simulation._conclusion(simulation.run())
     assert "timestep_s is too long for this motion" in said
     assert "is not a whole number of steps of" in said
     assert "rotates by more than 180° between samples" in said
@@ -394,7 +394,7 @@ def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to
     for name, after in (("early", 3), ("late", 10 if integrator == "radau" else 250)):
         run = Simulation(scene, tmp_path / name, warn=str)
         counted = iter(range(after))
-        reset = run.part.reset
+        reset = run._part.reset
 
         def counting(reset=reset, run=run, counted=counted):
             reset()
@@ -403,7 +403,7 @@ def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to
                 halts() or (next(counted, None) is None and (run.stop(15) or True))
             )
 
-        run.part.reset = counting
+        run._part.reset = counting
         results = run.run()
         assert (results.interrupted, results.signal, results.out_of_time) == (True, 15, False)
         assert run.engine.chosen_steps[0] == after + 1

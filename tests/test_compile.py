@@ -1,4 +1,4 @@
-"""The door to Numba: what we assume of it beyond its promises, addresses and their types, the
+"""The interface to Numba: what we assume of it beyond its promises, addresses and their types, the
 cache, and the rules that sources keep."""
 
 import ast

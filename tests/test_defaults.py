@@ -34,7 +34,7 @@ NVT = {"ensemble": "nvt", "temperature_K": 298.15, "duration_ps": 0.02}
 
 
 def scene(edge: float | None = 13.0, **tables) -> Scene:
-    """64 waters with nothing but what a user has to say."""
+    """64 waters with nothing but what a user has to state."""
     box = {"lengths_A": edge} if edge else {"lengths_A": 13.0, "periodic": False}
     forces = {"cutoff_A": 6.0} if edge else {}
     return Scene.from_dict(
@@ -62,12 +62,12 @@ def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
         (
             13.0,
             {"reaction_field_permittivity": 78.0},
-            "would do nothing with electrostatics = 'pme' .the default.",
+            "would have no effect with electrostatics = 'pme' .the default.",
         ),
         (
             None,
             {"ewald_accuracy": 1e-4},
-            "ewald_accuracy would do nothing with electrostatics = 'coulomb' .the default",
+            "ewald_accuracy would have no effect with electrostatics = 'coulomb' .the default",
         ),
         (
             13.0,
@@ -83,7 +83,7 @@ def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
         (
             13.0,
             {"electrostatics": "pme", "reaction_field_truncation": "switch"},
-            "reaction_field_truncation would do",
+            "reaction_field_truncation would have no effect",
         ),
     ],
 )
@@ -94,7 +94,7 @@ def test_keys_that_do_nothing_are_refused(edge, forces, message):
 
 def test_without_a_box_all_pairs_of_charges_act_whatever_the_cutoff():
     simulation = Simulation(scene(None, forces={"cutoff_A": 4.0}))
-    found = simulation.start_energy(KJ_PER_MOL, "kJ/mol")["components"]
+    found = simulation._start_energy(KJ_PER_MOL, "kJ/mol")["components"]
     system = simulation.system
     position, charge = (
         system.site_positions(simulation.state),
@@ -158,7 +158,7 @@ def positions_file(path, position, edges) -> str:
         ((5, 5, 5), (20.0, 20.0, 60.0), False),  # a slab
         ((5, 5, 5), (60.0, 60.0, 60.0), False),  # a droplet
         ((5, 5, 15), (20.0, 20.0, 60.0), True),
-        ((2, 2, 2), (20.0, 20.0, 20.0), True),  # few molecules are far apart, and even
+        ((2, 2, 2), (20.0, 20.0, 20.0), True),  # few molecules are far from each other, and even
     ],
 )
 def test_a_tail_correction_is_for_boxes_that_molecules_fill(lattice, edges, expected, tmp_path):
@@ -531,7 +531,7 @@ def test_a_run_keeps_its_default_step_and_check_tells_its_error(tmp_path, capsys
     )
     assert main(["check", str(path)]) == 0
     out = capsys.readouterr().out
-    error = "error of the step: spce rotates about its lightest axis as if forces were wrong by"
+    error = "time-step error: spce rotates about its lightest axis as if forces were wrong by"
     assert "0: nvt: 5 steps of 4 fs = 0.02 ps, baoab" in out
     assert f"{error} 4 %; bias of U about 0.002 kT per degree of freedom" in out
     assert "1: nve: 10 steps of 2 fs = 0.02 ps, velocity_verlet" in out

@@ -137,7 +137,7 @@ def test_the_choice_of_the_equilibrated_part_leaves_errors_as_they_are(times, n,
 @pytest.mark.parametrize("size", [3.0, 10.0, 50.0])
 @pytest.mark.parametrize("decay", [0.02, 0.06])
 def test_a_transient_leaves_no_bias_that_the_error_does_not_cover(decay, size, times):
-    """Of this size in standard deviations, decaying in this fraction of 500 samples."""
+    """For this size in standard deviations, decaying in this fraction of 500 samples."""
     rng = np.random.default_rng(int(size * times))
     transient = size * np.exp(-np.arange(500) / (500 * decay))
     series = memory(rng, 500, 500 / times)[:200] + transient

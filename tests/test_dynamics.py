@@ -32,7 +32,7 @@ VERLET = SCHEMES["velocity_verlet"]
 
 @pytest.fixture(scope="module")
 def liquid():
-    """64 waters (13.4 Å, cut-off 6 Å, smooth), equilibrated: system, engine, state."""
+    """64 waters (13.4 Å, cutoff 6 Å, smooth), equilibrated: system, engine, state."""
     scene = small_scene(
         {"spce": 64},
         12.42,
@@ -53,8 +53,8 @@ def run(engine, state, dt, steps, scheme=VERLET):
 
 
 def test_the_energy_error_is_of_order_two(liquid):
-    """Of its fluctuation: the error at the start is no measure, it is small or large by chance
-    (orders of 1.88 to 2.08 from 30 starts, those of the fluctuation 1.98 to 2.03)."""
+    """For its fluctuation: the error at the start is not a measure, it is small or large by chance
+    (orders of 1.88 to 2.08 from 30 starts, the values of the fluctuation 1.98 to 2.03)."""
     system, engine, state = liquid
     fluctuations = []
     for dt in (0.002, 0.001, 0.0005):

@@ -146,7 +146,7 @@ def test_gromacs_has_lengths_in_nm(tmp_path):
 
 
 def test_gromacs_places_a_site_off_the_plane_of_its_masses(tmp_path):
-    """Of a lone pair of TIP5P: r = r_i + a r_ij + b r_ik + c r_ij x r_ik, c in 1/nm."""
+    """For a lone pair of TIP5P: r = r_i + a r_ij + b r_ik + c r_ij x r_ik, c in 1/nm."""
     own = drawn(NVT, counts={"tip5p": 20})
     write_gromacs(tmp_path, own, own.system.state)
     block = (tmp_path / "topol.top").read_text().split("[ virtual_sites3 ]\n")[1].split("\n\n")[0]
@@ -450,7 +450,7 @@ def test_a_platform_with_one_precision_has_no_other():
             )
     with pytest.raises(
         SceneError,
-        match=r"precision would do nothing with engine.name = 'lammps'; it is for openmm",
+        match=r"precision would have no effect with engine.name = 'lammps'; it is for openmm",
     ):
         small_scene({"argon": 2}, 20.0, engine={"name": "lammps", "precision": "mixed"})
 
@@ -609,7 +609,7 @@ def test_adding_an_engine_takes_a_folder_and_a_file(tmp_path):
         "engine.name = 'mirror': stages.0.thermostat = 'andersen': Mirror has langevin"
         in refused[2]
     )
-    assert "tilt would do nothing with engine.name = 'lammps'; it is for mirror" in foreign[2]
+    assert "tilt would have no effect with engine.name = 'lammps'; it is for mirror" in foreign[2]
     assert (tmp_path / "exported" / "mirror.txt").read_text() == "1 kinds"
     assert '"mirror"' in schema[1] and '"Angle of mirror; default: 2"' in schema[1]
     assert "rigidmd, lammps, openmm or mirror" in text[1] and "--tilt N" in text[1]

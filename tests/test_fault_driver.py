@@ -1,4 +1,4 @@
-"""The driver of mixed faults, `python tests/faults.py`: a little of it on every change, an hour in
+"""The driver of mixed errors, `python tests/faults.py`: a little of it on every change, an hour in
 the soak tier."""
 
 import re

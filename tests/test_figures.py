@@ -1,4 +1,4 @@
-"""Figures: long curves have no gaps, many curves are told apart."""
+"""Figures: long curves have no gaps, many curves are given from each other."""
 
 import io
 import re
@@ -132,7 +132,7 @@ STEPS = [0, 5, 3, 4, 0, 500]
 
 
 def samples_of(rng, start=-1000.0):
-    """Samples of a run of STAGES; a minimisation begins far above, and its first stage begins far
+    """Samples of a run of STAGES; a minimisation starts far above, and its first stage starts far
     from its mean."""
     rows, step = [], 0
     blank = dict.fromkeys(Sample._fields, 0.0) | {"user_energies": ()}

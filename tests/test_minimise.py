@@ -1,5 +1,5 @@
 """Minimisation in the rigid degrees of freedom and the cell: gradients, known minima, what a stage
-of it says and keeps."""
+of it states and keeps."""
 
 import csv
 import json
@@ -67,7 +67,7 @@ def minimum_of(scene, state: State | None = None):
     ],
 )
 def test_the_gradient_is_that_of_the_enthalpy(coupling, electrostatics):
-    """Points, linear and asymmetric molecules, shifts, turns and all components of a leaning
+    """Points, linear and asymmetric molecules, shifts, rotates and all components of a tilting
     cell."""
     asked = {"pressure_bar": ASKED[coupling], "pressure_coupling": coupling} if coupling else {}
     scene = small_scene(
@@ -164,7 +164,7 @@ def test_lennard_jones_clusters(points, energy):
 
 
 def pair_energy(model: str, x: np.ndarray) -> float:
-    """Two rigid molecules (kJ/mol), the first at the origin: x (9,), place and rotation vectors of
+    """Two rigid molecules (kJ/mol), the first at the origin: x (9,), position and rotation vectors of
     both. Plain NumPy."""
     m = load_model(model)
     sites = m.positions_body
@@ -204,7 +204,7 @@ def test_the_water_dimer(model, published):
 
 
 def test_fcc_argon_has_its_lattice_constant_at_no_pressure():
-    """Shells within the cut-off: 2 (sigma/a)^6 S12 = S6 with S_p = sum (r/a)^-p."""
+    """Shells within the cutoff: 2 (sigma/a)^6 S12 = S6 with S_p = sum (r/a)^-p."""
     cutoff, n = 8.66, 4
     near = np.array(list(np.ndindex(7, 7, 7))) - 3
     sites = (
@@ -311,7 +311,7 @@ def test_the_cell_takes_the_pressure_asked_for(coupling):
 
 
 def test_it_begins_from_overlaps():
-    """Two pairs of molecules in one another, one of them a hundredth of a diameter apart: 1e24
+    """Two pairs of molecules in one another, one of them a hundredth of a diameter from each other: 1e24
     wells."""
     scene = small_scene({"argon": 10, "spce": 10}, 18.5, stages=[stage_of()])
     system, _, state = shaken(build(scene), 1, spread=0.1)
@@ -377,7 +377,9 @@ def test_what_it_keeps_and_what_it_books():
     conserved = results["conserved"]
     taken = results["potential"][1] - results["potential"][2]
     assert taken > 100
-    assert conserved[2] == pytest.approx(conserved[1], abs=1e-9 * taken)  # it is booked as work
+    assert conserved[2] == pytest.approx(
+        conserved[1], abs=1e-9 * taken
+    )  # it is accounted for as work
     assert results["work"][1] - results["work"][2] == pytest.approx(taken, rel=1e-9)
     drift = results["drift"]
     assert np.isnan(drift[results["stage"] == 1]).all()
@@ -466,19 +468,19 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
 @pytest.mark.parametrize(
     ("stages", "more", "expected"),
     [
-        ([stage_of(duration_ps=1.0)], {}, "duration_ps would do nothing in a minimise stage"),
-        ([stage_of(timestep_fs=1.0)], {}, "timestep_fs would do nothing"),
-        ([stage_of(temperature_K=300.0)], {}, "temperature_K would do nothing"),
-        ([stage_of(integrator="srkn_6")], {}, "integrator would do nothing"),
+        ([stage_of(duration_ps=1.0)], {}, "duration_ps would have no effect in a minimise stage"),
+        ([stage_of(timestep_fs=1.0)], {}, "timestep_fs would have no effect"),
+        ([stage_of(temperature_K=300.0)], {}, "temperature_K would have no effect"),
+        ([stage_of(integrator="srkn_6")], {}, "integrator would have no effect"),
         (
             [stage_of(pressure_coupling="flexible")],
             {},
-            "would do nothing in a minimise stage without pressure_bar",
+            "would have no effect in a minimise stage without pressure_bar",
         ),
         (
             [stage_of(pressure_limit_bar=2.0)],
             {},
-            "would do nothing in a minimise stage without pressure_bar",
+            "would have no effect in a minimise stage without pressure_bar",
         ),
         ([stage_of(pressure_bar=(1.0, 2.0))], {}, "one pressure, not one that changes"),
         ([stage_of(pressure_bar=(1.0, 2.0, 3.0))], {}, "pressure_coupling = 'anisotropic'"),
@@ -487,7 +489,7 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
         (
             [{"duration_ps": 1.0, "force_limit_kJ_mol_A": 0.2}],
             {},
-            "force_limit_kJ_mol_A would do nothing in an nve stage",
+            "force_limit_kJ_mol_A would have no effect in an nve stage",
         ),
         ([{"ensemble": "nve"}], {}, r"stages.0.duration_ps: is missing"),
         (
@@ -808,7 +810,7 @@ def test_a_pressure_is_found_in_double_precision():
 
 
 def test_where_mixed_precision_stalls_double_precision_continues(monkeypatch):
-    """Also from a start whose energy single precision cannot hold: two sites 0.001 Å apart."""
+    """Also from a start whose energy single precision cannot hold: two sites 0.001 Å from each other."""
     scene = small_scene({"argon": 10}, 18.5, stages=[stage_of()], precision="mixed")
     system, _, state = shaken(build(scene), 1, spread=0.1)
     overlapping = state.copy()

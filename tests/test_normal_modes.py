@@ -1,5 +1,5 @@
 """Normal modes: closed forms, sums over a lattice, differences of an energy in NumPy, counts of
-modes, what is refused."""
+modes, what is rejected."""
 
 import csv
 
@@ -471,7 +471,7 @@ def test_the_layout_of_vectors(mixture):
 
 
 def test_the_lattice_energy_of_a_crystal(tmp_path, capsys):
-    """It does not depend on the number of cells, and is no part of a liquid or of a crystal in a
+    """It does not depend on the number of cells, and is not a part of a liquid or of a crystal in a
     field."""
     cells = [
         rigidmd.Simulation(crystal(tmp_path, repeat)).start_energy(100.0, "kJ/mol")

@@ -1,4 +1,4 @@
-"""In a notebook: progress, what values show, figures of columns, films, a plot of a run that goes
+"""In a notebook: progress, what values show, figures of columns, animations, a plot of a run that goes
 on, the tutorial."""
 
 import base64

@@ -342,7 +342,7 @@ def test_intervals_that_are_not_whole_steps_are_noted():
     ]
     run = Simulation(scene, warn=str)
     for note in scene.rounded_times():
-        assert note in run.introduction()
+        assert note in run._introduction()
         assert note in describe(scene)
     results = run.run()
     assert set(scene.rounded_times()) <= set(results.summary["notes"])
@@ -364,7 +364,7 @@ def test_one_point_molecule_runs_under_every_thermostat(thermostat):
     results = run.run()
     moves = thermostat in ("langevin", "andersen")
     assert results.summary["degrees_of_freedom"] == (3 if moves else 0)
-    assert f"{3 if moves else 0} degrees of freedom" in run.introduction()
+    assert f"{3 if moves else 0} degrees of freedom" in run._introduction()
     assert any("no temperature is defined" in note for note in results.summary["notes"]) != moves
     told = results.summary["stages"][0]["temperature_K"]
     assert told > 0 if moves else told is None
@@ -374,7 +374,7 @@ def test_one_point_molecule_runs_under_every_thermostat(thermostat):
 
 
 def free_flight(name, folder):
-    """Two argon atoms far apart in a large box, which cross its sides."""
+    """Two argon atoms far from each other in a large box, which cross its sides."""
     scene = small_scene(
         {"argon": 2},
         60.0,
@@ -454,7 +454,7 @@ def argon(**more):
 
 
 def test_energy_that_goes_with_the_total_momentum_is_booked():
-    """Total momentum goes at steps that the row decides, and its energy into the books, whatever
+    """Total momentum goes at steps that the row decides, and its energy into the ledger, whatever
     else acts."""
     system = build(argon())
     mass = float(system.model.mass[system.model.species].sum())
@@ -841,7 +841,7 @@ def test_a_drift_is_noted_where_it_is_certain_and_has_added_up(
 
 
 def test_a_run_prints_each_note_once(tmp_path, capsys):
-    """Those of the introduction and warnings are not repeated; the summary has all."""
+    """The values of the introduction and warnings are not repeated; the summary has all."""
     scene = {"watch.move": False, "stages.0.timestep_fs": 40.0, "stages.0.duration_ps": 0.4}
     text = "[box]\nlengths_A = 20\n[[molecules]]\nmodel = 'argon'\ncount = 20\n[start]\ntemperature_K = 90\n"
     text += "[[stages]]\nensemble = 'nve'\n[forces]\ncutoff_A = 3.0\n[output]\nfigures = false\n"
@@ -1104,7 +1104,7 @@ def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
         (5.1, 63),
         (5.2, 64),
         (5.21, 64),
-    ):  # lines that come seldom do not wait
+    ):  # rare lines do not wait
         file.write(samples[0])
         assert lines() == written, now
     assert file.kept[0] == path.stat().st_size
@@ -1179,7 +1179,7 @@ def test_observers_cannot_write_to_the_state():
 
 
 def running(tmp_path, lines):
-    """A long argon run in another process, once its log has so many lines: (process, its
+    """A long argon run in another process, once its log has this many lines: (process, its
     folder)."""
     scene, out = str(ROOT / "systems" / "argon.toml"), tmp_path / "out"
     arguments = ["run", scene, "-o", str(out), "--set", "stages.0.duration_ps=1000"]
@@ -1220,7 +1220,7 @@ def test_a_signal_stops_with_a_summary_and_its_code(number, code, tmp_path):
 
 
 def test_compiling_is_announced_without_a_terminal(tmp_path, monkeypatch, capsys):
-    """A run that waits for the compiler says so, once."""
+    """A run that waits for the compiler states so, once."""
     prepare = MolecularRun.prepare
     index = CacheIndex(str(tmp_path), "kernel", 0)
 
@@ -1607,7 +1607,7 @@ ROWS = {
     + [pytest.param(name, "mixed", marks=pytest.mark.soak) for name in ROWS],
 )
 def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch):
-    """They are those of an evaluation, to the bit, and the run goes on as if nobody had looked."""
+    """They are those of an evaluation, to the bit, and the run continues as if nobody had observed."""
     electrostatics = "pme" if precision == "double" else "reaction_field"
     forces = {"cutoff_A": 5.5, "electrostatics": electrostatics, "tail_correction": True}
     stage = {"duration_ps": 1.0} | ROWS[name]
@@ -1643,7 +1643,7 @@ def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch
 
 
 class Spring(rigidmd.Force):
-    """A spring to the origin, which counts how often it is asked."""
+    """A spring to the origin, which counts how often it is requested."""
 
     asked = 0
 
@@ -1712,7 +1712,7 @@ def test_the_lists_of_the_start_serve_the_first_stage(monkeypatch):
     simulation = Simulation(small_scene({"argon": 20}, 25.0, stages=stages))
     simulation.start_from(simulation.state)
     made.clear()
-    simulation.part.reset()
+    simulation._part.reset()
     simulation.run()
     used = [engine for engine in made if engine.workspaces]
     assert len(used) == 2

@@ -1,4 +1,4 @@
-"""Input that was made to break: each is refused at once, with what is wrong, where and what was
+"""Input that was made to break: each is rejected at once, with what is wrong, where and what was
 expected."""
 
 import io

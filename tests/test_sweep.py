@@ -1,4 +1,4 @@
-"""Sweeps: what is asked for, points in processes of their own, stops of every kind, tables,
+"""Sweeps: what is requested, points in processes of their own, stops of every kind, tables,
 clusters, bad input."""
 
 import csv
@@ -124,7 +124,7 @@ def run_here(scene, axes, folder, **more):
     return read_manifest(folder)
 
 
-# What is asked for
+# What is requested
 
 
 @pytest.mark.parametrize(
@@ -269,7 +269,7 @@ def test_a_point_has_the_bits_of_a_run(finished, argon, tmp_path, capsys):
 
 
 def test_the_energy_of_a_molecule_has_its_share_of_the_error(finished):
-    """Of a longer run, whose energies forget themselves from one sample to the next."""
+    """For a longer run, whose energies forget themselves from one sample to the next."""
     record = read_record(finished / "temperature_K=90_seed=1")
     columns = {name: np.resize(values, 40) for name, values in record.columns.items()}
     columns["time"] = np.linspace(0.0, 0.5, 40)
@@ -306,7 +306,7 @@ def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
         assert cli.main(["sweep", str(argon), *changes, "-o", str(copied)]) == 2
         said = capsys.readouterr().err
         assert expected in said
-        assert "--force begins it anew" in said
+        assert "--force starts it again" in said
     assert (copied / "temperature_K=90_seed=1" / "log.csv").exists()
 
 
@@ -391,7 +391,7 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
 
 
 def test_energy_at_a_step_of_zero_has_a_joint_fit(argon, tmp_path, capsys):
-    """Beside the independent one, with a smaller error, and with the heat capacity."""
+    """Next to the independent one, with a smaller error, and with the heat capacity."""
     folder = tmp_path / "steps"
     stage = {"ensemble": "nvt", "temperature_K": 150.0, "duration_ps": 60.0}
     fixed = {f"stages.0.{key}": value for key, value in stage.items()}
@@ -647,7 +647,7 @@ def test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run():
 
 
 def test_bodies_and_words(tmp_path, capsys):
-    """A body has no seeds; a key whose values are words has places on the axis."""
+    """A body has no seeds; a key whose values are words has positions on the axis."""
     scene = ROOT / "systems" / "heavy_top_3.toml"
     fixed = {"run.duration_s": 0.02, "output.figures": False, "output.trajectory": False}
     integrators = {"run.integrator": ["velocity_verlet", "kahan_li_8"]}
@@ -1278,4 +1278,4 @@ def test_an_invalid_manifest_is_refused(copied, argon, capsys):
             said = capsys.readouterr().err
             assert f"{copied / 'sweep.json'}" in said, change
             assert next(iter(change)) in said, change
-            assert "--force begins the sweep anew" in said, change
+            assert "--force starts the sweep again" in said, change

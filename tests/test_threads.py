@@ -1,4 +1,4 @@
-"""Threads: that each block is done once, whoever asks, and that those who wait leave their cores to
+"""Threads: that each block is done once, and that threads that wait leave their cores to
 others."""
 
 import os

@@ -245,7 +245,7 @@ def test_the_last_frame_of_a_trajectory(ending, names, tmp_path):
         assert np.abs(first.position - system.state.position).max() < error
         assert not [
             other.name for other in tmp_path.iterdir() if other.name.startswith(".")
-        ]  # no offsets beside it
+        ]  # no offsets next to it
 
 
 @pytest.mark.parametrize(

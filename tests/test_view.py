@@ -1,4 +1,4 @@
-"""Pages and films of runs: what is in them, what a browser shows of them, and bad input."""
+"""Pages and animations of runs: what is in them, what a browser shows of them, and bad input."""
 
 import base64
 import json
@@ -68,7 +68,7 @@ def water(tmp_path_factory):
 
 
 def shown(page, out, at=None, size="420,700"):
-    """The pixels of a page in a browser, (h, w, 3), at a time of its film."""
+    """The pixels of a page in a browser, (h, w, 3), at a time of its animation."""
     flags = [
         "--headless=new",
         "--no-sandbox",
@@ -98,7 +98,7 @@ def shown(page, out, at=None, size="420,700"):
 
 
 def data_of(page):
-    """The data of the film in a page."""
+    """The data of the animation in a page."""
     found = re.search(
         r'<script type="application/json" id="film-data">(.*?)</script>', page.read_text("utf-8")
     )
@@ -147,7 +147,7 @@ def test_a_report_tells_of_molecules(water, tmp_path, capsys):
 
 
 def test_a_report_tells_of_a_body(top, capsys):
-    assert cli.main(["report", str(top)]) == 0  # beside the run, and again
+    assert cli.main(["report", str(top)]) == 0  # next to the run, and again
     assert cli.main(["report", str(top)]) == 0
     text = (top / "report.html").read_text("utf-8")
     assert is_alone(text)
@@ -213,7 +213,7 @@ def test_a_browser_shows_a_top_that_moves(top, tmp_path):
     assert cli.main(["view", str(top), "-o", str(page)]) == 0
     one, other = (
         shown(page, tmp_path / f"{at}.png", at)[150:400] for at in (0.05, 0.1)
-    )  # half a turn
+    )  # half a rotation
     red, green, blue = (np.stack([one, other])[..., k] for k in range(3))
     assert (blue > red + 0.15).mean() > 0.02  # its sides
     assert ((red > blue + 0.2) & (red > green + 0.2)).mean() > 0.005  # its painted side
@@ -412,8 +412,8 @@ def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
     from rigidmd.view.body_animation import BodyAnimation
 
     film = BodyAnimation(read_record(top))
-    assert film.loop_end() == (0.5, [])  # this top has fallen and risen, but turned elsewhere
-    half = np.pi * film.time / 0.13  # half the angle of a turn in 0.13 s, about z
+    assert film.loop_end() == (0.5, [])  # this top has fallen and risen, but rotated elsewhere
+    half = np.pi * film.time / 0.13  # half the angle of a rotation in 0.13 s, about z
     turning = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
     still = {name: np.tile(values[0], (len(values), 1)) for name, values in film.vectors.items()}
     film.quaternion, film.vectors = turning, still
@@ -538,7 +538,7 @@ def test_a_page_is_not_replaced_unless_asked(top, tmp_path, capsys):
 
 
 def volume(mesh):
-    """Of a closed surface whose faces are seen counterclockwise from outside."""
+    """For a closed surface whose faces are seen counterclockwise from outside."""
     corners = [mesh.vertices[face] for face in mesh.faces]
     return sum(p[0] @ np.cross(p[k], p[k + 1]) / 6 for p in corners for k in range(1, len(p) - 1))
 
@@ -674,7 +674,7 @@ TILTED = [
 @pytest.mark.parametrize("pinned", [False, True])
 @pytest.mark.parametrize("solids", [None, TILTED], ids=["handle", "tilted"])
 def test_a_body_of_solids_is_drawn_as_its_solids(solids, pinned):
-    """Of one density, the drawn surface has the centre and the inertia of the body."""
+    """For one density, the drawn surface has the centre and the inertia of the body."""
     parts = {} if solids is None else {"body.solids": solids}
     system = build_body(
         Scene.read(ROOT / "systems" / "t_handle.toml", parts | {"body.pinned": pinned})
@@ -784,7 +784,7 @@ def test_the_files_of_a_run_tell_the_same(tmp_path):
 
 @pytest.mark.filterwarnings(
     "ignore:1 A.3 CRYST1 record"
-)  # a body has no box, and MDAnalysis says so
+)  # a body has no box, and MDAnalysis states so
 def test_a_body_has_its_edges_as_bonds(tmp_path):
     more = {"run.duration_s": 0.01, "output.figures": False}
     results = Simulation(

@@ -47,7 +47,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     """The system of a scene. Raises SceneError, StructureError or MoleculeError, with all errors
     found.
 
-    user_code : whether to run the code of users; without it their terms are missing, which analyses
+    user_code : whether to run the code of users. Without it their terms are missing, which analyses
         do not need
     """
     scene, engine_notes = with_engine_defaults(scene)
@@ -251,7 +251,7 @@ def left_out(
     """What is not compiled for this scene, and why.
 
     charged : whether a site has a charge
-    without_tail : why the tail correction is left out; empty if it is included
+    without_tail : why the tail correction is omitted; empty if it is included
     """
     forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
     has_sums = any(name.endswith("_reciprocal") for name in terms)

@@ -2,7 +2,7 @@
 in.
 
 A resolved scene runs to the same bits as the original scene. Three values stay open in it: an
-integrator "auto", which a pilot run chooses; the number of threads, on which results do not depend;
+integrator "auto", which a pilot run chooses. The number of threads, on which results do not depend;
 and the grid of PME where another cell of the same lattice replaces a cell with a large tilt (see
 `SceneWithDefaults.pme_grid`).
 """

@@ -62,7 +62,7 @@ def describe_stage(stage: Stage) -> list[str]:
         text += f", {_barostat(stage)}"
     if stage.volume:
         text += ", in the mean box of the stage before"
-    sampled, conserved = DISTRIBUTIONS[stage.ensemble]  # up to the error of the step
+    sampled, conserved = DISTRIBUTIONS[stage.ensemble]  # up to the time-step error
     if stage.ensemble == "npt" and stage.pressure_coupling != "isotropic":
         sampled += ", with the invariant measure of the shape"
     if stage.ramps:

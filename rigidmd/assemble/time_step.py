@@ -31,7 +31,7 @@ SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
 #: cutoff of 9 Å: 3.2e-6 for 512 SPC/E with PME, 3.3e-6 for 216 TIP4P/2005 with a reaction field,
 #: 1.4e-6 for 500 argon; the largest 1e-5.
 MIXED_ERROR = 3e-6
-#: Least error of Ewald sums that grids in single precision allow, e²/Å².
+#: Minimum error of Ewald sums that grids in single precision allow, e²/Å².
 MIXED_EWALD_ERROR = 3e-6
 #: Bias of U per error of a step, kT per degree of freedom: of a thermostat that reads the momenta
 #: at the ends of steps (measured for SPC/E with velocity Verlet: 0.007 at 2 fs, 0.026 at 4 fs), and
@@ -52,7 +52,7 @@ INACCURATE = 0.1
 SMALL_ANGLE = 0.03
 #: A step that is this many times shorter than the longest stable one is probably in another unit.
 NEEDLESS = 1000
-#: precision = "auto" is mixed where the error of the time step is at least this many times that of
+#: precision = "auto" is mixed where the time-step error is at least this many times that of
 #: mixed precision. The limits of a minimisation in mixed precision are, too.
 MARGIN = 30
 
@@ -143,7 +143,7 @@ def _longest_angle(scheme: Scheme, error: float) -> float:
 
 
 def _bias_per_error(stage: Stage) -> float:
-    """Bias of U per error of the step, kT per degree of freedom, of a stage with a thermostat."""
+    """Bias of U per time-step error, kT per degree of freedom, of a stage with a thermostat."""
     if stage.is_hybrid:
         return 0.0
     return BIAS_IN_MIDDLE if stage.integrator in WITH_THERMOSTAT else BIAS_AT_ENDS
@@ -208,9 +208,9 @@ def describe_step(scene: MolecularScene, species: list[Molecule], k: int) -> str
         return ""
     error = step_error(stage.scheme, stage.step / fastest.time)
     if error == inf:
-        return "error of the step: unstable"
+        return "time-step error: unstable"
     text = (
-        f"error of the step: {fastest.molecule} {fastest.does} as if forces were wrong by"
+        f"time-step error: {fastest.molecule} {fastest.does} as if forces were wrong by"
         f" {100 * error:.1g} %"
     )
     if stage.is_hybrid:
@@ -315,14 +315,14 @@ def _accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> 
 
 
 def precision_for(error: float) -> Literal["double", "mixed"]:
-    """The precision of forces that suits an error of the time step."""
+    """The precision of forces that suits a time-step error."""
     return "mixed" if error >= MARGIN * MIXED_ERROR else "double"
 
 
 def with_precision(
     scene: MolecularScene, species: list[Molecule], temperature: float, force_error: float | None
 ) -> tuple[MolecularScene, str]:
-    """A scene with its precision and, for "auto", the reason: mixed if the error of the time step
+    """A scene with its precision and, for "auto", the reason: mixed if the time-step error
     hides that of single precision in every stage, else double.
 
     species : those that are not frozen; temperature : of velocities from a file, K; force_error :

@@ -90,7 +90,7 @@ def _print_profile(scene: Any) -> None:
         problem = "--profile needs a stage with a time step, and forces that are not user-defined"
         raise SceneError(scene.source, [problem])
     simulation = Simulation(scene)
-    state = simulation.settle()
+    state = simulation._settle()
     system, stage = simulation.system, simulation.scene.stages[stages[0]]
     scheme = integrator_of_stage(system, stages[0])
     profile = profile_of(system.engine(), state, scheme, stage.step)

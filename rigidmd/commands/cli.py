@@ -1,6 +1,6 @@
 """`rigidmd`: the parsing of the command line, the messages and exit codes of errors.
 
-All modules of this package are imported; their functions with the decorator `command` are the
+All modules of this package are imported. Their functions with the decorator `command` are the
 commands. They compute nothing. Modules import what they need inside functions, so that `rigidmd
 --help` loads none of it.
 """

@@ -67,7 +67,7 @@ from rigidmd.mechanics.free_rotor import restore_orthogonality, rotate_by_vector
 
 #: Random numbers that a flow may draw for one molecule in a step.
 DRAWS = 1 << 20
-#: The times of two pending kicks by the present load; 0 stands for no kick.
+#: The times of two pending kicks by the current load; 0 stands for no kick.
 NO_PENDING_KICKS = (0.0, 0.0)
 #: Steps between two corrections of the rounding errors of QᵀQ. They would grow, and with them the
 #: error of the total torque: a step of two waters had one of 5e-14 of the forces after 1e3 steps
@@ -92,7 +92,7 @@ class FlowArrays(NamedTuple):
     fraction: np.ndarray  # (flows,) of the time step
     moment: np.ndarray  # (flows,) the sum of the fractions of the drifts up to each flow
     every: np.ndarray  # (flows,) the interval in steps at which the flow acts,
-    phase: np.ndarray  # (flows,) at its begin, 0, or at its end, 1
+    phase: np.ndarray  # (flows,) at its start, 0, or at its end, 1
     row: np.ndarray  # (flows,) of its pass, see `coupling_passes`; -1 for kicks and drifts
     gradient: np.ndarray | None  # (flows,) of dt²; None (not compiled) where no kick has a gradient
     last: int  # index of the last drift
@@ -146,7 +146,7 @@ def coupling_passes(
     registers: Registers,
     status: np.ndarray,
 ) -> dict[int, Pass]:
-    """Kind of a flow of a scheme -> its pass, for all flows besides kicks and drifts."""
+    """Kind of a flow of a scheme -> its pass, for all flows in addition to kicks and drifts."""
     heat, box, trajectory = workspaces
     kinds = {flow.kind for flow in scheme.flows}
     thermostat, barostat = scheme.thermostat, scheme.barostat
@@ -312,7 +312,7 @@ class Advance:
         )
 
     def begin(self, dt: float, until: int, observed: bool, loaded: bool) -> None:
-        """Set what the next calls do. loaded : whether the load belongs to the present positions"""
+        """Set what the next calls do. loaded : whether the load belongs to the current positions"""
         self._dt[0] = dt
         self._integers[:] = until, observed, OK
         self._registers.progress[:] = 0, loaded, 0
@@ -324,7 +324,7 @@ class Advance:
 
     @property
     def loaded(self) -> bool:
-        """Whether the load belongs to the present positions."""
+        """Whether the load belongs to the current positions."""
         return self._registers.progress[LOADED] != 0
 
     @property

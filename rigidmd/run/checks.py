@@ -34,12 +34,12 @@ CHARGED_OVERLAP, CHARGES_OVERLAP = 0.3, 1.0
 MIN_INERTIA_FRACTION = 0.01
 #: Rounding may change a potential energy by this fraction, half of its digits.
 ROUNDING = sqrt(np.finfo(float).eps)
-#: Most moves of molecules between two checks.
+#: Maximum number of moves of molecules between two checks.
 MOVES_PER_CHECK = 250_000
 
 
 class FailedCheck(SimulationError):
-    """A failed check; its message is a sentence.
+    """A failed check. Its message is a sentence.
 
     molecule : index of the molecule concerned
     factor : by which the step would have to be shorter to stay within the limit, if known

@@ -45,6 +45,7 @@ from rigidmd.run.part import RunPart
 from rigidmd.run.report import summary_text
 from rigidmd.run.resume import Count, RunRecord, check_same_scene, plain, state_from
 from rigidmd.run.schedule import Segment, interruptible
+from rigidmd.run.short_report import short_summary
 from rigidmd.run.stable_step import DIRECTIONS, SMALL_SYSTEM, stiffest_mode
 from rigidmd.run.summary import Minimum, describe_minimum, summarise
 from rigidmd.scene import MolecularScene
@@ -80,7 +81,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     time_unit = "ps"
     record_type = MolecularRecord
-    summary_text = staticmethod(summary_text)
+    summary_text, short_summary = staticmethod(summary_text), staticmethod(short_summary)
 
     def __init__(
         self, simulation: "Simulation", scene: MolecularScene, forces: Any, thermostat: Any
@@ -136,7 +137,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     def reset(self) -> None:
         super().reset()
-        self._is_sampled = False  # whether `_sampler` belongs to the present state
+        self._is_sampled = False  # whether `_sampler` belongs to the current state
         self._set_stages(self._start.scene.stages)  # an earlier run may have chosen an integrator
         self.engine = self.system.engine()
         self.state = self.system.state.copy()
@@ -185,13 +186,13 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         self.engine.forget()
         sentences = [*velocity_notes(self.system, self.state), *accuracy_warnings(self.scene)]
         for sentence in sentences:
-            self.simulation.note(sentence)
+            self.simulation._note(sentence)
 
     def _remove_overlaps(self) -> None:
         """Compile the forces, and remove overlaps of a lattice."""
         system, scene, first = self.system, self.scene, self.scene.stages[0]
         for note in check_compiled_code(system, self.state):
-            self.simulation.note(note)
+            self.simulation._note(note)
         with user_errors_explained(system):
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
@@ -244,7 +245,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             self.system.engine().advance(self._state_for(method).copy(), method, 0.0, 0)
 
     def _state_for(self, method: Scheme | Solver) -> State:
-        """The present state, without copies, with the additional variables of an integrator."""
+        """The current state, without copies, with the additional variables of an integrator."""
         return self.state._replace(extra_variables=self.engine.variables(self.state, method))
 
     def _engine_of(self, k: int) -> Engine:
@@ -336,11 +337,11 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return segment
 
     def _minimise(self, progress: bool | None) -> None:
-        """Run the present stage, a minimisation, with a warning if it does not converge."""
+        """Run the current stage, a minimisation, with a warning if it does not converge."""
         k = self.record.position.segment
         stage = self.scene.stages[k]
         with progress_of(
-            stage.most_iterations, "iterations", progress, self.simulation.spot
+            stage.most_iterations, "iterations", progress, self.simulation._spot
         ) as bar:
 
             def advance(count: float) -> None:
@@ -350,11 +351,11 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
                     bar.unpause()
                     bar.skip(count)
 
-            minimum = minimise(self.system, self.state, stage, self.simulation.must_end, advance)
+            minimum = minimise(self.system, self.state, stage, self.simulation._must_end, advance)
         self.engine.forget()
         self.record.minima[k] = minimum
         if not minimum.converged:
-            self.simulation.note(f"stages.{k}: {describe_minimum(minimum, stage)}")
+            self.simulation._note(f"stages.{k}: {describe_minimum(minimum, stage)}")
 
     def _estimate(self, k: int) -> None:
         """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is
@@ -371,7 +372,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             return
         stable = self.record.stable[k] = stable_angle(stage.scheme) / mode.rate
         if stage.step > stable:
-            self.simulation.note(
+            self.simulation._note(
                 f"stages.{k}: timestep_fs = {stage.step_fs:g} is longer than what is stable:"
                 " the stiffest motion at its start, of"
                 f" {checks.molecule_label(self.system, mode.molecule)}, has a period of"
@@ -380,19 +381,19 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             )
 
     def _choose(self, k: int) -> None:
-        """Choose integrator and step of a stage by pilot runs from the present state, and set them
+        """Choose integrator and step of a stage by pilot runs from the current state, and set them
         in the scene."""
         from rigidmd.run.pilot.stages import choose_for_stage
 
-        self.simulation.announce("choosing integrator and step by pilot runs")
+        self.simulation._announce("choosing integrator and step by pilot runs")
         decided, reason = choose_for_stage(self.system, self.state, k)
         self.record.choices[k] = f"{decided.integrator} at {decided.step_fs:g} fs chosen: {reason}"
         stages = self.record.stages
         self._set_stages((*stages[:k], decided, *stages[k + 1 :]))
         for sentence in self.scene.rounded_times([k]):
-            self.simulation.note(sentence)
+            self.simulation._note(sentence)
         if self.simulation.folder is not None:
-            self.simulation.write_scene(self.simulation.folder)
+            self.simulation._write_scene(self.simulation.folder)
 
     def is_replaced(self, moment: Moment) -> bool:
         stages, k = self.scene.stages, moment.stage
@@ -401,7 +402,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         ended = moment.step == sum(stage.steps for stage in stages[: k + 1])
         # an interrupted minimisation is repeated by a run that resumes, which also has another
         # frame for it
-        ends_here = stages[k].is_minimisation and self.simulation.is_interrupted
+        ends_here = stages[k].is_minimisation and self.simulation._is_interrupted
         return ended and not ends_here and k + 1 < len(stages) and stages[k + 1].is_minimisation
 
     def is_finite(self) -> bool:
@@ -506,7 +507,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             self.state,
             preparing,
             wall,
-            self.simulation.is_interrupted,
+            self.simulation._is_interrupted,
         )
 
     def explain(self, error: SimulationError) -> str:

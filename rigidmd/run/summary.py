@@ -215,7 +215,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     of the ensemble.
     """
     of_stage = samples.of_stage(k)
-    if system.scene.stages[k].is_hybrid:  # its averages have no error of the step
+    if system.scene.stages[k].is_hybrid:  # its averages have no time-step error
         return _notes_on_trajectories(system.scene.stages[k], k, of_stage["acceptance"])
     half = len(of_stage) // 2
     if len(of_stage) - half < MIN_SAMPLES:
@@ -483,7 +483,7 @@ def _minimised(
 
 
 def _means(samples: Samples, columns: Mapping[str, str]) -> dict[str, float | None]:
-    """Means of columns, and their errors; the columns have the units of their keys."""
+    """Means of columns, and their errors. The columns have the units of their keys."""
     means = {}
     for name, unit in columns.items():
         values = samples[name]  # no trajectory has ended at the first sample

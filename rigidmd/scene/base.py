@@ -89,7 +89,7 @@ class Scene(Section, Displayed):
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
-    #: From which `_folder` begins
+    #: From which `_folder` starts
     _read_in: Path = PrivateAttr(default_factory=lambda: _working_directory())
     _embedded_files: dict[str, bytes] = PrivateAttr(default_factory=dict)
 

@@ -73,7 +73,7 @@ TRAJECTORY_PS = 0.1
 
 def _describe_trajectories(values: Values) -> str:
     steps, new = values.values()
-    drawn = "" if new == 1 else f", {new:g} of each momentum's variance drawn anew"
+    drawn = "" if new == 1 else f", {new:g} of each momentum's variance drawn again"
     return f"trajectories of {steps:g} step{'s' if steps > 1 else ''}{drawn}"
 
 
@@ -178,7 +178,7 @@ class ThermostatKeys(Section):
     """Steps of a trajectory of hybrid_monte_carlo, after which it is accepted or rejected; default:
     those of 0.1 ps"""
     momentum_refreshment: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Fraction of the variance of each momentum that hybrid_monte_carlo draws anew before a
+    """Fraction of the variance of each momentum that hybrid_monte_carlo draws again before a
     trajectory; 1: all of it"""
 
 

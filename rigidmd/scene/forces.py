@@ -31,7 +31,7 @@ class Method(NamedTuple):
 
     # in `forces`: its function `interactions`, and `setting_errors` and `settings` if it needs them
     module: str = ""
-    keys: tuple[str, ...] = ()  # of `Forces`, which do nothing with other methods
+    keys: tuple[str, ...] = ()  # of `Forces`, which have no effect with other methods
     sums_images: bool = False  # whether charges act on all periodic images
     conserves_momentum: bool = True
 
@@ -142,7 +142,8 @@ class CustomForce(Section):
             idle = [key for key in of_energy if getattr(self, key) not in (None, (), {})]
             if idle:
                 yield (
-                    f"{', '.join(idle)} would do nothing with a module: its object has `parameters`"
+                    f"{', '.join(idle)} would have no effect with a module: its object has"
+                    " `parameters`"
                 )
             if not self.module.endswith(".py"):
                 yield f"module = {shorten_repr(self.module)} must be a Python file (.py)"
@@ -213,9 +214,9 @@ class BodyForce(Section):
             keys = ("parameters", "pairs", "references", "cutoff_A", "switch_start_A")
             given |= {key: getattr(self, key) for key in keys}
         if idle := [key for key, value in given.items() if value]:
-            yield f"{', '.join(idle)} would do nothing here"
+            yield f"{', '.join(idle)} would have no effect here"
         if self.truncation == "plain" and self.switch_start_A is not None:
-            yield "switch_start_A would do nothing with truncation = 'plain'"
+            yield "switch_start_A would have no effect with truncation = 'plain'"
 
     @property
     def label(self) -> str:
@@ -325,14 +326,15 @@ class Forces(Section):
             and "switch" not in f"{self.truncation} {self.reaction_field_truncation}"
         ):
             yield (
-                f"switch_start_A would do nothing with truncation = {self.truncation!r}: add"
+                f"switch_start_A would have no effect with truncation = {self.truncation!r}: add"
                 " truncation = 'switch'"
             )
         if self.dispersion == "cutoff":
             names = (f"dispersion_{key}" for key in ("accuracy", "beta_per_A", "order", "grid"))
             idle = [key for key in names if getattr(self, key) is not None]
             yield from (
-                f"{key} would do nothing with dispersion = 'cutoff' (the default)" for key in idle
+                f"{key} would have no effect with dispersion = 'cutoff' (the default)"
+                for key in idle
             )
         else:
             yield from (
@@ -351,7 +353,7 @@ class Forces(Section):
             self.pme_grid is not None and self.pme_order is not None
         )
         if determined and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
-            yield "ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given"
+            yield "ewald_accuracy would have no effect: alpha and k-vectors or grid are given"
 
     @property
     def _not_summable(self) -> tuple[tuple[str, object], ...]:
@@ -385,15 +387,15 @@ class Forces(Section):
 
     @property
     def idle_keys(self) -> list[str]:
-        """The keys that do nothing with the method of electrostatics."""
+        """The keys that have no effect with the method of electrostatics."""
         return _idle_keys(self.electrostatics or PERIODIC)
 
     def idle_key_errors(self, method: str) -> Iterator[str]:
-        """Messages on keys that do nothing with a method of electrostatics."""
+        """Messages on keys that have no effect with a method of electrostatics."""
         default = "" if self.electrostatics else " (the default)"
         for key in _idle_keys(method):
             if getattr(self, key) != type(self).model_fields[key].default:
-                yield f"{key} would do nothing with electrostatics = {method!r}{default}"
+                yield f"{key} would have no effect with electrostatics = {method!r}{default}"
 
     @property
     def sets_k_vectors(self) -> bool:
@@ -402,6 +404,6 @@ class Forces(Section):
 
 
 def _idle_keys(method: str) -> list[str]:
-    """Keys of [forces] that do nothing with a method of electrostatics."""
+    """Keys of [forces] that have no effect with a method of electrostatics."""
     keys = dict.fromkeys(key for other in ELECTROSTATICS.values() for key in other.keys)
     return [key for key in keys if key not in ELECTROSTATICS[method].keys]

@@ -355,7 +355,7 @@ class MolecularScene(Scene):
             )
         if self.start.temperature_K is not None and from_file:
             yield (
-                "start.temperature_K would do nothing: the velocities are read from the structure"
+                "start.temperature_K would have no effect: velocities are read from the structure"
                 " file"
             )
         if (
@@ -432,7 +432,7 @@ class MolecularScene(Scene):
         yield from self._uneven_frames()
 
     def errors_of_steps(self) -> list[str]:
-        """Messages on default time steps that contradict other keys; without them a scene has no
+        """Messages on default time steps that contradict other keys. Without them a scene has no
         errors."""
         of_stages = [
             f"stages.{k}: {fault}"

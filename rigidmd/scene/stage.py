@@ -79,7 +79,7 @@ OTHER_INTEGRATORS = {
 }
 
 
-#: Step with which pilot runs begin, and the default for molecules without a known fast motion, fs.
+#: Step with which pilot runs start, and the default for molecules without a known fast motion, fs.
 USUAL_STEP = 2.0
 
 
@@ -115,7 +115,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     )
     """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift; auto: the
     scheme and step that keep the requested error with the fewest force evaluations. Default: baoab
-    with nvt and npt, whose averages have hardly an error of the step, except with
+    with nvt and npt, whose averages have almost no time-step error, except with
     hybrid_monte_carlo, which corrects it; else velocity_verlet"""
     energy_error_kT: Positive | None = None
     """With auto: rms error of the energy over the whole stage, as pilot runs predict it, in kT per
@@ -186,7 +186,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         if self.has_barostat and self.pressure_bar is None:
             yield f"an {self.ensemble} stage needs pressure_bar"
         if idle := [key for key in self.idle_keys if self._is_given(key)]:
-            yield f"{', '.join(idle)} would do nothing {self._where([_users(key) for key in idle])}"
+            where = self._where([_users(key) for key in idle])
+            yield f"{', '.join(idle)} would have no effect {where}"
         if (
             self.integrator in WITH_THERMOSTAT
             and not self.has_thermostat
@@ -210,8 +211,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             if set_keys := [key for key, target in targets.items() if target is not None]:
                 kind = self.thermostat_kind
                 yield (
-                    f"{', '.join(set_keys)} would do nothing: averages of {kind} have no error of"
-                    " the step"
+                    f"{', '.join(set_keys)} would have no effect: averages of {kind} have no"
+                    " time-step error"
                 )
         else:
             yield from auto_errors(self.integrator, targets, step_keys)
@@ -226,7 +227,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def idle_keys(self) -> list[str]:
-        """The keys that do nothing in this stage."""
+        """The keys that have no effect in this stage."""
         parts = {self.ensemble, self.thermostat_kind, self.barostat_kind}
         parts |= {CELL} if self.is_minimisation and self.changes_box else set()
         return [
@@ -239,7 +240,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         return getattr(self, key) != type(self).model_fields[key].default
 
     def _where(self, users: list[set[str]]) -> str:
-        """The settings with which keys that have these users would do nothing, for the message."""
+        """The settings with which keys of these users would have no effect, for the message."""
         if self.is_minimisation:
             return "in a minimise stage" + (
                 " without pressure_bar" if all(CELL in names for names in users) else ""
@@ -334,7 +335,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def step_fs(self) -> float:
-        """Time step, fs; the usual one until `assemble.time_step` or a pilot run has set it."""
+        """Time step, fs. The usual one until `assemble.time_step` or a pilot run has set it."""
         return self.timestep_fs or USUAL_STEP
 
     @property
@@ -347,7 +348,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         return self.steps_of(self.duration) if self.duration else 0
 
     def steps_of(self, interval: float) -> int:
-        """The nearest number of steps to an interval (ps), at least one step or trajectory; at most
+        """The nearest number of steps to an interval (ps), at least one step or trajectory. At most
         `MOST_STEPS`, which no stage has."""
         together = self.steps_together
         steps = min(interval / self.step, MOST_STEPS)
@@ -366,7 +367,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def refreshment_rate(self) -> float:
-        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo anew in one step;
+        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo again in one step;
         infinite for all of it."""
         kept_fraction = 1 - self.momentum_refreshment
         return -log(kept_fraction) / (2 * self.step) if kept_fraction else inf
@@ -438,7 +439,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def temperatures(self) -> tuple[float, float]:
-        """Temperature of the thermostat at begin and end, K."""
+        """Temperature of the thermostat at start and end, K."""
         temperature = self.temperature_K
         if isinstance(temperature, tuple):
             return temperature
@@ -456,7 +457,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def pressures(self) -> tuple[Six, Six]:
-        """Pressure at begin and end, bar: xx, yy, zz, xy, xz, yz."""
+        """Pressure at start and end, bar: xx, yy, zz, xy, xz, yz."""
         pressure = self.pressure_bar
         first, last = (
             pressure if isinstance(pressure, tuple) and len(pressure) == 2 else (pressure, pressure)

@@ -1,4 +1,4 @@
-// The film of a single body on a canvas: its faces, its path on the sphere, vectors. Drag to turn, wheel to zoom.
+// The animation of a single body on a canvas: its faces, its path on the sphere, vectors. Drag to rotate, wheel to zoom.
 "use strict";
 (() => {
   const data = rigidmdData("film-data"), f32 = (text) => rigidmdArray(text, Float32Array);
@@ -18,7 +18,7 @@
   }
   const between = (array, n, [low, high, share]) =>
     Array.from({ length: n }, (_, k) => (1 - share) * array[n * low + k] + share * array[n * high + k]);
-  function rotation(moment) { // the turn from one sample to the next, at a constant rate
+  function rotation(moment) { // the rotation from one sample to the next, at a constant rate
     const [low, high, share] = moment, a = q.slice(4 * low, 4 * low + 4), b = q.slice(4 * high, 4 * high + 4);
     const cos = Math.min(1, a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]), angle = Math.acos(cos);
     const [u, v] = angle < 1e-4 ? [1 - share, share] : [Math.sin((1 - share) * angle) / Math.sin(angle), Math.sin(share * angle) / Math.sin(angle)];

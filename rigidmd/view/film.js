@@ -7,7 +7,7 @@ function rigidmdArray(text, kind) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   return new kind(bytes.buffer);
 }
-// film: {times, unit, show(time) -> nothing or a promise}
+// animation: {times, unit, show(time) -> nothing or a promise}
 function rigidmdPlayer(film) {
   const find = (name) => document.getElementById("film-" + name);
   const first = film.times[0], last = film.times[film.times.length - 1], span = last - first || 1;

@@ -55,7 +55,7 @@ def simulation_html(simulation: Simulation) -> str:
     folder = simulation.folder
     where = "nowhere: the results stay in memory" if folder is None else str(folder)
     rows = [("threads", str(simulation.threads)), ("writes to", where)]
-    if names := [type(observer).__name__ for observer in simulation.observers]:
+    if names := [type(observer).__name__ for observer in simulation._observers]:
         rows.append(("observers", ", ".join(names)))
     text = code(describe_system(simulation.system)) + table([], rows, words=True)
     return framed(simulation.scene.name, "ready to run: run() does it", text)

@@ -152,7 +152,7 @@ class LivePlot(Observer):
         if isinstance(scene, BodyScene):
             described, every = BODY_COLUMNS, not_none(scene.output.interval_s)
         else:
-            described, every = run.part.samples().described, scene.output.log_interval_ps
+            described, every = run._part.samples().described, scene.output.log_interval_ps
         self.interval = every if self._asked is None else self._asked
         check_names(self._columns, described)
         self._spot = DisplayArea() if in_notebook() else None
@@ -171,7 +171,7 @@ class LivePlot(Observer):
     def _draw(self) -> None:
         if self._spot is None:
             return
-        began, samples = clock.monotonic(), self._run.part.samples()
+        began, samples = clock.monotonic(), self._run._part.samples()
         if len(samples) < 2:
             return
         described = samples.described

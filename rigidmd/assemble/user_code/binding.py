@@ -96,7 +96,7 @@ def _custom(scene: MolecularScene, entry: CustomForce | BodyForce, key: str) -> 
             raise ValueError(f"{entry.label}(...) raised {describe_error(error)}") from error
     elif entry.parameters:
         raise ValueError(
-            f"parameters would do nothing: {entry.label} is an object, which is not called"
+            f"parameters would have no effect: {entry.label} is an object, which is not called"
         )
     return made
 

@@ -109,7 +109,7 @@ def body_pair_potential(
     if truncation not in ("switch", "plain"):
         raise ValueError(f"truncation is {truncation!r}, must be 'switch' or 'plain'")
     if truncation == "plain" and switch_start_A is not None:
-        raise ValueError("switch_start_A would do nothing with truncation = 'plain'")
+        raise ValueError("switch_start_A would have no effect with truncation = 'plain'")
     for key, value in (("cutoff_A", cutoff_A), ("switch_start_A", switch_start_A)):
         if value is not None and not (isinstance(value, int | float) and value > 0):
             raise ValueError(f"{key} is {value!r}, must be a number above 0")

@@ -304,7 +304,7 @@ class CpuEngine(Engine):
         )
 
     def memory(self) -> dict[str, np.ndarray] | None:
-        """Neighbour lists as last built, forces at the present positions, and the memory of the
+        """Neighbour lists as last built, forces at the current positions, and the memory of the
         barostat."""
         owners = self._checkpoint_arrays()
         if self.load is not None and self._last.is_current:
@@ -455,7 +455,7 @@ class CpuEngine(Engine):
         return self._workspaces
 
     def _compile(self, make: Callable[[], object]) -> None:
-        """Compile all code that a function makes for molecules; a body has too little for a second
+        """Compile all code that a function makes for molecules. A body has too little for a second
         process."""
         if isinstance(self.model, Model):
             compile_together(make)

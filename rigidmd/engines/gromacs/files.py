@@ -134,7 +134,7 @@ TRANSLATIONS = Translations(
 
 
 def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]:
-    """Write the files for a system that begins at a state, and return their names. Raises
+    """Write the files for a system that starts at a state, and return their names. Raises
     OutputError."""
     bodies = [gromacs_points(m) for m in view.system.species]
     stages = [

@@ -480,7 +480,7 @@ def _velocity_verlet(dt: float) -> Any:
 
 
 def step(integrator: Any, steps: int) -> None:
-    """Take steps. Velocity Verlet begins and ends with half a kick."""
+    """Take steps. Velocity Verlet starts and ends with half a kick."""
     if not hasattr(integrator, "setGlobalVariableByName"):
         integrator.step(steps)
         return

@@ -112,7 +112,7 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
 def _begun(
     system: System, state: State, k: int, stage: Stage, engine: Engine
 ) -> tuple[State, Scheme]:
-    """A state at the begin of a pilot run with `stage` instead of stage k, and its integrator."""
+    """A state at the start of a pilot run with `stage` instead of stage k, and its integrator."""
     stages = system.scene.stages
     scene = system.scene.model_copy(update={"stages": (*stages[:k], stage, *stages[k + 1 :])})
     scheme = integrator_of_stage(replace(system, scene=scene), k)
@@ -123,7 +123,7 @@ def _begun(
 TRIED = ("velocity_verlet", "two_stage", "srkn_4")
 #: Steps that are tried, as fractions of the longest stable one, and trajectories with each.
 FRACTIONS, TRAJECTORIES = (0.2, 0.28, 0.4, 0.56, 0.8), 16
-#: Least acceptance with which longer steps are tried.
+#: Minimum acceptance with which longer steps are tried.
 LEAST_ACCEPTANCE = 0.2
 #: Steps of the first trajectories, which leave the lattice of a start, whose forces are not those
 #: of a liquid.

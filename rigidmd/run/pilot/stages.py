@@ -22,7 +22,7 @@ PILOT_STEP, PILOT_SPAN = 0.15, 10.0
 #: For an error of the energy over a stage a pilot run takes this part of the stage, at least these
 #: radians.
 PILOT_PART, LEAST_SPAN = 0.01, 3.0
-#: Least fraction of a chosen step to which it is shortened to fit the interval of samples.
+#: Minimum fraction of a chosen step to which it is shortened to fit the interval of samples.
 MIN_STEP_FRACTION = 0.25
 
 

@@ -18,7 +18,7 @@ from rigidmd.figures.style import (
     open_axis,
     write_figure,
 )
-from rigidmd.io.write import Column, Table
+from rigidmd.io.write import Column, Table, columns_text
 from rigidmd.run.force_errors import single_precision_errors
 from rigidmd.run.trial_systems import (
     COMPARATORS,
@@ -31,6 +31,7 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
 from rigidmd.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
+from rigidmd.studies.accuracy.orders import FLOOR_MARK, order_table, with_marks
 from rigidmd.view.page import chips, code, items, section, table, wide, write_page
 
 #: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body
@@ -58,13 +59,13 @@ def measure_accuracy(
     """Error against run time of integrators at time steps, on the start of a scene. Raises
     SceneError.
 
-    integrators : names; default: the scene's and those that suit it; the others are in `left_out`.
+    integrators : names; default: the scene's and those that suit it. The others are in `left_out`.
         rk4, dop853 and radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion
         or _euler_angles sets another
     timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost
         around the scene's
     span : ps or s
-    progress : called with the fraction that is done; at 0, after all arguments have been checked
+    progress : called with the fraction that is done. At 0, after all arguments have been checked
 
     Molecules start where the last stage starts, after the earlier stages have run; no thermostat
     acts.
@@ -197,6 +198,24 @@ def table_text(measured: IntegratorAccuracy) -> str:
     return text + trial_table(measured).text()
 
 
+def describe_accuracy(measured: IntegratorAccuracy, verbose: bool = False) -> list[str]:
+    """The answer first: the fastest integrator for each error, measured orders, all trials, and
+    remarks."""
+    fastest = [("target error", "fastest integrator", f"compared with {COMMON}")]
+    for error, best, faster, _ in cheapest(measured):
+        gain, _, _ = faster.partition(f" than {COMMON}")
+        fastest.append((error.removeprefix("an "), best, gain))
+    marked = with_marks(measured, trial_table(measured))
+    lines = [f"{measured.trial_system.name}, {_span(measured)}", ""]
+    if len(fastest) > 1:
+        lines += [columns_text(fastest, left=(0, 1, 2)), ""]
+    lines += [order_table(measured).text(), "", marked.text()]
+    lines.append(f"{FLOOR_MARK} at the floor: a shorter step does not reduce this error")
+    if verbose:
+        return [*lines, "", *recommendations(measured)]
+    return [*lines, "", *remarks(measured)]
+
+
 def recommendations(measured: IntegratorAccuracy) -> list[str]:
     """Sentences on the cheapest integrator for each accuracy, and `remarks`."""
     s, lines = measured.trial_system, []
@@ -219,7 +238,7 @@ def _span(measured: IntegratorAccuracy) -> str:
 
 
 def remarks(measured: IntegratorAccuracy) -> list[str]:
-    """Sentences on the reference, the longest stable steps, what failed or was left out, and the
+    """Sentences on the reference, the longest stable steps, what failed or was omitted, and the
     timings."""
     s = measured.trial_system
     lines = [

@@ -1,4 +1,4 @@
-"""Averages of a sweep over a time step, extrapolated to a step of 0: extrapolation.csv, .png and
+"""Averages of a sweep over a time step, extrapolated to zero time step: extrapolation.csv, .png and
 .html."""
 
 import csv
@@ -45,7 +45,7 @@ INDEPENDENT, JOINT, FLUCTUATIONS = "independent", "joint", "fluctuations"
 
 
 class Limit(NamedTuple):
-    """A quantity at a step of 0, for a combination of values of the keys other than the step and
+    """A quantity at zero time step, for a combination of values of the keys other than the step and
     the seed."""
 
     values: dict[str, Any]
