@@ -486,4 +486,4 @@ def test_a_figure_is_laid_out_once_and_drawn_once_for_each_file(tmp_path, monkey
     scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.01})
     files = Simulation(scene, tmp_path / "run").run().files
     assert len(drawn) == len([path for path in files if path.suffix in (".png", ".svg")]) == 8
-    assert len(laid_out) == 1  # axis.png; panels of curves have fixed places
+    assert len(laid_out) == 1  # axis.png; panels of curves have fixed positions

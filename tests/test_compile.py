@@ -681,7 +681,7 @@ files.untrusted_reason = of_another
 def test_code_behind_a_link_in_the_cache_is_not_used(kept, tmp_path):
     by_user, inside = copies(kept, tmp_path, 2)
     by_user.rename(tmp_path / "other")
-    by_user.symlink_to(tmp_path / "other")  # the user's own choice of a folder
+    by_user.symlink_to(tmp_path / "other")  # the user's choice of a folder
     kernels = folders_of(inside, ".nbi")[1]
     kernels.rename(tmp_path / "elsewhere")
     kernels.symlink_to(tmp_path / "elsewhere")

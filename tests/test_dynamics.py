@@ -299,7 +299,7 @@ def test_rotations_become_orthogonal_again():
 
 @pytest.mark.parametrize("picoseconds", [10, pytest.param(20, marks=pytest.mark.soak)])
 def test_no_drift_beyond_its_error_at_one_femtosecond(liquid, picoseconds):
-    """Of four starts together: the error of a single slope is known to a third only, and one in
+    """With four starts together: the error of a single slope is known to a third only, and one in
     fifty passes three of it by chance. Over 48 starts the slopes of 20 ps had a mean of 0.0006 and
     a standard deviation of 0.017 kJ/mol/ns."""
     system, engine, state = liquid

@@ -266,7 +266,7 @@ def lab(color, viewer):
 
 
 def test_distances_of_colours_are_those_of_cie():
-    # blue and purple of rigidmd 0.2, which the review found 2.2 apart for deuteranopes
+    # blue and purple of rigidmd 0.2, which the review found at a distance of 2.2 for deuteranopes
     pair = "#2b6f9e", "#7a5ca3"
     distance = {
         viewer: np.linalg.norm(lab(pair[0], viewer) - lab(pair[1], viewer)) for viewer in VIEWERS

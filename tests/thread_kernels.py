@@ -32,7 +32,7 @@ def counted(blocks: int, work: int = 10, times: int = 1) -> np.ndarray:
 
 @task()
 def meet(task_arguments, block):
-    """Wait until the other of two blocks has begun, or for so many looks; note whether it has."""
+    """Wait until the other of two blocks has begun, or for this many observations; note whether it has."""
     at, most = load_arguments(task_arguments)
     _write(at, block, 1)
     looks = 0

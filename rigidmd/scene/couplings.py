@@ -113,8 +113,7 @@ THERMOSTATS = {
         on_molecules=True,
     ),
     "hybrid_monte_carlo": Coupling(
-        "trajectories from new momenta, accepted or rejected: averages without an error of the"
-        " step",
+        "trajectories from new momenta, accepted or rejected: averages without a time-step error",
         "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216",
         {
             "trajectory_steps": lambda stage: max(1, round(TRAJECTORY_PS / stage.step)),

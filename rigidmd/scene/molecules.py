@@ -176,7 +176,7 @@ class MolecularScene(Scene):
     """Seed of all random numbers"""
     precision: Literal["auto", "double", "mixed"] = "auto"
     """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in
-    double; auto: mixed where the error of the time step hides that of single precision, else
+    double; auto: mixed where the time-step error hides the error of single precision, else
     double. Minimisations with tight limits, or with a pressure, are in double"""
     threads: Count | None = None
     """Number of threads; default: all cores. Results do not depend on it"""

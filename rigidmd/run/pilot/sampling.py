@@ -29,7 +29,7 @@ UNBIASED, BIAS = "baoab", 1 / 24
 #: its samples.
 PILOT_STEP, PILOT_RADIANS, PILOT_SAMPLES = 0.15, 50.0, 25
 #: Where the mean (w t)² of the fastest motion of a liquid, of time t, is below this, molecules
-#: collide seldom: the stiffest motion is then the one in a collision, as fast as in a liquid.
+#: collide rarely: the stiffest motion is then the one in a collision, as fast as in a liquid.
 GAS = 0.01
 #: Longest step, as a fraction of the longest stable step: beyond it higher orders than dt² matter.
 MAX_STABLE_FRACTION = 0.5
