@@ -215,7 +215,7 @@ def test_models_may_be_files_and_tables(tmp_path, monkeypatch):
     light = load_model("tip3p").mass
     assert build(from_file).species[0].mass == light
     (tmp_path / "run").mkdir()
-    Simulation(from_file).write_scene(tmp_path / "run")
+    Simulation(from_file)._write_scene(tmp_path / "run")
     (tmp_path / "mine.toml").unlink()
     assert (
         rigidmd.resolve(Scene.read(tmp_path / "run" / "scene.toml")).molecules[0].file

@@ -68,7 +68,7 @@ GAY_BERNE = {
 
 def shuffled(simulation: Simulation, seed: int):
     """The start of a simulation with other orientations."""
-    simulation.start()
+    simulation._start()
     state = simulation.state.copy()
     n = len(state.position)
     state.rotation[:] = Rotation.random(n, random_state=seed).as_matrix()

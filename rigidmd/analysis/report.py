@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from rigidmd.analysis.result import AnalysisResult, Value
 from rigidmd.core.statistics import format_with_error
 from rigidmd.io.write import columns_text
+from rigidmd.scene.validation import not_none
 
 HEADERS = ("quantity", "value", "unit", "correlation time (ps)")
 
@@ -31,7 +32,8 @@ def results_text(results: Sequence[AnalysisResult], failed: Mapping[str, str]) -
 def _row(value: Value) -> tuple[str, str, str, str]:
     unit = "" if value.unit == "1" else value.unit
     time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
-    return value.name, format_with_error(value.value, value.error), unit, time
+    number = format_with_error(not_none(value.value), value.error)
+    return value.name, number, unit, time
 
 
 def _section(title: str, reasons: Mapping[str, str]) -> list[str]:

@@ -49,7 +49,7 @@ class Picture(Figure):
         options: dict[str, Any] = {"dpi": dpi}
         if kind == "svg":
             options = {"dpi": SVG_DPI, "metadata": {"Date": None, "Creator": None}}
-        changed: dict[Any, str] = {f"svg.{name}": value for name, value in settings.items()}
+        changed: Any = {f"svg.{name}": value for name, value in settings.items()}
         # Matplotlib has one set of settings for all threads
         with PROCESS_LOCK, rc_context(changed | {"svg.hashsalt": hashsalt}):
             self.savefig(stream, format=kind, **options)

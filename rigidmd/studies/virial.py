@@ -226,7 +226,7 @@ def _integral_of_points(energy: Energy, thermal: np.ndarray) -> np.ndarray:
         return 4 * pi * r**3 * _integrand(energy, thermal, at, np.eye(3)[None])[..., 0]
 
     ends = np.log([1e-3 * NEAREST, FARTHEST])
-    limits = np.linspace(*ends, SEGMENTS + 1)[1:-1]
+    limits = np.linspace(ends[0], ends[1], SEGMENTS + 1)[1:-1]
     integral, _, details = quad_vec(
         shell, *ends, epsabs=1e-200, epsrel=POINT_ERROR, norm="max", points=limits, full_output=True
     )
@@ -259,11 +259,16 @@ def _distances(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return r, r * (1 + growth) * (last - np.log(NEAREST))
 
 
+def _points(seed: int) -> qmc.Sobol:
+    """Randomised points of the unit cube of six dimensions."""
+    return qmc.Sobol(6, seed=seed)  # pyright: ignore[reportCallIssue]  # SciPy 1.15 renames it rng
+
+
 def _adapted_edges(energy: Energy, thermal: np.ndarray, seed: int) -> np.ndarray:
     """Edges (6, bins + 1) of intervals of the variables with equal numbers of samples, narrow where
     the integrand is large (Lepage 1978, J. Comput. Phys. 27, 192)."""
     even = np.linspace(0, 1, BINS + 1)
-    edges, points = np.tile(even, (6, 1)), qmc.Sobol(6, seed=seed)
+    edges, points = np.tile(even, (6, 1)), _points(seed)
     for _ in range(ADAPTATIONS):
         u = points.random(AT_ONCE)
         size = np.abs(_samples(energy, thermal, edges, u))
@@ -281,7 +286,7 @@ def _integral(
     energy: Energy, thermal: np.ndarray, edges: np.ndarray, samples: int, seed: int
 ) -> np.ndarray:
     """The integrals (2, t) by randomised Sobol points."""
-    points, total = qmc.Sobol(6, seed=seed), 0.0
+    points, total = _points(seed), 0.0
     for begin in range(0, samples, AT_ONCE):
         u = points.random(min(AT_ONCE, samples - begin))
         total = total + _samples(energy, thermal, edges, u).sum(axis=2)
