@@ -482,6 +482,7 @@ def test_the_default_step_divides_the_duration_and_the_intervals():
         return build(scene(stages=stages, **tables)).scene.stages[0].timestep_fs
 
     assert with_intervals() == 4  # as does 0.3 ps
+    assert step_of(model="argon", duration_ps=0.004) == 4  # no step is longer than its stage
     assert with_intervals(output={"log_interval_ps": 0.015}) == 2.5
     assert with_intervals(output={"trajectory_interval_ps": 0.05}) == 2.5
     of_no_file = {"trajectory": False, "trajectory_interval_ps": 0.05}

@@ -1580,8 +1580,8 @@ def test_output_goes_to_runs_by_default(tmp_path, monkeypatch, capsys):
     assert main(command) == 0
     assert (tmp_path / "runs" / "argon" / "summary.json").exists()
     printed = capsys.readouterr().out
-    assert "argon: 500 argon; 500 bodies, 500 sites, 1497 degrees of freedom" in printed
-    assert "summary.json" in printed
+    assert "argon: 500 molecules, 500 sites, 1497 degrees of freedom" in printed
+    assert "results in runs/argon" in printed
     assert main(command) == 2
     assert "--force" in capsys.readouterr().err
     assert main([*command, "--force"]) == 0

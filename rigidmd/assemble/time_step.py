@@ -158,7 +158,7 @@ def _default_step(scene: MolecularScene, stage: Stage, fastest: FastMotion | Non
     if stage.has_thermostat and not (stage.is_hybrid or scene.engine.is_external):
         error = DEFAULT_BIAS / _bias_per_error(stage)
     longest = _longest_angle(stage.scheme, error) * fastest.time / FEMTOSECOND
-    longest = min(longest, LONGEST_DEFAULT)
+    longest = min(longest, LONGEST_DEFAULT, stage.duration / FEMTOSECOND)
     if longest == 0:
         return USUAL_STEP
     decade = floor(log10(longest))
