@@ -324,8 +324,8 @@ def test_a_run_says_its_precision_and_energy_is_in_double(tmp_path):
     summary = simulation.run().summary
     assert summary["precision"] == "mixed"
     assert summary["precision_reason"].startswith("mixed: the error of baoab at 4 fs")
-    energy = Simulation(scene()).start_energy(KJ_PER_MOL, "kJ/mol")
-    exact = Simulation(scene(precision="double")).start_energy(KJ_PER_MOL, "kJ/mol")
+    energy = Simulation(scene())._start_energy(KJ_PER_MOL, "kJ/mol")
+    exact = Simulation(scene(precision="double"))._start_energy(KJ_PER_MOL, "kJ/mol")
     assert energy["components"] == exact["components"]
 
 

@@ -213,7 +213,7 @@ def test_a_poor_environment(changed, scene, tmp_path):
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
-    assert b"orthogonality" in done.stdout
+    assert b"rigidmd view" in done.stdout
     assert same(scene, folder)
 
 

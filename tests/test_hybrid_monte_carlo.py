@@ -197,7 +197,7 @@ def test_a_trajectory_that_diverges_is_rejected(name):
         stage, {"nitrogen_trappe": 12, "argon": 4}, 13.0, 12.0, watch=watch
     )
     start = Simulation(simulation.scene)
-    start.start()
+    start._start()
     assert np.array_equal(results.state.position, start.state.position)
     assert results["acceptance"][1:].tolist() == [0.0] * 4
     assert np.isfinite(results["abs_dH_kT"][1:]).all()

@@ -269,7 +269,7 @@ def test_an_exported_folder_runs_by_itself(tmp_path):
 
 
 def _start_potential(scene: Path) -> float:
-    found = Simulation(Scene.read(scene)).start_energy(100.0, "kJ/mol")
+    found = Simulation(Scene.read(scene))._start_energy(100.0, "kJ/mol")
     return found["potential"]
 
 

@@ -570,7 +570,8 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
     )
     assert "1: cell: to a minimum of the enthalpy at 1 bar, the cell isotropic" in said
     assert "torques of 0.1 kJ/mol and a pressure within 1 bar; at most 5000 iterations" in said
-    assert main(["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]) == 0
+    command = ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out"), "-v"]
+    assert main(command) == 0
     said = capsys.readouterr().out
     assert "minimise: converged after" in said
     assert "cell: converged after" in said
@@ -844,11 +845,11 @@ def test_molecules_in_a_uniform_field_alone_have_torques_and_no_forces(field):
     }
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        removal = Simulation(small_scene({"spce": 30}, None, **sections), warn=str).start()
+        removal = Simulation(small_scene({"spce": 30}, None, **sections), warn=str)._start()
     assert removal.steps > 0
     assert removal.excess <= 1
     sections["stages"] = [{"duration_ps": 5.0, "timestep_fs": 500.0}]
     with pytest.raises(
         SceneError, match=r"timestep_fs of the first stage is too long for electric"
     ):
-        Simulation(small_scene({"na_spce": 3}, None, **sections), warn=str).start()
+        Simulation(small_scene({"na_spce": 3}, None, **sections), warn=str)._start()
