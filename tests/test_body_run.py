@@ -36,7 +36,8 @@ def read(path):
 
 def test_a_run_leaves_what_it_promises(tmp_path, capsys):
     folder = tmp_path / "top"
-    assert main(["run", str(TOP), "-o", str(folder), "--set", "output.npz=true", *SHORT]) == 0
+    command = ["run", str(TOP), "-o", str(folder), "--set", "output.npz=true", "-v", *SHORT]
+    assert main(command) == 0
     said = capsys.readouterr().out
     for part in ("3 degrees of freedom", "L_z error", "orthogonality", "motion.csv", "axis.png"):
         assert part in said
