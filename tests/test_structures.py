@@ -1415,7 +1415,7 @@ def test_velocities_of_some_atoms(tmp_path):
         "forces": {"cutoff_A": 5.0},
     }
     with pytest.raises(
-        StructureError, match=r"no velocities of all atoms; 1 of its .*the first is atom 6"
+        StructureError, match=r"lacks velocities for some atoms; 1 of its .*the first is atom 6"
     ):
         build(Scene.from_dict(data, tmp_path))
 
@@ -1438,7 +1438,7 @@ def test_velocities_in_a_column_without_units_are_not_used(column, tmp_path):
     }
     with pytest.raises(
         StructureError,
-        match=rf"no velocities of all atoms; its velocities in the column {column} have no",
+        match=rf"lacks velocities for some atoms; its velocities in the column {column} have no",
     ):
         build(Scene.from_dict(data, tmp_path))
 

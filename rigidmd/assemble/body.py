@@ -175,7 +175,7 @@ def _body_errors(
     if not rotates:
         yield from _rotation_keys_of_point(scene)
         if scene.body.pinned:
-            yield "body: a point at the pivot cannot move; give it inertia or a centre_of_mass_m"
+            yield "body: a point at the pivot cannot move; set its inertia or its centre_of_mass_m"
         if added_mass.any():
             yield "fluid.added_mass_kg: a point carries no fluid along; leave it out"
         for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m"):

@@ -79,9 +79,7 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
                 )
         if scene.structure.velocities and configuration.velocity is None:
             why = "".join(f"; {note}" for note in configuration.notes if "velocit" in note)
-            faults.append(
-                f"has no velocities of all atoms{why}. Leave out structure.velocities = true"
-            )
+            faults.append(f"lacks velocities for some atoms{why}. Omit structure.velocities = true")
         if faults:
             raise StructureError(scene.structure_source, faults)
         return configuration

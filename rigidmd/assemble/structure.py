@@ -269,7 +269,8 @@ def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
     advice = "set structure.atom_types, or these masses by masses_u"
     if unknown:
         return [
-            f"its atom types {', '.join(unknown)} have masses of no site of {expected}: {advice}"
+            f"its atom types {', '.join(unknown)} have masses that match no site of {expected}:"
+            f" {advice}"
         ]
     return []
 

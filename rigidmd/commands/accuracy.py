@@ -57,7 +57,10 @@ from rigidmd.commands.arguments import (
         "--sample-ps",
         type=float,
         metavar="PS",
-        help="with --averages: time sampled with every step, after a fifth of it (default: 20)",
+        help=(
+            "with --averages: sampling time for each time step, after an equilibration of a fifth"
+            " of it (default: 20)"
+        ),
     ),
     argument(
         "-v",

@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     from rigidmd.core.process import check_address_space, without_local_settings
 
     options = argparse.Namespace()
-    # Nothing of what is imported is garbage: the search for it took a quarter of a short run, most
+    # Skip garbage collection of imported objects: it took a quarter of a short run, most
     # of it at the exit.
     gc.set_threshold(10_000, 50)
     atexit.register(gc.freeze)

@@ -8,7 +8,7 @@ from rigidmd.commands.arguments import Options, argument, command, output_folder
 
 @command(
     110,
-    "try to break the engine: named cases, each compared with a known answer; exit code 1 if an"
+    "run the built-in stress tests, each compared with a known answer; exit code 1 if an"
     " error is undetected",
     "rigidmd stability --quick --case near_linear --case water_steps",
     argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes"),

@@ -57,13 +57,13 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
         "--jobs",
         type=COUNT,
         metavar="N",
-        help="points at a time (default: as many as fill all cores)",
+        help="runs in parallel (default: as many as fill all cores)",
     ),
     argument(
         "--threads",
         type=COUNT,
         metavar="N",
-        help="threads of each point (default: cores over jobs)",
+        help="threads per run (default: cores / jobs)",
     ),
     argument(
         "--walltime",

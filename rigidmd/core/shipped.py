@@ -48,7 +48,7 @@ SECTIONS = {
     "guides": tuple(name for names in GUIDES.values() for name in names),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
-    "evidence": ("benchmarks", "collection", "validation"),
+    "evidence": ("benchmarks", "accuracy_cost", "collection", "validation", "robustness"),
     "project": ("contributing", "architecture", "changelog"),
 }
 CHAPTERS = {

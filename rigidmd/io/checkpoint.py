@@ -79,9 +79,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         name = JSON if JSON in arrays else FORMER_JSON
         values = json.loads(arrays.pop(name).tobytes())
         schema = int(values.pop("schema"))
-    except (
-        Exception
-    ) as error:  # zipfile, zlib, numpy and json refusals all mean the same to the user
+    except Exception as error:  # errors from zipfile, zlib, numpy and json all mean the same
         raise CheckpointError(f"{path}: is damaged, or not a checkpoint: {error}") from None
     if schema != SCHEMA:
         age = "a later" if schema > SCHEMA else "an earlier"

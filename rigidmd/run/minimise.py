@@ -260,7 +260,7 @@ DECREASE = 1e-4
 #: fraction of its size at the start, with the other sign (Hager & Zhang 2005, SIAM J. Optim. 16,
 #: 170, eq. 4.1 with delta = 0.1).
 OPPOSITE_SLOPE = 0.8
-#: Maximum trial moves along a direction; each is at most half as long as the one before.
+#: Maximum number of line-search trials; each is at most half as long as the one before.
 TRIALS = 30
 #: If a move fails with an error even after it has been shortened by this factor, the error is
 #: final.

@@ -98,7 +98,7 @@ class Observer:
     steps: int | None = None
     ends = False
     once = False  # whether it is called once for each time: not before a minimisation
-    # whether it only draws: its `end` is called after the others, and its errors are notes
+    # True if the observer only draws: `end` runs last, and errors become warnings
     draws = False
     reads_energies = (
         False  # whether it reads forces or energies, which the last step then computes too

@@ -443,7 +443,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         The first call starts the run: it compiles and writes the first files. A minimisation is
         done with the next step after it. `run` or `close` completes the run. A signal such as
-        Ctrl-C ends the run with all files, and is raised then.
+        Ctrl-C completes all files; the exception is then re-raised.
 
         Raises
         ------

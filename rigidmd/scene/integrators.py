@@ -1,4 +1,4 @@
-"""Integrators of users as scheme, in the tables [[integrators]] of a scene or by
+"""User-defined integrators, in the tables [[integrators]] of a scene or by
 `integrator`."""
 
 from collections.abc import Sequence

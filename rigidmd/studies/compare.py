@@ -239,7 +239,7 @@ def describe_run_comparison(found: RunComparison) -> str:
             f" {samples.common}"
         )
     elif samples is not None and samples.lengths != (samples.common, samples.common):
-        verdict = "the runs are the same to the last bit as far as both have samples"
+        verdict = "the runs are bitwise identical over their common samples"
     return "\n".join([f"{one} and {other}", columns_text(cells, left=(0, 1, 2)), "", verdict])
 
 

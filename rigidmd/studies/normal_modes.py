@@ -48,7 +48,7 @@ SMOOTH = (
     "where forces jump at the cutoff, forces.truncation = 'smooth_switch', and with PME or Ewald"
     " sums also forces.ewald_accuracy = 1e-7, make them smooth"
 )
-#: Most coordinates of a complete spectrum by default: a matrix of them has 0.3 GB. Modes at each
+#: Maximum size of a dense Hessian (0.3 GB), so of a complete spectrum by default. Modes at each
 #: end beyond it.
 MOST_DENSE, COUNT = 6000, 20
 #: Residual of Lanczos vectors as a fraction of the largest w², and least dimension of their Krylov
@@ -243,7 +243,8 @@ def normal_modes(
     simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
     if isinstance(simulation.scene, BodyScene):
         raise SceneError(
-            simulation.scene.source, ["normal modes are of molecules, and this is a single body"]
+            simulation.scene.source,
+            ["normal modes need a molecular scene, and this is a single body"],
         )
     state, system = (
         (simulation.state if simulation is scene else simulation._settle()).copy(),

@@ -52,7 +52,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
     is in use."""
     if not isinstance(scene, MolecularScene):
         raise SceneError(
-            scene.source, ["a single body stays with rigidmd: export is for molecules"]
+            scene.source, ["export supports molecules only, and this is a single body"]
         )
     check_folder(folder, force, what="export", marker=MARKER)
     program = programs()[to]

@@ -93,7 +93,7 @@ class BodyAnimation:
             self.unit = 1.05 * extent + mesh.reach * enlarged
             self.position = path = (position - middle) / self.unit
             if turns and enlarged > 1:
-                times = f"{enlarged:.3g} times as large as it is relative to its path"
+                times = f"{enlarged:.3g} times larger than to scale"
                 self.notes.append(f"The body is drawn {times}.")
         else:
             self.unit, self.position = 1.08 * radius, np.zeros_like(position)

@@ -10,7 +10,6 @@ machine), rigidmd/docs/images/collection_NAME.png and rigidmd/docs/evidence/coll
 """
 
 import argparse
-import csv
 import json
 import shlex
 import sys
@@ -144,18 +143,6 @@ def measure(name: str) -> None:
     (DATA / f"{name}.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
-def measured_order(rows: list[dict], error: str, floor: float) -> str:
-    """Slope of the log of an error over the log of the step, of the shortest steps above the floor;
-    empty if unknown."""
-    points = [
-        (float(next(v for k, v in row.items() if k.startswith("step"))), float(row[error]))
-        for row in rows
-        if row[error]
-    ]
-    points = sorted(point for point in points if point[1] > 10 * floor)[:3]
-    return f"{np.polyfit(*np.log(np.array(points).T), 1)[0]:.1f}" if len(points) == 3 else ""
-
-
 def table(titles: list[str], rows: list[list[str]]) -> str:
     return "\n".join(
         "| " + " | ".join(row) + " |" for row in [titles, ["---"] * len(titles), *rows]
@@ -181,33 +168,7 @@ def summary_row(name: str, facts: dict) -> list[str]:
 
 
 def section_of(name: str, facts: dict) -> list[str]:
-    with (DATA / f"{name}.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    trajectory = next(
-        key
-        for key in ("error of Q", "error of X (Å)", "error of X (m)")
-        if any(r.get(key) for r in rows)
-    )
-    unit, per = facts["unit"], "ps" if facts["unit"] == "fs" else "s"
-    lines = []
-    for n, order in facts["order"].items():
-        mine = [row for row in rows if row["integrator"] == n]
-        right = [float(r[f"step ({unit})"]) for r in mine if r[f"seconds per {per}"] != "fails"]
-        orders = [
-            measured_order(mine, error, floor)
-            for error, floor in (("energy rms", 1e-15), (trajectory, facts["reference_error"]))
-        ]
-        fails = "yes" if len(right) < len(mine) else ""
-        lines.append(
-            [
-                f"`{n}`",
-                "8" if n.startswith("dop853") else str(order),
-                *orders,
-                f"{max(right):.3g}" if right else "none",
-                fails,
-            ]
-        )
-    versions = ", ".join(f"{package} {number}" for package, number in facts["versions"].items())
+    spread = f"{facts['median_spread']:.0%}"
     return [
         f"## {name}",
         "",
@@ -220,25 +181,21 @@ def section_of(name: str, facts: dict) -> list[str]:
         "",
         f"![{name}: error against run time](../images/collection_{name}.png)",
         "",
-        *(f"- {line}" for line in facts["advice"]),
-        "",
-        table(
-            [
-                "method",
-                "order",
-                "measured, energy",
-                f"measured, {trajectory.removeprefix('error of ').partition(' ')[0]}",
-                f"longest step that ran ({unit})",
-                "a longer one failed",
-            ],
-            lines,
-        ),
-        "",
-        f"Versions: {versions}, Python {facts['python']}. Machine: {facts['processor']}, one thread. Date: {facts['date']}. "
-        f"The median spread of the {REPEATS} timings of a trial is {facts['median_spread']:.0%}. "
-        f"All trials: [{name}.csv](data/collection/{name}.csv).",
+        f"The median spread of the {REPEATS} timings of a trial is {spread}. "
+        f"All trials: [{name}.csv](data/collection/{name}.csv). Longest steps, failures and "
+        f"what is fastest for other errors: [{name}.json](data/collection/{name}.json).",
         "",
     ]
+
+
+def machines_of(found: dict[str, dict]) -> str:
+    """Versions, machine and dates of all scenes."""
+    lines = dict.fromkeys(
+        ", ".join(f"{package} {number}" for package, number in facts["versions"].items())
+        + f", Python {facts['python']}, {facts['processor']}, one thread, {facts['date']}"
+        for facts in found.values()
+    )
+    return "Measured with " + "; with ".join(lines) + "."
 
 
 def page_text() -> str:
@@ -254,7 +211,7 @@ def page_text() -> str:
             [
                 "# Collection",
                 "",
-                "Error against run time of every integrator in ten scenes, with versions, machine and failures.",
+                "Error against run time of every integrator in ten scenes: the fastest for three errors, and a figure of each scene.",
                 "",
                 "<!-- written by python tests/benchmarks/collection.py from data/collection; do not edit -->",
                 "",
@@ -265,8 +222,8 @@ def page_text() -> str:
                 "python tests/benchmarks/collection.py",
                 "```",
                 "",
-                "Each row has the cheapest integrator for three errors of the energy, and how many times faster than",
-                "`velocity_verlet` it is at that error. The factor is absent where `velocity_verlet` is the cheapest or does not reach the",
+                "Each row has the fastest integrator for three errors of the energy, and how many times faster than",
+                "`velocity_verlet` it is at that error. The factor is absent where `velocity_verlet` is the fastest or does not reach the",
                 "error with its shortest step. The unit of the error is kT per degree of freedom for molecules, over 0.1 ps, and the",
                 "largest kinetic energy for a body, over its run. High orders need smooth forces, so all molecules have",
                 '`forces.truncation = "smooth_switch"`. The cost is the median of three timings on a shared machine, and the spread of',
@@ -276,9 +233,10 @@ def page_text() -> str:
                     ["scene", *heads], [summary_row(name, facts) for name, facts in found.items()]
                 ),
                 "",
-                "The tables below have the order of each method and two measured orders: the slopes of the errors of the energy and of",
-                "the trajectory through the three shortest steps whose error is ten times above the rounding error or the error of the",
-                "reference. An empty cell has fewer than three such steps.",
+                "Curves end at a floor, below which a shorter step does not reduce the error: the rounding error, or with PME the error",
+                "of the energy that the grid and the truncated real-space sum leave. A method at its floor shows no order.",
+                "",
+                machines_of(found),
                 "",
                 *(line for name, facts in found.items() for line in section_of(name, facts)),
             ]

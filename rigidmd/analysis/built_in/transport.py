@@ -82,7 +82,7 @@ def interval_and_lags(runs: Runs, what: str) -> tuple[float, int]:
 
 @built_in("mean squared displacement of the centres of mass", position=50)
 def msd(runs: Runs) -> AnalysisResult:
-    """Mean squared displacement (Å²) of each species against time, all origins, up to half a fifth
+    """Mean squared displacement (Å²) of each species against time, all origins, up to a tenth
     of the frames. Paths continue through the faces of the box, without the scaling by a barostat.
     Raises OutputError."""
     interval, lags = interval_and_lags(runs, "a mean squared displacement")
@@ -197,7 +197,7 @@ def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResul
         )
     if edge is None and runs.has_box:
         result.notes.append(
-            "no correction for the size of the box: the one of Yeh and Hummer is for cubic boxes"
+            "no correction for the size of the box: the Yeh-Hummer correction is for cubic boxes"
         )
     return result
 

@@ -221,8 +221,8 @@ def recommendations(measured: IntegratorAccuracy) -> list[str]:
     s, lines = measured.trial_system, []
     for error, best, faster, rivals in cheapest(measured):
         faster = f": {faster}" if faster else ""
-        rivals = f"; as fast within the spread of the timings: {rivals}" if rivals else ""
-        lines.append(f"for {error} over {_span(measured)} the cheapest is {best}{faster}{rivals}")
+        rivals = f"; equally fast within timing noise: {rivals}" if rivals else ""
+        lines.append(f"for {error} over {_span(measured)} the fastest is {best}{faster}{rivals}")
     if lines and s.time_unit == "fs":
         lines.append(
             "energy errors grow over longer runs, by a random walk where forces are truncated:"
@@ -453,7 +453,7 @@ def _page_parts(measured: IntegratorAccuracy, command: str) -> Iterator[str]:
         f"error over {_span(measured)}",
         "least run time",
         "gain",
-        "as fast within the spread of the timings",
+        "equally fast within timing noise",
     ]
     advice = table(titles, cheapest(measured), words=True)
     drawn = wide(accuracy_figure(measured), "accuracy", "log error over log run time")

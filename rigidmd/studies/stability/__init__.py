@@ -1,3 +1,3 @@
-"""Named ways to try to break the engine, each compared with a known answer."""
+"""Stress tests of the engine, each compared with a known answer."""
 
 from rigidmd.studies.stability import bodies, molecules  # noqa: F401  (register builders)

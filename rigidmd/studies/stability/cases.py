@@ -72,7 +72,7 @@ class Trial(NamedTuple):
 
 
 class Case(NamedTuple):
-    """A way to try to break the engine."""
+    """A stress test of the engine."""
 
     name: str
     group: int  # number of its kind of difficulty, from 1 to 14
