@@ -754,8 +754,8 @@ def test_a_command_line_that_is_not_known_suggests_what_is(words, expected, caps
 @pytest.mark.parametrize(
     ("word", "expected"),
     [
-        ("restarts", "there are installation, why"),
-        ("rdf", "the word is in water ("),
+        ("restarts", "there are five_minutes, installation, why"),
+        ("rdf", "the word is in five_minutes ("),
         ("anlysis", "did you mean analysis?"),
     ],
 )

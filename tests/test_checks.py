@@ -206,7 +206,14 @@ def test_a_bound_on_all_molecules_hides_no_finding(monkeypatch, name):
 def test_a_thermostat_is_held_to_its_own_time_only():
     """A drift that a thermostat carries off may add up to any size; within its time constant it may
     not."""
-    nvt = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]
+    nvt = [
+        {
+            "ensemble": "nvt",
+            "temperature_K": 300.0,
+            "duration_ps": 1.0,
+            "thermostat_time_ps": 0.1,
+        }
+    ]
     scene = small_scene({"spce": 40}, 18.5, stages=nvt, output={"log_interval_ps": 0.05})
     system, simulation = build(scene), Simulation(scene)
     rows = simulation.run().samples.rows
