@@ -25,11 +25,10 @@ from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.io.trajectory import (
     from_files,
     in_memory,
-    open_trajectory,
     read_frames,
     reader_of,
-    write_topology,
 )
+from rigidmd.io.trajectory_file import open_trajectory, write_topology
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene

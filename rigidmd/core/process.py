@@ -3,6 +3,7 @@ Python."""
 
 import contextlib
 import os
+import subprocess
 import sys
 import threading
 import warnings
@@ -57,6 +58,14 @@ def without_local_settings() -> Iterator[None]:
         yield
     finally:
         os.path.exists = exists
+
+
+#: Arguments of `subprocess.Popen` for a process that gets no Ctrl-C of this one's terminal.
+OWN_GROUP: Json = (
+    {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    if sys.platform == "win32"
+    else {"start_new_session": True}
+)
 
 
 def python_process(*arguments: str) -> Json:

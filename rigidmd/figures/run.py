@@ -7,18 +7,18 @@ import numpy as np
 from rigidmd.core.statistics import format_signed
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Samples, moving
-from rigidmd.engines.system import System
 from rigidmd.figures.body import body_figures
 from rigidmd.figures.style import COOL, FAINT, WARM, new_figure, shown_range, thin_series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from rigidmd.engines.system import System
     from rigidmd.figures.picture import Picture
 
 
 def run_figures(
-    system: System | BodySystem, samples: Any, summary: dict[str, Any]
+    system: "System | BodySystem", samples: Any, summary: dict[str, Any]
 ) -> "dict[str, Picture]":
     """The figures of a run by the names of their files, if there are enough samples."""
     if isinstance(system, BodySystem):
@@ -34,7 +34,7 @@ LETTER_WIDTH, MOST_ROWS = 0.012, 5
 DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
 
 
-def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
+def energy_figure(system: "System", samples: Samples, summary: dict) -> "Picture":
     """The drift of the conserved energy in each stage, on the scale of the last; energies and
     temperatures."""
     stages, n = system.scene.stages, len(system.model.species)

@@ -23,7 +23,7 @@ from rigidmd.core.toml import Json, shorten_text
 from rigidmd.errors import CheckpointError, SceneError, option
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import elsewhere
-from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene import Scene, is_molecular
 
 #: Packages that may change the last bits of a result.
 PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy")
@@ -69,7 +69,7 @@ def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: st
 
     inputs : `input_digests` at the start; engine : the program that computed the motion
     """
-    molecular = isinstance(scene, MolecularScene)
+    molecular = is_molecular(scene)
     return {
         "scene": scene.name,
         **computed_with(),
@@ -162,7 +162,7 @@ def check_same_scene(
     some steps. The last stage of molecules may be longer or shorter than before, but not shorter
     than it has run."""
     excluded = [*scene.inputs, *scene.embedded_files, *NOT_COMPARED]
-    if isinstance(scene, MolecularScene) and not scene.stages[-1].ramps:
+    if is_molecular(scene) and not scene.stages[-1].ramps:
         excluded.append(f"stages.{len(scene.stages) - 1}.duration_ps")
         if sum(stage.steps for stage in scene.stages) < steps:
             raise CheckpointError(

@@ -10,7 +10,6 @@ import time as clock
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from math import inf
 from pathlib import Path
 from typing import (
@@ -39,7 +38,7 @@ from rigidmd.run.loop import RunLoop
 from rigidmd.run.observers import as_observer
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import checked_walltime, signal_handler, stop_signals
-from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.scene import BodyScene, Scene
 
 if TYPE_CHECKING:
     import ase
@@ -54,6 +53,7 @@ if TYPE_CHECKING:
     from rigidmd.run.minimise import OverlapRemoval
     from rigidmd.run.molecular import MolecularRun
     from rigidmd.run.schedule import Segment
+    from rigidmd.scene import MolecularScene
 
     UserForce = Force | PairPotential | HasTerm | NamedTuple
 
@@ -133,7 +133,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         @overload
         def __init__(
             self: "Simulation[System, MolecularScene]",
-            scene: MolecularScene,
+            scene: "MolecularScene",
             folder: str | Path | None = None,
             force: bool = False,
             **options: Unpack[Options],
@@ -541,6 +541,8 @@ def run_together(
     jobs
         Runs at a time; default: the number of cores
     """
+    from concurrent.futures import ThreadPoolExecutor, wait
+
     simulations = list(simulations)
     if wrong := [value for value in simulations if not isinstance(value, Simulation)]:
         raise TypeError(f"{wrong[0]!r:.60} is not a Simulation")

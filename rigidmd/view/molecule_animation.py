@@ -7,7 +7,8 @@ from itertools import combinations, product
 
 import numpy as np
 
-from rigidmd.engines.system import Sites, System
+from rigidmd.engines.sites import Sites
+from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.figures.style import FAINT, INK, UP, camera, draw_scale
 from rigidmd.formats.bonds import COVALENT, connections

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.assemble.build import integrator_of_stage
-from rigidmd.assemble.time_step import stable_angle
+from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, State
 from rigidmd.dynamics.hybrid_monte_carlo import CHANCES, ENDED
