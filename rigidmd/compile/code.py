@@ -27,7 +27,8 @@ from rigidmd.compile.cache import is_persistent, lock_in_cache
 from rigidmd.compile.kernels import NotStored, chosen_by_type, compile_callback, compiler_options
 from rigidmd.compile.machine import MOST_THREADS, cast_pointer, pointer_to
 from rigidmd.compile.records import NumbaStruct, by_reference, load_invariant, stored_by_reference
-from rigidmd.core.process import OWN_GROUP, python_process
+from rigidmd.core.process import python_process
+from rigidmd.core.signals import OWN_GROUP
 from rigidmd.errors import SettingError
 
 #: Longest time to wait for the code of another process, s.

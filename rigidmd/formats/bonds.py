@@ -97,7 +97,7 @@ def _hull(points: np.ndarray) -> np.ndarray:
         outline = _flattened(points[side])
         for ends in _sides(outline):
             along = _flattened(outline[ends])[:, 0]
-            corners = side[ends[along.argmin()]], side[ends[along.argmax()]]
+            corners = int(side[ends[along.argmin()]]), int(side[ends[along.argmax()]])
             edges[min(corners), max(corners)] = None
     return np.array(list(edges))
 

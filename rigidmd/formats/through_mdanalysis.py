@@ -100,7 +100,7 @@ class FrameFiles:
 @contextlib.contextmanager
 def scratch_file() -> Iterator[str]:
     """A path for the file of a frame: in memory on Linux, elsewhere in a temporary folder."""
-    if hasattr(os, "memfd_create"):
+    if sys.platform == "linux":
         handle = os.memfd_create("frame")
         try:
             yield f"/proc/self/fd/{handle}"

@@ -26,7 +26,7 @@ from rigidmd.io.folder import elsewhere
 from rigidmd.scene import Scene, is_molecular
 
 #: Packages that may change the last bits of a result.
-PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy")
+PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy", "scipy", "rocket_fft")
 #: Keys of a summary on programs and machine.
 MADE_WITH = (
     *(f"{package}_version" for package in PACKAGES),
@@ -185,6 +185,7 @@ def describe_changes(before: Mapping[str, object]) -> str | None:
         f"{key.replace('_', ' ').removesuffix(' version')} {then} there, {here} here"
         for key, (then, here) in differences(before, computed_with(), None).items()
         if key not in ("python_version", "processor_features")
+        and (key in before or not key.endswith("_version"))  # earlier versions named fewer packages
     ]
     if not changed:
         return None

@@ -28,6 +28,7 @@ import numpy as np
 
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.display import Displayed
+from rigidmd.core.signals import CHECKPOINT_SIGNALS
 from rigidmd.core.state import State
 from rigidmd.core.toml import Json
 from rigidmd.errors import RigidMDError, RigidMDWarning, SceneError
@@ -578,8 +579,7 @@ def run_together(
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(signal_handler(stop, *stop_signals()))
-        if hasattr(signal, "SIGUSR1"):
-            stack.enter_context(signal_handler(ask_for_checkpoints, signal.SIGUSR1))
+        stack.enter_context(signal_handler(ask_for_checkpoints, *CHECKPOINT_SIGNALS))
         pool = stack.enter_context(ThreadPoolExecutor(jobs or MOST_THREADS, "run"))
         futures = [pool.submit(run, simulation) for simulation in simulations]
         running = set(futures)

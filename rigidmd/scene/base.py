@@ -240,7 +240,7 @@ class Scene(Section, Displayed):
         """
         folder, data = Path(folder), plain_values(data)
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
-        kind = _kind_of_scene(data) if cls is Scene else cls
+        kind: Any = _kind_of_scene(data) if cls is Scene else cls
         if kind is None:
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults, overridden = [], []
