@@ -1,14 +1,17 @@
 """rigidmd: molecular dynamics of rigid molecules, and the motion of single rigid bodies.
 
-import rigidmd
+Examples
+--------
+    import rigidmd
 
-scene = rigidmd.Scene.read("water.toml")
-results = rigidmd.Simulation(scene).run()
-print(results["temperature"].mean(), results.units["temperature"], results.universe())
+    results = rigidmd.Simulation("water.toml").run()
+    print(results["temperature"].mean(), results.units["temperature"], results.universe())
 
-with rigidmd.Simulation(scene) as simulation:
-    simulation.step(100)  # the first 100 steps; simulation.run() would run the rest
-    print(simulation.state.time, simulation.state.position)
+    with rigidmd.Simulation("water.toml") as simulation:
+        simulation.step(100)  # the first 100 steps; simulation.run() would run the rest
+        print(simulation.state.time, simulation.state.position)
+
+    results = rigidmd.read_run("runs/water")  # of an earlier run
 """
 
 import lazy_loader

@@ -5,6 +5,8 @@ from . import view as view
 from .assemble.scenes import atoms_of as atoms_of
 from .assemble.scenes import resolve as resolve
 from .assemble.scenes import scene_from_atoms as scene_from_atoms
+from .assemble.user_code.body_pairs import BodyPairPotential as BodyPairPotential
+from .assemble.user_code.body_pairs import body_pair_potential as body_pair_potential
 from .assemble.user_code.force import Force as Force
 from .assemble.user_code.pair_potential import PairPotential as PairPotential
 from .assemble.user_code.pair_potential import pair_law as pair_law
@@ -26,6 +28,7 @@ from .studies.normal_modes import normal_modes as normal_modes
 from .studies.stored_runs import read_run as read_run
 from .studies.sweep.sweeping import sweep as sweep
 from .studies.sweep.windows import pmf as pmf
+from .studies.virial import second_virial as second_virial
 from .view.plots import LivePlot as LivePlot
 
 __version__: str

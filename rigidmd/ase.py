@@ -205,7 +205,7 @@ class RigidMD(Calculator):
     def _fit_atoms(self, atoms: Atoms) -> "_FittedAtoms":
         """Rigid molecules fitted to the atoms, as matched before if this still fits. If they
         deviate much more than before, other atoms may be at the positions of these: then they are
-        matched anew, and the better match counts, so that an energy does not depend on the atoms
+        matched again, and the better match counts, so that an energy does not depend on the atoms
         that were seen before."""
         if faults := atoms_errors(atoms):
             raise SceneError(SOURCE, faults)
@@ -370,7 +370,7 @@ class CalculatorForce(Force):
         In logs and messages; default: the name of the calculator's class
     energy_noise_eV
         Random error of its energies, as of self-consistent iterations or of single precision;
-        larger differences between forces and differences of the energy are refused at the start of
+        larger differences between forces and differences of the energy are rejected at the start of
         a run
     changes_momentum
         Which components of the total momentum it may change: True for external fields and

@@ -1,4 +1,4 @@
-"""The exceptions of rigidmd. Every refusal raises one of them, with an explanation.
+"""The exceptions of rigidmd. Every rejection raises one of them, with an explanation.
 
 The command line prints the message and exits with 2 for bad input and 1 for a failed run. Python
 code gets the exception.
@@ -67,7 +67,7 @@ class RigidMDWarning(UserWarning):
 
 
 class RigidMDError(Exception):
-    """Base of all errors of this package. Messages may quote untrusted input; they are safe to
+    """Base of all errors of this package. Messages may quote untrusted input. They are safe to
     print."""
 
     def __init__(self, message: str):

@@ -14,7 +14,7 @@ os.environ.setdefault("RIGIDMD_COMPILERS", "1")
 # 15 % of its time.
 gc.set_threshold(50_000, 20, 20)
 
-pytest.register_assert_rewrite("support")
+pytest.register_assert_rewrite("support", "stops")
 from hooks import (  # noqa: E402, F401
     pytest_collection_modifyitems,
     pytest_collectreport,
@@ -27,7 +27,7 @@ from support import ROOT  # noqa: E402
 
 @pytest.fixture(scope="session")
 def reference() -> Path:
-    """Outside data: RIGIDMD_REFERENCE, or ../shared/reference beside the project."""
+    """Outside data: RIGIDMD_REFERENCE, or ../shared/reference next to the project."""
     folder = Path(os.environ.get("RIGIDMD_REFERENCE", ROOT.parent / "shared" / "reference"))
     if not folder.is_dir():
         pytest.skip(f"no outside reference data at {folder} (RIGIDMD_REFERENCE names it)")

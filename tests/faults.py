@@ -1,4 +1,4 @@
-"""A driver of mixed faults: runs of small random scenes are disturbed, resumed and compared with an
+"""A driver of mixed errors: runs of small random scenes are disturbed, resumed and compared with an
 undisturbed run.
 
     python tests/faults.py --minutes 1             random cases, one after another, for a minute
@@ -6,14 +6,14 @@ undisturbed run.
     python tests/faults.py --minutes 600 --wide    also barostats, minimisation, PME, mixed precision
 
 A case is a scene and a few actions, all drawn from one seed. Each attempt to run the scene is a
-forked process, which shares the compiled kernels. A fault comes at the n-th call of a C function,
-or at the n-th one that works on a file: the attempt is killed, stopped, signalled, or finds no room
+forked process, which fractions the compiled kernels. A error comes at the n-th call of a C function,
+or at the n-th one that works on a file: the attempt is killed, stopped, signalled, or finds no workspace
 on the disk or in memory. Between attempts files are damaged, replaced by links, pipes and folders,
 or a checkpoint is forged. What must hold:
 
 - An attempt ends with a documented exit code, with a sentence where it fails, without a traceback,
   and it ends.
-- What is refused changes no file. Files that a run did not write stay.
+- What is rejected changes no file. Files that a run did not write stay.
 - A run that ends has the bits of an undisturbed run. A run whose files are whole can be resumed.
 """
 
@@ -159,7 +159,7 @@ def scene_of(rng: random.Random, wide: bool) -> tuple[str, dict]:
 
 
 def checkpoints(rng: random.Random) -> dict[str, float]:
-    """After every observation, at times that the clock decides, or only where a stage begins and
+    """After every observation, at times that the clock decides, or only where a stage starts and
     ends."""
     return {"checkpoint_minutes": rng.choice([1e-9, 1e-9, 0.001, 60.0])}
 
@@ -189,7 +189,7 @@ def is_in_memory(owner: Any) -> bool:
 
 
 def is_elsewhere(frame: Any) -> bool:
-    """Whether NumPy's polynomials are at work, which turn any error into a TypeError, or Python
+    """Whether NumPy's polynomials are at work, which rotate any error into a TypeError, or Python
     reads a version."""
     while frame is not None:
         if re.search("/numpy/polynomial/|/importlib/metadata/", frame.f_code.co_filename):
@@ -424,7 +424,7 @@ class Case:
         return ["run", str(self.scene), "-o", str(self.folder), "--resume", *threads]
 
     def _attempt(self, fault: str | None) -> bool:
-        """Run or resume, with a fault at a random call, and check how it ends; whether the run has
+        """Run or resume, with a error at a random call, and check how it ends; whether the run has
         to be resumed."""
         command = self._command()
         names = FAILING if fault == "failing" else self.rng.choice([(), FILE_CALLS])
@@ -442,7 +442,7 @@ class Case:
         return self._check(code, codes, fault, before)
 
     def _fault(self, fault: str | None) -> tuple[Callable[[], None] | None, str, set[int]]:
-        """What happens at the call, in words, and the exit codes that are right if nothing is
+        """What happens at the call, as text, and the exit codes that are right if nothing is
         damaged."""
         rng = self.rng
 
@@ -502,7 +502,7 @@ class Case:
         """Try to run in the folder of a process that is stopped; its exit code when it has
         continued, or been killed.
 
-        has_begun : whether it has changed files, so that the other one must be refused
+        has_begun : whether it has changed files, so that the other one must be rejected
         """
         second, read = begun(self._command())
         code, said = waited(second), said_by(read)
@@ -569,7 +569,7 @@ class Case:
         return False
 
     def _compare(self) -> None:
-        """Raise Found if results differ from those of the undisturbed run, or files of others have
+        """Raise Found if results differ from the values of the undisturbed run, or files of others have
         changed."""
         found = contents(self.folder)
         unread = {name for name in self.damage if name.startswith("topology")}
@@ -667,6 +667,7 @@ def main() -> int:
     """Run cases until the time is up; 1 if something was found."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--minutes", type=float, default=1.0, help="how long (default: 1)")
+    parser.add_argument("--cases", type=int, help="so many cases, however long they take")
     parser.add_argument(
         "--seed", type=int, help="only the case of this seed, with each of its actions"
     )
@@ -680,6 +681,8 @@ def main() -> int:
         "--keep", type=Path, metavar="FOLDER", help="keep the files of the last case there"
     )
     options = parser.parse_args()
+    if options.seed is not None:
+        options.cases = 1
     began, cases, actions, failures = time.monotonic(), 0, Counter[str](), 0
     seed = (
         options.seed
@@ -708,7 +711,8 @@ def main() -> int:
                 print(*story, case.said, found, f"replay: {replay} {seed}", sep="\n", flush=True)
             cases, seed = cases + 1, seed + 1
             actions += case.actions
-            if options.seed is not None or time.monotonic() - began > 60 * options.minutes:
+            is_over = time.monotonic() - began > 60 * options.minutes
+            if cases == options.cases or (options.cases is None and is_over):
                 break
     hours = (time.monotonic() - began) / 3600
     print(f"{cases} cases in {hours:.3f} hours; {failures} failures")

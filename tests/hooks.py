@@ -14,30 +14,31 @@ from pathlib import Path
 import pytest
 
 #: Files that take longest with cold kernels, the longest first: a file is run by one worker, so
-#: they begin first. By CPU seconds of a cold run on two cores: 223 of forces, 232 of docs, 200 of
-#: run, 196 of ewald, 25 of notebook. The first two have no kernels in common, which both workers
-#: would compile.
+#: they begin first. The first two have no kernels in common, which both workers would compile.
 LONGEST = (
     "forces",
     "body_engine",
-    "ewald",
     "docs",
     "run",
-    "dynamics",
+    "ewald",
     "resume",
-    "user_code",
-    "compile",
-    "view",
-    "minimise",
     "sweep",
-    "ase",
-    "simd",
+    "compile",
+    "dispersion",
     "python",
     "bodies",
+    "view",
+    "ase",
+    "strangers",
+    "faults",
+    "user_code",
+    "dynamics",
     "threads",
+    "simd",
+    "minimise",
+    "ensembles",
     "fuzz",
     "trajectory_structures",
-    "engine_settings",
     "notebook",
 )
 RANKS = {f"test_{name}.py": rank for rank, name in enumerate(LONGEST)}
@@ -119,6 +120,7 @@ EXTENDED = {
     ),
     "test_simd.py": (
         "mixed_precision_costs_less_than_a_hundred_thousandth*switch*",
+        "the_narrowest_vectors*",
         "the_same_bits_for_any_number_of_threads[[]mixed]",
     ),
     "test_threads.py": ("simulations_on_all_threads_at_once_have_the_bits_of_each_alone",),

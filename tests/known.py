@@ -2,7 +2,7 @@
 package.
 
 The oracle for the dynamics of one body. Q takes body to lab; omega and L are in the body frame
-unless the name says `_lab`; Euler angles are 3-1-3, Q = Rz(phi) Rx(theta) Rz(psi); gravity points
+unless the name states `_lab`; Euler angles are 3-1-3, Q = Rz(phi) Rx(theta) Rz(psi); gravity points
 along -z; the axis of a symmetric top is body axis 3 and I1 = I2, about the pivot where there is
 one. Any coherent units.
 
@@ -25,7 +25,7 @@ def quarter_period(m1: float) -> float:
 
 
 def amplitude(u, m1: float):
-    """(half turns, s, c): am(u | m) = pi half_turns + an angle of sine s and cosine c >= 0, each
+    """(half rotates, s, c): am(u | m) = pi half_turns + an angle of sine s and cosine c >= 0, each
     good to its own size.
 
     So sn = (-1)^half_turns s, cn = (-1)^half_turns c. Gauss's transformation by the
@@ -100,7 +100,7 @@ def euler_rotation(phi, theta, psi) -> np.ndarray:
 def free_symmetric_top(i1, i3, omega0, times, rotation0=None):
     """(omega (n, 3), Q (n, 3, 3)) of a body with moments (i1, i1, i3) under no torque.
 
-    Q(t) = R(L_lab, |L| t / I1) Q0 Rz((I1 - I3) omega3 t / I1); omega turns about axis 3 at (I3 -
+    Q(t) = R(L_lab, |L| t / I1) Q0 Rz((I1 - I3) omega3 t / I1); omega rotates about axis 3 at (I3 -
     I1) omega3 / I1. Landau & Lifshitz, Mechanics, sections 33 and 36.
     """
     omega0, times = np.asarray(omega0, float), np.asarray(times, float)
@@ -343,7 +343,7 @@ class LagrangeTop:
         `_phi_base`, `_psi_base`.
 
         Unless the path comes near the downward vertical, F is taken out of both Pi and put into
-        those rates (the ones at u1), so that a slow precession is no difference of two large terms.
+        those rates (the ones at u1), so that a slow precession is not a difference of two large terms.
         """
         m, m1, scale = self._m, self._m1, 2 * self.i1 * self._p
 
@@ -360,7 +360,7 @@ class LagrangeTop:
         above = below = np.zeros_like(s)
         if self._high:
             above = term(self._minus, self._wide, self._width / self._wide, self._high / self._wide)
-        elif self._width:  # through the upward vertical: a half turn there
+        elif self._width:  # through the upward vertical: a half rotation there
             above = np.pi * half
         if self._low:
             below = term(self._plus, self._low, -self._width / self._low, self._tall / self._low)
@@ -406,7 +406,7 @@ def steady_precession_rates(i1, l3, mgl, theta) -> tuple[float, float]:
     """(slow, fast) roots of I1 cos(theta) x^2 - L3 x + M = 0; nan if there are none, fast inf at 90
     degrees.
 
-    Of sin(theta) (I1 cos(theta) x^2 - L3 x + M) = I1 theta'' at theta'' = 0. Landau & Lifshitz,
+    For sin(theta) (I1 cos(theta) x^2 - L3 x + M) = I1 theta'' at theta'' = 0. Landau & Lifshitz,
     Mechanics, section 35.
     """
     lead = i1 * np.cos(theta)
@@ -422,11 +422,11 @@ def sleeping_limit(i1, mgl) -> float:
     return float(2 * np.sqrt(i1 * mgl))
 
 
-# Frames that turn
+# Frames that rotate
 
 
 def rotating_fall(omega_frame, gravity, x0, v0, times):
-    """(x, v), each (n, 3), of a point in a frame that turns at a constant rate, relative to the
+    """(x, v), each (n, 3), of a point in a frame that rotates at a constant rate, relative to the
     frame.
 
     x'' = g - 2 W x x' - W x (W x x), g and W constant in the frame. In axes at rest X = R(t) x has
@@ -460,12 +460,12 @@ def rotating_fall(omega_frame, gravity, x0, v0, times):
 
 
 def gyrocompass_period(h, mgl, omega, latitude) -> float:
-    """2 pi sqrt(h / (m g l W cos(latitude))): the rotor's own inertia and the frame's rate beside
+    """2 pi sqrt(h / (m g l W cos(latitude))): the rotor's inertia and the frame's rate next to
     the weight neglected.
 
-    The axis at azimuth a east of north and elevation e: the frame's vertical rate apart, the
+    The axis at azimuth a east of north and elevation e: the frame's vertical rate from each other, the
     horizon under an axis that points east sinks, e' = W cos(latitude) a; the pendulum's torque m g
-    l e turns the axis, a' = -m g l e / h. Together a'' = -(m g l W cos(latitude) / h) a. Period of
+    l e rotates the axis, a' = -m g l e / h. Together a'' = -(m g l W cos(latitude) / h) a. Period of
     the undamped gyrocompass.
     """
     return float(2 * np.pi * np.sqrt(h / (mgl * omega * np.cos(latitude))))
@@ -567,7 +567,7 @@ def wheel_turn(i_body, torque, t_on, times) -> np.ndarray:
     L = I omega + h = 0, h = torque min(t, t_on): angle = -torque t^2 / (2 I), later -torque t_on (t
     - t_on / 2) / I. If h is the wheel's whole momentum, `torque` is the motor's and I is the body's
     without the wheel;
-    if h counts from the body (relative spin), I is that of the two locked together.
+    if h counts from the body (relative spin), I is the value of the two locked together.
     """
     times = np.asarray(times, float)
     on = np.minimum(times, t_on)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class Mutation(NamedTuple):
-    """A change of one place in the sources that no test may overlook."""
+    """A change of one position in the sources that no test may overlook."""
 
     name: str
     sentence: str  # what is wrong then
@@ -230,7 +230,7 @@ RINGS = [
     ),
     Mutation(
         "B13",
-        "temperatures at constant energy: the error of the step twice",
+        "temperatures at constant energy: the time-step error twice",
         "core/integrators.py",
         "        return (1 / 6 - moment) / 2",
         "        return 1 / 6 - moment",

@@ -35,7 +35,7 @@ PASSED, FAILED, INTERRUPTED = 0, 1, 2
 
 
 def copy_of_checkout(folder: Path, working_tree: bool) -> Path:
-    """The files of HEAD, or those of the working tree, in a folder that is empty or holds an
+    """The files of HEAD, or the values of the working tree, in a folder that is empty or holds an
     earlier copy.
 
     Files that are there already keep their times, and so the kernels that were compiled from them.
@@ -157,7 +157,7 @@ def run_tests(copy: Path, arguments: Sequence[str], limit: float) -> tuple[int |
 
 
 def verdict(mutation: Mutation, copy: Path, limit: float, whole: bool) -> tuple[bool, str]:
-    """Whether a test finds a mutation, and that in words."""
+    """Whether a test finds a mutation, and that as text."""
     selections = [["-n", "0", *(f"tests/{test}" for test in mutation.tests)]] + (
         [["tests"]] if whole else []
     )

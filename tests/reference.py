@@ -1,8 +1,8 @@
 """The slow, obvious NumPy version of the forces: every pair of sites, no list, no cells, formulas
 as on paper.
 
-The oracle against which kernels are checked. It shares no code with them, not even the endings at
-the cut-off.
+The oracle against which kernels are checked. It has no common code with them, not even the truncations at
+the cutoff.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ SWITCHES = {"switch": quintic, "smooth_switch": nonic}
 
 
 def inverse_power(r, p, cutoff, start, name):
-    """Energy of r^-p with its ending; by the definition of each ending in the manuals."""
+    """Energy of r^-p with its truncation; by the definition of each truncation in the manuals."""
     force = p * cutoff ** (-p - 1)
     if name == "plain":
         return r**-p
@@ -148,7 +148,7 @@ class Oracle:
 
 
 class EwaldOracle:
-    """Ewald sums term by term: all pairs of sites by scipy's erfc, all waves by complex
+    """Ewald sums term by term: all pairs of sites by scipy's erfc, all k-vectors by complex
     exponentials, any cell.
 
     x (s, 3) sites with molecules whole, q (s,) in e, owner (s,), cell (3, 3) rows a, b, c; energies
@@ -156,7 +156,7 @@ class EwaldOracle:
     """
 
     def __init__(self, x, q, owner, cell, alpha, cutoff, inside):
-        """inside(n) says which integer vectors n (..., 3), up to 20 on each axis, are summed."""
+        """inside(n) states which integer vectors n (..., 3), up to 20 on each axis, are summed."""
         self.x, self.q, self.owner, self.cell = (
             np.array(x),
             np.array(q) * np.sqrt(KE),

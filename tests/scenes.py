@@ -14,7 +14,7 @@ import numpy as np
 
 PME = {"electrostatics": "pme", "cutoff_A": 7.0}
 WALL = [{"model": "argon", "count": 20, "frozen": True}, {"model": "spce", "count": 30}]
-#: Ten systems of every kind, in a cube of 15 Å unless they say otherwise: name -> models and
+#: Ten systems of every kind, in a cube of 15 Å unless they state otherwise: name -> models and
 #: counts, tables of the scene.
 SCENES = {
     "three sites": ({"spce": 30}, {"forces": PME}),
@@ -32,7 +32,7 @@ SCENES = {
     ),
 }
 
-#: Forty waters, and stages: what is stopped, goes on and is read back.
+#: Forty waters, and stages: what is stopped, continues and is read back.
 FORTY_WATERS = {
     "box": {"density_g_cm3": 0.9},
     "molecules": [{"model": "spce", "count": 40}],
@@ -88,7 +88,7 @@ temperature_K = 300
 [[stages]]
 duration_ps = 0.01
 """
-#: A body in a frame that turns, with a wheel.
+#: A body in a frame that rotates, with a wheel.
 SATELLITE = """
 [body]
 mass_kg = 10.0

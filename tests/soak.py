@@ -1,12 +1,12 @@
-"""Runs what takes hours, and says when it last passed.
+"""Runs what takes hours, and states when it last passed.
 
-    python tests/soak.py                          all parts: statistics, faults, mutations
+    python tests/soak.py                          all parts: statistics, errors, mutations
     python tests/soak.py statistics               one of them
-    python tests/soak.py faults --minutes 600     so long for the fault driver
+    `python tests/soak.py faults --minutes 600`   for 600 minutes
     python tests/soak.py --when                   when each part last ran and last passed, and at which commit
 
 Each run of a part adds a line to the record, a file of JSON lines (default: .soak/record.jsonl in
-the checkout, which git ignores), and its output is beside it. Exit code: 0 if every part passed, 1
+the checkout, which git ignores), and its output is next to it. Exit code: 0 if every part passed, 1
 if one did not.
 """
 

@@ -1,17 +1,11 @@
 """Helpers that several test files use. What a test tests it imports from its module."""
 
-import os
-import re
 import shutil
-import signal
 import subprocess
-import sys
-import zlib
 from pathlib import Path
 
 import numpy as np
 
-import rigidmd
 from rigidmd import BodyScene, Scene
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.assemble.build import build
@@ -29,7 +23,7 @@ SYSTEMS = sorted((ROOT / "systems").glob("*.toml"))
 BODIES = [path for path in SYSTEMS if isinstance(Scene.read(path), BodyScene)]
 MOLECULES = [path for path in SYSTEMS if path not in BODIES]
 
-#: Argon atoms on springs, so far apart that nothing else acts on them: m w² in u/ps², and w dt = 1
+#: Argon atoms on springs, so far from each other that nothing else acts on them: m w² in u/ps², and w dt = 1
 #: at 36 fs.
 SPRING = 30_000.0
 
@@ -39,13 +33,19 @@ SPRING = 30_000.0
 
 def pinned(tables: dict) -> dict:
     """Tables of a scene of molecules with a reaction field, one truncation for all forces, no tail
-    correction and double precision, unless they say otherwise: one set of kernels for most tests.
-    The defaults of users have tests of their own."""
+    correction, double precision and steps of 2 fs, unless they state otherwise: one set of kernels
+    for most tests. The defaults of users have tests of their own."""
     forces = {"electrostatics": "reaction_field", "tail_correction": False, "truncation": "switch"}
     forces |= tables.get("forces", {})
     if forces["electrostatics"] == "reaction_field":
         forces = {"reaction_field_truncation": forces["truncation"]} | forces
-    return {"precision": "double"} | tables | {"forces": forces}
+    stages = [
+        stage
+        if stage.get("ensemble") == "minimise" or stage.get("integrator") == "auto"
+        else {"timestep_fs": 2.0} | stage
+        for stage in tables.get("stages", [])
+    ]
+    return {"precision": "double"} | tables | {"forces": forces, "stages": stages}
 
 
 def small_scene(counts: dict[str, int], edge: float | None, folder=".", **sections) -> Scene:
@@ -65,7 +65,7 @@ def system_of(counts, edge=40.0, cutoff=5.0, **sections) -> System:
 
 
 def shaken(system: System, seed: int, spread: float = 0.4) -> tuple[System, Engine, State]:
-    """A system, its engine, and its start with molecules shaken off the lattice and turned anew."""
+    """A system, its engine, and its start with molecules shaken off the lattice and rotated again."""
     rng = np.random.default_rng(seed)
     state = system.state.copy()
     state.position[:] += spread * rng.standard_normal(state.position.shape)
@@ -75,7 +75,7 @@ def shaken(system: System, seed: int, spread: float = 0.4) -> tuple[System, Engi
 
 
 def bits_with(threads: int, system: System, state: State) -> tuple:
-    """All bits of forces, torques, energies and virials of a state, computed by so many threads."""
+    """All bits of forces, torques, energies and virials of a state, computed by this many threads."""
     engine = system.engine()
     engine.threads = threads
     load, tallies = engine.evaluate(state)
@@ -94,20 +94,20 @@ def observe(system: System, engine: Engine, state: State, **options):
 
 
 def move(engine: Engine, state: State, scheme: Scheme, dt: float, steps: int) -> None:
-    """Take so many more steps, in place."""
+    """Take this many more steps, in place."""
     engine.advance(state, scheme, dt, int(state.step[NOW]) + steps)
 
 
 @kernel(from_python=True)
 def spin(rotor, rotation, angular_momentum, h: float, steps: int) -> None:
-    """Turn the first molecule without torque, in place."""
+    """Rotation the first molecule without torque, in place."""
     for _ in range(steps):
         rotate(rotor, 0, rotation, angular_momentum, 0, h)
 
 
 def springs(**stage) -> Scene:
     """64 argon atoms, each an isotropic oscillator, under Langevin's thermostat at 300 K unless the
-    stage says otherwise."""
+    stage states otherwise."""
     whole = {
         "ensemble": "nvt",
         "temperature_K": 300.0,
@@ -125,60 +125,7 @@ def springs(**stage) -> Scene:
     )
 
 
-# runs: other programs, stops
-
-
-def rigidmd_command(*arguments, **options) -> subprocess.CompletedProcess:
-    """The command line, in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "rigidmd", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        **options,
-    )
-
-
-#: Loads modules of rigidmd from other files, in a process that has not imported rigidmd.
-OTHER_MODULES = """
-import importlib.util, sys
-class Other:
-    modules = {modules!r}
-    @classmethod
-    def find_spec(cls, name, path=None, target=None):
-        return importlib.util.spec_from_file_location(name, cls.modules[name]) if name in cls.modules else None
-sys.meta_path.insert(0, Other)
-sys.path.insert(0, {tests!r})
-"""
-
-
-def run_with_files(folder: Path, files: dict[str, str], script: str) -> str:
-    """What a script prints in a process in which the package has these files, new ones or others of
-    the same name. Classes of terms are named by the text, because compiled code is found by their
-    names."""
-    found = {}
-    for k, (name, text) in enumerate(files.items()):
-        for term in re.findall(
-            r"^class (\w+)\(NamedTuple\)", "" if (ROOT / "rigidmd" / name).exists() else text, re.M
-        ):
-            text = re.sub(rf"\b{term}\b", f"{term}_{zlib.crc32(text.encode()):x}", text)
-        path = folder / f"{k}_{Path(name).name}"
-        path.write_text(text)
-        found["rigidmd." + name.removesuffix(".py").replace("/", ".")] = str(path)
-    prelude = OTHER_MODULES.format(modules=found, tests=str(ROOT / "tests"))
-    done = subprocess.run(
-        [sys.executable, "-c", prelude + script], capture_output=True, text=True, cwd=folder
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
-
-
-def edited(name: str, *changes: tuple[str, str]) -> str:
-    """The text of a file of the package with some changes; each old text must be there once."""
-    text = (ROOT / "rigidmd" / name).read_text()
-    for old, new in changes:
-        assert text.count(old) == 1, f"{name}: {old!r} is there {text.count(old)} times"
-        text = text.replace(old, new)
-    return text
+# other programs
 
 
 def gmx(folder: Path, *arguments, text: str = "") -> str:
@@ -193,59 +140,6 @@ def gmx(folder: Path, *arguments, text: str = "") -> str:
     )
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-1500:]
     return done.stdout
-
-
-def stopped_at(steps: set[int]) -> "rigidmd.Every":
-    """An observer that sends SIGTERM to this process after some of the steps of a run."""
-
-    def stop(moment):
-        if moment.step in steps:
-            steps.discard(moment.step)
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    return rigidmd.Every(0.001, stop)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """The files of a run that have to be the same to the bit."""
-    names = [
-        path.name
-        for path in folder.iterdir()
-        if path.name.startswith(("trajectory", "log", "topology", "motion", "pressure_tensor"))
-    ]
-    found = {name: (folder / name).read_bytes() for name in names}
-    if (folder / "final.npz").exists():
-        with np.load(folder / "final.npz") as data:
-            found |= {name: data[name].tobytes() for name in data.files}
-    return found
-
-
-def same_after_stops(data: dict, steps: list[int], folder: Path) -> None:
-    """Run once without a stop, once with stops after these steps, each time with another number of
-    threads."""
-    observers = rigidmd.Every(
-        0.001, lambda moment: None
-    )  # observes at the same steps as those that stop
-    rigidmd.Simulation(
-        Scene.from_dict(data | {"threads": 1}), folder / "whole", observers=observers
-    ).run()
-    left, runs = set(steps), 0
-    while True:
-        simulation = rigidmd.Simulation(
-            Scene.from_dict(data | {"threads": 1 + runs % 2}),
-            folder / "parts",
-            observers=stopped_at(left),
-            resume=True,
-        )
-        results = simulation.run()
-        runs += 1
-        if not results.interrupted:
-            break
-        assert results.signal == signal.SIGTERM
-    assert runs == len(steps) + 1
-    whole, parts = contents(folder / "whole"), contents(folder / "parts")
-    assert whole.keys() == parts.keys() and len(whole) > 3
-    assert [name for name in whole if whole[name] != parts[name]] == []
 
 
 # made-up frames

@@ -35,6 +35,7 @@ from rigidmd.studies.accuracy.averages import (
     measure_averages,
 )
 from rigidmd.studies.accuracy.measurement import IntegratorAccuracy, measure, time_span
+from rigidmd.studies.accuracy.orders import convergence, order_table
 from rigidmd.studies.extrapolation import MeanAtStep, Together, extrapolate, means_of_runs
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -384,7 +385,7 @@ def test_steps_suit_what_is_fast_in_a_body():
     compass = measure_accuracy(
         Scene.read(ROOT / "systems" / "gyrocompass.toml"), ["kahan_li_6"], span=60.0, repeats=1
     )
-    # the wheel's nutation, 20 rad/s, sets the steps, not the Earth's turning
+    # the wheel's nutation, 20 rad/s, sets the steps, not the Earth's rotating
     assert not any(trial.diverged for trial in compass.trials[-3:])
     assert compass.trials[-1].rotation_error < 1e-6
 
@@ -540,7 +541,7 @@ def test_the_formulation_of_the_scene_is_the_one_measured():
 
 @pytest.fixture
 def planned(monkeypatch):
-    """(names tried, what was left out) by default on a scene; nothing is run."""
+    """(names tried, what was omitted) by default on a scene; nothing is run."""
     monkeypatch.setattr(
         accuracy,
         "measure",
@@ -653,7 +654,7 @@ def test_errors_of_a_limit_and_of_biases_are_those_of_repeated_measurements():
             for point in zip(steps, 2 + b * steps**2 + n, errors, strict=True)
         ]
         fit = extrapolate(points)
-        if fit.longest == 4:  # of what was not left out by chance
+        if fit.longest == 4:  # of what was not omitted by chance
             limits.append((fit.limit, fit.limit_error))
             biases.append([fit.bias(point) for point in points])
     assert len(limits) > 1700
@@ -747,7 +748,7 @@ def test_the_step_of_a_bias_that_is_not_seen_allows_for_its_error(slope, error, 
             6.0,
             1.0,
             4.0,
-        ),  # the longest step has more than dt², and is left out
+        ),  # the longest step has more than dt², and is omitted
     ],
 )
 def test_pulls_of_limits_have_unit_width(steps, runs, more, errors, longest):
@@ -880,7 +881,7 @@ def test_what_is_said_of_averages_follows_from_them(oscillators):
 
 
 def test_averages_leave_out_what_comes_before_equilibrium():
-    """A fifth of the time sampled comes before it: the means are those of the same run without its
+    """A fifth of the time sampled comes before it: the means are the values of the same run without its
     first part."""
     (run,) = measure_averages(springs(), ["baoab"], [10.0], sample=2.0).runs
     again = springs(integrator="baoab", timestep_fs=10.0, duration_ps=2.4)
@@ -1015,3 +1016,24 @@ def test_orders_cost_and_temperatures_of_512_waters():
     for step in (4.0, 2.0):
         gap, error = mean_and_error(at_constant_energy(scene, "velocity_verlet", step, 40.0)[0])
         assert abs(gap) < 2.5 * error
+
+
+def test_the_output_of_accuracy_begins_with_the_answer_and_marks_floors():
+    steps = [8e-3, 4e-3, 2e-3, 1e-3]
+    second = [("velocity_verlet", h, (1.0, 1.0, 1.0), 1e3 * h**2) for h in steps]
+    fourth = [("srkn_4", h, (2.0, 2.0, 2.0), max(1e6 * h**4, 1.1e-5)) for h in steps]
+    found = made(*second, *fourth)
+    lines = accuracy.describe_accuracy(found)
+    assert lines[2].startswith("target error")
+    orders = {row[0]: row[1:4] for row in order_table(found).shown()[1]}
+    assert orders == {"velocity_verlet": ["2", "2.0", "2.0"], "srkn_4": ["4", "4.0", "4.0"]}
+    floor = convergence(found, "srkn_4", "energy_rms").floor
+    assert [trial.timestep for trial in floor] == [1e-3]
+    assert convergence(found, "velocity_verlet", "energy_rms").floor == []
+    (marked,) = (line for line in "\n".join(lines).splitlines() if line.count("1.1e-05*") == 2)
+    assert marked.startswith("srkn_4") and "0.001" in marked
+
+
+def test_a_single_step_has_no_measured_order():
+    found = made(("velocity_verlet", 1e-3, (1.0, 1.0, 1.0), 1e-3))
+    assert convergence(found, "velocity_verlet", "energy_rms").order is None

@@ -207,7 +207,7 @@ def test_scaling_the_box_moves_nothing():
 
 
 def test_times_of_files_are_even_though_rounded():
-    """Single precision at 10 ns cannot tell 4 fs better than to a quarter."""
+    """Single precision at 10 ns cannot show 4 fs better than to a quarter."""
     system = system_of({"argon": 2})
     time = (10_000 + 0.004 * np.arange(50)).astype(np.float32).astype(float)
     assert history(system, time, None).interval == pytest.approx(0.004, rel=0.01)
@@ -349,7 +349,7 @@ def test_hydrogen_bonds_are_those_of_the_geometry():
         way = rotations_about(np.array([0.0, 0.0, np.radians(off)])) @ arm
         positions = np.zeros((4, 2, 3))
         positions[:, 1] = gap * way + np.array([25.0, -50.0, 0.0])
-        # the second turns its hydrogens away, and its oxygen is where the first one's bond points
+        # the second rotates its hydrogens away, and its oxygen is where the first one's bond points
         flip = np.eye(3)
         Q = np.broadcast_to(np.stack([np.eye(3), flip]), (4, 2, 3, 3))
         found = hydrogen_bonds(history(system, np.arange(4.0), positions, np.eye(3) * 25.0, Q))
@@ -383,7 +383,7 @@ def test_neighbours_up_to_the_first_minimum_follow_it_and_have_an_honest_error()
         )
 
     def distances(moved, level):
-        """Of fractions of all pairs; and the fraction within the minimum."""
+        """For fractions of all pairs; and the fraction within the minimum."""
         g = sum(
             h * np.exp(-0.5 * ((r - moved - at) / wide) ** 2)
             for h, at, wide in ((2, 3.2, 0.25), (0.8, 5.2, 0.7))
@@ -419,7 +419,7 @@ def test_neighbours_up_to_the_first_minimum_follow_it_and_have_an_honest_error()
 
 
 def test_diffusion_is_that_of_a_random_walk_and_its_error_honest():
-    """Scatter over seeds against the error that is told."""
+    """Scatter over seeds against the error that is given."""
     system = system_of({"argon": 16}, 25.0)
     D, found = 0.25, []
     for seed in range(60):
@@ -429,7 +429,7 @@ def test_diffusion_is_that_of_a_random_walk_and_its_error_honest():
         )
         told = diffusion(walk, viscosity_mPa_s=0.85).value("D of argon")
         found += [] if told.value is None else [(told.value, told.error)]
-    assert len(found) >= 55  # few are refused for what is chance
+    assert len(found) >= 55  # few are rejected for what is chance
     values, errors = np.array(found).T
     assert values.mean() == pytest.approx(D / NM2_PER_S, abs=4 * values.std() / np.sqrt(len(found)))
     assert 0.7 < np.sqrt(np.mean(((values - D / NM2_PER_S) / errors) ** 2)) < 1.3
@@ -458,7 +458,7 @@ def test_the_correction_for_the_size_of_the_box_is_that_of_yeh_and_hummer():
 
 def test_what_does_not_diffuse_gives_no_value():
     """Free flight bends upwards, a cage downwards; a walk too short for neighbours to change is
-    told as that."""
+    given as that."""
     system = system_of({"argon": 16}, 25.0)
     rng = np.random.default_rng(0)
     time, box = 0.5 * np.arange(400), np.eye(3) * 25.0
@@ -478,11 +478,11 @@ def test_what_does_not_diffuse_gives_no_value():
     assert diffusion(history(system, time[:40], flight[:40], box)).values
 
 
-# turning
+# rotating
 
 
 def test_free_rotational_diffusion_decays_as_it_must():
-    """C1 = exp(-2 D t), C2 = exp(-6 D t) of a sphere that turns at random."""
+    """C1 = exp(-2 D t), C2 = exp(-6 D t) of a sphere that rotates at random."""
     system = system_of({"ccl4": 60}, 60.0, 9.0)
     D, interval, frames, rng = 0.05, 0.4, 600, np.random.default_rng(2)
     turns = rotations_about(np.sqrt(2 * D * interval) * rng.standard_normal((frames, 60, 3)))
@@ -491,7 +491,7 @@ def test_free_rotational_diffusion_decays_as_it_must():
     for k in range(1, frames):
         Q[k] = Q[k - 1] @ turns[k]
     found = orientation(history(system, interval * np.arange(frames), None, np.eye(3) * 60, Q))
-    # mean cosine and P2 of one turn, exact for steps of a finite size
+    # mean cosine and P2 of one rotation, exact for steps of a finite size
     angle = np.linalg.norm(np.sqrt(2 * D * interval) * rng.standard_normal((400_000, 3)), axis=1)
     once = [
         (1 + 2 * np.cos(angle)).mean() / 3,
@@ -514,7 +514,7 @@ def test_free_rotational_diffusion_decays_as_it_must():
 
 
 def test_errors_of_a_gas_are_those_of_its_molecules():
-    """Free rotors in free flight: all blocks of a run are alike, and tell nothing of the scatter
+    """Free rotors in free flight: all blocks of a run are alike, and show nothing of the scatter
     over molecules."""
     system, n, time = system_of({"nitrogen": 100}, 60.0), 100, 0.01 * np.arange(200)
     rate, speed = np.sqrt(BOLTZMANN * 300 / system.species[0].inertia[1]), 3.0

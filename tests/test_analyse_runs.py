@@ -60,7 +60,7 @@ def copy(water, tmp_path):
 
 
 def said(capsys, *arguments, code=2):
-    """What the command says of it: one sentence, without a traceback."""
+    """What the command states of it: one sentence, without a traceback."""
     assert cli.main(["analyse", *map(str, arguments)]) == code
     found = capsys.readouterr().err.strip()
     assert found.startswith("rigidmd: ") and "\n" not in found and "Traceback" not in found
@@ -77,7 +77,7 @@ def table(path):
 
 
 def names(folder):
-    """Files of a folder, without those that MDAnalysis leaves beside a trajectory."""
+    """Files of a folder, without those that MDAnalysis leaves next to a trajectory."""
     return sorted(path.name for path in folder.iterdir() if "_offsets." not in path.name)
 
 
@@ -111,7 +111,7 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     ]
     assert left_out == ["interfaces", "viscosity", "surface_tension"]
     assert (
-        "viscosity: skipped: a viscosity needs at least 20 ps of the pressure tensor; there are 0.2 ps"
+        "viscosity: a viscosity needs at least 20 ps of the pressure tensor; there are 0.2 ps"
         in text
     )
     files = [name for entry in found.values() for name in entry["files"]]
@@ -208,7 +208,7 @@ def test_a_file_of_the_pressure_tensor_is_read_with_care(copy):
     ]
     (copy / "pressure_tensor.csv").write_text("\n".join([lines[0], *rows]) + "\n" + rows[0][:-30])
     history = frames_of_folder(read_record(copy), 0.02)
-    assert history.tensor.shape == (10, 7)  # the line that is cut is left out
+    assert history.tensor.shape == (10, 7)  # the line that is cut is omitted
     (copy / "pressure_tensor.csv").write_text("\n".join([lines[0], *rows, "0,x,0,0,0,0,0"]) + "\n")
     with pytest.raises(
         OutputError, match=r"pressure_tensor.csv: column .* has a cell that is not a number"
@@ -262,7 +262,7 @@ def test_displacements_are_those_of_mdanalysis(water):
 
 @pytest.fixture(scope="module")
 def topology(water):
-    """A GROMACS run input of the waters, written from our own molecules."""
+    """A GROMACS run input of the waters, written from our molecules."""
     system = read_record(water).system
     species = system.species[0]
     sites = {
@@ -345,7 +345,7 @@ def test_g_of_r_is_that_of_gromacs(water, topology):
             axis=1
         )
         assert r[1 : 1 + len(found)] == pytest.approx(0.01 * np.arange(1, 90))
-        found *= 215 / 216  # it counts the own molecule among those that could be there
+        found *= 215 / 216  # it counts the molecule among those that could be there
         assert (
             np.abs(g[1 : 1 + len(found)] - found).max() < 0.0015
         )  # three decimals, and a pair at the edge of a bin
@@ -371,7 +371,7 @@ def test_displacements_are_those_of_gromacs(water, topology):
         "-o",
         "slow.trr",
         text="System\n",
-    )  # as it does not find times again that are no whole numbers
+    )  # as it does not find times again that are not whole numbers
     gmx(
         topology,
         "msd",
@@ -571,7 +571,7 @@ def test_files_of_others_are_not_overwritten(copy, capsys):
     assert (copy / "msd.csv").read_text() == "mine\n" and not (copy / "analysis.json").exists()
     (copy / "msd.csv").unlink()
     assert cli.main(["analyse", str(copy), "--only", "msd", "--from", "0.02ps"]) == 0
-    (copy / "analysis.json").unlink()  # files of this command may be written anew
+    (copy / "analysis.json").unlink()  # files of this command may be written again
     assert cli.main(["analyse", str(copy), "--only", "msd,dielectric", "--from", "0.02ps"]) == 0
     trusted = copy.parent / "own.py"
     for name, words in (
@@ -598,7 +598,7 @@ def test_a_folder_that_cannot_be_written_is_told(copy, capsys):
         copy.chmod(0o755)
 
 
-# analyses of one's own
+# analyses of user-defined
 
 
 OWN = """import numpy as np
@@ -618,7 +618,7 @@ def spins(frames):
 def test_a_function_of_ones_own_is_found_by_name(copy, capsys):
     (copy.parent / "own.py").write_text(OWN)
     trust = ["--trust", str(copy.parent / "own.py"), "--from", "0.02ps"]
-    assert cli.main(["analyse", str(copy), *trust, "--only", "height,spins"]) == 0
+    assert cli.main(["analyse", str(copy), *trust, "-v", "--only", "height,spins"]) == 0
     entries = json.loads((copy / "analysis.json").read_text())["analyses"]
     assert entries["height"]["about"] == "mean height of the centres (A)"
     columns, history = table(copy / "height.csv"), frames_of_folder(read_record(copy), 0.02)
@@ -706,7 +706,7 @@ def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys):
 
 
 def test_adding_an_analysis_takes_one_file(tmp_path, monkeypatch, copy, capsys):
-    """A file beside the built-in ones: a command, a position, a function of results with its
+    """A file next to the built-in ones: a command, a position, a function of results with its
     arguments and help."""
     (tmp_path / "cosines.py").write_text(
         f"from {registry.__name__} import built_in\n"

@@ -19,7 +19,8 @@ from ase.constraints import FixAtoms, FixBondLengths
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from scenes import FORTY_WATERS, forty_waters
-from support import ROOT, contents, same_after_stops, small_scene, stopped_at
+from stops import contents, same_after_stops, stopped_at
+from support import ROOT, small_scene
 
 import rigidmd
 from rigidmd import BodyScene, MolecularScene, Scene, Simulation
@@ -214,7 +215,7 @@ def test_models_may_be_files_and_tables(tmp_path, monkeypatch):
     light = load_model("tip3p").mass
     assert build(from_file).species[0].mass == light
     (tmp_path / "run").mkdir()
-    Simulation(from_file).write_scene(tmp_path / "run")
+    Simulation(from_file)._write_scene(tmp_path / "run")
     (tmp_path / "mine.toml").unlink()
     assert (
         rigidmd.resolve(Scene.read(tmp_path / "run" / "scene.toml")).molecules[0].file
@@ -306,7 +307,7 @@ def test_settings_that_cannot_be_used_are_told(settings, said):
 
 
 def test_energies_do_not_depend_on_the_atoms_before():
-    """Two ends of a molecule exchange places, which the earlier assignment of atoms fits within the
+    """Two ends of a molecule exchange positions, which the earlier assignment of atoms fits within the
     tolerance."""
     angle, charges = np.radians(124.0), (0.2, -0.3, 0.1)
     x = np.array(
@@ -366,7 +367,7 @@ def test_frames_of_a_run(results):
     state, model = results.state, results.system.model
     mass = model.mass[model.species]
     squares = mass @ (state.velocity**2).sum(axis=1)
-    # the log's kinetic energy of constant energy has no error of the step
+    # the log's kinetic energy of constant energy has no time-step error
     force = results.system.engine().evaluate(state)[0].force
     dt = results.system.scene.stages[-1].timestep_fs * FEMTOSECOND
     squares += dt**2 / 6 * ((force**2).sum(axis=1) / mass).sum()
@@ -406,7 +407,7 @@ def held_rigid(n: int) -> FixBondLengths:
 
 @pytest.mark.parametrize(("model", "theirs"), [("tip3p", tip3p.TIP3P), ("tip4p", tip4p.TIP4P)])
 def test_energies_and_forces_are_those_of_ase(model, theirs):
-    """Without a box and cut-off: to rounding with ASE's constants, to the difference of constants
+    """Without a box and cutoff: to rounding with ASE's constants, to the difference of constants
     with ours."""
     atoms = cluster(model, 6)
     other = atoms.copy()
@@ -436,7 +437,7 @@ def test_energies_and_forces_are_those_of_ase(model, theirs):
 
 
 def test_forces_are_the_gradient_of_the_energy():
-    """Of rigid and of bent molecules; they add up to the load on each molecule, in both forms."""
+    """For rigid and of bent molecules; they add up to the load on each molecule, in both forms."""
     atoms = cluster("tip4p", 4)
     rng = np.random.default_rng(4)
     for bend in (0.0, 0.02):
@@ -482,7 +483,7 @@ def test_a_force_on_a_massless_site_is_spread_with_its_torque(model):
 
 
 def strained(atoms: Atoms, strain: np.ndarray) -> float:
-    """The energy after a strain (3, 3) that moves centres of mass and turns nothing."""
+    """The energy after a strain (3, 3) that moves centres of mass and rotates nothing."""
     placed = atoms.calc._fit_atoms(atoms)
     system, other = placed.assembly.system, atoms.copy()
     owner = system.sites.molecule[system.sites.mass > 0]
@@ -509,7 +510,7 @@ def check_stress(atoms: Atoms) -> None:
 
 
 def turned(atoms: Atoms) -> Atoms:
-    """The same, turned in space, in a slanted left-handed cell of the same lattice."""
+    """The same, rotated in space, in a slanted left-handed cell of the same lattice."""
     found, turn = atoms.copy(), random_rotations(np.random.default_rng(3), 1)[0]
     a, b, c = atoms.cell.array
     found.set_cell(np.array([a, b + a, -c]) @ turn.T)

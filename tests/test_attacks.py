@@ -147,7 +147,7 @@ BODIES = {
 
 def outcome(command: list[str], capsys) -> tuple[int, str]:
     """Exit code and standard error of a command: 0; 1 if the run stopped; 2 if the input was
-    refused; 75 out of time."""
+    rejected; 75 out of time."""
     code = main(command)
     said = capsys.readouterr()
     assert code in (0, 1, 2, 75), said.err
@@ -167,7 +167,7 @@ def is_finite(value: object) -> bool:
 
 
 def run_of(text: str, overrides: tuple[str, ...], folder, capsys) -> None:
-    """Run a scene: its summary is finite, or a message stands in its place."""
+    """Run a scene: its summary is finite, or a message stands in its position."""
     scene = folder / "scene.toml"
     scene.write_text(text)
     sets = [word for override in overrides for word in ("--set", override)]
@@ -175,7 +175,7 @@ def run_of(text: str, overrides: tuple[str, ...], folder, capsys) -> None:
     code, said = outcome(
         ["run", str(scene), *sets, "-o", str(folder / "run"), "--walltime", "0:00:40"], capsys
     )
-    assert code == 2 or checked == 0, said  # what `check` refuses does not run
+    assert code == 2 or checked == 0, said  # what `check` rejects does not run
     if code in (0, 75):
         assert is_finite(json.loads((folder / "run" / "summary.json").read_text()))
     else:
@@ -267,7 +267,7 @@ ATOMS = {
 @pytest.mark.soak
 @pytest.mark.parametrize("attack", ATOMS)
 def test_extreme_atoms_of_the_calculator(attack):
-    """Energy, forces and stress are finite, or one sentence says what is wrong."""
+    """Energy, forces and stress are finite, or one sentence states what is wrong."""
     atoms = ATOMS[attack]()
     atoms.calc = RigidMD("spce", cutoff_A=5.0)
     try:
@@ -305,7 +305,7 @@ AXES = [
 @pytest.mark.soak
 @pytest.mark.parametrize("axis", AXES)
 def test_odd_axes_of_a_sweep(axis, capsys, tmp_path):
-    """Refused before the first point with nothing written, or every point ends."""
+    """Rejected before the first point with nothing written, or every point ends."""
     (tmp_path / "scene.toml").write_text(ARGON)
     folder = tmp_path / "sweep"
     code, said = outcome(

@@ -1,4 +1,4 @@
-"""integrator = "auto": what is chosen keeps the error asked for, is written down, and repeats."""
+"""integrator = "auto": what is chosen keeps the error requested, is written down, and repeats."""
 
 import re
 from math import comb
@@ -23,7 +23,7 @@ TOP = ROOT / "systems" / "heavy_top_3.toml"
 
 
 def liquid(**last):
-    """27 waters, warmed up, then 0.3 ps of NVE as told."""
+    """27 waters, warmed up, then 0.3 ps of NVE as given."""
     stages = [
         {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.5},
         {"duration_ps": 0.3} | last,
@@ -54,7 +54,7 @@ def test_the_energy_error_asked_for_is_kept_with_fewer_forces_than_verlet_needs(
     assert energy_error(results) < 1e-5
     said = float(re.search(r"In the [\d.]+ ps that ran it was (\S+)", stage["choice"])[1])
     assert said == pytest.approx(energy_error(results), rel=0.3)
-    # the scene that was written says what was chosen, and repeats the run to the bit
+    # the scene that was written states what was chosen, and repeats the run to the bit
     again = Scene.read(tmp_path / "a" / "scene.toml")
     assert again.stages[1].integrator == stage["integrator"]
     assert again.stages[1].timestep_fs == stage["timestep_fs"]
@@ -110,7 +110,7 @@ def test_a_crude_error_is_kept_crudely():
     assert "chosen: error of the energy" in coarse["choice"]
     assert "over 0.3 ps for a target of 0.003 (expected, from" in coarse["choice"]
     assert "ps that ran it was" in coarse["choice"]
-    second = simulation.run().summary["stages"][1]  # a simulation chooses anew, and the same
+    second = simulation.run().summary["stages"][1]  # a simulation chooses again, and the same
     assert (second["integrator"], second["timestep_fs"]) == (
         coarse["integrator"],
         coarse["timestep_fs"],
@@ -270,21 +270,24 @@ def test_what_cannot_be_kept_is_said(capsys, tmp_path):
             "integrator = 'auto' needs one of energy_error_kT, trajectory_error",
         ),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "trajectory_error": 1e-3}, "needs one of"),
-        ({"energy_error_kT": 1e-3}, "energy_error_kT would do nothing without integrator = 'auto'"),
+        (
+            {"energy_error_kT": 1e-3},
+            "energy_error_kT would have no effect without integrator = 'auto'",
+        ),
         (
             {"integrator": "auto", "energy_error_kT": 1e-3, "timestep_fs": 1.0},
-            "timestep_fs would do nothing with",
+            "timestep_fs would have no effect with",
         ),
         (
             {"integrator": "auto", "energy_error_kT": 1e-3, "rotor": "split"},
-            "rotor would do nothing with",
+            "rotor would have no effect with",
         ),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "bias_kT": 1e-3}, "needs one of"),
         (
             {"integrator": "auto", "bias_kT": 1e-3},
             "bias_kT is for averages at a temperature, and nve has no thermostat",
         ),
-        ({"bias_kT": 1e-3}, "bias_kT would do nothing without integrator = 'auto'"),
+        ({"bias_kT": 1e-3}, "bias_kT would have no effect without integrator = 'auto'"),
     ],
 )
 def test_contradictions_are_refused(stage, fault):
@@ -305,7 +308,9 @@ def test_check_says_that_it_is_open(capsys):
         "--set",
         "stages.production.energy_error_kT=1e-4",
     ]
-    assert main(["check", water, *more, "--set", "stages.production.timestep_fs=2.0"]) == 0
+    assert main(["check", water, *more]) == 2
+    assert "timestep_fs" in capsys.readouterr().err
+    assert main(["check", water, *more, "--set", "stages.production.timestep_fs="]) == 0
     assert (
         "integrator and step chosen at its start for an error of 0.0001 kT"
         in capsys.readouterr().out
@@ -323,32 +328,29 @@ def test_a_first_stage_for_which_nothing_can_be_chosen_says_so():
 
 
 @pytest.mark.parametrize(
-    ("thermostat", "integrator", "part"),
+    "thermostat",
     [
-        pytest.param("andersen", "velocity_verlet", 2 / 8, marks=pytest.mark.soak),
-        pytest.param("langevin", "baoab", 1 / 24, marks=pytest.mark.soak),
-        (None, "baoab", 1 / 24),
+        pytest.param("andersen", marks=pytest.mark.soak),
+        pytest.param("langevin", marks=pytest.mark.soak),
+        None,
     ],
 )
-def test_the_bias_asked_for_sets_the_step(thermostat, integrator, part, tmp_path):
-    """Of oscillators w is known: the pilot finds it to the error of its sampling, some per cent."""
+def test_the_bias_asked_for_sets_the_step(thermostat, tmp_path):
+    """For oscillators w is known: the pilot finds it to the error of its sampling, some per cent."""
     stage = {"integrator": "auto", "bias_kT": 1e-3, "thermostat": thermostat, "duration_ps": 0.2}
     if thermostat != "langevin":
         stage["friction_translation_per_ps"] = None
     results = Simulation(springs(**stage), tmp_path / "a").run()
     found = results.summary["stages"][0]
-    assert found["integrator"] == integrator
+    assert found["integrator"] == "baoab"
     assert found["timestep_fs"] == pytest.approx(
-        1e3 * np.sqrt(1e-3 / part * 39.948 / SPRING), rel=0.1
+        1e3 * np.sqrt(24 * 1e-3 * 39.948 / SPRING), rel=0.1
     )
-    assert (
-        f"{integrator} at {found['timestep_fs']:g} fs chosen: bias of U below about"
-        in found["choice"]
-    )
+    assert f"baoab at {found['timestep_fs']:g} fs chosen: bias of U below about" in found["choice"]
     assert "not sampled" in found["choice"]
     again = Scene.read(tmp_path / "a" / "scene.toml")
     assert again.stages[0].bias_kT is None
-    assert again.stages[0].thermostat_kind == (thermostat or "langevin")
+    assert again.stages[0].thermostat_kind == (thermostat or "velocity_rescaling")
     repeated = Simulation(again).run()
     for one, other in zip(results.state, repeated.state, strict=True):
         assert one.tobytes() == other.tobytes()
@@ -384,17 +386,12 @@ def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
     scene = small_scene({"spce": 64}, 12.42, forces={"cutoff_A": 6.0}, stages=stages)
     _, state = start_of_last_stage(scene)
     rate = mean_square_rate(Simulation(scene).system, state, 1)
-    found = measure_averages(scene, ["velocity_verlet", "baoab"], [2.0, 4.0, 5.0], sample=200.0)
+    found = measure_averages(scene, ["baoab"], [2.0, 4.0, 5.0], sample=200.0)
     potential = found.quantities[0]
     for run in found.runs:
         if run.timestep == 5.0:
             bias, error = found.bias(run, potential)
-            estimate = bias_of_potential(run.integrator, rate, 5e-3)
-            if run.integrator == "baoab":
-                assert abs(bias) < 2 * estimate + 2 * error
-            else:
-                assert error < bias / 4
-                assert 0.5 - error / estimate < bias / estimate < 2 + error / estimate
+            assert abs(bias) < 2 * bias_of_potential(rate, 5e-3) + 2 * error
 
 
 @pytest.mark.parametrize(
@@ -427,3 +424,18 @@ def test_a_chosen_step_of_a_body_fits_its_duration_and_samples(
     assert found == pytest.approx(wanted, rel=1e-12)
     assert round(duration / found) * found == pytest.approx(duration, rel=1e-12)
     assert found <= timestep * (1 + 1e-9)
+
+
+def test_the_step_of_a_dilute_gas_resolves_collisions():
+    """Argon atoms beyond their cutoff at the start hardly interact: the mean frequency is that of
+    no collision."""
+    stage = {
+        "ensemble": "nvt",
+        "temperature_K": 90.0,
+        "duration_ps": 1.0,
+        "integrator": "auto",
+        "bias_kT": 1e-2,
+    }
+    gas = {"stages": [stage], "forces": {"cutoff_A": 6.2}}
+    found = Simulation(small_scene({"argon": 27}, 19.0, **gas), warn=str).run()
+    assert 2 <= found.summary["stages"][0]["timestep_fs"] < 60

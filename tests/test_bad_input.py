@@ -1,4 +1,4 @@
-"""Bad input: each gets one message that says what, where and what to do; no traceback, nothing
+"""Bad input: each gets one message that states what, where and what to do; no traceback, nothing
 half-written."""
 
 import json
@@ -217,7 +217,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         (
             "timestep_fs = 1",
             "temperature_K = 300",
-            ["temperature_K would do nothing in an nve stage"],
+            ["temperature_K would have no effect in an nve stage"],
         ),
         ("temperature_K = 300", "temperature_K = -1", ["start.temperature_K", "-1"]),
         ("[start]\ntemperature_K = 300", "", ["start.temperature_K is missing"]),
@@ -253,7 +253,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         (
             "[start]",
             '[forces]\ntruncation = "shift"\nswitch_start_A = 5\n[start]',
-            ["would do nothing with truncation = 'shift'"],
+            ["would have no effect with truncation = 'shift'"],
         ),
         ("[start]", "[forces]\nskin_A = 1e300\n[start]", ["forces.skin_A", "not be more than 100"]),
         ("count = 20", "count = 10000000000000", ["not enough memory"]),
@@ -291,7 +291,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         (
             "count = 20",
             'count = 20\nparameters = "p.toml"',
-            ["line 4: molecules.0: parameters would do nothing"],
+            ["line 4: molecules.0: parameters would have no effect"],
         ),
         (
             "lengths_A = 20.0",
@@ -510,6 +510,50 @@ def test_a_hint_names_the_table_and_the_unit():
         small_scene({"spce": 20}, 20.0, stages=[{"timestep": 1.0}])
 
 
+LIQUID = {
+    "box": {"lengths_A": 20.0},
+    "molecules": [{"model": "spce", "count": 20}],
+    "stages": [{"ensemble": "nvt", "duration_ps": 1.0, "temperature_K": 300.0}],
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"stages": [{"tau_t_ps": 1.0}]}, "this is thermostat_time_ps in [[stages]] (in ps)"),
+        ({"stages": [{"tdamp_ps": 1.0}]}, "this is thermostat_time_ps in [[stages]]"),
+        ({"stages": [{"duration_ns": 1.5}]}, "duration_ns: unknown key; write duration_ps = 1500"),
+        ({"forces": {"cutoff_nm": 0.9}}, "cutoff_nm: unknown key; write cutoff_A = 9"),
+        ({"nonbonded": {}}, "nonbonded: unknown key; did you mean forces?"),
+        ({"initial": {}}, "initial: unknown key; did you mean start?"),
+        ({"electrostatics": {"method": "pme"}}, "electrostatics is a key of [forces]"),
+        ({"run": {"seed": 3}}, "run.seed: unknown key; seed is a key of the top level"),
+        ({"stages": [{"cutoff_A": 9.0}]}, "cutoff_A is a key of [forces]"),
+        ({"forces": {"integrator": "baoab"}}, "integrator is a key of [[stages]]"),
+    ],
+)
+def test_a_hint_on_units_tables_and_keys_of_other_tables(changes, expected):
+    with pytest.raises(SceneError) as raised:
+        Scene.from_dict(LIQUID | changes)
+    assert expected in str(raised.value)
+
+
+def test_a_long_list_of_keys_has_the_most_similar_ones():
+    with pytest.raises(SceneError) as raised:
+        Scene.from_dict(LIQUID | {"stages": [{"xyzzy": 1.0, "duration_ps": 1.0}]})
+    (line,) = (line for line in raised.value.errors if "xyzzy" in line)
+    assert re.search(r"there are (\w+, ){7}\w+ and \d+ others$", line)
+
+
+def test_american_spelling_is_accepted():
+    stage = {"ensemble": "minimize"}
+    assert Scene.from_dict(LIQUID | {"stages": [stage]}).stages[0].ensemble == "minimise"
+    top = {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 0.5], "center_of_mass_m": [0, 0, 0.1]}
+    run = {"duration_s": 1.0, "timestep_s": 0.01}
+    scene = Scene.from_dict({"body": top | {"pinned": True}, "run": run})
+    assert scene.body.centre_of_mass_m == (0, 0, 0.1)
+
+
 @pytest.mark.parametrize(
     ("table", "key", "given", "meant"),
     [
@@ -710,8 +754,8 @@ def test_a_command_line_that_is_not_known_suggests_what_is(words, expected, caps
 @pytest.mark.parametrize(
     ("word", "expected"),
     [
-        ("restarts", "there are installation, why"),
-        ("rdf", "the word is in water ("),
+        ("restarts", "there are five_minutes, installation, why"),
+        ("rdf", "the word is in five_minutes ("),
         ("anlysis", "did you mean analysis?"),
     ],
 )
@@ -836,7 +880,7 @@ def test_an_override_with_nothing_removes_the_key(tmp_path):
     )
     assert read("forces=").forces.skin_A == 1.9
     assert [stage.timestep_fs for stage in read("stages.0=").stages] == [4]
-    assert read("stages.1.timestep_fs=").stages[1].timestep_fs == 2.0
+    assert read("stages.1.timestep_fs=").stages[1].timestep_fs is None
     with pytest.raises(
         SceneError, match=r"stages.0.name: is ''"
     ):  # an empty text is a value, here a wrong one

@@ -201,7 +201,7 @@ def test_a_top_runs_backwards(name):
 
 
 def test_a_long_spin_keeps_q_a_rotation():
-    # The same turn a million times over: an error of rounding in cos² + sin² would add up to 1e-10.
+    # The same rotation a million times over: an error of rounding in cos² + sin² would add up to 1e-10.
     for moments in ([0.7, 0.7, 0.9], [0.7, 0.7, 0.7], [0.5, 0.7, 0.9]):
         results = simulate(
             FREE,
@@ -233,7 +233,7 @@ FLUID = {
 
 
 def kirchhoff_end(t):
-    """P' = P x w + f, L' = L x w + P x v + n in the body frame, straight from the book."""
+    """P' = P x w + f, L' = L x w + P x v + n in the body frame, straight from the ledger."""
     m, i = (
         2 + np.array(FLUID["added_mass_kg"]),
         np.array([0.5, 0.7, 0.9]) + FLUID["added_inertia_kg_m2"],
@@ -285,7 +285,7 @@ def test_a_frictionless_fluid_keeps_energy_and_impulse():
     )
     assert np.abs(results["energy_error"]).max() < 1e-12
     before, after = results.system.state.velocity, results.state.velocity
-    assert (before == after).all()  # the impulse of body and fluid; the body's own velocity wanders
+    assert (before == after).all()  # the impulse of body and fluid; the body's velocity wanders
     assert np.ptp(results["vx"]) > 0.1
 
 
@@ -322,7 +322,7 @@ ROTOR = {
 
 
 def rotor_end(t_end):
-    """All of ROTOR seen from axes that do not turn: what is fixed in the frame turns with it."""
+    """All of ROTOR seen from axes that do not rotate: what is fixed in the frame rotates with it."""
     i = build_body(Scene.from_dict(PINNED)).inertia
     axes = build_body(Scene.from_dict(PINNED)).axes
     tensor = axes @ np.diag(i) @ axes.T
@@ -721,7 +721,7 @@ def test_a_python_function_can_apply_what_a_scene_does():
     assert end(results)[0] == pytest.approx(expected, abs=1e-9)
     assert np.abs(results["energy_error"]).max() < 1e-9
     assert seen[0].rotation.shape == (3, 3)
-    # on a pinned body it acts at the centre of mass: a weight of one's own
+    # on a pinned body it acts at the centre of mass: a weight of user-defined
     own = simulate(
         {k: v for k, v in PINNED.items() if k != "gravity"},
         {"weight": lambda pose: ([0, 0, -9.81 * 2], [0, 0, 0])},
@@ -741,7 +741,7 @@ def test_a_python_function_that_gives_no_force_is_told_so(answer):
 
 
 def test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn():
-    # a free body that nothing acts on, told in a frame that spins up about a fixed direction: exact
+    # a free body that nothing acts on, given in a frame that spins up about a fixed direction: exact
     rest = simulate(FREE, gravity__acceleration_m_s2=[0.0, 0.0, 0.0])
     direction = np.array([1.0, 2.0, -1.0])
     turned = simulate(
@@ -756,7 +756,7 @@ def test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn():
     assert v == pytest.approx(back @ end(rest)[1] - np.cross(0.7 * direction, x), abs=1e-12)
     assert (
         "energy_error" not in turned.samples.columns
-    )  # not conserved in such a frame, and not said to be
+    )  # not conserved in such a frame, and not stated to be
 
 
 def test_the_same_scene_gives_the_same_bits_however_often_it_is_looked_at():
@@ -900,7 +900,7 @@ def test_starts_given_in_different_ways_are_the_same_start():
 
 
 # The error of Q at t = 2 of a torqued asymmetric heavy top, steps of 0.025 x forces:
-# ../shared/REFERENCES.md, section 2. Which top is not said there: these are medians over 40, each
+# ../shared/REFERENCES.md, section 2. Which top is not stated there: these are medians over 40, each
 # within a factor 3.
 AT_EQUAL_COST = {
     "velocity_verlet": 8.7e-5,
@@ -985,7 +985,7 @@ def test_a_gradient_is_not_asked_of_forces_that_have_none():
 
 @pytest.mark.parametrize("strength", [1e-6, 1.0, 1e3, 1e6, 1e12])
 def test_quadratic_resistance_never_lets_go(strength):
-    """However strong, it brakes, and never past zero: |v| at the middle of a kick is that of the
+    """However strong, it brakes, and never past zero: |v| at the middle of a kick is the value of the
     resistance itself."""
     point = {
         "body": {"mass_kg": 1.0},
@@ -1047,7 +1047,7 @@ def pulled(pose):
 
 @pytest.mark.parametrize("start", [FREE["start"], {"position_m": [0.0, 0.0, 0.0]}])
 def test_functions_that_depend_on_velocities_are_noted(start):
-    """At rest too; not those of the pose, and not with a solver of the textbook equations."""
+    """At rest too; not the values of the pose, and not with a solver of the textbook equations."""
     data = FREE | {"start": start}
     simulation = Simulation(
         Scene.from_dict(data), applied={"drag": drag, "spin": gyroscopic, "pull": pulled}

@@ -1,4 +1,4 @@
-"""Scenes of a body that cannot be what their author meant: each fault one clear message, all at
+"""Scenes of a body that cannot be what their author meant: each error one clear message, all at
 once."""
 
 import pytest
@@ -98,7 +98,7 @@ def faults(**tables):
         ),
         (
             {"body": {"points": [{"mass_kg": 1.0, "position_m": [0.0, 0, 0]}], "mass_kg": 2.0}},
-            "mass_kg would do nothing",
+            "mass_kg would have no effect",
         ),
         ({"body": {"solids": [BALL]}}, "body.solids.0: give mass_kg or density_kg_m3"),
         (
@@ -111,7 +111,7 @@ def faults(**tables):
         ),
         (
             {"body": {"solids": [BALL | {"mass_kg": 1.0}], "mass_kg": 2.0}},
-            "mass_kg would do nothing: the solids have masses",
+            "mass_kg would have no effect: the solids have masses",
         ),
         (
             {
@@ -131,7 +131,7 @@ def faults(**tables):
                     "inertia_about": "pivot",
                 }
             },
-            "would do nothing with solids",
+            "would have no effect with solids",
         ),
         (
             {"body": {"solids": [BALL | {"mass_kg": 1.0}], "solid": BALL}},
@@ -240,7 +240,7 @@ def faults(**tables):
         ({"wheels": [{"axis": [0.0, 0, 0]}]}, "axis is zero"),
         (
             {"wheels": [{"axis": [0.0, 0, 1], "to_s": 1.0}]},
-            "would do nothing without motor_torque_N_m",
+            "would have no effect without motor_torque_N_m",
         ),
         (
             {
@@ -253,10 +253,10 @@ def faults(**tables):
         ),
         (
             {"run": RUN | {"formulation": "quaternion"}},
-            "formulation would do nothing with velocity_verlet",
+            "formulation would have no effect with velocity_verlet",
         ),
         ({"run": RUN | {"integrator": "rk5"}}, "did you mean rk4?"),
-        ({"run": RUN | {"relative_tolerance": 1e-8}}, "would do nothing with velocity_verlet"),
+        ({"run": RUN | {"relative_tolerance": 1e-8}}, "would have no effect with velocity_verlet"),
         ({"run": {"duration_s": 1.0, "timestep_s": 3.0}}, "less than one step"),
         ({"output": {"interval_s": 3.0}}, "longer than run.duration_s"),
         ({"output": {"axis": [0.0, 0, 0]}}, "axis is zero"),
@@ -290,9 +290,9 @@ def faults(**tables):
         ),
         (
             {"body": TOP | {"centre_of_mass_m": None}, "gravity": {}},
-            "gravity does nothing to a body pinned at its centre",
+            "gravity has no effect on a body pinned at its centre",
         ),
-        ({"body": TOP, "applied": [{"force_N": [1.0, 0, 0]}]}, "does nothing at the pivot"),
+        ({"body": TOP, "applied": [{"force_N": [1.0, 0, 0]}]}, "has no effect at the pivot"),
         (
             {
                 "body": {"mass_kg": 1.0, "pinned": True, "centre_of_mass_m": [0.0, 0, 1]},

@@ -232,7 +232,7 @@ def test_a_scene_names_a_calculator_in_a_trusted_file(tmp_path, monkeypatch, cap
     (tmp_path / "s.toml").write_text(tomli_w.dumps(data))
     assert main(["run", "s.toml"]) == 2
     assert "forces.py is Python code" in capsys.readouterr().err
-    assert main(["run", "s.toml", "--trust", "forces.py"]) == 0
+    assert main(["run", "s.toml", "--trust", "forces.py", "-v"]) == 0
     assert re.search(r"forces +waters: \d+ calls, [0-9.]+ s", capsys.readouterr().out)
 
 

@@ -92,7 +92,7 @@ def test_an_ideal_gas_has_its_volumes_through_a_whole_run():
     too many is 25 %.
 
     A move is at most kT/P long (two standard deviations by the compressibility of the scene), so
-    that half of the moves are refused where it matters; the pressure is that at which the mean
+    that half of the moves are rejected where it matters; the pressure is that at which the mean
     volume is 1000 Å³.
     """
     n, thermal = 3, 1.380649e-23 * 300  # J

@@ -1,5 +1,5 @@
-"""An engine that notices: each kind of finding, what it says, what it leaves behind; and that
-ordinary runs go on."""
+"""An engine that notices: each kind of finding, what it states, what it leaves behind; and that
+ordinary runs continue."""
 
 import json
 import os
@@ -156,7 +156,7 @@ def test_bad_inertia():
 
 def test_q_that_is_no_rotation():
     simulation = Simulation(water(2.0))
-    simulation.system.state.rotation[:] *= 1 + 1e-6  # start_from refuses such a state
+    simulation.system.state.rotation[:] *= 1 + 1e-6  # start_from rejects such a state
     with pytest.raises(SimulationError) as caught:
         simulation.run()
     said = str(caught.value)
@@ -177,7 +177,7 @@ def test_a_load_that_is_no_number(name):
 @pytest.mark.parametrize("name", ["force", "torque_body", "velocity", "angular_momentum_body"])
 def test_a_bound_on_all_molecules_hides_no_finding(monkeypatch, name):
     """One number of one molecule grows through its limit: found at the same size as if each
-    molecule were looked at."""
+    molecule were observed."""
     system = build(small_scene({"spce": 20, "nitrogen": 20}, 30.0))
     load, _ = system.engine().evaluate(system.state)
     verlet, number = (
@@ -206,7 +206,14 @@ def test_a_bound_on_all_molecules_hides_no_finding(monkeypatch, name):
 def test_a_thermostat_is_held_to_its_own_time_only():
     """A drift that a thermostat carries off may add up to any size; within its time constant it may
     not."""
-    nvt = [{"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}]
+    nvt = [
+        {
+            "ensemble": "nvt",
+            "temperature_K": 300.0,
+            "duration_ps": 1.0,
+            "thermostat_time_ps": 0.1,
+        }
+    ]
     scene = small_scene({"spce": 40}, 18.5, stages=nvt, output={"log_interval_ps": 0.05})
     system, simulation = build(scene), Simulation(scene)
     rows = simulation.run().samples.rows
@@ -267,7 +274,7 @@ def test_ordinary_and_hot_runs_go_on(counts, edge, kelvin, stage):
     warnings = []
     scene = small_scene(counts, edge, start={"temperature_K": kelvin}, stages=[stage])
     results = Simulation(scene, warn=warnings.append).run()
-    # 8 fs is too long for accurate forces on water, and not too long to go on
+    # 8 fs is too long for accurate forces on water, and not too long to continue
     assert ["is inaccurate for spce" in text for text in warnings] == [True] * (
         stage["timestep_fs"] == 8.0
     )
@@ -276,7 +283,7 @@ def test_ordinary_and_hot_runs_go_on(counts, edge, kelvin, stage):
 
 @pytest.mark.parametrize("spread", [1e-3, 1e-7, 1e-12])
 def test_bodies_that_are_all_but_linear_go_on(spread):
-    """They spin about their axis a thousand times faster than they tumble; their sites hardly feel
+    """They spin about their axis a thousand times faster than they tumble; their sites are barely disturbed by
     it."""
     arms = [site(f"H{k}", 12.0, (x, spread, 0.0), 0.2) for k, x in enumerate((-1.0, 1.0))]
     thin = {"name": "thin", "count": 20, "sites": [site("O", 16.0, charge=-0.4, sigma=3.1), *arms]}
@@ -289,7 +296,7 @@ def test_bodies_that_are_all_but_linear_go_on(spread):
 @pytest.mark.parametrize(("timestep", "wrong"), [(9.0, True), (2.0, False)])
 def test_a_thermostat_cannot_hide_a_step_that_is_too_long(timestep, wrong):
     """It takes out in every step what the step has added, so that the temperature of all motion
-    looks right."""
+    seems right."""
     stage = {
         "ensemble": "nvt",
         "temperature_K": 300.0,
@@ -356,7 +363,7 @@ def test_how_far_each_scheme_follows_an_oscillator(name):
     scheme = SCHEMES[name]
 
     def growth(angle, steps):
-        """Largest amplitude in so many steps from x = 1, v = 0, and from x = 0, v = w."""
+        """Largest amplitude in this many steps from x = 1, v = 0, and from x = 0, v = w."""
         largest = 0.0
         for x, v in ((1.0, 0.0), (0.0, angle)):
             for _ in range(steps):
@@ -449,7 +456,7 @@ def test_a_step_that_is_too_long_is_told_before_the_first_one(tmp_path):
     assert len(warnings) == 1
     assert "stages.0: timestep_fs = 30 is longer than what is stable" in warnings[0]
     assert warnings[0] in results.summary["notes"]
-    assert warnings[0] not in simulation.conclusion(results)  # it was printed before
+    assert warnings[0] not in simulation._conclusion(results)  # it was printed before
     written = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert 5 < written["stages"][0]["stable_timestep_fs"] < 30
 
@@ -622,4 +629,4 @@ def test_a_long_way_back_is_not_computed_again(monkeypatch):
     )
     scene = water(16.0, stages=[{"duration_ps": 160.0, "timestep_fs": 16.0}])
     stopped(scene)
-    assert len({id(state) for state in advanced}) <= 2  # that of compiling, that of the run
+    assert len({id(state) for state in advanced}) <= 2  # that of compiling, the value of the run

@@ -1,8 +1,9 @@
-"""The door to Numba: what we assume of it beyond its promises, addresses and their types, the
+"""The interface to Numba: what we assume of it beyond its promises, addresses and their types, the
 cache, and the rules that sources keep."""
 
 import ast
 import ctypes
+import json
 import os
 import platform
 import re
@@ -10,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import NamedTuple
 
 import numba
@@ -20,7 +22,6 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
 from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher, cpu_target
-from support import ROOT
 
 from rigidmd.compile import (
     BoundTask,
@@ -36,6 +37,8 @@ from rigidmd.compile import (
 from rigidmd.compile.cache import CacheIndex, cache_folder, compiling_announced
 from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
 from rigidmd.compile.records import array_struct
+
+ROOT = Path(__file__).parents[1]  # processes import this file, and should import no more for it
 
 # --- what Numba does not promise ------------------------------------------------------------------
 
@@ -503,45 +506,67 @@ def test_nothing_is_made_before_the_first_kernel_is_compiled(tmp_path):
 KERNEL = "from rigidmd.compile import kernel\n@kernel(from_python=True)\ndef twice(x):\n    return 2 * x\n"
 
 
-def compiled_in(folder, tmp_path, before=""):
-    """Run a kernel with the cache in a folder: what it printed, what it warned of."""
+#: Loads and calls the kernel with each of several caches; prints what it returned, how often its
+#: code was read, and the warnings.
+WITH_CACHES = """
+import importlib, json, os, sys, warnings
+from rigidmd.compile import cache
+results = []
+for folder in sys.argv[1:]:
+    os.environ["RIGIDMD_CACHE"] = folder
+    cache.cache_folders.cache_clear()
+    sys.modules.pop("own", None)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        twice = importlib.import_module("own").twice
+        result = f"{twice(21)} {sum(twice.stats.cache_hits.values())}"
+    results.append([result, " ".join(str(one.message) for one in caught)])
+print(json.dumps(results))
+"""
+
+
+def compiled_in(folders, tmp_path, before=""):
+    """Run a kernel with the cache in each of some folders, all in one process: for each what it
+    returned and how often its code was read, and its warnings."""
     if not (tmp_path / "own.py").exists():  # kernels are kept by the time of their file
         (tmp_path / "own.py").write_text(KERNEL)
     environment = os.environ | {
-        "RIGIDMD_CACHE": str(folder),
+        "RIGIDMD_CACHE": str(folders[0]),
         "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
     }
-    script = (
-        f"{before}\nfrom own import twice; print(twice(21), sum(twice.stats.cache_hits.values()))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
-    )
-    return done.stdout.strip(), done.stderr
+    command = [sys.executable, "-c", f"{before}\n{WITH_CACHES}", *map(str, folders)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return [tuple(one) for one in json.loads(done.stdout)]
 
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
     """A folder with a kernel, and a cache in it that has the kernel."""
     folder = tmp_path_factory.mktemp("kept")
-    assert compiled_in(folder / "cache", folder) == ("42 0", "")
-    assert compiled_in(folder / "cache", folder) == ("42 1", "")
+    assert compiled_in([folder / "cache"] * 2, folder) == [("42 0", ""), ("42 1", "")]
+    assert compiled_in([folder / "cache"], folder) == [("42 1", "")]
     return folder
 
 
-@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
-@pytest.mark.parametrize("damage", ["empty", "cut", "flipped"])
-def test_a_damaged_file_of_the_cache_counts_as_absent(ending, damage, kept, tmp_path):
-    shutil.copytree(kept / "cache", tmp_path / "cache")
-    (path,) = (
-        path for path in (tmp_path / "cache").rglob(f"*twice*{ending}*") if ending in path.name
-    )
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 16
-    path.write_bytes({"empty": b"", "cut": bytes(data[:40]), "flipped": bytes(data)}[damage])
-    printed, warned = compiled_in(tmp_path / "cache", kept)
-    assert printed == "42 0" and warned.count("is damaged; its code is compiled again") == 1
-    assert compiled_in(tmp_path / "cache", kept) == ("42 1", "")
+def copies(kept, tmp_path, count):
+    """Copies of a cache."""
+    return [shutil.copytree(kept / "cache", tmp_path / f"cache_{k}") for k in range(count)]
+
+
+def test_a_damaged_file_of_the_cache_counts_as_absent(kept, tmp_path):
+    """An index or code that is empty, cut or has a bit flipped."""
+    damages = [(e, d) for e in (".nbi", ".nbc") for d in ("empty", "cut", "flipped")]
+    caches = copies(kept, tmp_path, len(damages))
+    for cache, (ending, damage) in zip(caches, damages, strict=True):
+        path = folders_of(cache, ending)[-1]
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 16
+        path.write_bytes({"empty": b"", "cut": bytes(data[:40]), "flipped": bytes(data)}[damage])
+    for damage, (result, warned) in zip(damages, compiled_in(caches, kept), strict=True):
+        assert result == "42 0", damage
+        assert warned.count("is damaged; its code is compiled again") == 1, damage
+    assert compiled_in(caches, kept) == [("42 1", "")] * len(damages)
 
 
 def test_a_cache_that_cannot_be_written_is_read(kept):
@@ -554,7 +579,7 @@ def test_a_cache_that_cannot_be_written_is_read(kept):
         "    return allow(dir=dir)\n"
         "tempfile.TemporaryFile = refuse"
     )
-    assert compiled_in(kept / "cache", kept, read_only) == ("42 1", "")
+    assert compiled_in([kept / "cache"], kept, read_only) == [("42 1", "")]
     assert sorted(kept.rglob("*")) == before
 
 
@@ -588,9 +613,8 @@ def hits_with(tmp_path, before: str, value: str) -> int:
 def test_kernels_are_found_after_a_process_with_a_module_that_others_lack(tmp_path):
     assert hits_with(tmp_path, "", "(1.0,)") == 0
     assert hits_with(tmp_path, STRANGE_TERM, "module.Term(1.0)") == 0
-    assert hits_with(tmp_path, "", "(1.0,)") == 1
-    assert hits_with(tmp_path, "", "(1,)") == 0
-    assert hits_with(tmp_path, "", "(1,)") == 1
+    assert hits_with(tmp_path, "", "(1.0,)); double((1,)") == 1  # the second one is compiled
+    assert hits_with(tmp_path, "", "(1.0,)); double((1,)") == 2
 
 
 def test_an_index_that_cannot_be_read_is_not_replaced(tmp_path):
@@ -627,46 +651,43 @@ def folders_of(cache, ending):
     return [cache, path.parent.parent, path.parent, path]
 
 
-@pytest.mark.parametrize(
-    ("which", "bits", "ending"),
-    [(0, 0o020, ".nbi"), (1, 0o002, ".nbi"), (2, 0o020, ".nbi"), (3, 0o002, ".nbc")],
-)
-def test_code_that_others_may_write_is_not_used(which, bits, ending, kept, tmp_path):
-    shutil.copytree(kept / "cache", tmp_path / "cache")
-    path = folders_of(tmp_path / "cache", ending)[which]
-    path.chmod(path.stat().st_mode | bits)
-    printed, warned = compiled_in(tmp_path / "cache", kept)
-    assert printed == "42 0"
-    assert warned.count("may be written by others (chmod go-w forbids that)") == 1
+def test_code_that_others_may_write_is_not_used(kept, tmp_path):
+    cases = [(0, 0o020, ".nbi"), (1, 0o002, ".nbi"), (2, 0o020, ".nbi"), (3, 0o002, ".nbc")]
+    caches = copies(kept, tmp_path, len(cases))
+    for cache, (which, bits, ending) in zip(caches, cases, strict=True):
+        path = folders_of(cache, ending)[which]
+        path.chmod(path.stat().st_mode | bits)
+    for case, (result, warned) in zip(cases, compiled_in(caches, kept), strict=True):
+        assert result == "42 0", case
+        assert warned.count("may be written by others (chmod go-w forbids that)") == 1, case
 
 
-@pytest.mark.parametrize("which", [1, 3])
-def test_code_of_another_user_is_not_used(which, kept, tmp_path):
-    shutil.copytree(kept / "cache", tmp_path / "cache")
-    path = folders_of(tmp_path / "cache", ".nbi")[which]
+def test_code_of_another_user_is_not_used(kept, tmp_path):
+    caches = copies(kept, tmp_path, 2)
+    paths = [folders_of(cache, ".nbi")[k] for cache, k in zip(caches, (1, 3), strict=True)]
     before = f"""
 import os, rigidmd.core.files as files
 true = files.untrusted_reason
 def of_another(found):
     fields = list(found)
-    fields[4] += 1000 * (found.st_ino == {path.stat().st_ino})
+    fields[4] += 1000 * (found.st_ino in {[path.stat().st_ino for path in paths]})
     return true(os.stat_result(fields))
 files.untrusted_reason = of_another
 """
-    printed, warned = compiled_in(tmp_path / "cache", kept, before)
-    assert printed == "42 0" and warned.count("belongs to another user") == 1
+    for result, warned in compiled_in(caches, kept, before):
+        assert result == "42 0" and warned.count("belongs to another user") == 1
 
 
 def test_code_behind_a_link_in_the_cache_is_not_used(kept, tmp_path):
-    shutil.copytree(kept / "cache", tmp_path / "cache")
-    (tmp_path / "cache").rename(tmp_path / "other")
-    (tmp_path / "cache").symlink_to(tmp_path / "other")  # the user's own choice of a folder
-    assert compiled_in(tmp_path / "cache", kept) == ("42 1", "")
-    kernels = folders_of(tmp_path / "other", ".nbi")[1]
+    by_user, inside = copies(kept, tmp_path, 2)
+    by_user.rename(tmp_path / "other")
+    by_user.symlink_to(tmp_path / "other")  # the user's choice of a folder
+    kernels = folders_of(inside, ".nbi")[1]
     kernels.rename(tmp_path / "elsewhere")
     kernels.symlink_to(tmp_path / "elsewhere")
-    printed, warned = compiled_in(tmp_path / "cache", kept)
-    assert printed == "42 0" and "is a link" in warned
+    used, (result, warned) = compiled_in([by_user, inside], kept)
+    assert used == ("42 1", "")
+    assert result == "42 0" and "is a link" in warned
 
 
 @pytest.mark.parametrize("home", ["raise RuntimeError('no home')", "return '~/.cache/rigidmd'"])
@@ -707,8 +728,8 @@ def test_a_full_disk_costs_time_only(function, tmp_path):
     )
     if function == "tempfile.mkdtemp":  # neither in the cache nor elsewhere
         full += "tempfile.TemporaryFile = full\n"
-    printed, warned = compiled_in(tmp_path / "cache", tmp_path, full)
-    assert printed == "42 0"
+    [(result, warned)] = compiled_in([tmp_path / "cache"], tmp_path, full)
+    assert result == "42 0"
     assert warned.count("No space left on device") == (
         function == "IndexDataCacheFile._open_for_write"
     )

@@ -406,7 +406,7 @@ def test_atoms_listed_with_their_images_count_once(tmp_path):
 
 
 def test_short_bonds_across_a_symmetry_element_stay(tmp_path):
-    """H2 and N2 on inversion centres are no atoms on special positions."""
+    """H2 and N2 on inversion centres are not atoms on special positions."""
     for symbol, length in (("H", 0.7414), ("N", 1.0977)):
         atom = ((symbol, symbol, (0.5 * length / 9, 0, 0)),)
         found = read(tmp_path, cif(ORTHORHOMBIC, atom, **{NAME: "P -1"}))

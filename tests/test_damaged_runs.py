@@ -39,7 +39,7 @@ OTHERS = [
     '"\\u0000"',
     '"</script><b>"',
 ]
-#: Of a cell of a file of CSV.
+#: For a cell of a file of CSV.
 CELLS = [
     "",
     "x",
@@ -116,7 +116,7 @@ def replaced(data, path, text):
 
 
 def taken(function, *arguments):
-    """Whether a file is taken; it may be refused with a sentence that names it."""
+    """Whether a file is taken; it may be rejected with a sentence that names it."""
     try:
         function(*arguments)
     except OutputError as error:
@@ -244,7 +244,7 @@ def test_any_cell_of_a_table(which, name, request, tmp_path):
 
 
 def put(kind, path, tmp_path):
-    """What is no file, in the place of one."""
+    """What is not a file, in the position of one."""
     path.unlink(missing_ok=True)
     match kind:
         case "pipe":

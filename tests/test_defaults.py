@@ -15,7 +15,7 @@ from rigidmd import Scene, Simulation, resolve
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
 from rigidmd.assemble.harmonic import stable_angle, step_error
-from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, error_of_step
+from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, error_of_step, step_warnings
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.errors import SceneError
@@ -28,7 +28,7 @@ NVT = {"ensemble": "nvt", "temperature_K": 298.15, "duration_ps": 0.02}
 
 
 def scene(edge: float | None = 13.0, **tables) -> Scene:
-    """64 waters with nothing but what a user has to say."""
+    """64 waters with nothing but what a user has to state."""
     box = {"lengths_A": edge} if edge else {"lengths_A": 13.0, "periodic": False}
     forces = {"cutoff_A": 6.0} if edge else {}
     return Scene.from_dict(
@@ -56,12 +56,12 @@ def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
         (
             13.0,
             {"reaction_field_permittivity": 78.0},
-            "would do nothing with electrostatics = 'pme' .the default.",
+            "would have no effect with electrostatics = 'pme' .the default.",
         ),
         (
             None,
             {"ewald_accuracy": 1e-4},
-            "ewald_accuracy would do nothing with electrostatics = 'coulomb' .the default",
+            "ewald_accuracy would have no effect with electrostatics = 'coulomb' .the default",
         ),
         (
             13.0,
@@ -77,7 +77,7 @@ def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
         (
             13.0,
             {"electrostatics": "pme", "reaction_field_truncation": "switch"},
-            "reaction_field_truncation would do",
+            "reaction_field_truncation would have no effect",
         ),
     ],
 )
@@ -88,7 +88,7 @@ def test_keys_that_do_nothing_are_refused(edge, forces, message):
 
 def test_without_a_box_all_pairs_of_charges_act_whatever_the_cutoff():
     simulation = Simulation(scene(None, forces={"cutoff_A": 4.0}))
-    found = simulation.start_energy(KJ_PER_MOL, "kJ/mol")["components"]
+    found = simulation._start_energy(KJ_PER_MOL, "kJ/mol")["components"]
     system = simulation.system
     position, charge = (
         system.site_positions(simulation.state),
@@ -152,7 +152,7 @@ def positions_file(path, position, edges) -> str:
         ((5, 5, 5), (20.0, 20.0, 60.0), False),  # a slab
         ((5, 5, 5), (60.0, 60.0, 60.0), False),  # a droplet
         ((5, 5, 15), (20.0, 20.0, 60.0), True),
-        ((2, 2, 2), (20.0, 20.0, 20.0), True),  # few molecules are far apart, and even
+        ((2, 2, 2), (20.0, 20.0, 20.0), True),  # few molecules are far from each other, and even
     ],
 )
 def test_a_tail_correction_is_for_boxes_that_molecules_fill(lattice, edges, expected, tmp_path):
@@ -263,7 +263,7 @@ def precision_of(**stage) -> tuple[str, str]:
 @pytest.mark.parametrize(
     ("stage", "precision", "reason"),
     [
-        ({}, "mixed", "baoab at 2 fs, about 1e-02 of the forces, is 3,2"),
+        ({}, "mixed", "baoab at 4 fs, about 4e-02 of the forces, is 13,"),
         (
             {"timestep_fs": 0.1},
             "double",
@@ -317,9 +317,9 @@ def test_a_run_says_its_precision_and_energy_is_in_double(tmp_path):
     simulation = Simulation(scene())
     summary = simulation.run().summary
     assert summary["precision"] == "mixed"
-    assert summary["precision_reason"].startswith("mixed: the error of baoab at 2 fs")
-    energy = Simulation(scene()).start_energy(KJ_PER_MOL, "kJ/mol")
-    exact = Simulation(scene(precision="double")).start_energy(KJ_PER_MOL, "kJ/mol")
+    assert summary["precision_reason"].startswith("mixed: the error of baoab at 4 fs")
+    energy = Simulation(scene())._start_energy(KJ_PER_MOL, "kJ/mol")
+    exact = Simulation(scene(precision="double"))._start_energy(KJ_PER_MOL, "kJ/mol")
     assert energy["components"] == exact["components"]
 
 
@@ -343,6 +343,16 @@ def test_the_error_of_a_step_is_that_of_the_frequency(name):
         abs((followed / angle) ** 2 - 1), rel=1e-6, abs=1e-12
     )
     assert step_error(scheme, 1.01 * stable_angle(scheme)) == inf
+    for small in (1e-1, 1e-3, 1e-8, 1e-300):  # not the rounding error of the trace
+        assert step_error(scheme, small) <= small**2 / 10
+    assert step_error(scheme, 0.0) == 0.0
+
+
+def test_check_ends_for_a_step_far_below_rounding():
+    row = {"name": "mine", "steps": [0.6, -0.2, 0.6], "order": 2}
+    stage = {"duration_ps": 0.004, "timestep_fs": 1e-9, "integrator": "mine"}
+    found = scene(stages=[stage], integrators=[row], start={"temperature_K": 300})
+    assert "times shorter than mine needs" in "".join(step_warnings(found))
 
 
 def test_the_error_of_velocity_verlet_is_known():
@@ -416,3 +426,113 @@ def test_the_scene_of_a_run_has_no_keys_that_do_nothing(tmp_path):
 def test_check_names_no_classes(name):
     text = describe(Scene.read(ROOT / "systems" / f"{name}.toml"))
     assert re.findall(r"\b[A-Z][a-z]+[A-Z]\w*", text) == []
+
+
+def step_of(model="spce", temperature=298.15, masses=None, **stage) -> float:
+    """The default time step (fs) of a last stage, of 40 ps unless stated."""
+    molecules = {"model": model, "count": 64} | ({"masses_u": masses} if masses else {})
+    held = {"temperature_K": temperature} if stage.get("ensemble") in ("nvt", "npt") else {}
+    built = build(
+        scene(
+            30.0,
+            molecules=[molecules],
+            start={"temperature_K": temperature},
+            stages=[{"duration_ps": 40} | held | stage],
+        )
+    )
+    return built.scene.stages[-1].timestep_fs
+
+
+@pytest.mark.parametrize(
+    ("stage", "expected"),
+    [
+        ({"ensemble": "nvt"}, 4),
+        ({"ensemble": "npt", "pressure_bar": 1}, 4),
+        ({"ensemble": "nvt", "thermostat": "langevin"}, 4),
+        ({"ensemble": "nvt", "integrator": "velocity_verlet"}, 1),
+        ({"ensemble": "nvt", "thermostat": "hybrid_monte_carlo"}, 2),
+        ({"ensemble": "nve"}, 2),
+        ({"ensemble": "nph", "pressure_bar": 1}, 2),
+        ({"ensemble": "nve", "integrator": "srkn_4"}, 5),
+        ({"ensemble": "nvt", "timestep_fs": 3}, 3),
+        ({"ensemble": "nvt", "temperature": 350.0}, 4),
+        ({"ensemble": "nvt", "temperature": 500.0}, 2.5),
+        ({"ensemble": "nvt", "model": "tip4p2005"}, 4),
+        ({"ensemble": "nve", "model": "tip4p2005"}, 2),
+        ({"ensemble": "nvt", "masses": {"H": 4.0}}, 5),
+        ({"ensemble": "nvt", "model": "ammonia_trappe", "temperature": 240.0}, 5),
+        ({"ensemble": "nve", "model": "ammonia_trappe", "temperature": 240.0}, 4),
+        ({"ensemble": "nvt", "model": "nitrogen", "temperature": 77.0}, 10),
+        ({"ensemble": "nve", "model": "argon", "temperature": 94.0}, 10),
+    ],
+)
+def test_the_default_step_follows_from_the_molecules(stage, expected):
+    assert step_of(**stage) == expected
+
+
+def test_the_default_step_divides_the_duration_and_the_intervals():
+    def with_intervals(**tables) -> float:
+        stages = [{"ensemble": "nvt", "temperature_K": 298.15, "duration_ps": 0.3}]
+        return build(scene(stages=stages, **tables)).scene.stages[0].timestep_fs
+
+    assert with_intervals() == 4  # as does 0.3 ps
+    assert step_of(model="argon", duration_ps=0.004) == 4  # no step is longer than its stage
+    assert with_intervals(output={"log_interval_ps": 0.015}) == 2.5
+    assert with_intervals(output={"trajectory_interval_ps": 0.05}) == 2.5
+    of_no_file = {"trajectory": False, "trajectory_interval_ps": 0.05}
+    assert with_intervals(output=of_no_file) == 4
+    assert with_intervals(output={"log_interval_ps": 0.0017}) == 4  # none divides it
+
+
+def test_the_default_step_is_that_of_the_molecules_that_move():
+    of_water, of_argon = {"model": "spce", "count": 8}, {"model": "argon", "count": 8}
+    stages = [{"ensemble": "nvt", "temperature_K": 94, "duration_ps": 40}]
+    box = {"lengths_A": 30.0}
+
+    def step(*molecules, **tables) -> float:
+        return (
+            build(scene(molecules=list(molecules), box=box, stages=stages, **tables))
+            .scene.stages[0]
+            .timestep_fs
+        )
+
+    assert step(of_argon) == 10
+    assert step(of_water, of_argon) == 5
+    assert step(of_water | {"frozen": True}, of_argon) == 10
+
+
+def test_a_default_step_without_a_temperature_is_two_femtoseconds():
+    at_rest = {"start": {"temperature_K": 0}, "stages": [{"duration_ps": 1}]}
+    assert build(scene(**at_rest)).scene.stages[0].timestep_fs == 2
+
+
+def test_a_default_step_that_contradicts_another_key_is_told_with_its_length():
+    field = {
+        "electric_V_per_nm": [0, 0, 0.1],
+        "electric_frequency_per_ps": 150,
+    }  # a period of 6.7 fs
+    with pytest.raises(SceneError, match=r"two steps of stages\.0 \(4 fs\)"):
+        build(scene(fields=field))
+    stages = [NVT | {"timestep_fs": 3}]
+    assert build(scene(fields=field, stages=stages)).scene.stages[0].timestep_fs == 3
+
+
+def test_a_run_keeps_its_default_step_and_check_tells_its_error(tmp_path, capsys):
+    path = tmp_path / "water.toml"
+    path.write_text(
+        "box.lengths_A = 13.0\nforces.cutoff_A = 6.0\n[[molecules]]\nmodel = 'spce'\ncount = 64\n"
+        "[[stages]]\nensemble = 'nvt'\ntemperature_K = 298.15\nduration_ps = 0.02\n"
+        "[[stages]]\nduration_ps = 0.02\n"
+    )
+    assert main(["check", str(path)]) == 0
+    out = capsys.readouterr().out
+    error = "time-step error: spce rotates about its lightest axis as if forces were wrong by"
+    assert "0: nvt: 5 steps of 4 fs = 0.02 ps, baoab" in out
+    assert f"{error} 4 %; bias of U about 0.002 kT per degree of freedom" in out
+    assert "1: nve: 10 steps of 2 fs = 0.02 ps, velocity_verlet" in out
+    assert f"{error} 1 %\n" in out
+    assert main(["run", str(path), "-o", str(tmp_path / "run")]) == 0
+    written = tomllib.loads((tmp_path / "run" / "scene.toml").read_text())
+    assert [stage["timestep_fs"] for stage in written["stages"]] == [4.0, 2.0]
+    assert main(["resume", str(tmp_path / "run"), "--until", "0.06ps"]) == 0
+    assert Scene.read(path).stages[0].timestep_fs is None

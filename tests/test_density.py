@@ -24,7 +24,7 @@ STRING_ENDS = getattr(tokenize, "FSTRING_END", None)
 
 
 def tokens_and_lines(text):
-    """Number of tokens of Python code, and of lines on which one begins; without comments."""
+    """Number of tokens of Python code, and of lines on which one starts; without comments."""
     count, lines, depth = 0, set(), 0
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type == STRING_ENDS:

@@ -29,7 +29,7 @@ PLAIN = {"cutoff_A": 6.0, "truncation": "plain", "mixing": "geometric", "electro
 EWALD = PLAIN | {
     "dispersion": "ewald",
     "dispersion_accuracy": 1e-13,
-}  # the energy of the k-vectors left out has one sign
+}  # the energy of the k-vectors omitted has one sign
 MESH = PLAIN | {
     "dispersion": "pme",
     "dispersion_beta_per_A": 0.5,
@@ -172,7 +172,7 @@ def test_forces_torques_and_virial_are_slopes_of_the_energy(forces, box):
 )
 def test_forces_are_as_accurate_as_asked_for(asked, method, box):
     """Within a factor 2, relative to 24 epsilon/sigma, with molecules of one site each; as the note
-    says."""
+    states."""
     box = [
         {"lengths_A": 22.0},
         {"lengths_A": [24.0, 23.0, 24.0], "angles_deg": [75.0, 100.0, 80.0]},
@@ -357,7 +357,7 @@ def test_energy_is_conserved(barostat):
         ),
         ({"dispersion": "pme", "lennard_jones": False}, "lennard_jones is false"),
         ({"dispersion": "ewald", "dispersion_order": 5}, "belong to 'pme'"),
-        ({"dispersion_accuracy": 1e-4}, "would do nothing with dispersion = 'cutoff'"),
+        ({"dispersion_accuracy": 1e-4}, "would have no effect with dispersion = 'cutoff'"),
         (
             {"dispersion": "pme", "custom": [{"name": "a", "energy": "1/r^9"}]},
             "custom forces have no such sum",

@@ -1,7 +1,7 @@
 """README and the chapters: every command and snippet in them runs, every key and column is in the
 manual, no link is dead.
 
-A comment before a block tells this file how to treat it:
+A comment before a block shows this file how to treat it:
 
     <!-- test: file NAME -->       the block is the file NAME, which later commands use
     <!-- test: with OPTIONS -->    OPTIONS are added to each `rigidmd run`, `accuracy` and `sweep` of the block, and those
@@ -45,7 +45,7 @@ from rigidmd.assemble.describe import describe
 from rigidmd.commands import cli
 from rigidmd.commands.arguments import read_scene
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
-from rigidmd.core.shipped import CHAPTERS, DOCS, find_example
+from rigidmd.core.shipped import CHAPTERS, DOCS, GUIDES, SECTIONS, find_example
 from rigidmd.errors import SceneError
 from rigidmd.formats import BY_EXTENSION
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
@@ -76,12 +76,12 @@ MINIMAL = {
 
 
 class Block(NamedTuple):
-    """A fenced block, or the indented lines that README begins with."""
+    """A fenced block, or the indented lines that README starts with."""
 
     line: int  # of its first line of text
     language: str
     text: str
-    told: str  # what the comment before it tells this test
+    told: str  # what the comment before it shows this test
 
 
 def blocks_of(document: Path) -> list[Block]:
@@ -109,7 +109,7 @@ def blocks_of(document: Path) -> list[Block]:
 
 
 def commands_of(text: str) -> list[list[str]]:
-    """The words of each command of a shell block, comments left out."""
+    """The words of each command of a shell block, comments omitted."""
     joined = text.replace("\\\n", " ")
     return [
         shlex.split(part, comments=True)
@@ -139,7 +139,7 @@ def pattern_of(quoted: str, like: bool) -> re.Pattern:
 
 
 class Reader:
-    """Does what a document tells its reader to do, in the working directory."""
+    """Does what a document shows its reader to do, in the working directory."""
 
     def __init__(self, monkeypatch, capsys):
         self.monkeypatch, self.capsys = monkeypatch, capsys
@@ -199,14 +199,12 @@ class Reader:
                 source = (ROOT / script).read_text()
                 assert all(a in source for a in arguments if a.startswith("--")), words
             case ["python", script]:
-                # Terms of one's own name their classes in the cache, and would leave an index
-                # nobody else can read
-                own = {
-                    "RIGIDMD_CACHE": "cache",
-                    "PYTHONPATH": str(Path(rigidmd.__file__).parents[1]),
-                }
+                package = {"PYTHONPATH": str(Path(rigidmd.__file__).parents[1])}
                 done = subprocess.run(
-                    [sys.executable, script], env=os.environ | own, capture_output=True, text=True
+                    [sys.executable, script],
+                    env=os.environ | package,
+                    capture_output=True,
+                    text=True,
                 )
                 assert done.returncode == 0, done.stderr
             case ["pip", "install", what]:
@@ -306,7 +304,10 @@ def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsy
         part = section("Columns of log.csv" if path.name == "log.csv" else "Columns of motion.csv")
         named = set(re.findall(r"`([^`]+)`", part))
         scene = tomllib.loads((path.parent / "scene.toml").read_text())
-        own = {f"{entry['name']} (kJ/mole)" for entry in scene.get("forces", {}).get("custom", ())}
+        tables = scene.get("forces", {})
+        names = [entry["name"] for entry in tables.get("custom", ())]
+        names += [entry.get("name", entry.get("potential")) for entry in tables.get("bodies", ())]
+        own = {f"{name} (kJ/mole)" for name in names}
         header = ["NAME (kJ/mole)" if column in own else column for column in header]
         assert {_first_of_its_kind(column) for column in header} <= named
 
@@ -427,7 +428,7 @@ def test_every_key_of_a_scene_is_in_the_manual_with_its_default(kind):
     for heading, model in tables_of(kind):
         if kind is BodyScene and heading in ("Top level", "`[[integrators]]`"):
             continue  # the same as for molecules
-        title = f"{heading} of a body" if kind is BodyScene and heading in shared else heading
+        title = f"{heading} (single body)" if kind is BodyScene and heading in shared else heading
         said = {}
         for row in re.findall(r"^\| (`[a-z].*?) \| (.*?) ?\| ", section(title), re.MULTILINE):
             said |= {key: row[1].strip() for key in re.findall(r"`(\w+)`", row[0])}
@@ -439,7 +440,7 @@ def test_every_key_of_a_scene_is_in_the_manual_with_its_default(kind):
             else ""
             for key, field in model.model_fields.items()
             if not _models_in(field.annotation)
-            or "Literal" in str(field.annotation)  # a table, or a text in its place
+            or "Literal" in str(field.annotation)  # a table, or a text in its position
         }
         for key in REFUSED.get(heading, ()):
             wanted.pop(key)
@@ -471,11 +472,38 @@ def test_links_and_pictures_are_there(document):
             assert anchor in slugs(target), f"{document.name}: {link}"
 
 
-def test_readme_is_a_first_page_and_leads_to_every_chapter():
+def contents_text() -> str:
+    """The page start/contents.md, from the titles and first lines of all pages."""
+    lines = ["# All pages", "", "The pages of this documentation, with the subject of each."]
+    groups = {
+        folder.capitalize(): names for folder, names in SECTIONS.items() if folder != "guides"
+    }
+    ordered = {}
+    for title, names in groups.items():
+        ordered[title] = names
+        if title == "Tutorials":
+            ordered |= {f"Guides: {group.lower()}": names for group, names in GUIDES.items()}
+    for title, names in ordered.items():
+        lines += ["", f"## {title}", ""]
+        for name in names:
+            if name == "contents":
+                continue
+            heading, _, about, *_ = PAGES[name].read_text(encoding="utf-8").splitlines()
+            path = Path(os.path.relpath(PAGES[name], PAGES["contents"].parent)).as_posix()
+            lines.append(f"- [{heading.removeprefix('# ')}]({path}): {about[0].lower()}{about[1:]}")
+    return "\n".join(lines) + "\n"
+
+
+def test_readme_is_a_first_page_and_leads_to_the_list_of_all():
     text = README.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 130
-    for path in PAGES.values():
-        assert f"({path.relative_to(ROOT)})" in text
+    assert max(map(len, text.splitlines())) <= 100
+    assert f"({PAGES['contents'].relative_to(ROOT)})" in text
+
+
+def test_the_list_of_pages_has_their_titles_and_subjects():
+    """`python tests/test_docs.py` writes it."""
+    assert PAGES["contents"].read_text(encoding="utf-8") == contents_text()
 
 
 def test_author_and_version_are_the_same_wherever_they_are_said():
@@ -483,9 +511,10 @@ def test_author_and_version_are_the_same_wherever_they_are_said():
     version, (author,) = project["version"], project["authors"]
     text = README.read_text(encoding="utf-8")
     assert f"{author['name']}, *rigidmd" in text
-    assert f"{{{{{author['name']}}}}}" in text
     assert f"version {version}," in text
-    assert f"version = {{{version}}}" in text
+    citation = PAGES["contributing"].read_text(encoding="utf-8")
+    assert f"{{{{{author['name']}}}}}" in citation
+    assert f"version = {{{version}}}" in citation
     assert f"\n## {version}" in PAGES["changelog"].read_text(encoding="utf-8")
     zenodo = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
     found = [zenodo[key] for key in ("version", "keywords", "license", "creators")]
@@ -524,7 +553,10 @@ def test_help_lists_and_prints_the_chapters(capsys):
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("commandes", "did you mean commands?"), ("qqq", "there are installation, why, top, water")],
+    [
+        ("commandes", "did you mean commands?"),
+        ("qqq", "there are five_minutes, installation, why, contents, top, water"),
+    ],
 )
 def test_a_chapter_that_is_not_there(name, expected, capsys):
     assert cli.main(["help", name]) == 2
@@ -584,6 +616,7 @@ def test_the_page_of_models_has_the_tables_of_their_files():
 if __name__ == "__main__":
     text = PAGES["models"].read_text(encoding="utf-8")
     PAGES["models"].write_text(text[: text.index("## Water")] + models_tables(), encoding="utf-8")
+    PAGES["contents"].write_text(contents_text(), encoding="utf-8")
 
 
 def test_the_page_of_the_collection_is_written_from_its_data(monkeypatch):

@@ -7,6 +7,7 @@ from scipy.signal import lfilter
 from support import small_scene
 
 from rigidmd import Simulation
+from rigidmd.assemble.build import build
 from rigidmd.core.statistics import (
     correlation_time,
     error_of_mean,
@@ -16,8 +17,10 @@ from rigidmd.core.statistics import (
     steady_from,
 )
 from rigidmd.core.statistics import mean_and_error as mean
+from rigidmd.run.summary import drift_of_thermostats
 from rigidmd.studies.accuracy.averages import AveragedQuantity, AverageRun, Averages
 from rigidmd.studies.accuracy.averages_report import brief_table, describe_failures
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 SERIES = 400
 
@@ -134,7 +137,7 @@ def test_the_choice_of_the_equilibrated_part_leaves_errors_as_they_are(times, n,
 @pytest.mark.parametrize("size", [3.0, 10.0, 50.0])
 @pytest.mark.parametrize("decay", [0.02, 0.06])
 def test_a_transient_leaves_no_bias_that_the_error_does_not_cover(decay, size, times):
-    """Of this size in standard deviations, decaying in this fraction of 500 samples."""
+    """For this size in standard deviations, decaying in this fraction of 500 samples."""
     rng = np.random.default_rng(int(size * times))
     transient = size * np.exp(-np.arange(500) / (500 * decay))
     series = memory(rng, 500, 500 / times)[:200] + transient
@@ -253,3 +256,36 @@ def test_a_line_is_found_exactly():
     found = slope(time, 1 - 4 * time)
     assert found.value == pytest.approx(-4)
     assert found.rms < 1e-14
+
+
+class Columns(dict):
+    """Columns of a log, each of four samples."""
+
+    def __len__(self):
+        return 4
+
+
+def test_heat_between_two_thermostats_explains_a_drift():
+    """Temperatures off their set points by -1 and +1 K are a flow of heat, and a drift by the
+    difference of the mean (w dt)² of both motions."""
+    nvt = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 0.4, "timestep_fs": 4.0}
+    values = {
+        "temperature_translation": 299.0,
+        "temperature_rotation": 301.0,
+        "force_squares": 1e5,
+        "torque_squares": 4e5,
+    }
+    columns = Columns({name: np.full(4, value) for name, value in values.items()})
+
+    def of(**stage) -> tuple[float, float]:
+        scene = small_scene({"spce": 20}, 18.5, stages=[nvt | stage])
+        return drift_of_thermostats(build(scene), columns, 0)
+
+    unit = BOLTZMANN / KJ_PER_MOL
+    x = [0.004**2 * square / (count * unit * 300) for square, count in ((1e5, 57), (4e5, 60))]
+    flow = 0.5 * unit * (57 + 60) / 2 / 0.05
+    assert of() == pytest.approx((flow * (x[1] - x[0]) / 12, 0.0), rel=1e-9)
+    assert of(thermostat_time_ps=0.1)[0] == pytest.approx(of()[0] / 2)
+    assert of(integrator="velocity_verlet") == (0.0, 0.0)
+    assert of(thermostat="langevin") == (0.0, 0.0)
+    assert of(ensemble="nve", temperature_K=None) == (0.0, 0.0)

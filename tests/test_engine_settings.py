@@ -8,6 +8,7 @@ and its chains and pistons the inverse of an angular frequency, in fs and atm; O
 and frequencies in 1/ps, and pressures in bar.
 """
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -145,7 +146,7 @@ def test_gromacs_has_lengths_in_nm(tmp_path):
 
 
 def test_gromacs_places_a_site_off_the_plane_of_its_masses(tmp_path):
-    """Of a lone pair of TIP5P: r = r_i + a r_ij + b r_ik + c r_ij x r_ik, c in 1/nm."""
+    """For a lone pair of TIP5P: r = r_i + a r_ij + b r_ik + c r_ij x r_ik, c in 1/nm."""
     own = drawn(NVT, counts={"tip5p": 20})
     write_gromacs(tmp_path, own, own.system.state)
     block = (tmp_path / "topol.top").read_text().split("[ virtual_sites3 ]\n")[1].split("\n\n")[0]
@@ -449,7 +450,7 @@ def test_a_platform_with_one_precision_has_no_other():
             )
     with pytest.raises(
         SceneError,
-        match=r"precision would do nothing with engine.name = 'lammps'; it is for openmm",
+        match=r"precision would have no effect with engine.name = 'lammps'; it is for openmm",
     ):
         small_scene({"argon": 2}, 20.0, engine={"name": "lammps", "precision": "mixed"})
 
@@ -525,8 +526,9 @@ class MirrorEngine(ExternalEngine):
     def _receive(self, state):
         pass
 """
+#: Runs commands, given as JSON with the error of the engine, and prints exit code and output of each.
 SCRIPT = """
-import sys
+import contextlib, io, json, sys
 
 import rigidmd.engines
 import rigidmd.programs
@@ -536,15 +538,24 @@ rigidmd.programs.__path__.append(sys.argv[1] + "/programs")
 
 from rigidmd.commands import cli
 
-if sys.argv[2] == "wrong":
-    from rigidmd.engines.mirror.mirror import MirrorEngine
+results = []
+for error, arguments in json.load(sys.stdin):
+    if error:
+        from rigidmd.engines.mirror.mirror import MirrorEngine
 
-    MirrorEngine.error = 0.1
-sys.exit(cli.main(sys.argv[3:]))
+        MirrorEngine.error = error
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = cli.main(arguments)
+        except SystemExit as end:
+            code = end.code
+    results.append([code, out.getvalue(), err.getvalue()])
+print(json.dumps(results))
 """
 
 
-@pytest.mark.timeout(900)  # processes that compile
+@pytest.mark.timeout(900)  # a process that compiles
 def test_adding_an_engine_takes_a_folder_and_a_file(tmp_path):
     folder, programs = tmp_path / "engines" / "mirror", tmp_path / "programs"
     folder.mkdir(parents=True)
@@ -559,39 +570,47 @@ def test_adding_an_engine_takes_a_folder_and_a_file(tmp_path):
         "[start]\ntemperature_K = 90.0\n[[stages]]\nduration_ps = 0.02\n"
     )
 
-    def run(*arguments, error="right"):
-        command = [sys.executable, tmp_path / "script.py", tmp_path, error, *arguments]
-        return subprocess.run(
-            [*map(str, command)], capture_output=True, text=True, cwd=tmp_path, check=False
-        )
-
     there = ("--engine", "mirror", "--tilt", "3")
-    done = run("run", scene, *there, "-o", "out")
-    assert done.returncode == 0 and "computed by Mirror tilted by 3" in done.stdout, done.stderr
-    assert '"engine": "Mirror 1.0"' in (tmp_path / "out" / "summary.json").read_text()
-    assert run("resume", "out", "--until", "0.03ps").returncode == 0
-    wrong = run("run", scene, *there, "-o", "wrong", error="wrong")
-    assert wrong.returncode == 2 and "mirror and rigidmd do not agree at the start" in wrong.stderr
-    checked = run("check", scene, *there)
-    assert checked.returncode == 0 and checked.stdout.rstrip().endswith("Mirror 1.0")
-    assert run("verify", scene, *there).returncode == 0
     andersen = (
         "stages.0.ensemble=nvt",
         "stages.0.temperature_K=90",
         "stages.0.thermostat=andersen",
     )
-    refused = run(
-        "check", scene, *there, *(part for change in andersen for part in ("--set", change))
+    changes = [part for change in andersen for part in ("--set", change)]
+    commands = [
+        ("run", scene, *there, "-o", "out"),
+        ("resume", "out", "--until", "0.03ps"),
+        ("check", scene, *there),
+        ("verify", scene, *there),
+        ("check", scene, *there, *changes),
+        ("check", scene, "--engine", "lammps", "--tilt", "3"),
+        ("export", scene, "--to", "mirror", "-o", "exported"),
+        ("schema",),
+        ("run", "--help"),
+        ("run", scene, *there, "-o", "wrong"),
+    ]
+    errors = [0.0] * 9 + [0.1]
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "script.py"), str(tmp_path)],
+        input=json.dumps([[e, [*map(str, c)]] for e, c in zip(errors, commands, strict=True)]),
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
     )
+    assert done.returncode == 0, done.stderr
+    results = json.loads(done.stdout.splitlines()[-1])
+    assert [code for code, _, _ in results] == [0, 0, 0, 0, 2, 2, 0, 0, 0, 2], results
+    ran, _, checked, _, refused, foreign, _, schema, text, wrong = results
+    assert "computed by Mirror tilted by 3" in ran[1]
+    assert '"engine": "Mirror 1.0"' in (tmp_path / "out" / "summary.json").read_text()
+    assert checked[1].rstrip().endswith("Mirror 1.0")
     assert (
         "engine.name = 'mirror': stages.0.thermostat = 'andersen': Mirror has langevin"
-        in refused.stderr
+        in refused[2]
     )
-    refused = run("check", scene, "--engine", "lammps", "--tilt", "3")
-    assert "tilt would do nothing with engine.name = 'lammps'; it is for mirror" in refused.stderr
-    assert run("export", scene, "--to", "mirror", "-o", "exported").returncode == 0
+    assert "tilt would have no effect with engine.name = 'lammps'; it is for mirror" in foreign[2]
     assert (tmp_path / "exported" / "mirror.txt").read_text() == "1 kinds"
-    schema = run("schema").stdout
-    assert '"mirror"' in schema and '"Angle of mirror; default: 2"' in schema
-    text = run("run", "--help").stdout
-    assert "rigidmd, lammps, openmm or mirror" in text and "--tilt N" in text
+    assert '"mirror"' in schema[1] and '"Angle of mirror; default: 2"' in schema[1]
+    assert "rigidmd, lammps, openmm or mirror" in text[1] and "--tilt N" in text[1]
+    assert "mirror and rigidmd do not agree at the start" in wrong[2]

@@ -10,6 +10,7 @@ import io
 import re
 import shutil
 import warnings
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -50,14 +51,14 @@ WARM = {"ensemble": "nvt", "thermostat": "langevin", "friction_translation_per_p
 
 
 class Course(NamedTuple):
-    """The last stage of a run: f looks at n molecules."""
+    """The last stage of a run: f observations at n molecules."""
 
     system: System
     results: Results
     stage: int
     velocity: np.ndarray  # (f, n, 3) Å/ps
     angular: np.ndarray  # (f, n, 3) angular momentum along principal axes; 0 of points
-    sites: np.ndarray  # (f, s, 3) positions, where they were asked for
+    sites: np.ndarray  # (f, s, 3) positions, where they were requested
     site_velocities: np.ndarray  # (f, s, 3)
 
     def __getitem__(self, column: str) -> np.ndarray:
@@ -66,7 +67,7 @@ class Course(NamedTuple):
 
 
 def follow(scene: dict, interval: float, sites: bool = False, folder=".") -> Course:
-    """Run a scene and look at its last stage every `interval` ps."""
+    """Run a scene and observation at its last stage every `interval` ps."""
     last = len(scene["stages"]) - 1
     seen: list[tuple] = []
 
@@ -163,7 +164,7 @@ def squares(course: Course, temperature: float) -> dict[str, np.ndarray]:
 
 
 def kinetic_energies(course: Course) -> dict[str, tuple[np.ndarray, float]]:
-    """Of everything, and of each species: kinetic energies (f,), kJ/mol, and their degrees of
+    """For everything, and of each species: kinetic energies (f,), kJ/mol, and their degrees of
     freedom."""
     model = course.system.model
     kind, freedom = model.species, course.system.freedom_in(course.stage)
@@ -231,10 +232,14 @@ def equipartition_judged(course: Course, temperature: float) -> float:
     return float(np.nanmax(found))
 
 
-@pytest.mark.parametrize("thermostat", THERMOSTATS)
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[] if name == "nitrogen" else pytest.mark.soak) for name in LIQUIDS],
+    ("name", "thermostat"),
+    [
+        pytest.param(
+            *which, marks=[] if which == ("nitrogen", "velocity_rescaling") else pytest.mark.soak
+        )
+        for which in product(LIQUIDS, THERMOSTATS)
+    ],
 )
 def test_kinetic_energies_are_those_of_the_temperature(name, thermostat):
     """Distribution of the kinetic energies of translation and rotation of each species, and
@@ -325,7 +330,7 @@ def ensemble_judged(name: str, one, two, **options) -> float:
         : len(found)
     ]:  # the same follows as differences of temperature and pressure
         told(f"{name}, slope", float(slope), float(error), float(true))
-        assert float(error) < 0.15 * abs(float(true))  # a slope that is not known tells nothing
+        assert float(error) < 0.15 * abs(float(true))  # a slope that is not known shows nothing
     return float(np.max(found))
 
 
@@ -371,7 +376,7 @@ BAROSTATS = {
 def test_volumes_and_enthalpies_at_two_states(barostat):
     """Slopes (p1 - p2)/kT of V, 1/kT1 - 1/kT2 of the enthalpy, and both together of U and V."""
     found = []
-    # Hotter and pressed more, the volume is nearly that of the first: only so the distributions of
+    # Hotter and pressed more, the volume is nearly the value of the first: only so the distributions of
     # both overlap enough.
     for temperature, pressure in (
         (200.0, 1000.0),
@@ -514,7 +519,7 @@ def test_dipoles_at_a_long_step_by_hybrid_monte_carlo(duration, largest):
 # Liquids and crystals at a pressure.
 
 PRESSURE_UNIT = DEPTH * BOLTZMANN / DIAMETER**3 / BAR  # bar
-#: Of Mecke's equation of state at T* = 2 and p* = 2.013: density, residual energy; what is taken as
+#: From Mecke's equation of state at T* = 2 and p* = 2.013: density, residual energy; what is taken as
 #: its own uncertainty.
 DENSITY, ENERGY, UNCERTAIN = 0.458, -10.900, (5e-4, 0.01)
 
@@ -588,7 +593,7 @@ def test_a_liquid_has_the_density_and_compressibility_of_its_equation_of_state()
 
 @pytest.mark.soak
 def test_a_piston_keeps_the_mean_pressure():
-    """nph: over time the pressure is the one asked for."""
+    """nph: over time the pressure is the one requested."""
     warm = WARM | {"temperature_K": 200.0, "timestep_fs": 4.0, "duration_ps": 10.0}
     nph = {"ensemble": "nph", "pressure_bar": 1000.0, "timestep_fs": 2.0, "barostat_time_ps": 0.5}
     forces = {"cutoff_A": 6.3, "truncation": "smooth_switch", "tail_correction": True}
@@ -631,7 +636,7 @@ def crystal(folder, *stages: dict, stretched: np.ndarray | None = None) -> dict:
 
 
 def pressed(coupling: str, pressure: object, duration: float) -> tuple[dict, dict]:
-    """Two stages at a pressure: to come to it, to look."""
+    """Two stages at a pressure: to come to it, to observe."""
     stage = {
         "ensemble": "npt",
         "pressure_bar": pressure,
@@ -671,7 +676,7 @@ def test_a_crystal_has_the_same_edges_whichever_way_they_move(tmp_path):
 
 @pytest.mark.soak
 def test_a_crystal_gives_way_to_a_shear_as_its_elastic_constant_says(tmp_path):
-    """Under a pressure xy the cell leans the other way, by P_xy/C; C from the stress of a cell that
+    """Under a pressure xy the cell tilts the other way, by P_xy/C; C from the stress of a cell that
     is held sheared, and from how an unstressed cell fluctuates."""
 
     def lean(pressure, duration):

@@ -1,4 +1,4 @@
-"""Faults from outside: disks that fill, folders that go, signals, streams that are closed, damaged
+"""Errors from outside: disks that fill, folders that go, signals, streams that are closed, damaged
 files.
 
 Whatever happens, a run ends with one sentence, and what it has written before can be read and gone
@@ -51,7 +51,7 @@ LONG = ("--set", "stages.0.duration_ps=1000", "--set", "watch.stable_step=false"
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
-    """A scene; a run of it, in `whole` beside it."""
+    """A scene; a run of it, in `whole` next to it."""
     path = tmp_path_factory.mktemp("scene") / "water.toml"
     path.write_text(SCENE)
     assert cli.main(["run", str(path), "-o", str(path.parent / "whole"), "--threads", "1"]) == 0
@@ -102,7 +102,7 @@ def same(scene: Path, folder: Path) -> bool:
 
 @pytest.fixture
 def disk(tmp_path) -> Iterator:
-    """A function that makes a small file system of so many kB; its folder."""
+    """A function that makes a small file system of this many kB; its folder."""
     place = tmp_path / "disk"
     place.mkdir()
 
@@ -131,7 +131,7 @@ def disk(tmp_path) -> Iterator:
     ],
 )
 def test_a_disk_that_fills(size, scene, disk, tmp_path):
-    """The run ends with a sentence; with room again it goes on to the same bits."""
+    """The run ends with a sentence; with workspace again it continues to the same bits."""
     place = disk(size)
     done = ran(command(scene, place / "run", *LONG))
     said = done.stderr.decode()
@@ -213,7 +213,7 @@ def test_a_poor_environment(changed, scene, tmp_path):
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
-    assert b"orthogonality" in done.stdout
+    assert b"rigidmd view" in done.stdout
     assert same(scene, folder)
 
 
@@ -336,7 +336,7 @@ def test_what_a_library_makes_an_error_of_another_type_is_reported(of, scene, mo
 
 
 def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:
-    """What a command would go on with after reading a file of a run. Raises RigidMDError."""
+    """What a command would continue with after reading a file of a run. Raises RigidMDError."""
     if name == FINAL:
         found = read_state(folder / name)
         arrays = {
@@ -362,7 +362,7 @@ def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:
 
 @pytest.mark.parametrize("times", [25, pytest.param(1000, marks=pytest.mark.soak)])
 def test_damaged_files_of_a_run(times, scene, tmp_path):
-    """Flipped and cut files are refused by name or give way to the checkpoint before; or the damage
+    """Flipped and cut files are rejected by name or give way to the checkpoint before; or the damage
     changes nothing."""
     names = [CHECKPOINT, PREVIOUS, FINAL, LOG, TRAJECTORY]
     whole = {name: read_back(scene.parent / "whole", name) for name in names}

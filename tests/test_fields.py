@@ -7,7 +7,8 @@ from math import inf, pi, sqrt
 
 import numpy as np
 import pytest
-from support import edited, move, observe, run_with_files, small_scene
+from changed_package import edited, run_with_files
+from support import move, observe, small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
@@ -50,7 +51,7 @@ DUMBBELL = [
 
 
 def alone(counts, fields, box=None, **sections):
-    """The system, engine, and start, turned anew, of molecules of these sites that only fields act
+    """The system, engine, and start, rotated again, of molecules of these sites that only fields act
     on."""
     kinds = {
         "kite": KITE,
@@ -196,7 +197,7 @@ def test_a_dipole_turns_towards_the_field():
     size = np.linalg.norm(mu) * ELEMENTARY_CHARGE * AVOGADRO * 1e-2  # e Å times 1 V/nm
     assert np.linalg.norm(mu) / DEBYE == pytest.approx(2.351, abs=1e-3)
     for theta in (0.0, 0.4, pi / 2, pi):
-        # a turn that carries mu into the xz plane, theta from z
+        # a rotation that carries mu into the xz plane, theta from z
         axis = np.cross(mu, [0, 0, 1.0])
         upright = from_vector(
             (axis / np.linalg.norm(axis) * np.arccos(mu[2] / np.linalg.norm(mu)))[None]
@@ -293,7 +294,7 @@ RUNS = {
 
 
 def conserved_along(kind, scheme, dt):
-    """Energy less books after every step (u Å²/ps²), and how far the kinetic energy ranges."""
+    """Energy less ledger after every step (u Å²/ps²), and how far the kinetic energy ranges."""
     counts, fields, span, _ = RUNS[kind]
     system, engine, state = alone(counts, fields)
     draw_momenta(system.model, state, 300.0, np.random.default_rng(3))
@@ -321,8 +322,8 @@ def test_energy_less_work_is_conserved_to_the_order_of_the_scheme(kind, name):
 
 
 def test_a_field_that_oscillates_does_work_that_is_booked():
-    """Without the books the energy is not conserved at all; and a charge at rest gains what E0²/2 m
-    w² says."""
+    """Without the ledger the energy is not conserved at all; and a charge at rest gains what E0²/2 m
+    w² states."""
     counts, fields, span, dt = RUNS["oscillating"]
     system, engine, state = alone(counts, fields)
     before = observe(system, engine, state).energy
@@ -470,7 +471,7 @@ def test_threads_change_no_bit():
         move(engine, state, VERLET, 0.0005, 5)
         found.append((*state, observe(system, engine, state).potential))
     assert all(np.array_equal(a, b) for a, b in zip(*found, strict=True))
-    assert found[0][7].any()  # the books
+    assert found[0][7].any()  # the ledger
 
 
 def test_a_start_from_nothing_stands_between_walls():
@@ -593,12 +594,12 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         (
             {"electric_frequency_per_ps": 1.0},
             {},
-            "electric_frequency_per_ps would do nothing without electric_V_per_nm",
+            "electric_frequency_per_ps would have no effect without electric_V_per_nm",
         ),
         (
             {"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_phase_deg": 90.0},
             {},
-            "electric_phase_deg would do nothing without electric_frequency_per_ps",
+            "electric_phase_deg would have no effect without electric_frequency_per_ps",
         ),
         (
             {"electric_V_per_nm": [0.0, 0.0, 1.0], "electric_frequency_per_ps": 300.0},
@@ -608,7 +609,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         (
             {"electric_V_per_nm": [0.0, 0.0, 1.0]},
             {"molecules": [{"model": "argon", "count": 3}]},
-            "fields.electric_V_per_nm would do nothing: no molecule that moves has a charge",
+            "fields.electric_V_per_nm would have no effect: no molecule that moves has a charge",
         ),
         (
             {"electric_V_per_nm": [0.0, 1.0]},
@@ -633,7 +634,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         (
             {"walls": [LJ | {"stiffness_kJ_mol_A2": 1.0}]},
             {},
-            "fields.walls.0: stiffness_kJ_mol_A2 would do nothing with kind = 'lj93'",
+            "fields.walls.0: stiffness_kJ_mol_A2 would have no effect with kind = 'lj93'",
         ),
         (
             {"walls": [{key: LJ[key] for key in ("axis", "kind", "positions_A")}]},
@@ -691,7 +692,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         (
             {"restraints": [{"stiffness_kJ_mol_A2": [0.0, 0.0, 0.0]}]},
             {},
-            "stiffness_kJ_mol_A2: is 0: it would do nothing",
+            "stiffness_kJ_mol_A2: is 0: it would have no effect",
         ),
         (
             {"restraints": [HELD | {"molecules": "3-1"}]},
@@ -1012,12 +1013,12 @@ def test_a_restrained_distance_in_a_run():
         (PAIR | {"between": [2, 2]}, "between: a molecule is named twice"),
         (PAIR | {"between": [[1, 2], [2, 3]]}, "between: a molecule is named twice"),
         (PAIR | {"distance_A": None}, "between needs distance_A"),
-        (PAIR | {"between": None}, "distance_A would do nothing without between"),
+        (PAIR | {"between": None}, "distance_A would have no effect without between"),
         (
             PAIR | {"stiffness_kJ_mol_A2": [1.0, 1.0, 2.0]},
             "stiffness_kJ_mol_A2 has one number for a distance",
         ),
-        (PAIR | {"position_A": [1.0, 1.0, 2.0]}, "position_A would do nothing with between"),
+        (PAIR | {"position_A": [1.0, 1.0, 2.0]}, "position_A would have no effect with between"),
         (PAIR | {"distance_A": 9.5}, "may come near half the smallest height of the box, 10 Å"),
         (
             PAIR | {"distance_A": 8.0, "stiffness_kJ_mol_A2": 0.01},

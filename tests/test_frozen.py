@@ -16,7 +16,7 @@ from rigidmd.scene import Scene
 
 CALORIE = 4.184
 VERLET = SCHEMES["velocity_verlet"]
-# kcal/mol, Å: HOWTO.json beside the data
+# kcal/mol, Å: HOWTO.json next to the data
 WELLS = {1: (0.02, 2.5), 2: (0.005, 1.0), 3: (0.02, 3.2), 4: (0.015, 3.1), 5: (0.015, 3.1)}
 SPECIAL = {(2, 4): (0.005, 0.5)}
 
@@ -54,7 +54,7 @@ def columns(path, key):
 
 @pytest.mark.parametrize("case", ["small", "single"])
 def test_rigid_bodies_among_frozen_atoms_follow_lammps(reference, case):
-    """8 steps of 0.25 fs. The cut-off of 8 Å exceeds half the box of 15 Å, so the box stands there
+    """8 steps of 0.25 fs. The cutoff of 8 Å exceeds half the box of 15 Å, so the box stands there
     eight times."""
     folder = reference / "lammps_rigid"
     owner, kind, mass, position, velocity = fourmol(folder)
@@ -191,7 +191,7 @@ def test_a_run_among_frozen_molecules_keeps_its_energy(tmp_path):
     assert results["momentum"][-1] > 1  # walls push: it is not kept, and not taken out
     assert results.summary["degrees_of_freedom"] == 120
     walls = slice(20, None)
-    # relief of the lattice moved only what may move
+    # overlap removal of the lattice moved only what may move
     assert (results.state.position[walls] == simulation.system.state.position[walls]).all()
 
 

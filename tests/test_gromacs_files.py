@@ -24,7 +24,7 @@ STAGES = [{"duration_ps": 1e-5, "timestep_fs": 0.001}]
 FINE = {"electrostatics": "pme", "ewald_alpha_per_A": 0.5, "pme_order": 5, "pme_grid": [64] * 3}
 PAIRS = [{"sites": ["OW", "AR"], "sigma_A": 3.3, "epsilon_kJ_mol": 0.9}]
 WATER = {"spce": 12, "argon": 4}
-#: Without waves: energies are those of the oracle, which compiles nothing.
+#: Without k-vectors: energies are the values of the oracle, which compiles nothing.
 PLAIN = {
     "reaction_field": {"truncation": "shift"},
     **{
@@ -102,7 +102,7 @@ def test_endings(case, tmp_path):
 
 
 def nudged(system):
-    """The start, with molecules moved a little off their places and turned anew."""
+    """The start, with molecules moved a little off their positions and rotated again."""
     rng, state = np.random.default_rng(3), system.state.copy()
     state.position[:] += 0.2 * rng.standard_normal(state.position.shape)
     state.rotation[:] = random_rotations(rng, len(state.rotation))

@@ -6,7 +6,8 @@ import gsd.hoomd
 import numpy as np
 import pytest
 from scenes import FORTY_WATERS, NPT, NVT, forty_waters
-from support import same_after_stops, small_scene
+from stops import same_after_stops
+from support import small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.errors import OutputError, SceneError

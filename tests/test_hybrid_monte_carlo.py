@@ -52,7 +52,7 @@ def test_the_weights_of_every_integrator_have_the_mean_one(name):
 
 def test_a_rejected_trajectory_leaves_no_trace():
     """Positions and orientations return to the same bits, momenta to the negative of those at the
-    start, which a refreshment lost in rounding leaves as they were; and the forces are those of the
+    start, which a refreshment lost in rounding leaves as they were; and the forces are the values of the
     start."""
     system, engine, state = built(
         MIXTURE,
@@ -86,7 +86,7 @@ def test_a_rejected_trajectory_leaves_no_trace():
     "pressed", [{}, {"ensemble": "npt", "pressure_bar": 100.0, "barostat_interval_ps": 0.25}]
 )
 def test_energy_less_heat_and_work_is_conserved(pressed):
-    """Accepted errors of the energy are heat, so that they are no drift; rejected ones leave none,
+    """Accepted errors of the energy are heat, and not a drift; rejected ones leave none,
     also if the next move of the box needs the virial."""
     stage = {"timestep_fs": 50.0, "trajectory_steps": 5, "duration_ps": 20.0} | pressed
     forces = {"cutoff_A": 5.0, "electrostatics": "none", "tail_correction": False}
@@ -150,11 +150,11 @@ def test_auto_chooses_step_and_length():
     ("changes", "message"),
     [
         ({"integrator": "baoab"}, "baoab contains a thermostat of its own"),
-        ({"integrator": "auto", "bias_kT": 0.01}, "bias_kT would do nothing"),
+        ({"integrator": "auto", "bias_kT": 0.01}, "bias_kT would have no effect"),
         ({"momentum_refreshment": 0.0}, "momentum_refreshment"),
         (
             {"thermostat": "langevin", "trajectory_steps": 10},
-            "trajectory_steps would do nothing with langevin",
+            "trajectory_steps would have no effect with langevin",
         ),
         ({"trajectory_steps": 0}, "trajectory_steps"),
     ],
@@ -189,15 +189,15 @@ def test_fields_that_depend_on_time_are_refused():
 
 @pytest.mark.parametrize("name", ["velocity_verlet", "position_verlet", GRADIENT])
 def test_a_trajectory_that_diverges_is_rejected(name):
-    """Its step throws molecules out of all numbers. The run goes on from the start of the
-    trajectory, a rejection is no drift, and a note tells of few trajectories too."""
+    """Its step throws molecules out of all numbers. The run continues from the start of the
+    trajectory, a rejection is not a drift, and a note shows of few trajectories too."""
     stage = {"integrator": name, "timestep_fs": 3000.0, "trajectory_steps": 4, "duration_ps": 48.0}
     watch = {"move": False, "energy": False, "kick": False, "turn_rad": False}
     results, simulation = sampled(
         stage, {"nitrogen_trappe": 12, "argon": 4}, 13.0, 12.0, watch=watch
     )
     start = Simulation(simulation.scene)
-    start.start()
+    start._start()
     assert np.array_equal(results.state.position, start.state.position)
     assert results["acceptance"][1:].tolist() == [0.0] * 4
     assert np.isfinite(results["abs_dH_kT"][1:]).all()
@@ -276,7 +276,7 @@ def test_an_exception_of_a_python_force_ends_the_run():
 
 
 def test_every_metropolis_test_has_its_own_random_number():
-    """Of many tests of the same trajectory, with the same dH, a fraction exp(-dH/kT) is
+    """For many tests of the same trajectory, with the same dH, a fraction exp(-dH/kT) is
     accepted."""
     stages = [HYBRID | {"timestep_fs": 40.0, "trajectory_steps": 5, "duration_ps": 1.0} | KEPT]
     system, engine, state = built(MIXTURE, 12.0, forces={"cutoff_A": 5.0}, stages=stages)

@@ -26,7 +26,7 @@ from rigidmd.studies.joint_fit import (
 COUNT, FREEDOM, TEMPERATURE, PRESSURE = 50, 247, 120.0, 400.0
 THERMAL = GAS_CONSTANT * TEMPERATURE
 STEPS = (6.0, 10.0, 14.0)
-#: Of potential energy per molecule, volume, density, kinetic energy, and of sums of squares.
+#: For potential energy per molecule, volume, density, kinetic energy, and of sums of squares.
 MEANS = np.array([-5.0, 3.0, 0.8, FREEDOM * THERMAL / 2, 9000.0, 5000.0])
 SIZES = np.array([0.1, 0.1, -0.1 * 0.8 / 3, 11.0, 900.0, 500.0])
 CORRELATIONS = np.array(
@@ -98,7 +98,7 @@ def test_pulls_of_joint_limits_have_unit_width(
     has_barostat, correction, reads_kinetic, steps, replicas
 ):
     """(limit - truth)/error of limits, with the errors of independent fits or smaller ones; slopes
-    and responses are those of the process."""
+    and responses are the values of the process."""
     rng, truth = (
         np.random.default_rng(7),
         dict(zip((POTENTIAL, VOLUME, DENSITY), MEANS, strict=False)),
@@ -203,7 +203,7 @@ NPT = {"ensemble": "npt", "temperature_K": 90.0, "pressure_bar": 1.0}
         (NPT | {"barostat": "monte_carlo"}, ""),
         ({}, "it is for nvt and npt, and the stage is nve"),
         (NVT | {"temperature_K": [90.0, 100.0]}, "temperature or pressure change"),
-        (NVT | {"thermostat": "hybrid_monte_carlo"}, "has no error of the step"),
+        (NVT | {"thermostat": "hybrid_monte_carlo"}, "has no time-step error"),
         (NVT | {"integrator": "position_verlet"}, "the integrator is position_verlet"),
         (NVT | {"integrator": "srkn_4"}, "the integrator is srkn_4"),
         (NPT | {"pressure_coupling": "anisotropic"}, "not 'isotropic'"),

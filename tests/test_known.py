@@ -150,7 +150,7 @@ def test_free_asymmetric_top_over_many_periods(name):
     np.testing.assert_allclose(omega[0], omega0, atol=1e-15)
     if period < 100:
         np.testing.assert_allclose(omega[[3, 4, 5, 6]], omega[[0, 1, 2, 0]], atol=1e-11)
-        # every period turns Q by the same lab rotation, a hundred by its hundredth power
+        # every period rotates Q by the same lab rotation, a hundred by its hundredth power
         once = known.free_asymmetric_top(inertia, START, omega0, [period])[1][0] @ START.T
         np.testing.assert_allclose(
             np.linalg.matrix_power(once, 100) @ START, rotation[3], atol=1e-12
@@ -304,7 +304,7 @@ def test_fast_heavy_top(numbers):
     np.testing.assert_allclose((-x, -y, z), want, atol=3e-13)
 
 
-# Frames that turn
+# Frames that rotate
 
 
 @pytest.mark.parametrize("size", [0.0, 7.292e-5, 0.3, 2.0])
@@ -330,7 +330,7 @@ def test_rotating_fall(size):
 
 
 def test_eastward_drift():
-    """From rest: W g t^3 cos(latitude) / 3 to the east, for a frame that turns slowly."""
+    """From rest: W g t^3 cos(latitude) / 3 to the east, for a frame that rotates slowly."""
     spin, latitude, t = 7.292e-5, 0.8, 4.0
     axis = spin * np.array([0.0, np.cos(latitude), np.sin(latitude)])
     x, _ = known.rotating_fall(axis, (0, 0, -9.81), (0, 0, 0), (0, 0, 0), [t])

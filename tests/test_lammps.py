@@ -1,5 +1,5 @@
 """LAMMPS as an engine: both compute the same, a run comes back into the same folder, and what
-cannot be is refused."""
+cannot be is rejected."""
 
 import json
 import os
@@ -99,7 +99,7 @@ RANKS = [1, pytest.param(2, marks=pytest.mark.soak)]
 
 @pytest.mark.parametrize("ranks", RANKS)
 def test_a_short_run_is_the_same(ranks):
-    """Both turn bodies by the same composition of rotations: what is left is the constants of
+    """Both rotation bodies by the same composition of rotations: what is left is the constants of
     LAMMPS."""
     scene = small_scene(
         {"spce": 20, "nitrogen": 4, "argon": 2},
@@ -153,7 +153,7 @@ def test_chunks_are_the_whole_and_a_state_given_again_goes_on():
     for until in (5, 12, 20):
         engine.advance(parts, row, 0.001, until)
         if until == 12:
-            engine.forget()  # it is given the state anew: rounding
+            engine.forget()  # it is given the state again: rounding
     np.testing.assert_allclose(parts.position, whole.position, atol=1e-10)
     assert (
         parts.step[NOW] == 20
@@ -222,7 +222,7 @@ def test_a_run_is_one_like_any_other(ranks, scene, tmp_path, capsys):
         )
     capsys.readouterr()
     assert cli.main(["compare", str(folder), str(folder)]) == 0
-    # the folder knows its engine: it goes on there, from the state of the end
+    # the folder knows its engine: it continues there, from the state of the end
     assert cli.main(["resume", str(folder), "--until", "0.1ps"]) == 0
     assert read_record(folder).columns["step"][-1] == 80
     assert json.loads((folder / "summary.json").read_text())["engine"].startswith("LAMMPS 20")
@@ -269,7 +269,7 @@ def test_an_exported_folder_runs_by_itself(tmp_path):
 
 
 def _start_potential(scene: Path) -> float:
-    found = Simulation(Scene.read(scene)).start_energy(100.0, "kJ/mol")
+    found = Simulation(Scene.read(scene))._start_energy(100.0, "kJ/mol")
     return found["potential"]
 
 
@@ -293,7 +293,7 @@ def _start_potential(scene: Path) -> float:
             ["stages.0.ensemble=npt", "stages.0.pressure_bar=1", "stages.0.barostat=monte_carlo"],
             "has its own for rigid",
         ),
-        (["engine.platform=CUDA"], "platform would do nothing with engine.name = 'lammps'"),
+        (["engine.platform=CUDA"], "platform would have no effect with engine.name = 'lammps'"),
         (["engine.ranks=0"], "engine.ranks"),
         (["engine.ranks=1000"], "engine.ranks: 1000 ranks for "),
         ([f"engine.ranks={2**31}"], "some would have nothing to move; use fewer"),

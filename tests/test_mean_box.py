@@ -4,7 +4,8 @@ stops, error messages."""
 import numpy as np
 import pytest
 from scipy.stats import t as student
-from support import same_after_stops, small_scene
+from stops import same_after_stops
+from support import small_scene
 
 from rigidmd.commands import cli
 from rigidmd.errors import SceneError
@@ -40,7 +41,7 @@ def marginal_standard_error(values):
 
 
 def samples_per_independent_one(values):
-    """By the initial monotone sequence of pairs of correlations, whose mean is that of the samples;
+    """By the initial monotone sequence of pairs of correlations, whose mean is the value of the samples;
     by direct sums."""
     n, x = len(values), values - values.mean()
     correlation = [float(x[: n - k] @ x[k:] / (x @ x)) for k in range(n)]
@@ -154,7 +155,7 @@ def test_the_start_of_the_last_stage_is_in_the_mean_box():
             [NPT | {"pressure_bar": [1.0, 500.0]}, MEAN],
             r"stages.1.volume .*; stages.0 is npt, and its set point changes",
         ),
-        ([NPT | {"volume": "mean"}], "volume would do nothing in an npt stage"),
+        ([NPT | {"volume": "mean"}], "volume would have no effect in an npt stage"),
         ([NPT, MEAN | {"volume": "last"}], "volume"),
     ],
 )
@@ -189,4 +190,4 @@ def test_a_scene_that_begins_with_a_minimisation_settles_before_any_sample():
     simulation = Simulation(
         small_scene({"argon": 40}, 20.0, stages=stages, start={"temperature_K": 90.0})
     )
-    assert np.isfinite(simulation.settle().position).all()
+    assert np.isfinite(simulation._settle().position).all()

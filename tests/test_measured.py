@@ -1,4 +1,4 @@
-"""What is measured of liquids beside published values. Minutes each: the soak tier."""
+"""What is measured of liquids next to published values. Minutes each: the soak tier."""
 
 import numpy as np
 import pytest

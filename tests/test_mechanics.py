@@ -33,7 +33,7 @@ def turn_all(rotor, species, rotation, angular_momentum, h, together):
 @pytest.mark.parametrize("moments", ["of every kind", "of two axes", "round"])
 @pytest.mark.parametrize("longest", [0.2, 3.0])
 def test_many_bodies_turn_together_as_one_by_one(moments, longest):
-    """All six orders of axes, symmetric, linear and spherical bodies; short turns, and some too
+    """All six orders of axes, symmetric, linear and spherical bodies; short rotates, and some too
     long for the series."""
     rng = np.random.default_rng(4)
     inertia = {
@@ -255,7 +255,7 @@ def test_the_exact_rotor_is_exact(inertia, omega, h, steps):
     q, l = start.copy(), (inertia * omega)[None].copy()  # noqa: E741
     spin(ExactRotor(*split_rotor(inertia[None])), q, l, h, steps)
     spun, turned = known.free_asymmetric_top(inertia, start[0], omega, np.array([h * steps]))
-    # a rounded L turns a nearly linear body about its axis by so much more
+    # a rounded L rotates a nearly linear body about its axis by so much more
     allowed = 1e-13 + 4e-15 * inertia.max() / inertia.min()
     assert np.abs(q[0] - turned[0]).max() < allowed
     assert np.abs(l[0] / inertia - spun[0]).max() < allowed * np.abs(omega).max()

@@ -1,5 +1,5 @@
 """Minimisation in the rigid degrees of freedom and the cell: gradients, known minima, what a stage
-of it says and keeps."""
+of it states and keeps."""
 
 import csv
 import json
@@ -19,6 +19,7 @@ from rigidmd.core.state import NOW, State, state_of
 from rigidmd.dynamics.model import mobile
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
+from rigidmd.figures.panels import panels
 from rigidmd.io.trajectory import read_frames
 from rigidmd.run import Every, Simulation
 from rigidmd.run import minimise as minimise_module
@@ -30,7 +31,6 @@ from rigidmd.scene import Scene
 from rigidmd.scene.models import load_model
 from rigidmd.studies.accuracy.accuracy import measure_accuracy
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
-from rigidmd.view.plots import panels
 from rigidmd.view.run_page import write_report
 
 MIXTURE = {"argon": 4, "nitrogen": 4, "spce": 6}
@@ -67,7 +67,7 @@ def minimum_of(scene, state: State | None = None):
     ],
 )
 def test_the_gradient_is_that_of_the_enthalpy(coupling, electrostatics):
-    """Points, linear and asymmetric molecules, shifts, turns and all components of a leaning
+    """Points, linear and asymmetric molecules, shifts, rotates and all components of a tilting
     cell."""
     asked = {"pressure_bar": ASKED[coupling], "pressure_coupling": coupling} if coupling else {}
     scene = small_scene(
@@ -164,7 +164,7 @@ def test_lennard_jones_clusters(points, energy):
 
 
 def pair_energy(model: str, x: np.ndarray) -> float:
-    """Two rigid molecules (kJ/mol), the first at the origin: x (9,), place and rotation vectors of
+    """Two rigid molecules (kJ/mol), the first at the origin: x (9,), position and rotation vectors of
     both. Plain NumPy."""
     m = load_model(model)
     sites = m.positions_body
@@ -204,7 +204,7 @@ def test_the_water_dimer(model, published):
 
 
 def test_fcc_argon_has_its_lattice_constant_at_no_pressure():
-    """Shells within the cut-off: 2 (sigma/a)^6 S12 = S6 with S_p = sum (r/a)^-p."""
+    """Shells within the cutoff: 2 (sigma/a)^6 S12 = S6 with S_p = sum (r/a)^-p."""
     cutoff, n = 8.66, 4
     near = np.array(list(np.ndindex(7, 7, 7))) - 3
     sites = (
@@ -311,7 +311,7 @@ def test_the_cell_takes_the_pressure_asked_for(coupling):
 
 
 def test_it_begins_from_overlaps():
-    """Two pairs of molecules in one another, one of them a hundredth of a diameter apart: 1e24
+    """Two pairs of molecules in one another, one of them a hundredth of a diameter from each other: 1e24
     wells."""
     scene = small_scene({"argon": 10, "spce": 10}, 18.5, stages=[stage_of()])
     system, _, state = shaken(build(scene), 1, spread=0.1)
@@ -377,7 +377,9 @@ def test_what_it_keeps_and_what_it_books():
     conserved = results["conserved"]
     taken = results["potential"][1] - results["potential"][2]
     assert taken > 100
-    assert conserved[2] == pytest.approx(conserved[1], abs=1e-9 * taken)  # it is booked as work
+    assert conserved[2] == pytest.approx(
+        conserved[1], abs=1e-9 * taken
+    )  # it is accounted for as work
     assert results["work"][1] - results["work"][2] == pytest.approx(taken, rel=1e-9)
     drift = results["drift"]
     assert np.isnan(drift[results["stage"] == 1]).all()
@@ -466,19 +468,19 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
 @pytest.mark.parametrize(
     ("stages", "more", "expected"),
     [
-        ([stage_of(duration_ps=1.0)], {}, "duration_ps would do nothing in a minimise stage"),
-        ([stage_of(timestep_fs=1.0)], {}, "timestep_fs would do nothing"),
-        ([stage_of(temperature_K=300.0)], {}, "temperature_K would do nothing"),
-        ([stage_of(integrator="srkn_6")], {}, "integrator would do nothing"),
+        ([stage_of(duration_ps=1.0)], {}, "duration_ps would have no effect in a minimise stage"),
+        ([stage_of(timestep_fs=1.0)], {}, "timestep_fs would have no effect"),
+        ([stage_of(temperature_K=300.0)], {}, "temperature_K would have no effect"),
+        ([stage_of(integrator="srkn_6")], {}, "integrator would have no effect"),
         (
             [stage_of(pressure_coupling="flexible")],
             {},
-            "would do nothing in a minimise stage without pressure_bar",
+            "would have no effect in a minimise stage without pressure_bar",
         ),
         (
             [stage_of(pressure_limit_bar=2.0)],
             {},
-            "would do nothing in a minimise stage without pressure_bar",
+            "would have no effect in a minimise stage without pressure_bar",
         ),
         ([stage_of(pressure_bar=(1.0, 2.0))], {}, "one pressure, not one that changes"),
         ([stage_of(pressure_bar=(1.0, 2.0, 3.0))], {}, "pressure_coupling = 'anisotropic'"),
@@ -487,7 +489,7 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
         (
             [{"duration_ps": 1.0, "force_limit_kJ_mol_A": 0.2}],
             {},
-            "force_limit_kJ_mol_A would do nothing in an nve stage",
+            "force_limit_kJ_mol_A would have no effect in an nve stage",
         ),
         ([{"ensemble": "nve"}], {}, r"stages.0.duration_ps: is missing"),
         (
@@ -568,7 +570,8 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
     )
     assert "1: cell: to a minimum of the enthalpy at 1 bar, the cell isotropic" in said
     assert "torques of 0.1 kJ/mol and a pressure within 1 bar; at most 5000 iterations" in said
-    assert main(["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]) == 0
+    command = ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out"), "-v"]
+    assert main(command) == 0
     said = capsys.readouterr().out
     assert "minimise: converged after" in said
     assert "cell: converged after" in said
@@ -589,7 +592,7 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
     assert cell["density_g_cm3"] == pytest.approx(float(rows[2]["Density (g/mL)"]))
     assert cell["density_g_cm3"] != pytest.approx(0.9, rel=1e-3)
     assert 40 * kept["minimum"]["energy_after_kJ_mol_per_molecule"] == pytest.approx(energies[1])
-    assert nvt["steps"] == 10
+    assert nvt["steps"] == 8  # of 2.5 fs, the default that divides the intervals
     assert nvt["temperature_K"] > 0
     assert (tmp_path / "out" / "energy.png").is_file()
     again = Simulation(Scene.read(tmp_path / "out" / "scene.toml")).run()
@@ -726,7 +729,7 @@ def test_a_minimum_alone_has_one_frame(tmp_path):
     assert u.atoms.positions == pytest.approx(results.state.position, abs=6e-3)
     write_report(tmp_path / "out", tmp_path / "report.html")
     record = read_record(tmp_path / "out")
-    assert panels(record) == []
+    assert panels(record.system, record.columns) == []
     assert not record.moving.any()
 
 
@@ -808,7 +811,7 @@ def test_a_pressure_is_found_in_double_precision():
 
 
 def test_where_mixed_precision_stalls_double_precision_continues(monkeypatch):
-    """Also from a start whose energy single precision cannot hold: two sites 0.001 Å apart."""
+    """Also from a start whose energy single precision cannot hold: two sites 0.001 Å from each other."""
     scene = small_scene({"argon": 10}, 18.5, stages=[stage_of()], precision="mixed")
     system, _, state = shaken(build(scene), 1, spread=0.1)
     overlapping = state.copy()
@@ -842,11 +845,11 @@ def test_molecules_in_a_uniform_field_alone_have_torques_and_no_forces(field):
     }
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        removal = Simulation(small_scene({"spce": 30}, None, **sections), warn=str).start()
+        removal = Simulation(small_scene({"spce": 30}, None, **sections), warn=str)._start()
     assert removal.steps > 0
     assert removal.excess <= 1
     sections["stages"] = [{"duration_ps": 5.0, "timestep_fs": 500.0}]
     with pytest.raises(
         SceneError, match=r"timestep_fs of the first stage is too long for electric"
     ):
-        Simulation(small_scene({"na_spce": 3}, None, **sections), warn=str).start()
+        Simulation(small_scene({"na_spce": 3}, None, **sections), warn=str)._start()

@@ -56,7 +56,7 @@ def rotations(rng, *shape):
 
 
 def mixed(frames=12, breath=0.0, seed=7, counts=COUNTS):
-    """Molecules at random places with random orientations, new ones in each frame; some far outside
+    """Molecules at random positions with random orientations, new ones in each frame; some far outside
     the cell."""
     system = build(small_scene(counts, 20.0, forces={"cutoff_A": 5.0}))
     rng, n = np.random.default_rng(seed), sum(counts.values())
@@ -222,7 +222,7 @@ def test_a_structure_factor_is_the_sum_over_its_sites(name):
         values += np.abs(np.exp(1j * at @ (waves @ own).T).sum(axis=0)) ** 2 / len(at) / len(found)
     bins = (lengths / 0.1).astype(int)
     used = np.unique(bins)
-    assert max(np.bincount(bins)) <= 2 * 24  # so few that none is left out
+    assert max(np.bincount(bins)) <= 2 * 24  # so few that none is omitted
     assert seen["k (1/A)"] == pytest.approx([lengths[bins == b].mean() for b in used])
     assert seen[f"S {name or 'centres'}"] == pytest.approx(
         [values[bins == b].mean() for b in used], rel=1e-9
@@ -486,7 +486,7 @@ def test_the_tail_gives_the_energy_of_a_crystal(name, edge):
 
 
 def test_the_tail_of_another_engine_is_another_number():
-    """Of formulas that other programs evaluate: a wrong tail correction does not agree with
+    """For formulas that other programs evaluate: a wrong tail correction does not agree with
     itself."""
     forces = {"cutoff_A": 5.5, "truncation": "shift", "tail_correction": True}
     system, engine, state = built(COUNTS, 16.0, forces=forces)

@@ -1,5 +1,5 @@
 """The models that come along: published geometry, dipoles and inertia; other isotopes; molecules of
-one's own."""
+user-defined."""
 
 import json
 import re
@@ -32,9 +32,9 @@ DEBYE = 4.80320471  # D in e Å
 ROTATIONAL = 16.857629
 
 # name: kind, degrees of freedom, mass u, dipole D and what it may differ by (the digits of its
-# source), lengths Å, angles. Dipoles are those of the models' own papers, or of Vega & Abascal
-# 2011, Phys. Chem. Chem. Phys. 13, 19663 (water), and where no paper is at hand computed by the
-# formula beside it.
+# source), lengths Å, angles. Dipoles are the values of the models' papers, or of Vega & Abascal
+# 2011, Phys. Chem. Chem. Phys. 13, 19663 (water), and where no paper is available computed by the
+# formula next to it.
 OH, HOH = ("OW", "HW1"), ("HW1", "OW", "HW2")
 MODEL_TABLE = {
     "spc": ("asymmetric", 6, 18.0154, (2.27, 6e-3), {OH: 1.0}, {HOH: 109.47}),
@@ -360,7 +360,7 @@ def test_the_inertia_of_water(name):
     ],
 )
 def test_the_inertia_of_real_molecules(name, constants):
-    """A model that keeps the shape of its molecule turns as it does, within the 3 % that vibration
+    """A model that keeps the shape of its molecule rotates as it does, within the 3 % that vibration
     is worth (of water's plane, whose moments do not add up in the ground state)."""
     m = load_model(name)
     found = ROTATIONAL / m.inertia[m.inertia > 0][: len(constants)]
@@ -397,7 +397,7 @@ def test_charges_in_the_place_of_a_quadrupole(name, quadrupole):
     ("turn", "within"), [("T", 0.006), ("side by side", 0.04), ("slipped", 0.017)]
 )
 def test_how_well_charges_stand_for_a_quadrupole(turn, within):
-    """What the files say: energies of two at 4 Å against those of point quadrupoles (Gray & Gubbins
+    """What the files state: energies of two at 4 Å against those of point quadrupoles (Gray & Gubbins
     1984)."""
     m = load_model("acetylene_2cljq")
     row = np.flatnonzero(m.charges)
@@ -495,7 +495,7 @@ def test_heavy_water():
     across, along = 2 * 2.014 * x**2, 2 * 2.014 * 15.9994 / heavy.mass * y**2
     assert heavy.inertia == pytest.approx(sorted([along, across, along + across]), rel=1e-9)
     assert (heavy.title, heavy.source, heavy.group) == (light.title, light.source, light.group)
-    half = with_masses(light, {"H": 2.014, "HW1": 1.008})  # a name says more than an element
+    half = with_masses(light, {"H": 2.014, "HW1": 1.008})  # a name states more than an element
     assert half.mass == pytest.approx(15.9994 + 2.014 + 1.008)
     assert (heavy.charges == light.charges).all()
 
@@ -515,7 +515,7 @@ def test_isotopes_in_a_scene(tmp_path, capsys):
         Scene.from_dict(data)
 
 
-# molecules of one's own
+# molecules of user-defined
 
 TABLE = """
 title = "aromatic"
@@ -585,7 +585,7 @@ def test_a_geometry_with_a_table_of_parameters_is_the_model(own):
 
 
 def test_what_a_site_says_itself_goes_before_the_table(own):
-    """The scene's own entry, a charge of zero too, and in another unit of energy."""
+    """The scene's entry, a charge of zero too, and in another unit of energy."""
     entry = (
         'sites = [{ name = "H", charge_e = 0.0, sigma_A = 2.5, epsilon_kJ_mol = 0.2 }]\ncount = 8'
     )
@@ -671,7 +671,7 @@ def test_copied_files_do_not_rename_a_species(named, own):
             ('parameters = "aromatic.toml"', ""),
             "a geometry file needs sites, or a file of parameters",
         ),
-        (('file = "benzene.xyz"', 'model = "spce"'), "parameters would do nothing"),
+        (('file = "benzene.xyz"', 'model = "spce"'), "parameters would have no effect"),
         (
             ('"aromatic.toml"', '"aromatic.toml"\nsites = [{ name = "S" }]'),
             "sites: S is not an atom of it",
@@ -791,7 +791,7 @@ def test_a_drawing_is_not_overwritten_unasked(capsys, tmp_path, monkeypatch):
     "name", ["so2", "tip5p", "benzene_opls", "ccl4", "na_spce", "co2_epm2", "methane_trappe"]
 )
 def test_every_kind_of_molecule_can_be_drawn(name, tmp_path):
-    """Every site's name stands in the picture, once, and what is charged says so."""
+    """Every site's name stands in the picture, once, and what is charged states so."""
     assert main(["models", name, "-o", str(tmp_path / "m.svg")]) == 0
     text = (tmp_path / "m.svg").read_text()
     m = load_model(name)
@@ -803,7 +803,7 @@ def test_every_kind_of_molecule_can_be_drawn(name, tmp_path):
 
 
 def test_a_molecule_of_ones_own_is_shown_and_drawn(tmp_path, capsys):
-    """Whatever its sites are called: names are no formulas."""
+    """Whatever its sites are called: names are not formulas."""
     sites = "".join(
         f'[[sites]]\nname = "{name}"\nmass_u = 3.0\nposition_A = [0, 0, {12.0 * k}]\n'
         for k, name in enumerate(("A$b$", "B_{"))
@@ -826,7 +826,7 @@ def test_bonds_are_those_of_chemistry_and_join_everything():
     assert len(named("benzene_opls")) == 12
     assert named("so2") >= {frozenset(("S", "O1")), frozenset(("S", "O2"))}
     assert frozenset(("O1", "O2")) not in named("so2")
-    assert named("ethane_2cljq") >= {frozenset(("C1", "C2"))}  # further apart than a bond
+    assert named("ethane_2cljq") >= {frozenset(("C1", "C2"))}  # further from each other than a bond
     assert len(named("ccl4")) == 4
     assert named("argon") == set()
 

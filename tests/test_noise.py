@@ -1,4 +1,4 @@
-"""Random numbers by counting: known answers, distributions, and that streams are apart."""
+"""Random numbers by counting: known answers, distributions, and that streams are from each other."""
 
 import numpy as np
 import pytest
@@ -80,7 +80,7 @@ def fill_batches(found, key, step):
 
 
 def six_of_each(batches, key, step):
-    """The numbers (molecules, 6) of molecules 0, 1, ... in so many batches."""
+    """The numbers (molecules, 6) of molecules 0, 1, ... in this many batches."""
     found = np.empty((batches, 6 * BATCH))
     fill_batches(found, key, step)
     return found.reshape(batches, 6, BATCH).transpose(0, 2, 1).reshape(-1, 6)

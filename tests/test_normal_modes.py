@@ -1,5 +1,5 @@
 """Normal modes: closed forms, sums over a lattice, differences of an energy in NumPy, counts of
-modes, what is refused."""
+modes, what is rejected."""
 
 import csv
 
@@ -471,10 +471,10 @@ def test_the_layout_of_vectors(mixture):
 
 
 def test_the_lattice_energy_of_a_crystal(tmp_path, capsys):
-    """It does not depend on the number of cells, and is no part of a liquid or of a crystal in a
+    """It does not depend on the number of cells, and is not a part of a liquid or of a crystal in a
     field."""
     cells = [
-        rigidmd.Simulation(crystal(tmp_path, repeat)).start_energy(100.0, "kJ/mol")
+        rigidmd.Simulation(crystal(tmp_path, repeat))._start_energy(100.0, "kJ/mol")
         for repeat in ([2, 2, 2], [3, 2, 2])
     ]
     for found in cells:
@@ -484,7 +484,7 @@ def test_the_lattice_energy_of_a_crystal(tmp_path, capsys):
     assert (
         -8.5 < one < -6.9
     )  # 6.9 kJ/mol is the heat of sublimation, less than this by the zero-point energy
-    liquid = rigidmd.Simulation(small_scene(MIXTURE, 20.0)).start_energy(100.0, "kJ/mol")
+    liquid = rigidmd.Simulation(small_scene(MIXTURE, 20.0))._start_energy(100.0, "kJ/mol")
     assert liquid["lattice_energy_per_molecule"] is None
     assert liquid["potential_per_molecule"] == liquid["potential"] / 10
     scene = tmp_path / "crystal.toml"

@@ -1,4 +1,4 @@
-"""OpenMM as an engine: energies, forces on bodies and trajectories are those of rigidmd's own."""
+"""OpenMM as an engine: energies, forces on bodies and trajectories agree with rigidmd."""
 
 import json
 import subprocess
@@ -168,7 +168,7 @@ def extrapolated(system, make, start, row):
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])
 def test_both_engines_go_the_same_way(platform):
-    """OpenMM turns bodies by keeping distances, another method of order 2: what is left at no step
+    """OpenMM rotates bodies by keeping distances, another method of order 2: what is left at no step
     is the physics."""
     system, _, state = built(MIXTURE | {"argon": 2}, None, seed=3, spread=0.1)
     row = system.scene.stages[0].scheme
@@ -289,8 +289,8 @@ def test_pme_with_ions_and_frozen_molecules():
 
 
 def test_waves_of_ewald_become_a_grid():
-    """OpenMM has splines of order 5: a grid of the accuracy asked for takes the place of other
-    orders and of waves."""
+    """OpenMM has splines of order 5: a grid of the accuracy requested takes the position of other
+    orders and of k-vectors."""
     found = []
     for method in ("ewald", "pme"):
         forces = {
@@ -337,7 +337,7 @@ def staged(kind, duration=1.0, counts=None):
 
 
 def conserved(system, engine, state):
-    """Energy less the heat of baths, u Å²/ps²."""
+    """Energy less the heat of thermostats, u Å²/ps²."""
     potential = sum(t.energy for t in engine.evaluate(state)[1].values())
     return potential + sum(kinetic_energies(system, state)) - state.energy_ledger[HEAT]
 
@@ -362,7 +362,7 @@ def test_stages_repeat_go_on_and_conserve(kind):
     engine.advance(state, row, 1e-3, 100)
     other, again = fresh()
     other.advance(again, row, 1e-3, 60)
-    other.evaluate(again)  # looks leave no trace
+    other.evaluate(again)  # observations leave no trace
     other.advance(again, row, 1e-3, 100)
     resumed, _ = fresh()
     resumed.recall(kept, memory)
@@ -412,10 +412,10 @@ def test_thermostats_keep_the_temperature_of_both_motions(kind):
 
 @pytest.mark.soak
 def test_the_barostat_gives_the_volume_of_an_ideal_gas():
-    """(N + 1) kT/P, of bodies that hardly touch: the sites of a pair exclude 0.02 Å³, of 140 for
+    """(N + 1) kT/P, of bodies that barely touch: the sites of a pair exclude 0.02 Å³, of 140 for
     each molecule.
 
-    The cut-off is short because OpenMM's largest change of the volume is a part of what that was,
+    The cutoff is short because OpenMM's largest change of the volume is a part of what that was,
     not of what it is."""
     stage = (
         {"duration_ps": 1000.0, "timestep_fs": 2.0} | THERMOSTATS["npt"] | {"pressure_bar": 300.0}

@@ -1,4 +1,4 @@
-"""Numbers in another unit are told with the likely cause; shipped models and scenes give no
+"""Numbers in another unit are given with the likely cause; shipped models and scenes give no
 warning."""
 
 import numpy as np

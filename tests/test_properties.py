@@ -1,4 +1,4 @@
-"""Properties that hold for anything, by examples that hypothesis looks for: rotations, rotors,
+"""Properties that hold for anything, by examples that hypothesis observations for: rotations, rotors,
 whole scenes."""
 
 import numpy as np

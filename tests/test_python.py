@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import BODIES, ROOT, contents, small_scene
+from stops import contents
+from support import BODIES, ROOT, small_scene
 
 import rigidmd
 from rigidmd.engines.observables import Observation
@@ -103,7 +104,7 @@ def test_observers_see_the_units_of_the_log():
         assert reading.momentum.shape == (3,)
         assert reading.sample.momentum == pytest.approx(np.linalg.norm(reading.momentum))
         assert reading.sample.pressure_xy == reading.pressure_tensor_bar[0, 1]
-    # forces are the slopes of the energy that is told
+    # forces are the slopes of the energy that is given
     system, engine, state = simulation.system, simulation.engine, simulation.state.copy()
     energy = []
     for shift in (1e-4, -1e-4):
@@ -245,11 +246,11 @@ def test_values_show_what_they_are(tmp_path):
         assert "\n" not in repr(value)
         assert scene.name in value._repr_html_() or value is water
     shown = results._repr_html_()
-    assert "<code>q11</code> <code>q12</code>" in shown
+    assert "<code>q11</code>" in shown and "<code>q12</code>" in shown
     assert "<td>rad/s</td>" in shown
     shown = argon().run()._repr_html_()
     assert "<td><code>potential</code></td><td>kJ/mol</td>" in shown
-    assert "<td>nvt ... nve</td>" in shown
+    assert "<td><code>stage</code></td>" in shown
 
 
 SCRIPT = """import rigidmd
@@ -272,7 +273,7 @@ HOVER = {
     "results.universe()": "Universe",
     "results.state": "State",
     "rigidmd.view.plot(results)": "Picture",
-    "rigidmd.view.show(results)": "StructureWidget | AnimationPage",
+    "rigidmd.view.show(results)": "AnimationPage",
     "results.atoms()": "Atoms",
     "results.atoms(slice(3))": "list[Atoms]",
     'rigidmd.scene_from_atoms(results.atoms(), ["spce"], seed=3)': "MolecularScene",
@@ -280,7 +281,7 @@ HOVER = {
 
 
 def pyright(project):
-    """What pyright says of the project in a folder: its report as a dictionary."""
+    """What pyright states of the project in a folder: its report as a dictionary."""
     command = [
         sys.executable,
         "-m",
@@ -303,7 +304,7 @@ def pyright(project):
 
 
 def findings_in_script(folder, text):
-    """What pyright says of a script, the tutorial and the chapter about it: (severity, line,
+    """What pyright states of a script, the tutorial and the chapter about it: (severity, line,
     message) of each finding."""
     cells = json.loads((ROOT / "systems" / "notebooks" / "tutorial.ipynb").read_text())["cells"]
     chapter = (ROOT / "rigidmd" / "docs" / "tutorials" / "notebook.md").read_text()
@@ -433,7 +434,7 @@ def test_steps_are_the_steps_of_a_run(make, tmp_path):
     assert simulation.step() == 1 and simulation.state.step[0] == 1
     assert seen[0] == 0 and seen[-1] <= 1
     with pytest.raises(RuntimeError, match="the run has begun"):
-        simulation.take_threads(1)
+        simulation._take_threads(1)
     with pytest.raises(OutputError, match="another run is writing"):
         make(tmp_path / "steps", force=True).run()
     assert simulation.step(7) == 7
@@ -555,7 +556,7 @@ def test_a_simulation_takes_what_its_kind_of_scene_has():
         argon(applied={"push": lambda pose: ((0, 0, 0), (0, 0, 0))})
     with pytest.raises(SceneError, match="forces and thermostat: for molecules"):
         heavy_top(forces=[], thermostat=3)
-    for method in ("start", "settle", "atoms"):
+    for method in ("_start", "_settle", "atoms"):
         with pytest.raises(TypeError, match="is a single body; this method is for molecules"):
             getattr(heavy_top(), method)()
 
@@ -672,7 +673,7 @@ def test_a_simulation_cannot_be_pickled_or_copied():
 
 
 def test_messages_name_arguments_of_python_not_options(tmp_path):
-    """Of overrides, sweeps and code that is not trusted."""
+    """For overrides, sweeps and code that is not trusted."""
     path = tmp_path / "argon.toml"
     path.write_text((ROOT / "systems" / "argon.toml").read_text())
     (tmp_path / "spring.py").write_text("x = 3\n")
@@ -703,3 +704,41 @@ def test_messages_name_arguments_of_python_not_options(tmp_path):
             call()
         assert expected in str(caught.value)
         assert "--" not in str(caught.value)
+
+
+def test_a_simulation_takes_the_path_of_a_scene():
+    simulation = Simulation(ROOT / "systems" / "heavy_top_3.toml")
+    assert simulation.scene.name == "heavy_top_3"
+    assert Simulation(str(ROOT / "systems" / "heavy_top_3.toml")).scene == simulation.scene
+    with pytest.raises(TypeError, match=r"rigidmd\.Scene\.from_dict for a dictionary"):
+        Simulation({"body": {}})  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+@pytest.mark.parametrize("count", [10, 1, 2.5])
+def test_run_with_a_number_of_steps_names_step(count):
+    simulation = Simulation(ROOT / "systems" / "heavy_top_3.toml")
+    with pytest.raises(TypeError, match=rf"for {count} steps use step\({count}\)"):
+        simulation.run(count)
+    assert simulation.state.step[0] == 0  # nothing ran
+
+
+def test_a_simulation_shows_what_is_for_users():
+    shown = {name for name in dir(Simulation) if not name.startswith("_")}
+    values = {"scene", "system", "engine", "threads", "state", "observation", "energy", "forces"}
+    verbs = {"run", "step", "stop", "close", "compile", "start_from", "atoms", "path", "notes"}
+    assert shown == values | verbs
+    simulation = Simulation(ROOT / "systems" / "heavy_top_3.toml")
+    assert {name for name in vars(simulation) if not name.startswith("_")} == {"folder"}
+    assert set(dir(rigidmd.analysis)) == set(rigidmd.analysis.__all__)
+
+
+def test_the_reference_has_class_methods_cached_properties_and_code(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "rigidmd" / "docs" / "site")
+    import api
+
+    page = api.page()
+    for name in ("Scene.read", "Scene.from_dict", "Moment.observation", "Results.rotation"):
+        assert f"#### `{name}`" in page
+    assert "```python\nclass Spring(rigidmd.Force):\n    def on_molecules" in page
+    assert page.count("**Examples**") >= 9
+    assert " at 0x" not in page  # of default values

@@ -61,7 +61,7 @@ def test_nist_lennard_jones(reference, config):
 
 
 def test_a_cutoff_that_reaches_hundreds_of_clusters():
-    """More than the lists have room for at first."""
+    """More than the lists have workspace for at first."""
     n, edge, cutoff = 23, 26.0, 11.0
     rng = np.random.default_rng(8)
     lattice = np.stack(np.meshgrid(*[np.arange(n)] * 3), axis=-1).reshape(-1, 3)

@@ -42,7 +42,7 @@ def near(rng, rotations):
 
 
 def all_rotations(rng):
-    """Random ones, half turns, quarter turns, hardly any turn, and everything close to a lock of
+    """Random ones, half revolutions, quarter revolutions, barely any rotation, and everything close to a lock of
     either sequence."""
     axes = np.array(list(itertools.product([-1, 0, 1], repeat=3)), dtype=float)
     axes = axes[np.any(axes, axis=1)] / np.linalg.norm(
@@ -70,7 +70,7 @@ def all_rotations(rng):
 
 
 def same_angle(one, other):
-    """Largest difference of two sets of angles, full turns aside."""
+    """Largest difference of two sets of angles, full rotates aside."""
     return np.abs(np.remainder(one - other + np.pi, 2 * np.pi) - np.pi).max()
 
 
@@ -117,7 +117,7 @@ def test_euler_angles_and_yaw_pitch_roll_are_the_sequences_they_claim():
     assert from_yaw_pitch_roll(angles) == pytest.approx(
         from_vector(first * Z) @ from_vector(middle * Y) @ from_vector(last * X)
     )
-    # Capital letters are scipy's intrinsic sequences: about the axes that turn along, so the first
+    # Capital letters are scipy's intrinsic sequences: about the axes that rotate along, so the first
     # one stands leftmost.
     flat = angles.reshape(-1, 3)
     assert from_euler_angles(flat) == pytest.approx(Rotation.from_euler("ZXZ", flat).as_matrix())

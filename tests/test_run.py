@@ -16,7 +16,7 @@ import numba
 import numpy as np
 import pytest
 from MDAnalysis.lib.formats.libmdaxdr import XTCFile
-from support import MOLECULES, ROOT, built, observe, rigidmd_command, shaken, small_scene
+from support import MOLECULES, ROOT, built, observe, shaken, small_scene
 
 import rigidmd
 from rigidmd.assemble.build import build, integrator_of_stage
@@ -52,8 +52,9 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 def test_every_system_runs_a_few_steps(path, tmp_path):
     assert path.read_text().startswith("# ")
     scene = Scene.read(path)
-    moving = [k for k, stage in enumerate(scene.stages) if not stage.is_minimisation]
-    short = {f"stages.{k}.duration_ps": 8 * scene.stages[k].timestep_fs / 1000 for k in moving} | {
+    stages = rigidmd.resolve(scene).stages
+    moving = [k for k, stage in enumerate(stages) if not stage.is_minimisation]
+    short = {f"stages.{k}.duration_ps": 8 * stages[k].step for k in moving} | {
         "output.log_interval_ps": 0.004,
         "output.trajectory_interval_ps": 0.008,
     }
@@ -341,7 +342,7 @@ def test_intervals_that_are_not_whole_steps_are_noted():
     ]
     run = Simulation(scene, warn=str)
     for note in scene.rounded_times():
-        assert note in run.introduction()
+        assert note in run._introduction()
         assert note in describe(scene)
     results = run.run()
     assert set(scene.rounded_times()) <= set(results.summary["notes"])
@@ -363,7 +364,7 @@ def test_one_point_molecule_runs_under_every_thermostat(thermostat):
     results = run.run()
     moves = thermostat in ("langevin", "andersen")
     assert results.summary["degrees_of_freedom"] == (3 if moves else 0)
-    assert f"{3 if moves else 0} degrees of freedom" in run.introduction()
+    assert f"{3 if moves else 0} degrees of freedom" in run._introduction()
     assert any("no temperature is defined" in note for note in results.summary["notes"]) != moves
     told = results.summary["stages"][0]["temperature_K"]
     assert told > 0 if moves else told is None
@@ -373,7 +374,7 @@ def test_one_point_molecule_runs_under_every_thermostat(thermostat):
 
 
 def free_flight(name, folder):
-    """Two argon atoms far apart in a large box, which cross its sides."""
+    """Two argon atoms far from each other in a large box, which cross its sides."""
     scene = small_scene(
         {"argon": 2},
         60.0,
@@ -453,7 +454,7 @@ def argon(**more):
 
 
 def test_energy_that_goes_with_the_total_momentum_is_booked():
-    """Total momentum goes at steps that the row decides, and its energy into the books, whatever
+    """Total momentum goes at steps that the row decides, and its energy into the ledger, whatever
     else acts."""
     system = build(argon())
     mass = float(system.model.mass[system.model.species].sum())
@@ -840,7 +841,7 @@ def test_a_drift_is_noted_where_it_is_certain_and_has_added_up(
 
 
 def test_a_run_prints_each_note_once(tmp_path, capsys):
-    """Those of the introduction and warnings are not repeated; the summary has all."""
+    """The values of the introduction and warnings are not repeated; the summary has all."""
     scene = {"watch.move": False, "stages.0.timestep_fs": 40.0, "stages.0.duration_ps": 0.4}
     text = "[box]\nlengths_A = 20\n[[molecules]]\nmodel = 'argon'\ncount = 20\n[start]\ntemperature_K = 90\n"
     text += "[[stages]]\nensemble = 'nve'\n[forces]\ncutoff_A = 3.0\n[output]\nfigures = false\n"
@@ -892,6 +893,15 @@ def test_when_total_momentum_is_taken_out():
         is False
     )
     assert rigidmd.resolve(small_scene({"argon": 3}, None)).run.remove_momentum_interval_ps is False
+    nvt = {"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 1.0}
+    for thermostat, removed in [
+        ("velocity_rescaling", 1.0),
+        ("nose_hoover", 1.0),
+        ("langevin", False),
+        ("andersen", False),
+    ]:
+        scene = small_scene({"argon": 20}, 25.0, stages=[nvt | {"thermostat": thermostat}])
+        assert rigidmd.resolve(scene).run.remove_momentum_interval_ps == removed
     with pytest.raises(SceneError, match="total momentum is not conserved with frozen molecules"):
         small_scene({}, 25.0, molecules=frozen, run={"remove_momentum_interval_ps": 0.1})
     text = describe(argon(run={"remove_momentum_interval_ps": 0.2}))
@@ -1094,7 +1104,7 @@ def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
         (5.1, 63),
         (5.2, 64),
         (5.21, 64),
-    ):  # lines that come seldom do not wait
+    ):  # rare lines do not wait
         file.write(samples[0])
         assert lines() == written, now
     assert file.kept[0] == path.stat().st_size
@@ -1169,7 +1179,7 @@ def test_observers_cannot_write_to_the_state():
 
 
 def running(tmp_path, lines):
-    """A long argon run in another process, once its log has so many lines: (process, its
+    """A long argon run in another process, once its log has this many lines: (process, its
     folder)."""
     scene, out = str(ROOT / "systems" / "argon.toml"), tmp_path / "out"
     arguments = ["run", scene, "-o", str(out), "--set", "stages.0.duration_ps=1000"]
@@ -1210,7 +1220,7 @@ def test_a_signal_stops_with_a_summary_and_its_code(number, code, tmp_path):
 
 
 def test_compiling_is_announced_without_a_terminal(tmp_path, monkeypatch, capsys):
-    """A run that waits for the compiler says so, once."""
+    """A run that waits for the compiler states so, once."""
     prepare = MolecularRun.prepare
     index = CacheIndex(str(tmp_path), "kernel", 0)
 
@@ -1557,40 +1567,24 @@ def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys):
 
 
 def test_version():
-    assert rigidmd_command("--version").stdout.strip() == f"rigidmd {rigidmd.__version__}"
+    command = [sys.executable, "-m", "rigidmd", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.stdout.strip() == f"rigidmd {rigidmd.__version__}"
 
 
-def test_output_goes_to_runs_by_default(tmp_path):
-    short = ["--set", "stages.0.duration_ps=0.01", "--set", "stages.1.duration_ps=0.01"]
-    done = rigidmd_command(
-        "run",
-        ROOT / "systems" / "argon.toml",
-        *short,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert done.returncode == 0, done.stderr
+def test_output_goes_to_runs_by_default(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    changes = ("stages.0.duration_ps=0.01", "stages.1.duration_ps=0.01", "output.figures=false")
+    command = ["run", str(ROOT / "systems" / "argon.toml")]
+    command += [part for change in changes for part in ("--set", change)]
+    assert main(command) == 0
     assert (tmp_path / "runs" / "argon" / "summary.json").exists()
-    assert "argon: 500 argon; 500 bodies, 500 sites, 1497 degrees of freedom" in done.stdout
-    assert "summary.json" in done.stdout
-    again = rigidmd_command(
-        "run",
-        ROOT / "systems" / "argon.toml",
-        *short,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert again.returncode == 2
-    assert "--force" in again.stderr
-    forced = rigidmd_command(
-        "run",
-        ROOT / "systems" / "argon.toml",
-        *short,
-        "--force",
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert forced.returncode == 0
+    printed = capsys.readouterr().out
+    assert "argon: 500 molecules, 500 sites, 1497 degrees of freedom" in printed
+    assert "results in runs/argon" in printed
+    assert main(command) == 2
+    assert "--force" in capsys.readouterr().err
+    assert main([*command, "--force"]) == 0
 
 
 NPT = {"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0}
@@ -1613,7 +1607,7 @@ ROWS = {
     + [pytest.param(name, "mixed", marks=pytest.mark.soak) for name in ROWS],
 )
 def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch):
-    """They are those of an evaluation, to the bit, and the run goes on as if nobody had looked."""
+    """They are those of an evaluation, to the bit, and the run continues as if nobody had observed."""
     electrostatics = "pme" if precision == "double" else "reaction_field"
     forces = {"cutoff_A": 5.5, "electrostatics": electrostatics, "tail_correction": True}
     stage = {"duration_ps": 1.0} | ROWS[name]
@@ -1649,7 +1643,7 @@ def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch
 
 
 class Spring(rigidmd.Force):
-    """A spring to the origin, which counts how often it is asked."""
+    """A spring to the origin, which counts how often it is requested."""
 
     asked = 0
 
@@ -1718,7 +1712,7 @@ def test_the_lists_of_the_start_serve_the_first_stage(monkeypatch):
     simulation = Simulation(small_scene({"argon": 20}, 25.0, stages=stages))
     simulation.start_from(simulation.state)
     made.clear()
-    simulation.part.reset()
+    simulation._part.reset()
     simulation.run()
     used = [engine for engine in made if engine.workspaces]
     assert len(used) == 2

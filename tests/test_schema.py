@@ -1,4 +1,4 @@
-"""The JSON schema of scenes, as an editor uses it: shipped scenes are valid, errors are told where
+"""The JSON schema of scenes, as an editor uses it: shipped scenes are valid, errors are given where
 they are."""
 
 import json
@@ -35,7 +35,7 @@ timestep_s = 0.01
 
 
 def told(text):
-    """Where an editor would put its marks, and what it would say."""
+    """Where an editor would put its marks, and what it would state."""
     return [
         (error.json_path, error.message) for error in VALIDATOR.iter_errors(tomllib.loads(text))
     ]
@@ -104,7 +104,7 @@ def test_shipped_scenes_are_valid(path):
             "[[stages]]\n[run]",
             "$",
             "'stages' was unexpected",
-        ),  # a body has none: it is held against its kind
+        ),  # a body has none: it is compared with its kind
         (
             TOP,
             "duration_s = 1.0",

@@ -1,7 +1,7 @@
 """Whatever `check` accepts starts: every numeric key of the schema with odd values, one at a time.
 
-A scene with an odd value is refused by `check`, or it runs: to its end, or until a limit of `watch`
-or a lost molecule stops it. `run` never refuses what `check` accepts, with one exception: a lattice
+A scene with an odd value is rejected by `check`, or it runs: to its end, or until a limit of `watch`
+or a lost molecule stops it. `run` never rejects what `check` accepts, with one exception: a lattice
 of molecules that overlap removal cannot separate, which only forces show.
 """
 
@@ -80,7 +80,7 @@ def cases() -> dict[str, list[tuple[tuple, float]]]:
 
 
 def odd_values(name: str) -> list[tuple[tuple, float]]:
-    """The changed numbers of a scene, the most telling ones first."""
+    """The changed numbers of a scene, the most showing ones first."""
     odd = [
         (keys, value)
         for keys, number in cases()[name]

@@ -121,10 +121,10 @@ def test_charges_in_a_slab_are_those_of_lammps(tmp_path):
             lambda: slab(30.0, forces={"ewald_surface_permittivity": 1.0}),
             "give ewald_slab or ewald_surface_permittivity",
         ),
-        (lambda: slab(30.0, forces={"electrostatics": "none"}), "ewald_slab would do nothing"),
+        (lambda: slab(30.0, forces={"electrostatics": "none"}), "ewald_slab would have no effect"),
         (
             lambda: slab(30.0, box={"periodic": False}),
-            "vacuum_A would do nothing: periodic is false",
+            "vacuum_A would have no effect: periodic is false",
         ),
         (
             lambda: slab(

@@ -358,7 +358,7 @@ def test_added_inertia_of_almost_equal_axes_keeps_its_digits(difference):
 
 
 def test_added_inertia_passes_smoothly_through_equal_axes():
-    """Lamb's own differences are good to 1e-11 where b and c differ by 1e-4: there both forms must
+    """Lamb's differences are good to 1e-11 where b and c differ by 1e-4: there both forms must
     agree."""
     a, b, c = 3.0, 1.0001, 1.0
     beta, gamma = (

@@ -1,4 +1,4 @@
-"""The state: on disk and back, what damaged files are told, and that nothing of a run is anywhere
+"""The state: on disk and back, what damaged files are given, and that nothing of a run is anywhere
 else."""
 
 import numpy as np
@@ -41,7 +41,7 @@ def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
 
 @pytest.mark.parametrize("steps", [(10, 7, 3), (20,)])
 def test_another_engine_goes_on_where_the_state_is(tmp_path, steps):
-    """Time, heat and random numbers go on from the state alone; points, whose sums have one order,
+    """Time, heat and random numbers continue from the state alone; points, whose sums have one order,
     to the bit."""
     system, _, start = built({"argon": 2}, 30.0, 2)
     row = VERLET.with_thermostat(

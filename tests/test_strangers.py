@@ -1,4 +1,4 @@
-"""Input that was made to break: each is refused at once, with what is wrong, where and what was
+"""Input that was made to break: each is rejected at once, with what is wrong, where and what was
 expected."""
 
 import io
@@ -10,6 +10,7 @@ import sys
 import time
 import tracemalloc
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numba
@@ -703,21 +704,14 @@ def command_in(folder, *words, **environment):
 SHORT_TOP = ["--set", "run.duration_s=0.02"]
 
 
-def test_nothing_in_the_working_directory_is_executed_or_obeyed(hostile, tmp_path):
-    for folder in (hostile, tmp_path):
-        shutil.copy(ROOT / "systems" / "heavy_top_3.toml", folder / "top.toml")
-        command_in(folder, "run", "top.toml", "-o", "run", *SHORT_TOP)
-    command_in(
-        hostile,
-        "sweep",
-        "top.toml",
-        "-o",
-        "sweep",
-        "--set",
-        "run.duration_s=0.01,0.02",
-        "--jobs",
-        "2",
-    )
+def test_nothing_in_the_working_directory_is_executed_or_obeyed(hostile, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(ROOT / "systems" / "heavy_top_3.toml", hostile / "top.toml")
+    shutil.copy(ROOT / "systems" / "heavy_top_3.toml", tmp_path / "top.toml")
+    command_in(hostile, "run", "top.toml", "-o", "run", *SHORT_TOP)
+    assert main(["run", "top.toml", "-o", "run", *SHORT_TOP]) == 0
+    swept = ["--set", "run.duration_s=0.01,0.02", "--set", "output.figures=false"]
+    command_in(hostile, "sweep", "top.toml", "-o", "sweep", *swept, "--jobs", "1")
     assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
     same = [
         path.name
@@ -750,11 +744,11 @@ trajectory_interval_ps = 0.02
 """
 
 
-def run_and_analyse(folder, **environment):
-    """A short run of a liquid in a folder, with all analyses that it allows."""
+def run_and_analyse(folder, command):
+    """A short run of a liquid in a folder, with two analyses, by `command(*words)`."""
     (folder / "liquid.toml").write_text(LIQUID)
-    command_in(folder, "run", "liquid.toml", "-o", "liquid", **environment)
-    command_in(folder, "analyse", "liquid", "--only", "rdf,msd", **environment)
+    command("run", "liquid.toml", "-o", "liquid")
+    command("analyse", "liquid", "--only", "rdf,msd")
     return {
         path.name: path.read_bytes()
         for path in (folder / "liquid").iterdir()
@@ -763,19 +757,21 @@ def run_and_analyse(folder, **environment):
 
 
 @pytest.mark.timeout(600)
-def test_analyses_execute_and_obey_nothing_in_the_working_directory(hostile, tmp_path):
-    expected = run_and_analyse(tmp_path)
+def test_analyses_execute_and_obey_nothing_in_the_working_directory(hostile, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    expected = run_and_analyse(tmp_path, lambda *words: main(list(words)))
     assert {"rdf.csv", "msd.csv", "log.csv"} <= expected.keys()
-    assert run_and_analyse(hostile) == expected
+    assert run_and_analyse(hostile, partial(command_in, hostile)) == expected
     assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
 
 
 @pytest.mark.soak
 def test_a_liquid_is_compiled_by_nothing_in_the_working_directory(hostile, tmp_path):
     """From an empty cache, which a second process helps to fill."""
-    warm = run_and_analyse(tmp_path)
+    warm = run_and_analyse(tmp_path, partial(command_in, tmp_path))
     shutil.rmtree(hostile / "liquid", ignore_errors=True)
-    cold = run_and_analyse(hostile, RIGIDMD_CACHE=str(tmp_path / "cache"), RIGIDMD_COMPILERS="2")
+    empty = {"RIGIDMD_CACHE": str(tmp_path / "cache"), "RIGIDMD_COMPILERS": "2"}
+    cold = run_and_analyse(hostile, partial(command_in, hostile, **empty))
     assert any((tmp_path / "cache").rglob("*.nbc.*"))
     assert cold == warm
     assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()

@@ -1,4 +1,4 @@
-"""Structure files as people have them: read rightly, or refused with one clear message."""
+"""Structure files as people have them: read rightly, or rejected with one clear message."""
 
 import bz2
 import codecs
@@ -105,7 +105,7 @@ SPECIES = {
 
 
 class Truth:
-    """Molecules that are known: on a lattice so wide that none touch, turned at random."""
+    """Molecules that are known: on a lattice so wide that none touch, rotated at random."""
 
     def __init__(
         self, kinds: Sequence[str | Molecule], seed: int = 0, edges=(14.0, 15.0, 16.0), cell=None
@@ -123,7 +123,7 @@ class Truth:
         self.omega = 5 * rng.standard_normal((len(kinds), 3))  # lab
         for k, m in enumerate(
             self.species
-        ):  # a linear body does not turn about its axis, a point not at all
+        ):  # a linear body does not rotate about its axis, a point not at all
             body = self.rotation[k].T @ self.omega[k]
             self.omega[k] = self.rotation[k] @ (body * (m.inertia > 0))
 
@@ -462,7 +462,7 @@ def test_reference_files(reference, case):
     count, density_there, rms, largest, note = expected
     found = found()
     assert len(found.species) == count
-    if edge == inf:  # the file's own cell served only to make molecules whole
+    if edge == inf:  # the file's cell served only to make molecules whole
         assert found.cell is None
     else:
         per_volume = count * model.mass / np.linalg.det(found.cell) / GRAM_PER_CM3
@@ -675,7 +675,7 @@ def test_a_unique_name_decides_between_sites_that_look_alike(named, tmp_path):
     "pair", [("isobutane", "trans-butane"), ("CH3CH2OH", "CH3OCH3"), ("left", "right")]
 )
 def test_isomers_and_mirror_images_among_each_other(pair, tmp_path):
-    """Of one composition, without names but the elements, every molecule in an order of its own."""
+    """For one composition, without names but the elements, every molecule in an order of its own."""
 
     def isomer(name):
         known = ase.build.molecule("isobutane" if name in ("left", "right") else name)
@@ -750,7 +750,7 @@ def test_the_best_order_is_taken(names, order, digits, tmp_path):
     partner = same_molecules(found, truth, [kind], 2 * 10.0**-digits)
     ends = found.position[:, None] + np.einsum("nij,sj->nsi", found.rotation, kind.positions_body)
     there = truth.centre[:, None] + np.einsum("nij,sj->nsi", truth.rotation, kind.positions_body)
-    assert np.abs(ends - there[partner]).max() < 5 * 10.0**-digits  # each site at its own place
+    assert np.abs(ends - there[partner]).max() < 5 * 10.0**-digits  # each site at its own position
     assert found.notes == ()
 
 
@@ -863,7 +863,7 @@ def test_turned_shifted_wrapped_and_shuffled_atoms_are_the_same_molecules(
 ):
     kinds = [
         kind if kind != "tip4p2005" or "spce" not in kinds else "spce" for kind in kinds
-    ]  # those two look alike
+    ]  # those two observation alike
     rng = np.random.default_rng(seed)
     cell = np.diag([17.0, 19.0, 21.0]) + (np.tril(rng.uniform(-8, 8, (3, 3)), -1) if slant else 0.0)
     truth = Truth(kinds, seed, cell=cell)
@@ -956,7 +956,7 @@ def test_what_was_made_of_a_cell_is_said(tmp_path):
 
 
 def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
-    """The state has the box as it was described anew; the scene still has its own words for it."""
+    """The state has the box as it was described again; the scene still has its own words for it."""
     box = {"lengths_A": 24.0, "angles_deg": [90.0, 59.0, 90.0]}
     system = build(small_scene({"argon": 4}, None, box=box))
     assert any(
@@ -1027,7 +1027,7 @@ def test_a_pdb_that_is_cut_off_says_so(tmp_path):
 
 
 def test_a_state_is_not_taken_for_one_of_another_model_of_that_name(tmp_path):
-    """Masses, moments and number of sites tell, and whether there are rotations."""
+    """Masses, moments and number of sites show, and whether there are rotations."""
     system = build(small_scene({"tip4p2005": 8}, 20.0))
     write_state(tmp_path / "water.npz", system.saved(system.state))
 
@@ -1072,7 +1072,7 @@ def test_molecules_of_a_slanted_cell_are_made_whole(tmp_path):
         same_molecules(found, truth, [SPECIES["spce"]], 0.02)
     leaning = read(
         tmp_path, text, "a.xyz"
-    )  # c lies on top of b: the same lattice by a cell that leans less
+    )  # c lies on top of b: the same lattice by a cell that tilts less
     assert leaning.cell == pytest.approx(
         np.array([[12.0, 0, 0], [-3.0, 11.0, 0], [-5.0, -4.0, 12.0]])
     )
@@ -1084,8 +1084,8 @@ def test_molecules_of_a_slanted_cell_are_made_whole(tmp_path):
 
 
 def test_a_cell_with_room_for_a_cut_off_is_found(tmp_path):
-    """c of this cell stands 2 Å high, yet the lattice is that of a cube: turned, the box is upright
-    and has room."""
+    """c of this cell stands 2 Å high, yet the lattice is that of a cube: rotated, the box is upright
+    and has workspace."""
     cell = 14.0 * np.array([[1.0, 0, 0], [2.0, 1.0, 0], [7.0, 6.0, 1.0]]) @ standard_turn(3).T
     truth = Truth(["spce"] * 8, 6, edges=(14.0, 14.0, 14.0))
     turned = [(n, e, k, x @ standard_turn(3).T, v) for n, e, k, x, v in truth.atoms()]
@@ -1158,7 +1158,7 @@ def standard_turn(seed):
 
 
 def pair_distances(position, cell):
-    """Sorted distances of nearest images in a cell that leans little."""
+    """Sorted distances of nearest images in a cell that tilts little."""
     i, j = np.triu_indices(len(position), 1)
     d = (position[i] - position[j]) @ np.linalg.inv(cell)
     return np.sort(np.linalg.norm((d - np.rint(d)) @ cell, axis=1))
@@ -1208,7 +1208,7 @@ def test_a_mirror_image_is_another_molecule(tmp_path):
 
 
 def test_a_mirror_image_within_the_tolerance_is_noted(tmp_path):
-    """A molecule that is hardly chiral: half of a racemic crystal fits, and less well than its
+    """A molecule that is barely chiral: half of a racemic crystal fits, and less well than its
     mirror image does."""
     sites = [
         Site(name=e, element=e, mass_u=m, position_A=x)
@@ -1232,7 +1232,7 @@ def test_a_mirror_image_within_the_tolerance_is_noted(tmp_path):
 
 
 def test_hydrogen_bonds_are_none_of_the_bonds_of_larger_atoms(tmp_path):
-    """Waters 1.8 Å apart, in a scene that has bonds of 1.94 Å between other elements."""
+    """Waters 1.8 Å from each other, in a scene that has bonds of 1.94 Å between other elements."""
     rows = [("O", 0, 0, 0), ("H", 1, 0, 0), ("H", -1 / 3, 0.9428, 0)]
     rows += [("O", 2.8, 0, 0), ("H", 3.3774, 0.8165, 0), ("H", 3.3774, -0.8165, 0)]
     atoms = [("", e, 0, np.array([x, y, z]), None) for e, x, y, z in rows]
@@ -1312,7 +1312,7 @@ def rod(*labels: str, length=1.3) -> Molecule:
     return molecule("rod", tuple(sites), residue_names=("ROD",))
 
 
-#: Unit cells that are shorter than half of their molecules: upright, and with edges that lean on
+#: Unit cells that are shorter than half of their molecules: upright, and with edges that tilt on
 #: each other.
 SHORT_CELLS = {
     "upright": [[7.0, 0, 0], [0, 5.0, 0], [0, 0, 6.0]],
@@ -1471,7 +1471,7 @@ def test_one_of_several_frames(ending, tmp_path):
         read(tmp_path, text, f"a.{ending}", frame=4)
     one = read(
         tmp_path, frames_of(ending, truths[:1]), f"b.{ending}"
-    )  # a single MODEL is no choice
+    )  # a single MODEL is not a choice
     assert len(one.species) == 2
 
 
@@ -1660,7 +1660,7 @@ def test_atom_types_of_a_scene(tmp_path):
     ],
 )
 def test_elements_by_mass(mass, element):
-    """What weighs as nothing does, a united atom for one, is no element."""
+    """What weighs as nothing does, a united atom for one, is not a element."""
     assert element_of_mass(mass) == element
 
 
@@ -2518,7 +2518,7 @@ def test_deuterium_in_formats_that_know_elements(file, tmp_path):
 
 @pytest.mark.parametrize("file", ["a.g96", "CONFIG", "conf"])
 def test_ions_by_names_in_formats_of_force_fields(file, tmp_path):
-    """NA is no nitrogen, and CL no carbon."""
+    """NA is not a nitrogen, and CL no carbon."""
     truth = Truth(["sodium", "chloride", "spce", "sodium"], 42)
     rows = [(name.upper(), tuple(x)) for name, _, _, x, _ in truth.atoms()]
     text = FORMATS.get(file, as_g96)(rows, truth.cell)

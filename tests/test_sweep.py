@@ -1,4 +1,4 @@
-"""Sweeps: what is asked for, points in processes of their own, stops of every kind, tables,
+"""Sweeps: what is requested, points in processes of their own, stops of every kind, tables,
 clusters, bad input."""
 
 import csv
@@ -60,6 +60,7 @@ duration_ps = 0.5
 timestep_fs = 5
 
 [output]
+trajectory = "trajectory.trr"
 trajectory_interval_ps = 0.05
 figures = false
 """
@@ -77,6 +78,7 @@ def argon(tmp_path_factory):
 def finished(argon, tmp_path_factory):
     """A sweep that has finished: 2 temperatures, 2 seeds."""
     folder = tmp_path_factory.mktemp("runs") / "sweep"
+    run_here(argon, [parse_axis(text) for text in GRID[1::2]], folder)
     assert cli.main(["sweep", str(argon), *GRID, "-o", str(folder)]) == 0
     return folder
 
@@ -107,7 +109,7 @@ def same_runs(first, second):
     """Whether two sweeps have the same points, with the same bits in logs and trajectories."""
     names = sorted(path.parent.name for path in first.glob("*/log.csv"))
     assert names == sorted(path.parent.name for path in second.glob("*/log.csv"))
-    files = ("log.csv", "trajectory.xtc")
+    files = ("log.csv", "trajectory.trr")
     return all(
         (first / n / f).read_bytes() == (second / n / f).read_bytes() for n in names for f in files
     )
@@ -122,7 +124,7 @@ def run_here(scene, axes, folder, **more):
     return read_manifest(folder)
 
 
-# What is asked for
+# What is requested
 
 
 @pytest.mark.parametrize(
@@ -256,17 +258,18 @@ def test_a_sweep_is_a_folder_a_point_a_table_and_a_figure(finished):
 
 
 def test_a_point_has_the_bits_of_a_run(finished, argon, tmp_path, capsys):
-    changes = ["--set", "start.temperature_K=120", "--set", "seed=2"]
-    assert cli.main(["run", str(argon), *changes, "-o", str(tmp_path / "run")]) == 0
+    """In a process of its own."""
+    changes = ["--set", "start.temperature_K=120", "--set", "seed=2..2"]
+    assert cli.main(["sweep", str(argon), *changes, "-o", str(tmp_path / "s")]) == 0
     point = finished / "temperature_K=120_seed=2"
-    assert cli.main(["compare", str(point), str(tmp_path / "run")]) == 0
+    assert cli.main(["compare", str(point), str(tmp_path / "s" / "seed=2")]) == 0
     for command in (["report"], ["analyse", "--only", "rdf"]):
         copy = shutil.copytree(point, tmp_path / command[0])
         assert cli.main([*command, str(copy)]) == 0
 
 
 def test_the_energy_of_a_molecule_has_its_share_of_the_error(finished):
-    """Of a longer run, whose energies forget themselves from one sample to the next."""
+    """For a longer run, whose energies forget themselves from one sample to the next."""
     record = read_record(finished / "temperature_K=90_seed=1")
     columns = {name: np.resize(values, 40) for name, values in record.columns.items()}
     columns["time"] = np.linspace(0.0, 0.5, 40)
@@ -287,15 +290,11 @@ def test_what_has_finished_is_not_run_again(copied, argon, capsys):
     assert "4 skipped" in capsys.readouterr().out
     assert written(copied) == before
     # one value more, of a key that is varied
-    assert (
-        cli.main(
-            ["sweep", str(argon), *GRID[:2], "--set", "seed=3", "-o", str(copied), "--jobs", "1"]
-        )
-        == 0
-    )
-    assert "2 finished, 0 failed, 4 skipped" in capsys.readouterr().out
+    more = ["--set", "start.temperature_K=90", "--set", "seed=3"]
+    assert cli.main(["sweep", str(argon), *more, "-o", str(copied), "--jobs", "1"]) == 0
+    assert "1 finished, 0 failed, 4 skipped" in capsys.readouterr().out
     assert {name: time for name, time in written(copied).items() if name in before} == before
-    assert [row["runs"] for row in table(copied)] == ["3", "3"]
+    assert [row["runs"] for row in table(copied)] == ["3", "2"]
 
 
 def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
@@ -307,7 +306,7 @@ def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
         assert cli.main(["sweep", str(argon), *changes, "-o", str(copied)]) == 2
         said = capsys.readouterr().err
         assert expected in said
-        assert "--force begins it anew" in said
+        assert "--force starts it again" in said
     assert (copied / "temperature_K=90_seed=1" / "log.csv").exists()
 
 
@@ -392,9 +391,9 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
 
 
 def test_energy_at_a_step_of_zero_has_a_joint_fit(argon, tmp_path, capsys):
-    """Beside the independent one, with a smaller error, and with the heat capacity."""
+    """Next to the independent one, with a smaller error, and with the heat capacity."""
     folder = tmp_path / "steps"
-    stage = {"ensemble": "nvt", "temperature_K": 150.0, "duration_ps": 60.0}
+    stage = {"ensemble": "nvt", "temperature_K": 150.0, "duration_ps": 120.0}
     fixed = {f"stages.0.{key}": value for key, value in stage.items()}
     fixed["box.lengths_A"] = 17.0
     axes = sweeping.axes_of({STEP: [10, 20], "seed": [1, 2]} | fixed)
@@ -409,7 +408,7 @@ def test_energy_at_a_step_of_zero_has_a_joint_fit(argon, tmp_path, capsys):
     with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
         rows = {(row["average"], row["fit"]): row for row in csv.DictReader(file)}
     joint, alone = (rows[POTENTIAL, kind] for kind in ("joint", "independent"))
-    assert 0 < float(joint["limit error"]) < 0.5 * float(alone["limit error"])
+    assert 0 < float(joint["limit error"]) < 0.8 * float(alone["limit error"])
     apart = float(joint["limit"]) - float(alone["limit"])
     assert abs(apart) < 3 * float(alone["limit error"])
     assert float(joint["bias at 20 fs"]) == pytest.approx(4 * float(joint["bias at 10 fs"]))
@@ -420,7 +419,7 @@ def test_values_of_replicas_together_are_extrapolated(argon, tmp_path):
     """Not the means of the values of single runs: heights of peaks differ, and diffusion has none
     there."""
     folder = tmp_path / "steps"
-    swept = {STEP: [5, 10], "seed": [1, 2, 3], "stages.0.duration_ps": 2.0}
+    swept = {STEP: [5, 10], "seed": [1, 2], "stages.0.duration_ps": 2.0}
     points = run_here(argon, sweeping.axes_of(swept), folder, step=STEP).points
     assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
     with (folder / "analysis.csv").open(encoding="utf-8") as file:
@@ -529,7 +528,7 @@ def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):
 
 def test_analyses_of_a_sweep_go_on_without_a_damaged_point(copied, capsys, monkeypatch):
     """One point cannot be read, one analysis has an error of ours, one is not possible."""
-    (copied / "temperature_K=90_seed=1" / "trajectory.xtc").write_bytes(b"nothing")
+    (copied / "temperature_K=90_seed=1" / "trajectory.trr").write_bytes(b"nothing")
     rdf = registry.KNOWN["rdf"]
 
     def broken(runs):
@@ -538,12 +537,12 @@ def test_analyses_of_a_sweep_go_on_without_a_damaged_point(copied, capsys, monke
     monkeypatch.setitem(registry.KNOWN, "rdf", rdf._replace(function=broken))
     assert cli.main(["analyse", str(copied), "--only", "rdf,viscosity,structure_factor"]) == 1
     said = capsys.readouterr().out
-    assert re.search(r"temperature_K=90_seed=1: skipped: .*cannot be read as a trajectory", said)
+    assert re.search(r"temperature_K=90_seed=1: .*cannot be read as a trajectory", said)
     assert (
-        "rdf: skipped: an error of rigidmd, please report it: ZeroDivisionError: of no use (test_sweep.py:"
+        "rdf: an error of rigidmd, please report it: ZeroDivisionError: of no use (test_sweep.py:"
         in said
     )
-    assert "viscosity: skipped: a viscosity needs the pressure tensor" in said
+    assert "viscosity: a viscosity needs the pressure tensor" in said
     with (copied / "analysis.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["runs"] for row in rows] == ["1", "2"]
@@ -648,28 +647,12 @@ def test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run():
 
 
 def test_bodies_and_words(tmp_path, capsys):
-    """A body has no seeds; a key whose values are words has places on the axis."""
+    """A body has no seeds; a key whose values are words has positions on the axis."""
     scene = ROOT / "systems" / "heavy_top_3.toml"
-    fixed = [
-        "--set",
-        "run.duration_s=0.02",
-        "--set",
-        "output.figures=false",
-        "--set",
-        "output.trajectory=false",
-    ]
-    arguments = [
-        "sweep",
-        str(scene),
-        *fixed,
-        "--set",
-        "run.integrator=velocity_verlet,kahan_li_8",
-        "--jobs",
-        "1",
-        "-o",
-        str(tmp_path / "s"),
-    ]
-    assert cli.main(arguments) == 0
+    fixed = {"run.duration_s": 0.02, "output.figures": False, "output.trajectory": False}
+    integrators = {"run.integrator": ["velocity_verlet", "kahan_li_8"]}
+    run_here(scene, sweeping.axes_of(integrators | fixed), tmp_path / "s")
+    assert cli.main(["sweep", str(scene), "-o", str(tmp_path / "s"), "--collect"]) == 0
     errors = [float(row["energy_error largest"]) for row in table(tmp_path / "s")]
     assert errors[0] > 100 * errors[1]
     assert (tmp_path / "s" / "sweep.png").exists()
@@ -726,15 +709,18 @@ def test_values_of_numpy_in_a_sweep(argon, tmp_path):
     assert found[0] == found[1]
 
 
+#: Three points that take a while.
+LONG = {
+    "stages.0.duration_ps": 150.0,
+    "output.trajectory_interval_ps": 5.0,
+    "output.log_interval_ps": 1.0,
+    "seed": range(1, 4),
+}
+
+
 def long_sweep(argon, folder, **more):
     """Manifest of a sweep of three points that take a while."""
-    changes = {
-        "stages.0.duration_ps": 150.0,
-        "output.trajectory_interval_ps": 5.0,
-        "output.log_interval_ps": 1.0,
-        "seed": range(1, 4),
-    } | more
-    with sweeping.open_sweep(argon, sweeping.axes_of(changes), folder) as manifest:
+    with sweeping.open_sweep(argon, sweeping.axes_of(LONG | more), folder) as manifest:
         return manifest
 
 
@@ -776,8 +762,7 @@ def when_running(folder, act):
 def whole(argon, tmp_path_factory):
     """Three points that were never stopped."""
     folder = tmp_path_factory.mktemp("whole") / "sweep"
-    manifest = long_sweep(argon, folder)
-    assert finish(manifest) is None and not manifest.unfinished
+    run_here(argon, sweeping.axes_of(LONG), folder)
     return folder
 
 
@@ -860,7 +845,7 @@ def test_points_that_fail_are_told_and_repeated(argon, tmp_path, capsys):
         "--set",
         "stages.0.timestep_fs=5,100000",
         "--set",
-        "stages.0.duration_ps=300",
+        "stages.0.duration_ps=100",
         "--set",
         "watch.stable_step=false",
         "-o",
@@ -890,7 +875,7 @@ def test_a_wall_time_that_is_over_leaves_the_rest(argon, tmp_path, capsys):
         "-o",
         str(folder),
     ]
-    assert cli.main([*arguments, "--walltime", "0:00:03"]) == 75
+    assert cli.main([*arguments, "--walltime", "0:00:03", "--jobs", "1"]) == 75
     assert set(states(folder).values()) <= {"interrupted", "waiting"}
     assert "the same command continues" in capsys.readouterr().out
 
@@ -1293,4 +1278,4 @@ def test_an_invalid_manifest_is_refused(copied, argon, capsys):
             said = capsys.readouterr().err
             assert f"{copied / 'sweep.json'}" in said, change
             assert next(iter(change)) in said, change
-            assert "--force begins the sweep anew" in said, change
+            assert "--force starts the sweep again" in said, change

@@ -28,7 +28,7 @@ def run(**changes):
     ("integrator", "step", "allowed"), [("rk4", 0.05, 1e-8), ("dop853", 5.0, 1e-9)]
 )
 def test_a_satellite_that_loses_mass_keeps_its_angular_momentum(integrator, step, allowed):
-    """omega3 = L3/I3(t); L turns about axis 3 at L3 (1/I3 - 1/I1) in the body and keeps its size:
+    """omega3 = L3/I3(t); L rotates about axis 3 at L3 (1/I3 - 1/I1) in the body and keeps its size:
     of its transverse part comes omega = L/I1(t). In the lab L stays, though the energy grows."""
     results = run(run__integrator=integrator, run__timestep_s=step)
     t = results["time"]

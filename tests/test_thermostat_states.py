@@ -1,7 +1,8 @@
 """What thermostats evolve besides momenta: it outlives a stop."""
 
 import numpy as np
-from support import same_after_stops, small_scene
+from stops import same_after_stops
+from support import small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.core.state import State

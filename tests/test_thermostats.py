@@ -128,7 +128,7 @@ def test_collisions_come_after_their_mean_time():
 
 @pytest.fixture(scope="module")
 def liquid():
-    """27 waters and 5 nitrogens, relieved, with momenta: system, state."""
+    """27 waters and 5 nitrogens without overlaps, with momenta: system, state."""
     system, engine, state = built(
         {"spce": 27, "nitrogen": 5},
         12.0,
@@ -295,7 +295,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
     assert results["momentum"][own][-1] ** 2 / (2 * mass) > KJ_PER_MOL
     assert (
         results["momentum"][~own].max() < 1e-9
-    )  # taken out before the stage that conserves it, and booked
+    )  # taken out before the stage that conserves it, and accounted for
     assert np.abs(np.diff(results["conserved"])).max() < 0.05  # kJ/mol
 
 
@@ -308,7 +308,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
         ),
         (
             {"ensemble": "nvt", "temperature_K": 300.0, "friction_translation_per_ps": 1.0},
-            "would do nothing with velo",
+            "would have no effect with velo",
         ),
         (
             {
@@ -324,7 +324,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
             "must be greater than 0",
         ),
         ({"ensemble": "nvt"}, "needs temperature_K"),
-        ({"temperature_K": 300.0}, "would do nothing in an nve stage"),
+        ({"temperature_K": 300.0}, "would have no effect in an nve stage"),
         ({"integrator": "baoab"}, "contains a thermostat"),
         ({"ensemble": "npt", "temperature_K": 300.0}, "needs pressure_bar"),
         (
@@ -359,7 +359,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
                 "barostat": "monte_carlo",
                 "barostat_time_ps": 1.0,
             },
-            "barostat_time_ps would do nothing with monte_carlo$",
+            "barostat_time_ps would have no effect with monte_carlo$",
         ),
         (
             {
@@ -368,7 +368,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
                 "pressure_bar": 1.0,
                 "nose_hoover_links": 4,
             },
-            "nose_hoover_links would do nothing with velocity_rescaling$",
+            "nose_hoover_links would have no effect with velocity_rescaling$",
         ),
         (
             {
@@ -379,7 +379,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
                 "barostat_time_ps": 1.0,
                 "nose_hoover_links": 4,
             },
-            "nose_hoover_links, barostat_time_ps would do nothing with velocity_rescaling and monte_carlo$",
+            "nose_hoover_links, barostat_time_ps would have no effect with velocity_rescaling and monte_carlo$",
         ),
     ],
 )
@@ -465,7 +465,7 @@ def test_adding_a_thermostat_and_a_barostat(monkeypatch):
     for wrong, message in (
         (
             {"nose_hoover_links": 4, "barostat_time_ps": 1.0},
-            "nose_hoover_links, barostat_time_ps would do nothing with braking and swelling",
+            "nose_hoover_links, barostat_time_ps would have no effect with braking and swelling",
         ),
         (
             {"pressure_coupling": "flexible"},

@@ -1,4 +1,4 @@
-"""Threads: that each block is done once, whoever asks, and that those who wait leave their cores to
+"""Threads: that each block is done once, and that threads that wait leave their cores to
 others."""
 
 import os
@@ -13,8 +13,10 @@ import numba
 import numpy as np
 import pytest
 from support import ROOT, small_scene
+from thread_kernels import count_blocks, counted, run_blocks
 
 from rigidmd import Every, Simulation, run_together
+from rigidmd.commands.cli import main
 from rigidmd.compile import (
     Code,
     call_blocks,
@@ -40,37 +42,14 @@ from rigidmd.errors import SimulationError
 
 
 @task()
-def _count(task_arguments, block):
-    seen, work = load_arguments(task_arguments)
-    total = 0.0
-    for n in range(work):
-        total += np.sqrt(n + block)
-    seen[block, 0] += 1
-    seen[block, 1] = total
-
-
-@task()
 def _count_within(task_arguments, block):
     code, seen = load_arguments(task_arguments)
     call_blocks(code, "count", pack_arguments((seen[block], 10)), seen.shape[1])
 
 
 @kernel(from_python=True)
-def _run(code, seen, work, times):
-    for _ in range(times):
-        call_blocks(code, "count", pack_arguments((seen, work)), len(seen))
-
-
-@kernel(from_python=True)
 def _run_within(code, inner, seen):
     call_blocks(code, "within", pack_arguments((inner, seen)), len(seen))
-
-
-def counted(blocks: int, work: int = 10, times: int = 1) -> np.ndarray:
-    """How often each block was done, and its sum."""
-    seen = np.zeros((blocks, 2))
-    _run(Code(count=(_count, (seen, work))), seen, work, times)
-    return seen
 
 
 @pytest.fixture(autouse=True)
@@ -90,7 +69,7 @@ def test_every_block_is_done_once(threads, blocks, work):
 
 def test_every_block_is_done_once_by_many_more_threads():
     """As on a machine with 24 cores. Few blocks are usual: a small PME grid has three."""
-    script = "from test_threads import counted; assert all((counted(n, 10, 2000)[:, 0] == 2000).all() for n in range(1, 9))"
+    script = "from thread_kernels import counted; assert all((counted(n, 10, 2000)[:, 0] == 2000).all() for n in range(1, 9))"
     done = subprocess.run(
         [sys.executable, "-c", script],
         cwd=ROOT / "tests",
@@ -139,20 +118,20 @@ def test_each_thread_begins_with_its_share_and_goes_on_with_what_is_left(
 
 
 def test_a_block_may_have_blocks_of_its_own():
-    inner, seen = Code(count=(_count, (np.zeros((1, 2)), 10))), np.zeros((20, 30, 2))
+    inner, seen = Code(count=(count_blocks, (np.zeros((1, 2)), 10))), np.zeros((20, 30, 2))
     _run_within(Code(within=(_count_within, (inner, seen))), inner, seen)
     assert (seen[:, :, 0] == 1).all()
 
 
 @numba.njit(nogil=True)
 def _run_freely(code, seen, work, times):
-    _run(code, seen, work, times)
+    run_blocks(code, seen, work, times)
 
 
 def test_two_calling_threads_at_once_each_have_their_blocks_done_once():
     """Without Python's lock, so that each finds the pool busy with the other."""
     found = [np.zeros((16, 2)), np.zeros((40, 2))]
-    code = Code(count=(_count, (found[0], 10)))
+    code = Code(count=(count_blocks, (found[0], 10)))
     both = [threading.Thread(target=_run_freely, args=(code, seen, 10, 20_000)) for seen in found]
     for one in both:
         one.start()
@@ -301,34 +280,11 @@ def test_what_cannot_run_together_is_refused(twice, jobs, word):
         run_together(runs * 2 if twice else runs, jobs)
 
 
-@task()
-def _meet(task_arguments, block):
-    """Wait until the other of two blocks has begun, or for so many looks; note whether it has."""
-    at, most = load_arguments(task_arguments)
-    _write(at, block, 1)
-    looks = 0
-    while _read(at, 1 - block) == 0 and looks < most:
-        looks += 1
-        _pause()
-    _write(at, 2 + block, _read(at, 1 - block))
-
-
-@kernel(from_python=True)
-def _run_meeting(code, at, most):
-    call_blocks(code, "meet", pack_arguments((at, most)), 2)
-
-
-def met(most: int) -> list[int]:
-    """For each of two blocks whether the other had begun before it ended: one thread does them one
-    after another."""
-    cells = np.zeros(4, np.int64)
-    _run_meeting(Code(meet=(_meet, (cells.ctypes.data, most))), cells.ctypes.data, most)
-    return cells[2:].tolist()
-
-
 HELPER = """
 import time
-from test_threads import FIRST_WORKER, SLEEPS, _pool, met, set_threads
+from rigidmd.compile import set_threads
+from rigidmd.compile.thread_pool import FIRST_WORKER, SLEEPS, _pool
+from thread_kernels import met
 set_threads(1)
 assert met(1000) == [0, 1]
 set_threads(2)
@@ -354,14 +310,14 @@ def test_a_helper_helps_then_sleeps_and_is_woken():
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_forked_process_starts_its_own_threads():
     seen = np.zeros((16, 2))
-    code = Code(count=(_count, (seen, 10)))
+    code = Code(count=(count_blocks, (seen, 10)))
     child = os.fork()
     if child == 0:
         done = 1
         try:
-            _run(code, seen, 10, 100)  # without helpers, then with new ones
+            run_blocks(code, seen, 10, 100)  # without helpers, then with new ones
             set_threads(MOST_THREADS)
-            _run(code, seen, 10, 100)
+            run_blocks(code, seen, 10, 100)
             done = 0 if (seen[:, 0] == 200).all() and _pool.started == MOST_THREADS - 1 else 2
         finally:
             os._exit(done)
@@ -371,7 +327,8 @@ def test_a_forked_process_starts_its_own_threads():
 
 ALONE = """
 import threading
-from test_threads import counted, set_threads
+from rigidmd.compile import set_threads
+from thread_kernels import counted
 set_threads(1)
 counted(16)
 assert threading.active_count() == 1, threading.enumerate()
@@ -388,12 +345,12 @@ def test_one_thread_that_is_asked_for_has_no_helpers():
 
 MORE = """
 import numpy as np, sys
-from test_threads import counted
+from thread_kernels import counted
 assert (counted(64, 100, 2000)[:, 0] == 2000).all()
 """
 
 
-@pytest.mark.parametrize("threads", ["1", "7", "32"])
+@pytest.mark.parametrize("threads", ["7", "32"])
 def test_there_may_be_more_threads_than_cores_and_the_process_ends(threads):
     path = os.pathsep.join(map(str, (ROOT, ROOT / "tests")))
     environment = os.environ | {"NUMBA_NUM_THREADS": threads, "PYTHONPATH": path}
@@ -420,12 +377,10 @@ def test_benchmarks_measure_what_a_user_gets(monkeypatch):
     assert environment()["PATH"] == os.environ["PATH"]
 
 
-@pytest.mark.parametrize(
-    ("asked", "words"), [(None, "2 threads"), (1, "1 thread"), (7, "2 threads")]
-)
-def test_check_says_how_many_threads_compute(asked, words):
-    command = [sys.executable, "-m", "rigidmd", "check", "systems/water.toml"]
-    command += [] if asked is None else ["--set", f"threads={asked}"]
+def test_check_says_how_many_threads_compute(capsys):
+    command = [sys.executable, "-m", "rigidmd", "check", "systems/water.toml", "--set", "threads=7"]
     environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert f"computing: {words}, mixed precision" in done.stdout, done.stderr
+    assert "computing: 2 threads, mixed precision" in done.stdout, done.stderr
+    assert main(["check", str(ROOT / "systems" / "water.toml"), "--set", "threads=1"]) == 0
+    assert "computing: 1 thread, mixed precision" in capsys.readouterr().out

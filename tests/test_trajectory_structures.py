@@ -3,6 +3,7 @@ a clear message."""
 
 import shutil
 import sys
+from itertools import cycle
 from pathlib import Path
 
 import ase.io
@@ -168,8 +169,7 @@ def test_each_molecule_of_a_universe_is_one_fragment(tmp_path, model, sites, kep
     assert np.isfinite(found["eps_mean"])
 
 
-@pytest.mark.parametrize("ending", EVERY_ENDING)
-@pytest.mark.parametrize("frame", [1, -1])
+@pytest.mark.parametrize(("ending", "frame"), list(zip(EVERY_ENDING, cycle((1, -1)), strict=False)))
 def test_united_atoms_of_own_trajectories(tmp_path, ending, frame):
     """Sites with mass and no element, and sites with neither, are found by their names in every
     format."""
@@ -247,7 +247,7 @@ def test_the_last_frame_of_a_trajectory(ending, names, tmp_path):
         assert np.abs(first.position - system.state.position).max() < error
         assert not [
             other.name for other in tmp_path.iterdir() if other.name.startswith(".")
-        ]  # no offsets beside it
+        ]  # no offsets next to it
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Pages and films of runs: what is in them, what a browser shows of them, and bad input."""
+"""Pages and animations of runs: what is in them, what a browser shows of them, and bad input."""
 
 import base64
 import json
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from PIL import Image, ImageSequence
-from support import ROOT
+from support import ROOT, small_scene
 
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.body import build_body
@@ -22,9 +22,12 @@ from rigidmd.commands import cli
 from rigidmd.formats.bonds import connections
 from rigidmd.mechanics.inertia import SOLIDS, shifted_inertia, solid
 from rigidmd.run.record import read_record
+from rigidmd.view import animation as film
 from rigidmd.view import molecule_animation
 from rigidmd.view.animation import write_film
 from rigidmd.view.mesh import UNITS, mesh_of
+from rigidmd.view.plots import plots_part
+from rigidmd.view.run_page import write_report
 
 CHROMIUM = next(
     (
@@ -39,9 +42,11 @@ in_browser = pytest.mark.skipif(
 )
 SHORT_WATER = {
     "stages.equilibration.duration_ps": 0.02,
+    "stages.equilibration.timestep_fs": 2.0,
     "stages.production.duration_ps": 0.02,
     "output.trajectory_interval_ps": 0.01,
     "output.log_interval_ps": 0.004,
+    "output.figures": False,
 }
 
 
@@ -63,7 +68,7 @@ def water(tmp_path_factory):
 
 
 def shown(page, out, at=None, size="420,700"):
-    """The pixels of a page in a browser, (h, w, 3), at a time of its film."""
+    """The pixels of a page in a browser, (h, w, 3), at a time of its animation."""
     flags = [
         "--headless=new",
         "--no-sandbox",
@@ -93,7 +98,7 @@ def shown(page, out, at=None, size="420,700"):
 
 
 def data_of(page):
-    """The data of the film in a page."""
+    """The data of the animation in a page."""
     found = re.search(
         r'<script type="application/json" id="film-data">(.*?)</script>', page.read_text("utf-8")
     )
@@ -142,7 +147,7 @@ def test_a_report_tells_of_molecules(water, tmp_path, capsys):
 
 
 def test_a_report_tells_of_a_body(top, capsys):
-    assert cli.main(["report", str(top)]) == 0  # beside the run, and again
+    assert cli.main(["report", str(top)]) == 0  # next to the run, and again
     assert cli.main(["report", str(top)]) == 0
     text = (top / "report.html").read_text("utf-8")
     assert is_alone(text)
@@ -187,8 +192,9 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
 
 @pytest.mark.parametrize("ending", [".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb"])
 def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
-    more = SHORT_WATER | {"output.trajectory": f"t{ending}", "stages.production.duration_ps": 0.01}
-    results = Simulation(Scene.read(ROOT / "systems" / "water.toml", more), tmp_path / "run").run()
+    output = {"trajectory": f"t{ending}", "trajectory_interval_ps": 0.01, "figures": False}
+    scene = small_scene({"spce": 8}, 20.0, stages=[{"duration_ps": 0.03}], output=output)
+    results = Simulation(scene, tmp_path / "run").run()
     frames = molecule_animation.frames_of(read_record(tmp_path / "run"), 100)
     assert frames.time == pytest.approx([0, 0.01, 0.02, 0.03], abs=1e-6)
     assert frames.cells[-1] == pytest.approx(results.state.cell, abs=1e-3)
@@ -207,7 +213,7 @@ def test_a_browser_shows_a_top_that_moves(top, tmp_path):
     assert cli.main(["view", str(top), "-o", str(page)]) == 0
     one, other = (
         shown(page, tmp_path / f"{at}.png", at)[150:400] for at in (0.05, 0.1)
-    )  # half a turn
+    )  # half a rotation
     red, green, blue = (np.stack([one, other])[..., k] for k in range(3))
     assert (blue > red + 0.15).mean() > 0.02  # its sides
     assert ((red > blue + 0.2) & (red > green + 0.2)).mean() > 0.005  # its painted side
@@ -319,9 +325,43 @@ def test_a_film_moves(kind, request, tmp_path, capsys):
     assert "0.3 s of animation" in capsys.readouterr().out
 
 
-def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
-    from rigidmd.view import animation as film
+def test_a_gif_is_small(top, tmp_path):
+    """By default: the page of a run that shows it loads in a moment."""
+    path, _ = write_film(top, tmp_path / "film.gif", 3.0)
+    assert len(frames_in(path)) == 38
+    assert path.stat().st_size < 200_000  # 10 s are below 500 kB
 
+
+def test_a_gif_that_is_too_large_has_fewer_frames(top, tmp_path, monkeypatch):
+    monkeypatch.setattr(film, "GIF_BYTES", 20_000)
+    path, _ = write_film(top, tmp_path / "film.gif", 0.5)
+    with Image.open(path) as picture:
+        assert picture.n_frames == 2
+        assert picture.info["duration"] == 240  # as long as with all six
+
+
+def test_gifs_of_the_documentation_are_small():
+    gifs = [*(ROOT / "rigidmd" / "docs").rglob("*.gif")]
+    assert gifs
+    assert {path.name: path.stat().st_size for path in gifs if path.stat().st_size > 500_000} == {}
+
+
+@pytest.mark.parametrize("run", ["top", "water"])
+def test_time_axes_of_plots_are_aligned(run, request):
+    text = plots_part(read_record(request.getfixturevalue(run)))
+    boxes = re.findall(r'data-box="(\S+) (\S+) (\S+) (\S+)"', text)
+    assert len(boxes) >= 4
+    assert len({box[:2] for box in boxes}) == 1  # their left and right ends
+    assert all(0 < float(top) < float(bottom) < 1 for _, _, top, bottom in boxes)
+
+
+def test_notes_that_a_page_has_elsewhere_are_no_warnings(water, tmp_path):
+    write_report(water, tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text("utf-8")
+    assert text.count("pme: alpha") == 1  # in the description of the system
+
+
+def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(film.shutil, "which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # not installed
     assert film.default_name() == "film.gif"
@@ -372,8 +412,8 @@ def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
     from rigidmd.view.body_animation import BodyAnimation
 
     film = BodyAnimation(read_record(top))
-    assert film.loop_end() == (0.5, [])  # this top has fallen and risen, but turned elsewhere
-    half = np.pi * film.time / 0.13  # half the angle of a turn in 0.13 s, about z
+    assert film.loop_end() == (0.5, [])  # this top has fallen and risen, but rotated elsewhere
+    half = np.pi * film.time / 0.13  # half the angle of a rotation in 0.13 s, about z
     turning = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
     still = {name: np.tile(values[0], (len(values), 1)) for name, values in film.vectors.items()}
     film.quaternion, film.vectors = turning, still
@@ -498,7 +538,7 @@ def test_a_page_is_not_replaced_unless_asked(top, tmp_path, capsys):
 
 
 def volume(mesh):
-    """Of a closed surface whose faces are seen counterclockwise from outside."""
+    """For a closed surface whose faces are seen counterclockwise from outside."""
     corners = [mesh.vertices[face] for face in mesh.faces]
     return sum(p[0] @ np.cross(p[k], p[k + 1]) / 6 for p in corners for k in range(1, len(p) - 1))
 
@@ -634,7 +674,7 @@ TILTED = [
 @pytest.mark.parametrize("pinned", [False, True])
 @pytest.mark.parametrize("solids", [None, TILTED], ids=["handle", "tilted"])
 def test_a_body_of_solids_is_drawn_as_its_solids(solids, pinned):
-    """Of one density, the drawn surface has the centre and the inertia of the body."""
+    """For one density, the drawn surface has the centre and the inertia of the body."""
     parts = {} if solids is None else {"body.solids": solids}
     system = build_body(
         Scene.read(ROOT / "systems" / "t_handle.toml", parts | {"body.pinned": pinned})
@@ -744,7 +784,7 @@ def test_the_files_of_a_run_tell_the_same(tmp_path):
 
 @pytest.mark.filterwarnings(
     "ignore:1 A.3 CRYST1 record"
-)  # a body has no box, and MDAnalysis says so
+)  # a body has no box, and MDAnalysis states so
 def test_a_body_has_its_edges_as_bonds(tmp_path):
     more = {"run.duration_s": 0.01, "output.figures": False}
     results = Simulation(

@@ -362,7 +362,7 @@ def test_a_push_that_is_taken_out_is_the_same_for_all_molecules():
     assert taken == pytest.approx(np.sum((mass @ before) ** 2) / (2 * mass.sum()))
 
 
-# temperatures and pressures where a thermostat acts, or without the error of the step
+# temperatures and pressures where a thermostat acts, or without the time-step error
 
 
 def test_temperatures_and_pressures_have_the_corrected_kinetic_energy():

@@ -5,6 +5,7 @@ import functools
 import json
 import re
 import sys
+from pathlib import Path
 
 import pytest
 from support import ROOT
@@ -55,6 +56,10 @@ REFUSED_OUTSIDE_KERNELS = {
     r"flatter than|longer than thick": "oblate, prolate",
     r"rms about the line": "rms deviation from the linear fit",
     r"(?:must be|is|are|be) (?:a )?whole numbers?(?! of| from)": "integer",
+    r"anew|hence|seldom": "again; so, therefore; rarely",
+    r"(?:would do|does|do) nothing": "has no effect",
+    r"rows? of coefficients": "scheme, coefficients",
+    r"errors? of the (?:time )?steps?|corrected for the step": "time-step error",
 }
 KERNELS = re.compile(
     r"rigidmd/(?:compile|mechanics|forces|dynamics|engines/(?:cpu|ode|protocol)|core/(?:integrators|state))\b"
@@ -127,6 +132,17 @@ def texts_of(path):
     if path.suffix == ".md":
         yield 1, without_code(source)
         return
+    if path.suffix == ".js":
+        quoted = re.compile(r"//(.*)$|\"([^\"]* [^\"]*)\"|'([^']* [^']*)'|`([^`]* [^`]*)`")
+        for number, line in enumerate(source.splitlines(), 1):
+            yield from (
+                (number, without_code(next(filter(None, match.groups()), "")))
+                for match in quoted.finditer(line)
+            )
+        return
+    if path.is_relative_to(ROOT / "tests"):  # strings of tests quote code, input and messages
+        yield from docstrings_of(path)
+        return
     tree = tree_of(path)
     inner = {
         id(part)
@@ -145,6 +161,15 @@ def texts_of(path):
             continue
         if re.search(r"[A-Za-z]{2,}\S* \S*[A-Za-z]{2,}", text):
             yield node.lineno, without_code(text)
+
+
+def docstrings_of(path):
+    """(line, text) of the docstrings of a Python file."""
+    for node in ast.walk(tree_of(path)):
+        kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+        if isinstance(node, kinds) and ast.get_docstring(node, clean=False):
+            text = node.body[0].value
+            yield text.lineno, without_code(text.value)
 
 
 #: Parts of identifiers that are not used, besides the words above.
@@ -242,8 +267,11 @@ FILES = sorted(
             for path in (ROOT / "systems").rglob(f"*{suffix}")
         ),
         *PACKAGE.rglob("*.py"),
+        *PACKAGE.rglob("*.js"),
         *(PACKAGE / "docs").rglob("*.md"),
+        *(path for path in (ROOT / "tests").rglob("*.py") if path != Path(__file__).resolve()),
         ROOT / "README.md",
+        ROOT / "pyproject.toml",
     ]
 )
 
@@ -252,7 +280,7 @@ def test_words_of_the_field():
     errors = []
     for path in FILES:
         errors += found_in(path, comments=True)
-        if path.suffix == ".py":
+        if path.suffix == ".py" and path.is_relative_to(PACKAGE):
             errors += refused_names(path)
     assert not errors, "\n" + "\n".join(errors)
 
@@ -273,6 +301,7 @@ def test_words_of_the_field():
             ["are no atoms", "sites a molecule"],
         ),
         ("This takes place in its own file; there is no such file", []),
+        ("Hence it is computed anew and does nothing", ["Hence", "anew", "does nothing"]),
         ("The law of cosines; a plane wave is turned off", []),
         ("[a page](looking.md) of the wave vector `waves`", []),
     ],
@@ -294,6 +323,15 @@ def test_which_names_are_refused(tmp_path):
         "wave",
     ]
     assert [bad for _, bad in refused_names_in(path)] == [["told"], ["leaning"], ["room"], ["wave"]]
+
+
+def test_where_words_are_sought(tmp_path):
+    (page := tmp_path / "a.js").write_text(
+        "const a = 'so many of it'; // the own one\nb = 'own';\n"
+    )
+    assert [list(refused_in(text)) != [] for _, text in texts_of(page)] == [True, True]
+    assert ROOT / "pyproject.toml" in FILES
+    assert any(path.parent.name == "tests" for path in FILES)
 
 
 if __name__ == "__main__":

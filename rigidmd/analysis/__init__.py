@@ -39,7 +39,7 @@ def __getattr__(name: str) -> Callable[..., AnalysisResult]:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *registry.KNOWN})
+    return sorted({*__all__, *registry.KNOWN})
 
 
 def _check_results(results: object, name: str) -> None:

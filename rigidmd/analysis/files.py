@@ -87,7 +87,8 @@ def write_results(
         write_csv(folder / f"{curve.file}.csv", [list(columns), *lines], csv.QUOTE_NONNUMERIC)
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
     for curve in curves:
-        write_figure(folder / f"{curve.file}.{figures}", partial(curve_figure, curve))
+        title = f"{folder.absolute().name}: {curve.file.replace('_', ' ')}"
+        write_figure(folder / f"{curve.file}.{figures}", partial(curve_figure, curve), title)
         for other in (
             {f"{curve.file}.{kind}" for kind in FIGURES} & owner.keys() & {*marked} - new.keys()
         ):
@@ -192,11 +193,11 @@ def analyse_folder(
 ) -> AnalysisOutput:
     """Analyse the run in a folder and write the files into it.
 
-    An analysis that is not possible is left out with a sentence. Raises OutputError if none is
+    An analysis that is not possible is omitted with a sentence. Raises OutputError if none is
     possible.
 
     names : of analyses, all if empty; start : of the frames, ps; viscosity : mPa s
-    progress : called with the fraction done and the name of the present work
+    progress : called with the fraction done and the name of the current work
     figures : type of the figures, one of FIGURES
     """
     selected(names)  # before frames are read

@@ -1,6 +1,6 @@
 """Distances between sites of different molecules, counted in bins: the loop behind g(r).
 
-Neither MDAnalysis nor freud leaves out the pairs within a molecule without a list of all pairs,
+Neither MDAnalysis nor freud omits the pairs within a molecule without a list of all pairs,
 which takes 0.1 to 2 s a frame for 4096 waters within 10 Å.
 """
 
@@ -23,7 +23,7 @@ def _count(code, content):
 def _count_part(task_arguments, part):
     """Add to counts (PARTS, bins) the pairs (i of first, j of second) of different owners that are
     closer than edge * bins; fractions of the box, second sorted by cells of the grid, `start` where
-    each begins."""
+    each starts."""
     first, owner, second, owner_2, cell, grid, start, reach, edge, counts = load_arguments(
         task_arguments
     )

@@ -68,11 +68,6 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
     """Register a user-defined analysis under the name of its function; `rigidmd analyse --only
     NAME` runs it.
 
-    @rigidmd.analysis.register
-    def height(frames):
-        "mean height of the centres (Å)"
-        return frames.positions[:, :, 2].mean(axis=1)
-
     The function gets a `rigidmd.analysis.rigid_frames.RigidFrames` (time, positions, Q, L,
     velocities, cell, ...) and returns one number for each frame (f,), or a dictionary of such
     arrays, of which means, errors, a CSV file and a figure are made. The first line of its
@@ -82,6 +77,13 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
     ------
     OutputError
         If the name is not free.
+
+    Examples
+    --------
+        @rigidmd.analysis.register
+        def height(frames):
+            "mean height of the centres (Å)"
+            return frames.positions[:, :, 2].mean(axis=1)
     """
     name = getattr(function, "__name__", "")
     if is_built_in(name):

@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-#: Most relaxations of a model.
+#: Maximum number of relaxations of a model.
 MOST = 3
 #: Bands: the first frequencies are by themselves, later ones together with others within this
 #: ratio.
 ALONE, RATIO = 20, 1.08
-#: Least number of bands of a fit, and groups of bands whose sums of residuals give chi².
+#: Minimum number of bands of a fit, and groups of bands whose sums of residuals give chi².
 LEAST_BANDS, GROUPS = 15, 12
 #: Parts of the highest frequency, up to which a model is fitted. The first that it describes is
 #: used.
@@ -97,7 +97,7 @@ def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
     """Integral from 0 to infinity of the correlation function of series (n, d) of mean 0, mean over
     d and runs; None if the series are too short for a fit.
 
-    Models of one to three relaxations and a constant are fitted by their likelihood; their limits
+    Models of one to three relaxations and a constant are fitted by their likelihood. Their limits
     are averaged with Akaike's weights, and differences between them are a part of the error.
     """
     bands, span = spectral_bands(runs, interval), interval * min(map(len, runs))
@@ -152,7 +152,7 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
         return density, slopes / density[:, None]
 
     def surprise(density: np.ndarray) -> float:
-        """Minus the logarithm of the likelihood, but for a constant."""
+        """Minus the logarithm of the likelihood, except for a constant."""
         return float(bands.freedom @ (np.log(density) + bands.density / density))
 
     parameters, damping = np.clip(start, bottom, ceiling), 1e-2

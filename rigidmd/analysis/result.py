@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 #: Blocks of frames whose scatter gives errors. The error of an error is one third.
 BLOCKS = 5
 MAX_GROUPS = 10  # groups of molecules at most, whose scatter gives errors too
-#: Least length of a run for a value in correlation times of the whole system. For those of single
+#: Minimum length of a run for a value in correlation times of the whole system. For those of single
 #: molecules, of which there are many, it is `BLOCKS`, because each block should be one correlation
 #: time long.
 MIN_CORRELATION_TIMES = 20.0

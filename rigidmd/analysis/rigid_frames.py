@@ -2,7 +2,7 @@
 all analyses.
 
 They are from the folder of a run or from results in memory, by default from where production
-begins.
+starts.
 """
 
 from collections.abc import Callable, Iterator
@@ -198,7 +198,7 @@ def fit_frames(
     """Bodies of frames, each array with a first axis (f,), and notes. Raises OutputError.
 
     sites (f, s, 3); velocities alike or None; cells (f, 3, 3)
-    wrapped : whether centres are wrapped into the box; their paths are made continuous
+    wrapped : whether centres are wrapped into the box. Their paths are made continuous
     progress : called with the fraction done
     """
     fit, n, f = RigidFit(system), len(system.model.species), len(sites)
@@ -233,7 +233,7 @@ def fit_frames(
     return Bodies(position, Q, velocity, L), notes
 
 
-#: Most numbers of 8 bytes of frames in memory; a longer trajectory is thinned out.
+#: Maximum number of numbers of 8 bytes of frames in memory; a longer trajectory is thinned out.
 MOST_NUMBERS = 150_000_000
 
 
@@ -243,7 +243,7 @@ def frames_of_folder(
     progress: Callable[[float], object] = lambda fraction: None,
 ) -> RigidFrames:
     """The frames of a run of molecules in a folder, from `start` (ps) on, or from where production
-    begins.
+    starts.
 
     progress : called with the fraction done. Raises OutputError.
     """
@@ -370,7 +370,7 @@ def _rigid_frames(
 
 
 def _last_stage(system: System, columns: dict[str, np.ndarray]):
-    """The last moving stage with samples, its begin, end and equilibrated part, ps, and its samples
+    """The last moving stage with samples, its start, end and equilibrated part, ps, and its samples
     of motion (l,)."""
     time, stages = columns["time"], system.scene.stages
     if all(stage.is_minimisation for stage in stages):

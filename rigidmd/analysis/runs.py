@@ -104,7 +104,7 @@ class Runs:
         )
 
     def estimate(self, values: Sequence[Any], conclude: Callable[[np.ndarray], Any]) -> Measured:
-        """What follows from the mean of a value of each run, and its standard error by leaving out
+        """What follows from the mean of a value of each run, and its standard error by omitting
         one run after another (jackknife). Without further conclusions this is the standard error of
         the mean over runs.
 

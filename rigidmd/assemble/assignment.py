@@ -86,7 +86,7 @@ def fit_template(points: np.ndarray, molecule: Molecule) -> TemplateFit:
 
 def bond_reach(points: np.ndarray, classes: np.ndarray) -> np.ndarray:
     """Largest lengths (s, s) of bonds between atoms of a template with these points (s, 3), Å.
-    Bonds are its shortest links, and all pairs of the same classes (s,); other pairs have 0."""
+    Bonds are its shortest links, and all pairs of the same classes (s,). Other pairs have 0."""
     count = classes.max() + 1
     longest = np.zeros((count, count))
     for i, j in shortest_links(points):

@@ -32,9 +32,9 @@ def kinds_of(atoms: Atoms, species: list[Molecule]) -> list[str]:
     """The label of every atom: its element, or the name of a site; X for massless ones. "?" marks a
     guess.
 
-    An element in the file is accepted. A name counts if it is the name of a site or begins with an
+    An element in the file is accepted. A name counts if it is the name of a site or starts with an
     element of the scene. If the file has masses, names of sites and elements have priority over the
-    mass, and the mass over the beginning of any other name.
+    mass, and the mass over the start of any other name.
     """
     by_name, by_mass = {}, []
     for molecule in species:

@@ -203,13 +203,14 @@ def _body_errors(
             yield "changing_inertia: the centre of mass must be at the pivot of a pinned body"
         if scene.gravity is not None and not centre.any() and rotates:
             yield (
-                "gravity does nothing to a body pinned at its centre of mass; give"
+                "gravity has no effect on a body pinned at its centre of mass; give"
                 " body.centre_of_mass_m"
             )
         for k, entry in enumerate(scene.applied):
             if entry.force_N is not None and not any(entry.at_m or ()):
                 yield (
-                    f"applied.{k}.force_N does nothing at the pivot; give its point of action, at_m"
+                    f"applied.{k}.force_N has no effect at the pivot; give its point of action,"
+                    " at_m"
                 )
 
 

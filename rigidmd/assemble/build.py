@@ -21,7 +21,7 @@ from rigidmd.assemble.plausibility import scene_errors, scene_warnings
 from rigidmd.assemble.species import species_of, split_frozen
 from rigidmd.assemble.stage_description import stage_notes
 from rigidmd.assemble.start import overlaps, residue_numbers, set_momenta, starting_configuration
-from rigidmd.assemble.time_step import with_precision
+from rigidmd.assemble.time_step import with_precision, with_time_steps
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.barostats import BAROSTATS, Confinement, Pressure
@@ -40,19 +40,29 @@ from rigidmd.scene.fields import FIELDS, field_notes
 from rigidmd.scene.forces import ELECTROSTATICS, POTENTIALS
 from rigidmd.scene.molecules import missing_user_code
 from rigidmd.scene.stage import Stage
-from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
+from rigidmd.units import BAR, BOLTZMANN
 
 
 def build(scene: MolecularScene, user_code: bool = True) -> System:
     """The system of a scene. Raises SceneError, StructureError or MoleculeError, with all errors
     found.
 
-    user_code : whether to run the code of users; without it their terms are missing, which analyses
+    user_code : whether to run the code of users. Without it their terms are missing, which analyses
         do not need
     """
     scene, engine_notes = with_engine_defaults(scene)
     species = species_of(scene)
     start = starting_configuration(scene, species)
+    mass = np.array([m.mass for m in species])
+    velocity = (
+        start.velocity if scene.structure is not None and scene.structure.velocities else None
+    )
+    if velocity is None:
+        thermal = 0.0
+    else:
+        squares = mass[start.species] @ (velocity**2).sum(axis=1)
+        thermal = float(squares) / (3 * len(start.species))
+    scene = with_time_steps(scene, species, thermal / BOLTZMANN)
     space, number = space_of(start.cell), residue_numbers(start)
     warnings = scene_warnings(scene, species)
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
@@ -68,9 +78,6 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     if faults := [*faults, *resolved.errors]:
         raise SceneError(scene.source, faults)
     written, scene = scene, resolved.scene
-    velocity = (
-        start.velocity if scene.structure is not None and scene.structure.velocities else None
-    )
     mass = np.array([m.mass for m in species])
     inertia = np.where(frozen[:, None], 0.0, [m.inertia for m in species])
     rotor = split_rotor(inertia)
@@ -92,10 +99,6 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     acting.terms.update(field_terms(parts))
     model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
-    if velocity is None:
-        thermal = 0.0
-    else:
-        thermal = float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
     free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
     scene, precision_reason = with_precision(scene, free, thermal / BOLTZMANN, acting.force_error)
     without_tail = ""
@@ -131,7 +134,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
             raise SceneError(
                 scene.source, [missing_user_code(scene.from_python, scene.user_code.names)]
             )
-        if scene.forces.custom or scene.from_python:
+        if scene.forces.added or scene.from_python:
             from rigidmd.assemble.user_code.binding import with_user_code
 
             system = with_user_code(system)
@@ -248,7 +251,7 @@ def left_out(
     """What is not compiled for this scene, and why.
 
     charged : whether a site has a charge
-    without_tail : why the tail correction is left out; empty if it is included
+    without_tail : why the tail correction is omitted; empty if it is included
     """
     forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
     has_sums = any(name.endswith("_reciprocal") for name in terms)
@@ -301,9 +304,7 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
         else:
             scheme = scheme.with_barostat(barostat, stage.moves_every)
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
-        scheme = scheme.with_momentum_removal(
-            max(1, round(interval / (stage.timestep_fs * FEMTOSECOND)))
-        )
+        scheme = scheme.with_momentum_removal(max(1, round(interval / stage.step)))
     return scheme
 
 

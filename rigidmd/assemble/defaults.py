@@ -2,7 +2,7 @@
 in.
 
 A resolved scene runs to the same bits as the original scene. Three values stay open in it: an
-integrator "auto", which a pilot run chooses; the number of threads, on which results do not depend;
+integrator "auto", which a pilot run chooses. The number of threads, on which results do not depend;
 and the grid of PME where another cell of the same lattice replaces a cell with a large tilt (see
 `SceneWithDefaults.pme_grid`).
 """
@@ -35,12 +35,7 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
     notes, stages = [f"computed by {scene.engine.title}"], []
     for k, stage in enumerate(scene.stages):
         defaults = {}
-        if (
-            program.thermostat
-            and stage.has_thermostat
-            and stage.thermostat is None
-            and not stage.thermostat_is_open
-        ):
+        if program.thermostat and stage.has_thermostat and stage.thermostat is None:
             why = f"because {program.name} has no velocity_rescaling"
             notes.append(f"stages.{k}: thermostat {program.thermostat}, {why}")
             defaults["thermostat"] = program.thermostat
@@ -127,12 +122,18 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
 
 def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> MolecularScene:
     """A scene with the default of run.remove_momentum_interval_ps. keeps_momentum (3,) : conserved
-    components."""
+    components.
+
+    Where heat flows from rotation to translation, a thermostat that scales velocities scales the
+    velocity of the centre of mass with them, by the same factor above 1 on average: its rounding
+    error grows exponentially.
+    """
     if scene.run.remove_momentum_interval_ps is not None:
         return scene
     electrostatics = ELECTROSTATICS[scene.forces.electrostatics or "none"]
     conserved = electrostatics.conserves_momentum and scene.forces.dispersion != "pme"
-    removed = not conserved and keeps_momentum.any()
+    is_scaled = any(stage.has_thermostat and stage.keeps_momentum for stage in scene.stages)
+    removed = keeps_momentum.any() and (is_scaled or not conserved)
     run = {"remove_momentum_interval_ps": REMOVE_MOMENTUM_INTERVAL if removed else False}
     return scene.model_copy(update={"run": scene.run.model_copy(update=run)})
 
@@ -164,7 +165,7 @@ def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
         return "forces.lennard_jones is false"
     if forces.dispersion != "cutoff":
         return f"forces.dispersion = {forces.dispersion!r} sums over all images"
-    if forces.custom or scene.user_code.forces:
+    if forces.added or scene.user_code.forces:
         return "a user's potential may end at its cutoff or fall too slowly for one"
     if scene.engine.is_external and any(stage.has_barostat for stage in scene.stages):
         return f"the barostat of {scene.engine.name} does not include it"

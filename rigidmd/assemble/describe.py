@@ -11,7 +11,7 @@ from rigidmd.assemble.build import build
 from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
 from rigidmd.assemble.start import output_errors
-from rigidmd.assemble.time_step import MIXED_ERROR
+from rigidmd.assemble.time_step import MIXED_ERROR, describe_step
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import edges_and_angles
@@ -172,6 +172,8 @@ def _describe_molecules(system: System) -> str:
     for k, stage in enumerate(scene.stages):
         steps, sampled = describe_stage(stage)
         lines += [f"  {k}: {steps}", f"     {sampled}"]
+        if of_step := describe_step(scene, system.species, k):
+            lines.append(f"     {of_step}")
     lines.append(
         f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces, neighbour lists and"
         " samples"

@@ -11,6 +11,8 @@ from rigidmd.core.integrators import DRIFT, KICK, RK4, Scheme, Solver
 #: Largest error of a step, as a fraction of the forces, without a warning: 6 fs for water with
 #: velocity Verlet. What is advised instead has half of it.
 INACCURATE = 0.1
+#: Below this w dt the error of a step is extrapolated by the order of the scheme.
+SMALL_ANGLE = 0.03
 
 
 def _trace(scheme: Scheme, square: np.ndarray) -> np.ndarray:
@@ -43,5 +45,8 @@ def step_error(scheme: Scheme, angle: float) -> float:
     Infinite for an unstable step."""
     if angle >= stable_angle(scheme):
         return inf
+    small = min(SMALL_ANGLE, stable_angle(scheme) / 4)
+    if angle < small:  # rounding of the trace would be most of it
+        return step_error(scheme, small) * (angle / small) ** scheme.order
     followed = np.arccos(np.clip(_trace(scheme, np.array([angle**2]))[0] / 2, -1, 1))
-    return abs(float(followed / angle) ** 2 - 1) if angle > 0 else 0.0
+    return abs(float(followed / angle) ** 2 - 1)

@@ -13,7 +13,6 @@ from rigidmd.core.process import format_gigabytes, free_memory, memory_shortage
 from rigidmd.core.state import no_load
 from rigidmd.errors import SceneError
 from rigidmd.scene.validation import not_none
-from rigidmd.units import FEMTOSECOND
 
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
@@ -88,10 +87,7 @@ def _samples(scene: "MolecularScene") -> tuple[float, float]:
     at its end."""
     output = scene.output
     lines, frames = (  # at the interval and at the ends of stages
-        sum(
-            2 + s.duration / (every if s.is_auto else max(every, s.timestep_fs * FEMTOSECOND))
-            for s in scene.stages
-        )
+        sum(2 + s.duration / (every if s.is_auto else max(every, s.step)) for s in scene.stages)
         for every in (output.log_interval_ps, output.trajectory_interval_ps)
     )
     return lines, BYTES_PER_LOG_LINE * lines + BYTES_PER_FRAME * (

@@ -148,7 +148,7 @@ def model_from_geometry(
     """The model of a structure file with one molecule, with the positions in the file: its file,
     molecule, notes.
 
-    parameters : a table of parameters by atom name or element; without one the model has masses and
+    parameters : a table of parameters by atom name or element. Without one the model has masses and
         no interactions
     name : default: the name of the file. Raises StructureError or MoleculeError, with all errors.
     """

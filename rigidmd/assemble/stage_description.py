@@ -3,7 +3,6 @@ quantities."""
 
 from rigidmd.scene.couplings import BAROSTATS, COMPRESSIBILITY, THERMOSTATS
 from rigidmd.scene.stage import Stage
-from rigidmd.units import FEMTOSECOND
 
 #: Range of compressibilities (1/bar): diamond, a gas at 0.01 bar.
 STIFFEST, SOFTEST = 2e-7, 100.0
@@ -39,11 +38,11 @@ def describe_stage(stage: Stage) -> list[str]:
                 f" {stage.most_iterations} iterations"
             ),
         ]
-    rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
-    text = (
-        f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps,"
-        f" {stage.integrator}"
-    )
+    length = f"{stage.duration:g} ps"
+    if stage.timestep_fs is not None:
+        rounded = stage.steps * stage.step
+        length = f"{stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps"
+    text = f"{stage.label}: {length}, {stage.integrator}"
     if stage.is_auto:
         error = f"{stage.trajectory_error or 0:g} of Q or X"
         if stage.energy_error_kT:
@@ -63,7 +62,7 @@ def describe_stage(stage: Stage) -> list[str]:
         text += f", {_barostat(stage)}"
     if stage.volume:
         text += ", in the mean box of the stage before"
-    sampled, conserved = DISTRIBUTIONS[stage.ensemble]  # up to the error of the step
+    sampled, conserved = DISTRIBUTIONS[stage.ensemble]  # up to the time-step error
     if stage.ensemble == "npt" and stage.pressure_coupling != "isotropic":
         sampled += ", with the invariant measure of the shape"
     if stage.ramps:

@@ -7,16 +7,20 @@ moments of inertia and temperature.
 """
 
 from collections.abc import Callable, Iterator
-from math import inf, sqrt
+from functools import cache
+from math import floor, inf, log10, sqrt
 from operator import attrgetter
 from typing import Literal, NamedTuple
 
+import numpy as np
+
 from rigidmd.assemble.harmonic import INACCURATE, stable_angle, step_error
 from rigidmd.assemble.species import species_of
-from rigidmd.core.integrators import Scheme
+from rigidmd.core.integrators import WITH_THERMOSTAT, Scheme
+from rigidmd.errors import SceneError
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.stage import Stage
+from rigidmd.scene.stage import USUAL_STEP, Stage
 from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND
 
 #: Rms amplitudes of the fastest motions of a liquid at its temperature, as angles and in diameters.
@@ -28,11 +32,23 @@ SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
 #: cutoff of 9 Å: 3.2e-6 for 512 SPC/E with PME, 3.3e-6 for 216 TIP4P/2005 with a reaction field,
 #: 1.4e-6 for 500 argon; the largest 1e-5.
 MIXED_ERROR = 3e-6
-#: Least error of Ewald sums that grids in single precision allow, e²/Å².
+#: Minimum error of Ewald sums that grids in single precision allow, e²/Å².
 MIXED_EWALD_ERROR = 3e-6
+#: Bias of U per error of a step, kT per degree of freedom: of a thermostat that reads the momenta
+#: at the ends of steps (measured for SPC/E with velocity Verlet: 0.007 at 2 fs, 0.026 at 4 fs), and
+#: in the middle of the drift (below 0.002 at 4 fs).
+BIAS_AT_ENDS, BIAS_IN_MIDDLE = 0.6, 0.04
+#: Largest bias of U at a default step, kT per degree of freedom.
+DEFAULT_BIAS = 0.002
+#: Largest error of a default step without a thermostat, or with hybrid Monte Carlo: 2 fs for water.
+DEFAULT_ERROR = 0.0125
+#: Default steps are at most this long, fs: longer ones resolve no collision of argon at 94 K.
+LONGEST_DEFAULT = 10.0
+#: Leading digits of default steps, which divide usual intervals.
+DIGITS = (5.0, 4.0, 2.5, 2.0, 1.0)
 #: A step that is this many times shorter than the longest stable one is probably in another unit.
 NEEDLESS = 1000
-#: precision = "auto" is mixed where the error of the time step is at least this many times that of
+#: precision = "auto" is mixed where the time-step error is at least this many times that of
 #: mixed precision. The limits of a minimisation in mixed precision are, too.
 MARGIN = 30
 
@@ -78,6 +94,98 @@ def fastest_motion(species: list[Molecule], temperature: float) -> FastMotion | 
     return min(motions, key=attrgetter("time"), default=None)
 
 
+@cache
+def _longest_angle(scheme: Scheme, error: float) -> float:
+    """Largest w dt, up to half of the longest stable one, at which the error of a step is this."""
+    angles = stable_angle(scheme) / 2 * 0.98 ** np.arange(500)
+    return next((x for x in angles.tolist() if step_error(scheme, x) <= error), 0.0)
+
+
+def _bias_per_error(stage: Stage) -> float:
+    """Bias of U per time-step error, kT per degree of freedom, of a stage with a thermostat."""
+    if stage.is_hybrid:
+        return 0.0
+    return BIAS_IN_MIDDLE if stage.integrator in WITH_THERMOSTAT else BIAS_AT_ENDS
+
+
+def _default_step(scene: MolecularScene, stage: Stage, fastest: FastMotion | None) -> float:
+    """The default time step of a stage, fs: a round number that divides its intervals, if there is
+    one between the longest allowed step and half of it."""
+    if fastest is None or scene.forces.added or scene.from_python:
+        return USUAL_STEP
+    error = DEFAULT_ERROR
+    if stage.has_thermostat and not (stage.is_hybrid or scene.engine.is_external):
+        error = DEFAULT_BIAS / _bias_per_error(stage)
+    longest = _longest_angle(stage.scheme, error) * fastest.time / FEMTOSECOND
+    longest = min(longest, LONGEST_DEFAULT, stage.duration / FEMTOSECOND)
+    if longest == 0:
+        return USUAL_STEP
+    decade = floor(log10(longest))
+    steps = [float(f"{digit}e{k}") for k in (decade, decade - 1) for digit in DIGITS]
+    allowed = [step for step in steps if longest / 2 <= step <= longest]
+    output = scene.output
+    intervals = [stage.duration, output.log_interval_ps]
+    if output.trajectory:
+        intervals.append(output.trajectory_interval_ps)
+    return next((step for step in allowed if _divides(step, intervals)), allowed[0])
+
+
+def _divides(step: float, intervals: list[float]) -> bool:
+    """Whether a step (fs) divides all intervals (ps), up to rounding."""
+    ratios = [interval / (step * FEMTOSECOND) for interval in intervals]
+    return all(abs(ratio - round(ratio)) <= 1e-9 * ratio for ratio in ratios)
+
+
+def with_time_steps(
+    scene: MolecularScene, species: list[Molecule], temperature: float
+) -> MolecularScene:
+    """A scene with a time step in every stage that needs one. Raises SceneError.
+
+    temperature : of velocities from a file, K
+    """
+    moving, stages = _moving(scene, species), list(scene.stages)
+    for k, stage, of_stage in _given_steps(scene):
+        if stage.timestep_fs is None:
+            fastest = fastest_motion(moving, of_stage or temperature)
+            step = _default_step(scene, stage, fastest)
+            stages[k] = stage.model_copy(update={"timestep_fs": step})
+    complete = scene.model_copy(update={"stages": tuple(stages)})
+    if faults := complete.errors_of_steps():
+        raise SceneError(scene.source, faults)
+    return complete
+
+
+def describe_step(scene: MolecularScene, species: list[Molecule], k: int) -> str:
+    """The motion that limits the step of stage k, and the bias that is expected; empty if there is
+    no such motion."""
+    given = {index: (stage, temperature) for index, stage, temperature in _given_steps(scene)}
+    if k not in given:
+        return ""
+    stage, temperature = given[k]
+    fastest = fastest_motion(_moving(scene, species), temperature)
+    if fastest is None or scene.engine.is_external:
+        return ""
+    error = step_error(stage.scheme, stage.step / fastest.time)
+    if error == inf:
+        return "time-step error: unstable"
+    text = (
+        f"time-step error: {fastest.molecule} {fastest.does} as if forces were wrong by"
+        f" {100 * error:.1g} %"
+    )
+    if stage.is_hybrid:
+        return f"{text}; averages have none"
+    if stage.has_thermostat:
+        bias = _bias_per_error(stage) * error
+        text += f"; bias of U about {bias:.1g} kT per degree of freedom"
+    return text
+
+
+def _moving(scene: MolecularScene, species: list[Molecule]) -> list[Molecule]:
+    """The species that are not frozen."""
+    entries = zip(species, scene.molecules, strict=False)
+    return [m for m, entry in entries if entry.frozen is not True]
+
+
 def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
     """The stages other than minimisations with a given step: index, stage and temperature, K; 0 if
     it is not known."""
@@ -116,24 +224,20 @@ def _sentences_on_steps(
     scene: MolecularScene, about: Callable[[Stage, FastMotion, float], str]
 ) -> Iterator[str]:
     """What a function writes on the step of each stage, if the scene watches steps."""
-    species = [
-        m
-        for m, entry in zip(species_of(scene), scene.molecules, strict=True)
-        if entry.frozen is not True
-    ]
+    species = _moving(scene, species_of(scene))
     for k, stage, temperature in _given_steps(scene):
         fastest = fastest_motion(species, temperature)
         if fastest is None or not scene.watch.stable_step:
             continue
         if sentence := about(stage, fastest, temperature):
-            yield f"stages.{k}: timestep_fs = {stage.timestep_fs:g} {sentence}"
+            yield f"stages.{k}: timestep_fs = {stage.step_fs:g} {sentence}"
 
 
 def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
     """What is wrong with the step of a stage for a motion at a temperature, K; empty if nothing
     is."""
     time, size, unit, name, does = fastest
-    longest, dt = fastest.longest_step(stage), stage.timestep_fs * FEMTOSECOND
+    longest, dt = fastest.longest_step(stage), stage.step
     limit = f"{longest / FEMTOSECOND:.3g} fs"
     if dt > longest:
         return (
@@ -154,7 +258,7 @@ def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
 
 def _accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
     """Like `_step_warning`, of steps that are stable and have large errors."""
-    dt, limit = stage.timestep_fs * FEMTOSECOND, fastest.longest_step(stage)
+    dt, limit = stage.step, fastest.longest_step(stage)
     error = step_error(stage.scheme, dt / fastest.time)
     # hybrid Monte Carlo corrects the error of its steps
     if dt > limit or error <= INACCURATE or stage.is_hybrid:
@@ -170,14 +274,14 @@ def _accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> 
 
 
 def precision_for(error: float) -> Literal["double", "mixed"]:
-    """The precision of forces that suits an error of the time step."""
+    """The precision of forces that suits a time-step error."""
     return "mixed" if error >= MARGIN * MIXED_ERROR else "double"
 
 
 def with_precision(
     scene: MolecularScene, species: list[Molecule], temperature: float, force_error: float | None
 ) -> tuple[MolecularScene, str]:
-    """A scene with its precision and, for "auto", the reason: mixed if the error of the time step
+    """A scene with its precision and, for "auto", the reason: mixed if the time-step error
     hides that of single precision in every stage, else double.
 
     species : those that are not frozen; temperature : of velocities from a file, K; force_error :
@@ -186,7 +290,7 @@ def with_precision(
     if scene.precision != "auto":
         return scene, ""
     errors = {
-        k: error_of_step(species, stage_temperature or temperature, stage.scheme, stage.timestep_fs)
+        k: error_of_step(species, stage_temperature or temperature, stage.scheme, stage.step_fs)
         for k, stage, stage_temperature in _given_steps(scene)
     }
     seeks = [
@@ -207,7 +311,7 @@ def with_precision(
     elif errors:
         k = min(errors, key=lambda k: errors[k])
         precision, stage = precision_for(errors[k]), scene.stages[k]
-        step, ratio = f"{stage.integrator} at {stage.timestep_fs:g} fs", errors[k] / MIXED_ERROR
+        step, ratio = f"{stage.integrator} at {stage.step_fs:g} fs", errors[k] / MIXED_ERROR
         times = f"{ratio:,.0f}" if ratio > 9 else f"{ratio:.1g}"
         single = f"that of single precision, {MIXED_ERROR:.0e}"
         why = f"the error of {step}, about {errors[k]:.0e} of the forces, is {times} times {single}"

@@ -1,4 +1,4 @@
-"""The command line: cli.py lists the commands; each has a module with its arguments, its call and
+"""The command line: cli.py lists the commands. Each has a module with its arguments, its call and
 what it prints."""
 
 from rigidmd.core.process import BY_SIGNAL

@@ -59,6 +59,12 @@ from rigidmd.commands.arguments import (
         metavar="PS",
         help="with --averages: time sampled with every step, after a fifth of it (default: 20)",
     ),
+    argument(
+        "-v",
+        "--verbose",
+        action="store_true",
+        help="also print which integrators are equally fast within timing noise",
+    ),
     *output_folder("runs/NAME-accuracy"),
     writes=True,
 )
@@ -103,7 +109,7 @@ def _accuracy(options: Options) -> int:
         accuracy.FILES,
         "compiling and running the reference",
         lambda progress: accuracy.measure_accuracy(scene, *settings, progress),
-        lambda errors: [*accuracy.recommendations(errors), "", accuracy.table_text(errors)],
+        lambda errors: accuracy.describe_accuracy(errors, options.verbose),
         accuracy.write_accuracy,
     )
     return 0

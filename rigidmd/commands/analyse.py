@@ -75,9 +75,15 @@ class _List(argparse.Action):
         default=[],
         metavar="FILE.py",
         help=(
-            "run this Python file first, which may define analyses with @rigidmd.analysis; may be"
-            " repeated"
+            "run this Python file first, which may define analyses with"
+            " @rigidmd.analysis.register; may be repeated"
         ),
+    ),
+    argument(
+        "-v",
+        "--verbose",
+        action="store_true",
+        help="also print the notes of each analysis, and what its curves are",
     ),
     argument("--list", action=_List, nargs=0, help="list the analyses"),
     scene="this run",
@@ -105,7 +111,7 @@ def _analyse(options: Options) -> int:
                     f"{len(of.files)} files in {of.files[0].parent}" if of.files else "no results"
                 )
                 print(f"{of.title or folder}: {runs}, {files}")
-                _print_results(of.results, of.failed)
+                _print_results(of.results, of.failed, options.verbose)
                 print()
             print(f"values of all in {folder / ANALYSES}")
             if options.extrapolate is not None:
@@ -129,16 +135,17 @@ def _analyse(options: Options) -> int:
     )
     for note in used["notes"]:
         print(f"  {note}")
-    _print_results(done.results, done.failed)
+    _print_results(done.results, done.failed, options.verbose)
     print(
-        f"{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd"
+        f"\n{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd"
         " report` shows them"
     )
     return FAILED if options.only and done.failed else 0
 
 
-def _print_results(results: list, skipped: dict[str, str]) -> None:
-    for result in results:
-        print(result)
-    for name, why in skipped.items():
-        print(f"{name}: skipped: {why}")
+def _print_results(results: list, failed: dict[str, str], verbose: bool) -> None:
+    from rigidmd.analysis.report import results_text
+
+    print(*results_text(results, failed), sep="\n")
+    if verbose:
+        print(*("", *results), sep="\n")

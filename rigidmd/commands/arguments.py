@@ -201,7 +201,7 @@ def write_study(
     """Measure something, print it and write its files into a folder, which is locked meanwhile.
     Returns what was found.
 
-    files : names of all files that `write` may write; begins : what begins when the arguments have
+    files : names of all files that `write` may write; begins : what starts when the arguments have
         been checked
     """
     from rigidmd.io.folder import FolderLock, check_folder, make_folder

@@ -57,7 +57,7 @@ def _check(options: Options) -> int:
             _print_programs(system)
         if options.profile:
             _print_profile(scene)
-        warnings = [*system.warnings, *step_warnings(scene)]
+        warnings = [*system.warnings, *step_warnings(system.scene)]
     for warning in warnings:
         warn(warning)
     return 0
@@ -82,19 +82,18 @@ def _print_profile(scene: Any) -> None:
     from rigidmd.assemble.build import integrator_of_stage
     from rigidmd.engines.cpu.program import describe_profile, profile_of
     from rigidmd.run import Simulation
-    from rigidmd.units import FEMTOSECOND
 
     stages = [
         k for k, stage in enumerate(scene.stages) if not stage.is_minimisation and not stage.is_auto
     ]
-    if not stages or scene.forces.custom:
+    if not stages or scene.forces.added:
         problem = "--profile needs a stage with a time step, and forces that are not user-defined"
         raise SceneError(scene.source, [problem])
     simulation = Simulation(scene)
-    state = simulation.settle()
-    system, stage = simulation.system, scene.stages[stages[0]]
+    state = simulation._settle()
+    system, stage = simulation.system, simulation.scene.stages[stages[0]]
     scheme = integrator_of_stage(system, stages[0])
-    profile = profile_of(system.engine(), state, scheme, stage.timestep_fs * FEMTOSECOND)
+    profile = profile_of(system.engine(), state, scheme, stage.step)
     print(
         f"\ntime of a step of stages.{stages[0]} ({stage.label}) and of its rows,"
         f" {simulation.threads} threads:"

@@ -1,6 +1,6 @@
 """`rigidmd`: the parsing of the command line, the messages and exit codes of errors.
 
-The module of the command is imported, or without one all modules of this package; their functions
+The module of the command is imported, or without one all modules of this package. Their functions
 with the decorator `command` are the commands. They compute nothing. Modules import what they need
 inside functions, so that `rigidmd --help` loads none of it.
 """

@@ -38,10 +38,10 @@ def _energy(options: Options) -> int:
                 scene.source,
                 [f"--unit {options.unit} is for molecules; the energy of a body is in J"],
             )
-        energies, unit = Simulation(scene).start_energy(), "J"
+        energies, unit = Simulation(scene)._start_energy(), "J"
     else:
         unit = options.unit or "kJ/mol"
-        energies = Simulation(scene).start_energy(ENERGY_UNITS[unit], unit, options.accuracy)
+        energies = Simulation(scene)._start_energy(ENERGY_UNITS[unit], unit, options.accuracy)
     if options.json:
         print(json.dumps(energies, indent=2))
     elif isinstance(scene, BodyScene):

@@ -31,7 +31,7 @@ from rigidmd.commands.streams import progress_bar
         "--height",
         type=number(int, 100, 2160, "a number of pixels from 100 to 2160"),
         metavar="N",
-        help="pixels (default: 640, of a .gif 448)",
+        help="pixels (default: 640, of a .gif 300)",
     ),
     argument("--plots", action="store_true", help="put plots with a moving cursor next to it"),
     scene="this run",

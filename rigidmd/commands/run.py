@@ -17,7 +17,7 @@ from rigidmd.commands.arguments import (
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import SceneError
 
-#: Options of a run that begins or continues.
+#: Options of a run that starts or continues.
 DURATION = (
     argument(
         "--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)"
@@ -36,6 +36,12 @@ DURATION = (
             "let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a"
             " finished run"
         ),
+    ),
+    argument(
+        "-v",
+        "--verbose",
+        action="store_true",
+        help="print all that the summary has: every stage, precision, momentum, energy noise",
     ),
 )
 
@@ -87,20 +93,17 @@ def run(options: Options) -> int:
         resume=options.resume,
         walltime=options.walltime,
     )
-    print(simulation.introduction(), flush=True)
+    print(simulation._introduction(), flush=True)
     results = simulation.run(progress=True)
-    print(simulation.conclusion(results))
-    print(f"\n  files in {folder}: {', '.join(path.name for path in results.files)}")
+    print(simulation._conclusion(results, options.verbose))
+    names = f": {', '.join(path.name for path in results.files)}" if options.verbose else ""
+    print(f"\nresults in {folder}{names}")
     quoted = shlex.quote(str(folder))
     if results.interrupted:
-        print(f"  `rigidmd resume {quoted}` continues it")
+        print(f"`rigidmd resume {quoted}` continues it")
     else:
-        more = (
-            "report` the page alone"
-            if isinstance(scene, BodyScene)
-            else f"analyse {quoted}` measures it"
-        )
-        print(f"  `rigidmd view {quoted}` shows its animation on a page, `rigidmd {more}")
+        more = "report" if isinstance(scene, BodyScene) else "analyse"
+        print(f"next:  rigidmd {more} {quoted}     rigidmd view {quoted}")
     if results.out_of_time:
         return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0

@@ -24,7 +24,7 @@ def progress_bar(begins: str = "") -> Iterator[Callable]:
     """A bar on a terminal, which disappears at its end: a function of the fraction that is done and
     a description.
 
-    begins : what begins at the fraction 0, when all arguments have been checked
+    begins : what starts at the fraction 0, when all arguments have been checked
     """
     from tqdm import tqdm
 

@@ -24,7 +24,7 @@ APPEND_FLAGS = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY"
 
 
 def unreadable_reason(path: Path, largest: float = inf) -> str:
-    """Why a file cannot be read; empty if it can be. Pipes and devices are refused, because they
+    """Why a file cannot be read; empty if it can be. Pipes and devices are rejected, because they
     may never end.
 
     largest : greatest size in bytes
@@ -81,7 +81,7 @@ def writing(path: Path, what: str = "written", hint: str = "") -> Iterator[None]
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
     """A temporary path in the folder of `path`, renamed to `path` when the block succeeds and
-    removed when it fails. A link at `path` is replaced; its target is not changed."""
+    removed when it fails. A link at `path` is replaced. Its target is not changed."""
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
     with writing(path):
         temporary.touch(exist_ok=False)  # with the permissions of any new file
@@ -115,7 +115,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def create_empty_file(path: Path) -> None:
-    """Create an empty file for a library that opens it by name; an existing file or link is removed
+    """Create an empty file for a library that opens it by name. An existing file or link is removed
     first."""
     path.unlink(missing_ok=True)
     path.touch(exist_ok=False)
@@ -136,10 +136,10 @@ class AppendedFile:
     """A file that grows by whole records. A record that cannot be written is removed. Methods raise
     OutputError.
 
-    A new file replaces an existing one; an existing file is continued after `cut` has been called.
+    A new file replaces an existing one. An existing file is continued after `cut` has been called.
     Links are not followed.
 
-    kept : an earlier value of the property `kept`, at which the file is continued; None begins a
+    kept : an earlier value of the property `kept`, at which the file is continued; None starts a
         new file
     patched : offset and original value of bytes that `patch` replaces
     """

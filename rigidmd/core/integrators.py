@@ -159,7 +159,7 @@ class Scheme(_SchemeFields):
         """
         kinds = [flow.kind for flow in self.flows]
         if END_TRAJECTORY in kinds:
-            return 0.0  # trajectories that are accepted or rejected have no error of the step
+            return 0.0  # trajectories that are accepted or rejected have no time-step error
         if THERMOSTAT not in kinds:
             return self.shadow_correction
         last = len(kinds) - kinds[::-1].index(THERMOSTAT)
@@ -285,11 +285,11 @@ def auto_errors(
     set_keys = [key for key, value in requested.items() if value is not None]
     if integrator != AUTO:
         if set_keys:
-            return [f"{', '.join(set_keys)} would do nothing without integrator = 'auto'"]
+            return [f"{', '.join(set_keys)} would have no effect without integrator = 'auto'"]
         return []
     if unused:
         errors = [
-            f"{', '.join(unused)} would do nothing with integrator = 'auto', which chooses it"
+            f"{', '.join(unused)} would have no effect with integrator = 'auto', which chooses it"
         ]
     else:
         errors = []

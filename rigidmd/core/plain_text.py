@@ -37,7 +37,7 @@ def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
     return names_in_use[first:]
 
 
-#: With more similar names than this, no suggestion is made from a common beginning or end.
+#: With more similar names than this, no suggestion is made from a common starting or end.
 MOST_SUGGESTIONS = 8
 #: Limits of length and number of names beyond which none is suggested, because the comparison would
 #: take long.
@@ -56,7 +56,7 @@ def suggestion(names: list[str]) -> str:
 
 def similar_names(name: str, known: Iterable[str]) -> list[str]:
     """Known names that an unknown one may stand for: those that differ only in case and
-    punctuation; else those that begin with it, such as a key without its unit, or end with it; else
+    punctuation; else those that start with it, such as a key without its unit, or end with it; else
     the one with the most similar spelling."""
     known = list(known)
     if len(name) > LONGEST_NAME or len(known) > MOST_NAMES:

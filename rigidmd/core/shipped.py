@@ -24,35 +24,28 @@ NOTEBOOKS, SCRIPTS = "notebooks/*.ipynb", "scripts/*.py"
 _SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.py)")
 #: Kind of an example by the extension of its file.
 KINDS = {".toml": "scene", ".ipynb": "notebook", ".py": "script"}
+#: Guides by what they are for.
+GUIDES = {
+    "Set up": (
+        "structures",
+        "mixtures",
+        "crystals",
+        "electrostatics",
+        "tables",
+        "body_pairs",
+        "ensembles",
+    ),
+    "Run": ("npt", "slab", "time_step", "fast", "resume", "troubleshooting"),
+    "Analyse": ("analysis", "transport", "normal_modes", "pmf", "chemical_potential", "pictures"),
+    "Many runs": ("studies",),
+    "Other programs": ("coming_from", "ase", "calculators", "engines"),
+    "Extend": ("extending",),
+}
 #: Folders of the documentation and their chapters, in the order of the list.
 SECTIONS = {
-    "start": ("installation", "why"),
+    "start": ("five_minutes", "installation", "why", "contents"),
     "tutorials": ("top", "water", "molecule", "notebook"),
-    "guides": (
-        "npt",
-        "time_step",
-        "ensembles",
-        "electrostatics",
-        "structures",
-        "tables",
-        "slab",
-        "analysis",
-        "transport",
-        "normal_modes",
-        "pmf",
-        "replicas",
-        "studies",
-        "continuing",
-        "resume",
-        "stops",
-        "troubleshooting",
-        "pictures",
-        "ase",
-        "calculators",
-        "engines",
-        "coming_from",
-        "extending",
-    ),
+    "guides": tuple(name for names in GUIDES.values() for name in names),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
     "evidence": ("benchmarks", "collection", "validation"),

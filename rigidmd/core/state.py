@@ -23,8 +23,8 @@ NOT_FINITE = 5  # a position is not a number, or too large to be meaningful
 #: braking forces and of barostats, and the (negative) kinetic energy of total momentum that was
 #: removed.
 HEAT, WORK, REMOVED = 0, 1, 2
-#: Columns of `State.time` and `State.step`: now, and where the present segment of equal steps
-#: began.
+#: Columns of `State.time` and `State.step`: now, and where the current segment of equal steps
+#: started.
 NOW, ORIGIN = 0, 1
 
 # A tally is a float64 array (10,): energy, then the molecular virial tensor sum F (x) R in rows (u
@@ -48,8 +48,8 @@ class State(NamedTuple):
     rotation: np.ndarray  # (n, 3, 3) Q, body to lab
     angular_momentum_body: np.ndarray  # (n, 3)
     cell: np.ndarray  # (3, 3) rows a along x, b in the xy plane, c; infinite edges without a box
-    time: np.ndarray  # (2,) now; when this segment of equal steps began
-    step: np.ndarray  # (2,) int64, steps since the start; those when this segment began
+    time: np.ndarray  # (2,) now; when this segment of equal steps started
+    step: np.ndarray  # (2,) int64, steps since the start; those when this segment started
     #: (3,) energies added so far, see HEAT; the energy less their sum is conserved
     energy_ledger: np.ndarray
     #: (m,) of a thermostat, a piston or an ODE formulation; (0,) in most runs
@@ -88,7 +88,7 @@ class State(NamedTuple):
         )
 
     def begin_segment(self, time: float | None = None) -> None:
-        """Begin a segment of equal steps, in place; `time` is the present time if it is known
+        """Begin a segment of equal steps, in place; `time` is the current time if it is known
         exactly."""
         self.time[:] = self.time[NOW] if time is None else time
         self.step[ORIGIN] = self.step[NOW]
@@ -144,7 +144,7 @@ def _array(values: np.ndarray) -> np.ndarray:
 
 
 class Load(NamedTuple):
-    """Forces and torques on the bodies at the present positions."""
+    """Forces and torques on the bodies at the current positions."""
 
     force: np.ndarray  # (n, 3) lab frame; (0, 3) for a pinned body
     torque_body: np.ndarray  # (n, 3) body frame; (0, 3) for points

@@ -63,7 +63,7 @@ def read_state(path: Path) -> SavedState:
         schema = int(arrays.pop("schema", 1))
         names = [str(name) for name in arrays.pop("species_names")]
         species = arrays["species"]
-    except Exception as error:  # zipfile, numpy and pickle refusals all mean the same to the user
+    except Exception as error:  # zipfile, numpy and pickle rejections all mean the same to the user
         raise StructureError(str(path), [f"is not a state that rigidmd wrote: {error}"]) from None
     if schema > SCHEMA:
         reason = (

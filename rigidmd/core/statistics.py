@@ -18,7 +18,7 @@ BATCHES, BATCH_FACTOR = 5, 1.5
 #: need f/(f - 2) if f did not depend on the estimate; here a short window and a small estimate
 #: coincide.
 LOST_FREEDOM = 2.5
-#: A beginning of a series is cut off if chance explains its difference from the rest with less than
+#: A starting of a series is cut off if chance explains its difference from the rest with less than
 #: this
 #: two-sided probability. It is small, because the cut was chosen among many, and the quiet part
 #: that it may
@@ -29,7 +29,7 @@ CUT_CHANCE, CUT_FREEDOM = 1e-4, 2.0
 
 def mean_and_error(values: ArrayLike) -> tuple[float | None, float | None]:
     """Mean and standard error of evenly spaced samples (n,); None, None if a value is NaN. The
-    error accounts for correlation (theory chapter `errors`); it is None if the samples are too few,
+    error accounts for correlation (theory chapter `errors`). It is None if the samples are too few,
     or all of them correlated."""
     array = np.array(values, dtype=float)
     n = len(array)

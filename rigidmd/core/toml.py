@@ -205,6 +205,6 @@ def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:
 
 
 def _parts(key: str) -> list[str]:
-    """The parts of a dotted key, without quotes. A dot within quotes also divides; such a key has
+    """The parts of a dotted key, without quotes. A dot within quotes also divides. Such a key has
     no line."""
     return [part.strip("\"'") for part in key.split(".")]

@@ -1,4 +1,4 @@
-"""Barostats: flows that change the cell at a pressure, each a pass of the step; a constant volume
+"""Barostats: flows that change the cell at a pressure, each a pass of the step. A constant volume
 has none.
 
 See the theory chapter `sampling`. A lower triangular matrix T multiplies the cell (rows a, b, c)
@@ -43,7 +43,7 @@ LONGEST_DRIFT = 0.01
 
 
 class Pressure(NamedTuple):
-    """The target pressure, by component; it changes linearly over a run segment. u/(Å ps²)."""
+    """The target pressure, by component. It changes linearly over a run segment. u/(Å ps²)."""
 
     first: tuple[float, float, float, float, float, float]
     last: tuple[float, float, float, float, float, float]
@@ -94,7 +94,7 @@ class Piston(NamedTuple):
 
 
 class Confinement(NamedTuple):
-    """What a barostat is made from, besides the keys of its stage."""
+    """What a barostat is made from, in addition to the keys of its stage."""
 
     thermal_energy: Ramp
     pressure: Pressure
@@ -173,7 +173,7 @@ def needed_tallies(barostat: tuple | None) -> int:
 
 @kernel(inline=True)
 def compute_step_load(terms, state, load, registers, flows, which):
-    """Forces and torques at the present positions; a status code.
+    """Forces and torques at the current positions; a status code.
 
     which : FORCES_ONLY or WITH_ENERGIES (and virials). A step in which the barostat acts always
         computes virials, and energies if the move depends on them
@@ -192,7 +192,7 @@ def compute_step_load(terms, state, load, registers, flows, which):
 
 @kernel(inline=True)
 def compute_load_and_virial(terms, state, load, workspace, which):
-    """Forces, torques and virial at the present positions, with WITH_ENERGIES also energies; a
+    """Forces, torques and virial at the current positions, with WITH_ENERGIES also energies; a
     status code. which : WITH_ENERGIES or WITH_VIRIALS"""
     status = compute_load(terms, state, load, which)
     for k in range(TALLY_SIZE):
@@ -311,7 +311,7 @@ def _try_move(barostat, model, terms, state, load, workspace, progress, h, draw)
 
 @kernel(inline=True)
 def target_pressure(pressure, state, k):
-    """Component k of the target pressure in the present step."""
+    """Component k of the target pressure in the current step."""
     fraction = (state.step[NOW] - state.step[ORIGIN] + 1) / pressure.steps
     return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * fraction
 

@@ -147,7 +147,7 @@ def _add_gyration_of_body(model, load, tau, gain):
 @chosen_by_type(inline=True)
 def accumulate_work(model, terms, state, h):
     """Add the work of time-dependent terms over h to the energy ledger, half before a kick and half
-    after it: their power at the present velocity."""
+    after it: their power at the current velocity."""
     if not any(trait(term.instance_class, "time_dependent") for term in terms.types):
         return lambda model, terms, state, h: None
 

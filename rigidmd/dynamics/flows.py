@@ -20,7 +20,7 @@ class FlowArrays(NamedTuple):
     fraction: np.ndarray  # (flows,) of the time step
     moment: np.ndarray  # (flows,) the sum of the fractions of the drifts up to each flow
     every: np.ndarray  # (flows,) the interval in steps at which the flow acts,
-    phase: np.ndarray  # (flows,) at its begin, 0, or at its end, 1
+    phase: np.ndarray  # (flows,) at its start, 0, or at its end, 1
     row: np.ndarray  # (flows,) of its pass, see `coupling_passes`; -1 for kicks and drifts
     gradient: np.ndarray | None  # (flows,) of dt²; None (not compiled) where no kick has a gradient
     last: int  # index of the last drift

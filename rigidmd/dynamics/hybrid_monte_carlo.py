@@ -1,6 +1,6 @@
 """Trajectories of hybrid Monte Carlo: their start, and the Metropolis test of their end.
 
-A trajectory is some steps of any scheme. Its momenta are drawn anew, in whole or in part, and its
+A trajectory is some steps of any scheme. Its momenta are drawn again, in whole or in part, and its
 end is accepted with the probability min(1, exp(-dH/kT)). Otherwise positions and orientations
 return to its start, momenta with the opposite sign. The scheme is reversible and keeps volumes in
 phase space, so exp(-H/kT) is sampled exactly, whatever the step is (Duane, Kennedy, Pendleton &
@@ -37,8 +37,8 @@ class TrajectoryWorkspace(NamedTuple):
     angular_momentum_body: np.ndarray
     load: Load
     energies: np.ndarray  # (2,) potential, without constants, and kinetic, u Å²/ps²
-    known: np.ndarray  # (1,) whether the potential energy belongs to the present positions
-    # (1,) whether the present trajectory has diverged, so that it rests at its start
+    known: np.ndarray  # (1,) whether the potential energy belongs to the current positions
+    # (1,) whether the current trajectory has diverged, so that it rests at its start
     diverged: np.ndarray
     sums: np.ndarray  # (5,) see ENDED
 
@@ -51,7 +51,7 @@ def trajectory_workspace(state: State) -> TrajectoryWorkspace:
 
 @kernel
 def potential_energy(terms, state, load, progress):
-    """Status code and potential energy of the present positions, with forces if these are unknown.
+    """Status code and potential energy of the current positions, with forces if these are unknown.
     progress : see `dynamics.step_loop.advance`"""
     if progress[LOADED] != 1 or terms.tallies_valid[0] == 0:
         progress[LOADED] = 0
@@ -69,7 +69,7 @@ def potential_energy(terms, state, load, progress):
 def start_or_test_trajectory(
     thermostat, model, code, terms, state, load, blocks, workspace, registers, starts, draw
 ):
-    """Keep the present state as the start of a trajectory; or accept it as its end, or return to
+    """Keep the current state as the start of a trajectory; or accept it as its end, or return to
     the start. A status
     code. blocks : see `thermostat_workspace`"""
     progress = registers.progress
@@ -131,7 +131,7 @@ def _start_or_test(arguments, block):
 @task()
 def _rest(arguments, block):
     """After forces that failed. If a trajectory diverges, it rests at its start, where the forces
-    are unknown, until it is rejected; the status becomes OK."""
+    are unknown, until it is rejected. The status becomes OK."""
     workspace, state, load, registers = load_arguments(arguments)
     if diverges(workspace, registers.failure[0]):
         rest_at_start(workspace, state, load)

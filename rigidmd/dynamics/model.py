@@ -1,4 +1,4 @@
-"""The constant part of a system of molecules; the counterpart of `State`, which is everything that
+"""The constant part of a system of molecules. The counterpart of `State`, which is everything that
 changes."""
 
 from collections.abc import Mapping

@@ -2,7 +2,7 @@
 1, 2, 3, SC '11).
 
 A number is a function of a key and a counter. No state has to be saved, and the numbers are the
-same for any number of threads. The key depends on (seed, purpose, stage); the counter is (draw,
+same for any number of threads. The key depends on (seed, purpose, stage). The counter is (draw,
 molecule, step).
 """
 

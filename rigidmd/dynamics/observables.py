@@ -57,7 +57,7 @@ def largest_values(state: State, load: Load = EXAMPLE[1]) -> LargestValues:
 
 @kernel(from_python=True)
 def find_largest(position, velocity, rotation, angular, force, torque, found):
-    """Write the numbers (6,) of `LargestValues` into `found`; the arrays are one-dimensional."""
+    """Write the numbers (6,) of `LargestValues` into `found`. The arrays are one-dimensional."""
     bits = found.view(np.int64)
     bits[0], bits[1], bits[2] = _largest(position), _largest(velocity), _largest(rotation)
     bits[3], bits[4], bits[5] = _largest(angular), _largest(force), _largest(torque)
@@ -75,7 +75,7 @@ def _largest(values):
 
 
 def sums_of_state(model: Model, state: State, load: Load = EXAMPLE[1]) -> StateSums:
-    """Sums over a state and the load on it; without a load those of forces and torques are 0."""
+    """Sums over a state and the load on it. Without a load those of forces and torques are 0."""
     sums = np.zeros(SUM_COUNT)
     fill_sums(
         model.species,

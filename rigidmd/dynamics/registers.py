@@ -6,7 +6,7 @@ import numpy as np
 
 from rigidmd.core.state import TALLY_SIZE
 
-#: Indices of `Registers.progress`: flows done in this step; whether the load belongs to the present
+#: Indices of `Registers.progress`: flows done in this step; whether the load belongs to the current
 #: positions (1), with the gradient added (2); whether a move of the box has been made and is not
 #: yet accepted or rejected.
 DONE, LOADED, TRIAL = range(3)
@@ -18,7 +18,7 @@ AFTER_BAROSTAT, FAILED = -1, -2
 class Registers(NamedTuple):
     """The numbers, each an array."""
 
-    h: np.ndarray  # (1,) time over which the present flow acts, ps
+    h: np.ndarray  # (1,) time over which the current flow acts, ps
     draw: np.ndarray  # (1,) int64, its first random number
     progress: np.ndarray  # (3,) int64, see DONE
     tally: np.ndarray  # (2, 10) energies and virials for a barostat, see `BarostatWorkspace`

@@ -68,7 +68,7 @@ from rigidmd.mechanics.free_rotor import restore_orthogonality, rotate_by_vector
 
 #: Random numbers that a flow may draw for one molecule in a step.
 DRAWS = 1 << 20
-#: The times of two pending kicks by the present load; 0 stands for no kick.
+#: The times of two pending kicks by the current load; 0 stands for no kick.
 NO_PENDING_KICKS = (0.0, 0.0)
 #: Number of molecules that are kicked, moved and rotated together: few enough to stay in a core's
 #: cache.
@@ -100,7 +100,7 @@ def coupling_passes(
     registers: Registers,
     status: np.ndarray,
 ) -> dict[int, Pass]:
-    """Kind of a flow of a scheme -> its pass, for all flows besides kicks and drifts."""
+    """Kind of a flow of a scheme -> its pass, for all flows in addition to kicks and drifts."""
     heat, box, trajectory = workspaces
     kinds = {flow.kind for flow in scheme.flows}
     thermostat, barostat = scheme.thermostat, scheme.barostat
@@ -270,7 +270,7 @@ class Advance:
         )
 
     def begin(self, dt: float, until: int, observed: bool, loaded: bool) -> None:
-        """Set what the next calls do. loaded : whether the load belongs to the present positions"""
+        """Set what the next calls do. loaded : whether the load belongs to the current positions"""
         self._dt[0] = dt
         self._integers[:] = until, observed, OK
         self._registers.progress[:] = 0, loaded, 0
@@ -282,7 +282,7 @@ class Advance:
 
     @property
     def loaded(self) -> bool:
-        """Whether the load belongs to the present positions."""
+        """Whether the load belongs to the current positions."""
         return self._registers.progress[LOADED] != 0
 
     @property

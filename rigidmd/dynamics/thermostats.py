@@ -44,7 +44,7 @@ def constant_ramp(value: float) -> Ramp:
 
 @kernel(inline=True)
 def ramp_value(ramp, state):
-    """The value of a ramp in the present step."""
+    """The value of a ramp in the current step."""
     return ramp.first + (ramp.last - ramp.first) * (
         (state.step[NOW] - state.step[ORIGIN] + 1) / ramp.steps
     )
@@ -216,7 +216,7 @@ def _apply_by_molecule(thermostat, model, code, state, workspace, h, draw):
 
 @task()
 def _apply_langevin(arguments, block):
-    """Langevin friction and noise for the molecules of a block; the heat is written to
+    """Langevin friction and noise for the molecules of a block. The heat is written to
     workspace[block, 0]."""
     thermostat, model, state, workspace, h, draw = load_arguments(arguments)
     align_stack()
@@ -237,7 +237,7 @@ def _apply_langevin(arguments, block):
 
 @task()
 def _apply_andersen(arguments, block):
-    """Andersen collisions with the molecules of a block; the heat is written to workspace[block,
+    """Andersen collisions with the molecules of a block. The heat is written to workspace[block,
     0]."""
     thermostat, model, state, workspace, h, draw = load_arguments(arguments)
     velocity, momentum = state.velocity, state.angular_momentum_body

@@ -28,17 +28,6 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def compiled_force(kind: type) -> Callable[[Function], Function]:
     """Make a NamedTuple class a force that is compiled into the step loop.
 
-    class Trap(NamedTuple):
-        stiffness: float  # u/ps²
-
-    @rigidmd.compiled_force(Trap)
-    def trap(term, state, load, tally):
-        for m in range(len(state.position)):
-            for k in range(3):
-                load.force[m, k] -= term.stiffness * state.position[m, k]
-                if tally is not None:
-                    tally[0] += 0.5 * term.stiffness * state.position[m, k] ** 2
-
     The function adds forces (lab frame, u Å/ps²) and torques (body frame, u Å²/ps²) to `load` and,
     unless `tally` is None, its energy (u Å²/ps², 100 of them are 1 kJ/mol) and molecular virial,
     sum of F (x) R in rows, to `tally`.
@@ -48,6 +37,19 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
     molecules. `tied_to_places = True` means that the energy depends on positions in the lab, which
     excludes a barostat. The class may hold numbers, arrays and tuples of them. If its numbers come
     from the system, give `Simulation` an object with a method `term(system)` that makes it.
+
+    Examples
+    --------
+        class Trap(NamedTuple):
+            stiffness: float  # u/ps²
+
+        @rigidmd.compiled_force(Trap)
+        def trap(term, state, load, tally):
+            for m in range(len(state.position)):
+                for k in range(3):
+                    load.force[m, k] -= term.stiffness * state.position[m, k]
+                    if tally is not None:
+                        tally[0] += 0.5 * term.stiffness * state.position[m, k] ** 2
     """
     _check_class(kind)
 
@@ -65,9 +67,6 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
 
 def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     """Make a NamedTuple class a thermostat: a flow on the momenta.
-
-    @rigidmd.compiled_thermostat(Berendsen)
-    def rescale(thermostat, model, state, h, draw): ...
 
     The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and
     adds the change of the kinetic energy to `state.energy_ledger[0]`, so that energy less heat is
@@ -88,6 +87,21 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
         An integer, the first of the random numbers of this call. `rigidmd.dynamics.noise` has
         `normals(thermostat.key, draw, m, state.step[0])`, two normal numbers for molecule m; draw +
         1, ... gives more. The key is a field of the class, from `key_of(seed, THERMOSTAT, stage)`
+
+    Examples
+    --------
+        class Friction(NamedTuple):
+            rate: float  # 1/ps
+
+        @rigidmd.compiled_thermostat(Friction)
+        def slow_down(thermostat, model, state, h, draw):
+            factor = np.exp(-thermostat.rate * h)
+            for m in range(len(state.velocity)):
+                mass = model.mass[model.species[m]]
+                for k in range(3):
+                    before = 0.5 * mass * state.velocity[m, k] ** 2
+                    state.velocity[m, k] *= factor
+                    state.energy_ledger[0] += (factor**2 - 1.0) * before
     """
     _check_class(kind)
 

@@ -1,8 +1,8 @@
 """External engines: LAMMPS and OpenMM behind the protocol of engines, chosen by `engine.name` of a
 scene.
 
-What an engine can translate is a table. All that is not in the table is refused with one kind of
-message. Thermostats, potentials and fields do not know about other engines: a new one is refused
+What an engine can translate is a table. All that is not in the table is rejected with one kind of
+message. Thermostats, potentials and fields do not know about other engines: a new one is rejected
 until a table has it.
 """
 
@@ -61,7 +61,7 @@ class Limit(NamedTuple):
 
 class Translations(NamedTuple):
     """The table of an engine. rigidmd itself performs minimisations, in which nothing is
-    refused."""
+    rejected."""
 
     title: str
     scene: tuple[Key, ...]
@@ -135,7 +135,7 @@ class ExternalEngine(Engine, ABC):
         self._view = force_field_of(system)
         self._stage = system.scene.stages[stage]
         self.conserves_energy = not (self._stage.has_thermostat or self._stage.has_barostat)
-        self._known_state: State | None = None  # the present state of the program
+        self._known_state: State | None = None  # the current state of the program
         self._heat_offset = (
             0.0  # heat in the ledger of a state that was sent, less the heat of the program by then
         )

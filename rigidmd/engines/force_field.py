@@ -120,7 +120,7 @@ class ForceFieldView(NamedTuple):
 
 
 def force_field_of(system: System) -> ForceFieldView:
-    """The force field of a system. It leaves out the terms that `unknown_terms` lists."""
+    """The force field of a system. It omits the terms that `unknown_terms` lists."""
     index = system.model.species
     per_species = zip(system.species, _lennard_jones_kinds(system), strict=True)
     parameters = [

@@ -80,7 +80,7 @@ def observe(
         temperatures
     time : ps, by default of the state
     origin : conserved energy at the start of the stage, from which its drift is counted; by default
-        the present one
+        the current one
     correction : of the kinetic energy in temperatures and pressures, for each (ps²) of the squares
         of forces and torques, see `Scheme.kinetic_correction`
     moved : whether the engine has just moved this state, so that it may have its forces and

@@ -53,7 +53,7 @@ class Engine(Protocol):
     it is true"""
 
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
-        """The extra variables of an integrator (`state.extra_variables`) at the begin of a segment;
+        """The extra variables of an integrator (`state.extra_variables`) at the start of a segment;
         by default none."""
         return np.zeros(0)
 

@@ -355,7 +355,7 @@ def moving(stages: "Sequence[Stage]", of: np.ndarray) -> np.ndarray:
     return ~np.isin(of, [k for k, stage in enumerate(stages) if stage.is_minimisation])
 
 
-#: Least samples of a stage for the detection of its equilibration.
+#: Minimum samples of a stage for the detection of its equilibration.
 LEAST_SAMPLES = 40
 
 
@@ -385,7 +385,7 @@ def equilibrated(of_stage: Samples, stage: "Stage") -> Samples:
 def describe_equilibrated(
     of_stage: Mapping[str, np.ndarray] | SampleTable, stage: "Stage", begin: float
 ) -> str:
-    """The equilibrated part of a stage that began at a time (ps), such as "the last 14.2 of 20
+    """The equilibrated part of a stage that started at a time (ps), such as "the last 14.2 of 20
     ps"."""
     time, start = of_stage["time"], equilibrated_from(of_stage, stage)
     all_of_stage = f"all {time[-1] - begin:.4g} ps"

@@ -186,7 +186,7 @@ class System:
 
     @property
     def precision(self) -> Precision:
-        """Precision of forces; a resolved scene has no "auto"."""
+        """Precision of forces. A resolved scene has no "auto"."""
         return cast(Precision, self.scene.precision)
 
     def state_errors(self, state: State) -> list[str]:

@@ -3,16 +3,20 @@ slow to import."""
 
 import io
 from collections.abc import Iterator
+from typing import Any
 
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from rigidmd.figures.save import save_figure, settings
+from rigidmd.core.process import PROCESS_LOCK
 
 #: Dots per inch of a figure in a notebook, drawn twice as fine for sharp screens.
 DPI = 80
+#: Resolution of what is not made of lines in a .svg.
+SVG_DPI = 100
 
 
 class Picture(Figure):
@@ -31,19 +35,30 @@ class Picture(Figure):
         self.dpi = dpi
         if engine := self.get_layout_engine():
             engine.execute(self)
-        with settings({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        with PROCESS_LOCK, rc_context({"figure.constrained_layout.use": False}):
             self.set_layout_engine(None)
 
     def _take_texts_as_written(self) -> None:
         for text in _texts(self):
             text.set_parse_math(False)
 
+    def data(self, kind: str, dpi: float, hashsalt: str = "rigidmd", **settings: str) -> bytes:
+        """The bytes of a file of this type, which are the same for the same figure. settings : of
+        an .svg"""
+        stream = io.BytesIO()
+        options: dict[str, Any] = {"dpi": dpi}
+        if kind == "svg":
+            options = {"dpi": SVG_DPI, "metadata": {"Date": None, "Creator": None}}
+        changed: Any = {f"svg.{name}": value for name, value in settings.items()}
+        # Matplotlib has one set of settings for all threads
+        with PROCESS_LOCK, rc_context(changed | {"svg.hashsalt": hashsalt}):
+            self.savefig(stream, format=kind, **options)
+        return stream.getvalue()
+
     def png(self) -> tuple[bytes, dict[str, float]]:
         """The figure as PNG, and the width and height at which it is shown."""
-        stream = io.BytesIO()
-        save_figure(self, stream, format="png", dpi=2 * DPI)
         width, height = self.get_size_inches()
-        return stream.getvalue(), {"width": DPI * width, "height": DPI * height}
+        return self.data("png", 2 * DPI), {"width": DPI * width, "height": DPI * height}
 
     _repr_png_ = png
 

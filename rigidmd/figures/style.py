@@ -1,5 +1,4 @@
-"""Functions for all figures: new figures and their files, styles of curves, thinning of long
-series, views of 3D objects."""
+"""Functions for all figures: the palette, new figures and their files, thinning of long curves."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -11,35 +10,52 @@ import numpy as np
 
 from rigidmd.core.files import atomic_file
 from rigidmd.errors import RigidMDError, RigidMDWarning
-from rigidmd.figures.save import save_figure, settings
 
 if TYPE_CHECKING:
     from rigidmd.figures.picture import Picture
 
-INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
-COLORS = (
-    "#2b6f9e",
-    "#c8553d",
-    "#4f8a5b",
-    "#7a5ca3",
-    "#b8862d",
-    "#1f2430",
-    "#3fa7a0",
-    "#c2569a",
-    "#8a8f99",
-    "#7f9a1c",
-)
+#: Colours of curves. Any two differ by at least 25 in the Lab space, also for viewers who lack the
+#: pigment of red or of green.
+PALETTE = {
+    "cool": "#2b6f9e",
+    "warm": "#c8553d",
+    "amber": "#e0a019",
+    "ink": "#1f2430",
+    "green": "#1fc88a",
+    "navy": "#0d358d",
+    "violet": "#9298ff",
+    "cyan": "#10c5d1",
+}
+#: The same on dark pages.
+DARK_PALETTE = {
+    "cool": "#89c4ff",
+    "warm": "#e16642",
+    "amber": "#eeb500",
+    "ink": "#e6e8ee",
+    "green": "#08fa9b",
+    "navy": "#2751fa",
+    "violet": "#768aff",
+    "cyan": "#429b9f",
+}
+COLORS = tuple(PALETTE.values())
+COOL, WARM, AMBER, INK, *_ = COLORS
+FAINT = "#8a8f99"  # of what is not a curve: frames, notes, the backs of things
 MARKERS = "os^Dv*PX<>"
-UP = np.array([0.0, 0.0, 1.0])
 DASHES = ((), (5, 1.5), (1.5, 1.2), (6, 1.5, 1.5, 1.5))
 
 
 def curve_style(k: int) -> dict:
-    """Style of the k-th of many curves: ten colours, then other dashes and markers."""
+    """Style of the k-th of many curves: the colours of the palette, then other dashes and
+    markers."""
     rounds, color = divmod(k, len(COLORS))
     dashes = DASHES[rounds % len(DASHES)]
     marker = MARKERS[(color + 3 * rounds) % len(MARKERS)]
     return {"color": COLORS[color], "ls": (0, dashes) if dashes else "-", "marker": marker}
+
+
+def head(figure: "Picture", title: str) -> None:
+    """Put a title above all axes of a figure, on the left."""
+    figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
 
 
 @contextmanager
@@ -60,7 +76,7 @@ def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
     with drawing(path):
         figure = draw()
         if title:
-            figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
+            head(figure, title)
         save_files(figure, path.with_suffix(""), [path.suffix[1:]])
 
 
@@ -70,11 +86,8 @@ def save_files(figure: "Picture", stem: Path, suffixes: Sequence[str]) -> list[P
     figure.lay_out(150)
     paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in suffixes]
     for path in paths:
-        options = (
-            {"dpi": 100, "metadata": {"Date": None}} if path.suffix == ".svg" else {"dpi": 150}
-        )
-        with settings({"svg.hashsalt": "rigidmd"}), atomic_file(path) as temporary:
-            save_figure(figure, temporary, **options)
+        with atomic_file(path) as temporary:
+            temporary.write_bytes(figure.data(path.suffix[1:], 150))
     return paths
 
 
@@ -86,7 +99,7 @@ def new_figure(
 
     figure = Picture(figsize=(width, height), layout=layout, **options)
     if title:
-        figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
+        head(figure, title)
     return figure
 
 
@@ -127,6 +140,14 @@ def thin_series(
     return time[extremes], values[extremes]
 
 
+def largest_of_parts(
+    time: np.ndarray, values: np.ndarray, bins: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """A long series of errors reduced to the largest value of each of its parts."""
+    size = -(-len(time) // bins)
+    return time[::size], np.fmax.reduceat(values, np.arange(0, len(time), size))
+
+
 def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | None:
     """Limits of the axis of a curve (n,): the range of the second halves of the stages, and as much
     above and below, as the starts of stages would flatten the rest. None if the range is 0."""
@@ -138,64 +159,6 @@ def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | 
         return None
     low, high = max(values.min(), late.min() - span), min(values.max(), late.max() + span)
     return low - 0.05 * (high - low), high + 0.05 * (high - low)
-
-
-def thin_path(path: np.ndarray, max_points: int) -> np.ndarray:
-    """Indices of at most about `max_points` points of a path (n, d), evenly along its length,
-    with its ends."""
-    if len(path) <= max_points:
-        return np.arange(len(path))
-    way = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
-    if way[-1] == 0:
-        return np.array([0, len(path) - 1])
-    marks = np.searchsorted(way, np.linspace(0, way[-1], max_points))
-    return np.unique(np.concatenate([marks.clip(0, len(path) - 1), [0, len(path) - 1]]))
-
-
-def camera(eye: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """An orthographic view from the direction `eye`: rows are to the right, upwards and towards the
-    eye."""
-    toward, right = eye / np.linalg.norm(eye), np.cross(up, eye)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(toward, right), toward])
-
-
-def circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
-    """The circle on the unit sphere at this polar angle (degrees) from a direction."""
-    right, up, toward = camera(normal, np.eye(3)[np.abs(normal).argmin()])
-    angle, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
-    return np.sin(polar) * (np.cos(angle) * right + np.sin(angle) * up) + np.cos(polar) * toward
-
-
-def globe() -> list[np.ndarray]:
-    """Circles of longitude and latitude on the unit sphere, every 30 degrees."""
-    around = [
-        circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in np.radians(np.arange(0, 180, 30))
-    ]
-    return [*around, *(circle(UP, polar) for polar in range(30, 180, 30))]
-
-
-def draw_front_and_back(
-    axis, points, view: np.ndarray, depth, alphas: tuple[float, float], **style
-) -> None:
-    """Draw a line that is strong on the side of the eye (depth >= 0) and faint on the other."""
-    flat, front = points @ view[:2].T, depth >= 0
-    joined = front.copy()
-    joined[:-1] |= front[1:]
-    joined[1:] |= front[:-1]
-    for part, alpha, order in ((joined, alphas[0], 3), (~front, alphas[1], 1.5)):
-        axis.plot(*np.where(part[:, None], flat, np.nan).T, alpha=alpha, zorder=order, **style)
-
-
-def draw_scale(
-    axis, right: float, foot: float, length: float, label: str, fontsize: float = 10
-) -> None:
-    """Draw a bar of this length with its label above it, from its right end at (right, foot)."""
-    axis.plot(
-        [right - length, right], [foot, foot], color=INK, lw=2, solid_capstyle="butt", zorder=4
-    )
-    style = {"ha": "right", "va": "bottom", "zorder": 4, "textcoords": "offset points"}
-    axis.annotate(label, (right, foot), (0, 3), color=INK, fontsize=fontsize, **style)
 
 
 def label_minor_ticks(line) -> None:

@@ -147,7 +147,7 @@ class Interactions(NamedTuple):
 
 
 class Composition(NamedTuple):
-    """The properties of a system, besides its scene, on which defaults depend."""
+    """The properties of a system, in addition to its scene, on which defaults depend."""
 
     species: list[Any]  # `scene.models.Molecule`
     counts: np.ndarray  # (k,) molecules of each species

@@ -81,14 +81,14 @@ class Term:
         return self
 
     def checkpoint_arrays(self) -> dict[str, np.ndarray]:
-        """Arrays on which the next forces depend besides the state."""
+        """Arrays on which the next forces depend in addition to the state."""
         return {}
 
     def restore(self, arrays: dict[str, np.ndarray], skin: float, now: float):
         """The workspace, which has machine code, with its `checkpoint_arrays`.
 
         skin : of neighbour lists, as requested, Å
-        now : the present time, ps
+        now : the current time, ps
 
         Raises ValueError if the arrays do not fit.
         """
@@ -134,7 +134,7 @@ def add_forces(term, state, load, tally):
 
 @kernel(inline=True)
 def worse_status(status, other):
-    """The worse of two status codes; the other may be None, which is OK."""
+    """The worse of two status codes. The other may be None, which is OK."""
     return status if other is None else max(status, other)
 
 
@@ -233,14 +233,16 @@ class TermDispatcher:
         elsewhere = np.zeros_like(rows.arguments)
         self.table = TermTable(rows, elsewhere, self._rates.rows, self._tallies, valid, self._power)
         self._bound_to: tuple = ()
-        self._load: Load | None = None
+        self._copy_and_load: tuple[State, Load] | None = None
 
-    def load_for(self, state: State) -> Load:
-        """An array for the forces on the bodies of a state, which the next call may return
-        again."""
-        if self._load is None or len(self._load.force) != len(state.velocity):
-            self._load = no_load(state)
-        return self._load
+    def copy_and_load(self, state: State) -> tuple[State, Load]:
+        """A copy of a state, and arrays for its forces. The next call returns the same arrays for
+        the next state of this size: the table stays bound to them."""
+        if self._copy_and_load is None or _shapes(self._copy_and_load[0]) != _shapes(state):
+            self._copy_and_load = state.copy(), no_load(state)
+        for target, source in zip(self._copy_and_load[0], state, strict=True):
+            target[:] = source
+        return self._copy_and_load
 
     def _passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
         passes: list[Pass] = []
@@ -276,6 +278,10 @@ class TermDispatcher:
         return self.table
 
 
+def _shapes(state: State) -> list[tuple[int, ...]]:
+    return [array.shape for array in state]
+
+
 @kernel(from_python=True)
 def compute_load_with_energies(table, force, torque_body):
     """Write forces and torques of all terms, and energies and virials into the table; a status
@@ -285,7 +291,7 @@ def compute_load_with_energies(table, force, torque_body):
 
 @chosen_by_type
 def compute_load(terms, state, load, which):
-    """Write the forces and torques of all terms at the present positions; the worst status code.
+    """Write the forces and torques of all terms at the current positions; the worst status code.
     terms : a tuple of terms, which gives forces only, or a `TermTable`, which gets energies and
     virials. which : FORCES_ONLY, WITH_ENERGIES, INTO_OTHER_LOAD or WITH_VIRIALS; `load` must be the
     load that it means."""
@@ -324,7 +330,7 @@ def copy(source, target):
 
 @kernel(inline=True)
 def compute_body_load(terms, state, load):
-    """Write the forces and torques of all terms (a tuple) at the present positions; the worst
+    """Write the forces and torques of all terms (a tuple) at the current positions; the worst
     status code."""
     load.force[:] = 0.0
     load.torque_body[:] = 0.0

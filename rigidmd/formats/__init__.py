@@ -48,7 +48,7 @@ class Format(NamedTuple):
     # with `has_types` its last argument is structure.atom_types.
     read: Callable[..., list[Callable[[], Atoms]]] | None = None  # (path, lines)
     content: re.Pattern[str] | None = (
-        None  # recognises the begin of a text whose extension is unknown
+        None  # recognises the start of a text whose extension is unknown
     )
     has_types: bool = False
     crystals: bool = False  # every structure is the unit cell of a crystal

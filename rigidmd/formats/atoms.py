@@ -17,7 +17,7 @@ HEAVY_HYDROGEN = {
     "D": 2.014101777844,
     "T": 3.01604928132,
 }
-#: Names of ions in CHARMM's force fields that do not begin with their elements.
+#: Names of ions in CHARMM's force fields that do not start with their elements.
 CHARMM_IONS = {
     "SOD": "Na",
     "POT": "K",
@@ -28,7 +28,7 @@ CHARMM_IONS = {
     "CAL": "Ca",
     "BAR": "Ba",
 }
-#: CHARMM's names of the oxygen and the massless site of four-site waters, both of which begin like
+#: CHARMM's names of the oxygen and the massless site of four-site waters, both of which start like
 #: oxygen.
 CHARMM_WATER = ("OH2", "OM")
 #: Names of massless sites: M of four-site waters, L of five-site ones, and the names that programs

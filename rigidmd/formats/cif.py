@@ -356,7 +356,7 @@ def _to_fractional(block: Block, position: np.ndarray, cell: np.ndarray) -> np.n
 def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """The symmetry operations (g, 3, 4), and notes on where they are from.
 
-    The list of operations of a file defines the symmetry; without one it is defined by its Hall
+    The list of operations of a file defines the symmetry. Without one it is defined by its Hall
     symbol, its Hermann-Mauguin symbol, or the number of its space group, in this order. Statements
     of less rank select among the settings that are possible.
     """

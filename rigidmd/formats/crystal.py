@@ -211,7 +211,7 @@ class UnitCell(NamedTuple):
     owner: np.ndarray  # (m,) atom of the file
     fractional: np.ndarray  # (m, 3)
     special: int  # atoms of the file on special positions
-    copies: int  # atoms of the file that are images of others, and so are left out
+    copies: int  # atoms of the file that are images of others, and so are omitted
 
 
 def unit_cell(

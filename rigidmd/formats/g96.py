@@ -21,7 +21,7 @@ Lines = list[tuple[int, str]]
 
 
 def read_g96(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
-    """The frames of a .g96: blocks from a name to END, of which POSITION begins a frame."""
+    """The frames of a .g96: blocks from a name to END, of which POSITION starts a frame."""
     frames: list[dict[str, Lines]] = []
     block, content = "", []
     for number, line in enumerate(lines, 1):

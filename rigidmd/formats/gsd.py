@@ -3,7 +3,7 @@
 A molecule of several sites is a rigid body as in HOOMD: a central particle with mass, moments of
 inertia, orientation and angular momentum, and its sites as constituent particles. A molecule of one
 site is a free particle. In a file the box is centred at the origin and particles are wrapped, with
-their image numbers; here the box begins at the origin and positions are unwrapped. Files are read
+their image numbers; here the box starts at the origin and positions are unwrapped. Files are read
 chunk by chunk, and sizes are checked before arrays are allocated.
 """
 

@@ -241,7 +241,7 @@ DAMAGE = (KeyError, TypeError, IndexError, AttributeError, OverflowError, Memory
 
 
 class Stored(NamedTuple):
-    """A frame of a file, in Å and ASE's unit of momentum; all arrays are float64."""
+    """A frame of a file, in Å and ASE's unit of momentum. All arrays are float64."""
 
     positions: np.ndarray  # (a, 3) of the atoms
     momenta: np.ndarray | None  # (a, 3)

@@ -31,7 +31,7 @@ def input_names(scene: Scene) -> dict[str, str]:
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
-    """Write the scene into the folder of a run, so that it can be run again. Keys that do nothing
+    """Write the scene into the folder of a run, so that it can be run again. Keys without effect
     are left out."""
     data = plain_values(scene.model_dump(exclude_none=True))
     if is_molecular(scene):

@@ -287,7 +287,7 @@ def rotation_coefficient_series(x):
 
 @kernel(inline=True)
 def rotate_by_vector(rotation, x, y, z):
-    """Q <- Q R with the rotation vector (x, y, z) of R, body frame; its length is not needed, which
+    """Q <- Q R with the rotation vector (x, y, z) of R, body frame. Its length is not needed, which
     saves a third."""
     odd, even = rotation_coefficients(x * x + y * y + z * z)
     rotate_rows(rotation, x, y, z, -odd, even)

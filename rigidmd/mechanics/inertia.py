@@ -126,7 +126,7 @@ class Shape(NamedTuple):
     its principal frame. Axis 3 is the axis of symmetry, and the origin is the centre of mass.
 
     dimensions: the axes (0, 1, 2) that each dimension scales, by the name of the dimension in a
-    scene; the solid is thin along an axis without a dimension. mean_squares (3,): <x²>, <y²>, <z²>
+    scene. The solid is thin along an axis without a dimension. mean_squares (3,): <x²>, <y²>, <z²>
     over its mass. outline (k, 3): points on its surface. volume: 0 for a thin solid.
     """
 
@@ -155,7 +155,7 @@ COMPONENTS_PER_DIMENSION = {
 
 def _outline(*rings: tuple[int, float, float]) -> np.ndarray:
     """Points (k, 3) of all rings (count, radius, z), evenly spaced on circles about axis 3 at
-    height z; a ring of one point with radius 0 is a tip or a centre."""
+    height z. A ring of one point with radius 0 is a tip or a centre."""
     points = []
     for count, radius, z in rings:
         angle = 2 * np.pi * np.arange(count) / count

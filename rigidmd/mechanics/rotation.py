@@ -13,7 +13,7 @@ def random_rotations(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
-    """Q (..., 3, 3) of quaternions (..., 4) in order w, x, y, z, which are normalised; the length
+    """Q (..., 3, 3) of quaternions (..., 4) in order w, x, y, z, which are normalised. The length
     must not be 0."""
     q = np.asarray(quaternion_wxyz, dtype=float)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
@@ -32,7 +32,7 @@ def unit_vector(vector: ArrayLike) -> np.ndarray:
 
 
 def to_quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4) of Q (..., 3, 3) in order w, x, y, z; the first non-zero component
+    """Unit quaternions (..., 4) of Q (..., 3, 3) in order w, x, y, z. The first non-zero component
     is positive. No angle has cancellation (Shepperd 1978, J. Guid. Control 1, 223)."""
     q = np.asarray(rotation, dtype=float)
     xx, yy, zz = q[..., 0, 0], q[..., 1, 1], q[..., 2, 2]

@@ -13,7 +13,7 @@ class TimeFunction(NamedTuple):
     """A vector that is piecewise constant, linear or quadratic in time.
 
     Piece i, from times[i] to times[i + 1], is constant[i] + d slope[i] + d² curvature[i] with d = t
-    - times[i]. The first piece begins at time 0, like every run; the last has no end. Compiled code
+    - times[i]. The first piece starts at time 0, like every run. The last has no end. Compiled code
     gets one piece at a time (`piece_at`), and a run stops at every break, so that no step contains
     a jump or a kink.
     """
@@ -82,7 +82,7 @@ def values_at(function: TimeFunction, times: np.ndarray) -> np.ndarray:
 
 
 def piece_at(function: TimeFunction, time: float) -> TimeFunction:
-    """The piece that begins or continues at a time, as a function without an end."""
+    """The piece that starts or continues at a time, as a function without an end."""
     i, d = _locate(function, np.array([time]))
     constant = function.constant[i] + d * (function.slope[i] + d * function.curvature[i])
     slope = function.slope[i] + 2 * d * function.curvature[i]

@@ -62,7 +62,7 @@ def runnable() -> dict[str, Program]:
 
 
 def engine_options() -> dict[str, Option]:
-    """The keys of [engine] besides its name."""
+    """The keys of [engine] in addition to its name."""
     return {
         key: option for program in runnable().values() for key, option in program.options.items()
     }

@@ -3,7 +3,7 @@ molecule.
 
 `gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's
 force and torque, minus the gradient of the energy as a function of atoms to which rigid molecules
-are fitted; the guide `ase` has the formula. `site_forces`: each atom has the forces on its site.
+are fitted. The guide `ase` has the formula. `site_forces`: each atom has the forces on its site.
 Forces on massless sites are distributed over the atoms. Forces inside molecules are included;
 constraints have to balance them.
 """
@@ -63,7 +63,7 @@ def atoms_of_results(
     def with_logged_energy(atoms: "ase.Atoms", time: float) -> "ase.Atoms":
         """Atoms with the energy of the log, if it has a line at their time."""
         if len(same := np.flatnonzero(_same(results["time"], time))):
-            # after a minimisation that begins then
+            # after a minimisation that starts then
             energy = results["potential"][same[-1]] * KJ_PER_MOL / EV
             atoms.calc = SinglePointCalculator(atoms, energy=float(energy))
         return atoms

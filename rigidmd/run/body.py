@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from rigidmd.run.simulation import Simulation
 
 
-#: Most evaluations of forces between two checks, and most samples.
+#: Maximum number of evaluations of forces between two checks, and most samples.
 EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 1_000_000, 512
 
 
@@ -78,12 +78,12 @@ class Sampler(Observer):
         if not (
             (np.diff(times) >= 0).all()
             and (times >= 0).all()
-            and (times <= run.part.state.time[NOW]).all()
+            and (times <= run._part.state.time[NOW]).all()
         ):
             raise ValueError("the times of its samples cannot be of a run")
         for snapshot in self.snapshots:
             state_from(
-                dict(zip(State._fields, snapshot.state, strict=True)), run.part.state, exact=False
+                dict(zip(State._fields, snapshot.state, strict=True)), run._part.state, exact=False
             )
 
     def see(self, moment: Moment) -> None:
@@ -124,11 +124,11 @@ class BodyWatch(Observer):
         super().resume(run, kept)
         if self.exchanged < least:
             raise ValueError(f"it has exchanged an energy of {self.exchanged:g} J")
-        if problem := self._failed_check(run.part.state, run.scene.run.timestep_s):
+        if problem := self._failed_check(run._part.state, run.scene.run.timestep_s):
             raise ValueError(f"its state cannot be of this run: {problem}")
 
     def see(self, moment: Moment) -> None:
-        if problem := self._failed_check(self._run.part.state, self._run.segment.dt):
+        if problem := self._failed_check(self._run._part.state, self._run._part.segment.dt):
             raise problem
 
     @np.errstate(over="ignore", invalid="ignore")
@@ -170,7 +170,7 @@ class BodyWatch(Observer):
 
         stable : the longest stable step, s
         """
-        system, dt = self._system, self._run.segment.dt
+        system, dt = self._system, self._run._part.segment.dt
         if isinstance(error, NotFiniteError):
             failed = FailedCheck("position or momentum of the body is not finite")
         elif isinstance(error, FailedCheck):
@@ -241,7 +241,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
 
     time_unit = "s"
     record_type = BodyRecord
-    summary_text = staticmethod(body_summary_text)
+    summary_text = short_summary = staticmethod(body_summary_text)
 
     def __init__(
         self,
@@ -255,7 +255,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         if scene.run.is_auto:
             from rigidmd.run.pilot.stages import choose_for_body
 
-            simulation.announce("choosing integrator and step by pilot runs")
+            simulation._announce("choosing integrator and step by pilot runs")
             scene, self._choice = choose_for_body(scene, applied)
         self.system = build_body(scene, applied)
         self._segments = self._equal_step_segments()
@@ -264,7 +264,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
     def reset(self) -> None:
         super().reset()
         self.engine = self.system.engine()
-        self.engine.stop_requested = self.simulation.must_end
+        self.engine.stop_requested = self.simulation._must_end
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def prepare(self) -> None:
@@ -273,7 +273,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             compiled.begin(system.state, system.method), system.method, run.timestep_s, 0
         )
         if run.has_scheme and (names := system.velocity_dependent_functions()):
-            self.simulation.note(
+            self.simulation._note(
                 f"{' and '.join(names)}: depends on velocities, so that {run.integrator} is of"
                 " order 1. For friction and resistance use [friction] and [fluid], which keep"
                 " order 2; otherwise integrator = 'dop853'"
@@ -284,7 +284,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             return
         self.record.stable = angle / rate
         for sentence in body_step_warnings(system):
-            self.simulation.note(sentence)
+            self.simulation._note(sentence)
 
     def durations(self) -> list[float]:
         return [segment.steps * segment.dt for segment in self._segments]
@@ -363,13 +363,14 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
 
     def summary(self, samples: Motion, preparing: float, wall: float) -> Json:
         steps = sum(segment.steps for segment in self._segments)
-        computing, interrupted = sum(self.record.position.computing), self.simulation.is_interrupted
+        computing = sum(self.record.position.computing)
+        interrupted = self.simulation._is_interrupted
         summary = summarise_body(
             self.system, samples, steps, preparing, wall, computing, interrupted
         )
         summary["stable_timestep_s"] = self.record.stable
         if self.engine.is_stiff:
-            self.simulation.note(
+            self.simulation._note(
                 "the motion is stiff: stability, not accuracy, limits the steps of dop853;"
                 " integrator = 'radau' takes much longer ones"
             )

@@ -14,7 +14,7 @@ from rigidmd.mechanics.translation import FluidTranslation, InertialFrame
 from rigidmd.run.body_theory import free_body_period, heavy_top_motion
 from rigidmd.scene.body import EQUAL_MOMENTS
 
-#: Least samples of a motion, and of each period in it.
+#: Minimum samples of a motion, and of each period in it.
 LEAST_SAMPLES, SAMPLES_PER_PERIOD = 16, 8
 #: Angle (rad) within which an axis that stays there is along another, and an angle that stays there
 #: is constant.

@@ -29,7 +29,7 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 #: diameter; the hydrogen of a hydrogen bond stays at half of it. The second fraction is for
 #: molecules without any repulsion.
 CHARGED_OVERLAP, CHARGES_OVERLAP = 0.3, 1.0
-#: Most moves of molecules between two checks.
+#: Maximum number of moves of molecules between two checks.
 MOVES_PER_CHECK = 250_000
 
 

@@ -15,7 +15,7 @@ ROUNDING = sqrt(np.finfo(float).eps)
 
 
 class FailedCheck(SimulationError):
-    """A failed check; its message is a sentence.
+    """A failed check. Its message is a sentence.
 
     molecule : index of the molecule concerned
     factor : by which the step would have to be shorter to stay within the limit, if known

@@ -1,4 +1,4 @@
-"""The loop of a run: it begins or resumes, jumps from one observation to the next, and ends with
+"""The loop of a run: it starts or resumes, jumps from one observation to the next, and ends with
 all files."""
 
 import contextlib
@@ -62,7 +62,7 @@ def _observers_by_name(
 
 
 class RunLoop:
-    """A run of a simulation, from its beginning to its end.
+    """A run of a simulation, from its starting to its end.
 
     drive : advances it; the run pauses in between, and then holds its folder and its files
     advanced : steps of the last call of `drive`
@@ -72,13 +72,13 @@ class RunLoop:
     _advance from one observation to the next, _leave, and at the end _finish.
     """
 
-    _schedule: ObservationSchedule  # of the present segment
+    _schedule: ObservationSchedule  # of the current segment
 
     def __init__(
         self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None
     ):
         self._simulation, self._folder = simulation, simulation.folder
-        self._part: RunPart[Any, Any, Any] = simulation.part
+        self._part: RunPart[Any, Any, Any] = simulation._part
         self._force, self._resumes = force, resumes
         self.checkpoints = CheckpointSchedule(
             simulation.folder, simulation.scene.output.checkpoint_minutes, deadline
@@ -121,7 +121,7 @@ class RunLoop:
         self._progress = progress
         with contextlib.ExitStack() as stack:
             stack.enter_context(
-                signal_handler(self._simulation.ask_for_checkpoint, *CHECKPOINT_SIGNALS)
+                signal_handler(self._simulation._ask_for_checkpoint, *CHECKPOINT_SIGNALS)
             )
             if self._next == self._open:
                 with self._running():
@@ -131,7 +131,7 @@ class RunLoop:
             self._until = before + steps
             stack.enter_context(signal_handler(self._stop_by_signal, *stop_signals()))
             self._bar = progress_of(
-                total, part.time_unit, progress if total > 0 else False, self._simulation.spot
+                total, part.time_unit, progress if total > 0 else False, self._simulation._spot
             )
             stack.enter_context(self._bar).skip(float(part.state.time[NOW]))
             self._since = clock.perf_counter()
@@ -182,7 +182,7 @@ class RunLoop:
                 part.check_position()
                 changed = resume.describe_changes(checkpoint.values["with"])
         part.record.scene, part.record.inputs = scene, input_sha256
-        self._observers = _observers_by_name(part.default_observers(), simulation.observers)
+        self._observers = _observers_by_name(part.default_observers(), simulation._observers)
         names = [name for observer in self._observers.values() for name in observer.files()]
         names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self.checkpoints.writes else [])]
         if self._folder is not None and stays:
@@ -193,7 +193,7 @@ class RunLoop:
             run_folder.check_folder(self._folder, self._force, inputs, names)
         if checkpoint is None:
             for warning in part.system.warnings:
-                simulation.note(warning)
+                simulation._note(warning)
             # of several runs one compiles, and the others read its cache
             with interruptible(), PROCESS_LOCK, compiling_announced(self._announce_compiling):
                 part.prepare()
@@ -203,8 +203,8 @@ class RunLoop:
         if checkpoint is not None:
             self._resume_observers(checkpoint)
             if changed is not None:
-                simulation.note(changed)
-            simulation.announce(f"continuing from step {part.state.step[NOW]}")
+                simulation._note(changed)
+            simulation._announce(f"continuing from step {part.state.step[NOW]}")
         if self._folder is not None and stays:
             run_folder.add_to_folder(self._folder, names)
             with writing(self._folder):
@@ -250,7 +250,7 @@ class RunLoop:
             raise
 
     def _announce_compiling(self) -> None:
-        self._simulation.announce(f"compiling ({describe_cache()})")
+        self._simulation._announce(f"compiling ({describe_cache()})")
 
     def _if_not_forked(self, function: Callable[[], object]) -> None:
         """Call a function unless this is a forked process: files and locks belong to the process
@@ -304,14 +304,14 @@ class RunLoop:
             raise self._error
 
     def _note_lost_files(self) -> None:
-        """Note which files another program removed, replaced or changed; the run has no more to
+        """Note which files another program removed, replaced or changed. The run has no more to
         write to them."""
         for observer in self._observers.values():
             if isinstance(observer, GrowingFile):
                 try:
                     observer.check_file()
                 except LostFileError as error:
-                    self._simulation.note(str(error))
+                    self._simulation._note(str(error))
 
     @np.errstate(over="ignore", invalid="ignore")
     def _failed(self, error: SimulationError | OutputError) -> RigidMDError:
@@ -341,16 +341,16 @@ class RunLoop:
         return "".join(observer.failed(self._simulation) for observer in self._observers.values())
 
     def _read_checkpoint(self, folder: Path) -> tuple[Checkpoint | None, bool]:
-        """The checkpoint to resume from, None if the run has to begin, and whether the files of the
+        """The checkpoint to resume from, None if the run has to start, and whether the files of the
         folder stay."""
         if run_folder.is_empty(folder) or run_folder.never_began(folder):
-            self._simulation.announce(f"{folder} holds no run yet: beginning it")
+            self._simulation._announce(f"{folder} holds no run yet: beginning it")
             return None, not run_folder.is_empty(folder)
         for path in folder.iterdir():
             run_folder.check_inside(path)
         checkpoint, problems = latest(folder)
         for problem in problems:
-            self._simulation.warn(f"{problem}. The checkpoint before it is used")
+            self._simulation._warn(f"{problem}. The checkpoint before it is used")
         return checkpoint, True
 
     def _checkpoint(self) -> None:
@@ -481,11 +481,11 @@ class RunLoop:
 
     @property
     def _done(self) -> int:
-        """Steps since the start of the present segment."""
+        """Steps since the start of the current segment."""
         return int(self._part.state.step[NOW]) - self._part.record.position.first
 
     def _notify(self, done: int, due: Sequence[bool]) -> None:
-        """Call the observers that are due after `done` steps of the present segment."""
+        """Call the observers that are due after `done` steps of the current segment."""
         position = self._part.record.position
         time = position.time + done * self._part.segment.dt
         moment = Moment(self._simulation, position.first + done, time, position.segment)
@@ -498,7 +498,7 @@ class RunLoop:
         self, observer: Observer, method: Callable[..., None], *arguments: object
     ) -> None:
         """Call a method of an observer, unless the observer has failed before. Its error ends the
-        run, which raises it when all files are complete; an error of a figure becomes a note. `see`
+        run, which raises it when all files are complete. An error of a figure becomes a note. `see`
         may raise the errors of this package."""
         if observer in self._failed_before:
             return
@@ -511,12 +511,12 @@ class RunLoop:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
             name = type(observer).__name__
             if observer.draws:
-                self._simulation.note(
+                self._simulation._note(
                     f"{', '.join(observer.files()) or name} cannot be drawn: {reason}"
                 )
                 return
             part = self._part
-            self._simulation.note(
+            self._simulation._note(
                 f"{name} failed at {part.state.time[NOW]:g} {part.time_unit}: {reason}"
             )
             self.interrupted, self._error = True, self._error or error

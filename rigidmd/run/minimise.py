@@ -58,7 +58,7 @@ def remove_overlaps(
     move that lowers the energy the next is longer by a fifth; any other move is undone and halved.
 
     thermal, dt : scale of energies (u Å²/ps²) and time step (ps) of the kicks; stop : called before
-    each step; the removal ends if it is true
+    each step. The removal ends if it is true
     """
     model, scale = system.model, system.smallest_diameter
     load, tallies = engine.evaluate(state)
@@ -141,7 +141,7 @@ class Enthalpy:
         molecule (3 n; 0 of points) strains of the cell, one for each coordinate of the coupling: R
         <- R T, cell <- cell T, where T is lower triangular as in `barostats`, with the exponentials
         of the first three strains on its diagonal, the rest below. A strain is multiplied by sqrt(m
-        N) (V/N)^(1/3), for N molecules and m components that share the coordinate; the guide
+        N) (V/N)^(1/3), for N molecules and m components that share the coordinate. The guide
         `ensembles` has the reason and a measurement
 
     Axes without inertia do not rotate. The derivative for the strain follows from the molecular
@@ -260,7 +260,7 @@ DECREASE = 1e-4
 #: fraction of its size at the start, with the other sign (Hager & Zhang 2005, SIAM J. Optim. 16,
 #: 170, eq. 4.1 with delta = 0.1).
 OPPOSITE_SLOPE = 0.8
-#: Most trial moves along a direction; each is at most half as long as the one before.
+#: Maximum trial moves along a direction; each is at most half as long as the one before.
 TRIALS = 30
 #: If a move fails with an error even after it has been shortened by this factor, the error is
 #: final.
@@ -317,13 +317,13 @@ def minimise(
     energy ledger as work.
 
     The optimisers of libraries are not suitable: rotations form no vector space, so each iteration
-    starts from the present orientations, and an unbounded line search can put a charge without
+    starts from the current orientations, and an unbounded line search can put a charge without
     repulsion on an opposite charge.
 
     Forces have the precision of the scene if the limits are far above its error, and double
     precision from where no move lowers the energy in the other.
 
-    stop : called before each iteration; the minimisation ends if it is true; advanced : called
+    stop : called before each iteration. The minimisation ends if it is true; advanced : called
         after each with 1
 
     Raises SimulationError if the energy has no lower bound or is not a finite number, or the box

@@ -46,6 +46,7 @@ from rigidmd.run.part import RunPart
 from rigidmd.run.report import summary_text
 from rigidmd.run.resume import Count, RunRecord, check_same_scene, plain, state_from
 from rigidmd.run.schedule import Segment, interruptible
+from rigidmd.run.short_report import short_summary
 from rigidmd.run.stable_step import DIRECTIONS, SMALL_SYSTEM, stiffest_mode
 from rigidmd.run.summary import Minimum, describe_minimum, summarise
 from rigidmd.scene import MolecularScene
@@ -81,7 +82,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     time_unit = "ps"
     record_type = MolecularRecord
-    summary_text = staticmethod(summary_text)
+    summary_text, short_summary = staticmethod(summary_text), staticmethod(short_summary)
 
     def __init__(
         self, simulation: "Simulation", scene: MolecularScene, forces: Any, thermostat: Any
@@ -137,7 +138,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     def reset(self) -> None:
         super().reset()
-        self._is_sampled = False  # whether `_sampler` belongs to the present state
+        self._is_sampled = False  # whether `_sampler` belongs to the current state
         self._set_stages(self._start.scene.stages)  # an earlier run may have chosen an integrator
         self.engine = self.system.engine()
         self.state = self.system.state.copy()
@@ -186,13 +187,13 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         self.engine.forget()
         sentences = [*velocity_notes(self.system, self.state), *accuracy_warnings(self.scene)]
         for sentence in sentences:
-            self.simulation.note(sentence)
+            self.simulation._note(sentence)
 
     def _remove_overlaps(self) -> None:
         """Compile the forces, and remove overlaps of a lattice."""
         system, scene, first = self.system, self.scene, self.scene.stages[0]
         for note in check_compiled_code(system, self.state):
-            self.simulation.note(note)
+            self.simulation._note(note)
         with user_errors_explained(system):
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
@@ -204,7 +205,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         deepest = max((m.epsilon.max() for m in system.species), default=0.0)
         thermal = BOLTZMANN * (scene.start.temperature_K or 0.0) or deepest
         if system.from_lattice and not first.is_minimisation and thermal > 0:
-            dt = first.timestep_fs * FEMTOSECOND
+            dt = first.step
             removal = self.record.removal = remove_overlaps(
                 system, self.engine, self.state, thermal, dt
             )
@@ -245,7 +246,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             self.system.engine().advance(self._state_for(method).copy(), method, 0.0, 0)
 
     def _state_for(self, method: Scheme | Solver) -> State:
-        """The present state, without copies, with the additional variables of an integrator."""
+        """The current state, without copies, with the additional variables of an integrator."""
         return self.state._replace(extra_variables=self.engine.variables(self.state, method))
 
     def _engine_of(self, k: int) -> Engine:
@@ -295,7 +296,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         self._compile_stage(k)
 
     def reenter_segment(self, k: int) -> Segment:
-        stage, step = self.scene.stages[k], self.scene.stages[k].timestep_fs * FEMTOSECOND
+        stage, step = self.scene.stages[k], self.scene.stages[k].step
         for force in self.system.python_forces.values():
             force.may_diverge = stage.is_hybrid
         if stage.is_minimisation:
@@ -337,11 +338,11 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return segment
 
     def _minimise(self, progress: bool | None) -> None:
-        """Run the present stage, a minimisation, with a warning if it does not converge."""
+        """Run the current stage, a minimisation, with a warning if it does not converge."""
         k = self.record.position.segment
         stage = self.scene.stages[k]
         with progress_of(
-            stage.most_iterations, "iterations", progress, self.simulation.spot
+            stage.most_iterations, "iterations", progress, self.simulation._spot
         ) as bar:
 
             def advance(count: float) -> None:
@@ -351,11 +352,11 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
                     bar.unpause()
                     bar.skip(count)
 
-            minimum = minimise(self.system, self.state, stage, self.simulation.must_end, advance)
+            minimum = minimise(self.system, self.state, stage, self.simulation._must_end, advance)
         self.engine.forget()
         self.record.minima[k] = minimum
         if not minimum.converged:
-            self.simulation.note(f"stages.{k}: {describe_minimum(minimum, stage)}")
+            self.simulation._note(f"stages.{k}: {describe_minimum(minimum, stage)}")
 
     def _estimate(self, k: int) -> None:
         """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is
@@ -371,9 +372,9 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         if mode is None:
             return
         stable = self.record.stable[k] = stable_angle(stage.scheme) / mode.rate
-        if stage.timestep_fs * FEMTOSECOND > stable:
-            self.simulation.note(
-                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable:"
+        if stage.step > stable:
+            self.simulation._note(
+                f"stages.{k}: timestep_fs = {stage.step_fs:g} is longer than what is stable:"
                 " the stiffest motion at its start, of"
                 f" {checks.molecule_label(self.system, mode.molecule)}, has a period of"
                 f" {2 * np.pi / mode.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows"
@@ -381,21 +382,19 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             )
 
     def _choose(self, k: int) -> None:
-        """Choose integrator and step of a stage by pilot runs from the present state, and set them
+        """Choose integrator and step of a stage by pilot runs from the current state, and set them
         in the scene."""
         from rigidmd.run.pilot.stages import choose_for_stage
 
-        self.simulation.announce("choosing integrator and step by pilot runs")
+        self.simulation._announce("choosing integrator and step by pilot runs")
         decided, reason = choose_for_stage(self.system, self.state, k)
-        self.record.choices[k] = (
-            f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
-        )
+        self.record.choices[k] = f"{decided.integrator} at {decided.step_fs:g} fs chosen: {reason}"
         stages = self.record.stages
         self._set_stages((*stages[:k], decided, *stages[k + 1 :]))
         for sentence in self.scene.rounded_times([k]):
-            self.simulation.note(sentence)
+            self.simulation._note(sentence)
         if self.simulation.folder is not None:
-            self.simulation.write_scene(self.simulation.folder)
+            self.simulation._write_scene(self.simulation.folder)
 
     def is_replaced(self, moment: Moment) -> bool:
         stages, k = self.scene.stages, moment.stage
@@ -404,7 +403,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         ended = moment.step == sum(stage.steps for stage in stages[: k + 1])
         # an interrupted minimisation is repeated by a run that resumes, which also has another
         # frame for it
-        ends_here = stages[k].is_minimisation and self.simulation.is_interrupted
+        ends_here = stages[k].is_minimisation and self.simulation._is_interrupted
         return ended and not ends_here and k + 1 < len(stages) and stages[k + 1].is_minimisation
 
     def is_finite(self) -> bool:
@@ -424,7 +423,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         # other programs give the velocities where their thermostats act
         is_given = stage.has_thermostat and self.scene.engine.is_external
         if not (stage.is_minimisation or stage.is_auto or is_given):
-            step = stage.timestep_fs * FEMTOSECOND
+            step = stage.step
             correction = self._integrator(moment.stage).kinetic_correction * step**2
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
@@ -509,7 +508,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             self.state,
             preparing,
             wall,
-            self.simulation.is_interrupted,
+            self.simulation._is_interrupted,
         )
 
     def explain(self, error: SimulationError) -> str:

@@ -15,7 +15,7 @@ from rigidmd.io.run_files import TENSOR_FILE, Log, TensorFile, tensor_row
 from rigidmd.run import checks
 from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.scene.stage import Stage
-from rigidmd.units import FEMTOSECOND, KJ_PER_MOL
+from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
     from rigidmd.run.results import Results
@@ -72,9 +72,9 @@ class PressureTensor(GrowingFile):
 def _check_next_step(run: "Simulation", check: checks.StepCheck, load: Load, stage: Stage) -> None:
     """Raise the failed check of the next step of a stage, if the stage has steps."""
     if not stage.is_minimisation:
-        dt = stage.timestep_fs * FEMTOSECOND
+        dt = stage.step
         if problem := check.failed_check(
-            run.part.state, load, stage.scheme, dt, run.engine.extent(run.part.state)
+            run._part.state, load, stage.scheme, dt, run.engine.extent(run._part.state)
         ):
             raise problem
 
@@ -109,7 +109,7 @@ class Sampler(Observer):
         run, now, samples = self._run, moment.sample, self.samples
         since = self._begins.setdefault(now.stage, max(0, len(samples) - 1))
         samples.append(now)
-        if (trajectories := run.part.engine.trajectories) is not None:
+        if (trajectories := run._part.engine.trajectories) is not None:
             self.trajectories = trajectories
         stage = run.scene.stages[now.stage]
         if stage.has_thermostat:
@@ -122,7 +122,7 @@ class Sampler(Observer):
             raise problem
         self._check.rescale(kinetic)
         self.last_good = None  # its memory is free for the next
-        self.last_good = run.part.state.copy()
+        self.last_good = run._part.state.copy()
 
     @property
     def table(self) -> np.ndarray:
@@ -138,7 +138,7 @@ class Sampler(Observer):
         samples = self.samples
         names = ("step", "time", "stage", "conserved", "drift")
         steps, times, stages, conserved, drift = map(samples.__getitem__, names)
-        step, time = int(run.part.state.step[NOW]), float(run.part.state.time[NOW])
+        step, time = int(run._part.state.step[NOW]), float(run._part.state.time[NOW])
         series = ((steps, step), (times, time), (stages, len(samples.stages)))
         if not all(
             ((of >= 0) & (of <= largest)).all() and (np.diff(of) >= 0).all()
@@ -154,7 +154,7 @@ class Sampler(Observer):
             raise ValueError("the drifts of its samples are not those of their energies")
         if len(samples):
             self._check.rescale(samples.row(-1).kinetic * KJ_PER_MOL)
-        self.last_good = run.part.state.copy()
+        self.last_good = run._part.state.copy()
 
     def failed(self, run: "Simulation") -> str:
         if run.folder is None or self.last_good is None:
@@ -176,10 +176,7 @@ class StepWatch(Observer):
         self._run, self._check = run, check
         interval, stages = run.scene.output.log_interval_ps, run.scene.stages
         moving = [stage for stage in stages if not stage.is_minimisation]
-        of_samples = [
-            inf if stage.is_auto else interval / (stage.timestep_fs * FEMTOSECOND)
-            for stage in moving
-        ]
+        of_samples = [inf if stage.is_auto else interval / stage.step for stage in moving]
         every = checks.check_interval(run.system)
         # samples come at least as often
         self.steps = every if max(of_samples, default=0.0) > every else None
@@ -195,5 +192,5 @@ class FinalState(Observer):
     _names = (FINAL,)
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        write_state(run.path(FINAL), run.system.saved(run.part.state))
+        write_state(run.path(FINAL), run.system.saved(run._part.state))
         results.files.append(run.path(FINAL))

@@ -1,9 +1,9 @@
 """Observers are called between the steps of a run. They read its state and never change it.
 
 An observer is any object with an `interval` and a method `see`; `Observer` has all other methods,
-which do nothing. `see` is called every `interval` of time, counted in steps of each segment, or
+which have no effect. `see` is called every `interval` of time, counted in steps of each segment, or
 every `steps` steps, independent of the interval of results, and with `ends` also at the last moment
-of every segment. A time at which a minimisation begins has two states: with `once` only the second
+of every segment. A time at which a minimisation starts has two states: with `once` only the second
 is observed. No observer depends on another: data that several need belong to the moment or run.
 """
 
@@ -45,7 +45,7 @@ class Moment:
     """
 
     def __init__(self, run: "Simulation", step: int, time: float, stage: int):
-        self._run, self._state = run, run.part.state
+        self._run, self._state = run, run._part.state
         self.step, self.time, self.stage = step, time, stage
 
     def __repr__(self) -> str:
@@ -60,7 +60,7 @@ class Moment:
     def observation(self) -> Any:
         """Evaluated at its first use, for all observers: an `Observation` of molecules, in the
         units of the log, or the `Pose` of a body, in SI units."""
-        return self._run.part.observe(self)
+        return self._run._part.observe(self)
 
     @property
     def sample(self) -> "Sample":
@@ -81,7 +81,7 @@ def above_zero(interval: float, name: str) -> float:
 
 
 class Observer:
-    """Base class; its methods do nothing.
+    """Base class. Its methods have no effect.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class Observer:
         """Called instead of `begin` when a run is resumed: restore the data of `memory`, and check
         files unchanged.
 
-        The run is refused if this raises KeyError, TypeError, ValueError or OutputError.
+        The run is rejected if this raises KeyError, TypeError, ValueError or OutputError.
         """
         for name, value in restored(kept, self.remembers).items():
             setattr(self, name, value)
@@ -229,7 +229,7 @@ class SceneFile(Observer):
 
     def cut(self) -> None:
         if self._run.folder is not None:
-            self._run.write_scene(self._run.folder)
+            self._run._write_scene(self._run.folder)
 
     def end(self, run: "Simulation", results: "Results") -> None:
         results.files.append(run.path(SCENE))
@@ -294,8 +294,10 @@ class Frames(GrowingFile):
         from rigidmd.io.trajectory_file import open_trajectory, write_topology
 
         if self.kept is None:
-            write_topology(run.path(self._names[0]), run.system, run.part.state, self._wrapped)
-        elif self.kept[-1:] != [len(self._frames)] or (self.times > run.part.state.time[NOW]).any():
+            write_topology(run.path(self._names[0]), run.system, run._part.state, self._wrapped)
+        elif (
+            self.kept[-1:] != [len(self._frames)] or (self.times > run._part.state.time[NOW]).any()
+        ):
             raise ValueError("the times of its frames are not those of a run")
         path = run.path(self._names[1])
         self._file = open_trajectory(
@@ -303,7 +305,7 @@ class Frames(GrowingFile):
         )
 
     def see(self, moment: Moment) -> None:
-        system, state = self._run.system, self._run.part.state
+        system, state = self._run.system, self._run._part.state
         if self._file is not None:
             self._file.write(state, moment.time, moment.step)
             self._frames.append(Frame(moment.time))

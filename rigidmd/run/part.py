@@ -30,7 +30,7 @@ SamplesT = TypeVar("SamplesT", "Samples", "Motion")
 
 
 class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
-    """What a `Simulation` moves: system, engine, state, the present segment, and the record of the
+    """What a `Simulation` moves: system, engine, state, the current segment, and the record of the
     run.
 
     time_unit : "ps" or "s"
@@ -57,7 +57,7 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
 
     @property
     def threads(self) -> int:
-        """Number of threads; a single body has one."""
+        """Number of threads. A single body has one."""
         return 1
 
     @property
@@ -96,15 +96,15 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
 
     @abstractmethod
     def observe_now(self) -> Any:
-        """The observation of the present state."""
+        """The observation of the current state."""
 
     @abstractmethod
     def energy_now(self) -> float:
-        """Potential plus kinetic energy of the present state, kJ/mol, for a body J."""
+        """Potential plus kinetic energy of the current state, kJ/mol, for a body J."""
 
     @abstractmethod
     def forces_now(self) -> np.ndarray:
-        """Forces (n, 3) at the present state, kJ/mol/Å, for a body N."""
+        """Forces (n, 3) at the current state, kJ/mol/Å, for a body N."""
 
     @abstractmethod
     def default_observers(self) -> list[Observer]:
@@ -129,6 +129,11 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
     def summary_text(summary: Json, known: Any) -> str:
         """The summary as text, without the notes in `known`."""
 
+    @staticmethod
+    @abstractmethod
+    def short_summary(summary: Json, known: Any) -> str:
+        """The main results as text, without the notes in `known`."""
+
     @abstractmethod
     def explain(self, error: SimulationError) -> str:
         """An error in full: what was seen, the likely cause, what to try."""
@@ -138,7 +143,7 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         """Energies and forces at the start."""
 
     def take_threads(self, count: int) -> None:
-        """Set the number of threads; a single body always has one."""
+        """Set the number of threads. A single body always has one."""
 
     def reset(self) -> None:
         """Return to the start, so that repeated runs are identical: a new engine, state and
@@ -170,7 +175,7 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
             raise ValueError(f"step {step[NOW]} is not at {now:g} {self.time_unit}")
 
     def is_replaced(self, moment: Moment) -> bool:
-        """Whether the present moment is followed by another one of the same time."""
+        """Whether the current moment is followed by another one of the same time."""
         return False
 
     def is_finite(self) -> bool:

@@ -139,9 +139,7 @@ def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> n
     stage_of_row, first, end = np.full(len(names), len(stages) - 1), 0, 0.0
     for k, stage in enumerate(stages[:-1]):
         end += stage.duration
-        of_stage = (names[first:] == stage.label) & (
-            time[first:] <= end + 0.5e-3 * stage.timestep_fs
-        )
+        of_stage = (names[first:] == stage.label) & (time[first:] <= end + 0.5 * stage.step)
         count = len(of_stage) if of_stage.all() else int(of_stage.argmin())
         stage_of_row[first : first + count] = k
         first += count

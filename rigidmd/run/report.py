@@ -65,7 +65,8 @@ def _last_lines(summary: dict, known: Container[str]) -> list[str]:
 
 
 def _orthogonality(summary: dict) -> tuple[str, str]:
-    return "orthogonality", f"|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"
+    error = summary["largest_orthogonality_error"]
+    return "orthogonality", f"|QᵀQ - 1| at most {error:.1e}" if error else "exactly 0"
 
 
 def body_title(summary: dict) -> str:
@@ -125,7 +126,8 @@ def body_rows(summary: dict) -> list[tuple[str, str]]:
     ]
     for name, error in summary["largest_relative_error"].items():
         of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
-        rows.append((f"{name} error", f"at most {error:.1e} of {of}"))
+        size = f"at most {error:.1e} of {of}" if error else "exactly 0"
+        rows.append((f"{name} error", size))
     if summary["largest_orthogonality_error"] is not None:
         rows.append(_orthogonality(summary))
     return rows

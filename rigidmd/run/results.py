@@ -168,7 +168,7 @@ class Results(Displayed):
 
         Atoms are the sites with mass, with the masses of the models, cell, periodicity,
         `info["time_ps"]` and, where frames have velocities, momenta. The final state, and a last
-        frame at its time, is exact, with energy, forces and stress; other frames have the digits of
+        frame at its time, is exact, with energy, forces and stress. Other frames have the digits of
         the trajectory (single precision but for .traj), and the energy where the log has a line at
         their time. So has the final state of a run that was read from a folder, without forces.
 

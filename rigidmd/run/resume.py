@@ -49,7 +49,7 @@ NOT_COMPARED = (
 
 
 def computed_with() -> Json:
-    """Everything besides the scene that may change the bits of a result, as JSON values."""
+    """Everything in addition to the scene that may change the bits of a result, as JSON values."""
     settings = " ".join(
         f"{name}={os.environ[name]}" for name in CODE_SETTINGS if name in os.environ
     )
@@ -284,7 +284,7 @@ class RunPosition:
 
 @dataclass
 class RunRecord:
-    """The input of a run and all that evolves in it, besides its state, its engine and its
+    """The input of a run and all that evolves in it, in addition to its state, its engine and its
     observers.
 
     Every field of this class and its subclasses is in the checkpoints: `stored` and `restored`

@@ -2,7 +2,7 @@
 run has to end.
 
 Wall time and signals decide on checkpoints and the end, and change no bit of the results. Python
-handles signals in its main thread only; in other threads the functions for signals do nothing.
+handles signals in its main thread only. In other threads the functions for signals have no effect.
 """
 
 import _thread

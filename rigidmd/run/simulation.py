@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from rigidmd.run.body import BodyRun
     from rigidmd.run.minimise import OverlapRemoval
     from rigidmd.run.molecular import MolecularRun
-    from rigidmd.run.schedule import Segment
     from rigidmd.scene import MolecularScene
 
     UserForce = Force | PairPotential | HasTerm | NamedTuple
@@ -74,7 +73,7 @@ if TYPE_CHECKING:
 SystemT = TypeVar("SystemT")
 SceneT = TypeVar("SceneT")
 
-#: Simulations that have begun and not ended, which are closed when the interpreter exits.
+#: Simulations that have started and not ended, which are closed when the interpreter exits.
 _BEGUN: "weakref.WeakSet[Simulation]" = weakref.WeakSet()
 
 
@@ -86,6 +85,18 @@ def _as_warning(sentence: str) -> None:
     warnings.warn(sentence, RigidMDWarning, stacklevel=level)
 
 
+def _as_scene(scene: object) -> Scene:
+    """A scene, or the scene in a file."""
+    if isinstance(scene, str | Path):
+        return Scene.read(scene)
+    if isinstance(scene, Scene):
+        return scene
+    raise TypeError(
+        f"Simulation needs a scene or the path of its file, not {scene!r:.60}: use"
+        " rigidmd.Scene.from_dict for a dictionary"
+    )
+
+
 class Simulation(Displayed, Generic[SystemT, SceneT]):
     """A scene, ready to run: `run()` runs it to its end, `step(n)` advances it by n steps; both can
     be mixed.
@@ -93,7 +104,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     Parameters
     ----------
     scene
-        The scene
+        The scene, or the path of its TOML file
     folder
         Folder for the files; None writes nothing and keeps the frames in memory
     force
@@ -113,7 +124,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     walltime
         Seconds from now until the run has to have ended; it stops shortly before, with a checkpoint
     forces
-        For molecules, user-defined forces, besides the forces of the scene: `rigidmd.Force`,
+        For molecules, user-defined forces, in addition to the forces of the scene: `rigidmd.Force`,
         `rigidmd.pair_potential`, terms of classes with `rigidmd.compiled_force`, or objects whose
         method term(system) makes such a term. At the start forces and torques are compared with
         differences of the energy, and the virial with the effect of a strain of the box
@@ -125,9 +136,17 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         axes, at the centre of mass, and a torque (3,) in N m along the body's axes. It is called
         once for each position of the body. Forces that depend on the velocity are constant within a
         step, which reduces its order to 1
+
+    Examples
+    --------
+        results = rigidmd.Simulation("water.toml").run()
+
+        with rigidmd.Simulation("water.toml", "runs/water") as simulation:
+            simulation.step(100)
+            print(simulation.state.time, simulation.energy)
     """
 
-    part: "MolecularRun | BodyRun"
+    _part: "MolecularRun | BodyRun"
 
     if TYPE_CHECKING:
 
@@ -152,7 +171,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         @overload
         def __init__(
             self: "Simulation[Any, Any]",
-            scene: Scene,
+            scene: Scene | str | Path,
             folder: str | Path | None = None,
             force: bool = False,
             **options: Unpack[Options],
@@ -160,7 +179,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | str | Path,
         folder: str | Path | None = None,
         force: bool = False,
         *,
@@ -173,22 +192,23 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         thermostat: "NamedTuple | HasStage | None" = None,
         applied: "Mapping[str, Callable[[Pose], tuple]] | None" = None,
     ):
+        scene = _as_scene(scene)
         # a callback may change the directory
         self.folder = None if folder is None else Path(folder).absolute()
         if resume and folder is None:
             raise ValueError("a run without a folder has no checkpoint to resume from")
-        self._force, self._resume, self._user_say, self.warn = force, resume, say, warn
+        self._force, self._resume, self._user_say, self._warn = force, resume, say, warn
         self._deadline = (
             None if walltime is None else clock.monotonic() + checked_walltime(walltime)
         )
-        self.observers = [
+        self._observers = [
             as_observer(each)
             for each in (observers if isinstance(observers, Sequence) else [observers])
         ]
-        self.spot = DisplayArea()
+        self._spot = DisplayArea()
         self._progress: bool | None = None
         self._issued: list[str] = []  # warnings by this process
-        self._loop: RunLoop | None = None  # the run, after it has begun and before it has ended
+        self._loop: RunLoop | None = None  # the run, after it has started and before it has ended
         self._earlier: run_folder.RunMark | None = (
             None  # of the last run by this object in the folder
         )
@@ -202,7 +222,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
                     " function}"
                 )
                 raise SceneError(scene.source, [problem])
-            self.part = BodyRun(self, scene, applied)
+            self._part = BodyRun(self, scene, applied)
         else:
             from rigidmd.run.molecular import MolecularRun
 
@@ -210,7 +230,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
                 raise SceneError(
                     scene.source, ["applied: for a single body; molecules take forces=[...]"]
                 )
-            self.part = MolecularRun(self, cast(Any, scene), forces, thermostat)
+            self._part = MolecularRun(self, cast(Any, scene), forces, thermostat)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._summary_line}>"
@@ -233,40 +253,35 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     @property
     def scene(self) -> SceneT:
         """The scene as it runs, with defaults and choices."""
-        return cast(SceneT, self.part.scene)
+        return cast(SceneT, self._part.scene)
 
     @property
     def system(self) -> SystemT:
         """The system that the scene describes."""
-        return cast(SystemT, self.part.system)
+        return cast(SystemT, self._part.system)
 
     @property
     def engine(self) -> "Engine":
-        """The present engine."""
-        return self.part.engine
-
-    @property
-    def segment(self) -> "Segment":
-        """The present segment: its method, step and number of steps."""
-        return self.part.segment
+        """The current engine."""
+        return self._part.engine
 
     @property
     def threads(self) -> int:
         """Number of threads."""
-        return self.part.threads
+        return self._part.threads
 
     @property
     def state(self) -> State:
-        """The present state, read-only: the next step changes it, a copy stays as it is.
+        """The current state, read-only: the next step changes it, a copy stays as it is.
 
         For molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in
-        SI units. Runs begin from another state by `start_from`.
+        SI units. Runs start from another state by `start_from`.
         """
-        return self.part.state.read_only
+        return self._part.state.read_only
 
     @property
     def observation(self) -> "Observation | Pose":
-        """Observables of the present state, before, within and after a run; each use evaluates the
+        """Observables of the current state, before, within and after a run. Each use evaluates the
         forces.
 
         An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log; the `Pose` of a body,
@@ -277,24 +292,24 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         SimulationError
             If the forces cannot be evaluated.
         """
-        return self.part.observe_now()
+        return self._part.observe_now()
 
     @property
     def energy(self) -> float:
-        """Potential plus kinetic energy of the present state, kJ/mol, for a body J; `observation`
+        """Potential plus kinetic energy of the current state, kJ/mol, for a body J; `observation`
         has both."""
-        return self.part.energy_now()
+        return self._part.energy_now()
 
     @property
     def forces(self) -> np.ndarray:
-        """Forces (n, 3) on the centres of mass at the present state, lab frame, kJ/mol/Å; on a body
+        """Forces (n, 3) on the centres of mass at the current state, lab frame, kJ/mol/Å; on a body
         (1, 3) in N, empty if it is pinned."""
-        return self.part.forces_now()
+        return self._part.forces_now()
 
     @property
     def notes(self) -> list[str]:
         """The warnings of the run."""
-        return list(self.part.record.notes)
+        return list(self._part.record.notes)
 
     def path(self, file: str) -> Path:
         """Path of a file in the folder of the run.
@@ -311,20 +326,21 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     @property
     def _summary_line(self) -> str:
         where = "results stay in memory" if self.folder is None else f"writes to {self.folder}"
-        return f"{self.part.headline}; {where}"
+        return f"{self._part.headline}; {where}"
 
-    def introduction(self) -> str:
+    def _introduction(self) -> str:
         """A few lines for the start of a run."""
-        return "\n".join([self.part.headline, *(f"  {note}" for note in self.part.system.notes)])
+        return "\n".join([self._part.headline, *(f"  {note}" for note in self._part.system.notes)])
 
-    def conclusion(self, results: Results) -> str:
+    def _conclusion(self, results: Results, verbose: bool = False) -> str:
         """The summary as text, without the notes of the introduction and the warnings that were
         issued."""
-        return self.part.summary_text(results.summary, [*self.part.system.notes, *self._issued])
+        text_of = self._part.summary_text if verbose else self._part.short_summary
+        return text_of(results.summary, [*self._part.system.notes, *self._issued])
 
-    def write_scene(self, folder: Path) -> None:
+    def _write_scene(self, folder: Path) -> None:
         """Write the scene as it runs, with copies of the files that it reads."""
-        write_scene(folder, self.part.scene)
+        write_scene(folder, self._part.scene)
 
     # Before a run.
 
@@ -332,43 +348,43 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """The part, which is changed before a run. Raises RuntimeError within a run."""
         if self._loop is not None:
             raise RuntimeError("the run has begun; close() ends it")
-        return self.part
+        return self._part
 
     def _molecules(self, begun: bool = False) -> "MolecularRun":
         """The part of molecules. Raises TypeError for a body, RuntimeError within a run unless it
         may have `begun`."""
-        part = self.part if begun else self._before_run()
+        part = self._part if begun else self._before_run()
         if isinstance(part.scene, BodyScene):
             raise TypeError(f"{part.scene.name} is a single body; this method is for molecules")
         return cast("MolecularRun", part)
 
     def start_from(self, state: State) -> None:
-        """Let runs of molecules begin at the given positions and momenta, without removal of
+        """Let runs of molecules start at the given positions and momenta, without removal of
         overlaps.
 
         Parameters
         ----------
         state
             A state of as many molecules in the same order, in the units of `state`, such as
-            `results.state`. Time and step begin at 0. Raises StructureError for a state that this
+            `results.state`. Time and step start at 0. Raises StructureError for a state that this
             scene cannot have, TypeError for anything else.
         """
         self._molecules().start_from(state)
         if self._earlier is not None:
             self._earlier.is_complete = True  # the next run does not continue it
 
-    def start(self) -> "OverlapRemoval | None":
+    def _start(self) -> "OverlapRemoval | None":
         """Go to the state before the first step, from which `run` starts. Returns the removal of
         overlaps."""
         return self._molecules().start()
 
-    def settle(self) -> State:
+    def _settle(self) -> State:
         """Go to the state of molecules after removal of overlaps and the minimisations that come
         first."""
         return self._molecules().settle()
 
     def atoms(self) -> "ase.Atoms":
-        """The present state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers
+        """The current state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers
         may call it."""
         return self._molecules(begun=True).atoms()
 
@@ -379,14 +395,14 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         A stage with integrator = "auto" compiles more when pilot runs have chosen.
         """
         self._before_run().prepare()
-        self.part.reset()
+        self._part.reset()
 
-    def take_threads(self, count: int) -> None:
-        """Set the number of threads. Results do not depend on it; a single body always has one."""
+    def _take_threads(self, count: int) -> None:
+        """Set the number of threads. Results do not depend on it. A single body always has one."""
         self._before_run().take_threads(count)
 
-    def start_energy(self, *unit: Any, **options: Any) -> Json:
-        """Energies and forces at the start; for the arguments see `MolecularRun.start_energy`, a
+    def _start_energy(self, *unit: Any, **options: Any) -> Json:
+        """Energies and forces at the start. For the arguments see `MolecularRun.start_energy`, a
         body has none."""
         return self._before_run().start_energy(*unit, **options)
 
@@ -397,7 +413,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         After the end of a run, a call repeats it; in a folder it replaces the files of that run. A
         run in a folder that was interrupted is continued from its last checkpoint. Without a folder
-        there is none, and it begins anew.
+        there is none, and it starts again.
 
         Parameters
         ----------
@@ -407,6 +423,8 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         Raises
         ------
+        TypeError
+            For a number of steps, which `step` takes.
         OutputError
             Before computing, if the folder cannot be used.
         CheckpointError
@@ -414,13 +432,17 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         SimulationError
             If the run fails.
         """
+        if not isinstance(progress, bool | None):
+            raise TypeError(
+                f"run() runs the whole scene: for {progress!r:.20} steps use step({progress!r:.20})"
+            )
         return cast(Results, self._drive(inf, progress).results)
 
     def step(self, count: int = 1) -> int:
         """Advance by a number of steps, as `run` does. Returns the number done: fewer at the end of
         the scene, then 0.
 
-        The first call begins the run: it compiles and writes the first files. A minimisation is
+        The first call starts the run: it compiles and writes the first files. A minimisation is
         done with the next step after it. `run` or `close` completes the run. A signal such as
         Ctrl-C ends the run with all files, and is raised then.
 
@@ -434,7 +456,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         return self._drive(count, False).advanced
 
     def close(self) -> None:
-        """End a run that `step` has begun, with all files, as `stop` ends it: it can be resumed.
+        """End a run that `step` has started, with all files, as `stop` ends it: it can be resumed.
         The end of a `with` block does this, and so does the end of Python."""
         if (
             self._loop is not None
@@ -457,35 +479,35 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         if self._loop is not None:
             self._loop.stop(number)
 
-    def ask_for_checkpoint(self, number: int | None = None) -> None:
-        """Write a checkpoint at the next observation. number : of the signal that requests it"""
+    def _ask_for_checkpoint(self, number: int | None = None) -> None:
+        """Write a checkpoint at the next observation, at the request of a signal."""
         if self._loop is not None:
             self._loop.checkpoints.requested = True
 
-    def note(self, warning: str) -> None:
+    def _note(self, warning: str) -> None:
         """Issue a warning; the summary repeats it."""
-        self.part.record.notes.append(warning)
+        self._part.record.notes.append(warning)
         self._issued.append(warning)
-        self.warn(warning)
+        self._warn(warning)
 
-    def announce(self, sentence: str) -> None:
+    def _announce(self, sentence: str) -> None:
         """Print a sentence before something slow."""
         if self._user_say is not None:
             self._user_say(sentence)
         elif is_shown(self._progress):
-            announce(sentence, self.spot)
+            announce(sentence, self._spot)
 
-    def must_end(self) -> bool:
+    def _must_end(self) -> bool:
         """Whether a run has to end, by a signal or because its time is up."""
         return self._loop is not None and self._loop.must_end()
 
     @property
-    def is_interrupted(self) -> bool:
+    def _is_interrupted(self) -> bool:
         """Whether the run ends before the end of its scene."""
         return self._loop is not None and self._loop.interrupted
 
     def _drive(self, steps: float, progress: bool | None) -> RunLoop:
-        """Let the run advance by at most this number of steps, or to its end. A new one begins
+        """Let the run advance by at most this number of steps, or to its end. A new one starts
         after its end."""
         if self._loop is None:
             self._issued = []
@@ -500,7 +522,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
             raise RuntimeError(
                 "this simulation is running already; its observers cannot run it again"
             )
-        self._progress, self.spot = progress, DisplayArea()
+        self._progress, self._spot = progress, DisplayArea()
         try:
             loop.drive(steps, progress)
         finally:
@@ -552,7 +574,7 @@ def run_together(
     if jobs is not None and jobs < 1:
         raise ValueError(f"jobs = {jobs}: at least one run at a time")
     for simulation in simulations:
-        simulation.take_threads(1)
+        simulation._take_threads(1)
     begun: list[Simulation] = []
     received: list[int] = []  # the signals that end runs, so far
 
@@ -575,7 +597,7 @@ def run_together(
 
     def ask_for_checkpoints(number: int) -> None:
         for simulation in begun:
-            simulation.ask_for_checkpoint(number)
+            simulation._ask_for_checkpoint(number)
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(signal_handler(stop, *stop_signals()))
@@ -586,7 +608,7 @@ def run_together(
         while running:
             _, running = wait(running, POLL_INTERVAL)
             if received:
-                stop_all()  # repeatedly: a run that was just beginning may have missed it
+                stop_all()  # repeatedly: a run that was just starting may have missed it
     failed = {
         k: error for k, future in enumerate(futures, 1) if (error := future.exception()) is not None
     }

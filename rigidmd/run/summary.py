@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from math import isnan, sqrt
+from math import hypot, isnan, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from rigidmd.engines.samples import (
     equilibrated,
 )
 from rigidmd.engines.system import System
+from rigidmd.scene.couplings import THERMOSTATS
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
@@ -208,7 +209,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     of the ensemble.
     """
     of_stage = samples.of_stage(k)
-    if system.scene.stages[k].is_hybrid:  # its averages have no error of the step
+    if system.scene.stages[k].is_hybrid:  # its averages have no time-step error
         return _notes_on_trajectories(system.scene.stages[k], k, of_stage["acceptance"])
     half = len(of_stage) // 2
     if len(of_stage) - half < MIN_SAMPLES:
@@ -219,10 +220,10 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     freedom = system.freedom_in(k)
     level = float(temperature.mean())
     line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
-    if (
-        thermal > 0
-        and abs(line.value)
-        > _drift_limit(time[-1] - time[0]) * thermal + STANDARD_ERRORS * line.error
+    of_heat, uncertain = drift_of_thermostats(system, of_stage, k)
+    allowed = _drift_limit(time[-1] - time[0]) * thermal
+    if thermal > 0 and abs(line.value - of_heat) > allowed + STANDARD_ERRORS * hypot(
+        line.error, uncertain
     ):
         rate, error = (value * 1000 / thermal for value in (line.value, line.error))
         if system.scene.forces.truncation == "smooth_switch":
@@ -237,7 +238,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
             f"stages.{k}: in its second half the conserved energy drifts by {rate:+.2g} ±"
             f" {error:.1g} kT/ns per degree of freedom, as from a step that is too long or forces"
             f" that jump at the cutoff{hides}. Try a shorter timestep_fs than"
-            f" {stage.timestep_fs:g}{smooth}"
+            f" {stage.step_fs:g}{smooth}"
         )
     if not stage.has_thermostat:
         return notes
@@ -246,7 +247,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     scheme = integrator_of_stage(system, k)
     if scheme.kinetic_correction == 0 and not stage.is_hybrid:
         squares = (of_stage["force_squares"] + of_stage["torque_squares"])[half:]
-        step = stage.timestep_fs * FEMTOSECOND
+        step = stage.step
         per_square = 2 * scheme.shadow_correction * step**2 * KJ_PER_MOL / BOLTZMANN
         notes += _note_on_heating(stage, k, temperature, per_square / freedom.total * squares)
     moving, rotating = (of_stage[f"temperature_{motion}"][half:] for motion in MOTIONS)
@@ -280,11 +281,11 @@ def _note_on_heating(
     level = float(temperature.mean())
     if abs(heating) <= max(HEATING_LIMIT * level, STANDARD_ERRORS * error):
         return []
-    shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heating))
+    shorter = stage.step_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heating))
     shadow = temperature + excess
     mean = format_with_error(float(shadow.mean()), mean_and_error(shadow)[1])
     return [
-        f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules"
+        f"stages.{k}: the step of {stage.step_fs:g} fs leaves the molecules"
         f" {abs(heating):.2g} K too {'hot' if heating > 0 else 'cold'}: they move and rotate as at"
         f" {mean} K, while the thermostat controls the momenta at the ends of steps,"
         f" {level:.4g} K. Try timestep_fs = {shorter:.1g}, or integrator = 'baoab', the default,"
@@ -307,9 +308,40 @@ def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list
     return [
         f"stages.{k}: {where}{accepted:.1%} of the trajectories were accepted: positions hardly"
         " change and the errors of the means are too small. Try a shorter timestep_fs than"
-        f" {stage.timestep_fs:g}, an integrator of higher order such as 'srkn_4', or integrator ="
+        f" {stage.step_fs:g}, an integrator of higher order such as 'srkn_4', or integrator ="
         " 'auto'"
     ]
+
+
+def drift_of_thermostats(system: System, of_stage: Samples, k: int) -> tuple[float, float]:
+    """The drift of the conserved energy that heat between the thermostats of translation and
+    rotation causes, and its standard error, kJ/mol/ps.
+
+    In the middle of a drift the shadow Hamiltonian has 1 - x/12 of the kinetic energy, with the
+    mean x of (w dt)² of these motions, so that equal heats at both thermostats are not equal in it.
+    See "Temperatures" in the theory chapter `errors`.
+    """
+    stage, freedom = system.scene.stages[k], system.freedom_in(k)
+    if not (stage.has_thermostat and freedom.translation and freedom.rotation):
+        return 0.0, 0.0
+    if not THERMOSTATS[stage.thermostat_kind].by_motion:
+        return 0.0, 0.0
+    from rigidmd.assemble.build import integrator_of_stage  # not for single bodies
+
+    if integrator_of_stage(system, k).kinetic_correction == 0 or system.thermostat is not None:
+        return 0.0, 0.0
+    unit = BOLTZMANN / KJ_PER_MOL
+    heats, squares = [], []
+    target = np.linspace(*stage.temperatures, len(of_stage))
+    parts = (freedom.translation, freedom.rotation)
+    for count, motion, square in zip(parts, MOTIONS, ("force", "torque"), strict=True):
+        off = target - of_stage[f"temperature_{motion}"]
+        heats.append(0.5 * count * unit * off / stage.thermostat_time)
+        square_mean = float(of_stage[f"{square}_squares"].mean())
+        squares.append(stage.step**2 * square_mean / (count * unit * float(target.mean())))
+    rate, error = mean_and_error(0.5 * (heats[0] - heats[1]))
+    factor = (squares[1] - squares[0]) / 12
+    return factor * (rate or 0.0), abs(factor) * (error or 0.0)
 
 
 def _drift_limit(time: float) -> float:
@@ -317,18 +349,24 @@ def _drift_limit(time: float) -> float:
     return max(DRIFT_LIMIT / 1000, DRIFT_SUM_LIMIT / time)
 
 
-def _drift_verdict(drift: float, error: float, limit: float) -> str | None:
+def _drift_verdict(
+    drift: float, error: float, limit: float, expected: tuple[float, float]
+) -> str | None:
     """Whether a drift is significant, against its standard error and the largest small drift; None
-    without an error."""
+    without an error. expected : the drift by heat between thermostats, and its error"""
     if not error > 0:
         return None
     count = abs(drift) / error
     if count < STANDARD_ERRORS:
         return f"not significant, {count:.1f} standard errors"
-    return (
-        f"significant, {count:.1f} standard errors,"
-        f" {'but small' if abs(drift) <= limit else 'and large'}"
-    )
+    value, uncertain = expected
+    if abs(drift) <= limit:
+        size = "but small"
+    elif abs(drift - value) <= limit + STANDARD_ERRORS * hypot(error, uncertain) and value:
+        size = "by heat between its two thermostats at this step"
+    else:
+        size = "and large"
+    return f"significant, {count:.1f} standard errors, {size}"
 
 
 def stage_summary(
@@ -351,7 +389,7 @@ def stage_summary(
     temperatures = _means(steady, TEMPERATURES)
     potential = mean_and_error(steady["potential"] / n)
     pressure = mean_and_error(steady["pressure_bar"])
-    spread, duration = float(of_stage["kinetic"].std()), steps * stage.timestep_fs * FEMTOSECOND
+    spread, duration = float(of_stage["kinetic"].std()), steps * stage.step
     thermal = (
         BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total
     )
@@ -360,12 +398,12 @@ def stage_summary(
         "name": stage.label,
         "ensemble": stage.ensemble,
         "integrator": stage.integrator,
-        "timestep_fs": stage.timestep_fs,
+        "timestep_fs": stage.step_fs,
         "steps": steps,
         "duration_ps": duration,
         "computing_s": computing,
         "steps_per_s": speed,
-        "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
+        "ns_per_day": speed * stage.step_fs * 1e-6 * 86400 if speed else None,
         "means_over": describe_equilibrated(of_stage, stage, first.time),
         "equilibrated_from_ps": begin if len(time) >= LEAST_SAMPLES else None,
         "set_temperature_K": stage.temperature_K,
@@ -379,7 +417,12 @@ def stage_summary(
         "moves_tried": moves[0],
         "moves_accepted": moves[1],
         "drift_verdict": (
-            _drift_verdict(line.value, line.error, _drift_limit(duration) * thermal)
+            _drift_verdict(
+                line.value,
+                line.error,
+                _drift_limit(duration) * thermal,
+                drift_of_thermostats(system, of_stage, k),
+            )
             if duration
             else None
         ),
@@ -434,7 +477,7 @@ def _minimised(
 
 
 def _means(samples: Samples, columns: Mapping[str, str]) -> dict[str, float | None]:
-    """Means of columns, and their errors; the columns have the units of their keys."""
+    """Means of columns, and their errors. The columns have the units of their keys."""
     means = {}
     for name, unit in columns.items():
         values = samples[name]  # no trajectory has ended at the first sample

@@ -53,7 +53,7 @@ class TrialSystem:
     reference : name of the method of the reference
     conserved_errors : relative errors of other conserved quantities, of a state
     can_continue : whether timing may continue beyond the span instead of starting again
-    refused : name -> reason, of methods that cannot move this system; singular : names of those
+    rejected : name -> reason, of methods that cannot move this system; singular : names of those
         singular at the start
     rounding : relative rms errors of forces and torques in mixed precision; None in double
     chooses_precision : whether each trial has the precision that suits the error of its step

@@ -59,7 +59,7 @@ LONGEST_NAME = 100
 LONGEST_FILE_NAME = 200
 #: Keys that name a file.
 FILE_KEYS = re.compile(
-    r"(structure|(molecules|forces\.custom)\.[^.]+)\.(file|topology|parameters|module|table)"
+    r"(structure|(molecules|forces\.(custom|bodies))\.[^.]+)\.(file|topology|parameters|module|table)"
 )
 #: Programs whose input files have these names.
 FOREIGN_INPUTS = {
@@ -89,7 +89,7 @@ class Scene(Section, Displayed):
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
-    #: From which `_folder` begins
+    #: From which `_folder` starts
     _read_in: Path = PrivateAttr(default_factory=lambda: _working_directory())
     _embedded_files: dict[str, bytes] = PrivateAttr(default_factory=dict)
 

@@ -226,16 +226,16 @@ class BodyTable(Section):
         faults = {
             f"give one of {', '.join(ways)}": len(ways) > 1,
             "mass_kg is missing": not (has_parts or has_mass),
-            f"mass_kg would do nothing: the {parts} have masses": has_parts and has_mass,
+            f"mass_kg would have no effect: the {parts} have masses": has_parts and has_mass,
             "centre_of_mass_m is for a pinned body, from its pivot; this one is not pinned": (
                 has_centre and not self.pinned
             ),
-            f"centre_of_mass_m would do nothing: it follows from the {parts}": (
+            f"centre_of_mass_m would have no effect: it follows from the {parts}": (
                 has_centre and has_parts
             ),
             "inertia_about = 'pivot', but no inertia is given": about_pivot and not ways,
             "inertia_about = 'pivot', but the body is not pinned": about_pivot and not self.pinned,
-            f"inertia_about would do nothing with {''.join(ways[:1])}": (
+            f"inertia_about would have no effect with {''.join(ways[:1])}": (
                 about_pivot and ways[:1] in (["solid"], ["solids"], ["points"])
             ),
         }
@@ -311,7 +311,7 @@ class BodyStart(Section):
                 yield f"give one of {', '.join(set_keys)}"
         matrix = self.rotation or self.attitude_matrix
         if self.project and matrix is None:
-            yield "project would do nothing: no matrix is given"
+            yield "project would have no effect: no matrix is given"
         if matrix is not None:
             error = orthogonality_error(np.array([matrix]))
             sense = np.linalg.det(matrix)
@@ -404,11 +404,11 @@ class Run(MovedByScheme):
 
     def _errors(self):
         if self.rotor is not None and self.integrator in SOLVERS:
-            yield f"rotor would do nothing with {self.integrator}"
+            yield f"rotor would have no effect with {self.integrator}"
         yield from self._rotor_errors()
         if self.formulation is not None and self.integrator not in SOLVERS:
             yield (
-                f"formulation would do nothing with {self.integrator}: it is for"
+                f"formulation would have no effect with {self.integrator}: it is for"
                 f" {', '.join(SOLVERS)}"
             )
         tolerances = [
@@ -417,7 +417,7 @@ class Run(MovedByScheme):
             if getattr(self, key) is not None
         ]
         if tolerances and self.integrator not in ("dop853", "radau"):
-            yield f"{', '.join(tolerances)} would do nothing with {self.integrator}"
+            yield f"{', '.join(tolerances)} would have no effect with {self.integrator}"
         asked = {"energy_error": self.energy_error, "trajectory_error": self.trajectory_error}
         yield from auto_errors(self.integrator, asked, ["rotor"] if self.rotor is not None else [])
         if not self.duration_s / self.timestep_s < MOST_STEPS:
@@ -564,7 +564,7 @@ class BodyScene(Scene):
             buoyant = fluid.displaced_mass_kg is not None or fluid.density_kg_m3 is not None
             if fluid.centre_of_buoyancy_m is not None and not buoyant:
                 yield (
-                    "fluid.centre_of_buoyancy_m would do nothing without displaced_mass_kg or"
+                    "fluid.centre_of_buoyancy_m would have no effect without displaced_mass_kg or"
                     " density_kg_m3"
                 )
             if (fluid.displaced_mass_kg or fluid.density_kg_m3) and self.gravity is None:

@@ -44,11 +44,11 @@ class Timed(Section):
         return times
 
     def timing_errors(self, values: dict[str, Any], entry: type) -> Iterator[str]:
-        """Messages on quantities that do not match the times; a single value has the type
+        """Messages on quantities that do not match the times. A single value has the type
         `entry`."""
         times = self.times_s
         if times is not None and (self.from_s is not None or self.to_s is not None):
-            yield "from_s and to_s would do nothing next to times_s"
+            yield "from_s and to_s would have no effect next to times_s"
         if not (self.to_s is None or self.to_s > (self.from_s or 0)):
             yield f"to_s = {self.to_s:g} is not after from_s = {self.from_s or 0:g}"
         for key, value in values.items():
@@ -89,7 +89,7 @@ class Applied(Timed):
         if self.force_N is None and self.torque_N_m is None:
             yield "needs force_N or torque_N_m"
         if self.at_m is not None and self.force_N is None:
-            yield "at_m would do nothing without force_N"
+            yield "at_m would have no effect without force_N"
 
 
 class Friction(Section):
@@ -126,7 +126,7 @@ class Fluid(Section):
 
 
 class Frame(Timed):
-    """A frame with rotating axes or an accelerated origin; the motion is relative to it."""
+    """A frame with rotating axes or an accelerated origin. The motion is relative to it."""
 
     angular_velocity_rad_s: Vector | tuple[Vector, ...] | None = None
     """Angular velocity of the frame, along its own axes"""
@@ -173,7 +173,7 @@ class Wheel(Timed):
             yield "axis is zero, which is not a direction"
         idle = [key for key in ("times_s", "from_s", "to_s") if getattr(self, key) is not None]
         if self.motor_torque_N_m is None and idle:
-            yield f"{', '.join(idle)} would do nothing without motor_torque_N_m"
+            yield f"{', '.join(idle)} would have no effect without motor_torque_N_m"
 
 
 class ChangingInertia(Timed):

@@ -34,6 +34,9 @@ class Coupling(NamedTuple):
     #: the values of its keys.
     on_molecules: bool = False
     in_trajectories: bool = False  # whether steps are accepted or rejected together
+    #: Whether translation and rotation each have a thermostat, which relaxes their kinetic energy
+    #: to its mean in the time constant.
+    by_motion: bool = False
     time: Callable[[Values], float] = lambda values: values["thermostat_time_ps"]
     description: Callable[[Values], str] = lambda values: f"{values['thermostat_time_ps']:g} ps"
     #: Whether its time constant is the period of an oscillation, which steps have to resolve, or
@@ -70,7 +73,7 @@ TRAJECTORY_PS = 0.1
 
 def _describe_trajectories(values: Values) -> str:
     steps, new = values.values()
-    drawn = "" if new == 1 else f", {new:g} of each momentum's variance drawn anew"
+    drawn = "" if new == 1 else f", {new:g} of each momentum's variance drawn again"
     return f"trajectories of {steps:g} step{'s' if steps > 1 else ''}{drawn}"
 
 
@@ -83,7 +86,8 @@ THERMOSTATS = {
     "velocity_rescaling": Coupling(
         "stochastic, one of translation and one of rotation, by Bussi et al.",
         "Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101",
-        {"thermostat_time_ps": 0.1},
+        {"thermostat_time_ps": 0.05},
+        by_motion=True,
     ),
     "langevin": Coupling(
         "friction and noise",
@@ -109,13 +113,10 @@ THERMOSTATS = {
         on_molecules=True,
     ),
     "hybrid_monte_carlo": Coupling(
-        "trajectories from new momenta, accepted or rejected: averages without an error of the"
-        " step",
+        "trajectories from new momenta, accepted or rejected: averages without a time-step error",
         "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216",
         {
-            "trajectory_steps": lambda stage: max(
-                1, round(TRAJECTORY_PS * 1000 / stage.timestep_fs)
-            ),
+            "trajectory_steps": lambda stage: max(1, round(TRAJECTORY_PS / stage.step)),
             "momentum_refreshment": 1.0,
         },
         on_molecules=True,
@@ -164,7 +165,7 @@ class ThermostatKeys(Section):
         + f". Default: {DEFAULT_THERMOSTAT}",
     )
     thermostat_time_ps: Positive | None = None
-    """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or
+    """Time constant of velocity_rescaling (default: 0.05 ps), period of nose_hoover (0.5 ps), or
     mean time between two collisions of a molecule with andersen (1 ps)"""
     friction_translation_per_ps: Positive | None = None
     """Friction of langevin on translation; default: 1"""
@@ -176,7 +177,7 @@ class ThermostatKeys(Section):
     """Steps of a trajectory of hybrid_monte_carlo, after which it is accepted or rejected; default:
     those of 0.1 ps"""
     momentum_refreshment: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Fraction of the variance of each momentum that hybrid_monte_carlo draws anew before a
+    """Fraction of the variance of each momentum that hybrid_monte_carlo draws again before a
     trajectory; 1: all of it"""
 
 

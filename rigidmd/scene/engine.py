@@ -28,7 +28,8 @@ class _Engine(Section):
             for key in program.options.keys() - self.options.keys():
                 if getattr(self, key) is not None:
                     yield (
-                        f"{key} would do nothing with engine.name = {self.name!r}; it is for {name}"
+                        f"{key} would have no effect with engine.name = {self.name!r}; it is for"
+                        f" {name}"
                     )
         if self.program and (fault := self.program.option_errors(**self.options)):
             yield fault

@@ -57,7 +57,7 @@ class Walls(Section):
         for kind, keys in KEYS_OF_WALLS.items():
             set_keys = [key for key in keys if getattr(self, key) is not None]
             if kind != self.kind and set_keys:
-                yield f"{', '.join(set_keys)} would do nothing with kind = {self.kind!r}"
+                yield f"{', '.join(set_keys)} would have no effect with kind = {self.kind!r}"
             missing = [key for key, needed in keys.items() if needed and key not in set_keys]
             if kind == self.kind and missing:
                 yield f"kind = {kind!r} needs {' and '.join(missing)}"
@@ -103,13 +103,13 @@ class Restraint(Section):
     @classmethod
     def _does_something(cls, stiffness: float | tuple[float, float, float]):
         if not any(stiffness if isinstance(stiffness, tuple) else (stiffness,)):
-            raise ValueError("is 0: it would do nothing; leave the restraint out")
+            raise ValueError("is 0: it would have no effect; omit the restraint")
         return stiffness
 
     def _errors(self):
         if self.between is None:
             if self.distance_A is not None:
-                yield "distance_A would do nothing without between = [1, 2]"
+                yield "distance_A would have no effect without between = [1, 2]"
             return
         if self.distance_A is None:
             yield "between needs distance_A, at which the spring has no energy"
@@ -118,7 +118,8 @@ class Restraint(Section):
         if set_keys := [
             key for key in ("species", "molecules", "position_A") if getattr(self, key) is not None
         ]:
-            yield f"{', '.join(set_keys)} would do nothing with between, which names the molecules"
+            keys = ", ".join(set_keys)
+            yield f"{keys} would have no effect with between, which names the molecules"
 
     @property
     def groups(self) -> tuple[list[int], ...]:
@@ -160,9 +161,9 @@ class Fields(Section):
 
     def _errors(self):
         if self.electric_frequency_per_ps is not None and self.electric_V_per_nm is None:
-            yield "electric_frequency_per_ps would do nothing without electric_V_per_nm"
+            yield "electric_frequency_per_ps would have no effect without electric_V_per_nm"
         if self.electric_phase_deg and self.electric_frequency_per_ps is None:
-            yield "electric_phase_deg would do nothing without electric_frequency_per_ps"
+            yield "electric_phase_deg would have no effect without electric_frequency_per_ps"
 
     @property
     def entries(self) -> dict[str, tuple["FieldKind", Section, str]]:
@@ -303,9 +304,8 @@ def field_errors(scene: "MolecularScene") -> Iterator[str]:
         inf if fields.electric_frequency_per_ps is None else 1000 / fields.electric_frequency_per_ps
     )
     for k, stage in enumerate(scene.stages):
-        if not (stage.is_auto or stage.is_minimisation) and period < 2 * stage.timestep_fs:
+        if not (stage.is_auto or stage.is_minimisation) and period < 2 * stage.step_fs:
             what = (
-                f"less than two steps of stages.{k} ({stage.timestep_fs:g} fs), which cannot"
-                " follow it"
+                f"less than two steps of stages.{k} ({stage.step_fs:g} fs), which cannot follow it"
             )
             yield f"fields.electric_frequency_per_ps: a period of {period:.3g} fs is {what}"

@@ -31,7 +31,7 @@ class Method(NamedTuple):
 
     # in `forces`: its function `interactions`, and `setting_errors` and `settings` if it needs them
     module: str = ""
-    keys: tuple[str, ...] = ()  # of `Forces`, which do nothing with other methods
+    keys: tuple[str, ...] = ()  # of `Forces`, which have no effect with other methods
     sums_images: bool = False  # whether charges act on all periodic images
     conserves_momentum: bool = True
 
@@ -126,6 +126,10 @@ class CustomForce(Section):
     switch_start_A: Positive | None = None
     """With an energy: where a switch begins; default: forces.switch_start_A"""
 
+    @property
+    def label(self) -> str:
+        return self.name
+
     def _errors(self):
         if sum(source is not None for source in (self.module, self.energy, self.table)) != 1:
             kinds = (
@@ -138,10 +142,85 @@ class CustomForce(Section):
             idle = [key for key in of_energy if getattr(self, key) not in (None, (), {})]
             if idle:
                 yield (
-                    f"{', '.join(idle)} would do nothing with a module: its object has `parameters`"
+                    f"{', '.join(idle)} would have no effect with a module: its object has"
+                    " `parameters`"
                 )
             if not self.module.endswith(".py"):
                 yield f"module = {shorten_repr(self.module)} must be a Python file (.py)"
+
+
+class SpeciesPair(Section):
+    """Parameters of a potential of two bodies for two species."""
+
+    species: tuple[str, str]
+    """Names of the two species"""
+    parameters: dict[str, Number] = Field(default={}, max_length=MOST_TABLES)
+    """Parameters by name, which replace the parameters of both species"""
+
+
+class BodyForce(Section):
+    """A potential of two bodies: a function of the vector between them and of their
+    orientations."""
+
+    name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)] | None = None
+    """Name in the log; default: the name of the potential; with `module` also the name of the
+    object in it"""
+    potential: Literal["gay_berne", "dipole", "quadrupole", "patch"] | None = None
+    """gay_berne: ellipsoids; dipole, quadrupole: at a point; patch: spheres with an attractive
+    patch"""
+    energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
+    """Instead of a potential: the energy (kJ/mol) as a function of the distance r (Å), of the
+    cosines a_r and b_r of the angles of the axes of the first and the second body with the vector
+    from the first to the second, of the cosine a_b of the angle between the axes, and of named
+    parameters"""
+    module: Line | None = None
+    """Instead of a potential: Python file in the folder of the scene with a
+    `rigidmd.body_pair_potential`. Its code runs only with --trust FILE"""
+    parameters: dict[str, dict[str, Number]] = Field(default={}, max_length=MOST_TABLES)
+    """Species -> parameters by name; it acts on these species"""
+    pairs: tuple[SpeciesPair, ...] = Field(default=(), max_length=MOST_TABLES)
+    """Parameters of particular pairs of species"""
+    mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(
+        default={}, max_length=MOST_TABLES
+    )
+    """With an energy: the mean of each parameter for unlike species; default: arithmetic for names
+    that begin with sig, else geometric"""
+    options: dict[str, Number] = Field(default={}, max_length=MOST_TABLES)
+    """gay_berne: upsilon (default: 1), mu (2), gamma (1); dipole: reaction_field_A, the radius of a
+    conductor's reaction field (default: none)"""
+    axis: Literal["x", "y", "z"] = "z"
+    """Axis of the bodies, in the coordinates of the models' files"""
+    references: dict[str, tuple[Number, Number, Number]] = Field(default={}, max_length=MOST_TABLES)
+    """Species -> the point of the body between which distances count, in the coordinates of the
+    model's file, Å; default: the centre of mass"""
+    truncation: Literal["switch", "plain"] = "switch"
+    """switch: from switch_start_A the energy is switched to 0 at the cutoff; plain: it jumps"""
+    cutoff_A: Cutoff | None = None
+    """Cutoff between the points; default: forces.cutoff_A"""
+    switch_start_A: Positive | None = None
+    """Where the switch begins; default: 0.9 of the cutoff"""
+
+    def _errors(self):
+        sources = [self.potential, self.energy, self.module]
+        if sum(source is not None for source in sources) != 1:
+            yield "give one of potential, energy and module"
+        if self.module is not None and self.name is None:
+            yield "name is missing: with a module it is the name of the object in it"
+        given = {
+            "mixing": self.energy is None and self.mixing,
+            "options": self.potential is None and self.options,
+        }
+        if self.module is not None:
+            keys = ("parameters", "pairs", "references", "cutoff_A", "switch_start_A")
+            given |= {key: getattr(self, key) for key in keys}
+        if idle := [key for key, value in given.items() if value]:
+            yield f"{', '.join(idle)} would have no effect here"
+        if self.truncation == "plain" and self.switch_start_A is not None:
+            yield "switch_start_A would have no effect with truncation = 'plain'"
+
+    @property
+    def label(self) -> str:
+        return self.name or self.potential or "body_pairs"
 
 
 class Forces(Section):
@@ -164,6 +243,8 @@ class Forces(Section):
     """Lennard-Jones parameters of particular pairs, in place of the mixing rule"""
     custom: tuple[CustomForce, ...] = Field(default=(), max_length=MOST_TABLES)
     """Custom forces"""
+    bodies: tuple[BodyForce, ...] = Field(default=(), max_length=MOST_TABLES)
+    """Potentials of two bodies"""
     tail_correction: Flag | None = None
     """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it,
     `virial` does not. Default: true in a periodic box that the molecules fill evenly; false with
@@ -229,20 +310,31 @@ class Forces(Section):
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.9
     """Extra radius of the neighbour list; affects only the speed"""
 
+    @property
+    def added(self) -> dict[str, CustomForce | BodyForce]:
+        """The tables of custom forces and of potentials of two bodies, by their keys."""
+        tables = {"custom": self.custom, "bodies": self.bodies}
+        return {
+            f"forces.{key}.{k}": entry
+            for key, entries in tables.items()
+            for k, entry in enumerate(entries)
+        }
+
     def _errors(self):
         if (
             self.switch_start_A is not None
             and "switch" not in f"{self.truncation} {self.reaction_field_truncation}"
         ):
             yield (
-                f"switch_start_A would do nothing with truncation = {self.truncation!r}: add"
+                f"switch_start_A would have no effect with truncation = {self.truncation!r}: add"
                 " truncation = 'switch'"
             )
         if self.dispersion == "cutoff":
             names = (f"dispersion_{key}" for key in ("accuracy", "beta_per_A", "order", "grid"))
             idle = [key for key in names if getattr(self, key) is not None]
             yield from (
-                f"{key} would do nothing with dispersion = 'cutoff' (the default)" for key in idle
+                f"{key} would have no effect with dispersion = 'cutoff' (the default)"
+                for key in idle
             )
         else:
             yield from (
@@ -261,7 +353,7 @@ class Forces(Section):
             self.pme_grid is not None and self.pme_order is not None
         )
         if determined and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
-            yield "ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given"
+            yield "ewald_accuracy would have no effect: alpha and k-vectors or grid are given"
 
     @property
     def _not_summable(self) -> tuple[tuple[str, object], ...]:
@@ -295,15 +387,15 @@ class Forces(Section):
 
     @property
     def idle_keys(self) -> list[str]:
-        """The keys that do nothing with the method of electrostatics."""
+        """The keys that have no effect with the method of electrostatics."""
         return _idle_keys(self.electrostatics or PERIODIC)
 
     def idle_key_errors(self, method: str) -> Iterator[str]:
-        """Messages on keys that do nothing with a method of electrostatics."""
+        """Messages on keys that have no effect with a method of electrostatics."""
         default = "" if self.electrostatics else " (the default)"
         for key in _idle_keys(method):
             if getattr(self, key) != type(self).model_fields[key].default:
-                yield f"{key} would do nothing with electrostatics = {method!r}{default}"
+                yield f"{key} would have no effect with electrostatics = {method!r}{default}"
 
     @property
     def sets_k_vectors(self) -> bool:
@@ -312,6 +404,6 @@ class Forces(Section):
 
 
 def _idle_keys(method: str) -> list[str]:
-    """Keys of [forces] that do nothing with a method of electrostatics."""
+    """Keys of [forces] that have no effect with a method of electrostatics."""
     keys = dict.fromkeys(key for other in ELECTROSTATICS.values() for key in other.keys)
     return [key for key in keys if key not in ELECTROSTATICS[method].keys]

@@ -1,4 +1,4 @@
-"""Integrators of users as rows of coefficients, in the tables [[integrators]] of a scene or by
+"""Integrators of users as scheme, in the tables [[integrators]] of a scene or by
 `integrator`."""
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ ORDER_TOLERANCE = 0.5
 
 
 class IntegratorRow(Section):
-    """An integrator as a row of coefficients, for stages and for `rigidmd accuracy`."""
+    """An integrator as a scheme, for stages and for `rigidmd accuracy`."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$", max_length=60)]
     """Name for stages, [run] of a body and --integrators"""
@@ -100,10 +100,7 @@ def integrator(
     gradients: Sequence[float] | None = None,
     source: str = "",
 ) -> str:
-    """Make a row of coefficients an integrator, and return its name, which scenes then accept.
-
-    rigidmd.integrator("ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth
-    1990")
+    """Register coefficients as an integrator, and return its name, which scenes then accept.
 
     Fractions sum to 1 and read the same from both ends. A scene that names the row keeps its
     coefficients in its table [[integrators]], so that its file and the folder of its run are
@@ -121,6 +118,12 @@ def integrator(
     Raises
     ------
     SceneError
+
+    Examples
+    --------
+        rigidmd.integrator(
+            "ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth 1990"
+        )
     """
     values = {
         "name": name,

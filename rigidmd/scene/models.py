@@ -1,7 +1,7 @@
 """Molecular models: rigid bodies in their principal frames from lists of sites. `models/` has
 published ones."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -149,6 +149,8 @@ class Molecule:
 
     masses (s,) u, positions_body (s, 3) Å, charges (s,) e, sigma (s,) Å, epsilon (s,) u Å²/ps²;
     inertia (3,) u Å², ascending, 0 about an axis on which the whole mass lies.
+    centre (3,), axes (3, 3): centre of mass, Å, and principal axes (columns) in the coordinates of
+    the model's file.
     """
 
     name: str
@@ -163,6 +165,8 @@ class Molecule:
     mass: float
     inertia: np.ndarray
     kind: BodyKind
+    centre: np.ndarray
+    axes: np.ndarray
     title: str = ""
     source: str = ""
     group: str = "other"
@@ -321,6 +325,8 @@ def molecule(
         mass=float(frame.mass),
         inertia=frame.inertia,
         kind=frame.kind,
+        centre=frame.centre,
+        axes=frame.axes,
         parameters=tuple(s.parameters for s in sites),
         **about,
     )
@@ -349,7 +355,14 @@ def with_masses(original: Molecule, masses: dict[str, float]) -> Molecule:
         for i, entry in enumerate(original.sites())
     ]
     copied_keys = ("name", "residue_names", "title", "source", "group", "note", "mixing")
-    return molecule(sites=tuple(sites), **{key: getattr(original, key) for key in copied_keys})
+    changed_masses = molecule(
+        sites=tuple(sites), **{key: getattr(original, key) for key in copied_keys}
+    )
+    return replace(  # the sites were in the original's principal frame
+        changed_masses,
+        centre=original.centre + original.axes @ changed_masses.centre,
+        axes=original.axes @ changed_masses.axes,
+    )
 
 
 def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[Site, ...]:

@@ -74,8 +74,9 @@ class RunSettings(Section):
 
     remove_momentum_interval_ps: Interval | Literal[False] | None = None
     """Time between removals of the total momentum; false for never. Default: 1 ps with pme, whose
-    forces do not add up to zero exactly, else never. The energy removed counts as heat, as with a
-    thermostat"""
+    forces do not add up to zero exactly, and with a thermostat that scales all velocities, which
+    can make rounding errors of the momentum grow; else never. The energy removed counts as heat, as
+    with a thermostat"""
 
 
 class Output(Section):
@@ -175,7 +176,7 @@ class MolecularScene(Scene):
     """Seed of all random numbers"""
     precision: Literal["auto", "double", "mixed"] = "auto"
     """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in
-    double; auto: mixed where the error of the time step hides that of single precision, else
+    double; auto: mixed where the time-step error hides the error of single precision, else
     double. Minimisations with tight limits, or with a pressure, are in double"""
     threads: Count | None = None
     """Number of threads; default: all cores. Results do not depend on it"""
@@ -240,7 +241,7 @@ class MolecularScene(Scene):
                 self.source,
                 [f"{option('until')} {time:g} ps: the last stage begins at {before:g} ps"],
             )
-        if not (time - before) * 1000 / last.timestep_fs < MOST_STEPS:
+        if not (time - before) / last.step < MOST_STEPS:
             raise SceneError(
                 self.source,
                 [f"{option('until')} {time:g} ps is more than {MOST_STEPS:g} steps away"],
@@ -273,8 +274,8 @@ class MolecularScene(Scene):
         names["structure.topology"] = self.topology
         for k, species in enumerate(self.molecules):
             names |= {f"molecules.{k}.{key}": getattr(species, key) for key in SPECIES_FILES}
-        for k, force in enumerate(self.forces.custom):
-            names |= {f"forces.custom.{k}.{key}": getattr(force, key) for key in FORCE_FILES}
+        for where, force in self.forces.added.items():
+            names |= {f"{where}.{key}": getattr(force, key, None) for key in FORCE_FILES}
         return {key: self.path(name) for key, name in names.items() if name is not None}
 
     @property
@@ -354,7 +355,7 @@ class MolecularScene(Scene):
             )
         if self.start.temperature_K is not None and from_file:
             yield (
-                "start.temperature_K would do nothing: the velocities are read from the structure"
+                "start.temperature_K would have no effect: velocities are read from the structure"
                 " file"
             )
         if (
@@ -430,6 +431,16 @@ class MolecularScene(Scene):
         yield from field_errors(self)
         yield from self._uneven_frames()
 
+    def errors_of_steps(self) -> list[str]:
+        """Messages on default time steps that contradict other keys. Without them a scene has no
+        errors."""
+        of_stages = [
+            f"stages.{k}: {fault}"
+            for k, stage in enumerate(self.stages)
+            for fault in stage._errors()
+        ]
+        return [*of_stages, *self._errors()]
+
     def rounded_times(self, stages: Sequence[int] | None = None) -> list[str]:
         """Notes on intervals and durations that are not a whole number of steps, of all stages or
         these."""
@@ -452,14 +463,14 @@ class MolecularScene(Scene):
                     0, ("run.remove_momentum_interval_ps", self.run.remove_momentum_interval_ps)
                 )
             for key, duration in [*of_run, *of_stage]:
-                taken = duration and stage.steps_of(duration) * stage.timestep_fs / 1000
+                taken = duration and stage.steps_of(duration) * stage.step
                 if (
                     duration
-                    and taken < MOST_STEPS * stage.timestep_fs / 1000
+                    and taken < MOST_STEPS * stage.step
                     and abs(taken - duration) > 1e-9 * duration
                 ):
                     together = f"trajectories of {stage.steps_together} " if stage.is_hybrid else ""
-                    unit = f"a whole number of {together}steps of {stage.timestep_fs:g} fs"
+                    unit = f"a whole number of {together}steps of {stage.step_fs:g} fs"
                     stages_of.setdefault((key, duration, unit, taken), []).append(f"stages.{k}")
         return [
             f"{key} = {duration:g} is not {unit} ({', '.join(where)}): it is {taken:g} ps"
@@ -483,7 +494,7 @@ class MolecularScene(Scene):
                     f"output.trajectory: a {kind} file cannot follow the step of stages.{k};"
                     f" {other}"
                 )
-            elif abs(every * stage.timestep_fs / 1000 - interval) > 1e-9 * interval or uneven:
+            elif abs(every * stage.step - interval) > 1e-9 * interval or uneven:
                 fault = (
                     f"a {kind} file stores one time between frames, and stages.{k} cannot keep"
                     f" {interval:g} ps"

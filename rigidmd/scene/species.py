@@ -96,7 +96,7 @@ class Molecules(Section):
         is_complete = file and str(self.file).endswith(".toml")
         faults = {
             "give a model, or a custom file and sites, not both": model and (file or sites),
-            "parameters would do nothing: a model or a .toml file contains parameters": (
+            "parameters would have no effect: a model or a .toml file contains parameters": (
                 table and (model or is_complete)
             ),
             f"parameters = {self.parameters!r} must be a .toml file with [[sites]]": (
@@ -182,7 +182,7 @@ class Box(Section):
         if self.angles_deg is not None and self.lengths_A is None:
             yield "angles_deg needs lengths_A"
         if self.vacuum_A is not None and not self.periodic:
-            yield "vacuum_A would do nothing: periodic is false"
+            yield "vacuum_A would have no effect: periodic is false"
         angles = [radians(angle) for angle in self.angles_deg or (90, 90, 90)]
         # the edges would be in one plane, or could not meet
         if not 2 * max(angles) < sum(angles) < 2 * pi:

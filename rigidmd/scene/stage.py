@@ -79,6 +79,10 @@ OTHER_INTEGRATORS = {
 }
 
 
+#: Step with which pilot runs start, and the default for molecules without a known fast motion, fs.
+USUAL_STEP = 2.0
+
+
 class Timing(Section):
     """The first keys of a stage."""
 
@@ -91,8 +95,11 @@ class Timing(Section):
     enthalpy"""
     duration_ps: Positive | None = Field(default=None, validate_default=True)
     """Duration; required except with minimise"""
-    timestep_fs: Positive = 2.0
-    """Time step"""
+    timestep_fs: Positive | None = None
+    """Time step. Default: one of 1, 2, 2.5, 4, 5, 10 fs and their tenths, from the fastest motion
+    of the molecules and the temperature. With baoab it is the longest whose bias of U stays below
+    0.002 kT per degree of freedom, 4 fs for water at 300 K; at constant energy it is half as long.
+    `rigidmd check` prints it"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
     """Temperature of the thermostat; two for a linear change over the stage, [300, 240]"""
     volume: Literal["mean"] | None = None
@@ -108,7 +115,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     )
     """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift; auto: the
     scheme and step that keep the requested error with the fewest force evaluations. Default: baoab
-    with nvt and npt, whose averages have hardly an error of the step, except with
+    with nvt and npt, whose averages have almost no time-step error, except with
     hybrid_monte_carlo, which corrects it; else velocity_verlet"""
     energy_error_kT: Positive | None = None
     """With auto: rms error of the energy over the whole stage, as pilot runs predict it, in kT per
@@ -179,7 +186,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         if self.has_barostat and self.pressure_bar is None:
             yield f"an {self.ensemble} stage needs pressure_bar"
         if idle := [key for key in self.idle_keys if self._is_given(key)]:
-            yield f"{', '.join(idle)} would do nothing {self._where([_users(key) for key in idle])}"
+            where = self._where([_users(key) for key in idle])
+            yield f"{', '.join(idle)} would have no effect {where}"
         if (
             self.integrator in WITH_THERMOSTAT
             and not self.has_thermostat
@@ -203,24 +211,23 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             if set_keys := [key for key, target in targets.items() if target is not None]:
                 kind = self.thermostat_kind
                 yield (
-                    f"{', '.join(set_keys)} would do nothing: averages of {kind} have no error of"
-                    " the step"
+                    f"{', '.join(set_keys)} would have no effect: averages of {kind} have no"
+                    " time-step error"
                 )
         else:
             yield from auto_errors(self.integrator, targets, step_keys)
         if self.bias_kT is not None and not self.has_thermostat:
             yield f"bias_kT is for averages at a temperature, and {self.ensemble} has no thermostat"
-        if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
+        if not self.duration / self.step < MOST_STEPS:
             yield f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps"
-        if self.duration * 1000 < 0.5 * self.timestep_fs and not self.is_minimisation:
+        if self.duration < 0.5 * self.step and not self.is_minimisation:
             yield (
-                f"duration_ps = {self.duration_ps:g} is less than one step of"
-                f" {self.timestep_fs:g} fs"
+                f"duration_ps = {self.duration_ps:g} is less than one step of {self.step_fs:g} fs"
             )
 
     @property
     def idle_keys(self) -> list[str]:
-        """The keys that do nothing in this stage."""
+        """The keys that have no effect in this stage."""
         parts = {self.ensemble, self.thermostat_kind, self.barostat_kind}
         parts |= {CELL} if self.is_minimisation and self.changes_box else set()
         return [
@@ -233,7 +240,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         return getattr(self, key) != type(self).model_fields[key].default
 
     def _where(self, users: list[set[str]]) -> str:
-        """The settings with which keys that have these users would do nothing, for the message."""
+        """The settings with which keys of these users would have no effect, for the message."""
         if self.is_minimisation:
             return "in a minimise stage" + (
                 " without pressure_bar" if all(CELL in names for names in users) else ""
@@ -305,7 +312,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         """Messages on time constants that are too short for the steps of the stage."""
         if self.is_auto or self.is_minimisation:
             return
-        step = self.timestep_fs * FEMTOSECOND
+        step = self.step
         least = pi * step
         thermostat = THERMOSTATS.get(self.thermostat_kind)
         barostat = BAROSTATS.get(self.barostat_kind)
@@ -327,14 +334,24 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             )
 
     @property
+    def step_fs(self) -> float:
+        """Time step, fs. The usual one until `assemble.time_step` or a pilot run has set it."""
+        return self.timestep_fs or USUAL_STEP
+
+    @property
+    def step(self) -> float:
+        """Time step, ps."""
+        return self.step_fs * FEMTOSECOND
+
+    @property
     def steps(self) -> int:
         return self.steps_of(self.duration) if self.duration else 0
 
     def steps_of(self, interval: float) -> int:
-        """The nearest number of steps to an interval (ps), at least one step or trajectory; at most
+        """The nearest number of steps to an interval (ps), at least one step or trajectory. At most
         `MOST_STEPS`, which no stage has."""
         together = self.steps_together
-        steps = min(interval * 1000 / self.timestep_fs, MOST_STEPS)
+        steps = min(interval / self.step, MOST_STEPS)
         return max(1, round(steps / together)) * together
 
     @property
@@ -350,10 +367,10 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def refreshment_rate(self) -> float:
-        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo anew in one step;
+        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo again in one step;
         infinite for all of it."""
         kept_fraction = 1 - self.momentum_refreshment
-        return -log(kept_fraction) / (2 * self.timestep_fs * FEMTOSECOND) if kept_fraction else inf
+        return -log(kept_fraction) / (2 * self.step) if kept_fraction else inf
 
     @property
     def duration(self) -> float:
@@ -364,14 +381,6 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def is_minimisation(self) -> bool:
         return self.ensemble == "minimise"
 
-    @property
-    def thermostat_is_open(self) -> bool:
-        """Whether the thermostat is chosen with the integrator: bias_kT is given, and no key of a
-        thermostat."""
-        return (
-            self.bias_kT is not None and self.thermostat is None and self.thermostat_time_ps is None
-        )
-
     def with_integrator(self, integrator: str, timestep_fs: float) -> "Stage":
         """This stage with the integrator and step that pilot runs have chosen."""
         changes = {"integrator": integrator, "timestep_fs": timestep_fs}
@@ -381,7 +390,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def with_defaults(self) -> "Stage":
         """This stage with the defaults of all keys that it uses."""
         defaults: dict[str, Any] = {}
-        if self.has_thermostat and not self.thermostat_is_open:
+        if self.has_thermostat:
             defaults |= {"thermostat": self.thermostat_kind} | self.thermostat_values
         if self.has_barostat:
             named = {"barostat": self.barostat_kind} if self.ensemble == "npt" else {}
@@ -430,7 +439,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def temperatures(self) -> tuple[float, float]:
-        """Temperature of the thermostat at begin and end, K."""
+        """Temperature of the thermostat at start and end, K."""
         temperature = self.temperature_K
         if isinstance(temperature, tuple):
             return temperature
@@ -448,7 +457,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def pressures(self) -> tuple[Six, Six]:
-        """Pressure at begin and end, bar: xx, yy, zz, xy, xz, yz."""
+        """Pressure at start and end, bar: xx, yy, zz, xy, xz, yz."""
         pressure = self.pressure_bar
         first, last = (
             pressure if isinstance(pressure, tuple) and len(pressure) == 2 else (pressure, pressure)

@@ -4,12 +4,10 @@ and line."""
 import ast
 import inspect
 import re
-import tomllib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Container, Iterable
 from functools import cache
 from itertools import pairwise
 from math import isfinite
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
@@ -26,6 +24,7 @@ from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 from rigidmd.core.plain_text import did_you_mean, plain_letters
 from rigidmd.core.toml import Json, line_of, shorten_repr, shorten_text, values_in
 from rigidmd.errors import MOST_SHOWN, option
+from rigidmd.scene.hints import KEY_WITH_UNIT, OTHER_UNITS, hint_on_key, in_british, models_in
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
@@ -39,9 +38,6 @@ Flag = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]
 
 T = TypeVar("T")
-
-#: Names of settings in other programs, by table and key of a scene.
-FOREIGN_KEYS = Path(__file__).with_name("foreign_keys.toml")
 
 #: Largest number of tables in a list of tables.
 MOST_TABLES = 1000
@@ -90,7 +86,7 @@ ShortName = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]+$"
 
 
 class NameIn:
-    """Annotation of a text that is a name in a table, which is read anew at each validation. Its
+    """Annotation of a text that is a name in a table, which is read again at each validation. Its
     JSON schema lists the
     names. in_scene : whether names in the context of the validation are known too"""
 
@@ -221,30 +217,6 @@ SENTENCES = {
 ADVICE = ": write "
 #: Number of a text with a unit, such as "1 ns".
 WITH_UNIT = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-zÅµ°/]*\d?)\s*")
-BOHR = 0.529177210903  # Å
-#: By the unit of a key, the sizes of other units in it.
-OTHER_UNITS = {
-    "ps": {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "µs": 1e6, "s": 1e12},
-    "fs": {"as": 1e-3, "fs": 1.0, "ps": 1e3, "ns": 1e6, "s": 1e15},
-    "A": {"pm": 1e-2, "A": 1.0, "Å": 1.0, "bohr": BOHR, "nm": 10.0},
-    "K": {"K": 1.0},
-    "bar": {
-        "Pa": 1e-5,
-        "kPa": 1e-2,
-        "MPa": 10.0,
-        "GPa": 1e4,
-        "bar": 1.0,
-        "kbar": 1e3,
-        "atm": 1.01325,
-    },
-    "kJ_mol": {"J/mol": 1e-3, "kJ/mol": 1.0, "kcal/mol": 4.184},
-    "deg": {"deg": 1.0, "°": 1.0},
-    "s": {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
-    "m": {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3},
-    "kg": {"mg": 1e-6, "g": 1e-3, "kg": 1.0},
-}
-#: A key whose unit is one of these, and not a product or quotient of units.
-KEY_WITH_UNIT = re.compile(rf"(?:.*_)?[a-z]{{4,}}_({'|'.join(OTHER_UNITS)})")
 
 
 def _as_number(text: str, keys: list) -> str:
@@ -276,12 +248,7 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     context = detail.get("ctx", {})
     match detail["type"]:
         case "extra_forbidden":
-            known, name = _known_keys(model, keys[:-1]), str(keys[-1])
-            with_unit = any(re.fullmatch(f"{re.escape(name)}_[a-zA-Z0-9_]+", key) for key in known)
-            listed = f"; there are {', '.join(known)}" if known else ""
-            return "unknown key" + (
-                (not with_unit and _foreign(name, model)) or did_you_mean(name, known) or listed
-            )
+            return "unknown key" + hint_on_key(str(keys[-1]), keys[:-1], value, model)
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
         case "literal_error":
@@ -302,57 +269,35 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     return f"is {shown}: {detail['msg']}"
 
 
-def _foreign(name: str, model: type[BaseModel]) -> str:
-    """What a scene has for a setting of another program, for the message on its unknown key; empty
-    for other names."""
-    for table, entries in tomllib.loads(FOREIGN_KEYS.read_text(encoding="utf-8")).items():
-        section, path = model.model_fields.get(table), [] if table == "scene" else [table]
-        for key, text in entries.items():
-            names, _, note = text.partition(": ")
-            if plain_letters(name) not in map(plain_letters, names.split()):
-                continue
-            if table == "none" and "stages" in model.model_fields:
-                return f"; not needed: {note}"
-            if (section or not path) and key in _known_keys(model, path):
-                if "tuple" in str(section):
-                    place = f" in [[{table}]]"
-                elif path:
-                    place = f" in [{table}]"
-                else:
-                    place = ""
-                return f"; in rigidmd this is {key}{place}{note and f' ({note})'}"
-    return ""
-
-
-def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
-    """Keys of the section at a path of keys."""
-    for key in keys:
-        if isinstance(key, int):
-            continue
-        inner = _models_in(model.model_fields[key].annotation)
-        if not inner:
-            return []
-        model = inner[0]
-    return list(model.model_fields)
-
-
 def exact_names(data: Any, annotation: Any) -> Any:
-    """Data of a type in which values with a fixed choice have their exact spelling: "NVT" becomes
-    "nvt". The case of letters, hyphens, underscores and slashes do not matter in scenes."""
+    """Data of a type in which keys, and values with a fixed choice, have their exact spelling:
+    "NVT" becomes "nvt", and "minimize" becomes "minimise". The case of letters, hyphens,
+    underscores and slashes do not matter in values, nor does American spelling."""
     if isinstance(data, str):
-        near = [name for name in _choices(annotation) if plain_letters(name) == plain_letters(data)]
+        plain = plain_letters(in_british(data))
+        near = [name for name in _choices(annotation) if plain_letters(name) == plain]
         return near[0] if len(near) == 1 else data
     if isinstance(data, list):
         return [exact_names(value, annotation) for value in data]
     if not isinstance(data, dict):
         return data
     fields = {
-        key: kind for model in _models_in(annotation) for key, kind in _annotations(model).items()
+        key: kind for model in models_in(annotation) for key, kind in _annotations(model).items()
     }
     return {
         key: exact_names(value, fields.get(key) if fields else annotation)
-        for key, value in data.items()
+        for key, value in _british_keys(data, fields).items()
     }
+
+
+def _british_keys(data: dict, known: Container[str]) -> dict:
+    """Data in which an unknown key in American spelling is the known key in British spelling."""
+    names = {
+        key: in_british(key)
+        for key in data
+        if isinstance(key, str) and key not in known and in_british(key) in known
+    }
+    return {(key if names.get(key) in data else names.get(key, key)): data[key] for key in data}
 
 
 @cache
@@ -368,12 +313,6 @@ def _choices(annotation: Any) -> list[str]:
     if isinstance(annotation, NameIn):
         return [*annotation.names]
     return [n for part in parts for n in _choices(part)]
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [m for part in getattr(annotation, "__args__", ()) for m in _models_in(part)]
 
 
 #: Limits of checks during a run; false switches a check off. A limit below these stops every run.

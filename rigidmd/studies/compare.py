@@ -179,7 +179,7 @@ def _compare_samples(file: str, one: Columns, other: Columns) -> SampleCompariso
 
 def _rows_by_value(values: list[str]) -> dict[tuple[str, int], int]:
     """(value, number of earlier rows with it) -> row. A step has two samples where a stage
-    begins."""
+    starts."""
     seen: dict[str, int] = {}
     rows = {}
     for row, value in enumerate(values):

@@ -1,7 +1,7 @@
-"""Averages at a step of zero: mean = limit + slope dt^p, where p is the order of the integrator.
+"""Averages at zero time step: mean = limit + slope dt^p, where p is the order of the integrator.
 
 The limit belongs to the ensemble, not to the integrator, so that one weighted fit has the same
-limit for all methods and a slope for each of them. See "Averages at a step of zero" in the theory
+limit for all methods and a slope for each of them. See "Averages at zero time step" in the theory
 chapter `errors`.
 """
 
@@ -51,10 +51,10 @@ class BiasFit(NamedTuple):
 def extrapolate(
     points: Sequence[MeanAtStep], exact: float | None = None, order: int = 2
 ) -> BiasFit:
-    """The limit of means at a step of zero, from all methods at once and from the short steps that
+    """The limit of means at zero time step, from all methods at once and from the short steps that
     dt^order describes.
 
-    Long steps are left out one by one while chi² exceeds its mean by more than two of its standard
+    Long steps are omitted one by one while chi² exceeds its mean by more than two of its standard
     deviations and
     enough points are left. exact : the limit, where it is known. Raises ValueError without points.
     """
@@ -130,7 +130,7 @@ def means_of_runs(
     runs : step (fs) -> value and error of each of its runs
     together : step -> value of its runs together, used instead of the mean of their values
 
-    The errors of single runs give the ratios of the errors of the steps. Their common size is from
+    The errors of single runs give the ratios of the time-step errors. Their common size is from
     the scatter of the runs about the means of their steps if that has at least `LEAST_FREEDOM`
     degrees of freedom, else as it is. Values of runs together need no errors of single runs.
     """

@@ -1,4 +1,4 @@
-"""Energy and volume at a step of 0 together: means at several steps, and the slopes that
+"""Energy and volume at zero time step together: means at several steps, and the slopes that
 fluctuations predict.
 
 See "Energy and volume together" in the theory chapter `errors`.
@@ -29,7 +29,7 @@ GAS_CONSTANT = BOLTZMANN / KJ_PER_MOL  # kJ/mol/K
 BAR_NM3 = 1e3 * BAR / KJ_PER_MOL  # kJ/mol
 #: Blocks of a run that give errors of what fluctuations predict, and their correlations.
 BLOCKS = 10
-#: Least number of independent samples of a run whose fluctuations count.
+#: Minimum number of independent samples of a run whose fluctuations count.
 LEAST_SAMPLES = 20.0
 
 
@@ -80,7 +80,7 @@ NEXT_TERM = 1.0
 
 
 def why_not(stage: Stage) -> str:
-    """Why a stage has no joint fit; an empty text if it has one."""
+    """Why a stage has no joint fit. An empty text if it has one."""
     moving = [(flow.kind, flow.fraction) for flow in stage.scheme.flows if flow.kind <= DRIFT]
     drifts = sum(fraction for kind, fraction in moving if kind == DRIFT)
     if stage.ensemble not in ("nvt", "npt"):
@@ -88,7 +88,7 @@ def why_not(stage: Stage) -> str:
     if stage.ramps:
         return "temperature or pressure change during the stage"
     if stage.is_hybrid:
-        return "hybrid_monte_carlo has no error of the step"
+        return "hybrid_monte_carlo has no time-step error"
     if moving[0] != moving[-1] or moving[0] != (KICK, 0.5) or abs(drifts - 1) > 1e-12:
         return f"it is for velocity_verlet and baoab, and the integrator is {stage.integrator}"
     if stage.has_barostat and stage.pressure_coupling not in (None, "isotropic"):
@@ -121,7 +121,7 @@ def _conditions(record: Record, stage: Stage) -> Conditions:
     system = record.system
     freedom = system.freedom_in(system.scene.stages.index(stage))
     return Conditions(
-        stage.timestep_fs * FEMTOSECOND,
+        stage.step,
         stage.temperatures[0],
         stage.pressures[0][0] * BAR_NM3 if stage.has_barostat else 0.0,
         len(system.model.species),
@@ -342,7 +342,7 @@ class _Step(NamedTuple):
 
 
 def _fit_with_slopes(steps: Sequence[_Step]) -> list[BiasFit]:
-    """Generalised least squares. Long steps are left out as in `extrapolate`."""
+    """Generalised least squares. Long steps are omitted as in `extrapolate`."""
     steps = sorted(steps, key=lambda step: step.step)
     fits = [_fit_steps(steps[:count]) for count in range(len(steps), 0, -1)]
     for of_all in fits:

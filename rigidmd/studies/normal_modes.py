@@ -70,7 +70,7 @@ class Coordinates:
 
     The order is: shifts sqrt(m) X along x, y, z of molecule 1, of molecule 2, ...; then rotations
     sqrt(I_k) theta_k about the principal axes 1, 2, 3 of molecule 1, of molecule 2, ...; those that
-    do not move are left out.
+    do not move are omitted.
 
     scale : (d,) length of a move of `Enthalpy`, Å, for a unit of q
     index : (d,) of each coordinate among all shifts (3 n) and then all rotations (3 n)
@@ -211,9 +211,6 @@ def normal_modes(
     """Normal modes about the minimum next to the start of a scene, or next to the present state of
     a simulation.
 
-    modes = rigidmd.normal_modes(rigidmd.Scene.read("water_dimer.toml"))
-    print(modes.wavenumber, modes.free_energy(300.0), modes.longest_step_fs)
-
     A minimisation comes first, to the rounding of forces and torques and at constant cell.
 
     Parameters
@@ -237,6 +234,11 @@ def normal_modes(
         unit cell.
     SimulationError
         If a minimum is required and not found.
+
+    Examples
+    --------
+        modes = rigidmd.normal_modes(rigidmd.Scene.read("water_dimer.toml"))
+        print(modes.wavenumber, modes.free_energy(300.0), modes.longest_step_fs)
     """
     simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
     if isinstance(simulation.scene, BodyScene):
@@ -244,7 +246,7 @@ def normal_modes(
             simulation.scene.source, ["normal modes are of molecules, and this is a single body"]
         )
     state, system = (
-        (simulation.state if simulation is scene else simulation.settle()).copy(),
+        (simulation.state if simulation is scene else simulation._settle()).copy(),
         simulation.system,
     )
     numbers = _numbers(Coordinates(system, state), count, gamma)
@@ -356,7 +358,7 @@ def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, 
 
 def _stiffness(enthalpy: Enthalpy, system: System, state: State) -> float:
     """The force, kJ/(mol Å), with which the stiffest motion opposes a displacement by the smallest
-    diameter; at least the deepest well over this diameter, as far from each other molecules hardly
+    diameter; at least the deepest well over this diameter, as far from each other molecules barely
     attract. Raises SimulationError."""
     fastest = stiffest_mode(system, state, enthalpy.engine) if enthalpy.free.any() else None
     if fastest is None:

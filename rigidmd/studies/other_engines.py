@@ -95,7 +95,7 @@ def start_of(system: System) -> State:
     """The state after overlap removal and the first minimisations, by rigidmd itself."""
     return Simulation(
         system.scene.model_copy(update={"engine": EngineChoice()}), warn=lambda sentence: None
-    ).settle()
+    )._settle()
 
 
 STEPS, STEP = 50, 1.0  # number of steps of the short run, and their length, fs

@@ -24,11 +24,6 @@ def read_run(folder: str | Path) -> Results | Table:
     """Open the folder of a run, ended or not, or of a sweep. Nothing is written, locked or
     computed.
 
-    results = rigidmd.read_run("runs/water")
-    print(results["temperature"].mean(), results.summary, rigidmd.analysis.rdf(results, "OW", "OW"))
-    table = rigidmd.read_run("runs/water-sweep")
-    several = [rigidmd.read_run(path) for path in table.runs.values()]
-
     A run gives the `Results` that `Simulation.run` returned, with three differences. Columns that
     log.csv does not have are NaN. The last frame of `results.atoms` has no forces, because nothing
     is computed. A run that has not ended has results so far: its summary has only `interrupted`,
@@ -39,6 +34,15 @@ def read_run(folder: str | Path) -> Results | Table:
     ------
     OutputError
         If the folder has no run, or a damaged one.
+
+    Examples
+    --------
+        results = rigidmd.read_run("runs/water")
+        print(results["temperature"].mean(), results.summary)
+        print(rigidmd.analysis.rdf(results, "OW", "OW"))
+
+        table = rigidmd.read_run("runs/water-sweep")
+        several = [rigidmd.read_run(path) for path in table.runs.values()]
     """
     folder = Path(folder)
     if (folder / SWEEP).is_file():
@@ -70,7 +74,7 @@ def _results_of(record: Record) -> Results:
 
 
 def _state_of(record: Record) -> tuple[State | None, str]:
-    """The final state of a run, or the state of its last checkpoint; if there is none, None and
+    """The final state of a run, or the state of its last checkpoint. If there is none, None and
     why."""
     path, start = record.folder / FINAL, record.system.state
     try:

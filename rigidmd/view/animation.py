@@ -4,7 +4,10 @@ by Matplotlib."""
 import contextlib
 import importlib
 import shutil
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
+from itertools import chain
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +15,34 @@ import numpy as np
 
 from rigidmd.core.files import atomic_file
 from rigidmd.errors import OutputError
-from rigidmd.figures.style import INK, WARM, new_figure
+from rigidmd.figures.panels import draw_rows, panels, timeline
+from rigidmd.figures.style import COLORS, INK, WARM, new_figure
 from rigidmd.run.record import Record, read_record
-from rigidmd.view import plots
+from rigidmd.scene.validation import not_none
 from rigidmd.view.run_page import animation_of
 
 EXTENSIONS = (".mp4", ".gif")
 #: Frames per second, length in seconds, and height in pixels of an animation; inches of its
 #: picture. A frame of a .gif lasts a whole number of hundredths of a second.
-RATE, SECONDS, HEIGHT = {".mp4": 25, ".gif": 12.5}, 10.0, {".mp4": 640, ".gif": 448}
-INCHES = 6.4
-#: Most panels next to an animation.
-PANELS = 3
+RATE, SECONDS, HEIGHT = {".mp4": 25, ".gif": 12.5}, 10.0, {".mp4": 640, ".gif": 300}
+INCHES = 5.0
+#: Most panels next to an animation, size of its name and clock, colour of the cursor of panels.
+PANELS, FONT, CURSOR = 3, 13, tuple(bytes.fromhex(WARM[1:]))
 #: Most frames of molecules that are read.
 MOST_FRAMES = 2000
+#: Most bytes of a .gif of the default height, which otherwise has every second or third frame only.
+GIF_BYTES, GIF_STEPS = 500_000, (1, 2, 3)
+#: Colours of a .gif besides those of curves, the same in all frames, so that what is at rest is
+#: stored once.
+GIF_COLORS = 40
 
 
 def ffmpeg() -> str | None:
     """The program that writes .mp4, on the path or in the package imageio-ffmpeg, or None."""
     if program := shutil.which("ffmpeg"):
         return program
-    with contextlib.suppress(
-        ImportError, RuntimeError
-    ):  # RuntimeError: the package without its program
+    # RuntimeError: the package without its program
+    with contextlib.suppress(ImportError, RuntimeError):
         return importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
     return None
 
@@ -57,89 +65,109 @@ def write_film(
 
     seconds : its length; height : pixels, made even; progress : called with the fraction done
     """
-    from matplotlib import rc_context
-    from matplotlib.animation import FFMpegWriter, PillowWriter
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    if path.suffix == ".mp4" and ffmpeg() is None:
+    kind = path.suffix
+    if kind == ".mp4" and ffmpeg() is None:
         advice = "install the program, or `pip install imageio-ffmpeg`, which contains it"
         raise OutputError(f"{path}: .mp4 needs ffmpeg: {advice}; a .gif needs no other program")
     record = read_record(folder)
     animation = animation_of(record, MOST_FRAMES)
     begin, (end, notes) = float(animation.time[0]), animation.loop_end()
-    pixels = 2 * round((height or HEIGHT[path.suffix]) / 2)
-    across = 2 * round(pixels * (1.75 if with_plots else 1.0) / 2)
-    figure = new_figure(INCHES * across / pixels, INCHES, layout=None, dpi=pixels / INCHES)
-    FigureCanvasAgg(figure)
-    width = 1 / 1.75 if with_plots else 1.0
-    axes = figure.add_axes((0.0, 0.0, width, 1.0))
-    cursors = _draw_panels(figure, record, width) if with_plots else []
-    figure.text(0.02, 0.965, record.scene.name, color=INK, fontsize=13, weight="bold", va="top")
-    clock = figure.text(0.02, 0.92, "", color=INK, fontsize=13, va="top")
-    rate = RATE[path.suffix]
-    count = max(2, round(seconds * rate))
-    digits = int(np.clip(2 - np.floor(np.log10((end - begin) or 1.0)), 0, 6))
-    kind = FFMpegWriter if path.suffix == ".mp4" else PillowWriter
-    options = (
-        {"codec": "h264", "extra_args": ["-pix_fmt", "yuv420p", "-crf", "20"]}
-        if path.suffix == ".mp4"
-        else {}
-    )
-    writer = kind(fps=rate, **options)
+    count = max(2, round(seconds * RATE[kind]))
     times = np.linspace(begin, end, count)
-    notes = [
-        *record.missing,
-        *animation.notes,
-        *notes,
-        *animation.film_notes(times[1] - times[0], seconds),
-    ]
-    with (
-        atomic_file(path) as temporary,
-        rc_context({"animation.ffmpeg_path": ffmpeg() or "ffmpeg"}),
-    ):
+    notes = [*record.missing, *animation.notes, *notes]
+    notes += animation.film_notes(times[1] - times[0], seconds)
+    pixels = 2 * round((height or HEIGHT[kind]) / 2)
+    frames = _frames(record, animation, times, pixels, with_plots, progress)
+    with atomic_file(path) as temporary:
         try:
-            with writer.saving(figure, str(temporary), figure.dpi):
-                for k, time in enumerate(times):
-                    animation.draw(axes, time)
-                    clock.set_text(f"{time:.{digits}f} {record.time_unit}")
-                    for cursor, axis in cursors:
-                        low, high = axis.get_xlim()
-                        box = axis.get_position()
-                        at = box.x0 + (time - low) / (high - low) * box.width
-                        cursor.set_xdata([at, at])
-                    writer.grab_frame()
-                    progress((k + 1) / count)
-        except (RuntimeError, ValueError) as error:
+            if kind == ".gif":
+                _write_gif(temporary, frames, inf if height else GIF_BYTES)
+            else:
+                _write_mp4(temporary, frames)
+        except (OSError, ValueError) as error:
             raise OutputError(f"{path} cannot be written: {error}") from None
-    return path, [
-        *notes,
-        f"{seconds:g} s of animation: {(end - begin) / seconds:.3g} {record.time_unit} per second",
-    ]
+    rate = f"{(end - begin) / seconds:.3g} {record.time_unit} per second"
+    return path, [*notes, f"{seconds:g} s of animation: {rate}"]
 
 
-def _draw_panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:
-    """Put the first plots of the run next to the picture, as an image. Returns (cursor line, axis)
-    of each."""
+def _pixels(figure: Any) -> np.ndarray:
+    """Red, green and blue of a figure, (h, w, 3)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.lines import Line2D
 
-    still = new_figure(*figure.get_size_inches(), layout=None, dpi=figure.dpi)
-    canvas = FigureCanvasAgg(still)
-    panels = plots.panels(record)[:PANELS]
-    cursors = []
-    for k, panel in enumerate(panels):
-        height = 0.94 / len(panels)
-        axis = still.add_axes(
-            (left + 0.06, 0.98 - height * (k + 1) + 0.07, 0.86 - left, height - 0.11)
-        )
-        plots.draw_panel(axis, record, panel)
-        axis.set_title(panel.title, loc="left", fontsize=9, color=INK, x=-0.06)
-        if k == len(panels) - 1:
-            axis.set_xlabel(f"time ({record.time_unit})", fontsize=8, color=INK)
-        cursor = Line2D(
-            [0, 0], axis.get_position().intervaly, color=WARM, lw=1.2, transform=figure.transFigure
-        )
-        cursors.append((figure.add_artist(cursor), axis))
+    canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    figure.figimage(np.asarray(canvas.buffer_rgba()), zorder=-1)
-    return cursors
+    return np.array(canvas.buffer_rgba())[..., :3]
+
+
+def _frames(
+    record: Record,
+    animation: Any,
+    times: np.ndarray,
+    pixels: int,
+    with_plots: bool,
+    progress: Callable[[float], object],
+) -> Iterator[np.ndarray]:
+    """The pictures (h, w, 3) of an animation, with a name and a clock, next to plots."""
+    dpi = pixels / INCHES
+    plots, cursors = _plots(record, dpi) if with_plots else (np.empty((pixels, 0, 3), "u1"), [])
+    figure = new_figure(INCHES, INCHES, layout=None, dpi=dpi)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    style = {"color": INK, "fontsize": FONT, "va": "top"}
+    figure.text(0.02, 0.97, record.scene.name, weight="bold", **style)
+    clock = figure.text(0.02, 0.92, "", **style)
+    digits = int(np.clip(2 - np.floor(np.log10((times[-1] - times[0]) or 1.0)), 0, 6))
+    for k, time in enumerate(times):
+        animation.draw(axes, time)
+        clock.set_text(f"{time:.{digits}f} {record.time_unit}")
+        beside = plots.copy()
+        for axis in cursors:
+            x, _ = axis.transData.transform((time, 0)).astype(int)
+            low, high = pixels - axis.bbox.intervaly.astype(int)
+            beside[high:low, x : x + 2] = CURSOR
+        yield np.hstack([_pixels(figure), beside])
+        progress((k + 1) / len(times))
+
+
+def _plots(record: Record, dpi: float) -> tuple[np.ndarray, list[Any]]:
+    """A picture of the first plots of a run, and their axes."""
+    width = 2 * round(0.375 * INCHES * dpi) / dpi  # an even number of pixels
+    figure = new_figure(width, INCHES, layout=None, dpi=dpi)
+    times = timeline(record.system, record.columns)
+    rows = [[(times, panel)] for panel in panels(record.system, record.columns)[:PANELS]]
+    axes = draw_rows(figure, rows, (0.0, 0.05, width, INCHES - 0.1))
+    return _pixels(figure), axes
+
+
+def _write_gif(path: Path, frames: Iterator[np.ndarray], most: float) -> None:
+    """Write frames with one palette, without dithering, by which still parts would flicker."""
+    from PIL import Image
+
+    pictures = [*frames]
+    some = np.vstack(pictures[:: -(-len(pictures) // 8)])
+    colors = Image.fromarray(some).quantize(GIF_COLORS).getpalette()
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(
+        bytes(colors or ()) + bytes.fromhex("".join(COLORS).replace("#", "") + "ffffff")
+    )
+    quantized = [
+        Image.fromarray(x).quantize(palette=palette, dither=Image.Dither.NONE) for x in pictures
+    ]
+    for step in GIF_STEPS:
+        first, *others = quantized[::step]
+        options = {"duration": round(1000 * step / RATE[".gif"]), "loop": 0, "optimize": True}
+        first.save(path, save_all=True, append_images=others, **options)
+        if path.stat().st_size < most:
+            break
+
+
+def _write_mp4(path: Path, frames: Iterator[np.ndarray]) -> None:
+    first = next(frames)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(RATE[".mp4"])]
+    target = ["-codec:v", "h264", "-pix_fmt", "yuv420p", "-crf", "20", str(path)]
+    command = [str(ffmpeg()), "-loglevel", "error", "-y", *source, "-i", "-", *target]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as program:
+        for frame in chain([first], frames):
+            not_none(program.stdin).write(frame.tobytes())
+    if program.returncode:
+        raise OSError(f"ffmpeg ended with exit code {program.returncode}")

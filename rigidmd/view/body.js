@@ -1,14 +1,13 @@
-// The film of a single body on a canvas: its faces, its path on the sphere, vectors. Drag to turn, wheel to zoom.
+// The animation of a single body on a canvas: its faces, its path on the sphere, vectors. Drag to rotate, wheel to zoom.
 "use strict";
 (() => {
   const data = rigidmdData("film-data"), f32 = (text) => rigidmdArray(text, Float32Array);
   const times = rigidmdArray(data.time, Float64Array), q = f32(data.quaternion), place = f32(data.position);
   const path = f32(data.path), when = rigidmdArray(data.when, Float64Array), angles = data.angles && f32(data.angles);
-  const vectors = Object.entries(data.vectors).map(([name, text]) => ({ name, values: f32(text) }));
+  const vectors = Object.entries(data.vectors).map(([name, one]) => ({ name, color: one.color, values: f32(one.values) }));
   const canvas = document.getElementById("film"), pen = canvas.getContext("2d"), readout = document.getElementById("film-readout");
   let azimuth = data.azimuth, lift = 0.35, zoom = 1, shown = times[0];
   const color = (name) => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
-  const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
   function at(time) { // index and share between two samples
@@ -19,7 +18,7 @@
   }
   const between = (array, n, [low, high, share]) =>
     Array.from({ length: n }, (_, k) => (1 - share) * array[n * low + k] + share * array[n * high + k]);
-  function rotation(moment) { // the turn from one sample to the next, at a constant rate
+  function rotation(moment) { // the rotation from one sample to the next, at a constant rate
     const [low, high, share] = moment, a = q.slice(4 * low, 4 * low + 4), b = q.slice(4 * high, 4 * high + 4);
     const cos = Math.min(1, a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]), angle = Math.acos(cos);
     const [u, v] = angle < 1e-4 ? [1 - share, share] : [Math.sin((1 - share) * angle) / Math.sin(angle), Math.sin(share * angle) / Math.sin(angle)];
@@ -128,7 +127,7 @@
     const before = dot(centre, view.eye) > 0;
     if (before) rod();
     for (const face of faces) {
-      const tint = 0.62 + 0.38 * Math.max(0, dot(face.normal, light)), [r, g, b] = rgb(face.painted ? "#d9694f" : "#4f93c4").map((c) => Math.round(c * tint));
+      const tint = 0.62 + 0.38 * Math.max(0, dot(face.normal, light)), [r, g, b] = data.sides[+face.painted].map((c) => Math.round(c * tint));
       pen.fillStyle = pen.strokeStyle = `rgb(${r},${g},${b})`;
       pen.lineWidth = 0.7;
       pen.beginPath();
@@ -147,9 +146,8 @@
       const side = { L: -11, ω: 11 }[name] || 0; // of vectors that lie on one another
       pen.fillText(name, u + 10 * a - 5 - side * b, v + 12 * b + 5 + side * a);
     }
-    const shades = { L: "#7a5ca3", ω: "#b8862d" };
     const from = data.pinned ? origin : centre;
-    for (const { name, values } of vectors) arrow(from, between(values, 3, moment), shades[name], name);
+    for (const { name, color: paint, values } of vectors) arrow(from, between(values, 3, moment), color(paint), name);
     if (data.gravity) arrow(centre, data.gravity, ink, "g");
     if (data.sphere) {
       circles.forEach((circle) => curve(circle, faint, 0.6, 0.35, 0));

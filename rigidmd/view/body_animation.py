@@ -2,22 +2,13 @@
 drawing by Matplotlib."""
 
 import html
+from typing import Any
 
 import numpy as np
 
 from rigidmd.engines.body_motion import drawn_axis
-from rigidmd.figures.style import (
-    COOL,
-    FAINT,
-    INK,
-    UP,
-    WARM,
-    camera,
-    draw_front_and_back,
-    draw_scale,
-    globe,
-    thin_path,
-)
+from rigidmd.figures.space import UP, View, camera, globe, thin_path
+from rigidmd.figures.style import COOL, FAINT, INK, PALETTE, WARM
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run.record import Record
 from rigidmd.view.mesh import mesh_of
@@ -36,12 +27,16 @@ VECTOR_LENGTH, GRAVITY_LENGTH = {True: 1.0, False: 0.45}, {True: 0.45, False: 0.
 #: Height of the eye above the horizon, rad; colours of a body's sides, painted or not.
 LIFT = 0.35
 SIDES = np.array([[0.31, 0.58, 0.77], [0.85, 0.41, 0.31]])
-#: Vectors: columns, unit, colour, description, and side of the label, as vectors may coincide.
+#: Vectors: columns, unit, colour of the palette, description, and side of the label, as vectors
+#: may coincide.
 VECTORS = {
-    "L": ("L_lab", "kg m²/s", "#7a5ca3", "angular momentum L", 0.05),
-    "ω": ("omega_lab", "rad/s", "#b8862d", "angular velocity ω", -0.05),
+    "L": ("L_lab", "kg m²/s", "violet", "angular momentum L", 0.05),
+    "ω": ("omega_lab", "rad/s", "amber", "angular velocity ω", -0.05),
 }
-ARROW = {"arrowstyle": "-|>,head_width=0.25,head_length=0.5", "lw": 2, "shrinkA": 0, "shrinkB": 0}
+USAGE = (
+    "Drag to rotate, wheel or pinch to zoom, double click to reset; space plays. A click on a plot"
+    " jumps to it."
+)
 #: Rotations between two frames beyond which a body seems to rotate backwards.
 MAX_ROTATION = 0.5
 #: Differences of Q (rad), and of velocities and position, in their largest values, at which a
@@ -65,7 +60,7 @@ class BodyAnimation:
     gravity : (3,) or None
     unit : of the picture, m
     azimuth : of the eye, rad
-    notes : on thinning and enlargement
+    notes : on thinning, the shape and enlargement
     """
 
     def __init__(self, record: Record):
@@ -73,15 +68,17 @@ class BodyAnimation:
         system, columns, count = record.system, record.columns, len(record.time)
         stride = -(-count // MOST_SAMPLES)
         rows = np.arange(0, count, stride)
-        self.time = record.time[rows]
-        self.notes = (
-            [f"{len(rows)} of {count} samples are shown: every {stride}th."] if stride > 1 else []
-        )
+        self.time, self.notes = record.time[rows], []
+        if stride > 1:
+            self.notes.append(f"{len(rows)} of {count} samples are shown: every {stride}th.")
         mesh = mesh_of(system)
         self.notes.append(f"The body is drawn as {mesh.about}.")
 
         def of(*names: str) -> np.ndarray:
             return np.stack([columns[name][rows] for name in names], axis=-1)
+
+        def along(name: str) -> np.ndarray:
+            return of(*(f"{name}_{axis}" for axis in "xyz"))
 
         position = of("x", "y", "z") if system.translates else np.zeros((len(rows), 3))
         turns = system.rotates and "qw" in columns
@@ -96,164 +93,89 @@ class BodyAnimation:
             self.unit = 1.05 * extent + mesh.reach * enlarged
             self.position = path = (position - middle) / self.unit
             if turns and enlarged > 1:
-                self.notes.append(
-                    f"The body is drawn {enlarged:.3g} times as large as it is relative to its"
-                    " path."
-                )
+                times = f"{enlarged:.3g} times as large as it is relative to its path"
+                self.notes.append(f"The body is drawn {times}.")
         else:
             self.unit, self.position = 1.08 * radius, np.zeros_like(position)
-            turned = [
-                sum(columns[f"q{i}{j + 1}"][rows] * self.axis[j] for j in range(3))
-                for i in (1, 2, 3)
-            ]
-            path = radius / self.unit * np.stack(turned, axis=-1)
+            Q = of(*(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))).reshape(-1, 3, 3)
+            path = radius / self.unit * (Q @ self.axis)
         self.sphere = 0.0 if moves else radius / self.unit
-        self.quaternion = (
-            of("qw", "qx", "qy", "qz") if turns else np.tile([1.0, 0, 0, 0], (len(rows), 1))
-        )
+        still = np.tile([1.0, 0, 0, 0], (len(rows), 1))
+        self.quaternion = of("qw", "qx", "qy", "qz") if turns else still
         shown = thin_path(path, MOST_POINTS)
         self.path, self.when = path[shown], self.time[shown]
         self.vectors, self.largest = {}, {}
         for name, (key, size, *_) in VECTORS.items():
             if turns and f"{key}_x" in columns:
-                values = of(f"{key}_x", f"{key}_y", f"{key}_z")
+                values = along(key)
                 longest = float(np.linalg.norm(values, axis=1).max())
                 if longest > 0:
                     scale = VECTOR_LENGTH[not moves] * (self.sphere or 1.0) / longest
                     self.vectors[name], self.largest[name] = scale * values, f"{longest:.4g} {size}"
-        gravity = np.array(
-            system.scene.gravity.acceleration_m_s2 if system.scene.gravity else np.zeros(3), float
-        )
-        self.gravity = (
-            GRAVITY_LENGTH[not moves] * gravity / np.linalg.norm(gravity) if gravity.any() else None
-        )
+        self.gravity, field = None, system.scene.gravity
+        if field and np.any(field.acceleration_m_s2):
+            gravity = np.array(field.acceleration_m_s2)
+            self.gravity = GRAVITY_LENGTH[not moves] * gravity / np.linalg.norm(gravity)
         self.angles = np.degrees(of("phi", "theta", "psi")) if turns else np.empty(0)
-        self.azimuth = (
-            float(np.arctan2(path[0, 1], path[0, 0])) - 0.6
-            if np.hypot(*path[0, :2]) > 1e-9
-            else 0.6
-        )
+        x, y, _ = path[0]
+        self.azimuth = float(np.arctan2(y, x)) - 0.6 if np.hypot(x, y) > 1e-9 else 0.6
         self.mesh = mesh._replace(vertices=mesh.vertices * enlarged / self.unit)
         self.centre, self.pinned = system.centre * enlarged / self.unit, not system.translates
         level = np.array([np.cos(self.azimuth), np.sin(self.azimuth), 0.0])
-        self._view = camera(np.cos(LIFT) * level + np.sin(LIFT) * UP, UP)
-        self._rings = self.sphere * np.concatenate(
-            [np.vstack([ring, np.full(3, np.nan)]) for ring in globe()]
-        )
+        self._view = camera(np.cos(LIFT) * level + np.sin(LIFT) * UP)
 
-    def draw(self, axes, time: float) -> None:
+    def draw(self, axes: Any, time: float) -> None:
         """Draw a time into axes, which are cleared."""
         from matplotlib.patches import Circle
 
-        view = self._view
-        axes.clear()
-        axes.set(xlim=(-1.08, 1.08), ylim=(-1.08, 1.08), aspect="equal")
-        axes.set_axis_off()
+        view = View(axes, self._view, 1.08)
         rotation, origin = self._pose(time)
         centre = origin + rotation @ self.centre
         past = self.path[self.when <= time]
         if self.sphere:
             tip = self.sphere * rotation @ self.axis
-            past = np.concatenate([past, tip[None]])
             axes.add_patch(Circle((0, 0), self.sphere, fc=FAINT, alpha=0.08, lw=0))
-            for curve, alphas, style in (
-                (self._rings, (0.4, 0.15), {"color": FAINT, "lw": 0.5}),
-                (self.path, (0.25, 0.08), {"color": COOL, "lw": 0.9}),
-                (past, (0.95, 0.3), {"color": COOL, "lw": 1.7}),
-            ):
-                draw_front_and_back(axes, curve, view, curve @ view[2], alphas, **style)
-            toward = float(view[2] @ tip) >= 0
-            axes.plot(
-                *(view[:2] @ tip),
-                "o",
-                color=WARM,
-                ms=6,
-                alpha=1.0 if toward else 0.4,
-                zorder=5 if toward else 1,
-            )
+            view.curve(self.sphere * globe(), (0.4, 0.15), color=FAINT, lw=0.5)
+            view.curve(self.path, (0.25, 0.08), color=COOL, lw=0.9)
+            view.curve(np.vstack([past, tip]), (0.95, 0.3), color=COOL, lw=1.7)
+            front = view.depth(tip) >= 0
+            style = {"ms": 6, "alpha": 1.0 if front else 0.4, "zorder": 5 if front else 1}
+            axes.plot(*view.flat(tip), "o", color=WARM, **style)
         else:
-            axes.plot(*(self.path @ view[:2].T).T, color=COOL, lw=0.9, alpha=0.3, zorder=1)
-            axes.plot(
-                *(np.concatenate([past, origin[None]]) @ view[:2].T).T, color=COOL, lw=1.7, zorder=1
-            )
-        self._faces(axes, rotation, origin)
+            for line, alpha, width in ((self.path, 0.3, 0.9), (np.vstack([past, origin]), 1, 1.7)):
+                axes.plot(*view.flat(line).T, color=COOL, lw=width, alpha=alpha, zorder=1)
+        vertices = self.mesh.vertices @ rotation.T + origin
+        faces = [vertices[face] for face in self.mesh.faces]
+        view.faces(faces, SIDES[np.array(self.mesh.painted, int)])
         if self.pinned:
-            ends = np.stack([origin, centre]) @ view[:2].T
+            ends = view.flat(np.stack([origin, centre]))
             if not self.mesh.stem:
-                axes.plot(
-                    *ends.T,
-                    color=INK,
-                    lw=2.2,
-                    zorder=2.5 if view[2] @ (centre - origin) < 0 else 1.5,
-                )
+                behind = view.depth(centre - origin) >= 0
+                axes.plot(*ends.T, color=INK, lw=2.2, zorder=1.5 if behind else 2.5)
             axes.plot(*ends[0], "o", color=INK, ms=5, zorder=2.5)
+        start = origin if self.pinned else centre
         for name, values in self.vectors.items():
-            vector = np.array([np.interp(time, self.time, values[:, k]) for k in range(3)])
-            self._arrow(
-                axes,
-                origin if self.pinned else centre,
-                vector,
-                VECTORS[name][2],
-                name,
-                VECTORS[name][4],
-            )
+            vector = np.array([np.interp(time, self.time, column) for column in values.T])
+            view.arrow(start, vector, PALETTE[VECTORS[name][2]], name, VECTORS[name][4])
         if self.gravity is not None:
-            self._arrow(axes, centre, self.gravity, INK, "g")
+            view.arrow(centre, self.gravity, INK, "g")
         length = 10.0 ** np.floor(np.log10(0.6 * self.unit))
-        draw_scale(axes, 1.02, -1.02, length / self.unit, f"{length:g} m")
+        view.scale(length / self.unit, f"{length:g} m")
 
     def _pose(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Q and the position at a time: between samples the body rotates at a constant rate."""
         high = int(np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1))
         gap = self.time[high] - self.time[high - 1]
         fraction = float((time - self.time[high - 1]) / gap) if gap > 0 else 0.0
-        a, b = self.quaternion[high - 1], self.quaternion[high]
+        pair = slice(high - 1, high + 1)
+        a, b = self.quaternion[pair]
+        weights = np.array([1 - fraction, fraction])
+        position = weights @ self.position[pair]
         angle = np.arccos(np.clip(a @ b, -1, 1))
-        mixed = (1 - fraction) * a + fraction * b
         if angle > 1e-4:
-            mixed = (np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b) / np.sin(
-                angle
-            )
-        position = (1 - fraction) * self.position[high - 1] + fraction * self.position[high]
+            weights = np.sin(weights * angle)
+        mixed = weights @ self.quaternion[pair]
         return from_quaternion(mixed / np.linalg.norm(mixed)), position
-
-    def _faces(self, axes, rotation: np.ndarray, origin: np.ndarray) -> None:
-        from matplotlib.collections import PolyCollection
-
-        # right, up, towards the eye
-        projected = (self.mesh.vertices @ rotation.T + origin) @ self._view.T
-        light = np.array([-0.5, 0.65, 0.55])
-        shown = []
-        for face, painted in zip(self.mesh.faces, self.mesh.painted, strict=True):
-            corners = projected[face]
-            normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
-            if normal[2] > 0:
-                lit = 0.62 + 0.38 * max(0.0, float(normal @ light) / np.linalg.norm(normal))
-                shown.append((corners[:, 2].mean(), corners[:, :2], lit * SIDES[int(painted)]))
-        shown.sort(key=lambda entry: entry[0])
-        colors = [color for _, _, color in shown]
-        style = {"facecolors": colors, "edgecolors": colors, "lw": 0.5, "zorder": 2}
-        axes.add_collection(PolyCollection([flat for _, flat, _ in shown], **style))
-
-    def _arrow(
-        self, axes, start: np.ndarray, vector: np.ndarray, color: str, name: str, side: float = 0.0
-    ) -> None:
-        tail, tip = (self._view[:2] @ point for point in (start, start + vector))
-        size = float(np.linalg.norm(tip - tail))
-        if size < 0.02:
-            return
-        axes.annotate("", tip, xytext=tail, arrowprops=ARROW | {"color": color}, zorder=4)
-        along = (tip - tail) / size
-        label = tip + 0.06 * along + side * np.array([-along[1], along[0]])
-        style = {
-            "fontsize": 13,
-            "style": "italic",
-            "weight": "bold",
-            "ha": "center",
-            "va": "center",
-            "zorder": 4,
-        }
-        axes.text(*label, name, color=color, **style)
 
     def loop_end(self) -> tuple[float, list[str]]:
         """End of an animation, and a note: the last return of the motion to its start, to repeat it
@@ -272,12 +194,10 @@ class BodyAnimation:
         # the best of the last returns
         near = back[np.searchsorted(back, back[-1] - 0.1 * len(off)) :]
         end = float(self.time[near[off[near].argmin()]])
-        how = (
-            "returns to its start"
-            if off[near].min() < EXACT_RETURN
-            else "nearly returns to its start"
-        )
-        return end, [f"The motion {how} at {end:.6g} s, where the animation ends."]
+        nearly = "" if off[near].min() < EXACT_RETURN else "nearly "
+        return end, [
+            f"The motion {nearly}returns to its start at {end:.6g} s, the animation's end."
+        ]
 
     def film_notes(self, interval: float, seconds: float) -> list[str]:
         """A sentence if the body rotates too far between frames for its rotation to be seen."""
@@ -285,18 +205,16 @@ class BodyAnimation:
             return []
         size = np.linalg.norm([self._record.columns[f"omega_lab_{k}"] for k in "xyz"], axis=0)
         turns = float(size.max() * interval / (2 * np.pi))
-        note = (
+        if turns <= MAX_ROTATION:
+            return []
+        return [
             f"The body rotates up to {turns:.2g} times between two frames, so that it may seem to"
-            " stand or to rotate"
-        )
-        note += (
-            f" backwards: an animation of {seconds * turns / MAX_ROTATION:.3g} s shows its"
-            " rotation."
-        )
-        return [note] if turns > MAX_ROTATION else []
+            " stand or to rotate backwards: an animation of"
+            f" {seconds * turns / MAX_ROTATION:.3g} s shows its rotation."
+        ]
 
     def page_part(self) -> PagePart:
-        def short(values):
+        def short(values: np.ndarray) -> np.ndarray:
             return values.astype("<f4")
 
         data = {
@@ -306,11 +224,15 @@ class BodyAnimation:
             "path": short(self.path),
             "when": self.when,
             "angles": short(self.angles) if self.angles.size else None,
-            "vectors": {name: short(values) for name, values in self.vectors.items()},
+            "vectors": {
+                name: {"values": short(values), "color": VECTORS[name][2]}
+                for name, values in self.vectors.items()
+            },
             "gravity": None if self.gravity is None else self.gravity.tolist(),
             "vertices": self.mesh.vertices.round(6).tolist(),
             "faces": self.mesh.faces,
             "painted": self.mesh.painted,
+            "sides": (255 * SIDES).tolist(),
             "sphere": self.sphere,
             "axis": self.axis.tolist(),
             "centre": self.centre.tolist(),
@@ -323,18 +245,11 @@ class BodyAnimation:
             (VECTORS[name][2], f"{VECTORS[name][3]}, at most {largest}")
             for name, largest in self.largest.items()
         ]
-        chips += [] if self.gravity is None else [("var(--ink)", "gravity g")]
-        trace = (
-            "path of the centre of mass"
-            if not self.sphere
-            else "path of the body axis on the sphere"
-        )
-        chips.append(("var(--cool)", trace))
-        chip = '<span><i class="chip" style="background:{}"></i>{}</span>'
+        chips += [] if self.gravity is None else [("ink", "gravity g")]
+        drawn = "body axis on the sphere" if self.sphere else "centre of mass"
+        chips.append(("cool", f"path of the {drawn}"))
+        chip = '<span><i class="chip" style="background:var(--{})"></i>{}</span>'
         legend = "".join(chip.format(color, html.escape(text)) for color, text in chips)
-        usage = "Drag to rotate, wheel or pinch to zoom, double click to reset; space plays."
-        usage += " A click on a plot jumps to it."
-        picture = '<canvas id="film" role="img" aria-label="film of the body"></canvas>'
-        return PagePart(
-            picture, legend, usage, data, self.notes, [read_asset("film.js"), read_asset("body.js")]
-        )
+        picture = '<canvas id="film" role="img" aria-label="animation of the body"></canvas>'
+        scripts = [read_asset("film.js"), read_asset("body.js")]
+        return PagePart(picture, legend, USAGE, data, scripts)

@@ -7,7 +7,7 @@ function rigidmdArray(text, kind) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   return new kind(bytes.buffer);
 }
-// film: {times, unit, show(time) -> nothing or a promise}
+// animation: {times, unit, show(time) -> nothing or a promise}
 function rigidmdPlayer(film) {
   const find = (name) => document.getElementById("film-" + name);
   const first = film.times[0], last = film.times[film.times.length - 1], span = last - first || 1;
@@ -25,12 +25,14 @@ function rigidmdPlayer(film) {
   for (const s of lengths) speed.add(new Option(words(s), s));
   const wanted = film.unit === "s" && span >= 5 && span <= 40 ? span : film.length || 20;
   speed.value = lengths.reduce((a, b) => (Math.abs(Math.log(b / wanted)) < Math.abs(Math.log(a / wanted)) ? b : a));
-  const figures = [...document.querySelectorAll("figure[data-left]")];
+  const figures = [...document.querySelectorAll("figure[data-box]")];
   const cursors = figures.map((figure) => {
     const line = document.createElement("div");
     line.className = "cursor";
     figure.append(line);
-    const place = figure.dataset, left = +place.left, right = +place.right, from = +place.from, to = +place.to;
+    const place = figure.dataset, [left, right, top, bottom] = place.box.split(" ").map(Number), from = +place.from, to = +place.to;
+    line.style.top = 100 * top + "%";
+    line.style.height = 100 * (bottom - top) + "%";
     figure.addEventListener("click", (event) => {
       const box = figure.getBoundingClientRect(), x = (event.clientX - box.left) / box.width;
       set(from + ((x - left) / (right - left)) * (to - from));

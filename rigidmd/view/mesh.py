@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidmd.assemble.body import assembled, inertia_at_centre, inertia_of, principal
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.figures.style import camera
+from rigidmd.figures.space import camera
 from rigidmd.formats.bonds import shortest_links
 from rigidmd.mechanics.inertia import SOLIDS
 from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry

@@ -3,14 +3,14 @@ Lennard-Jones diameters, charges, massless sites, principal axes."""
 
 import re
 from collections import Counter
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from textwrap import shorten, wrap
-from typing import Any
 
 import numpy as np
 
-from rigidmd.figures.style import COOL, FAINT, INK, draw_scale, new_figure, save_files
+from rigidmd.figures.space import View, camera
+from rigidmd.figures.style import COOL, FAINT, INK, new_figure, save_files
 from rigidmd.formats.bonds import COVALENT, bonds, distance
 from rigidmd.io.write import check_target
 from rigidmd.scene.models import GROUPS, Molecule
@@ -140,9 +140,18 @@ COLOURS = {
 OTHER = "#b0b4ba"
 #: Radius of a sphere as a fraction of the covalent radius, or else of the Lennard-Jones diameter.
 OF_COVALENT, OF_DIAMETER, LEAST = 0.62, 0.2, 0.22
-#: View of bodies that are not flat: degrees about the vertical, then towards the viewer.
-AZIMUTH, LIFT = 25.0, 20.0
+#: Direction of the eye of bodies that are not flat.
+EYE = np.array([-0.4, 0.34, 0.85])
 INCHES, FONT = 7.0, 9.0
+#: Gaps between a sphere and its label in half widths, and steps of 22.5° from outward, by
+#: preference.
+GAPS, STEPS = (0.02, 0.08, 0.16, 0.26, 0.38, 0.52), sorted(range(-7, 9), key=abs)
+
+
+def color_of(element: str) -> np.ndarray:
+    """Red, green and blue of an element, 0 to 1."""
+    digits = COLOURS.get(element, OTHER)
+    return np.array([int(digits[k : k + 2], 16) for k in (1, 3, 5)]) / 255
 
 
 def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
@@ -150,35 +159,34 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     from matplotlib.patches import Circle
 
     check_target(path, EXTENSIONS, force, "figure")
-    view = _view(m)
-    projected: Any = m.positions_body @ view.T  # right, up, towards the viewer
+    is_flat = m.planar or m.kind in ("point", "linear")
+    matrix = np.eye(3) if is_flat else camera(EYE, np.array([0.0, 1.0, 0.0]))
     covalent = np.array([COVALENT.get(element, 0.0) for element in m.elements])
-    radius: Any = np.maximum(
-        LEAST, np.where(covalent > 0, OF_COVALENT * covalent, OF_DIAMETER * m.sigma)
-    )
-    radius[m.masses == 0] = LEAST / 2
+    radius = np.where(covalent > 0, OF_COVALENT * covalent, OF_DIAMETER * m.sigma)
+    radius = np.where(m.masses > 0, np.maximum(LEAST, radius), LEAST / 2)
     reach = np.maximum(radius, np.where(m.epsilon > 0, m.sigma / 2, 0.0))
-    half = float(1.12 * (np.abs(projected[:, :2]).max(axis=1) + reach).max())
+    flat = m.positions_body @ matrix[:2].T
+    half = float(1.12 * (np.abs(flat).max(axis=1) + reach).max())
     figure = new_figure(INCHES, INCHES * 1.12, layout=None)
-    axes = figure.add_axes(
-        (0.02, 0.02, 0.96, 0.96 / 1.12), aspect="equal", xlim=(-half, half), ylim=(-half, half)
-    )
-    axes.set_axis_off()
+    view = View(figure.add_axes((0.02, 0.02, 0.96, 0.96 / 1.12)), matrix, half)
     for i in np.flatnonzero(m.epsilon > 0).tolist():
-        colour = COLOURS.get(m.elements[i], OTHER) if m.elements[i] != "H" else OTHER
-        dashed = {"lw": 0.8, "ls": (0, (4, 3)), "zorder": 1}
-        axes.add_patch(
-            Circle(projected[i, :2], m.sigma[i] / 2, fc=colour, alpha=0.07, lw=0, zorder=1)
+        color = color_of(m.elements[i] if m.elements[i] != "H" else "")
+        disc = {"xy": flat[i], "radius": m.sigma[i] / 2, "zorder": 1}
+        view.axis.add_patch(Circle(**disc, fc=color, alpha=0.07, lw=0))
+        view.axis.add_patch(
+            Circle(**disc, fill=False, ec=color, alpha=0.45, lw=0.8, ls=(0, (4, 3)))
         )
-        axes.add_patch(
-            Circle(projected[i, :2], m.sigma[i] / 2, fill=False, ec=colour, alpha=0.45, **dashed)
-        )
-    bonded = _links(axes, m, projected, radius)
-    for i in np.argsort(projected[:, 2], kind="stable"):
-        _sphere(axes, m, i, projected[i], radius[i])
-    _labels(axes, m, projected[:, :2], radius, half, _principal_axes(axes, m, view, half) + bonded)
+    taken = [*_axes(view, m), *_bonds(view, m, radius)]
+    for i, order in enumerate(_order(view, m.positions_body)):
+        if m.masses[i] > 0:
+            color = color_of(m.elements[i])
+            view.spheres(m.positions_body[i : i + 1], radius[i : i + 1], color[None], order)
+        else:
+            style = {"marker": "D", "ms": 6, "mfc": "white", "mec": COOL, "mew": 1.5}
+            view.axis.plot(*flat[i], **style, zorder=6.5)
+    _labels(view, m, radius, taken)
     length = 1.0 if half > 1.6 else 0.5
-    draw_scale(axes, length - 0.96 * half, -0.95 * half, length, f"{length:g} Å", FONT)
+    view.scale(length, f"{length:g} Å")
     title, plain = m.title or m.name, {"color": INK, "va": "top", "parse_math": False}
     figure.text(0.03, 0.975, title, fontsize=min(13.0, 780 / len(title)), weight="bold", **plain)
     lines = [f"{m.name}: {m.description}"]
@@ -195,150 +203,66 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     save_files(figure, path.with_suffix(""), [path.suffix[1:]])
 
 
-def _view(m: Molecule) -> np.ndarray:
-    """Rotation (3, 3) from the principal frame to right, up and towards the viewer; flat bodies
-    face the viewer."""
-    if m.planar or m.kind in ("point", "linear"):
-        return np.eye(3)
-    a, b = np.radians([AZIMUTH, LIFT])
-    about_up = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    return np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]]) @ about_up
+def _order(view: View, points: np.ndarray) -> np.ndarray:
+    """Drawing order within the layer of the molecule: nearer things later."""
+    return 5.0 + np.tanh(view.depth(points) / 5.0)
 
 
-def _links(axes, m: Molecule, projected: np.ndarray, radius: np.ndarray) -> list[tuple]:
+def _bonds(view: View, m: Molecule, radius: np.ndarray) -> list[np.ndarray]:
     """Draw bonds between the surfaces of spheres. Returns points that labels must not cover."""
     taken = []
     for i, j in bonds(m):
+        ends = m.positions_body[[i, j]]
+        order = _order(view, ends.mean(axis=0))
         if m.masses[j] == 0:
-            axes.plot(
-                *projected[[i, j], :2].T, color=FAINT, lw=1.0, zorder=_order(projected[j, 2]) - 0.01
-            )
+            view.axis.plot(*view.flat(ends).T, color=FAINT, lw=1.0, zorder=order - 0.01)
             continue
-        along = (projected[j] - projected[i]) / np.linalg.norm(projected[j] - projected[i])
-        ends = np.array(
-            [projected[i] + 0.9 * radius[i] * along, projected[j] - 0.9 * radius[j] * along]
-        )
-        for colour, width in (("#8f949b", 7.0), ("#c9cdd2", 4.0)):
-            axes.plot(
-                *ends[:, :2].T,
-                color=colour,
-                lw=width,
-                solid_capstyle="butt",
-                zorder=_order(ends[:, 2].mean()),
-            )
-        taken += [(*x, *x) for x in np.linspace(ends[0, :2], ends[1, :2], 12)]
+        along = 0.9 * (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        flat = view.flat(ends + np.outer([radius[i], -radius[j]], along))
+        for color, width in (("#8f949b", 7.0), ("#c9cdd2", 4.0)):
+            style = {"color": color, "lw": width, "solid_capstyle": "butt"}
+            view.axis.plot(*flat.T, **style, zorder=order)
+        taken += [*np.linspace(flat[0], flat[1], 12)]
     return taken
 
 
-def _order(depth: float) -> float:
-    """Drawing order within the layer of the molecule: nearer things later."""
-    return 5.0 + np.tanh(depth / 5.0)
-
-
-def _sphere(axes, m: Molecule, i: int, projected: Any, radius: float) -> None:
-    from matplotlib.colors import to_rgb
-    from matplotlib.patches import Circle, RegularPolygon
-
-    if m.masses[i] == 0:
-        axes.add_patch(
-            RegularPolygon(projected[:2], 4, radius=radius, fc="white", ec=COOL, lw=1.5, zorder=6.5)
-        )
-        return
-    base, steps, order = (
-        np.array(to_rgb(COLOURS.get(m.elements[i], OTHER))),
-        24,
-        _order(projected[2]),
-    )
-    for k in range(steps):
-        fraction = k / (steps - 1)  # from the dark rim to the light spot
-        colour = np.clip(
-            base * (0.72 + 0.33 * fraction) + 0.55 * max(0.0, fraction - 0.45) ** 2, 0, 1
-        )
-        x, y = projected[:2] + fraction * np.array([-0.32 * radius, 0.36 * radius])
-        axes.add_patch(
-            Circle((x, y), radius * (1 - 0.93 * fraction), fc=colour, lw=0, zorder=order)
-        )
-    axes.add_patch(Circle(projected[:2], radius, fill=False, ec=0.55 * base, lw=0.8, zorder=order))
-
-
-def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tuple]:
-    """Draw arrows along the axes, a ring for one towards the viewer. Returns boxes that labels must
-    not cover."""
-    if m.radius == 0:
-        return []
+def _axes(view: View, m: Molecule) -> list[np.ndarray]:
+    """Draw the principal axes as arrows, a ring for one towards the viewer. Returns points that
+    labels must not cover."""
     taken = []
-    for k in range(3):
-        if m.kind == "linear" and k > 0:
-            break
-        tip = 0.9 * half * view[:, k]
-        if np.linalg.norm(tip[:2]) < 0.1 * half:
-            axes.plot(0, 0, marker="o", ms=9, mfc="none", mec=INK, mew=1.0, zorder=7)
-            axes.plot(0, 0, marker=".", ms=4, color=INK, zorder=7)
-            continue
-        style = {
-            "arrowstyle": "-|>",
-            "color": INK,
-            "lw": 0.9,
-            "alpha": 0.75,
-            "shrinkA": 0,
-            "shrinkB": 0,
-        }
-        axes.annotate("", tip[:2], (0, 0), arrowprops=style, zorder=3)
-        at = tip[:2] + 0.04 * half * tip[:2] / np.linalg.norm(tip[:2])
-        axes.text(
-            *at,
-            str(k + 1),
-            color=INK,
-            fontsize=FONT,
-            ha="center",
-            va="center",
-            style="italic",
-            zorder=8,
-        )
-        taken.append((*(at - 0.03 * half), *(at + 0.03 * half)))
-        taken += [(*x, *x) for x in np.linspace(0, 1, 30)[:, None] * tip[:2]]
+    count = 0 if m.radius == 0 else 1 if m.kind == "linear" else 3
+    for k, tip in enumerate(0.9 * view.half.max() * np.eye(3)[:count]):
+        name = view.arrow(np.zeros(3), tip, INK, str(k + 1), lw=0.9, fontsize=FONT, zorder=3)
+        if name is None:
+            ring = {"ms": 9, "mfc": "none", "mec": INK, "zorder": 7}
+            view.axis.plot(0, 0, "o", **ring)
+            view.axis.plot(0, 0, ".", ms=4, color=INK, zorder=7)
+        else:
+            taken += [*np.linspace(np.zeros(2), name, 30)]
     return taken
 
 
-def _labels(
-    axes, m: Molecule, centres: np.ndarray, radius: np.ndarray, half: float, taken: list[tuple]
-) -> None:
-    """Draw names and charges in the first free direction, from outward on."""
+def _labels(view: View, m: Molecule, radius: np.ndarray, taken: list[np.ndarray]) -> None:
+    """Draw names and charges at the first free position, from outward on."""
+    centres, half = view.flat(m.positions_body), view.half.max()
     height = FONT * 1.25 / 72 * 2 * half / (INCHES * 0.96)
-    for i in sorted(
-        range(len(radius)), key=lambda i: (m.masses[i] > 0, -np.linalg.norm(centres[i]))
-    ):
+    points, inner = np.array(taken).reshape(-1, 2), 0.8 * radius[:, None]
+    lows, highs = np.vstack([points, centres - inner]), np.vstack([points, centres + inner])
+    for i in np.lexsort((-np.linalg.norm(centres, axis=1), m.masses > 0)):
         text = f"{m.site_names[i]} {m.charges[i]:+.5g}" if m.charges[i] else m.site_names[i]
         size = np.array([0.56 * height * len(text), height])
         x, y = centres[i]
         outward = np.arctan2(y, x) if np.hypot(x, y) > 1e-6 * half else -np.pi / 2
-        boxes = np.array(taken).reshape(-1, 4)  # left, bottom, right, top
-        best = None
-        for gap in (0.02, 0.08, 0.16, 0.26, 0.38, 0.52):
-            for step in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6, 7, -7, 8):
-                angle = outward + step * np.pi / 8
-                way = np.array([np.cos(angle), np.sin(angle)])
-                centre = centres[i] + way * (radius[i] + gap * half) + way * size / 2
-                low, high = centre - size / 2, centre + size / 2
-                cost = ((low < boxes[:, 2:]) & (boxes[:, :2] < high)).all(axis=1).sum()
-                cost += (
-                    np.linalg.norm(np.clip(centres, low, high) - centres, axis=1) < radius
-                ).sum()
-                cost += 10 * (np.abs([low, high]).max() > 0.99 * half)
-                if best is None or cost < best[0]:
-                    best = (cost, centre, low, high, gap)
-            if best[0] == 0:
-                break
-        _, centre, low, high, gap = best
-        taken.append((*low, *high))
-        if gap > 0.02:
-            near = np.clip(centres[i], low, high)
-            axes.plot(*np.array([centres[i], near]).T, color=FAINT, lw=0.7, zorder=6.4)
-        style = {
-            "color": INK,
-            "fontsize": FONT,
-            "ha": "center",
-            "va": "center",
-            "parse_math": False,
-        }
-        axes.text(*centre, text, zorder=9, **style)
+        gap, step = np.array([*product(GAPS, STEPS)]).T[..., None]
+        way = np.hstack([np.cos(outward + step * np.pi / 8), np.sin(outward + step * np.pi / 8)])
+        middle = centres[i] + way * (radius[i] + gap * half + size / 2)
+        low, high = middle - size / 2, middle + size / 2
+        covers = (low[:, None] < highs) & (lows < high[:, None])
+        outside = np.abs([low, high]).max(axis=(0, 2)) > 0.99 * half
+        best = (covers.all(axis=2).sum(axis=1) + 10 * outside).argmin()
+        lows, highs = np.vstack([lows, low[best]]), np.vstack([highs, high[best]])
+        if gap[best] > GAPS[0]:
+            line = [centres[i], np.clip(centres[i], low[best], high[best])]
+            view.axis.plot(*np.array(line).T, color=FAINT, lw=0.7, zorder=6.4)
+        style = {"ha": "center", "va": "center", "parse_math": False, "zorder": 9}
+        view.axis.text(*middle[best], text, color=INK, fontsize=FONT, **style)

@@ -1,4 +1,4 @@
-// The film of molecules: chemiscope draws a frame, which is unpacked when it is first shown.
+// The animation of molecules: chemiscope draws a frame, which is unpacked when it is first shown.
 "use strict";
 (async () => {
   const data = rigidmdData("film-data"), times = [...rigidmdArray(data.time, Float64Array)];
@@ -55,4 +55,4 @@
   });
   window.rigidmd.viewer = viewer;
   window.rigidmd.ready = performance.now();
-})().catch((error) => { document.getElementById("film-readout").textContent = `The film cannot be shown: ${error.message}`; });
+})().catch((error) => { document.getElementById("film-readout").textContent = `The animation cannot be shown: ${error.message}`; });

@@ -1,30 +1,26 @@
-"""The template of all pages: one self-contained HTML file, readable on a phone, in the dark and in
-print."""
+"""The template and the writer of all pages: one self-contained HTML file, readable on a phone, in
+the dark and in print."""
 
 import html
-import io
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rigidmd.core.files import write_text
-from rigidmd.figures.save import save_figure, settings
-from rigidmd.figures.style import (
-    COOL,
-    FAINT,
-    INK,
-    WARM,
-    curve_style,
-    drawing,
-)
+from rigidmd.figures.style import DARK_PALETTE, FAINT, PALETTE, curve_style, drawing
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 
 
 def read_asset(name: str) -> str:
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+    """A script or a style of this package, with the colours of figures."""
+    text = Path(__file__).with_name(name).read_text(encoding="utf-8")
+    for kind, palette in (("light", PALETTE), ("dark", DARK_PALETTE)):
+        colors = ";".join(f"--{color}:{digits}" for color, digits in palette.items())
+        text = text.replace(f"--palette:{kind}", colors)
+    return text
 
 
 STYLE = read_asset("page.css")
@@ -37,19 +33,17 @@ class PagePart(NamedTuple):
     legend: str  # HTML
     usage: str  # how to use it
     data: dict[str, Any]  # for the scripts: JSON values and arrays
-    notes: list[str]
     scripts: list[str]
 
 
-def page(title: str, parts: Iterable[str], head: str = "") -> str:
-    """A whole page of HTML parts under a title (plain text). `head` is added to its head: more
-    style or scripts."""
+def page(title: str, parts: Iterable[str], style: str = "") -> str:
+    """A whole page of HTML parts under a title (plain text), with more style."""
     title_html, body = html.escape(title), "\n".join(part for part in parts if part)
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8">\
 <meta name="viewport" content="width=device-width,initial-scale=1">\
 <title>{title_html}</title>
-<style>{STYLE}</style>{head}</head>
+<style>{STYLE}{style}</style></head>
 <body>
 <h1>{title_html}</h1>
 {body}
@@ -57,10 +51,11 @@ def page(title: str, parts: Iterable[str], head: str = "") -> str:
 """
 
 
-def write_page(path: Path, make: Callable[[], str]) -> None:
-    """Write a page with figures; see `figures.style.drawing`. Raises OutputError."""
+def write_page(path: Path, title: str, parts: Iterable[str], style: str = "") -> None:
+    """Write a page of parts, which may be made while it is written; see `figures.style.drawing`.
+    Raises OutputError."""
     with drawing(path):
-        write_text(path, make())
+        write_text(path, page(title, parts, style))
 
 
 def section(title: str, *parts: str, anchor: str = "") -> str:
@@ -136,17 +131,12 @@ def code(text: str) -> str:
 def figure(drawn, salt: str, about: str) -> str:
     """A figure of Matplotlib as part of a page, whose colours it takes. salt: another one for each
     figure of a page."""
-    stream = io.StringIO()
-    drawn.patch.set_visible(False)
-    for axis in drawn.axes:
-        axis.patch.set_visible(False)
-    with settings({"svg.fonttype": "none", "svg.hashsalt": salt}):
-        save_figure(drawn, stream, format="svg", metadata={"Date": None, "Creator": None})
-    text = stream.getvalue()
-    svg = text[text.index("<svg") :].replace(
-        "<svg", f'<svg role="img" aria-label="{html.escape(about)}"', 1
-    )
-    for color, name in ((INK, "ink"), (FAINT, "faint"), (COOL, "cool"), (WARM, "warm")):
+    for part in (drawn, *drawn.axes):
+        part.patch.set_visible(False)
+    text = drawn.data("svg", 0, fonttype="none", hashsalt=salt).decode()
+    label = f'<svg role="img" aria-label="{html.escape(about)}"'
+    svg = text[text.index("<svg") :].replace("<svg", label, 1)
+    for name, color in (PALETTE | {"faint": FAINT}).items():
         svg = svg.replace(color, f"var(--{name})")
     return svg
 

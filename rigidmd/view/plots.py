@@ -3,9 +3,8 @@ live ones."""
 
 import time as clock
 from collections.abc import Sequence
-from itertools import cycle
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -13,17 +12,10 @@ from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import BODY_COLUMNS, MATRIX, Column, Samples
 from rigidmd.engines.system import System
+from rigidmd.figures.panels import Panel, draw_rows, panels, stack, timeline
 from rigidmd.figures.picture import Picture
 from rigidmd.figures.run import run_figures
-from rigidmd.figures.style import (
-    COLORS,
-    FAINT,
-    INK,
-    new_figure,
-    open_axis,
-    shown_range,
-    thin_series,
-)
+from rigidmd.figures.style import new_figure
 from rigidmd.io.progress import DisplayArea, in_notebook
 from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.record import Record
@@ -35,134 +27,21 @@ from rigidmd.view.page import figure as figure_part
 
 #: Inches: narrow, to be readable on a phone.
 WIDTH, HEIGHT = 4.4, 2.3
-#: Errors of exactly 0 are drawn at this value.
-FLOOR = 1e-17
-
-
-class Panel(NamedTuple):
-    """Curves on one axis: a title with the unit, (label, values) each; logarithmic or not."""
-
-    title: str
-    curves: list[tuple[str, np.ndarray]]
-    log: bool = False
-
-
-def panels(record: Record) -> list[Panel]:
-    all_panels = _body_panels(record) if record.is_body else _molecular_panels(record)
-    return [panel for panel in all_panels if panel.curves]
-
-
-def _molecular_panels(record: Record) -> list[Panel]:
-    columns, n, shown = record.columns, len(record.system.model.species), record.moving
-
-    def curves(per: int = 1, **labels: str) -> list[tuple[str, np.ndarray]]:
-        recorded = [
-            name for name in labels if name in columns and np.isfinite(columns[name][shown]).any()
-        ]
-        return [(labels[name], columns[name] / per) for name in recorded]
-
-    panel_list = [
-        Panel(
-            "temperature (K)",
-            curves(temperature_translation="translation", temperature_rotation="rotation"),
-        ),
-        Panel("potential energy (kJ/mol per molecule)", curves(n, potential="")),
-        Panel(
-            "drift of the conserved energy in a stage (kJ/mol per molecule)", curves(n, drift="")
-        ),
-        Panel("pressure (bar)", curves(pressure_bar="")),
-    ]
-    if "density" in columns and np.ptp(np.nan_to_num(columns["density"])) > 0:
-        panel_list.append(Panel("density (g/cm³)", curves(density="")))
-        panel_list.append(Panel("edges of the box (Å)", curves(a="a", b="b", c="c")))
-    return panel_list
-
-
-def _body_panels(record: Record) -> list[Panel]:
-    columns = record.columns
-    panel_list = []
-    if "theta" in columns:
-        panel_list.append(Panel("θ (°)", [("", np.degrees(columns["theta"]))]))
-        for name, key in (
-            ("φ", "phi"),
-            ("ψ", "psi"),
-        ):  # one panel each: precession is much slower than spin
-            angle = np.unwrap(columns[key])
-            unit, size = ("turns", 2 * np.pi) if np.ptp(angle) > 2 * np.pi else ("°", np.pi / 180)
-            panel_list.append(Panel(f"{name} ({unit})", [("", angle / size)]))
-        omega = [("ω" + "₁₂₃"[k], columns[f"omega_body_{k + 1}"]) for k in range(3)]
-        panel_list.append(Panel("ω along the body's axes (rad/s)", omega))
-    if "x" in columns and any(np.ptp(columns[k]) > 0 for k in "xyz") and record.system.translates:
-        panel_list.append(Panel("centre of mass (m)", [(k, columns[k]) for k in "xyz"]))
-    parts = [
-        (name, columns[name]) for name in ("kinetic", "potential", "energy") if name in columns
-    ]
-    panel_list.append(Panel("energies (J)", parts))
-    known = [
-        name
-        for name, values in columns.items()
-        if name.endswith("_error") and np.isfinite(values).any()
-    ]
-    errors = [
-        (name.removesuffix("_error"), np.maximum(np.abs(columns[name]), FLOOR)) for name in known
-    ]
-    panel_list.append(
-        Panel(f"relative errors of what is conserved (0 is drawn at {FLOOR:.0e})", errors, log=True)
-    )
-    return panel_list
 
 
 def plots_part(record: Record) -> str:
-    """All plots as HTML. Attributes for the animation: data-left and data-right, the ends of the
-    time axis as fractions of the width, data-from and data-to, its limits."""
-    figures = []
-    for k, panel in enumerate(panels(record)):
-        figure = new_figure(WIDTH, HEIGHT)
-        axis = figure.subplots()
-        draw_panel(axis, record, panel)
-        axis.set_title(panel.title, loc="left", fontsize=9, color=INK)
-        axis.set_xlabel(f"time ({record.time_unit})", fontsize=8, color=INK)
-        svg = figure_part(figure, f"panel{k}", panel.title)  # sets the position of the axis
+    """All plots as HTML. Attributes for the animation: data-box, the ends of the axis as fractions
+    of the figure (left, right, top, bottom), data-from and data-to, the limits of its times."""
+    figures, times = [], timeline(record.system, record.columns)
+    for k, panel in enumerate(panels(record.system, record.columns)):
+        figure = new_figure(WIDTH, HEIGHT, layout=None)
+        (axis,) = draw_rows(figure, [[(times, panel)]], (0.0, 0.0, WIDTH, HEIGHT))
+        svg = figure_part(figure, f"panel{k}", panel.title)
         box, (left, right) = axis.get_position(), axis.get_xlim()
-        where = (
-            f'data-left="{box.x0:.5f}" data-right="{box.x1:.5f}" data-from="{left:.9g}"'
-            f' data-to="{right:.9g}"'
-        )
-        figures.append(f"<figure {where}>{svg}</figure>")
+        ends = " ".join(f"{end:.5f}" for end in (box.x0, box.x1, 1 - box.y1, 1 - box.y0))
+        limits = f'data-from="{left:.9g}" data-to="{right:.9g}"'
+        figures.append(f'<figure data-box="{ends}" {limits}>{svg}</figure>')
     return f'<div class="plots">{"".join(figures)}</div>'
-
-
-def draw_panel(axis, record: Record, panel: Panel) -> None:
-    """Draw the curves of a panel, without minimisations, with the beginnings of stages."""
-    shown, ranges = record.moving, []
-    time, stages = record.time[shown], record.columns.get("stage", np.zeros(len(shown)))[shown]
-    for color, (label, values) in zip(cycle(COLORS), panel.curves, strict=False):
-        axis.plot(*thin_series(time, values[shown], 600), color=color, lw=0.9, label=label or None)
-        ranges.append(None if panel.log or record.is_body else shown_range(values[shown], stages))
-    if panel.log:
-        axis.set_yscale("log")
-    else:
-        axis.ticklabel_format(axis="y", useOffset=False)
-    if None not in ranges:
-        axis.set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
-    for k in np.flatnonzero(stages[1:] != stages[:-1]):
-        axis.axvline(time[k], color=FAINT, lw=0.6, ls=":")
-    axis.margins(x=0)
-    open_axis(axis, labelsize=8)
-    if len(panel.curves) > 1:
-        axis.legend(
-            frameon=False,
-            fontsize=8,
-            loc="upper left",
-            bbox_to_anchor=(1.0, 1.02),
-            handlelength=1.2,
-            borderaxespad=0.2,
-            labelcolor=INK,
-        )
-
-
-#: Inches: width of a figure, height of a panel, height of labels around the panels.
-FIGURE_WIDTH, PANEL_HEIGHT, FIGURE_MARGIN = 7.2, 2.0, 0.6
 
 
 def record_of(
@@ -209,14 +88,10 @@ def check_names(names: Sequence[str], described: dict[str, Column], figures: Any
     known = [name for name, column in described.items() if column.unit and name != MATRIX]
     for name in (name for name in names if name not in known):
         if name in described:
-            raise KeyError(
-                f"column {name!r} has {'matrices' if name == MATRIX else 'text'}, which are not"
-                " plotted"
-            )
-        hint = (
-            did_you_mean(name, [*known, *figures]) or f"; there are {', '.join([*known, *figures])}"
-        )
-        raise KeyError(f"no column {name!r}{hint}")
+            kind = "matrices" if name == MATRIX else "text"
+            raise KeyError(f"column {name!r} has {kind}, which are not plotted")
+        others = f"; there are {', '.join([*known, *figures])}"
+        raise KeyError(f"no column {name!r}{did_you_mean(name, [*known, *figures]) or others}")
 
 
 def columns_figure(
@@ -226,27 +101,15 @@ def columns_figure(
     units: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
         units.setdefault(described[name].unit, []).append(name)
-    figure = new_figure(
-        FIGURE_WIDTH, PANEL_HEIGHT * len(units) + FIGURE_MARGIN, title=record.scene.name
-    )
-    axes = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, (unit, members) in zip(axes, units.items(), strict=True):
-        title = axis_label(members[0], unit) if len(members) == 1 else ""
-        suffix = "" if unit == "1" else f"{' ' * bool(title)}({unit})" if title else unit
-        curves = [(axis_label(name, unit), record.columns[name]) for name in members]
-        draw_panel(
-            axis, record, Panel("", [(label, np.abs(y) if log else y) for label, y in curves], log)
-        )
-        if len(members) > 1:
-            axis.legend(frameon=False, fontsize=8, labelcolor=INK)
-        axis.set_ylabel(f"{title}{suffix}", fontsize=9, color=INK)
-    axes[-1].set_xlabel(f"time ({record.time_unit})", fontsize=9, color=INK)
-    return figure
-
-
-def axis_label(name: str, unit: str) -> str:
-    """The name of a column without its unit, for an axis: pressure_bar is the pressure in bar."""
-    return name.removesuffix(f"_{unit}").replace("_", " ")
+    times = timeline(record.system, record.columns)
+    rows = []
+    for unit, members in units.items():
+        labels = [name.removesuffix(f"_{unit}").replace("_", " ") for name in members]
+        values = [record.columns[name] for name in members]
+        curves = [(label, np.abs(y) if log else y) for label, y in zip(labels, values, strict=True)]
+        title = ", ".join(labels) + (f" ({unit})" if unit != "1" else "")
+        rows.append([(times, Panel(title, curves, log))])
+    return stack(rows, record.scene.name)
 
 
 #: Default columns; for a body the first one that it has.
@@ -289,13 +152,13 @@ class LivePlot(Observer):
         if isinstance(scene, BodyScene):
             described, every = BODY_COLUMNS, not_none(scene.output.interval_s)
         else:
-            described, every = run.part.samples().described, scene.output.log_interval_ps
+            described, every = run._part.samples().described, scene.output.log_interval_ps
         self.interval = every if self._asked is None else self._asked
         check_names(self._columns, described)
         self._spot = DisplayArea() if in_notebook() else None
 
     def see(self, moment: Moment) -> None:
-        if self._spot is not None and clock.monotonic() >= self._due:
+        if clock.monotonic() >= self._due:
             self._draw()
 
     def end(self, run: Simulation, results: Results) -> None:
@@ -308,21 +171,17 @@ class LivePlot(Observer):
     def _draw(self) -> None:
         if self._spot is None:
             return
-        began, samples = clock.monotonic(), self._run.part.samples()
+        began, samples = clock.monotonic(), self._run._part.samples()
         if len(samples) < 2:
             return
         described = samples.described
-        default = (
-            MOLECULES if "drift" in described else [name for name in BODY if name in described][:1]
-        )
-        names = self._columns or default
+        names = self._columns or MOLECULES
+        if not self._columns and "drift" not in described:
+            names = [name for name in BODY if name in described][:1]
         check_names(names, described)
-        png, size = columns_figure(
-            record_of(self._run.system, samples, None, names), names, described
-        ).png()
-        self._spot.show(
-            {"image/png": png, "text/plain": f"{', '.join(names)} against time"},
-            {"image/png": size},
-        )
+        record = record_of(self._run.system, samples, None, names)
+        png, size = columns_figure(record, names, described).png()
+        text = f"{', '.join(names)} against time"
+        self._spot.show({"image/png": png, "text/plain": text}, {"image/png": size})
         now = clock.monotonic()
         self._due = now + max(self._pause, (now - began) * (1 / TIME_FRACTION - 1))

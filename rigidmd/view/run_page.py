@@ -10,13 +10,13 @@ import json
 import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rigidmd.analysis.curve_figure import curve_figure
 from rigidmd.analysis.files import read_results
 from rigidmd.assemble.describe import describe
-from rigidmd.core.files import write_text
 from rigidmd.core.shipped import Example, examples
 from rigidmd.core.statistics import format_with_error
 from rigidmd.engines.samples import BODY
@@ -43,10 +43,10 @@ from rigidmd.view.page import (
     figure,
     items,
     notes,
-    page,
     read_asset,
     section,
     table,
+    write_page,
 )
 
 REPORT = "report.html"
@@ -70,14 +70,17 @@ def write_report(folder: Path, path: Path) -> tuple[Path, list[str]]:
     """Write the page of the run in a folder. Returns its path, and notes on missing data. Raises
     OutputError."""
     record = read_record(folder)
-    write_text(path, page(f"{record.scene.name}: a run of rigidmd", parts(record)))
+    write_page(path, f"{record.scene.name}: a run of rigidmd", parts(record))
     return path, record.missing
 
 
 def parts(record: Record, animation: str = "") -> Iterator[str]:
     """The parts of the page, as HTML. animation : HTML with the plots"""
+    lines = describe(record.scene, user_code=False).splitlines()  # the output of `rigidmd check`
+    known = {line.strip() for line in lines}
+    warnings = [note for note in (record.summary or {}).get("notes", ()) if note not in known]
     yield f'<p class="faint">{html.escape(record.scene.in_short)}</p>'
-    yield notes([*record.missing, *(record.summary or {}).get("notes", ())])
+    yield notes([*record.missing, *warnings])
     yield animation
     if record.is_body:
         yield section("Results", _body_table(record))
@@ -87,7 +90,6 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
         yield section("Plots", plots.plots_part(record))
     yield section("Analyses", *_analyses(record))
     yield section("Stability margins", _margins(record))
-    lines = describe(record.scene, user_code=False).splitlines()  # the output of `rigidmd check`
     start = lines.index("left out:") if "left out:" in lines else len(lines)
     end = next(
         (k for k in range(start + 1, len(lines)) if not lines[k].startswith("  ")), len(lines)
@@ -115,32 +117,26 @@ def _analyses(record: Record) -> Iterator[str]:
     """Results of `rigidmd analyse`: values, analyses left out, figures."""
     rows, left_out, figures, phrases = [], [], [], []
     for result, phrase in read_results(record.folder):
-        for value in result.values:
-            text = "" if value.value is None else format_with_error(value.value, value.error)
-            time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
-            rows.append(
-                [
-                    value.name,
-                    text,
-                    value.unit if text and value.unit != "1" else "",
-                    time,
-                    value.note,
-                ]
-            )
         if not result.values and not result.curves:
             left_out += [f"{result.name}: {note}" for note in result.notes]
-        else:
-            phrases.append(phrase)
+            continue
+        phrases.append(phrase)
+        for value in result.values:
+            if value.value is None:
+                left_out.append(f"{value.name}: {value.note}")
+                continue
+            text = format_with_error(value.value, value.error)
+            time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
+            unit = "" if value.unit == "1" else value.unit
+            rows.append([value.name, text, unit, time, value.note])
         for curve in result.curves:
             svg = figure(curve_figure(curve), f"analysis-{curve.file}", curve.label)
-            figures.append(f"<figure>{svg}</figure>")
-    if not rows and not figures and not left_out:
-        return
-    text = "; ".join(dict.fromkeys(phrases))
-    yield (
-        f'<p class="faint">Values ± one standard error, of {html.escape(text)}.</p>' if text else ""
-    )
-    yield table(["", "value", "unit", "correlation time (ps)", ""], rows, words=True)
+            caption = html.escape(f"{result.name}: {curve.label}")
+            figures.append(f"<figure>{svg}<figcaption>{caption}</figcaption></figure>")
+    if phrases:
+        text = html.escape("; ".join(dict.fromkeys(phrases)))
+        yield f'<p class="faint">Values ± one standard error, of {text}.</p>'
+    yield table(["", "value", "unit", "correlation time (ps)", "note"], rows, words=True)
     yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
     yield "<p>Skipped:</p>" + items(left_out) if left_out else ""
 
@@ -158,36 +154,20 @@ def _body_table(record: Record) -> str:
 def _margins(record: Record) -> str:
     """Time steps compared with the longest stable ones."""
     summary, rows = record.summary or {}, []
-    if record.is_body:
-        stages = [{"name": record.scene.name, **summary}] if summary else []
-        step, stable, unit = "timestep_s", "stable_timestep_s", "s"
-    else:
-        stages, step, stable, unit = (
-            summary.get("stages", ()),
-            "timestep_fs",
-            "stable_timestep_fs",
-            "fs",
-        )
+    unit = "s" if record.is_body else "fs"
+    whole: list[dict[str, Any]] = [{"name": record.scene.name} | summary]
+    stages = whole if record.is_body else summary.get("stages", ())
     for stage in stages:
-        if stage.get(step) and stage.get(stable):
-            fraction = stage[step] / stage[stable]
-            kind, word = next(entry[1:] for entry in MARGINS if fraction <= entry[0])
-            sizes = [f"{stage[step]:g}", f"{stage[stable]:.3g}", f"{100 * fraction:.2g} %"]
+        step, stable = stage.get(f"timestep_{unit}"), stage.get(f"stable_timestep_{unit}")
+        if step and stable:
+            kind, word = next(entry[1:] for entry in MARGINS if step / stable <= entry[0])
+            sizes = [f"{step:g}", f"{stable:.3g}", f"{100 * step / stable:.2g} %"]
             rows.append([stage["name"], *sizes, Raw(f'<span class="{kind}">{word}</span>')])
-    more = (
-        ""
-        if record.is_body
-        else " Errors of averages grow long before: see `rigidmd accuracy --averages`."
-    )
-    text = (
-        '<p class="faint">The longest stable step is estimated from the fastest motion at the'
-        f" start.{more}</p>"
-    )
-    return (
-        table(["stage", f"step ({unit})", f"longest stable ({unit})", "fraction", ""], rows) + text
-        if rows
-        else ""
-    )
+    titles = ["stage", f"step ({unit})", f"longest stable ({unit})", "fraction", ""]
+    text = "The longest stable step is estimated from the fastest motion at the start."
+    if not record.is_body:
+        text += " Errors of averages grow long before: see `rigidmd accuracy --averages`."
+    return table(titles, rows) + f'<p class="faint">{text}</p>' if rows else ""
 
 
 #: Fraction of the longest stable step up to which a verdict holds.
@@ -233,13 +213,14 @@ def _repeat(record: Record) -> Iterator[str]:
 
 
 VIEW = "view.html"
-FILM_STYLE = f"<style>{read_asset('film.css')}</style>"
+FILM_STYLE = read_asset("film.css")
 BAR = """<div class="bar noprint"><button id="film-play" aria-label="play">▶</button>
 <button id="film-back" aria-label="a frame back">◂</button>
 <button id="film-on" aria-label="a frame on">▸</button>
 <input id="film-slider" type="range" min="0" max="100000" value="0" aria-label="time">
 <span id="film-clock" class="clock"></span>
-<select id="film-speed" aria-label="speed"></select></div>"""
+<select id="film-speed" aria-label="speed"></select></div>
+<div class="readout" id="film-readout"></div>"""
 
 
 def animation_of(
@@ -256,41 +237,28 @@ def write_view(folder: Path, path: Path) -> tuple[Path, list[str]]:
     record = read_record(folder)
     animation = animation_of(record)
     first, *others = animation_parts(record, animation)
-    write_text(
-        path,
-        page(
-            f"{record.scene.name}: the animation of a run",
-            [*parts(record, first), *others],
-            FILM_STYLE,
-        ),
-    )
+    title = f"{record.scene.name}: the animation of a run"
+    write_page(path, title, [*parts(record, first), *others], FILM_STYLE)
     return path, [*record.missing, *animation.notes]
 
 
 def animation_parts(record: Record, animation: BodyAnimation | MoleculeAnimation) -> list[str]:
     """The animation next to the plots, its data and its scripts, as HTML."""
     part = animation.page_part()
-    left = (
-        f'<div><div class="stage">{part.picture}{BAR}<div class="readout"'
-        ' id="film-readout"></div></div>'
-    )
-    left += f'<p class="legend">{part.legend}</p><p class="faint noprint">{part.usage}</p>'
-    left += f'<div class="faint">{items(part.notes)}</div></div>'
 
     def packed(values: np.ndarray) -> str:
         """The bytes of an array, as base64."""
-        return base64.b64encode(
-            np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
-        ).decode()
+        little_endian = values.dtype.newbyteorder("<")
+        return base64.b64encode(values.astype(little_endian).tobytes()).decode()
 
-    data = json.dumps(
-        part.data, ensure_ascii=False, separators=(",", ":"), allow_nan=False, default=packed
-    )
-    data = data.replace("<", "\\u003c")
+    data = json.dumps(part.data, separators=(",", ":"), allow_nan=False, default=packed)
     if any("</script" in text.lower() for text in part.scripts):
         raise ValueError("a script has the end tag of its element")
+    data = data.replace("<", "\\u003c")
     return [
-        f'<div class="film">{left}{plots.plots_part(record)}</div>',
+        f'<div class="film"><div><div class="stage">{part.picture}{BAR}</div>'
+        f'<p class="legend">{part.legend}</p><p class="faint noprint">{part.usage}</p>'
+        f'<div class="faint">{items(animation.notes)}</div></div>{plots.plots_part(record)}</div>',
         f'<script type="application/json" id="film-data">{data}</script>',
         *(f"<script>{text}</script>" for text in part.scripts),
     ]
@@ -307,11 +275,11 @@ SHOWN = (
 )
 #: Inches of a picture, and the fraction of the run that has passed in it.
 INCHES, RUN_FRACTION = 3.2, 0.62
-STYLE = """<style>
-.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,250px),1fr));gap:1rem}
+STYLE = """.cards{display:grid;grid-template-columns:repeat(auto-fill,
+minmax(min(100%,250px),1fr));gap:1rem}
 .cards a{color:inherit;text-decoration:none;border:1px solid var(--line);border-radius:8px;
 padding:.6rem;display:block}
-.cards img{width:100%;background:#fff;border-radius:4px}.cards b{display:block}</style>"""
+.cards img{width:100%;background:#fff;border-radius:4px}.cards b{display:block}"""
 
 
 def selected_bodies(names: list[str]) -> list[Example]:
@@ -344,8 +312,8 @@ def write_gallery(
         Simulation(scene, run, force).run()
         target, _ = write_view(run, folder / f"{example.name}.html")
         animation, figure = BodyAnimation(read_record(run)), new_figure(INCHES, INCHES, layout=None)
-        begin, end = animation.time[[0, -1]]
-        animation.draw(figure.add_axes((0, 0, 1, 1)), float(begin + RUN_FRACTION * (end - begin)))
+        moment = np.interp(RUN_FRACTION, (0, 1), animation.time[[0, -1]])
+        animation.draw(figure.add_axes((0, 0, 1, 1)), float(moment))
         picture = base64.b64encode(figure.png()[0]).decode()
         cards.append(
             f'<a href="{target.name}"><img alt="" src="data:image/png;base64,{picture}">'
@@ -353,5 +321,5 @@ def write_gallery(
         )
     about = '<p class="faint">Each picture links to the animation of the body.</p>'
     index = [about, f'<div class="cards">{"".join(cards)}</div>', code(command)]
-    write_text(folder / INDEX, page("Tops, gyroscopes and a stone", index, STYLE))
+    write_page(folder / INDEX, "Tops, gyroscopes and a stone", index, STYLE)
     return folder / INDEX

@@ -47,7 +47,7 @@ def toml(value) -> str:
 
 
 def run_rigidmd(case: dict, folder: Path, steps: int) -> float:
-    """Steps/s of `rigidmd run`. The scene says what the molecules are, their start and the cutoff,
+    """Steps/s of `rigidmd run`. The scene states what the molecules are, their start and the cutoff,
     and no more."""
     work, start = (
         WORKLOADS[case["start"]],
@@ -123,7 +123,7 @@ def main() -> None:
             for (
                 engine,
                 run,
-            ) in RUNS.items():  # compiles, and tells how many steps fit into the seconds
+            ) in RUNS.items():  # compiles, and shows how many steps fit into the seconds
                 steps[engine] = max(
                     PILOT_STEPS, round(options.seconds * run(case, Path(folder), PILOT_STEPS))
                 )

@@ -3,11 +3,11 @@ errors.
 
     python tests/benchmarks/densities.py --models spce,tip4p2005 --duration 2000
 
-512 molecules, cut-off 9 Å, PME, dispersion beyond the cut-off in the pressure, steps of 2 fs, one
+512 molecules, cutoff 9 Å, PME, dispersion beyond the cutoff in the pressure, steps of 2 fs, one
 thread each, both at once. rigidmd: baoab with Langevin friction, stochastic cell rescaling, mixed
 precision. GROMACS: leap-frog, v-rescale, C-rescale. Both measure the kinetic energy where harmonic
-motions leave no error of the step in positions. Errors are standard errors by pymbar's statistical
-inefficiency; the first tenth of each run is left out.
+motions leave no time-step error in positions. Errors are standard errors by pymbar's statistical
+inefficiency; the first tenth of each run is omitted.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from rigidmd import Scene, Simulation
 
 COUNT, CUTOFF, TEMPERATURE, STEP = 512, 9.0, 298.15, 2.0  # Å, K, fs
 EVERY = 0.1  # ps between samples
-RELAXATION = 0.4  # ps, of the barostats: shorter than the volume's own, near 1 ps, so that it hardly lengthens it
+RELAXATION = 0.4  # ps, of the barostats: shorter than the time of the volume, near 1 ps, so that it barely lengthens it
 
 
 def scene(model: str, *stages: dict) -> dict:

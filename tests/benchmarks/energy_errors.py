@@ -1,10 +1,10 @@
-"""Whether `integrator = "auto"` keeps the error of the energy that it is asked for: rms error over
+"""Whether `integrator = "auto"` keeps the error of the energy that it is requested: rms error over
 the target.
 
     python tests/benchmarks/energy_errors.py --scenes water,smooth --targets 1e-4,1e-6 --ps 10
 
-The error is that of the whole stage and of its first 0.1 and 1 ps, in the target; beside them the
-force evaluations of the pilots in those of the stage.
+The error is the value of the whole stage and of its first 0.1 and 1 ps, in the target; next to them the
+force evaluations of the pilots in the values of the stage.
 """
 
 import argparse

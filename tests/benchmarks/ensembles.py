@@ -1,9 +1,9 @@
-"""What ensembles cost: steps a second with each thermostat and barostat, against constant energy.
+"""What ensembles cost: steps per second with each thermostat and barostat, against constant energy.
 
     python tests/benchmarks/ensembles.py --workloads W1,W2 --rounds 5
 
 All move the same start in steps of 2 fs in mixed precision, in turns in one process, and nobody
-looks. The thermostats and barostats have their default strengths. The workloads are those of
+observations. The thermostats and barostats have their default strengths. The workloads are those of
 peers.py.
 """
 
@@ -35,7 +35,7 @@ WARM_UP = 200
 def measure(
     workload: str, folder: Path, rounds: int, seconds: float
 ) -> dict[str, tuple[float, float]]:
-    """Of each ensemble its median steps a second, and the median of the ratios to constant
+    """Of each ensemble its median steps per second, and the median of the ratios to constant
     energy."""
     stages = [{"duration_ps": 1.0, "timestep_fs": 1e3 * STEP} | stage for stage in STAGES.values()]
     data = WORKLOADS[workload].scene(precision="mixed", stages=stages, output={"trajectory": False})

@@ -1,11 +1,11 @@
-"""From which size a hand-over to LAMMPS is worth it: steps a second of one scene on rigidmd and on
+"""From which size a hand-over to LAMMPS is worth it: steps per second of one scene on rigidmd and on
 LAMMPS, one core and two.
 
     python tests/benchmarks/hand_over.py
 
 SPC/E with PME at 1e-5, 9 Å, 2 fs, as `rigidmd run` runs it, in double precision and mixed. Engines
-take turns, three times; medians. The last column is the number of LAMMPS' ranks that would be as
-fast as two threads here, if it went on to scale as from one rank to two.
+take rotates, three times; medians. The last column is the number of LAMMPS' ranks that would be as
+fast as two threads here, if it continued to scale as from one rank to two.
 """
 
 import json
@@ -49,7 +49,7 @@ RUNS = {
 
 
 def speed(scene: Path, options: tuple[str, ...]) -> float:
-    """Steps a second of a run."""
+    """Steps per second of a run."""
     with tempfile.TemporaryDirectory() as folder:
         command = [
             sys.executable,

@@ -4,7 +4,7 @@ vector width.
     python tests/benchmarks/kernels.py --workloads W1,W2,W3 --bits 512,256,128
 
 The liquids are those of peers.py. A lane is one site of a vector that meets another site; it is
-useful if the two are inside the cut-off and act on one another. Times are the shortest of many
+useful if the two are inside the cutoff and act on one another. Times are the shortest of many
 calls, since other programs can only add to them. A kernel is called several times by compiled code,
 and what a call from Python takes with no kernel at all, some milliseconds to find the types of so
 many arrays, is taken off. Each width runs in a process of its own, since it is chosen when the
@@ -45,21 +45,21 @@ ENDINGS = ("shift", "switch", "smooth_switch")
 
 @njit
 def run_blocks(code, name, content, blocks, times):
-    """All blocks of a task on this thread, so many times."""
+    """All blocks of a task on this thread, this many times."""
     for _ in range(times):
         call_blocks(code, literally(name), pack_arguments(content), blocks)
 
 
 @njit
 def run_once(code, name, content, times):
-    """A task that has one block, so many times."""
+    """A task that has one block, this many times."""
     for _ in range(times):
         call(code, literally(name), pack_arguments(content))
 
 
 @njit
 def entries_that_matter(pairs):
-    """Entries of the rows' shells that can hold a site inside the cut-off."""
+    """Entries of the rows' shells that can hold a site inside the cutoff."""
     found, moved = 0, largest_displacement(pairs)
     clusters, per_cluster = pairs.clusters, len(pairs.row_end) * 4 // len(pairs.clusters.origin)
     for block in range(len(pairs.needed)):
@@ -85,7 +85,7 @@ def milliseconds(function, *arguments) -> float:
 
 
 def useful_pairs(term: PairWorkspace, state: State) -> int:
-    """Pairs of sites of different molecules inside the cut-off."""
+    """Pairs of sites of different molecules inside the cutoff."""
     edges, group = state.cell.diagonal(), term.pairs.group
     position = np.empty((len(group), 3))
     compute_site_positions(term.sites, state, position)
@@ -102,7 +102,7 @@ def lanes_of(term: PairWorkspace) -> int:
 
 
 def measure(job: dict) -> list[dict]:
-    """Rows of both tables for one workload, precision and ending, in this process' vector width."""
+    """Rows of both tables for one workload, precision and truncation, in this process' vector width."""
     work = WORKLOADS[job["workload"]]
     folder = start_of(job["workload"], "own").sites_file.parent
     scene = Scene.from_dict(work.scene(job["ending"], precision=job["precision"]), folder)
@@ -141,7 +141,7 @@ def builds_of(term: NamedTuple) -> int:
 
 
 def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
-    """Times of the kernels of a law between pairs, whose list is built anew every so many steps."""
+    """Times of the kernels of a pair potential between pairs, whose list is built again every this many steps."""
     load = no_load(state)
     pairs, blocks = term.pairs, len(term.pairs.needed)
     code, lists, content = (

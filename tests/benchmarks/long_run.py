@@ -6,7 +6,7 @@ double and mixed precision.
     python tests/benchmarks/long_run.py            # draws the figure and prints the table
 
 writes rigidmd/docs/evidence/data/long_run.json and rigidmd/docs/images/long_run.png. A curve is the
-root mean square change of a quantity in n steps, over all pairs of samples n steps apart in one
+root mean square change of a quantity in n steps, over all pairs of samples n steps from each other in one
 run: a random walk of rounding errors has slope 1/2 (Brouwer 1937), a drift slope 1, a bounded error
 slope 0. The change over the whole run is one number besides.
 """
@@ -92,7 +92,10 @@ QUANTITIES = {
     "energy": "energy / kinetic energy",
     "QTQ": "orthogonality, QQᵀ per entry",
 }
-FINE, COARSE = 1000, 20_000  # samples 10 steps apart at the start, then evenly over the run
+FINE, COARSE = (
+    1000,
+    20_000,
+)  # samples 10 steps from each other at the start, then evenly over the run
 FITTED = (1e3, 1e7)  # steps between which a slope is fitted
 
 

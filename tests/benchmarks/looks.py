@@ -1,4 +1,4 @@
-"""What looks cost: steps a second of a run with its default output, against those of the engine
+"""What observations cost: steps per second of a run with its default output, against the values of the engine
 alone.
 
     python tests/benchmarks/looks.py --workloads 216,W1,W2,W3 --rounds 5
@@ -6,7 +6,7 @@ alone.
 Both move the same start at constant energy in steps of 2 fs, in one process: the engine takes half
 of its steps before each run and half of them after it, in one piece as in peers.py. The run is that
 of `rigidmd run`: a log, a trajectory, a checkpoint, the estimate of the longest stable step. Its
-time is that of its stages, looks included; the figure and the summary come after it. 216: the
+time is that of its stages, observations included; the figure and the summary come after it. 216: the
 smallest box of scaling.py; the others are those of peers.py.
 """
 
@@ -30,7 +30,7 @@ WARM_UP = 200
 
 
 def scene(name: str, folder: Path, duration: float, **output) -> Scene:
-    """The scene of a workload, for so many ps."""
+    """The scene of a workload, for this many ps."""
     more = {
         "precision": "mixed",
         "stages": [{"duration_ps": duration, "timestep_fs": 1e3 * STEP}],
@@ -42,7 +42,7 @@ def scene(name: str, folder: Path, duration: float, **output) -> Scene:
 
 
 def measure(name: str, folder: Path, rounds: int, seconds: float) -> dict:
-    """Median steps a second of the engine and of the run, and the median of their ratios."""
+    """Median steps per second of the engine and of the run, and the median of their ratios."""
     alone = Simulation(scene(name, folder, 1.0, trajectory=False))
     engine, state = alone.engine, alone.state
 

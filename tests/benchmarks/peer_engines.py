@@ -5,7 +5,7 @@
 reads FOLDER/job.json, and FOLDER/result.json is what came of it; a job with `forces` true also
 leaves the forces on molecules at its start, (n, 3) in kJ/mol/Å, in FOLDER/forces.npy. `peers.py`
 writes the jobs. A job is: engine, cores, cpus (their numbers), timestep_fs, steps, every (steps
-between looks at the energy; 0 for none), options (of the curve), workload (cut-off and so on),
+between observations at the energy; 0 for none), options (of the curve), workload (cutoff and so on),
 sites (file of the start) and, for rigidmd, its scene.
 """
 
@@ -22,12 +22,12 @@ from pathlib import Path
 import numpy as np
 
 KCAL = 4.184  # kJ
-#: Variables that say how many threads there are and how they wait. An engine is told its cores by
+#: Variables that state how many threads there are and how they wait. An engine is given its cores by
 #: its own option.
 THREADING = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "NUMBA_NUM_THREADS")
 WARM_UP = 2  # steps before the clock starts, where the engine does not time its own loop
 OPENMM_TOLERANCE = (
-    2.5e-4  # of PME; the default is 5e-4. Forces are then about as good as those of the others
+    2.5e-4  # of PME; the default is 5e-4. Forces are then about as good as the values of the others
 )
 DSF_ALPHA = 0.2  # 1/Å, damping of LAMMPS's coul/dsf
 
@@ -41,13 +41,13 @@ class Failed(Exception):
 
 
 def environment() -> dict[str, str]:
-    """What a user has in his shell: none of what this shell, or rigidmd when it was imported, says
+    """What a user has in his shell: none of what this shell, or rigidmd when it was imported, states
     about threads."""
     return {key: value for key, value in os.environ.items() if key not in THREADING}
 
 
 def program(name: str, beside: str = sys.executable) -> str:
-    """Path of a program, beside another one or on PATH. Raises Absent."""
+    """Path of a program, next to another one or on PATH. Raises Absent."""
     found = shutil.which(name, path=str(Path(beside).parent)) or shutil.which(name)
     if found is None:
         raise Absent(f"there is no {name} on PATH")
@@ -65,13 +65,13 @@ def call(command: list, folder: Path, text: str | None = None) -> str:
 
 
 def leapfrog_velocity(job: dict, sites: dict) -> np.ndarray:
-    """Velocities half a step before the start, which a leap-frog integrator begins with; Å/ps."""
+    """Velocities half a step before the start, which a leap-frog integrator starts with; Å/ps."""
     return sites["velocity"] - 0.5e-3 * job["timestep_fs"] * sites["kick"]
 
 
-# Each engine: version() says which one there is, and run(job, sites, folder) returns
-#   seconds, timed_steps: of stepping; time_ps, total, potential, kinetic: looks, kJ/mol; settings:
-#   what it says it did
+# Each engine: version() states which one there is, and run(job, sites, folder) returns
+#   seconds, timed_steps: of stepping; time_ps, total, potential, kinetic: observations, kJ/mol; settings:
+#   what it states it did
 
 
 class Rigidmd:
@@ -177,7 +177,7 @@ class OpenMM:
             seconds += time.perf_counter() - began
             if job["every"]:
                 look()
-        # platforms/cpu/src/CpuKernels.cpp: a quarter of the cut-off is added; the list lasts until
+        # platforms/cpu/src/CpuKernels.cpp: a quarter of the cutoff is added; the list lasts until
         # half of that is gone
         settings = (
             f"list {12.5 * cutoff:.4g} Å, rebuilt when an atom has moved {1.25 * cutoff:.3g} Å"
@@ -411,14 +411,14 @@ def sites_of(system, state) -> dict:
 
 
 def pieces(job: dict) -> list[int]:
-    """Steps between looks; all of them at once where there are none."""
+    """Steps between observations; all of them at once where there are none."""
     every = job["every"] or job["steps"]
     whole, rest = divmod(job["steps"], every)
     return [every] * whole + ([rest] if rest else [])
 
 
 def series(job: dict, looks: list) -> dict:
-    """Energies (kJ/mol) at evenly spaced times (ps); a last look out of step is left out."""
+    """Energies (kJ/mol) at evenly spaced times (ps); a last observation out of step is omitted."""
     looks = looks[: job["steps"] // job["every"] + 1] if job["every"] else looks[:1]
     total, potential, kinetic = np.array(looks).T.tolist()
     times = (np.arange(len(looks)) * job["every"] * job["timestep_fs"] * 1e-3).tolist()
@@ -507,7 +507,7 @@ def lammps_data(sites: dict) -> str:
 
 def busy(cpus: list[int]) -> float:
     """Seconds that these processors have worked for anyone since they started; 0 where the system
-    does not say."""
+    does not state."""
     try:
         lines = [line.split() for line in Path("/proc/stat").read_text().splitlines()]
     except OSError:

@@ -16,15 +16,15 @@ rounds.
 Accuracy: NVE at several time steps, for the same seconds of computing each, so that a faster engine
 is watched for longer and its drift known better.
 
-The share of the cores' time that other programs took stands beside every reading. On one core it is
-taken off, since an engine that is alone on its core does nothing while another program has it
+The fraction of the cores' time that other programs took stands next to every reading. On one core it is
+taken off, since an engine that is alone on its core waits while another program has it
 (readings with 38 % taken came within 3 % of undisturbed ones). On several cores threads wait for
 one another and no such correction is possible: run it on a quiet machine; --patience waits for
 quiet, --tries repeats what was disturbed, and what still was is marked.
 
-The potential energy of the start, as each engine computes it, is held against this engine's own
-with the same treatment of the cut-off; with PME, the forces on molecules too, against an Ewald sum.
-The treatments differ where an engine cannot do what the workload says: OpenMM has no
+The potential energy of the start, as each engine computes it, is compared with the energy of this engine
+with the same treatment of the cutoff; with PME, the forces on molecules too, against an Ewald sum.
+The treatments differ where an engine cannot do what the workload states: OpenMM has no
 potential-shift (it truncates Lennard-Jones, or switches it), LAMMPS no reaction field (damped
 shifted Coulomb instead, checked against its formula). Leap-frog engines (GROMACS, OpenMM) are given
 the velocities of half a step before.
@@ -69,26 +69,26 @@ from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 HERE = Path(__file__).resolve().parent
 SPEED_STEP = 2.0  # fs
-PILOT_STEPS = 30  # of the run that tells how many steps fit into the seconds asked for
+PILOT_STEPS = 30  # of the run that shows how many steps fit into the seconds requested
 FEWEST_STEPS = 64
 LOOKS = 128  # at the energy in a run
 SHORTEST_SPAN = 0.25  # ps of a run of accuracy, however slow: the noise of the energy needs some librations to show
-CLOSEST_LOOKS = 4  # steps; a look costs some engines a force evaluation with energies
+CLOSEST_LOOKS = 4  # steps; a observation costs some engines a force evaluation with energies
 DIVERGED = 0.5  # of the kinetic energy
-SAME_ENERGY = 1e-2  # kJ/mol per molecule: single precision leaves 0.003 of water's; other cut-offs differ by more
+SAME_ENERGY = 1e-2  # kJ/mol per molecule: single precision leaves 0.003 of water's; other cutoffs differ by more
 DISTURBED = (
-    0.05  # share of its cores that other programs took, from which on a run is a disturbed one
+    0.05  # fraction of its cores that other programs took, from which on a run is a disturbed one
 )
 LONGEST_RUN = 1800  # s, after which an engine is taken to hang
-SWITCH = 1.0  # Å before the cut-off, where a switch begins
+SWITCH = 1.0  # Å before the cutoff, where a switch starts
 PRECISIONS = {
     "mixed": "pairs float32, sums and state float64"
 }  # of rigidmd, other than what is usual
-#: Of PME: rms error of forces on sites, in e²/Å². By this engine's estimate GROMACS's defaults
+#: With PME: rms error of forces on sites, in e²/Å². By this engine's estimate GROMACS's defaults
 #: (ewald-rtol 1e-5, spacing 1.2 Å, order 4), which every engine with the same keys gets, make 8e-5,
 #: nearly all of it on the grid.
 PME_ACCURACY = 5e-5
-EWALD_ACCURACY = 1e-7  # e²/Å², of the forces that those of PME are held against
+EWALD_ACCURACY = 1e-7  # e²/Å², of the forces that those of PME are compared with
 COPIES = 2  # the start is grown from this many copies along each edge of a small box that has come to rest
 
 NITROGEN_14 = {  # two centres of 14 u
@@ -119,7 +119,7 @@ class Workload:
     cutoff: float
     permittivity: float  # of the reaction field
     nstlist: int  # what suits GROMACS best at 2 fs
-    timesteps: tuple[float, ...]  # of accuracy unless others are asked for, fs
+    timesteps: tuple[float, ...]  # of accuracy unless others are requested, fs
     reference: str  # file of --start reference; empty: it has none, and the start is grown
     pme: bool = False  # smooth particle mesh Ewald in place of the reaction field
     liquid: float | None = (
@@ -249,7 +249,7 @@ class Curve:
         return PRECISIONS.get(self.options.get("precision")) or ENGINES[self.engine].precision
 
     def treatment(self, work: Workload) -> str:
-        """How its forces end at the cut-off, in words."""
+        """How its forces end at the cutoff, as text."""
         if work.pme:
             own = f", PME, error of forces {PME_ACCURACY:g} e²/Å²"
             theirs = {
@@ -321,7 +321,7 @@ CURVES = (
 class Start:
     """A start on disk, and its potential energy as this engine has it."""
 
-    sites_file: Path  # what the others read; beside it start.npz, a state of rigidmd
+    sites_file: Path  # what the others read; next to it start.npz, a state of rigidmd
     kinetic: float  # kJ/mol per molecule
     potentials: dict[
         str, float
@@ -329,12 +329,12 @@ class Start:
     force: np.ndarray | None  # (n, 3) on molecules, kJ/mol/Å, by an Ewald sum; where there is PME
 
     def expected(self, curve: Curve) -> float:
-        """What an engine should find with its treatment of the cut-off."""
+        """What an engine should find with its treatment of the cutoff."""
         return self.potentials[curve.lennard_jones] + self.potentials[curve.coulomb]
 
 
 def grow(work: Workload, folder: Path) -> None:
-    """A start of one's own, folder/start.npz: a small box from lattice to liquid, copies of it, and
+    """A start of user-defined, folder/start.npz: a small box from lattice to liquid, copies of it, and
     2 ps more."""
     quiet = {
         "thermostat_time_ps": 0.1,
@@ -391,7 +391,7 @@ def take(work: Workload, folder: Path) -> None:
 def write_start(
     folder: Path, work: Workload, position, velocity, rotation, momentum_body, edge=None
 ) -> None:
-    """A state as `[structure] file` reads it (output/state.py); the box is that of the workload
+    """A state as `[structure] file` reads it (output/state.py); the box is the value of the workload
     unless given."""
     names = [work.molecules.get("model") or work.molecules["name"]]
     np.savez(
@@ -432,7 +432,7 @@ def describe(work: Workload, folder: Path) -> Start:
         "switch",
         "smooth_switch",
         "shift",
-    ):  # as the workload says comes last, and is what goes on
+    ):  # as the workload states comes last, and is what continues
         simulation = Simulation(Scene.from_dict(work.scene(ending, accuracy=1e-6), folder))
         seen = observe(simulation.system, simulation.engine, simulation.state)
         energies = {
@@ -477,7 +477,7 @@ def ewald_forces(work: Workload, folder: Path) -> np.ndarray:
 
 def damped_shifted(sites: dict, cutoff: float) -> float:
     """Energy (kJ/mol) of Fennell & Gezelter 2006, J. Chem. Phys. 124, 234104, eq. 19, with LAMMPS's
-    own energy."""
+    energy."""
     n, s = sites["position"].shape[:2]
     edges = sites["edges"]
     points = np.mod(sites["position"].reshape(-1, 3), edges)
@@ -496,7 +496,7 @@ def damped_shifted(sites: dict, cutoff: float) -> float:
 
 @dataclass
 class Bench:
-    """Everything that is asked for, and what has been found."""
+    """Everything that is requested, and what has been found."""
 
     workloads: list[str]
     curves: list[Curve]
@@ -757,7 +757,7 @@ def speed_table(rows: list[dict]) -> str:
 
 
 def draw(path: Path, name: str, found: dict) -> None:
-    """Energy rms and drift against seconds per ps, a curve an engine; what each one is beside
+    """Energy rms and drift against seconds per ps, a curve an engine; what each one is next to
     it."""
     rows = [row for row in found["rows"] if row["workload"] == name and not row["diverged"]]
     figure = Figure(figsize=(13, 6.6), layout="constrained")
@@ -829,7 +829,7 @@ def drift_seen(row: dict) -> bool:
 
 
 def label(curve: Curve, rows: list[dict], name: str) -> str:
-    """Name, precision, cut-off and list of a curve, as the legend has it."""
+    """Name, precision, cutoff and list of a curve, as the legend has it."""
     settings = list(
         dict.fromkeys(re.split(", constraint|; pme", row["settings"])[0] for row in rows)
     )
@@ -857,7 +857,7 @@ def caption(rows: list[dict], found: dict) -> str:
 
 
 def machine() -> str:
-    """The processor, in words."""
+    """The processor, as text."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(

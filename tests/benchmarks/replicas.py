@@ -3,7 +3,7 @@
     python tests/benchmarks/replicas.py --systems 216,27,6 --replicas 8 --rounds 3
 
 Replicas differ in their seeds. They run one after another on all cores; at once in this process by
-`run_together`, a thread each; and by `rigidmd sweep --replicas` in processes, a thread each. Beside
+`run_together`, a thread each; and by `rigidmd sweep --replicas` in processes, a thread each. Next to
 them stands what the engine alone takes on one core, times the cores. 216 and 27: liquid SPC/E in a
 box; 6: a cluster in vacuum. Steps of 2 fs at constant temperature in mixed precision, a line of the
 log every 0.1 ps, all files but the trajectory and figures. A time is that of all replicas from the
@@ -45,7 +45,7 @@ TO_REST, WARM_UP = 1.0, 500  # ps, steps
 
 
 def data(name: str, duration: float, seed: int = 1) -> dict:
-    """A replica for so many ps."""
+    """A replica for this many ps."""
     stage = {
         "ensemble": "nvt",
         "temperature_K": TEMPERATURES[name],
@@ -62,9 +62,9 @@ def data(name: str, duration: float, seed: int = 1) -> dict:
 
 
 def bare_speed(name: str, seconds: float) -> float:
-    """Steps a second of the engine alone on one core, from a state that has come to rest."""
+    """Steps per second of the engine alone on one core, from a state that has come to rest."""
     simulation = Simulation(Scene.from_dict(data(name, TO_REST)))
-    simulation.take_threads(1)
+    simulation._take_threads(1)
     state = simulation.run().state
     engine, scheme = simulation.engine, row(simulation.system, 0)
 

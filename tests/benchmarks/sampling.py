@@ -5,13 +5,13 @@ OpenMM.
     python tests/benchmarks/sampling.py runs/sampling --collect --json sampling.json --figure
     sampling.png
 
-512 SPC/E waters at 298.15 K; cut-off 9 Å, Lennard-Jones switched over the last Å with tail
+512 SPC/E waters at 298.15 K; cutoff 9 Å, Lennard-Jones switched over the last Å with tail
 corrections, PME. All engines have the same forces, one thread, and otherwise the settings that
 their users have: the step, the integrator and the coupling differ. Averages: U, the height of the
 first peak of g(r) of oxygens and D at 0.997 g/cm³, and the density at 1 bar.
 
 Many short runs (6 ps to relax, 48 ps sampled) from a few starts, in rounds of all methods and
-steps; a step of 1 fs in one round of four. Each leaves a small file, so that the command goes on
+steps; a step of 1 fs in one round of four. Each leaves a small file, so that the command continues
 where it was stopped, and several of them share the work: `--next N` does N runs and fails if none
 is left. Then, of each average,
 
@@ -20,7 +20,7 @@ is left. Then, of each average,
 - the variance of a mean over 1 ns: from the scatter of blocks of 6 ps (for D of 24 ps) about the
   mean of their run, one for Langevin dynamics and one for thermostats of the whole system; those of
   single methods are printed;
-- the cost: seconds of a processor (user and system) per ns, a median over runs. It hardly depends
+- the cost: seconds of a processor (user and system) per ns, a median over runs. It barely depends
   on what else runs.
 
 The total error after a time t is sqrt(bias² + variance / t); of the square of a bias that of its
@@ -211,7 +211,7 @@ def simulate(data: dict, folder: Path, **options) -> Simulation:
 
 
 def make_starts(folder: Path) -> None:
-    """STARTS states of the liquid, 12 ps apart, in folder/start0, start1, ...: start.npz of
+    """STARTS states of the liquid, 12 ps from each other, in folder/start0, start1, ...: start.npz of
     rigidmd, sites.npz of all sites."""
     from peers import WORKLOADS, write_start
 
@@ -485,7 +485,7 @@ def read(folder: Path) -> dict[tuple[str, str, float], list[dict]]:
 
 
 def analyse(name: str, found: dict) -> dict:
-    """Of a quantity its limit, those of the engines alone, variances of methods over that of all,
+    """For a quantity its limit, the values of the engines alone, variances of methods over that of all,
     and points."""
     quantity = QUANTITIES[name]
     values = {

@@ -4,7 +4,7 @@ time and memory.
     python tests/benchmarks/scaling.py --copies 1,2,4,8,17 --cores 1,2 --precision mixed --figure
     scaling.png
 
-The liquid is W1 of peers.py: cut-off 9 Å, reaction field, steps of 2 fs at constant energy. A box
+The liquid is W1 of peers.py: cutoff 9 Å, reaction field, steps of 2 fs at constant energy. A box
 of 216 waters that has come to rest is copied along each edge, so every size is the same liquid.
 Each size runs in a process of its own, so that its peak of memory is its own. The start is the time
 from the state on disk to the end of the first step. Lists are built before the clock of the steps
@@ -33,7 +33,7 @@ from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW
 
 WORK = WORKLOADS["W1"]
-UNIT = 216  # molecules in the box that is copied, whose edge is little more than twice the cut-off
+UNIT = 216  # molecules in the box that is copied, whose edge is little more than twice the cutoff
 EDGE = WORK.edge * (UNIT / WORK.count) ** (1 / 3)  # Å
 STEP = 2e-3  # ps
 FEWEST_STEPS = 20
@@ -41,7 +41,7 @@ SECONDS = 3.0
 
 
 def scene(copies: int, precision: str, **changes) -> dict:
-    """The scene of so many copies along each edge."""
+    """The scene of this many copies along each edge."""
     molecules = [{**WORK.molecules, "count": UNIT * copies**3}]
     return WORK.scene(
         box={"lengths_A": EDGE * copies}, molecules=molecules, precision=precision, **changes
@@ -64,7 +64,7 @@ def relax(folder: Path) -> None:
 
 
 def speed(engine, state, row, steps: int) -> float:
-    """Steps a second of an engine that moves a state, in one piece."""
+    """Steps per second of an engine that moves a state, in one piece."""
     began = time.perf_counter()
     engine.advance(state, row, STEP, int(state.step[NOW]) + steps)
     return steps / (time.perf_counter() - began)

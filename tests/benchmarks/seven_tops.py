@@ -33,7 +33,7 @@ for k, (cell, title) in enumerate(zip(figure.subplots(2, 4).flat, TITLES, strict
     ).run()
     angle = np.linspace(0, 2 * np.pi, 400)
     x, y, up = results["q13"], results["q23"], results["q33"]
-    zoom = 1.0 if k != 2 else 3.0  # waves are small: a third of the circle
+    zoom = 1.0 if k != 2 else 3.0  # k-vectors are small: a third of the circle
     cell.plot(np.cos(angle), np.sin(angle), color="#8a8f99", lw=0.6)
     for theta in (results["theta"].min(), results["theta"].max()):
         cell.plot(

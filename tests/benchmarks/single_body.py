@@ -123,7 +123,7 @@ def main():
 
 
 def speed(system, start, top):
-    """Steps a second of velocity Verlet, one call of a million steps."""
+    """Steps per second of velocity Verlet, one call of a million steps."""
     spent = []
     for _ in range(REPEATS):
         engine, state = system.engine(), start.copy()

@@ -1,5 +1,5 @@
 """What a custom pair potential costs, compared with the built-in Lennard-Jones with the same
-ending, in turns.
+truncation, in turns.
 
 python tests/benchmarks/user_potential.py [molecules] [rounds]
 """

@@ -29,7 +29,7 @@ MN_PER_M = 100 * BAR
 BIN = 0.5  # Å
 #: The density of the vapour is at most this fraction of the density of the liquid.
 LARGEST_RATIO = 0.5
-#: Least number of dipoles in a bin for a mean, as a fraction of the largest number in a bin.
+#: Minimum number of dipoles in a bin for a mean, as a fraction of the largest number in a bin.
 FEWEST = 1e-3
 
 

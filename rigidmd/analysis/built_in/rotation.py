@@ -55,7 +55,7 @@ def orientation(runs: Runs) -> AnalysisResult:
     """C_l(t) = <P_l(u(0)·u(t))>, l = 1, 2, of principal axes u, correlation times (ps), rotational
     diffusion (1/ps).
 
-    Axes are those of `rigidmd models NAME`, ascending in inertia; a linear molecule has one.
+    Axes are those of `rigidmd models NAME`, ascending in inertia. A linear molecule has one.
     Rotational diffusion is the slope of the mean squared rotation about an axis of the body, summed
     over frames. Raises OutputError.
     """
@@ -124,7 +124,7 @@ def _axis_along_dipole(kind: Kind) -> int | None:
 
 
 def _integral(values: np.ndarray, interval: float) -> float:
-    """Integral of a correlation function that begins at 1: to where it has decayed, then an
+    """Integral of a correlation function that starts at 1: to where it has decayed, then an
     exponential."""
     below = np.flatnonzero(values < TAIL)
     end = int(below[0]) if len(below) else len(values) - 1

@@ -55,9 +55,19 @@ def rdf(
     """g(r) of two sites, elements or species (centres of mass); default: all pairs of elements, in
     mixtures of species.
 
-    g counts pairs of different molecules against the number that there are, so that it is 1 far
-    away in a small box
-    too. largest, width : Å. Each frame has its own cell. Raises OutputError.
+    g is normalised by the number of pairs of different molecules, so it tends to 1 in a small box
+    too. Each frame has its own cell.
+
+    Parameters
+    ----------
+    largest
+        Largest distance, Å; default: half the box, at most 10 Å
+    width
+        Width of a bin, Å
+
+    Raises
+    ------
+    OutputError
     """
     if not runs.has_box:
         raise OutputError("g(r) needs a box, which defines a density to compare with")
@@ -231,7 +241,7 @@ def _errors_over_blocks(
     frames: np.ndarray, conclude: Callable[[np.ndarray], np.ndarray], samples: float
 ) -> Measured:
     """Two estimates of the standard errors of what follows from the mean of frames (f, ...): the
-    scatter of blocks of frames, whose means are noisy, and that of leaving out one block after
+    scatter of blocks of frames, whose means are noisy, and that of omitting one block after
     another, which sees few of the jumps.
 
     samples : frames for each independent one
@@ -263,9 +273,19 @@ def _first_top(g: np.ndarray) -> int:
 
 @built_in("structure factor S(k) of the centres of mass", position=20)
 def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> AnalysisResult:
-    """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box;
-    without a name, of the
-    centres of all molecules. largest : 1/Å. Raises OutputError."""
+    """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box.
+
+    Parameters
+    ----------
+    name
+        A site, an element or a species; default: the centres of all molecules
+    largest
+        Largest wave vector, 1/Å
+
+    Raises
+    ------
+    OutputError
+    """
     if not runs.has_box:
         raise OutputError("a structure factor needs a box")
     thinned, notes = _thinned(runs, ENOUGH_MOLECULES_K)

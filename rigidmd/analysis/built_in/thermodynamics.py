@@ -38,12 +38,12 @@ UNITS = {
     "c_v": Unit("J/(mol K)", 1e-3 * KJ_PER_MOL),
     "gamma_V": Unit("bar/K", BAR),
 }
-#: Least length of a run in correlation times: variances then have errors of 20 %, and a smaller
+#: Minimum length of a run in correlation times: variances then have errors of 20 %, and a smaller
 #: variance that comes with a smaller error does not matter.
 LEAST = 100.0
 #: Relative change of moments for the derivatives of what follows from them.
 CHANGE = 1e-5
-#: A running estimate begins at this fraction of a run, and has this number of points at most.
+#: A running estimate starts at this fraction of a run, and has this number of points at most.
 FIRST, POINTS = 0.05, 500
 #: Largest fraction of a variance that the subtraction of the mean is taken to hide.
 MOST_HIDDEN = 0.5

@@ -102,8 +102,14 @@ def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResul
     """D of each species (1e-9 m²/s) from the slope of its mean squared displacement, and D of an
     infinite box.
 
-    viscosity_mPa_s : for the correction of Yeh and Hummer; default: from the pressure tensor of the
-    run, if any Raises OutputError.
+    Parameters
+    ----------
+    viscosity_mPa_s
+        For the correction of Yeh and Hummer; default: from the pressure tensor of the run, if any
+
+    Raises
+    ------
+    OutputError
     """
     if viscosity_mPa_s is not None and not 0 < viscosity_mPa_s < np.inf:
         raise OutputError(f"viscosity_mPa_s must be a number above 0, not {viscosity_mPa_s:g}")

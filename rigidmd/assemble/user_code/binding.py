@@ -9,6 +9,11 @@ from typing import Any
 import numpy as np
 
 from rigidmd.assemble.defaults import with_momentum_removal
+from rigidmd.assemble.user_code.body_pairs import (
+    BodyPairPotential,
+    bind_body_pairs,
+    potential_of_scene,
+)
 from rigidmd.assemble.user_code.compiled import describe_compile_error
 from rigidmd.assemble.user_code.cutoffs import check_cutoff
 from rigidmd.assemble.user_code.force import (
@@ -32,8 +37,9 @@ from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.parts import sum_of_tails
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.forces import CustomForce
+from rigidmd.scene.forces import BodyForce, CustomForce
 from rigidmd.scene.molecules import name_of
+from rigidmd.scene.validation import not_none
 
 #: Names that a force cannot have, and what they are.
 RESERVED = {
@@ -46,25 +52,24 @@ RESERVED = {
 
 
 def custom_forces(scene: MolecularScene) -> list[Any]:
-    """The objects of [[forces.custom]]. Raises SceneError with all errors."""
+    """The objects of [[forces.custom]] and [[forces.bodies]]. Raises SceneError with all errors."""
     forces, faults = [], []
-    for k, entry in enumerate(scene.forces.custom):
+    for where, entry in scene.forces.added.items():
         try:
-            forces.append(_custom(scene, entry, f"forces.custom.{k}"))
+            forces.append(_custom(scene, entry, where))
         except (SceneError, ValueError) as error:
             module = entry.module if isinstance(error, SceneError) else None
-            faults += [
-                (module, f"forces.custom.{k}: {fault}")
-                for fault in getattr(error, "errors", [error])
-            ]
+            faults += [(module, f"{where}: {fault}") for fault in getattr(error, "errors", [error])]
     if faults:  # each file once
         messages = {module or fault: fault for module, fault in reversed(faults)}
         raise SceneError(scene.source, list(messages.values())[::-1])
     return forces
 
 
-def _custom(scene: MolecularScene, entry: CustomForce, key: str) -> Any:
-    if entry.module is None:
+def _custom(scene: MolecularScene, entry: CustomForce | BodyForce, key: str) -> Any:
+    if entry.module is None and isinstance(entry, BodyForce):
+        return potential_of_scene(entry)
+    if entry.module is None and isinstance(entry, CustomForce):
         pairs = {pair.sites: pair.parameters for pair in entry.pairs}
         table = None if entry.table is None else scene.path(entry.table)
         return pair_potential(
@@ -79,20 +84,20 @@ def _custom(scene: MolecularScene, entry: CustomForce, key: str) -> Any:
             switch_start_A=entry.switch_start_A,
             name=entry.name,
         )
-    module = trusted_module(scene.path(entry.module), f"{key}.module")
-    if not hasattr(module, entry.name):
+    module = trusted_module(scene.path(not_none(entry.module)), f"{key}.module")
+    if not hasattr(module, entry.label):
         public_names = [name for name in vars(module) if not name.startswith("_")]
-        hint = did_you_mean(entry.name, public_names) or ""
-        raise ValueError(f"name: {entry.module} has no {entry.name}{hint}")
-    made = getattr(module, entry.name)
+        hint = did_you_mean(entry.label, public_names) or ""
+        raise ValueError(f"name: {entry.module} has no {entry.label}{hint}")
+    made = getattr(module, entry.label)
     if isinstance(made, type) or (callable(made) and not isinstance(made, Force)):
         try:
             made = made(**entry.parameters)
         except (Exception, SystemExit) as error:  # user code may raise anything
-            raise ValueError(f"{entry.name}(...) raised {describe_error(error)}") from error
+            raise ValueError(f"{entry.label}(...) raised {describe_error(error)}") from error
     elif entry.parameters:
         raise ValueError(
-            f"parameters would do nothing: {entry.name} is an object, which is not called"
+            f"parameters would have no effect: {entry.label} is an object, which is not called"
         )
     return made
 
@@ -120,7 +125,7 @@ def with_user_code(system: System) -> System:
     with all errors."""
     scene, (added, thermostat) = system.scene, system.scene.user_code
     forces = [*custom_forces(scene), *added]
-    force_names = [*(entry.name for entry in scene.forces.custom), *map(name_of, added)]
+    force_names = [*(entry.label for entry in scene.forces.added.values()), *map(name_of, added)]
     names = distinct(force_names, [*system.terms, *system.constants])
     errors = [
         f"{name} is {RESERVED[name]}; name the force otherwise"
@@ -184,6 +189,8 @@ def bind(force: Any, system: System, name: str) -> BoundTerm:
     SceneError."""
     if isinstance(force, PairPotential):
         return bind_pair_potential(force, system)
+    if isinstance(force, BodyPairPotential):
+        return bind_body_pairs(force, system)
     if isinstance(force, Force):
         return bind_force(force, system, name)
     return _bind_term(force, system)

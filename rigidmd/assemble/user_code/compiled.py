@@ -18,7 +18,6 @@ from rigidmd.engines.cpu.engine import CompileError
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.scene.molecules import name_of
-from rigidmd.units import FEMTOSECOND
 
 #: Largest difference by rounding between a change of the kinetic energy and of the ledger, as a
 #: fraction of the energy.
@@ -67,7 +66,7 @@ def _thermostats(system: System) -> Iterator[tuple[str, Any, float]]:
         thermostat = system.user_thermostat(k)
         if type(thermostat) in THERMOSTATS:
             name = f"thermostat {name_of(system.thermostat)}"
-            yield name, thermostat, float(stage.timestep_fs * FEMTOSECOND)
+            yield name, thermostat, float(stage.step)
 
 
 def _faults(name: str, function: Callable, arguments: tuple) -> list[str]:

@@ -56,10 +56,6 @@ class Force:
     """A force on molecules in plain Python: derive a class from it and define `on_sites` or
     `on_molecules`.
 
-    class Spring(rigidmd.Force):
-        def on_molecules(self, state):
-            return 0.5 * (state.position**2).sum(), -state.position
-
     It is called once for every new set of positions, between steps of the compiled loop; a
     `compiled_force` is faster.
 
@@ -75,6 +71,12 @@ class Force:
     energy_noise
         Random error of its energies, kJ/mol, for the comparison with its forces at the start of a
         run
+
+    Examples
+    --------
+        class Spring(rigidmd.Force):
+            def on_molecules(self, state):
+                return 0.5 * (state.position**2).sum(), -state.position
     """
 
     name: ClassVar[str | None] = None
@@ -99,7 +101,7 @@ class Force:
         """(energy in kJ/mol, forces (n, 3) on centres of mass in kJ/mol/Å, torques (n, 3) in
         kJ/mol, body frame).
 
-        Torques may be left out. A fourth value is the molecular virial (3, 3), kJ/mol.
+        Torques may be omitted. A fourth value is the molecular virial (3, 3), kJ/mol.
         """
         raise NotImplementedError
 

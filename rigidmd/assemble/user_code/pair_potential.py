@@ -81,8 +81,6 @@ def pair_potential(
 ) -> PairPotential:
     """A pair potential between sites of different molecules, for `Simulation(scene, forces=[...])`.
 
-    rigidmd.pair_potential("A*exp(-B*r) - C/r**6", {"Ar": {"A": 1.6e6, "B": 4.4, "C": 6.2e3}})
-
     Parameters
     ----------
     energy
@@ -114,6 +112,10 @@ def pair_potential(
     Raises
     ------
     ValueError
+
+    Examples
+    --------
+        rigidmd.pair_potential("A*exp(-B*r) - C/r**6", {"Ar": {"A": 1.6e6, "B": 4.4, "C": 6.2e3}})
     """
     if (energy is None) == (table is None):
         raise ValueError("needs an energy or a table")

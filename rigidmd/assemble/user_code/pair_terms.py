@@ -66,7 +66,9 @@ def cutoff_scheme(potential: PairPotential, system: System) -> CutoffScheme:
     name: TruncationName = potential.truncation or forces.truncation
     if "switch" not in name:
         if potential.switch_start_A is not None:
-            raise PairPotentialError(f"switch_start_A would do nothing with truncation = {name!r}")
+            raise PairPotentialError(
+                f"switch_start_A would have no effect with truncation = {name!r}"
+            )
         return CutoffScheme(cutoff, name, truncation_of(name, cutoff, cutoff))
     of_scene = forces.switch_start_A if cutoff == system.cutoff else None
     start = potential.switch_start_A or of_scene or default_switch_start(name, cutoff)
@@ -89,7 +91,7 @@ def bound_pair(
 ) -> BoundPair:
     """The potential with the parameters of a pair.
 
-    tail_without : the pairs inside molecules, which a tail correction leaves out; None without a
+    tail_without : the pairs inside molecules, which a tail correction omits; None without a
         tail correction
 
     Raises FormulaError, ArithmeticError, ValueError or TypeError, from the formula.

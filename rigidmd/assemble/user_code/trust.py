@@ -31,13 +31,16 @@ def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
     for path in unused_files(scene, paths):
         named = ", ".join(map(str, _modules(scene)))
         files = f"it names {named}" if named else "it names none"
-        what = f"is not a file that [[forces.custom]] of {scene.source} names by module"
+        what = (
+            "is not a file that [[forces.custom]] or [[forces.bodies]] of"
+            f" {scene.source} names by module"
+        )
         raise SceneError(option("trust"), [f"{path} {what}: {files}"])
 
 
 def unused_files(scene: Scene, paths: Iterable[str | Path]) -> list[str | Path]:
     """The trusted files that a scene does not run."""
-    contents = [_source(path, "forces.custom") for path in _modules(scene)]
+    contents = [_source(path, "forces") for path in _modules(scene)]
     return [path for path in paths if _source(Path(path), option("trust")) not in contents]
 
 

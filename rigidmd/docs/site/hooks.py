@@ -1,21 +1,18 @@
 """Hooks of MkDocs for the site: pages made from other files, live pages, and equations."""
 
 import html
-import inspect
 import re
 import subprocess
 import sys
 import tempfile
-from importlib import import_module
 from os.path import normpath
 from pathlib import Path
 
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
-from rigidmd.core.shipped import SECTIONS
+from rigidmd.core.shipped import GUIDES, SECTIONS
 
-README = Path(__file__).parents[3] / "README.md"
 #: Live pages: scene, options of the run.
 LIVE = {
     "heavy_top_3": (),
@@ -28,110 +25,41 @@ LIVE = {
         "output.trajectory_interval_ps=0.1",
     ),
 }
-API = ("rigidmd", "rigidmd.view", "rigidmd.analysis", "rigidmd.ase", "rigidmd.errors")
-CSS = """math {
-  font-family: "Latin Modern Math", "STIX Two Math", "Cambria Math", "DejaVu Math TeX Gyre", math;
-}
-.md-typeset math { font-size: 1.08em; }
-.md-typeset math mi[mathvariant^=bold] { font-weight: bold; }
-.md-typeset mtd[columnalign=right] { text-align: right; }
-.md-typeset mtd[columnalign=left] { text-align: left; }
-.md-typeset td:first-child code, .md-typeset th code { white-space: nowrap; }
-.md-typeset div.arithmatex { overflow-x: auto; overflow-y: hidden; padding: .3em 0; }
-.md-typeset .docstring { white-space: pre-line; }
-.md-typeset table:not([class]) td, .md-typeset table:not([class]) th {
-  padding: .5em .8em; min-width: 0;
-}
-"""
+SITE = Path(__file__).parent
+#: Pages with keys of scenes, each of which has an anchor.
+WITH_KEYS = ("reference/scene.md", "reference/body.md")
+HEADING_OR_KEY = re.compile(
+    r'<h[23] id="(?P<heading>[^"]+)"'
+    r"|(?P<row><tr>\s*)<td(?P<style>[^>]*)><code>(?P<key>\w+)</code>"
+)
 
 
 def on_config(config):
-    config.nav = [
-        {"Home": ["index.md"]},
-        *(
-            {folder.capitalize(): [f"{folder}/{name}.md" for name in names]}
-            for folder, names in SECTIONS.items()
-        ),
+    pages = {
+        folder: [f"{folder}/{name}.md" for name in names] for folder, names in SECTIONS.items()
+    }
+    pages["guides"] = [
+        {group: [f"guides/{name}.md" for name in names]} for group, names in GUIDES.items()
     ]
-    next(group["Reference"] for group in config.nav if "Reference" in group).append(
-        "reference/api.md"
-    )
+    pages["reference"].append("reference/api.md")
+    named = {"evidence": "Evidence", "start": "Start"}
+    config.nav = [
+        {"Home": "index.md"},
+        *({named.get(folder, folder.capitalize()): found} for folder, found in pages.items()),
+    ]
     return config
 
 
 def on_files(files, config):
-    front = README.read_text(encoding="utf-8").replace("rigidmd/docs/", "")
-    live = [f"[{name}](live/{name}.html)" for name in LIVE]
-    front += (
-        "\n## Live pages\n\nPages that `rigidmd view` wrote of shipped scenes:"
-        f" {', '.join(live)}.\n"
-    )
+    front = (SITE / "front.txt").read_text(encoding="utf-8")
     files.append(File.generated(config, "index.md", content=front))
-    files.append(File.generated(config, "reference/api.md", content=_api()))
-    files.append(File.generated(config, "site.css", content=CSS))
+    for name in ("site.css", "math.woff2", "math.OFL.txt"):
+        files.append(File.generated(config, name, abs_src_path=str(SITE / name)))
     for name in LIVE:
         files.append(
             File.generated(config, f"live/{name}.html", abs_src_path=str(_live_page(name)))
         )
     return files
-
-
-def _api() -> str:
-    """A page with every public name of the Python interface."""
-    lines = [
-        "# Python interface",
-        "",
-        "Every public class and function, from the docstrings of the package.",
-        "",
-    ]
-    for module in map(import_module, API):
-        lines += [f"## {module.__name__}", "", (module.__doc__ or "").partition("\n")[0], ""]
-        for name, member in (
-            (name, getattr(module, name)) for name in sorted(getattr(module, "__all__", ()))
-        ):
-            if not callable(member):
-                continue
-            lines += [*_entry("###", name, member), ""]
-            methods = (
-                vars(member).items()
-                if inspect.isclass(member) and not issubclass(member, Exception)
-                else ()
-            )
-            for method, found in methods:
-                if not method.startswith(("_", "model_")) and (
-                    callable(found) or isinstance(found, property)
-                ):
-                    lines += [*_entry("####", f"{name}.{method}", found), ""]
-    return "\n".join(lines)
-
-
-def _entry(rank: str, name: str, member: object) -> list[str]:
-    """Heading, signature and docstring of a class, function or property."""
-    function = getattr(member, "__func__", member)
-    try:
-        signature = "" if isinstance(member, property) else str(inspect.signature(function))
-    except ValueError:
-        signature = "(...)"
-    kind = "class " if inspect.isclass(member) else ""
-    text = html.escape(inspect.getdoc(member) or "")
-    text = re.sub(r"^(Parameters|Returns|Raises)\n-+$", r"<strong>\1</strong>", text, flags=re.M)
-    text = re.sub(r"^(`?\w[\w, `]*)\n(?=    )", _names_as_code, text, flags=re.M)
-    text = re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
-    signature = re.sub(r"rigidmd\.(?:\w+\.)*|'", "", signature)
-    return [
-        f"{rank} {name}",
-        "",
-        "```python",
-        f"{kind}{name}{signature}",
-        "```",
-        "",
-        f'<div class="docstring">{text}</div>',
-    ]
-
-
-def _names_as_code(names: re.Match) -> str:
-    """A line of names of a NumPy docstring, whose description follows."""
-    return f"<code>{names[1].replace('`', '')}</code>\n"
 
 
 def _live_page(name: str) -> Path:
@@ -159,8 +87,29 @@ def on_page_markdown(markdown, page, config, files):
     return re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", link, markdown)
 
 
+def _key_anchors(content: str) -> str:
+    """An anchor for each key in a table: #stages-timestep_fs below the heading `[[stages]]`."""
+    heading, known = "", set()
+
+    def anchor(found: re.Match) -> str:
+        nonlocal heading
+        if found["heading"]:
+            heading = found["heading"]
+            return found[0]
+        name = f"{heading}-{found['key']}"
+        if name in known:
+            return found[0]
+        known.add(name)
+        link = f'<a class="key" href="#{name}"><code>{found["key"]}</code></a>'
+        return f'{found["row"]}<td id="{name}"{found["style"]}>{link}'
+
+    return HEADING_OR_KEY.sub(anchor, content)
+
+
 def on_page_content(content, page, config, files):
-    """Equations in TeX become MathML."""
+    """Equations in TeX become MathML, and keys of scenes get anchors."""
+    if page.file.src_uri in WITH_KEYS:
+        content = _key_anchors(content)
 
     def equation(found: re.Match) -> str:
         tag, opening, tex = found[1], found[2], html.unescape(found[3])

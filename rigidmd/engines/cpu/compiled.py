@@ -177,8 +177,8 @@ class CompiledEngine(Engine):
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         workspaces = self._prepare(state)
         dispatcher = self._dispatcher("observations", workspaces)
-        load = dispatcher.load_for(state)
-        while status := compute_load_with_energies(dispatcher.bind(workspaces, state, load), *load):
+        copy, load = dispatcher.copy_and_load(state)
+        while status := compute_load_with_energies(dispatcher.bind(workspaces, copy, load), *load):
             workspaces = self._handle_status(status, state)
         return self._copies(load, dispatcher)
 
@@ -202,7 +202,7 @@ class CompiledEngine(Engine):
         }
 
     def _memory_by_owner(self) -> dict[str, dict[str, np.ndarray]]:
-        """Neighbour lists as last built, and forces at the present positions."""
+        """Neighbour lists as last built, and forces at the current positions."""
         arrays_of = self._checkpoint_arrays()
         if self.load is not None and self._last.is_current:
             arrays_of[LOAD] = self.load._asdict()

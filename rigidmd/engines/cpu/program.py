@@ -22,7 +22,7 @@ from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.forces.neighbors.sites import blocks_of
 from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES
 
-#: Kinds of flows besides kicks and drifts -> what they do.
+#: Kinds of flows in addition to kicks and drifts -> what they do.
 FLOWS = {
     THERMOSTAT: "thermostat",
     BAROSTAT: "barostat",

@@ -134,7 +134,7 @@ TRANSLATIONS = Translations(
 
 
 def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]:
-    """Write the files for a system that begins at a state, and return their names. Raises
+    """Write the files for a system that starts at a state, and return their names. Raises
     OutputError."""
     bodies = [gromacs_points(m) for m in view.system.species]
     stages = [
@@ -274,14 +274,14 @@ def _settings(view: ForceFieldView, k: int) -> str:
     cutoff = system.cutoff * NM
 
     def every(interval: float) -> int:
-        return max(1, round(interval * 1e3 / stage.timestep_fs))
+        return max(1, round(interval / stage.step))
 
     keeps = system.freedom_in(k).translation < 3 * len(system.model.species)
     interval = system.removes_momentum_every
     integrator, _ = TRANSLATIONS.of("thermostat")[stage.thermostat]
     settings: dict[str, object] = {
         "integrator": integrator,
-        "dt": f"{stage.timestep_fs * 1e-3:.12g}",
+        "dt": f"{stage.step:.12g}",
         "nsteps": stage.steps,
         "comm-mode": "Linear" if keeps else "None",
         "nstcomm": every(interval) if interval else 100,

@@ -404,13 +404,13 @@ def input_script(view: ForceFieldView) -> str:
     for k, stage in enumerate(system.scene.stages):
         if stage.is_minimisation:
             continue
-        every = max(1, round(output.log_interval_ps * 1e3 / stage.timestep_fs))
-        frames = max(1, round(output.trajectory_interval_ps * 1e3 / stage.timestep_fs))
+        every = max(1, round(output.log_interval_ps / stage.step))
+        frames = max(1, round(output.trajectory_interval_ps / stage.step))
         stage_fixes = fixes(view, k)
         lines += [
             "",
             f"# {in_comment(stage.label)}: {stage.duration:g} ps",
-            f"timestep {_num(stage.timestep_fs)}",
+            f"timestep {_num(stage.step_fs)}",
         ]
         lines += [*stage_fixes, f"thermo {every}"]
         if output.trajectory:

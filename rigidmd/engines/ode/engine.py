@@ -44,7 +44,7 @@ class OdeEngine(BodyEngine):
 
     The solver's variables are in `state.extra_variables`, and the rest of the state is computed
     from them. DOP853 and Radau step beyond the requested time, so for them these are (time and
-    length of the last step, variables at its begin, variables now, scales of all variables except
+    length of the last step, variables at its start, variables now, scales of all variables except
     the work). DOP853 resumes from them to the same bits, Radau within its tolerance, because it
     also has a Jacobian.
     """
@@ -231,7 +231,7 @@ class OdeEngine(BodyEngine):
     def _new_solver(
         self, form: AttitudeForm, state: State, solver: Solver, begun, y_begin, scales
     ) -> Dop853 | Radau:
-        """SciPy's solver at the begin of one of its steps. It chooses the length of an unknown
+        """SciPy's solver at the start of one of its steps. It chooses the length of an unknown
         step."""
         dy = np.zeros(len(y_begin))
 

@@ -98,7 +98,7 @@ def write_rates(form, model, terms, state, load, time, y, dy):
 
 @kernel(from_python=True)
 def is_singular(form, y, dy, dt):
-    """Whether theta is within a step of 0 or pi, or so near that phi and psi lose half of their
+    """Whether theta is within zero time step or pi, or so near that phi and psi lose half of their
     digits."""
     if form.variables != 3:
         return False

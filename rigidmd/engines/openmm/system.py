@@ -438,7 +438,7 @@ TOLERANCES = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> Any:
     """The integrator of stage k. A minimisation gets velocity Verlet."""
     mm, stage = library(), view.system.scene.stages[k]
-    dt = stage.timestep_fs * 1e-3
+    dt = stage.step
     if stage.thermostat_kind == "langevin":
         made = mm.LangevinMiddleIntegrator(stage.temperatures[0], stage.frictions[0], dt)
         made.setRandomNumberSeed(_seed(view, k))
@@ -480,7 +480,7 @@ def _velocity_verlet(dt: float) -> Any:
 
 
 def step(integrator: Any, steps: int) -> None:
-    """Take steps. Velocity Verlet begins and ends with half a kick."""
+    """Take steps. Velocity Verlet starts and ends with half a kick."""
     if not hasattr(integrator, "setGlobalVariableByName"):
         integrator.step(steps)
         return

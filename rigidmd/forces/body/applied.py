@@ -55,7 +55,7 @@ class PythonForceWorkspace(NamedTuple):
     """Workspace of a `PythonForce`; it requests new values (NEEDS_PYTHON_FORCES) whenever positions
     have changed."""
 
-    fresh: np.ndarray  # (1,) 1 if the values are those at the present positions
+    fresh: np.ndarray  # (1,) 1 if the values are those at the current positions
     force_lab: np.ndarray  # (3,)
     torque_body: np.ndarray  # (3,)
 
@@ -144,7 +144,7 @@ def _add_python_force(term, state, load, tally):
 
 @kernel(inline=True)
 def add_to_load(term, load):
-    """Add the present force and torque of a term to the load of the body; returns OK."""
+    """Add the current force and torque of a term to the load of the body; returns OK."""
     for k in range(len(load.force)):
         for i in range(3):
             load.force[k, i] += term.force_lab[i]

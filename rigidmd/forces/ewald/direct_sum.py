@@ -29,7 +29,7 @@ SAME_BASIS = np.eye(3, dtype=int)  #: of a cell whose edges are those of its des
 
 
 class KVectors(NamedTuple):
-    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns along n_z; the other half are
+    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns along n_z. The other half are
     minus these."""
 
     column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, index of that vector in the sum
@@ -49,7 +49,7 @@ def k_vectors_up_to(
     """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` if
     given.
 
-    basis (3, 3) : integers; the edges of this cell are `basis` times those of another cell of the
+    basis (3, 3) : integers. The edges of this cell are `basis` times those of another cell of the
         same lattice, and the bounds apply to n in that cell
     """
     square = np.inf if largest_square is None else largest_square

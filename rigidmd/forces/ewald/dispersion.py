@@ -32,7 +32,7 @@ from rigidmd.forces.parts import (
 )
 from rigidmd.units import KJ_PER_MOL
 
-#: Default of forces.dispersion_accuracy, with which the pairs that are left out change the pressure
+#: Default of forces.dispersion_accuracy, with which the pairs that are omitted change the pressure
 #: of water by 1 bar.
 ACCURACY = 5e-5
 MOST_K_VECTORS_IN_ALL = 2e7  #: as for charges

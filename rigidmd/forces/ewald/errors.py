@@ -2,7 +2,7 @@
 chapter `interactions`.
 
 The unit of an error, the rms over sites, is COULOMB, the force between two charges e at a distance
-of 1 Å; for dispersion it is u Å/ps².
+of 1 Å. For dispersion it is u Å/ps².
 """
 
 from bisect import bisect_left
@@ -310,7 +310,7 @@ def fastest_cutoff(
         return PAIR_NS * pairs + _fastest_grid(charges, alpha, cell, error)[0]
 
     low, high = 0, len(cutoffs) - 1
-    while high - low > 2:  # the cost has one minimum, but for the steps between sizes of grids
+    while high - low > 2:  # the cost has one minimum, except for the steps between sizes of grids
         third = max(1, (high - low) // 3)
         if cost(low + third) <= cost(high - third):
             high -= third

@@ -165,7 +165,7 @@ def _number_of_k_vectors(forces: Any, radius: float | None, volume: float) -> fl
 
 
 def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | None]:
-    """Errors of real space and of k-space (e²/Å², see `ewald.errors`), and the k-vectors; with PME
+    """Errors of real space and of k-space (e²/Å², see `ewald.errors`), and the k-vectors. With PME
     these are only for the interactions of frozen molecules, and None without any. Raises
     SceneError."""
     forces, volume, cell = parts.scene.forces, parts.space.volume, cell_of(parts.space)
@@ -244,11 +244,10 @@ def interactions(parts: SystemParts) -> Interactions:
     error = float(np.hypot(real, k_space))
     notes = [
         f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cutoff {cutoff:g} Å, {how}"
-        + ("" if potential.shift == 0 else "; energies of real space shifted to 0 at the cutoff"),
+        + ("" if potential.shift == 0 else ", shifted energies"),
         (
             f"estimated rms error of the force on a site: {error:.2g} e²/Å² ="
-            f" {error * COULOMB / KJ_PER_MOL:.2g} kJ/(mol Å); {real:.2g} beyond the cutoff,"
-            f" {k_space:.2g} in the reciprocal part"
+            f" {error * COULOMB / KJ_PER_MOL:.2g} kJ/(mol Å)"
         ),
     ]
     frozen_sites = ~parts.moves[parts.model.species][sites.molecule]

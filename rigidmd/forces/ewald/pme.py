@@ -170,7 +170,7 @@ class PmeWorkspace(NamedTuple):
         return self._replace(code=Code(influence=(_set_influence, self._content)))
 
     def passes(self, into: Evaluation) -> list[Pass]:
-        """Positions; the influence function, if the cell has changed; charges on the grid, and the
+        """Positions. The influence function, if the cell has changed; charges on the grid, and the
         forces."""
         mesh, content = self.mesh, self._content
         blocks = len(mesh.tallies)
@@ -285,7 +285,7 @@ def _scale_positions(arguments, block):
 
 @task(count_references=False)
 def _find_first_sites(arguments, block):
-    """Where the sites of each plane and block begin in the order by planes, if all are on the
+    """Where the sites of each plane and block start in the order by planes, if all are on the
     grid."""
     mesh, status = load_arguments(arguments)
     for b in range(len(mesh.not_finite)):
@@ -304,7 +304,7 @@ def _find_first_sites(arguments, block):
 
 @task(count_references=False)
 def _sort_sites(arguments, block):
-    """Enter the sites of a block into the order by planes; the sort is stable."""
+    """Enter the sites of a block into the order by planes. The sort is stable."""
     (mesh,) = load_arguments(arguments)
     following = mesh.next_of_plane[block]
     for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):

@@ -68,7 +68,7 @@ def distance_restraint(
     if any(len(np.unique(group)) < len(group) for group in groups) or np.isin(*groups).any():
         faults.append(f"{where}.between: a molecule is named twice")
     if not any(parts.moves[parts.model.species[group]].any() for group in groups):
-        faults.append(f"{where} would do nothing: all its molecules are frozen")
+        faults.append(f"{where} would have no effect: all its molecules are frozen")
     mass = [parts.model.mass[parts.model.species[group]] for group in groups]
     fractions = [of / of.sum() for of in mass]
     restraint = DistanceRestraint(

@@ -66,7 +66,7 @@ def term(
     )
     present = np.unique(parts.model.species)
     if not (charge[present].any() or dipole[present].any()):
-        faults.append(f"{where} would do nothing: no molecule that moves has a charge")
+        faults.append(f"{where} would have no effect: no molecule that moves has a charge")
     steady = ElectricField(
         parts.model.species, charge, dipole, np.array(fields.electric_V_per_nm) * VOLT_PER_NM
     )

@@ -32,7 +32,7 @@ class PythonForcesWorkspace(NamedTuple):
     """Workspace of a `PythonForces`; it requests new values (NEEDS_PYTHON_FORCES) whenever
     positions have changed."""
 
-    fresh: np.ndarray  # (1,) 1 if the values are those at the present positions
+    fresh: np.ndarray  # (1,) 1 if the values are those at the current positions
     force: np.ndarray  # (n, 3) lab, u Å/ps²
     torque_body: np.ndarray  # (n, 3), u Å²/ps²
     tally: np.ndarray  # (10,) energy and molecular virial

@@ -62,7 +62,7 @@ def term(
         restrained |= mask
     if not restrained.any():
         if entry.molecules is None:
-            faults.append(f"{where} would do nothing: all {name} are frozen")
+            faults.append(f"{where} would have no effect: all {name} are frozen")
         return None
     molecule = np.flatnonzero(restrained)
     position = (

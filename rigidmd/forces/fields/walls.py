@@ -18,7 +18,7 @@ from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces
 from rigidmd.units import KJ_PER_MOL
 
-#: Distance of the well of a Lennard-Jones wall, in sigma, at which a lattice of molecules begins.
+#: Distance of the well of a Lennard-Jones wall, in sigma, at which a lattice of molecules starts.
 WELL = (2 / 5) ** (1 / 6)
 
 

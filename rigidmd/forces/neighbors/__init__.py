@@ -13,10 +13,10 @@ The terms, from small to large, for vectors of 4 lanes (float64 with AVX2; float
         local   | x x x x y y y y z z z z    | x x x x ...
                   `------' at 3 * 4 * c       relative to the origin of the cluster
 
-    row       two slots (2r, 2r + 1) near one another; a cluster has 2 rows
+    row       two slots (2r, 2r + 1) near one another. A cluster has 2 rows
     entry     a cluster and one periodic image of it, in a row: both sites of the row interact with
               its 4 sites
-    masked    an entry with lanes that are left out: sites of the same molecule, the cluster itself,
+    masked    an entry with lanes that are omitted: sites of the same molecule, the cluster itself,
               padding at the end
     shell     entries of a row at similar distance. The first shell is within the cutoff when the
               list is built; shell k may come within it once sites have moved by k/14 of the skin

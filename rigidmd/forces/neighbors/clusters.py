@@ -34,7 +34,7 @@ MAX_DISTANCE = 1e9
 
 
 class Clusters(NamedTuple):
-    """The sites of one potential in clusters; the last cluster is padded with copies of the last
+    """The sites of one potential in clusters. The last cluster is padded with copies of the last
     site."""
 
     bounds: np.ndarray  # (blocks + 1,) block b has clusters bounds[b] ... bounds[b + 1] - 1
@@ -138,7 +138,7 @@ def wrap_sites(arguments, block):
 def bin_sites(arguments, block):
     """Write the bins of the sites of a block of molecules, and heights within bins, into `slot` and
     `moved`. Bins form columns along z, as wide as a cluster. They run up one column and down the
-    next, so that a cluster that begins in one column and ends in the next is compact too."""
+    next, so that a cluster that starts in one column and ends in the next is compact too."""
     pairs, sites, _ = load_arguments(arguments)
     clusters = pairs.clusters
     low, extent, (nx, ny, nz) = _bins(clusters)
@@ -241,7 +241,7 @@ def _bin(x, extent, count):
 
 @task(count_references=False)
 def set_origins(arguments, block):
-    """Set origins and references of newly sorted clusters; the origin is the centre of the bounding
+    """Set origins and references of newly sorted clusters. The origin is the centre of the bounding
     box."""
     pairs, sites, state = load_arguments(arguments)
     clusters, cell, lead = pairs.clusters, pairs.cell, pairs.times[LEAD_TIME]
@@ -284,7 +284,7 @@ def _ahead_in_brick(clusters, cell, sites, state, i, lead):
 
 @kernel(inline=True)
 def _ahead(sites, state, m, i, lead):
-    """`predict_site`; for lead = 0 the present position, which does not need finite velocities."""
+    """`predict_site`; for lead = 0 the current position, which does not need finite velocities."""
     return (
         predict_site(sites, state, m, i, lead) if lead != 0.0 else locate_site(sites, state, m, i)
     )
@@ -322,7 +322,7 @@ def restore_half_squares(clusters):
 
 @task(count_references=False)
 def set_local(arguments, block):
-    """Set `local` of the sites of a block of molecules to the present positions; padding stays at
+    """Set `local` of the sites of a block of molecules to the current positions; padding stays at
     its reference."""
     pairs, sites, state = load_arguments(arguments)
     clusters, cell = pairs.clusters, pairs.cell

@@ -4,7 +4,7 @@ the cutoff.
 A row is two sites near one another, so that what is loaded of a cluster serves both. The rows of a
 cluster have almost the same neighbours: these are listed once, with the vectors between origins,
 and an entry of a row is an index in that list. The clusters of each row are sorted into shells by
-distance; the displacements of the sites determine how many shells can matter. See the theory
+distance. The displacements of the sites determine how many shells can matter. See the theory
 chapter `interactions` for when a list is valid.
 
 This module has the list and how it is read; `update` decides when it is rebuilt, `rows` fills it.
@@ -58,7 +58,7 @@ class PairList(NamedTuple):
     multiple: np.ndarray  # (IMAGES, 3) int32 edges a, b, c by which each image is displaced
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
     slack: np.ndarray  # (1,) the largest displacement of an image since the list was built, Å
-    # (rows,) int32 end in entries[b] of row r (slots 2 r and 2 r + 1); row r + 1 begins there
+    # (rows,) int32 end in entries[b] of row r (slots 2 r and 2 r + 1); row r + 1 starts there
     row_end: np.ndarray
     # (rows, SHELLS) uint8 number of entries at the end of a row that are beyond shell k
     beyond: np.ndarray
@@ -203,7 +203,7 @@ def restored(
 ) -> PairList:
     """The new list with the clusters and the skin of a checkpoint; `update.refill` must follow if
     there are clusters.
-    requested_skin : in Å. now : the present time, ps. Raises ValueError if the arrays do not fit
+    requested_skin : in Å. now : the current time, ps. Raises ValueError if the arrays do not fit
         such a list."""
     clusters, cell = pairs.clusters, pairs.cell
     like = {name: getattr(clusters, name) for name in (*CHECKPOINTED, "order")}

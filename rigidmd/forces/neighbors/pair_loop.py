@@ -289,7 +289,7 @@ def block_forces(potential, pairs, into, tallies, energies, block):
     The distance of two sites is the difference of their positions in the box, less the shift of an
     image. So the virial is the sum over sites of f (x) position, see `gather_block`, less the sum
     over entries of the force on the row (x) shift. The latter is added here when the image changes
-    along a row. That is seldom: in each shell the entries of one image are consecutive, and rows
+    along a row. That is rarely: in each shell the entries of one image are consecutive, and rows
     far from the edges have no other image.
     """
     align_stack()

@@ -71,7 +71,7 @@ def fill_rows(arguments, block):
 @kernel(inline=True)
 def _fill_block(pairs, block, capacity):
     """Fill the rows of one block. Entries beyond the capacity are counted but not stored. Returns
-    0, or the capacity needed for candidates if it is too small; the rows are then incomplete."""
+    0, or the capacity needed for candidates if it is too small. The rows are then incomplete."""
     clusters = pairs.clusters
     arity, rows = lanes_of(pairs.tree.low), lanes_of(clusters.local) // 2
     scratch = Scratch(
@@ -244,7 +244,7 @@ def _sort_by_kind(pairs, c, scratch, count):
 
 @kernel(inline=True)
 def _begin_kinds(beyond, kind_end):
-    """Where the entries of each kind begin in a row, from their numbers; how many are beyond each
+    """Where the entries of each kind start in a row, from their numbers; how many are beyond each
     shell. `beyond` is limited by its type: entries above the limit are treated as if they were
     inside the shell."""
     inside = 0

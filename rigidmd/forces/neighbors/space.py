@@ -27,7 +27,7 @@ class Orthorhombic(NamedTuple):
 
 
 class Triclinic(NamedTuple):
-    """Periodic box of any shape: a = (x, 0, 0), b = (xy, y, 0), c = (xz, yz, z), Å; the names are
+    """Periodic box of any shape: a = (x, 0, 0), b = (xy, y, 0), c = (xz, yz, z), Å. The names are
     those of LAMMPS. A brick with edges x, y, z repeats along a, b and c without gaps too. Sites are
     shifted into that brick, where lists for an orthorhombic box are used."""
 

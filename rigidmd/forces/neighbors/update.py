@@ -98,7 +98,7 @@ def update_list(pairs, code, sites, state):
             call_blocks(code, "origins", site_arguments, blocks)
             call_blocks(code, "local", site_arguments, blocks)
             if ahead == 0.0:
-                # the present positions: a skin may be smaller than their rounding
+                # the current positions: a skin may be smaller than their rounding
                 copy(pairs.clusters.local, pairs.clusters.reference)
             call_blocks(code, "displacements", arguments, blocks)
             if largest_displacement(pairs) < inf:
@@ -163,7 +163,7 @@ def _cell_fits(pairs):
 @kernel
 def _max_slack(pairs):
     """How far images may move until the list is built again, Å. Images are sought within a radius
-    that is larger by this: an image that was left out, and may move by twice as much as those that
+    that is larger by this: an image that was omitted, and may move by twice as much as those that
     were found, stays out of reach. 0 if such a search could find more images than the capacity."""
     is_short = pairs.cutoff < inf and 2.5 * pairs.skin <= _shortest(pairs.built)
     return 0.25 * pairs.skin if is_short else 0.0
@@ -187,7 +187,7 @@ def _move_images(pairs):
 
 @kernel(inline=True)
 def _displacement(cell, multiple, k):
-    """Component k of a sum of edges; an edge that does not occur in it may be infinite."""
+    """Component k of a sum of edges. An edge that does not occur in it may be infinite."""
     total = 0.0
     for vector in range(3):
         if multiple[vector] != 0:
@@ -205,7 +205,7 @@ def _sort_sites(arguments, block):
 
 @kernel
 def _find_images(pairs):
-    """Find the images of the brick (see `clusters`) near it in the present cell. Shift 0 is the
+    """Find the images of the brick (see `clusters`) near it in the current cell. Shift 0 is the
     first. Bricks are stacked in layers along c and in rows along b. The radius is not longer than
     any edge, so there are 27 images in an orthorhombic box and up to 48 in a triclinic one."""
     cell, multiple = pairs.cell, pairs.multiple

@@ -28,12 +28,12 @@ from rigidmd.forces.potentials.truncation import (
 
 
 class CustomPotential(NamedTuple):
-    """A formula between kinds of sites; the energy between kinds is 0 if their `interacts` is 0."""
+    """A formula between kinds of sites. The energy between kinds is 0 if their `interacts` is 0."""
 
     cutoff: float  # Å
     truncation: Truncation
     formula: NamedTuple  # parameters of one kind with itself
-    shared: tuple  # what a formula needs besides its parameters, the same for all kinds
+    shared: tuple  # what a formula needs in addition to its parameters, the same for all kinds
     kind: np.ndarray  # (s,) kind of each site
     parameters: np.ndarray  # (parameters, kinds, kinds)
     # (4, kinds, kinds) see truncation.truncation_terms; 0 without interaction

@@ -58,7 +58,7 @@ class FormulaError(ValueError):
 # --- from a function ------------------------------------------------------------------------------
 
 _COUNT = itertools.count()
-#: Arguments that a user function may have besides the parameters.
+#: Arguments that a user function may have in addition to the parameters.
 ARGUMENTS = ("r", "r2", "inverse")
 
 

@@ -61,7 +61,7 @@ class ScreenedDispersion(NamedTuple):
 
 
 class LennardJones(NamedTuple):
-    """c12/r¹² - c6/r⁶ between kinds of sites; each power is truncated by itself."""
+    """c12/r¹² - c6/r⁶ between kinds of sites. Each power is truncated by itself."""
 
     cutoff: float  # Å
     truncation: Truncation

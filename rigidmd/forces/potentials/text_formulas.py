@@ -41,7 +41,7 @@ def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -
     constants : values of parameters that are the same for all sites. Raises FormulaError.
     """
     try:
-        parsed = _parsed(energy, constants or {})
+        parsed = parse_energy(energy, constants)
         r = sympy.Symbol(DISTANCE, positive=True)
         if r not in parsed.free_symbols:
             raise FormulaError(f"{energy!r} does not depend on the distance {DISTANCE}")
@@ -274,7 +274,7 @@ def _code(e) -> str:
     raise FormulaError(f"its derivative has {name}, which cannot be computed at every distance")
 
 
-def _parsed(energy: str, constants: Mapping[str, float]) -> sympy.Expr:
+def parse_energy(energy: str, constants: Mapping[str, float] | None = None) -> sympy.Expr:
     """An energy as a SymPy expression, parsed without running it: arithmetic and `FUNCTIONS`.
     Raises FormulaError."""
     if len(energy) > MAX_TEXT_LENGTH:
@@ -289,7 +289,7 @@ def _parsed(energy: str, constants: Mapping[str, float]) -> sympy.Expr:
         ) from None
     if sum(1 for _ in ast.walk(tree)) > MAX_NODES:
         raise FormulaError(f"it has more than {MAX_NODES} numbers, names and operations")
-    parsed = _read(tree.body, constants, 0).value
+    parsed = _read(tree.body, constants or {}, 0).value
     if parsed.has(sympy.zoo, sympy.nan, sympy.oo, sympy.I):
         raise FormulaError(f"{energy!r} is not finite")
     return parsed

@@ -104,7 +104,7 @@ class SwitchTerm(NamedTuple):
 
 
 class SwitchCorrection(NamedTuple):
-    """(x + 1)² (b0 + b1 x + b2 x² + ...), which `switch` adds to force/r; it needs no square root.
+    """(x + 1)² (b0 + b1 x + b2 x² + ...), which `switch` adds to force/r. It needs no square root.
     x is linear in r², from -1 at the start to 1 at the cutoff. In powers of x + 1 the terms would
     be thousands of times their sum."""
 

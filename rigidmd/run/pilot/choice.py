@@ -29,7 +29,7 @@ CANDIDATES = sorted(
 #: Most trials of each, how much its longest step is shortened at most, and the least gain for
 #: another trial.
 MAX_TRIALS, MAX_SHORTENING, MIN_GAIN = 16, 4096, 1.1
-#: Most halvings of the reference's step.
+#: Maximum number of halvings of the reference's step.
 HALVINGS = 12
 #: An interpolated step is shortened by this factor, so that its error falls below the target.
 MARGIN = 0.95
@@ -103,7 +103,7 @@ class _Search:
         return sqrt(regular**2 + self.walk_square(name, step, self.time))
 
     def trial(self, name: str, timestep: float, span: float | None = None) -> Trial:
-        """A trial of an integrator at a step; it ends exactly at the span if trajectories are
+        """A trial of an integrator at a step. It ends exactly at the span if trajectories are
         compared."""
         system = self.system if span is None else replace(self.system, span=span)
         n = max(1, ceil(system.span / (timestep * system.time_size) * (1 - 1e-12)))

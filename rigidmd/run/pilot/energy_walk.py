@@ -42,7 +42,7 @@ class EnergyWalk(NamedTuple):
 
 @cache
 def weight(scheme: Scheme, jump: float) -> float:
-    """w of an integrator; the sum of b² for a jump below 0, where the errors of kicks are
+    """w of an integrator. The sum of b² for a jump below 0, where the errors of kicks are
     independent."""
     at, kicks, n = 0.0, [], np.arange(1.0, 1000.0)
     for flow in scheme.flows:

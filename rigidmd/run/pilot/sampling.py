@@ -4,12 +4,12 @@ Hamiltonian, see "The bias of averages" in the theory chapter `errors`."""
 
 from dataclasses import replace
 from math import inf, isfinite, sqrt
-from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.assemble.build import integrator_of_stage
 from rigidmd.assemble.harmonic import stable_angle
+from rigidmd.assemble.time_step import fastest_motion
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, State
 from rigidmd.dynamics.hybrid_monte_carlo import CHANCES, ENDED
@@ -23,62 +23,44 @@ from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
-
-class Bias(NamedTuple):
-    """The bias of U of an integrator, in kT per degree of freedom and in (w dt)²."""
-
-    size: float
-    allowance: float  # factor by which it may be larger
-    basis: str  # for the reason of a choice
-
-
-BIAS = {
-    # the heat capacity of water is twice that of harmonic motions, and then the bias may be too
-    "velocity_verlet": Bias(1 / 8, 2.0, "as twice the bias of harmonic motions"),
-    "baoab": Bias(1 / 24, 1.0, "as one of two parts that cancel in harmonic motions"),
-}
+#: The integrator for averages, and its largest bias of U, in kT per degree of freedom and in (w
+#: dt)²: one of two parts, which cancel in harmonic motions.
+UNBIASED, BIAS = "baoab", 1 / 24
 #: Step and length of the pilot run, in radians of the faster mean motion, translation or rotation;
 #: its samples.
 PILOT_STEP, PILOT_RADIANS, PILOT_SAMPLES = 0.15, 50.0, 25
+#: Where the mean (w t)² of the fastest motion of a liquid, of time t, is below this, molecules
+#: collide rarely: the stiffest motion is then the one in a collision, as fast as in a liquid.
+GAS = 0.01
 #: Longest step, as a fraction of the longest stable step: beyond it higher orders than dt² matter.
 MAX_STABLE_FRACTION = 0.5
 
 
-def bias_of_potential(integrator: str, rate: float, timestep: float) -> float:
-    """Estimated size of the bias of U, kT per degree of freedom; rate : mean w² of one, 1/ps²;
+def bias_of_potential(rate: float, timestep: float) -> float:
+    """Largest bias of U of `UNBIASED`, kT per degree of freedom; rate : mean w² of one, 1/ps²;
     timestep : ps."""
-    return BIAS[integrator].size * rate * timestep**2
+    return BIAS * rate * timestep**2
 
 
 def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, str]:
-    """Stage k with the integrator and step that keep its bias_kT with the fewest forces, and the
-    reason.
-
-    If the stage names a thermostat: velocity Verlet with it, or, if it is Langevin's, also BAOAB.
-    Otherwise: velocity Verlet with velocity rescaling, or BAOAB with Langevin's. Raises
-    SimulationError.
-    """
+    """Stage k with `UNBIASED` and the longest step that keeps its bias_kT, and the reason. Raises
+    SimulationError."""
     stage = system.scene.stages[k]
-    target, candidates = not_none(stage.bias_kT), {}
+    target = not_none(stage.bias_kT)
     stiffest, rate = stiffest_mode(system, state), mean_square_rate(system, state, k)
-    for integrator, bias in BIAS.items():
-        needs = {"thermostat": "langevin"} if integrator == "baoab" else {}
-        if needs and not (stage.thermostat_is_open or stage.thermostat == "langevin"):
-            continue
-        decided = stage.with_integrator(integrator, stage.timestep_fs).model_copy(update=needs)
-        if rate > 0:
-            stable = stable_angle(decided.scheme) / stiffest.rate if stiffest else inf
-            unbiased = sqrt(target / (bias.allowance * bias.size * rate))
-            step = min(unbiased, MAX_STABLE_FRACTION * stable, stage.duration)
-            decided = decided.with_integrator(integrator, round_down(step / FEMTOSECOND))
-        candidates[integrator] = decided.with_defaults
-    best = max(candidates, key=lambda name: (candidates[name].timestep_fs, -BIAS[name].size))
-    step = candidates[best].timestep_fs * FEMTOSECOND
-    error = BIAS[best].allowance * bias_of_potential(best, rate, step)
-    return candidates[best], (
-        f"bias of U below about {error:.1e} kT per degree of freedom, where {target:g} was"
-        f" requested: estimated from {sqrt(rate):.3g} rad/ps, the rms frequency of the motions,"
-        f" {BIAS[best].basis}, not sampled; {1 / step:.4g} forces per ps"
+    decided = stage.with_integrator(UNBIASED, stage.step_fs)
+    if rate > 0:
+        stable = stable_angle(decided.scheme) / stiffest.rate if stiffest else inf
+        fastest = fastest_motion(system.species, max(stage.temperatures))
+        if fastest is not None and rate * fastest.time**2 < GAS:
+            stable = min(stable, fastest.longest_step(decided))
+        longest = min(sqrt(target / (BIAS * rate)), MAX_STABLE_FRACTION * stable, stage.duration)
+        decided = stage.with_integrator(UNBIASED, round_down(longest / FEMTOSECOND))
+    return decided.with_defaults, (
+        f"bias of U below about {bias_of_potential(rate, decided.step):.1e} kT per degree of"
+        f" freedom, where {target:g} was requested: estimated from {sqrt(rate):.3g} rad/ps, the rms"
+        " frequency of the motions, as one of two parts that cancel in harmonic motions, not"
+        f" sampled; {1 / decided.step:.4g} forces per ps"
     )
 
 
@@ -101,6 +83,8 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
     if not isfinite(fastest) or fastest <= 0:
         return 0.0
     dt = PILOT_STEP / sqrt(fastest)
+    if (motion := fastest_motion(system.species, max(stage.temperatures))) is not None:
+        dt = min(dt, motion.time)  # molecules beyond their cutoff may collide later
     # Langevin's thermostat at a fifth of that rate brings any start to the temperature in the first
     # half of the run
     heat = {
@@ -129,7 +113,7 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
 def _begun(
     system: System, state: State, k: int, stage: Stage, engine: Engine
 ) -> tuple[State, Scheme]:
-    """A state at the begin of a pilot run with `stage` instead of stage k, and its integrator."""
+    """A state at the start of a pilot run with `stage` instead of stage k, and its integrator."""
     stages = system.scene.stages
     scene = system.scene.model_copy(update={"stages": (*stages[:k], stage, *stages[k + 1 :])})
     scheme = integrator_of_stage(replace(system, scene=scene), k)
@@ -140,7 +124,7 @@ def _begun(
 TRIED = ("velocity_verlet", "two_stage", "srkn_4")
 #: Steps that are tried, as fractions of the longest stable one, and trajectories with each.
 FRACTIONS, TRAJECTORIES = (0.2, 0.28, 0.4, 0.56, 0.8), 16
-#: Least acceptance with which longer steps are tried.
+#: Minimum acceptance with which longer steps are tried.
 LEAST_ACCEPTANCE = 0.2
 #: Steps of the first trajectories, which leave the lattice of a start, whose forces are not those
 #: of a liquid.
@@ -162,7 +146,7 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
         decided = stage.with_integrator(integrator, timestep_fs)
         return decided.model_copy(update={"trajectory_steps": steps})
 
-    now, _ = _acceptance(system, state, k, with_steps(TRIED[0], stage.timestep_fs, WARMING_STEPS))
+    now, _ = _acceptance(system, state, k, with_steps(TRIED[0], stage.step_fs, WARMING_STEPS))
     stiffest, rate = stiffest_mode(system, now), mean_square_rate(system, now, k)
     if stiffest is None or rate == 0:
         raise SimulationError(
@@ -201,7 +185,7 @@ def _acceptance(system: System, state: State, k: int, stage: Stage) -> tuple[Sta
     now.begin_segment()
     until = int(now.step[NOW]) + TRAJECTORIES * stage.steps_together
     try:
-        engine.advance(now, scheme, stage.timestep_fs * FEMTOSECOND, until)
+        engine.advance(now, scheme, stage.step, until)
     except SimulationError:  # a molecule was lost in a step that is too long
         return state, 0.0
     sums = not_none(engine.trajectories)

@@ -22,7 +22,7 @@ PILOT_STEP, PILOT_SPAN = 0.15, 10.0
 #: For an error of the energy over a stage a pilot run takes this part of the stage, at least these
 #: radians.
 PILOT_PART, LEAST_SPAN = 0.01, 3.0
-#: Least fraction of a chosen step to which it is shortened to fit the interval of samples.
+#: Minimum fraction of a chosen step to which it is shortened to fit the interval of samples.
 MIN_STEP_FRACTION = 0.25
 
 
@@ -50,7 +50,7 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
     SimulationError."""
     stage = system.scene.stages[k]
     natural = natural_time(system, state)
-    step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.timestep_fs
+    step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.step_fs
     span = PILOT_SPAN * natural if natural else SPAN_PS
     if stage.energy_error_kT:
         span = min(span, max(PILOT_PART * stage.duration, LEAST_SPAN / PILOT_SPAN * span))

@@ -1,7 +1,7 @@
 """`rigidmd accuracy`: the errors and run times of integrators at several time steps, from the start
 of a scene; as a table, recommendations, accuracy.csv, .png and a self-contained page."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from math import inf
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from rigidmd.figures.style import (
     open_axis,
     write_figure,
 )
-from rigidmd.io.write import Column, Table
+from rigidmd.io.write import Column, Table, columns_text
 from rigidmd.run.force_errors import single_precision_errors
 from rigidmd.run.trial_systems import (
     COMPARATORS,
@@ -31,7 +31,8 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
 from rigidmd.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
-from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
+from rigidmd.studies.accuracy.orders import FLOOR_MARK, order_table, with_marks
+from rigidmd.view.page import chips, code, items, section, table, wide, write_page
 
 #: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body
 #: also solvers.
@@ -58,13 +59,13 @@ def measure_accuracy(
     """Error against run time of integrators at time steps, on the start of a scene. Raises
     SceneError.
 
-    integrators : names; default: the scene's and those that suit it; the others are in `left_out`.
+    integrators : names; default: the scene's and those that suit it. The others are in `left_out`.
         rk4, dop853 and radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion
         or _euler_angles sets another
     timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost
         around the scene's
     span : ps or s
-    progress : called with the fraction that is done; at 0, after all arguments have been checked
+    progress : called with the fraction that is done. At 0, after all arguments have been checked
 
     Molecules start where the last stage starts, after the earlier stages have run; no thermostat
     acts.
@@ -102,7 +103,8 @@ def measure_accuracy(
         simulation, state = start_of_last_stage(scene)
         trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
         trial_system.rounding = single_precision_errors(simulation.system, state)
-        base = last.timestep_fs / (last.row.force_evaluations if last.has_scheme else 1)
+        evaluations = last.row.force_evaluations if last.has_scheme else 1
+        base = simulation.scene.stages[-1].step_fs / evaluations
     if refused := [name for name in integrators if name not in trial_system.methods]:
         reasons = [
             f"{name} does not suit this scene: {trial_system.refused[name]}" for name in refused
@@ -146,6 +148,7 @@ def _method_name(name: str, scene: MolecularScene | BodyScene) -> str:
 
 
 FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")
+LABEL = (0.14, 0.045)  # width and height of the label of a step, as fractions of an axis
 DOUBTFUL = 0.2  # spread of repeated timings that causes a warning
 
 
@@ -195,6 +198,24 @@ def table_text(measured: IntegratorAccuracy) -> str:
     return text + trial_table(measured).text()
 
 
+def describe_accuracy(measured: IntegratorAccuracy, verbose: bool = False) -> list[str]:
+    """The answer first: the fastest integrator for each error, measured orders, all trials, and
+    remarks."""
+    fastest = [("target error", "fastest integrator", f"compared with {COMMON}")]
+    for error, best, faster, _ in cheapest(measured):
+        gain, _, _ = faster.partition(f" than {COMMON}")
+        fastest.append((error.removeprefix("an "), best, gain))
+    marked = with_marks(measured, trial_table(measured))
+    lines = [f"{measured.trial_system.name}, {_span(measured)}", ""]
+    if len(fastest) > 1:
+        lines += [columns_text(fastest, left=(0, 1, 2)), ""]
+    lines += [order_table(measured).text(), "", marked.text()]
+    lines.append(f"{FLOOR_MARK} at the floor: a shorter step does not reduce this error")
+    if verbose:
+        return [*lines, "", *recommendations(measured)]
+    return [*lines, "", *remarks(measured)]
+
+
 def recommendations(measured: IntegratorAccuracy) -> list[str]:
     """Sentences on the cheapest integrator for each accuracy, and `remarks`."""
     s, lines = measured.trial_system, []
@@ -217,7 +238,7 @@ def _span(measured: IntegratorAccuracy) -> str:
 
 
 def remarks(measured: IntegratorAccuracy) -> list[str]:
-    """Sentences on the reference, the longest stable steps, what failed or was left out, and the
+    """Sentences on the reference, the longest stable steps, what failed or was omitted, and the
     timings."""
     s = measured.trial_system
     lines = [
@@ -328,21 +349,24 @@ def write_accuracy(folder: Path, measured: IntegratorAccuracy, command: str) -> 
     trial_table(measured).write(folder / FILES[0])
     title = f"{measured.trial_system.name}: error against run time"
     write_figure(folder / FILES[1], lambda: accuracy_figure(measured), title)
-    write_page(folder / FILES[2], lambda: accuracy_page(measured, command))
+    write_page(folder / FILES[2], title, _page_parts(measured, command))
     return [folder / name for name in FILES if (folder / name).is_file()]
 
 
-def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
-    """Label points (time, error, step) in this order, each that is far enough from the one labelled
+def _label_steps(axis, points: list[tuple[float, float, float]], unit: str) -> None:
+    """Label points (time, error, step) in this order, each that is far enough from those labelled
     before."""
-    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    left, right = axis.get_xlim()
+    left *= (left / right) ** LABEL[0]  # space for the label of the first point
+    axis.set_xlim(left, right)
+    low, high = axis.get_ylim()
     size = np.array([np.log(right / left), np.log(high / low)])
-    before = np.full(2, np.inf)
+    labelled = np.empty((0, 2))
     for time, error, step in points:
         at = np.log([time, error]) / size
-        if (np.abs(at - before) > [0.06, 0.04]).any():
+        if (np.abs(at - labelled) > LABEL).any(axis=1).all():
             axis.annotate(
-                f"{step:.2g}",
+                f"{step:.2g} {unit}",
                 (time, error),
                 xytext=(-6, -6),
                 textcoords="offset points",
@@ -351,7 +375,7 @@ def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
                 ha="right",
                 va="top",
             )
-            before = at
+            labelled = np.vstack([labelled, at])
 
 
 def accuracy_figure(measured: IntegratorAccuracy):
@@ -391,12 +415,13 @@ def accuracy_figure(measured: IntegratorAccuracy):
             "mfc": "none",
             "mec": INK,
             "mew": 0.8,
-            "label": f"best, with its step ({s.time_unit})",
+            "label": "best, with its step",
         }
         axis.loglog(
             [t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring
         )
-        _label_steps(axis, [(t.time / s.span, getattr(t, error), t.timestep) for t in front])
+        points = [(t.time / s.span, getattr(t, error), t.timestep) for t in front]
+        _label_steps(axis, points, s.time_unit)
         axis.set_title(title, loc="left", fontsize=9, color=INK)
         open_axis(axis, which="both")
         label_minor_ticks(axis.xaxis)
@@ -405,11 +430,10 @@ def accuracy_figure(measured: IntegratorAccuracy):
     left.axhline(measured.reference_error, color=FAINT, lw=0.8, ls=":")
     left.annotate(
         "error of the reference",
-        (1, measured.reference_error),
+        (0.01, measured.reference_error),
         xycoords=("axes fraction", "data"),
         fontsize=8,
         color=FAINT,
-        ha="right",
         va="bottom",
     )
     right.legend(
@@ -423,25 +447,17 @@ def accuracy_figure(measured: IntegratorAccuracy):
     return figure
 
 
-def accuracy_page(measured: IntegratorAccuracy, command: str) -> str:
-    colored = chips(list(dict.fromkeys(t.integrator for t in measured.trials)))
+def _page_parts(measured: IntegratorAccuracy, command: str) -> Iterator[str]:
+    colored = chips(dict.fromkeys(t.integrator for t in measured.trials))
     titles = [
-        f"for, over {_span(measured)}",
-        "the cheapest is",
+        f"error over {_span(measured)}",
+        "least run time",
         "gain",
         "as fast within the spread of the timings",
     ]
-    parts = [
-        section(
-            "Recommendations",
-            table(titles, cheapest(measured), words=True),
-            items(remarks(measured)),
-        ),
-        section(
-            "Error against run time",
-            wide(accuracy_figure(measured), "accuracy", "log error over log run time"),
-        ),
-        section("All trials", table(*trial_table(measured).shown(), marked=colored)),
-        section("How to repeat it", code(command)),
-    ]
-    return page(f"{measured.trial_system.name}: error against run time", parts)
+    advice = table(titles, cheapest(measured), words=True)
+    drawn = wide(accuracy_figure(measured), "accuracy", "log error over log run time")
+    yield section("Recommendations", advice, items(remarks(measured)))
+    yield section("Error against run time", drawn)
+    yield section("All trials", table(*trial_table(measured).shown(), marked=colored))
+    yield section("How to repeat it", code(command))

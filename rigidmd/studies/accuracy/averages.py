@@ -33,7 +33,7 @@ UNSEEN = 2.0  # a slope of at most this many standard errors counts as not seen
 class AveragedQuantity(NamedTuple):
     name: str
     unit: str
-    # of which the bias limit is a fraction; NaN: the limit of the quantity at a step of zero
+    # of which the bias limit is a fraction; NaN: the limit of the quantity at zero time step
     scale: float
     exact: float | None = None  # the limit where it is known
     bias_unit: str = ""  # of reported biases, `unit` when empty
@@ -124,7 +124,7 @@ class Averages:
         """The step (fs) at which the bias of a method reaches the limit, and whether a bias was
         seen.
 
-        A bias is not seen if its slope is within `UNSEEN` errors of 0; it is then smaller up to
+        A bias is not seen if its slope is within `UNSEEN` errors of 0. It is then smaller up to
         that step. None if the fit has no slope of the method.
         """
         fit = self.fit(quantity)
@@ -140,7 +140,7 @@ class Averages:
         )
 
 
-#: Measured besides the method of the stage when no methods are given.
+#: Measured in addition to the method of the stage when no methods are given.
 DEFAULT_METHODS = (
     "baoab+velocity_rescaling",
     "baoab+langevin",
@@ -180,7 +180,7 @@ def measure_averages(
         `DEFAULT_METHODS`
     timesteps : fs, the same for all; default: fractions of the longest stable step of each method
     sample : ps that each is sampled, after a fifth of that
-    progress : called with the fraction that is done; at 0, after all arguments have been checked
+    progress : called with the fraction that is done. At 0, after all arguments have been checked
 
     The earlier stages of the scene run before, once.
     """
@@ -210,7 +210,9 @@ def measure_averages(
     plan: list[tuple[Stage, AverageRun]] = []
     for integrator, thermostat in pairs:
         scheme = schemes[integrator]
-        steps = timesteps or [ratio * stage.timestep_fs for ratio in LADDER_AROUND_SCENE]
+        steps = timesteps or [
+            ratio * simulation.scene.stages[-1].step_fs for ratio in LADDER_AROUND_SCENE
+        ]
         if stiffest is not None and not timesteps:
             exact = [ratio * stable_angle(scheme) / stiffest.rate / FEMTOSECOND for ratio in LADDER]
             # two digits, for tables and legends
@@ -268,7 +270,7 @@ def measure_averages(
 
 
 def start_of_last_stage(scene: MolecularScene) -> tuple[Simulation, State]:
-    """A simulation of a scene, and the state in which its last stage begins. Earlier stages run
+    """A simulation of a scene, and the state in which its last stage starts. Earlier stages run
     without files."""
     simulation = Simulation(scene)
     if len(scene.stages) > 1:
@@ -282,7 +284,7 @@ def start_of_last_stage(scene: MolecularScene) -> tuple[Simulation, State]:
             simulation.system, results.state, cast(Samples, results.samples), len(scene.stages) - 1
         )
         return simulation, results.state
-    simulation.start()
+    simulation._start()
     return simulation, simulation.state.copy()
 
 
@@ -327,7 +329,7 @@ def _parse_method(text: str, stage: Stage, known: Iterable[str]) -> tuple[str, s
 def _with_method(
     stage: Stage, integrator: str, thermostat: str, step: float, sample: float
 ) -> Stage:
-    """The stage by another method at another step; its settings of a thermostat or rotor are kept
+    """The stage by another method at another step. Its settings of a thermostat or rotor are kept
     only for the same."""
     changes = dict.fromkeys(ERROR_TARGETS) | {
         "integrator": integrator,

@@ -1,6 +1,7 @@
 """Report of `rigidmd accuracy --averages`: a table, conclusions, accuracy.csv and .json,
 averages.png and .html."""
 
+from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from rigidmd.core.statistics import format_signed
 from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, panel_grid, write_figure
 from rigidmd.io.write import Column, Table, with_error, write_json
 from rigidmd.studies.accuracy.averages import BIAS_LIMIT, AveragedQuantity, Averages
-from rigidmd.view.page import chips, code, items, page, plain, section, table, wide, write_page
+from rigidmd.view.page import chips, code, items, plain, section, table, wide, write_page
 
 FILES = ("accuracy.csv", "accuracy.json", "averages.png", "averages.html")
 
@@ -117,7 +118,8 @@ def write_averages(folder: Path, averages: Averages, command: str) -> list[Path]
     write_json(folder / FILES[1], to_json(averages, command), indent=2, allow_nan=False)
     title = f"{averages.name}: bias of averages over {averages.sampled:g} ps"
     write_figure(folder / FILES[2], lambda: averages_figure(averages), title)
-    write_page(folder / FILES[3], lambda: averages_page(averages, command))
+    page_title = f"{averages.name}: bias of averages"
+    write_page(folder / FILES[3], page_title, _page_parts(averages, command))
     return [folder / name for name in FILES if (folder / name).is_file()]
 
 
@@ -194,7 +196,7 @@ def averages_figure(averages: Averages):
                     steps, values, errors, ms=3.5, lw=1.1, capsize=2, **style
                 )
         axis.set_title(
-            f"{quantity.name}, {quantity.unit_of_bias}", loc="left", fontsize=9, color=INK, pad=17
+            f"{quantity.name} ({quantity.unit_of_bias})", loc="left", fontsize=9, color=INK, pad=17
         )
         axis.annotate(
             f"band: {BIAS_LIMIT:.0%} of {quantity.of}",
@@ -208,7 +210,7 @@ def averages_figure(averages: Averages):
         axis.set_xlim(left=0)
         open_axis(axis)
     for axis in axes[-3:]:
-        axis.set_xlabel("time step, fs", color=INK)
+        axis.set_xlabel("time step (fs)", color=INK)
     figure.legend(
         handles.values(),
         handles.keys(),
@@ -221,7 +223,7 @@ def averages_figure(averages: Averages):
     return figure
 
 
-def averages_page(averages: Averages, command: str) -> str:
+def _page_parts(averages: Averages, command: str) -> Iterator[str]:
     methods = averages.methods
     colored = chips(methods)
 
@@ -251,14 +253,9 @@ def averages_page(averages: Averages, command: str) -> str:
         table(*brief_table(averages).shown(), marked=colored),
         items(describe_failures(averages)),
     )
-    parts = [
-        f'<p class="faint">{plain(about)}; {averages.sampled:g} ps at every step</p>',
-        section(f"Steps (fs) at which an average is off by {BIAS_LIMIT:.0%}", *steps),
-        section(
-            "Bias against the time step",
-            wide(averages_figure(averages), "averages", "biases over time steps"),
-        ),
-        section("All runs: biases, U in kT per degree of freedom", *all_runs),
-        section("How to repeat it", code(command)),
-    ]
-    return page(f"{averages.name}: bias of averages", parts)
+    drawn = wide(averages_figure(averages), "averages", "biases over time steps")
+    yield f'<p class="faint">{plain(about)}; {averages.sampled:g} ps at every step</p>'
+    yield section(f"Steps (fs) at which an average is off by {BIAS_LIMIT:.0%}", *steps)
+    yield section("Bias against the time step", drawn)
+    yield section("All runs: biases, U in kT per degree of freedom", *all_runs)
+    yield section("How to repeat it", code(command))

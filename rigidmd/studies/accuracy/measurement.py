@@ -24,12 +24,12 @@ from rigidmd.run.trials import (
 
 #: Fraction of an integrator's longest stable step that is recommended, where a longer one diverges.
 STABLE_FRACTION = 0.8
-#: Least steps in a span of a trial that extends the steps of an integrator.
+#: Minimum steps in a span of a trial that extends the steps of an integrator.
 MIN_STEPS = 4
 #: Steps that warm up an engine (lists, buffers, memory): the first 25 steps of 216 waters took 40
 #: ms, the next 20 ms.
 WARM_UP = 10
-#: Least seconds of computing in the timing of a span.
+#: Minimum seconds of computing in the timing of a span.
 TIMING_SECONDS = 0.2
 #: Tolerances of general solvers that choose their steps.
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)

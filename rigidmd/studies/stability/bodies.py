@@ -39,7 +39,7 @@ def rotation(trial: Trial, x: float) -> Trials:
 
 
 def free_rotation(inertia: np.ndarray, omega: np.ndarray, span: float) -> np.ndarray:
-    """Q of a free body at the end, by DOP853 on Euler's equations and a quaternion; its error is
+    """Q of a free body at the end, by DOP853 on Euler's equations and a quaternion. Its error is
     1e-13 per radian."""
     i1, i2, i3 = inertia.tolist()
     k1, k2, k3 = (i2 - i3) / i1, (i3 - i1) / i2, (i1 - i2) / i3

@@ -38,7 +38,7 @@ class Outcome(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A setting of a case and its expected outcome; it runs with several integrators.
+    """A setting of a case and its expected outcome. It runs with several integrators.
 
     It lasts for its duration or number of steps, whichever is longer. Times are in s for a body, in
     fs for molecules.

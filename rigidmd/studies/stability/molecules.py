@@ -168,7 +168,7 @@ def far_away_in_file(trial: Trial, shift: float) -> Trials:
 
 @builder
 def far_away(trial: Trial, shift: float) -> Trials:
-    """The change of energy and forces, relative; without a shift the first molecule is on a face.
+    """The change of energy and forces, relative. Without a shift the first molecule is on a face.
 
     Positions have an error of eps times the distance; forces vary relatively by about ten per Å.
     """

@@ -3,12 +3,11 @@
 import html
 import platform
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any
 
-from rigidmd.core.files import write_text
 from rigidmd.io.write import columns_text, format_cell, write_csv
 from rigidmd.studies.stability.cases import (
     BOUND,
@@ -19,7 +18,18 @@ from rigidmd.studies.stability.cases import (
     UNDETECTED,
 )
 from rigidmd.studies.stability.runner import FAILURES, TrialResult
-from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table
+from rigidmd.view.page import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    Raw,
+    code,
+    items,
+    plain,
+    section,
+    table,
+    write_page,
+)
 
 #: Meaning of each verdict, and how it is shown.
 VERDICTS = {
@@ -136,7 +146,7 @@ def _limit_cells(results: Results, unit: str) -> tuple[str, str]:
 
 def write_stability(folder: Path, results: Results, command: str) -> list[Path]:
     write_csv(folder / FILES[0], [COLUMNS.split(","), *map(_csv_row, results)])
-    write_text(folder / FILES[1], stability_page(results, command))
+    write_page(folder / FILES[1], "Stability", _page_parts(results, command))
     return [folder / name for name in FILES]
 
 
@@ -154,21 +164,18 @@ def _csv_row(result: TrialResult) -> list[Any]:
     return ["" if isinstance(cell, float) and isnan(cell) else cell for cell in row]
 
 
-def stability_page(results: Results, command: str) -> str:
+def _page_parts(results: Results, command: str) -> Iterator[str]:
     cases = grouped(results, lambda result: result.case.name)
     names = [plain(group[0].case.name) for group in cases]
     links = {name: Raw(f'<a href="#case-{name}">{name}</a>') for name in names}
     meanings = [[Raw(_badge(verdict)), meaning] for verdict, (meaning, _) in VERDICTS.items()]
     all_cases = table(HEADERS.split(","), rows_of(results), marked=links)
     machine = platform.processor() or platform.machine()
-    parts = [
-        items(conclusions(results)),
-        table([], meanings, words=True),
-        section("All cases", all_cases, f"<p>{BOUND_TEXT}</p>"),
-        *map(_case_section, cases),
-        section("How to repeat it", code(f"{command}    # on {machine}")),
-    ]
-    return page("Stability", parts)
+    yield items(conclusions(results))
+    yield table([], meanings, words=True)
+    yield section("All cases", all_cases, f"<p>{BOUND_TEXT}</p>")
+    yield from map(_case_section, cases)
+    yield section("How to repeat it", code(f"{command}    # on {machine}"))
 
 
 def _badge(verdict: str, count: str = "") -> str:

@@ -37,7 +37,7 @@ from rigidmd.studies.stability.cases import (
 FAILURES = (UNDETECTED, CRASH)
 #: Ways in which a step that is too long fails, the worst first.
 BEYOND = (CRASH, UNDETECTED, "blow-up", "drift", "detected")
-#: Most doublings of a step that is bounded; ratio at which bisection ends.
+#: Maximum number of doublings of a step that is bounded; ratio at which bisection ends.
 DOUBLINGS, RATIO = 10, 1.1
 Warn = Callable[[str], object]
 
@@ -138,7 +138,7 @@ def run_trial(case: Case, trial: Trial, integrator: str) -> TrialResult:
 
 
 def attempt(trial: Trial, integrator: str, warn: Warn, step: float) -> Outcome:
-    """Run a trial; an error of rigidmd becomes a message, any other exception a crash."""
+    """Run a trial. An error of rigidmd becomes a message, any other exception a crash."""
     try:
         return (trial.run or run_scene)(trial, integrator, warn, step)
     except RigidMDError as error:

@@ -15,6 +15,7 @@ from rigidmd.studies.sweep.folder import (
     TABLE,
     Manifest,
     describe_values,
+    readable_key,
     short_keys,
     value_name,
 )
@@ -40,25 +41,6 @@ LONG_WORD = 12  # letters of a value from which on the values are written at an 
 #: Ratio of the largest to the smallest value from which on the axis is logarithmic; values that
 #: need a power of ten.
 DECADES, TINY = 100.0, 1e-3
-#: Last parts of keys -> units on axes.
-UNITS = {
-    "K": "K",
-    "fs": "fs",
-    "ps": "ps",
-    "A": "Å",
-    "bar": "bar",
-    "g_cm3": "g/cm³",
-    "nm": "nm",
-    "s": "s",
-    "kg": "kg",
-    "m": "m",
-    "kJ_mol": "kJ/mol",
-    "V_per_nm": "V/nm",
-    "per_ps": "1/ps",
-    "deg": "°",
-    "u": "u",
-    "rad": "rad",
-}
 
 
 def collect(manifest: Manifest) -> tuple[Table, list[Path]]:
@@ -99,11 +81,7 @@ def write_analyses_figure(table: Table, name: str) -> None:
 def axis_label(key: str, together: Iterable[str]) -> str:
     """A swept key as the label of an axis: with its unit, and with the keys that vary together with
     it."""
-    *table, name = key.split(".")
-    end = max((end for end in UNITS if name.endswith(f"_{end}")), key=len, default="")
-    label = name.removesuffix(f"_{end}").replace("_", " ")
-    label += f" of {'.'.join(table)}" if table else ""
-    label += f" ({UNITS[end]})" if end else ""
+    label = readable_key(key)
     others = [other for other in together if other != key]
     return f"{label}\ntogether with {', '.join(others)}" if others else label
 
@@ -148,7 +126,8 @@ def draw_table(table: Table, columns: list[str], connected: bool = True):
     rows = [row for row in table.rows if row.runs]
     numbers = [key for key in table.keys if all(_is_number(row.values[key]) for row in rows)]
     key = [*numbers, *table.keys, SEED][0]
-    figure, axes = _panels([SHORT.get(column, column) for column in columns])
+    titles = [SHORT.get(column, column).replace("kJ/mole", "kJ/mol") for column in columns]
+    figure, axes = _panels(titles)
     if key == SEED:
         for axis, column in zip(axes, columns, strict=True):
             _draw_band(axis, *rows[0][column])

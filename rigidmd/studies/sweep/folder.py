@@ -122,7 +122,7 @@ def is_sweep(folder: Path) -> bool:
 def read_manifest(folder: Path) -> Manifest:
     """The manifest of a sweep, with the states that the folders of its points show. Raises
     OutputError."""
-    remedy = f"; {option('force')} begins the sweep anew"
+    remedy = f"; {option('force')} starts the sweep again"
     manifest = read_json(folder / MANIFEST, Manifest, remedy)
     if manifest is None:
         raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
@@ -175,6 +175,36 @@ def short_keys(keys: Iterable[str]) -> dict[str, str]:
         unique = next((end for end in ends_of_key if count[end] == 1), key)
         short[key] = re.sub(r"[^\w.+\-]", "-", unique)
     return short
+
+
+#: Last parts of keys -> units on axes.
+UNITS = {
+    "K": "K",
+    "fs": "fs",
+    "ps": "ps",
+    "A": "Å",
+    "bar": "bar",
+    "g_cm3": "g/cm³",
+    "nm": "nm",
+    "s": "s",
+    "kg": "kg",
+    "m": "m",
+    "kJ_mol": "kJ/mol",
+    "V_per_nm": "V/nm",
+    "per_ps": "1/ps",
+    "deg": "°",
+    "u": "u",
+    "rad": "rad",
+}
+
+
+def readable_key(key: str) -> str:
+    """A key with its unit, for readers: "temperature of stages.0 (K)"."""
+    *table, name = key.split(".")
+    end = max((end for end in UNITS if name.endswith(f"_{end}")), key=len, default="")
+    label = name.removesuffix(f"_{end}").replace("_", " ")
+    label += f" of {'.'.join(table)}" if table else ""
+    return label + (f" ({UNITS[end]})" if end else "")
 
 
 def value_name(value: Any) -> str:

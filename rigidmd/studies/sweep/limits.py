@@ -1,4 +1,4 @@
-"""Averages of a sweep over a time step, extrapolated to a step of 0: extrapolation.csv, .png and
+"""Averages of a sweep over a time step, extrapolated to zero time step: extrapolation.csv, .png and
 .html."""
 
 import csv
@@ -33,7 +33,7 @@ from rigidmd.studies.sweep.table import (
     table_of,
 )
 from rigidmd.studies.sweep.table import Table as SweepTable
-from rigidmd.view.page import code, items, page, plain, section, table, wide, write_page
+from rigidmd.view.page import code, items, plain, section, table, wide, write_page
 
 OPTION = "--extrapolate"
 FILES = ("extrapolation.csv", "extrapolation.png", "extrapolation.html")
@@ -45,7 +45,7 @@ INDEPENDENT, JOINT, FLUCTUATIONS = "independent", "joint", "fluctuations"
 
 
 class Limit(NamedTuple):
-    """A quantity at a step of 0, for a combination of values of the keys other than the step and
+    """A quantity at zero time step, for a combination of values of the keys other than the step and
     the seed."""
 
     values: dict[str, Any]
@@ -291,21 +291,19 @@ def write_limits(folder: Path, limits: Limits, command: str) -> list[str]:
     add_to_folder(folder, FILES)
     report_of(limits.lines()).write(folder / FILES[0], csv.QUOTE_NONNUMERIC)
     write_figure(folder / FILES[1], lambda: _figure(limits), f"{limits.name}: {limits.title}")
-    write_page(folder / FILES[2], lambda: _page(limits, command))
+    title = f"{limits.name}: averages at a step of 0"
+    write_page(folder / FILES[2], title, _parts(limits, command))
     return [name for name in FILES if (folder / name).is_file()]
 
 
-def _page(limits: Limits, command: str) -> str:
+def _parts(limits: Limits, command: str) -> Iterator[str]:
     note = "mean = limit + slope · dt^order, up to the longest step that chi² allows (column `to`)"
     rows = table(*limits.as_text().shown())
     drawn = wide(_figure(limits), "extrapolation", "means over the time step, and their limits")
-    sections = [
-        f'<p class="faint">{plain(limits.title)}</p>',
-        section("Limits and biases", rows, items([note, *limits.missing, *limits.not_joint])),
-        section("Means against the time step", drawn),
-        section("How to repeat it", code(command)),
-    ]
-    return page(f"{limits.name}: averages at a step of 0", sections)
+    yield f'<p class="faint">{plain(limits.title)}</p>'
+    yield section("Limits and biases", rows, items([note, *limits.missing, *limits.not_joint]))
+    yield section("Means against the time step", drawn)
+    yield section("How to repeat it", code(command))
 
 
 def _figure(limits: Limits):

@@ -273,7 +273,7 @@ def digest_of(scene: Scene, file_digest: Callable[[Path], str] = file_digest) ->
 
 
 def order_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
-    """The axes in the order of the sweep in a folder; a single value of a key that it varies is one
+    """The axes in the order of the sweep in a folder. A single value of a key that it varies is one
     more value."""
     if not is_sweep(folder):
         return axes
@@ -302,7 +302,7 @@ def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> None:
         if problems := _differences_between(earlier, fresh):
             raise OutputError(
                 f"{folder} holds a sweep of another scene: {'; '.join(problems[:MOST_SHOWN])}."
-                f" {option('force')} begins it anew, {elsewhere()}"
+                f" {option('force')} starts it again, {elsewhere()}"
             )
         names = {point.folder for point in earlier.points}
         new = [point for point in fresh.points if point.folder not in names]

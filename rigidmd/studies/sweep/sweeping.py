@@ -136,9 +136,6 @@ def sweep(
     """Run a scene file at many points in parallel, and return the table of means and errors, as
     `rigidmd sweep` does.
 
-    table = rigidmd.sweep("water.toml", {"stages.equilibration.temperature_K": [280, 290], "seed":
-    range(1, 9)}, jobs=2) print(table["Temperature (K)"], table.error("Temperature (K)"))
-
     The same call continues a sweep.
 
     Parameters
@@ -161,6 +158,15 @@ def sweep(
         If points failed; `sweep.json` has the reasons.
     KeyboardInterrupt
         After Ctrl-C.
+
+    Examples
+    --------
+        table = rigidmd.sweep(
+            "water.toml",
+            {"stages.equilibration.temperature_K": [280, 290], "seed": range(1, 9)},
+            jobs=2,
+        )
+        print(table["Temperature (K)"], table.error("Temperature (K)"))
     """
     where = None if folder is None else Path(folder)
     with open_sweep(Path(scene), axes_of(sets), where, trust=trust, force=force) as manifest:

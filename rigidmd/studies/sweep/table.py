@@ -19,7 +19,7 @@ from rigidmd.errors import RigidMDError
 from rigidmd.io.write import Column, nine_digits
 from rigidmd.io.write import Table as ReportTable
 from rigidmd.run.record import Record, read_record
-from rigidmd.studies.sweep.folder import SEED, Manifest, short_keys, value_name
+from rigidmd.studies.sweep.folder import SEED, Manifest, readable_key, short_keys, value_name
 
 if TYPE_CHECKING:
     import pandas
@@ -36,7 +36,7 @@ MAIN_OF_BODY = (
     "L_size_error largest",
 )
 #: Short titles for the printed table.
-SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/d.o.f.)"}
+SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/DOF)"}
 #: The box, whose averages over an earlier stage are in the table if that stage changes it.
 OF_BOX = tuple(IN_LOGS[name].header for name in ("volume", "a", "b", "c", "alpha", "beta", "gamma"))
 #: Columns of a body that are not in the table; nor are the entries of Q and of the quaternion.
@@ -145,9 +145,10 @@ class Table(Displayed):
         """The table that is printed and displayed: keys, number of runs, and the main columns with
         their errors."""
         short = short_keys(self.keys)
+        headers = {key: f"set {readable_key(short[key])}" for key in self.keys}
         lines = []
         for row in self.rows:
-            line = {short[key]: value_name(value) for key, value in row.values.items()}
+            line = {headers[key]: value_name(value) for key, value in row.values.items()}
             line["runs"] = str(row.count)
             for name in self.main_columns():
                 mean, error = row[name]

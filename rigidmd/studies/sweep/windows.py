@@ -29,7 +29,7 @@ def is_of_windows(manifest: Manifest) -> bool:
 def pmf(sweep: Table | str | Path) -> AnalysisResult:
     """The potential of mean force along the restrained distance of a sweep, by all its windows.
 
-    Points that have not finished are left out. Nothing is written.
+    Points that have not finished are omitted. Nothing is written.
 
     Parameters
     ----------

@@ -1,0 +1,255 @@
+"""Potentials of pairs of bodies in a system: the parameters of each pair of species, and where they
+are cut off."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import inf
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from rigidmd.assemble.user_code.cutoffs import PairPotentialError, check_cutoff
+from rigidmd.assemble.user_code.force import BoundTerm
+from rigidmd.core.plain_text import did_you_mean
+from rigidmd.engines.system import System
+from rigidmd.scene.forces import BodyForce
+from rigidmd.scene.validation import not_none
+
+if TYPE_CHECKING:
+    from rigidmd.forces.poses.formulas import PoseFormula
+
+Parameters = Mapping[str, float]
+Vector = tuple[float, float, float]
+#: In the log, for a function without a name, or with the name of a column.
+DEFAULT_NAME, UNNAMED = "body_pairs", ("", "<lambda>", "energy")
+#: The switch begins at this fraction of the cutoff.
+SWITCH_START = 0.9
+
+
+@dataclass(frozen=True)
+class BodyPairPotential:
+    """A potential of pairs of bodies for `Simulation(scene, forces=[...])`, made by
+    `body_pair_potential`."""
+
+    function: Callable[..., Any]
+    parameters: Mapping[str, Parameters]  # by species
+    species: tuple[str, ...]  # on which it acts; none: on all
+    pairs: Mapping[tuple[str, str], Parameters]
+    axis: Literal["x", "y", "z"] | None
+    references: Mapping[str, Vector]
+    truncation: Literal["switch", "plain"]
+    cutoff_A: float | None
+    switch_start_A: float | None
+    name: str
+
+
+def body_pair_potential(
+    function: Callable[..., Any],
+    parameters: Mapping[str, Parameters] | None = None,
+    *,
+    species: tuple[str, ...] = (),
+    pairs: Mapping[tuple[str, str], Parameters] | None = None,
+    axis: Literal["x", "y", "z"] | None = None,
+    references: Mapping[str, Vector] | None = None,
+    truncation: Literal["switch", "plain"] = "switch",
+    cutoff_A: float | None = None,
+    switch_start_A: float | None = None,
+    name: str = "",
+) -> BodyPairPotential:
+    """An energy of pairs of bodies as a function of their relative position and orientations, for
+    `Simulation(scene, forces=[...])`.
+
+    def dipoles(r, u, v):
+        s = np.sqrt(r @ r)
+        return 20 * (u @ v / s**3 - 3 * (u @ r) * (v @ r) / s**5)
+
+    rigidmd.body_pair_potential(dipoles, axis="z")
+
+    Parameters
+    ----------
+    function
+        function(r, a, b) or function(r, a, b, p, q). r is the vector (3,) in Å between the
+        reference points, from the first body to the second. a and b are their rotation matrices
+        (3, 3) from the coordinates of the models' files to the lab, p and q their parameters. It
+        gives the energy in kJ/mol. Force and torques are derived from it, so that it may have
+        arithmetic and functions of NumPy such as numpy.exp and numpy.where, but no branches. Or it
+        gives a tuple of the energy, the force (3,) on the second body in kJ/mol/Å, and the torques
+        (3,) on the first and on the second body in kJ/mol, along the axes of the lab. An exchange
+        of both bodies must not change the energy. If their species differ, the one that is first in
+        the scene is a
+    parameters
+        Species -> numbers by name, the attributes of p and q. It acts on these species
+    species
+        Without `parameters`: the species that it acts on; default: all
+    pairs
+        (species, species) -> parameters of the pair, in place of those of p and q
+    axis
+        An axis of the models' files: a and b are then unit vectors (3,) along it
+    references
+        Species -> reference point in the coordinates of its model's file, Å; default: the centre of
+        mass
+    truncation
+        switch: from `switch_start_A` the energy is switched to 0 at the cutoff, with two continuous
+        derivatives; plain: it jumps
+    cutoff_A
+        Default: the cutoff of the scene
+    switch_start_A
+        Default: 0.9 of the cutoff
+    name
+        In the log and in messages; default: the name of the function
+
+    Raises
+    ------
+    ValueError
+    """
+    if not callable(function):
+        raise ValueError(f"{function!r:.60} is not a function of (r, a, b)")
+    if axis not in (None, "x", "y", "z"):
+        raise ValueError(f"axis is {axis!r}, must be 'x', 'y' or 'z'")
+    if truncation not in ("switch", "plain"):
+        raise ValueError(f"truncation is {truncation!r}, must be 'switch' or 'plain'")
+    if truncation == "plain" and switch_start_A is not None:
+        raise ValueError("switch_start_A would have no effect with truncation = 'plain'")
+    for key, value in (("cutoff_A", cutoff_A), ("switch_start_A", switch_start_A)):
+        if value is not None and not (isinstance(value, int | float) and value > 0):
+            raise ValueError(f"{key} is {value!r}, must be a number above 0")
+    for key in pairs or {}:
+        if not (isinstance(key, tuple) and [type(one) for one in key] == [str, str]):
+            raise ValueError(f"pairs: {key!r} is not a pair of names of species")
+    called = getattr(function, "__name__", "")
+    return BodyPairPotential(
+        function=function,
+        parameters=dict(parameters or {}),
+        species=tuple(species),
+        pairs=dict(pairs or {}),
+        axis=axis,
+        references=dict(references or {}),
+        truncation=truncation,
+        cutoff_A=cutoff_A,
+        switch_start_A=switch_start_A,
+        name=name or (DEFAULT_NAME if called in UNNAMED else called),
+    )
+
+
+def potential_of_scene(entry: BodyForce) -> BodyPairPotential:
+    """The potential of one of [[forces.bodies]] without a module. Raises ValueError."""
+    from rigidmd.forces.poses.shipped import function_of_text, shipped_function
+
+    if entry.potential is not None:
+        function = shipped_function(entry.potential, entry.options, entry.parameters)
+    else:
+        function = function_of_text(not_none(entry.energy), entry.mixing)
+    return body_pair_potential(
+        function,
+        entry.parameters,
+        pairs={pair.species: pair.parameters for pair in entry.pairs},
+        axis=entry.axis,
+        references=entry.references,
+        truncation=entry.truncation,
+        cutoff_A=entry.cutoff_A,
+        switch_start_A=entry.switch_start_A,
+        name=entry.label,
+    )
+
+
+def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
+    """The potential between the bodies of a system.
+
+    Raises
+    ------
+    PairPotentialError
+        With all errors.
+    """
+    from rigidmd.forces.poses.pairs import BodyPairs  # for such scenes only
+
+    species = [m.name for m in system.species]
+    faults = _unknown_species(potential, list(dict.fromkeys(species)))
+    acts_on = potential.species or tuple(potential.parameters) or tuple(dict.fromkeys(species))
+    kinds = [name for name in dict.fromkeys(species) if name in acts_on]
+    if not len(system.state.rotation):
+        faults.append("no body of the scene rotates: rigidmd.pair_potential is for points")
+    if faults:
+        raise PairPotentialError(*faults)
+    cutoff = potential.cutoff_A or system.cutoff
+    check_cutoff(cutoff, system)
+    start = cutoff
+    if potential.truncation == "switch" and cutoff < inf:
+        start = potential.switch_start_A or SWITCH_START * cutoff
+    if not start <= cutoff:
+        raise PairPotentialError(f"switch_start_A = {start:g} is beyond the cutoff of {cutoff:g} Å")
+    formula, rows = _rows(potential, kinds)
+    of_species = np.array([kinds.index(name) if name in kinds else -1 for name in species])
+    kind = of_species[system.model.species]
+    body = np.arange(len(kind))
+    frozen = (system.model.inverse_mass == 0)[system.model.species]
+    models = {m.name: m for m in system.species}
+    references = [
+        (np.array(potential.references.get(name, models[name].centre)) - models[name].centre)
+        @ models[name].axes
+        for name in kinds
+    ]
+    term = BodyPairs(
+        formula=formula.kind(),
+        kind=kind,
+        group=np.where(frozen, len(body), body),
+        reference=np.array(references, float).reshape(-1, 3),
+        frame=np.ascontiguousarray([models[name].axes.T for name in kinds]),
+        parameters=rows,
+        interacts=np.ones((len(kinds), len(kinds)), bool),
+        switch_start=float(start),
+        cutoff=float(cutoff),
+    )
+    ends = "no cutoff" if cutoff == inf else f"cutoff {cutoff:g} Å, {potential.truncation}"
+    source = "derived from its energy" if formula.is_derived else "as given"
+    text = (
+        f"pairs of {', '.join(kinds)}, {formula.operations} operations, force and torques {source},"
+        f" {ends}"
+    )
+    return BoundTerm(term, text)
+
+
+def _unknown_species(potential: BodyPairPotential, species: list[str]) -> list[str]:
+    named = {
+        "parameters": potential.parameters,
+        "species": potential.species,
+        "references": potential.references,
+        "pairs": [name for pair in potential.pairs for name in pair],
+    }
+    return [
+        f"{key}: there is no {name}{did_you_mean(name, species) or ''}; there are"
+        f" {', '.join(species)}"
+        for key, names in named.items()
+        for name in dict.fromkeys(names)
+        if name not in species
+    ]
+
+
+def _rows(potential: BodyPairPotential, kinds: list[str]) -> "tuple[PoseFormula, np.ndarray]":
+    """The formula, and its numbers (kinds, kinds, numbers) for each pair of kinds. Raises
+    PairPotentialError."""
+    from rigidmd.forces.poses.formulas import formula_of_poses
+    from rigidmd.forces.poses.trace import TraceError
+
+    sets = [*potential.parameters.values(), *potential.pairs.values()]
+    names = list(dict.fromkeys(key for values in sets for key in values))
+    try:
+        formula = formula_of_poses(potential.function, names, potential.axis)
+        rows = [
+            [formula.numbers(*_parameters_of(potential, names, one, other)) for other in kinds]
+            for one in kinds
+        ]
+    except TraceError as error:
+        raise PairPotentialError(str(error)) from None
+    return formula, np.array(rows, float).reshape(len(kinds), len(kinds), -1)
+
+
+def _parameters_of(
+    potential: BodyPairPotential, names: list[str], one: str, other: str
+) -> tuple[Parameters, Parameters]:
+    """The parameters of two species. Raises PairPotentialError if one is missing."""
+    of_pair = potential.pairs.get((one, other)) or potential.pairs.get((other, one)) or {}
+    both = [{**potential.parameters.get(name, {}), **of_pair} for name in (one, other)]
+    for name, values in zip((one, other), both, strict=True):
+        if missing := [key for key in names if key not in values]:
+            raise PairPotentialError(f"{name} has no parameter {', '.join(missing)}")
+    return both[0], both[1]

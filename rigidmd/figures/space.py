@@ -1,0 +1,242 @@
+"""Drawing of things in space, for all figures and animations: curves, spheres, faces, arrows."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rigidmd.figures.style import FAINT, INK, WARM
+
+UP = np.array([0.0, 0.0, 1.0])
+#: Direction of the light: right, up, towards the eye.
+LIGHT = np.array([-0.5, 0.65, 0.55])
+#: Discs of a lit sphere from its rim on: radius, shift towards the light (both in radii), amount of
+#: white.
+DISCS = ((1.0, 0.0, -0.35), (0.93, 0.03, 0.0), (0.62, 0.2, 0.12), (0.3, 0.34, 0.45))
+#: Most points of a line that are drawn at once: the renderer fails on 200,000 across a figure.
+AT_ONCE = 5000
+#: Lines with more points are images in an .svg.
+MOST_POINTS = 10_000
+
+
+def camera(eye: np.ndarray, up: np.ndarray = UP) -> np.ndarray:
+    """An orthographic view from the direction `eye`: rows are to the right, upwards and towards the
+    eye."""
+    toward, right = eye / np.linalg.norm(eye), np.cross(up, eye)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(toward, right), toward])
+
+
+def circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
+    """The circle on the unit sphere at this polar angle (degrees) from a direction."""
+    right, up, toward = camera(normal, np.eye(3)[np.abs(normal).argmin()])
+    angle, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
+    return np.sin(polar) * (np.cos(angle) * right + np.sin(angle) * up) + np.cos(polar) * toward
+
+
+def globe() -> np.ndarray:
+    """Circles of longitude and latitude on the unit sphere, every 30 degrees, with gaps of NaN."""
+    azimuths = np.radians(np.arange(0, 180, 30))
+    rings = [circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in azimuths]
+    rings += [circle(UP, polar) for polar in range(30, 180, 30)]
+    return np.concatenate([np.vstack([ring, np.full(3, np.nan)]) for ring in rings])
+
+
+def thin_path(path: np.ndarray, max_points: int) -> np.ndarray:
+    """Indices of at most about `max_points` points of a path (n, d), evenly along its length,
+    with its ends."""
+    if len(path) <= max_points:
+        return np.arange(len(path))
+    way = np.append(0.0, np.linalg.norm(np.diff(path, axis=0), axis=1)).cumsum()
+    marks = np.searchsorted(way, np.linspace(0, way[-1], max_points))
+    return np.unique([0, *marks.clip(0, len(path) - 1), len(path) - 1])
+
+
+def draw_line(axis: Any, flat: np.ndarray, **style: Any) -> None:
+    """Draw a line of any number of points (n, 2), in pieces that join."""
+    for first in range(0, max(1, len(flat) - 1), AT_ONCE):
+        axis.plot(*flat[first : first + AT_ONCE + 1].T, snap=False, **style)
+
+
+def path_style(flat: np.ndarray, half: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    """Indices of the points of a path (n, 2) to draw, about one per pixel of a picture of this half
+    width, and the style of its line: longer ones are thinner."""
+    length = np.linalg.norm(np.diff(flat, axis=0) / half, axis=1).sum()
+    shown = thin_path(flat / half, int(800 * length) + 2)
+    width = max(0.25, 1.7 / (1 + length / 60))
+    return shown, {"lw": width, "rasterized": len(shown) > MOST_POINTS}
+
+
+class View:
+    """A picture of things in space, in axes of Matplotlib, which are cleared.
+
+    Parameters
+    ----------
+    matrix
+        (3, 3), as of `camera`.
+    half, centre
+        (2,) Half the width and height of the picture, and its centre.
+    """
+
+    def __init__(self, axis: Any, matrix: np.ndarray, half: Any = 1.0, centre: Any = (0.0, 0.0)):
+        self.axis, self.matrix = axis, matrix
+        self.half, self.centre = np.broadcast_to(half, 2), np.asarray(centre)
+        axis.clear()
+        axis.set_axis_off()
+        low, high = self.centre - self.half, self.centre + self.half
+        axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+
+    def flat(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) in the picture, (..., 2)."""
+        return points @ self.matrix[:2].T
+
+    def depth(self, points: np.ndarray) -> np.ndarray:
+        """How far points are towards the eye."""
+        return points @ self.matrix[2]
+
+    def curve(
+        self,
+        points: np.ndarray,
+        alphas: tuple[float, float],
+        depth: np.ndarray | None = None,
+        **style: Any,
+    ) -> None:
+        """Draw a line that is strong on the side of the eye (depth >= 0) and faint on the other."""
+        flat = self.flat(points)
+        front = (self.depth(points) if depth is None else depth) >= 0
+        joined = front.copy()
+        joined[:-1] |= front[1:]
+        joined[1:] |= front[:-1]
+        for part, alpha, order in ((joined, alphas[0], 3), (~front, alphas[1], 1.5)):
+            line = np.where(part[:, None], flat, np.nan)
+            draw_line(self.axis, line, alpha=alpha, zorder=order, **style)
+
+    def path(self, points: np.ndarray, color: str, depth: np.ndarray | None = None) -> None:
+        """Draw the path of a motion, with a dot at its start."""
+        depth = self.depth(points) if depth is None else depth
+        flat = self.flat(points)
+        shown, style = path_style(flat, self.half.max())
+        self.curve(points[shown], (0.95, 0.25), depth[shown], color=color, **style)
+        self.axis.plot(*flat[0], "o", color=WARM, ms=5, zorder=4)
+
+    def spheres(
+        self, centres: np.ndarray, radius: np.ndarray, colors: np.ndarray, zorder: float = 2.0
+    ) -> None:
+        """Draw lit spheres (n,), each over those behind it. colors : (n, 3)"""
+        from matplotlib.collections import EllipseCollection
+
+        order = self.depth(centres).argsort()
+        flat, radius = self.flat(centres[order])[:, None], radius[order, None]
+        colors = colors[order, None]
+        size, lift, white = np.array(DISCS).T[..., None]  # of the discs (d, 1) of each sphere
+        tint = colors + np.where(white > 0, 1 - colors, colors) * white
+        widths = (2 * size[:, 0] * radius).ravel()
+        middles = flat + (lift * LIGHT[:2] / 0.82) * radius[..., None]
+        style = {"facecolors": tint.reshape(-1, 3).clip(0, 1), "edgecolors": "none"}
+        style |= {"offsets": middles.reshape(-1, 2), "offset_transform": self.axis.transData}
+        self.axis.add_collection(
+            EllipseCollection(widths, widths, 0, units="xy", zorder=zorder, **style)
+        )
+
+    def faces(self, corners: Sequence[np.ndarray], colors: np.ndarray) -> None:
+        """Draw the lit faces of a solid, each (k, 3) counterclockwise from outside. colors :
+        (n, 3)"""
+        from matplotlib.collections import PolyCollection
+
+        shown = []
+        for face, color in zip(corners, colors, strict=True):
+            seen = face @ self.matrix.T
+            normal = np.cross(seen, np.roll(seen, -1, axis=0)).sum(axis=0)
+            if normal[2] > 0:
+                lit = 0.62 + 0.38 * max(0.0, float(normal @ LIGHT) / np.linalg.norm(normal))
+                shown.append((seen[:, 2].mean(), seen[:, :2], lit * color))
+        shown.sort(key=lambda entry: entry[0])
+        tints = [color for *_, color in shown]
+        style = {"facecolors": tints, "edgecolors": tints, "lw": 0.5, "zorder": 2}
+        self.axis.add_collection(PolyCollection([flat for _, flat, _ in shown], **style))
+
+    def ellipsoids(self, solids: Sequence[tuple[np.ndarray, str]]) -> None:
+        """Draw ellipsoids (semi-axes, colour) about the origin, which may intersect, in pale
+        colours."""
+        from matplotlib.colors import to_rgb
+
+        view, (right, up) = self.matrix, self.half
+        count = (500 * self.half / self.half.max()).astype(int)
+        x, y = (
+            np.linspace(middle - half, middle + half, n)
+            for middle, half, n in zip(self.centre, self.half, count, strict=True)
+        )
+        base = x[None, :, None] * view[0] + y[:, None, None] * view[1]
+        nearest = np.full(base.shape[:2], -np.inf)
+        image = np.zeros((*nearest.shape, 4))
+        for semi, color in solids:
+            weight = semi**-2.0
+            a, b, c = view[2] ** 2 @ weight, base @ (weight * view[2]), base**2 @ weight - 1
+            depth = (np.sqrt(np.maximum(b * b - a * c, 0)) - b) / a
+            normal = (base + depth[..., None] * view[2]) * weight
+            normal /= np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-300)
+            tint = 0.38 - 0.28 * np.clip(normal @ (LIGHT @ view), 0, 1)[..., None]
+            visible = (b * b >= a * c) & (depth > nearest + 1e-6 * max(right, up))
+            image[visible, :3] = (1 - tint * (1 - np.array(to_rgb(color))))[visible]
+            image[visible, 3] = 1.0
+            nearest[visible] = depth[visible]
+            rim = self.flat(semi * circle(view[2] / semi))
+            draw_line(self.axis, rim, color=color, lw=0.8, alpha=0.6)
+        box = (x[0], x[-1], y[0], y[-1])
+        self.axis.imshow(image, origin="lower", extent=box, interpolation="bilinear", zorder=0)
+
+    def arrow(
+        self,
+        start: np.ndarray,
+        vector: np.ndarray,
+        color: str,
+        name: str,
+        side: float = 0.0,
+        lw: float = 2.0,
+        fontsize: float = 13.0,
+        zorder: float = 4.0,
+    ) -> np.ndarray | None:
+        """Draw a named arrow, unless it is seen from its end. side : of the name, as arrows may
+        coincide. Returns where the name is."""
+        tail, tip = self.flat(start), self.flat(start + vector)
+        size = float(np.linalg.norm(tip - tail))
+        unit = self.half.max()
+        if size < 0.02 * unit:
+            return None
+        head = f"-|>,head_width={0.12 * lw:g},head_length={0.25 * lw:g}"
+        arrow = {"arrowstyle": head, "color": color, "lw": lw, "shrinkA": 0, "shrinkB": 0}
+        self.axis.annotate("", tip, xytext=tail, arrowprops=arrow, zorder=zorder)
+        along = (tip - tail) / size
+        label = tip + unit * (0.055 * along + side * np.array([-along[1], along[0]]))
+        style = {"ha": "center", "va": "center", "style": "italic", "zorder": zorder}
+        self.axis.text(*label, name, color=color, fontsize=fontsize, **style)
+        return label
+
+    def triad(self, names: Sequence[str], down: np.ndarray | None = None) -> None:
+        """Draw the axes of space as small arrows in the lower left corner, and the direction of
+        gravity."""
+        corner = (self.centre - 0.8 * self.half) @ self.matrix[:2]
+        vectors = [*zip(np.eye(3), names, [INK] * 3, strict=False)]
+        if down is not None:
+            vectors.append((0.8 * down, "g", WARM))
+        for vector, name, color in vectors:
+            arrow = 0.13 * self.half.max() * vector
+            self.arrow(corner, arrow, color, name, lw=0.8, fontsize=9)
+
+    def scale(self, length: float, label: str) -> None:
+        """Draw a bar of this length with its label in the lower right corner."""
+        x, y = self.centre + 0.95 * self.half * [1, -1]
+        self.axis.plot([x - length, x], [y, y], color=INK, lw=2, solid_capstyle="butt", zorder=4)
+        where = {"textcoords": "offset points", "ha": "right", "va": "bottom"}
+        self.axis.annotate(label, (x, y), (0, 3), color=INK, fontsize=10, zorder=4, **where)
+
+    def box(self, corners: np.ndarray) -> None:
+        """Draw the edges of a box of eight corners (8, 3) in binary order; those at the furthest
+        corner are faint."""
+        furthest = int(self.depth(corners).argmin())
+        for i in range(8):
+            for j in (i ^ 1, i ^ 2, i ^ 4):
+                if i < j:
+                    back = furthest in (i, j)
+                    style = {"color": FAINT if back else INK, "zorder": 1 if back else 3}
+                    self.axis.plot(*self.flat(corners[[i, j]]).T, lw=0.8, **style)

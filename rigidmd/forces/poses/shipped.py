@@ -1,0 +1,105 @@
+"""The shipped potentials of pairs of bodies, and those of a text, for scenes."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.core.plain_text import did_you_mean
+from rigidmd.forces.poses import gay_berne, multipoles, patch
+
+
+class Shipped(NamedTuple):
+    """A potential that a scene can name."""
+
+    make: Callable[..., Callable]  # the function of two poses, from its options
+    parameters: tuple[str, ...]  # of a species
+    options: tuple[str, ...] = ()
+
+
+SHIPPED = {
+    "gay_berne": Shipped(gay_berne.gay_berne, gay_berne.PARAMETERS, ("upsilon", "mu", "gamma")),
+    "dipole": Shipped(multipoles.dipole, multipoles.DIPOLE, ("reaction_field_A",)),
+    "quadrupole": Shipped(multipoles.quadrupole, multipoles.QUADRUPOLE),
+    "patch": Shipped(patch.patch, patch.PARAMETERS),
+}
+
+
+def shipped_function(
+    name: str, options: Mapping[str, float], parameters: Mapping[str, Mapping[str, float]]
+) -> Callable:
+    """The function of a shipped potential. Raises ValueError for wrong options and parameters."""
+    kind = SHIPPED[name]
+    for key in options:
+        if key not in kind.options:
+            known = ", ".join(kind.options) or "none"
+            hint = did_you_mean(key, kind.options) or ""
+            raise ValueError(f"options: {name} has no {key}{hint}; there are {known}")
+    if not parameters:
+        raise ValueError(
+            f"parameters is missing: {name} needs {', '.join(kind.parameters)} of each species"
+        )
+    for species, values in parameters.items():
+        if wrong := [key for key in values if key not in kind.parameters]:
+            hint = did_you_mean(wrong[0], kind.parameters) or ""
+            raise ValueError(f"parameters of {species}: {name} has no {wrong[0]}{hint}")
+        if missing := [key for key in kind.parameters if key not in values]:
+            raise ValueError(f"parameters of {species}: {', '.join(missing)} is missing")
+    return kind.make(**options)
+
+
+#: In a text: the distance; cosines of the angles of the axes of the first and the second body with
+#: the vector from the first to the second, and with each other.
+DISTANCE, ANGLES = "r", ("a_r", "b_r", "a_b")
+
+
+def function_of_text(energy: str, mixing: Mapping[str, str]) -> Callable:
+    """The function of a text such as "4*eps*((sig/r)**12 - (sig/r)**6)*(1 + k*a_r*b_r)". Raises
+    FormulaError."""
+    from rigidmd.forces.potentials import text_formulas  # SymPy is slow to import
+
+    parsed = text_formulas.parse_energy(energy)
+    prefix = text_formulas.PARAMETER_PREFIX
+    names = sorted(
+        symbol.name.removeprefix(prefix)
+        for symbol in parsed.free_symbols
+        if symbol.name.startswith(prefix) and symbol.name.removeprefix(prefix) not in ANGLES
+    )
+
+    def function(r: Any, u: Any, v: Any, p: Any, q: Any) -> Any:
+        distance = np.sqrt(r @ r)
+        values = {DISTANCE: distance}
+        angles = ((u @ r) / distance, (v @ r) / distance, u @ v)
+        values |= {prefix + name: angle for name, angle in zip(ANGLES, angles, strict=True)}
+        for name in names:
+            mean = MEANS[mixing.get(name, "arithmetic" if name[:3] == "sig" else "geometric")]
+            values[prefix + name] = mean(getattr(p, name), getattr(q, name))
+        return _value(parsed, values)
+
+    return function
+
+
+MEANS: dict[str, Callable] = {
+    "arithmetic": lambda x, y: (x + y) / 2,
+    "geometric": lambda x, y: np.sqrt(x * y),
+    "harmonic": lambda x, y: 2 * x * y / (x + y),
+}
+
+
+def _value(expression: Any, values: Mapping[str, Any]) -> Any:
+    """The value of a SymPy expression of arithmetic and functions of NumPy."""
+    if expression.is_Symbol:
+        return values[expression.name]
+    if expression.is_Number or expression.is_NumberSymbol:
+        return float(expression)
+    parts = [_value(part, values) for part in expression.args]
+    if expression.is_Add:
+        return sum(parts[1:], parts[0])
+    if expression.is_Mul:
+        product = parts[0]
+        for part in parts[1:]:
+            product = product * part
+        return product
+    if expression.is_Pow:
+        return parts[0] ** parts[1]
+    return getattr(np, expression.func.__name__)(*parts)

@@ -1,0 +1,547 @@
+"""Energies of pairs of bodies: derived slopes, the shipped potentials, the neighbour list, scenes."""
+
+import shutil
+import subprocess
+import sys
+from functools import partial
+from itertools import product
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from stops import same_after_stops
+from support import bits_with
+
+import rigidmd
+from rigidmd import Scene, Simulation
+from rigidmd.assemble.build import build
+from rigidmd.errors import SceneError
+from rigidmd.forces.poses.formulas import formula_of_poses
+from rigidmd.forces.poses.gay_berne import PARAMETERS, gay_berne
+from rigidmd.forces.poses.multipoles import dipole, quadrupole
+from rigidmd.forces.poses.patch import patch
+from rigidmd.forces.poses.trace import Graph, TraceError, code_of, slopes_of
+from rigidmd.units import COULOMB, DEBYE, KJ_PER_MOL
+
+ROD = {"length_A": 12.0, "width_A": 4.0, "epsilon_kJ_mol": 1.0, "side": 1.0, "end": 0.2}
+DISC = {"length_A": 3.0, "width_A": 8.0, "epsilon_kJ_mol": 1.5, "side": 0.5, "end": 1.2}
+BALL = {"length_A": 4.0, "width_A": 4.0, "epsilon_kJ_mol": 0.8, "side": 1.0, "end": 1.0}
+SITES = {
+    "rod": [[0.0, 0.0, 3.4], [0.0, 0.0, -3.4]],
+    "disc": [[3.0, 0.0, 0.0], [-1.5, 2.6, 0.0], [-1.5, -2.6, 0.0]],
+}
+
+
+def body(name: str, count: int) -> dict:
+    sites = [
+        {"name": f"A{k}", "mass_u": 20.0, "position_A": position}
+        for k, position in enumerate(SITES[name])
+    ]
+    return {"name": name, "count": count, "sites": sites}
+
+
+def scene(forces: dict | None, counts=None, **tables) -> Scene:
+    """Rods and discs in a slanted box, with a potential of [[forces.bodies]]."""
+    molecules = [body(name, count) for name, count in (counts or {"rod": 24, "disc": 8}).items()]
+    return Scene.from_dict(
+        {
+            "box": {"lengths_A": [36.0, 37.0, 38.0], "angles_deg": [90.0, 84.0, 78.0]},
+            "molecules": molecules,
+            "start": {"temperature_K": 200.0},
+            "precision": "double",
+            "threads": 1,
+            "forces": {"bodies": [forces] if forces else []},
+            "stages": [{"duration_ps": 0.05, "timestep_fs": 5.0}],
+        }
+        | tables
+    )
+
+
+GAY_BERNE = {
+    "potential": "gay_berne",
+    "parameters": {"rod": ROD, "disc": DISC},
+    "references": {"disc": [0.5, 0.2, 0.3]},
+    "cutoff_A": 15.0,
+}
+
+
+def shuffled(simulation: Simulation, seed: int):
+    """The start of a simulation with other orientations."""
+    simulation._start()
+    state = simulation.state.copy()
+    n = len(state.position)
+    state.rotation[:] = Rotation.random(n, random_state=seed).as_matrix()
+    return state
+
+
+# --- slopes ---------------------------------------------------------------------------------------
+
+
+def traced(function, names):
+    """(energy, slopes) of a function of numbers, as a function that Python runs."""
+    graph = Graph()
+    leaves = [graph.leaf(name) for name in names]
+    output = function(*leaves)
+    lines, texts = code_of([output, *slopes_of(output, leaves)])
+    source = "\n    ".join([f"def f({', '.join(names)}):", *lines, f"return {', '.join(texts)}"])
+    space: dict = {}
+    exec(f"from math import *\n{source}", space)
+    return space["f"], len(lines)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x, y: x * y + 2 * x - y / x,
+        lambda x, y: np.exp(-x) * np.sin(y) + np.cos(x * y),
+        lambda x, y: np.sqrt(x * x + y**2) ** 3 + x**-1.5 + 2**y,
+        lambda x, y: np.tanh(x - y) + np.log(x) - abs(y - 3) + np.arccos(y / 5),
+        lambda x, y: np.where(x > y, x * x, y * x) + np.maximum(x, 0.1) - np.minimum(y, 0.7),
+        lambda x, y: -(x * -1) + 0 * y + x * 1 - (0 - y) + x**1 + x**0 + (x - x),
+        lambda x, y: x**y,
+        lambda x, y: np.array([x, y], object) @ np.array([y, x], object) + np.square(x),
+    ],
+)
+@pytest.mark.parametrize("at", [(0.8, 0.3), (0.4, 1.7)])
+def test_slopes_are_those_of_differences(function, at):
+    compiled, _ = traced(function, ("x", "y"))
+    value, *slopes = compiled(*at)
+    assert value == pytest.approx(float(function(*map(np.float64, at))), rel=1e-14)
+    for k in range(2):
+        step = 1e-6 * np.eye(2)[k]
+        ends = [float(function(*(np.array(at) + sign * step))) for sign in (1, -1)]
+        assert slopes[k] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-7, abs=1e-8)
+
+
+def test_equal_parts_are_computed_once_and_constants_here():
+    _, lines = traced(lambda x, y: np.exp(x * y) + np.exp(x * y) ** 2, ("x", "y"))
+    _, shorter = traced(lambda x, y: np.exp(x * y), ("x", "y"))
+    assert lines <= shorter + 8
+    _, none = traced(lambda x, y: x + 0.0 * np.exp(2.0) * y, ("x", "y"))
+    assert none == 0
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda r, u, v: 1.0 if r[0] > 0 else 2.0, "branches on a value"),
+        (lambda r, u, v: float(r[0]), "use the functions of NumPy"),
+        (lambda r, u, v: np.arctan(r[0]), "arctan"),
+        (lambda r, u, v: 3.0, "must return an energy that depends on"),
+        (lambda r, u, v: (r[0], r), "a tuple of the energy"),
+        (lambda r, u: r[0], r"must have the arguments \(r, a, b\)"),
+        (lambda r, u, v: r[7], "IndexError"),
+        (lambda r, u, v: r[0] / 0.0, "not a finite number"),
+    ],
+)
+def test_functions_without_slopes_are_refused_with_the_reason(function, message):
+    with pytest.raises(TraceError, match=message):
+        formula_of_poses(function, (), "z")
+
+
+# --- potentials -----------------------------------------------------------------------------------
+
+
+def named(values: dict) -> SimpleNamespace:
+    return SimpleNamespace(**values)
+
+
+def test_gay_berne_of_two_rods_has_the_wells_of_its_paper():
+    """Side by side epsilon_0 / sqrt(1 - chi²) = 5/3 deep, end to end a fifth of it."""
+    z, energy = np.array([0.0, 0.0, 1.0]), gay_berne()
+    side = 4.0 * 2 ** (1 / 6) * np.array([1.0, 0.0, 0.0])
+    end = (8.0 + 4.0 * 2 ** (1 / 6)) * z
+    assert energy(side, z, z, named(ROD), named(ROD)) == pytest.approx(-5 / 3, rel=1e-12)
+    assert energy(end, z, z, named(ROD), named(ROD)) == pytest.approx(-1 / 3, rel=1e-12)
+
+
+def from_matrices(r, u, v, p, q, upsilon, mu, gamma):
+    """The general form for ellipsoids by 3 x 3 matrices, Everaers & Ejtehadi 2003."""
+    distance = np.linalg.norm(r)
+    unit = r / distance
+
+    def matrix(axis, across, along):
+        return across * np.eye(3) + (along - across) * np.outer(axis, axis)
+
+    bodies = (u, p), (v, q)
+    shape = sum(matrix(axis, (x.width_A / 2) ** 2, (x.length_A / 2) ** 2) for axis, x in bodies)
+    wells = sum(matrix(axis, x.side ** (-1 / mu), x.end ** (-1 / mu)) for axis, x in bodies)
+    sizes = [((x.width_A / 2) ** 2 + (x.length_A / 2) ** 2) * x.width_A / 2 for _, x in bodies]
+    eta = (2 * sizes[0] * sizes[1] / np.linalg.det(shape)) ** (upsilon / 2)
+    chi = (2 * unit @ np.linalg.solve(wells, unit)) ** mu
+    contact = (0.5 * unit @ np.linalg.solve(shape, unit)) ** -0.5
+    sigma = (p.width_A + q.width_A) / 2
+    ratio = sigma / (distance - contact + gamma * sigma)
+    epsilon = np.sqrt(p.epsilon_kJ_mol * q.epsilon_kJ_mol)
+    return 4 * epsilon * (ratio**12 - ratio**6) * eta * chi
+
+
+@pytest.mark.parametrize("exponents", [(1.0, 2.0, 1.0), (3.0, 1.0, 0.8)])
+def test_unlike_ellipsoids_are_those_of_the_general_form(exponents):
+    rng, energy = np.random.default_rng(1), gay_berne(*exponents)
+    kinds = [named(ROD), named(DISC), named(BALL)]
+    for p, q in product(kinds, kinds):
+        u, v, direction = (x / np.linalg.norm(x) for x in rng.standard_normal((3, 3)))
+        r = 11.0 * direction
+        expected = from_matrices(r, u, v, p, q, *exponents)
+        assert energy(r, u, v, p, q) == pytest.approx(expected, rel=1e-11)
+        assert energy(-r, v, u, q, p) == pytest.approx(expected, rel=1e-11)
+
+
+def lammps(*lines: str, folder) -> None:
+    program = shutil.which("lmp")
+    if program is None:
+        pytest.skip("LAMMPS is not installed")
+    (folder / "in.lmp").write_text("\n".join(lines))
+    ended = subprocess.run(
+        [program, "-in", "in.lmp", "-log", "none", "-screen", "none"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+
+
+def test_a_thousand_pairs_have_the_energies_forces_and_torques_of_lammps(tmp_path):
+    pairs, apart = 1000, 100.0
+    rng = np.random.default_rng(5)
+    rotation = Rotation.random(2 * pairs, random_state=6)
+    centre = apart * np.array(list(product(range(10), repeat=3)))[:pairs]
+    direction = rng.standard_normal((pairs, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    second = centre + direction * rng.uniform(9.0, 15.0, pairs)[:, None]
+    kind = rng.integers(1, 3, 2 * pairs)
+    quaternion = rotation.as_quat()[:, [3, 0, 1, 2]]
+    position = np.stack([centre, second], axis=1).reshape(-1, 3)
+    shapes = {1: ROD, 2: DISC}
+    rows = [
+        f"{k + 1} {kind[k]} 1 1 {x:.17g} {y:.17g} {z:.17g}" for k, (x, y, z) in enumerate(position)
+    ]
+    ellipsoids = [
+        f"{k + 1} {s['width_A']} {s['width_A']} {s['length_A']} "
+        + " ".join(f"{x:.17g}" for x in quaternion[k])
+        for k, s in enumerate(shapes[one] for one in kind)
+    ]
+    size = 10 * apart + 50
+    (tmp_path / "pairs.data").write_text(
+        f"pairs\n\n{2 * pairs} atoms\n{2 * pairs} ellipsoids\n2 atom types\n\n"
+        + "".join(f"-50 {size} {x}lo {x}hi\n" for x in "xyz")
+        + "\nAtoms # ellipsoid\n\n"
+        + "\n".join(rows)
+        + "\n\nEllipsoids\n\n"
+        + "\n".join(ellipsoids)
+        + "\n"
+    )
+    coefficients = [
+        f"pair_coeff {i} {j} {np.sqrt(p['epsilon_kJ_mol'] * q['epsilon_kJ_mol']):.17g}"
+        f" {(p['width_A'] + q['width_A']) / 2}"
+        f" {p['side']} {p['side']} {p['end']} {q['side']} {q['side']} {q['end']}"
+        for (i, p), (j, q) in product(shapes.items(), repeat=2)
+        if i <= j
+    ]
+    lammps(
+        "units lj",
+        "atom_style ellipsoid",
+        "boundary f f f",
+        "read_data pairs.data",
+        "pair_style gayberne 1.0 1.0 2.0 20.0",
+        *coefficients,
+        "compute energy all pe/atom",
+        "dump 1 all custom 1 forces.txt id fx fy fz tqx tqy tqz c_energy",
+        'dump_modify 1 sort id format float "%.17g"',
+        "run 0",
+        folder=tmp_path,
+    )
+    table = np.loadtxt(tmp_path / "forces.txt", skiprows=9).reshape(pairs, 2, 8)
+    formula = formula_of_poses(gay_berne(), PARAMETERS, "z")
+    evaluate = evaluated(formula)
+    matrices = rotation.as_matrix().reshape(pairs, 2, 3, 3)
+    for k in range(pairs):
+        p, q = (shapes[one] for one in kind[2 * k : 2 * k + 2])
+        row = np.array(formula.numbers(p, q))
+        values = evaluate(row, tuple(second[k] - centre[k]), *matrices[k])
+        energy, slope, torque, other = (np.array(part) / KJ_PER_MOL for part in values)
+        size = np.abs(table[k]).max()
+        assert energy == pytest.approx(table[k, :, 7].sum(), rel=1e-10, abs=1e-10 * size)
+        assert slope == pytest.approx(table[k, 0, 1:4], rel=1e-10, abs=1e-10 * size)
+        assert torque == pytest.approx(table[k, 0, 4:7], rel=1e-10, abs=1e-10 * size)
+        assert other == pytest.approx(table[k, 1, 4:7], rel=1e-10, abs=1e-10 * size)
+
+
+def evaluated(formula):
+    """A formula as a function of a row of numbers and two poses, in plain Python."""
+    function = sys.modules[formula.kind.__module__]._of_poses
+    return partial(getattr(function, "py_func", function), formula.kind())
+
+
+def test_dipoles_and_quadrupoles_are_limits_of_charges():
+    """Charges at the distance 2 h on the axis: the error is of the order h²."""
+    rng = np.random.default_rng(3)
+    u, v, direction = (x / np.linalg.norm(x) for x in rng.standard_normal((3, 3)))
+    r = 6.0 * direction
+
+    def of_charges(first, second, h):
+        return sum(
+            a * b * COULOMB / KJ_PER_MOL / np.linalg.norm(r + h * y * v - h * x * u)
+            for (x, a), (y, b) in product(first.items(), second.items())
+        )
+
+    two, three = {1: 1.0, -1: -1.0}, {1: 1.0, 0: -2.0, -1: 1.0}
+    for h in (0.1, 0.05):
+        for charges, energy, key, moment in [
+            (two, dipole(), "dipole_D", 2 * h / DEBYE),
+            (three, quadrupole(), "quadrupole_D_A", 2 * h * h / DEBYE),
+        ]:
+            expected = of_charges(charges, charges, h)
+            found = energy(r, u, v, named({key: moment}), named({key: moment}))
+            assert found == pytest.approx(expected, rel=10 * h * h)
+    inside = dipole(12.0)(r, u, v, *[named({"dipole_D": 2.0})] * 2)
+    outside = dipole()(r, u, v, *[named({"dipole_D": 2.0})] * 2)
+    factor = COULOMB / KJ_PER_MOL * DEBYE**2 * 4 / 12.0**3
+    assert inside - outside == pytest.approx(-factor * (u @ v), rel=1e-12)
+
+
+def test_patches_attract_where_they_face_each_other():
+    x, energy = np.array([1.0, 0.0, 0.0]), patch()
+    kind = named({"sigma_A": 4.0, "epsilon_kJ_mol": 2.0, "width": 0.2})
+    contact = 4.0 * 2 ** (1 / 6) * x
+    assert energy(contact, x, -x, kind, kind) == pytest.approx(-2.0, rel=1e-12)
+    assert energy(contact, -x, x, kind, kind) > 1.9
+
+
+# --- in a run -------------------------------------------------------------------------------------
+
+
+def simulation(tables: dict, counts=None, **more) -> Simulation:
+    return Simulation(scene(tables, counts, **more), warn=str)
+
+
+def brute_force(system, state, forces: dict) -> float:
+    """The Gay-Berne energy (kJ/mol) by a loop over all pairs and their nearest images."""
+    cutoff, cell, energy = forces["cutoff_A"], state.cell, gay_berne()
+    shifts = np.array(list(product((-1, 0, 1), repeat=3))) @ cell
+    models, names = system.species, [m.name for m in system.species]
+    frames = [state.rotation[k] @ models[s].axes.T for k, s in enumerate(system.model.species)]
+    points = []
+    for k, s in enumerate(system.model.species):
+        m = models[s]
+        reference = np.array(forces["references"].get(m.name, m.centre)) - m.centre
+        points.append(state.position[k] + frames[k] @ reference)
+    total = 0.0
+    for i in range(len(points)):
+        for j in range(i + 1, len(points)):
+            r = points[j] - points[i]
+            r = r - np.rint(np.linalg.solve(cell.T, r)) @ cell
+            r = min(r + shifts, key=np.linalg.norm)
+            distance = np.linalg.norm(r)
+            if distance >= cutoff:
+                continue
+            x = max(0.0, (distance / cutoff - 0.9) / 0.1)
+            kinds = [names[system.model.species[k]] for k in (i, j)]
+            parameters = [named(forces["parameters"][name]) for name in kinds]
+            axes = frames[i][:, 2], frames[j][:, 2]
+            total += (1 - x**3 * (10 - 15 * x + 6 * x * x)) * energy(r, *axes, *parameters)
+    return total
+
+
+def test_a_mixture_has_the_energy_of_all_its_pairs_and_forces_that_are_its_slopes():
+    run = simulation(GAY_BERNE)
+    state = shuffled(run, 4)
+    system, engine = run.system, run.system.engine()
+    load, tallies = engine.evaluate(state)
+    name = "gay_berne"
+    assert tallies[name].energy / KJ_PER_MOL == pytest.approx(
+        brute_force(system, state, GAY_BERNE), rel=1e-11
+    )
+
+    def slope(change) -> float:
+        ends = []
+        for sign in (1, -1):
+            moved = state.copy()
+            change(moved, sign * 1e-5)
+            ends.append(engine.evaluate(moved)[1][name].energy)
+        return (ends[0] - ends[1]) / 2e-5
+
+    size = np.abs(load.force).max()
+    for m, k in [(0, 0), (11, 1), (25, 2), (30, 0)]:
+
+        def move(moved, h, m=m, k=k):
+            moved.position[m, k] += h
+
+        def rotate(moved, h, m=m, k=k):
+            moved.rotation[m] = (
+                state.rotation[m] @ Rotation.from_rotvec(h * np.eye(3)[k]).as_matrix()
+            )
+
+        assert load.force[m, k] == pytest.approx(-slope(move), abs=1e-7 * size)
+        assert load.torque_body[m, k] == pytest.approx(-slope(rotate), abs=1e-6 * size)
+    for i, j in [(0, 0), (1, 0), (2, 1), (2, 2)]:
+
+        def strain(moved, h, i=i, j=j):
+            matrix = np.eye(3)
+            matrix[i, j] += h
+            moved.cell[:] = moved.cell @ matrix
+            moved.position[:] = moved.position @ matrix
+
+        virial = np.array(tallies[name].virial).reshape(3, 3)
+        assert virial[j, i] == pytest.approx(-slope(strain), abs=1e-6 * size)
+    assert load.force.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-12 * size)
+
+
+def test_given_forces_are_those_that_are_derived():
+    """Dipoles, with force and torques by hand."""
+    strength = 30.0
+
+    def energy(r, u, v):
+        s = np.sqrt(r @ r)
+        return strength * (u @ v / s**3 - 3 * (u @ r) * (v @ r) / s**5)
+
+    def with_forces(r, u, v):
+        s2 = r @ r
+        s3, s5 = s2**1.5, s2**2.5
+        a, b, c = u @ r, v @ r, u @ v
+        force = strength * 3 * ((c * r + b * u + a * v) / s5 - 5 * a * b * r / (s5 * s2))
+        to_first = strength * (v / s3 - 3 * b * r / s5)
+        to_second = strength * (u / s3 - 3 * a * r / s5)
+        return energy(r, u, v), force, np.cross(to_first, u), np.cross(to_second, v)
+
+    derived, given = (formula_of_poses(f, (), "z") for f in (energy, with_forces))
+    assert derived.is_derived and not given.is_derived
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        r = 6 * rng.standard_normal(3)
+        a, b = Rotation.random(2, random_state=rng).as_matrix()
+        one, other = (
+            np.hstack(evaluated(formula)(np.zeros(1), tuple(r), a, b))
+            for formula in (derived, given)
+        )
+        assert one == pytest.approx(other, rel=1e-11, abs=1e-11 * np.abs(one).max())
+
+
+def test_bits_do_not_depend_on_threads_nor_on_stops(tmp_path):
+    system = build(scene(GAY_BERNE))
+    state = system.state.copy()
+    assert bits_with(1, system, state) == bits_with(2, system, state)
+    stages = [{"ensemble": "nvt", "temperature_K": 200.0, "duration_ps": 0.2, "timestep_fs": 5.0}]
+    molecules = [body("rod", 24), body("disc", 8)]
+    tables = {
+        "box": {"lengths_A": 37.0},
+        "molecules": molecules,
+        "forces": {"bodies": [GAY_BERNE]},
+        "stages": stages,
+    }
+    same_after_stops(tables, [7, 22], tmp_path)
+
+
+def test_the_list_finds_every_pair_while_bodies_move_and_the_box_changes():
+    """Few bodies in a long box of many bins, hot, with a barostat: the energy at the end is that of
+    all pairs."""
+    npt = {
+        "ensemble": "npt",
+        "temperature_K": 900.0,
+        "pressure_bar": 1.0,
+        "barostat_time_ps": 0.05,
+        "duration_ps": 3.0,
+        "timestep_fs": 5.0,
+    }
+    tables = {"box": {"lengths_A": [34.0, 36.0, 120.0]}, "stages": [npt]}
+    run = simulation(GAY_BERNE, {"rod": 40, "disc": 20}, **tables)
+    results = run.run()
+    _, tallies = run.system.engine().evaluate(results.state)
+    expected = brute_force(run.system, results.state, GAY_BERNE)
+    assert tallies["gay_berne"].energy / KJ_PER_MOL == pytest.approx(expected, rel=1e-10)
+    assert results["potential"][-1] == pytest.approx(expected, rel=1e-9)
+    assert results["volume"][-1] != results["volume"][0]
+
+
+def test_energy_is_conserved_with_the_order_of_the_integrator():
+    stage = {"duration_ps": 1.0, "timestep_fs": 8.0, "ensemble": "nve"}
+    noise = []
+    for step in (20.0, 10.0):
+        run = simulation(GAY_BERNE, stages=[stage | {"timestep_fs": step}])
+        results = run.run()
+        noise.append(np.ptp(results["energy"]))
+    assert 3.0 < noise[0] / noise[1] < 5.5
+
+
+def test_a_text_has_the_same_energy_as_its_function():
+    text = "4*eps*((sig/r)**12 - (sig/r)**6)*(1 + k*a_r*b_r + exp(-a_b**2))"
+    parameters = {
+        "rod": {"eps": 1.0, "sig": 5.0, "k": 0.3},
+        "disc": {"eps": 0.5, "sig": 6.0, "k": 0.7},
+    }
+    of_text = simulation({"energy": text, "name": "text", "parameters": parameters})
+
+    def function(r, u, v, p, q):
+        s = np.sqrt(r @ r)
+        six = ((p.sig + q.sig) / 2 / s) ** 6
+        angles = np.sqrt(p.k * q.k) * (u @ r) * (v @ r) / s**2 + np.exp(-((u @ v) ** 2))
+        return 4 * np.sqrt(p.eps * q.eps) * (six**2 - six) * (1 + angles)
+
+    potential = rigidmd.body_pair_potential(function, parameters, axis="z")
+    state = shuffled(of_text, 9)
+    other = build(scene(None).with_user_code([potential]))
+    (one,) = of_text.system.engine().evaluate(state)[1].values()
+    (two,) = other.engine().evaluate(state)[1].values()
+    assert one.energy == pytest.approx(two.energy, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"potential": "gay_berne"}, r"parameters is missing: gay_berne needs length_A"),
+        (
+            {"potential": "gay_berne", "parameters": {"rod": ROD | {"lenght_A": 3.0}}},
+            r"parameters of rod: gay_berne has no lenght_A; did you mean length_A",
+        ),
+        (
+            {"potential": "patch", "parameters": {"rod": {"sigma_A": 3.0}}},
+            r"parameters of rod: epsilon_kJ_mol, width is missing",
+        ),
+        (
+            {"potential": "gay_berne", "parameters": {"rodd": ROD}},
+            r"parameters: there is no rodd; did you mean rod",
+        ),
+        ({"potential": "gay_berne", "energy": "1/r"}, "give one of potential, energy and module"),
+        ({"energy": "1/r +"}, "is not a formula"),
+        ({"energy": "k/r"}, "no species has the parameter k"),
+        (GAY_BERNE | {"cutoff_A": 30.0}, "longer than half an edge of the box"),
+        (GAY_BERNE | {"options": {"nu": 1.0}}, r"options: gay_berne has no nu; there are upsilon"),
+        (GAY_BERNE | {"truncation": "plain", "switch_start_A": 9.0}, "would have no effect"),
+        (
+            {"module": "own.py", "name": "own", "parameters": {"rod": {"k": 1.0}}},
+            "parameters would have no effect here",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_potential_is_told(tables, message, tmp_path):
+    with pytest.raises(SceneError, match=message):
+        build(scene(tables))
+
+
+def test_bodies_that_do_not_rotate_have_no_such_potential():
+    tables = {"energy": "1/r**12", "name": "wall"}
+    with pytest.raises(SceneError, match="no body of the scene rotates"):
+        build(scene(tables, molecules=[{"model": "argon", "count": 10}]))
+
+
+def test_a_potential_of_a_module_needs_trust(tmp_path):
+    (tmp_path / "own.py").write_text(
+        "import numpy as np, rigidmd\n"
+        "own = rigidmd.body_pair_potential(lambda r, a, b: 100 / (r @ r) ** 3, cutoff_A=12)\n"
+    )
+    tables = {"module": "own.py", "name": "own"}
+    data = {
+        "box": {"lengths_A": 40.0},
+        "molecules": [body("rod", 10)],
+        "start": {"temperature_K": 200.0},
+        "forces": {"bodies": [tables]},
+        "stages": [{"duration_ps": 0.05}],
+    }
+    untrusted = Scene.from_dict(data, tmp_path)
+    with pytest.raises(SceneError, match="is Python code"):
+        build(untrusted)
+    rigidmd.trust(tmp_path / "own.py")
+    assert list(build(Scene.from_dict(data, tmp_path)).terms) == ["own"]
