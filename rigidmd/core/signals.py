@@ -1,7 +1,7 @@
 """Signals of processes, on all systems.
 
 Windows has neither SIGTERM for another process, which it can only kill, nor SIGUSR1. Its Ctrl-Break
-stops a run as SIGTERM does elsewhere, and nothing asks a run for a checkpoint.
+stops a run as SIGTERM does elsewhere, and no signal requests a checkpoint.
 """
 
 import os
@@ -18,16 +18,16 @@ if sys.platform == "win32":
     #: Signals that request a checkpoint.
     CHECKPOINT_SIGNALS: tuple[signal.Signals, ...] = ()
     #: Arguments of `subprocess.Popen` for a process that gets no Ctrl-C of this one's terminal.
-    OWN_GROUP: Json = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    SEPARATE_GROUP: Json = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
 else:
     STOP_SIGNAL, CHECKPOINT_SIGNALS = signal.SIGTERM, (signal.SIGUSR1,)
-    OWN_GROUP: Json = {"start_new_session": True}
+    SEPARATE_GROUP: Json = {"start_new_session": True}
 #: Number of the signal that ends a process at once, which Windows has no name for.
 KILL_SIGNAL = 9
 
 
 def stop_process(process: subprocess.Popen) -> None:
-    """Let a process of `OWN_GROUP` end with a checkpoint."""
+    """Let a process of `SEPARATE_GROUP` end with a checkpoint."""
     process.send_signal(signal.CTRL_BREAK_EVENT if sys.platform == "win32" else signal.SIGTERM)
 
 
@@ -40,7 +40,7 @@ def stop_this_process() -> None:
 
 
 def kill_group(process: subprocess.Popen) -> None:
-    """End a process of `OWN_GROUP` at once, with those that it has started; on Windows without
+    """End a process of `SEPARATE_GROUP` at once, with those that it has started; on Windows without
     them."""
     if sys.platform == "win32":
         process.kill()

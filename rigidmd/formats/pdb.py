@@ -164,8 +164,8 @@ def encoder(system: System, interval: float, velocities: bool) -> Encode:
 
 
 def pdb_text(system: Topology) -> str:
-    """One model with its bonds. Of numbers wider than their columns the leading digits are left
-    out; atoms from 100,000 on have no bonds."""
+    """One model with its bonds. Numbers wider than their columns lose their leading digits. Atoms
+    from 100,000 on have no bonds."""
     lines = ["TITLE     Written by rigidmd"]
     if box := dimensions(system.cell):
         edges, angles = box[:3], box[3:]

@@ -270,7 +270,7 @@ class CompiledEngine(Engine):
         arrays_of: dict[str, dict[str, np.ndarray]],
         tallies: dict[str, Tally],
     ) -> None:
-        """Raise ValueError unless the kept lists are those of the state."""
+        """Raise ValueError unless the kept lists fit the state."""
         if not self._has_lists(arrays_of):
             raise ValueError("its neighbour lists are not those of its state")
 

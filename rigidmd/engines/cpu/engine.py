@@ -131,7 +131,7 @@ class CpuEngine(CompiledEngine):
         return self._bound[1].extent
 
     def _memory_by_owner(self) -> dict[str, dict[str, np.ndarray]]:
-        """Those of the terms, and the memory of barostat and trajectories."""
+        """The arrays of terms, and the memory of barostat and trajectories."""
         arrays_of = super()._memory_by_owner()
         if (box := self._couplings.box) is not None:
             arrays_of[BOX] = {key: getattr(box, key) for key in BOX_FIELDS}

@@ -18,7 +18,7 @@ from typing import IO, NamedTuple, cast
 
 import numpy as np
 
-from rigidmd.core.signals import OWN_GROUP, kill_group
+from rigidmd.core.signals import SEPARATE_GROUP, kill_group
 from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.model import Model
 from rigidmd.engines.external import ExternalEngine, same_state
@@ -239,7 +239,7 @@ class Process:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 env=os.environ | {"OMP_NUM_THREADS": "1"},
-                **OWN_GROUP,  # Ctrl-C is for this program, which ends LAMMPS
+                **SEPARATE_GROUP,  # Ctrl-C is for this program, which ends LAMMPS
             )
         except OSError as error:
             raise EngineError(

@@ -193,7 +193,7 @@ def energy_and_force(system: System, state: State) -> tuple[float, np.ndarray]:
 
 @builder
 def memory(trial: Trial, x: float) -> Trials:
-    if sys.platform == "linux":  # which tells the memory of a process
+    if sys.platform == "linux":  # where a process can read its memory
         yield trial._replace(run=memory_error)
 
 

@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 from rigidmd.assemble.user_code.trust import unused_files
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.process import BY_SIGNAL, OUT_OF_TIME, python_process
-from rigidmd.core.signals import KILL_SIGNAL, OWN_GROUP, STOP_SIGNAL, stop_process
+from rigidmd.core.signals import KILL_SIGNAL, SEPARATE_GROUP, STOP_SIGNAL, stop_process
 from rigidmd.errors import OutputError, RigidMDError, SettingError, describe_error, option
 from rigidmd.io.folder import LOCK
 from rigidmd.io.progress import Bar
@@ -109,7 +109,7 @@ def run_point(point: SweepPoint, common: CommonSettings) -> tuple[int, float]:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=output,
-            **OWN_GROUP,
+            **SEPARATE_GROUP,
         )
     sent = 0
     with process:
