@@ -8,6 +8,7 @@ import os
 import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -48,13 +49,18 @@ NOT_COMPARED = (
 )
 
 
+@cache
+def _versions() -> dict[str, str]:
+    return {f"{package}_version": version(package) for package in PACKAGES}
+
+
 def computed_with() -> Json:
     """Everything in addition to the scene that may change the bits of a result, as JSON values."""
     settings = " ".join(
         f"{name}={os.environ[name]}" for name in CODE_SETTINGS if name in os.environ
     )
     return {
-        **{f"{package}_version": version(package) for package in PACKAGES},
+        **_versions(),
         "python_version": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
         "processor": PROCESSOR,
