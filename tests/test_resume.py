@@ -850,7 +850,7 @@ def changes_of(kept: Checkpoint) -> list[tuple[str, Checkpoint]]:
 #: end by itself. The time at which a list was built decides how far ahead the next one is built,
 #: and so the order of sums.
 FREE = re.compile(
-    r"state/(velocity|angular_momentum_body|books|bath|position|rotation)|Sampler/|engine/load.torque_body|engine/\w+.times"
+    r"state/(velocity|angular_momentum_body|energy_ledger|extra_variables|position|rotation)|Sampler/|engine/load.torque_body|engine/\w+.times"
 )
 
 
