@@ -12,7 +12,7 @@ from rigidmd.compile import kernel
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.body_step_loop import Body
-from rigidmd.engines.cpu.engine import CpuEngine as Engine
+from rigidmd.engines.cpu.body import BodyEngine
 from rigidmd.errors import SimulationError
 from rigidmd.mechanics.free_rotor import ExactRotor, rotate, split_rotor
 from rigidmd.mechanics.rotation import from_vector, orthogonality_error, random_rotations
@@ -498,7 +498,7 @@ def turned_alone(inertia, momentum, dt, steps, scheme):
     """L in the body frame (3,) of a free body with any moments after this many steps: a scene rejects
     what no mass has."""
     state = state_of(rotation=np.eye(3)[None], angular_momentum_body=[momentum])
-    engine = Engine(Body(NoTranslation(1.0), split_rotor(np.array([inertia], float))), {})
+    engine = BodyEngine(Body(NoTranslation(1.0), split_rotor(np.array([inertia], float))), {})
     move(engine, state, SCHEMES[scheme], dt, steps)
     return state.angular_momentum_body[0]
 

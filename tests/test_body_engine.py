@@ -21,7 +21,7 @@ from rigidmd.core.integrators import (
 )
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.body_step_loop import Body
-from rigidmd.engines.cpu.engine import CpuEngine as Engine
+from rigidmd.engines.cpu.body import BodyEngine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.forces.body import resistance
 from rigidmd.forces.body.applied import SteadyForce
@@ -926,7 +926,7 @@ def test_the_ranking_of_schemes_at_equal_cost():
     for _ in range(40):
         a, b, c = rng.uniform(0.1, 1.0, 3)
         body = Body(NoTranslation(1.0), split_rotor(np.array([[a + b, b + c, c + a]])))
-        engine = Engine(
+        engine = BodyEngine(
             body, {"weight": SteadyForce(np.array([0.0, 0.0, -3.0]), 0.5 * rng.standard_normal(3))}
         )
         state = state_of(
@@ -954,7 +954,7 @@ def test_takahashi_imada_is_of_order_four_but_for_a_change_of_variables():
     # itself.
     tilt, swings = 1e-4, 5
     body = Body(NoTranslation(1.0), split_rotor(np.array([[1.0, 1.0, 1.0]])))
-    engine = Engine(
+    engine = BodyEngine(
         body, {"weight": SteadyForce(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, -1.0]))}
     )
     start = from_vector(np.array([[tilt, 0.0, 0.0]]))

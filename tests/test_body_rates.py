@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy import special
 from scipy.integrate import quad
 from scipy.special import ellipk
 from support import ROOT
@@ -12,6 +13,7 @@ from support import ROOT
 import rigidmd
 from rigidmd.commands.cli import main
 from rigidmd.run.body_theory import free_body_period, heavy_top_motion
+from rigidmd.run.elliptic import complete, rf, rj
 
 SYSTEMS = ROOT / "systems"
 #: A top whose spin is fast enough for steady precession at 30°.
@@ -231,3 +233,16 @@ def test_the_range_of_theta_is_that_of_the_whole_run(sense):
     theta = np.degrees(results["theta"])
     assert (low, high) == (theta.min(), theta.max())
     assert low < 45 and high > 55
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_elliptic_integrals_are_those_of_scipy(seed):
+    """Also of arguments that differ by many orders, and complete ones near the singular end."""
+    rng = np.random.default_rng(seed)
+    for _ in range(200):
+        x, y, z, p = (10.0 ** rng.uniform(-8, 3, 4)).tolist()
+        for first in (0.0, x):
+            assert rf(first, y, z) == pytest.approx(special.elliprf(first, y, z), rel=3e-15)
+            assert rj(first, y, z, p) == pytest.approx(special.elliprj(first, y, z, p), rel=1e-12)
+        assert complete(p * 1e-200) == pytest.approx(special.ellipkm1(p * 1e-200), rel=3e-15)
+    assert complete(0.0) == rf(0.0, 0.0, 1.0) == rj(0.0, 0.5, 1.0, 0.0) == np.inf

@@ -11,7 +11,7 @@ import pytest
 from support import BODIES, ROOT, small_scene
 
 from rigidmd.assemble.build import build
-from rigidmd.assemble.time_step import stable_angle
+from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import KICK, SCHEMES
 from rigidmd.core.state import NOW

@@ -14,14 +14,8 @@ from support import ROOT
 from rigidmd import Scene, Simulation, resolve
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
-from rigidmd.assemble.time_step import (
-    MARGIN,
-    MIXED_ERROR,
-    error_of_step,
-    stable_angle,
-    step_error,
-    step_warnings,
-)
+from rigidmd.assemble.harmonic import stable_angle, step_error
+from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, error_of_step, step_warnings
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.errors import SceneError

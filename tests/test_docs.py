@@ -91,9 +91,11 @@ def blocks_of(document: Path) -> list[Block]:
         line = lines[k]
         if marker := re.fullmatch(r"<!-- (test|output): (.*) -->", line):
             told = marker[2] if marker[1] == "test" else f"recorded {marker[2]}"
-            assert lines[k + 1].startswith("```"), (
-                f"{document.name}:{k + 1}: a block must follow at once"
+            assert lines[k + 1].startswith(("```", "|")), (
+                f"{document.name}:{k + 1}: a block or a table must follow at once"
             )
+        elif line.startswith("|"):
+            told = ""
         elif line.startswith("```"):
             end = lines.index("```", k + 1)
             found.append(Block(k + 2, line[3:], "\n".join(lines[k + 1 : end]), told))

@@ -36,7 +36,7 @@ from rigidmd.formats.cells import (
     standard_rotation,
 )
 from rigidmd.io.structure_file import read_geometry
-from rigidmd.io.trajectory import TrajectoryFile, write_topology
+from rigidmd.io.trajectory_file import TrajectoryFile, write_topology
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import Scene
 from rigidmd.scene.models import Molecule, Site, load_model, molecule, with_masses

@@ -11,6 +11,7 @@ import MDAnalysis as mda
 import numpy as np
 import pytest
 from MDAnalysis.analysis.dielectric import DielectricConstant
+from MDAnalysis.lib.formats.libmdaxdr import XTCFile
 from scenes import FORTY_WATERS, NVT, forty_waters
 from support import small_scene
 
@@ -19,18 +20,19 @@ from rigidmd.analysis.rigid_frames import without_rounding
 from rigidmd.assemble.build import build
 from rigidmd.assemble.structure import read_structure
 from rigidmd.commands import cli
+from rigidmd.core.process import ignore_warnings
+from rigidmd.core.state import NO_CELL
 from rigidmd.errors import SceneError, SimulationError, StructureError
-from rigidmd.formats import through_mdanalysis
+from rigidmd.formats import BY_EXTENSION, Topology, through_mdanalysis
 from rigidmd.formats.atoms import Frame
 from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.io.trajectory import (
     from_files,
     in_memory,
-    open_trajectory,
     read_frames,
     reader_of,
-    write_topology,
 )
+from rigidmd.io.trajectory_file import open_trajectory, write_topology
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
@@ -591,3 +593,62 @@ def test_adding_a_format_takes_one_file(tmp_path, monkeypatch):
         SceneError, match=r"must end in one of \.dcd \.gsd \.nc \.pdb \.traj \.trr \.xtc \.xyz"
     ):
         small_scene({"tip4p2005": 4}, 20.0, output=output)
+
+
+@pytest.mark.parametrize("sites", [1, 9, 10])
+def test_a_small_frame_of_an_xtc_has_the_bytes_of_gromacs_library(sites, tmp_path):
+    """Up to nine sites without compression, by rigidmd itself; more by the library."""
+    rng = np.random.default_rng(sites)
+    positions, cell = 10 * rng.standard_normal((sites, 3)), 30 * np.eye(3)
+    encode = BY_EXTENSION[".xtc"].encoder(None, 1.0, False)
+    written = encode(Frame(2.5, positions, cell, None, step=-3), 0)
+    with XTCFile(str(tmp_path / "t.xtc"), "w") as file:
+        box = (0.1 * cell).astype(np.float32)
+        file.write(np.float32(0.1) * positions.astype(np.float32), box, -3, 2.5, 1000.0)
+    assert written == (tmp_path / "t.xtc").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["t.gro", "t.pdb"])
+@pytest.mark.parametrize("box", [None, "oblique"])
+def test_a_topology_is_read_by_other_programs(name, box, tmp_path):
+    """Names, residues, positions, the box and, where the format has them, elements and bonds."""
+    cell = {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 95.0, 75.0]}
+    system = build(small_scene({"tip4p2005": 4}, None, box=cell))
+    state = system.state
+    if not box:
+        state = state._replace(cell=NO_CELL.copy())
+    write_topology(tmp_path / name, system, state, wrapped=False)
+    with ignore_warnings():  # of a box of zeros
+        u = mda.Universe(str(tmp_path / name))
+    assert u.atoms.names.tolist() == system.sites.name.tolist()
+    assert u.atoms.resnames.tolist() == system.residue_names[system.sites.molecule].tolist()
+    assert u.atoms.resids.tolist() == (1 + system.sites.molecule).tolist()
+    assert np.abs(u.atoms.positions - system.site_positions(state)).max() < 6e-3
+    if box:
+        assert u.dimensions == pytest.approx([20.0, 21.0, 22.0, 80.0, 95.0, 75.0], abs=0.01)
+    else:
+        assert u.dimensions is None or not u.dimensions[:3].any()
+    if name == "t.pdb":
+        assert u.atoms.elements.tolist() == ["O", "H", "H", ""] * 4  # MDAnalysis knows no X
+        pairs = {tuple(sorted(pair)) for pair in u.bonds.indices.tolist()}
+        assert pairs == {(4 * m, 4 * m + h) for m in range(4) for h in (1, 2)}
+
+
+def test_numbers_beyond_the_columns_of_a_topology():
+    sites = 100_001
+    names, numbers = ["C1"] * sites, list(range(1, sites + 1))
+    system = Topology(
+        names, ["C"] * sites, numbers, ["LONGER"] * sites, np.zeros((sites, 3)), None, lambda: PAIRS
+    )
+    gro = BY_EXTENSION[".gro"].topology(system).splitlines()
+    assert gro[1].split() == [str(sites)] and gro[-1].split() == ["0.00000"] * 3
+    assert gro[100_001].startswith("    0LONGE   C1    0   0.000")
+    pdb = BY_EXTENSION[".pdb"].topology(system).splitlines()
+    assert pdb[100_000].startswith("ATOM      0  C1  LONGX   0       0.000")
+    bonds = [line for line in pdb if line.startswith("CONECT")]
+    assert bonds[:2] == ["CONECT    1    2    3    4    5", "CONECT    1    6"]
+    assert not any(line[6:11] == "    0" for line in bonds)
+
+
+#: Five bonds of the first atom, and one to an atom without a number.
+PAIRS = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (0, 5), (1, 99_999)])

@@ -40,7 +40,8 @@ from rigidmd.forces.potentials.lennard_jones import lennard_jones as built_in
 from rigidmd.forces.potentials.lennard_jones import tail
 from rigidmd.forces.potentials.text_formulas import formula_of_text
 from rigidmd.forces.potentials.truncation import TRUNCATIONS, Unmodified, truncation_terms
-from rigidmd.run.checks import FailedCheck, explain
+from rigidmd.run.checks import explain
+from rigidmd.run.failed_check import FailedCheck
 from rigidmd.run.force_errors import check_forces
 from rigidmd.units import KJ_PER_MOL
 

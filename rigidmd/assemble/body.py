@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.defaults import body_with_defaults
+from rigidmd.assemble.body_defaults import body_with_defaults
 from rigidmd.assemble.memory_check import check_memory_of_samples
 from rigidmd.assemble.plausibility import body_warnings
 from rigidmd.core.integrators import SCHEMES, SOLVERS

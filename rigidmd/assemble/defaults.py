@@ -13,29 +13,19 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.distance import pdist
 
 from rigidmd.assemble.plausibility import shortest_contact
-from rigidmd.core.integrators import RK4, SOLVERS, WITH_THERMOSTAT
+from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.forces.neighbors.space import Triclinic, longest_gaps
 from rigidmd.forces.parts import Composition, Grid, Settings
 from rigidmd.forces.potentials.truncation import default_switch_start
-from rigidmd.formats import BODY_TOPOLOGY, TOPOLOGY
-from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.body import FORMULATION, SAMPLES
+from rigidmd.scene import MolecularScene
 from rigidmd.scene.forces import ELECTROSTATICS, OPEN, PERIODIC, Forces
 
 CUTOFF = 9.0  # Å, in a periodic box
 #: Default with PME, ps. PME forces do not add up to zero exactly: in 1 ps 216 waters at an accuracy
 #: of 1e-4 gained a momentum of 26 u Å/ps; their thermal momentum is 980.
 REMOVE_MOMENTUM_INTERVAL = 1.0
-TOLERANCE = 1e-10  # of DOP853 and RADAU
-TRAJECTORY_RADIUS = 10.0  # Å, of a body
-#: Å, of a body in BODY_TOPOLOGY, whose columns are too narrow for coordinates below -999.
-FARTHEST = 900.0
-#: Largest entry of abs(QᵀQ - 1) of a body with schemes, which preserve it, and with ODE solvers,
-#: which do not.
-ORTHOGONALITY, ORTHOGONALITY_OF_SOLVERS = 1e-9, 0.1
 
 
 def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[str]]:
@@ -214,6 +204,8 @@ def _cutoff_and_switch(
     forces: Forces, composition: Composition
 ) -> tuple[dict[str, Any], list[str]]:
     """Cutoff and start of a switch as keys of [forces], and error messages."""
+    from scipy.spatial.distance import pdist  # slow to import
+
     space = composition.space
     cutoff_A = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
     cutoff, start, faults = cutoff_A or inf, forces.switch_start_A, []
@@ -248,32 +240,3 @@ def _cutoff_and_switch(
             (default_switch_start(name, cutoff) for name in schemes if "switch" in name), None
         )
     return {"cutoff_A": cutoff_A, "switch_start_A": start}, faults
-
-
-def body_with_defaults(scene: BodyScene, rotates: bool, radius: float) -> BodyScene:
-    """A scene of a single body with all defaults; rotates: it has an orientation; radius: of its
-    trajectory, m."""
-    run, watch = scene.run, scene.watch
-    solver = run.integrator in SOLVERS
-    if solver:
-        numbers: dict[str, Any] = {
-            "formulation": (run.formulation or FORMULATION) if rotates else None
-        }
-        if run.integrator != RK4:
-            numbers["relative_tolerance"] = run.relative_tolerance or TOLERANCE
-            numbers["absolute_tolerance"] = run.absolute_tolerance or TOLERANCE
-        run = run.model_copy(update=numbers)
-    scale = scene.output.trajectory_A_per_m or (TRAJECTORY_RADIUS / radius if radius > 0 else 1.0)
-    reach = scale * (radius + max(map(abs, scene.start.position_m or (0.0,))))
-    output = {
-        "interval_s": scene.output.interval_s or run.duration_s / SAMPLES,
-        "trajectory_A_per_m": scale,
-        "topology": scene.output.topology or (BODY_TOPOLOGY if reach < FARTHEST else TOPOLOGY),
-    }
-    if watch.orthogonality is None:
-        watch = watch.model_copy(
-            update={"orthogonality": ORTHOGONALITY_OF_SOLVERS if solver else ORTHOGONALITY}
-        )
-    return scene.model_copy(
-        update={"run": run, "output": scene.output.model_copy(update=output), "watch": watch}
-    )

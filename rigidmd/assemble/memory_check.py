@@ -5,15 +5,18 @@ made and added up.
 """
 
 from math import prod
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidmd.core.process import format_gigabytes, free_memory, memory_shortage
 from rigidmd.core.state import no_load
-from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
-from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import not_none
+
+if TYPE_CHECKING:
+    from rigidmd.engines.system import System
+    from rigidmd.scene import BodyScene, MolecularScene
 
 #: Bytes per molecule and site of a system while it is built; measured per site: 310 of argon, 500
 #: of nitrogen, 640 of SPC/E, 690 of TIP4P.
@@ -46,7 +49,7 @@ def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:
     )
 
 
-def check_memory_of_samples(scene: BodyScene) -> None:
+def check_memory_of_samples(scene: "BodyScene") -> None:
     """Raise SceneError if the samples of a resolved scene of a body exceed the memory."""
     run, interval = scene.run, not_none(scene.output.interval_s)
     count = run.duration_s / (interval if run.is_auto else max(interval, run.timestep_s))
@@ -58,7 +61,7 @@ def check_memory_of_samples(scene: BodyScene) -> None:
     )
 
 
-def check_memory(system: System) -> None:
+def check_memory(system: "System") -> None:
     """Raise SceneError if a run of a system exceeds the memory: states, forces, lists, grids,
     samples."""
     source = system.scene.source
@@ -79,7 +82,7 @@ def check_memory(system: System) -> None:
     _require(source, needed, "the run", ADVICE)
 
 
-def _samples(scene: MolecularScene) -> tuple[float, float]:
+def _samples(scene: "MolecularScene") -> tuple[float, float]:
     """Number of lines of the log of a run, and the bytes of these lines and of the times of frames
     at its end."""
     output = scene.output
@@ -92,7 +95,7 @@ def _samples(scene: MolecularScene) -> tuple[float, float]:
     )
 
 
-def bytes_of(system: System) -> int:
+def bytes_of(system: "System") -> int:
     """Bytes of a run: three states (start, present, last good one), two loads (of steps and
     observations), samples."""
     state = system.state

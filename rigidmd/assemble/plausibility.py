@@ -6,14 +6,16 @@ numbers that are warned of, `REFUSED` of numbers that no scene can mean.
 
 from collections.abc import Iterable, Iterator
 from math import degrees, inf, pi
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.forces.neighbors.space import Space
-from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3, KJ_PER_MOL
+
+if TYPE_CHECKING:
+    from rigidmd.forces.neighbors.space import Space
+    from rigidmd.scene import BodyScene, MolecularScene
+    from rigidmd.scene.models import Molecule
 
 #: Distance of the minimum of a Lennard-Jones energy, over sigma.
 MINIMUM = 2 ** (1 / 6)
@@ -76,7 +78,7 @@ REFUSED = {
 
 
 def scene_errors(
-    scene: MolecularScene, species: list[Molecule], counts: np.ndarray, space: Space
+    scene: "MolecularScene", species: "list[Molecule]", counts: np.ndarray, space: "Space"
 ) -> list[str]:
     """Messages on numbers that no scene can mean. counts (k,) : molecules of each species"""
     mass = float(counts @ np.array([m.mass for m in species]))
@@ -107,14 +109,14 @@ def scene_errors(
     return faults
 
 
-def shortest_contact(species: list[Molecule]) -> float:
+def shortest_contact(species: "list[Molecule]") -> float:
     """Smallest distance of the minimum of the energy of two like molecules, by their largest sites,
     Å; inf without."""
     largest = [float(m.sigma.max(where=m.epsilon > 0, initial=0.0)) for m in species]
     return MINIMUM * min((x for x in largest if x > 0), default=inf)
 
 
-def scene_warnings(scene: MolecularScene, species: list[Molecule]) -> list[str]:
+def scene_warnings(scene: "MolecularScene", species: "list[Molecule]") -> list[str]:
     """Warnings of numbers that are probably in another unit."""
     warnings = _implausible(_scene_values(scene))
     for entry, m in zip(scene.molecules, species, strict=True):
@@ -149,7 +151,7 @@ def _implausible(values: Iterable[tuple[str, float, str]]) -> list[str]:
     return [*dict.fromkeys(filter(None, descriptions))]
 
 
-def _scene_values(scene: MolecularScene) -> Iterator[tuple[str, float, str]]:
+def _scene_values(scene: "MolecularScene") -> Iterator[tuple[str, float, str]]:
     """Quantity, value and key of numbers of a scene that do not depend on its molecules."""
     for k, stage in enumerate(scene.stages):
         pressures = (
@@ -165,12 +167,12 @@ def _scene_values(scene: MolecularScene) -> Iterator[tuple[str, float, str]]:
         yield "electric_V_per_nm", field, "fields.electric_V_per_nm"
 
 
-def molecule_warnings(m: Molecule) -> list[str]:
+def molecule_warnings(m: "Molecule") -> list[str]:
     """Warnings of numbers of a molecule that are probably in another unit."""
     return _implausible(_molecule_values(m)) + _mass_warnings(m)
 
 
-def _molecule_values(m: Molecule) -> Iterator[tuple[str, float, str]]:
+def _molecule_values(m: "Molecule") -> Iterator[tuple[str, float, str]]:
     """Quantity, value and description of numbers of a molecule."""
     position = m.positions_body[m.masses > 0]
     if len(position) > 1:
@@ -192,7 +194,7 @@ def _molecule_values(m: Molecule) -> Iterator[tuple[str, float, str]]:
         yield "mass_u", mass, f"{m.name}: mass_u of {name}"
 
 
-def _mass_warnings(m: Molecule) -> list[str]:
+def _mass_warnings(m: "Molecule") -> list[str]:
     """Warnings of masses that differ from the masses of the elements."""
     from ase.data import atomic_masses, atomic_numbers  # not needed for shipped models
 
@@ -218,7 +220,7 @@ def gravity_warnings(key: str, acceleration: tuple[float, float, float]) -> list
     return warnings
 
 
-def body_warnings(scene: BodyScene) -> list[str]:
+def body_warnings(scene: "BodyScene") -> list[str]:
     """Warnings of numbers of a single body that are probably in another unit."""
     if scene.gravity is None:
         warnings = []

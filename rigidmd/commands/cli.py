@@ -1,8 +1,8 @@
 """`rigidmd`: the parsing of the command line, the messages and exit codes of errors.
 
-All modules of this package are imported. Their functions with the decorator `command` are the
-commands. They compute nothing. Modules import what they need inside functions, so that `rigidmd
---help` loads none of it.
+The module of the command is imported, or without one all modules of this package. Their functions
+with the decorator `command` are the commands. They compute nothing. Modules import what they need
+inside functions, so that `rigidmd --help` loads none of it.
 """
 
 import argparse
@@ -128,7 +128,7 @@ def _free() -> str:
 def _parse(words: list[str]) -> argparse.Namespace:
     """The options of a command line; an unknown command or option ends the process with a
     suggestion."""
-    parser, commands = _parser()
+    parser, commands = _parser(words[0] if words else "")
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in commands:
         suggestion = did_you_mean(name, commands) or "; `rigidmd --help` lists them"
@@ -141,8 +141,9 @@ def _parse(words: list[str]) -> argparse.Namespace:
     return options
 
 
-def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """The parser of a command line, and those of its commands by name."""
+def _parser(first: str = "") -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The parser of a command line, and those of its commands by name: of all, or of the one that
+    is the first word."""
     about = (
         "Molecular dynamics of rigid molecules, and the motion of single rigid bodies, from a scene"
         " file."
@@ -153,8 +154,9 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for module in iter_modules(package.__path__):
-        import_module(f"{package.__name__}.{module.name}")
+    names = [module.name for module in iter_modules(package.__path__)]
+    for name in [first] if first in names else names:
+        import_module(f"{package.__name__}.{name}")
     for name, command in sorted(COMMANDS.items(), key=lambda item: item[1].position):
         description, epilog = (
             command.about[0].upper() + command.about[1:] + ".",

@@ -14,7 +14,9 @@ nothing else.
 Private parts of Numba, each tested by tests/test_compile.py: a `FunctionCache` reads its folder
 from `numba.config.CACHE_DIR` when it is created, in a subfolder named by
 `get_suitable_cache_subpath`. Its class and that of its index, an `IndexDataCacheFile`, may be
-changed. The methods of `CacheIndex` load and save its index and data.
+changed. The methods of `CacheIndex` load and save its index and data. `load_overload` of a
+`FunctionCache` refreshes the context of the target before `_load_overload` reads, and a compilation
+refreshes it again.
 """
 
 import atexit
@@ -41,6 +43,7 @@ import numba
 from filelock import FileLock, Timeout
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache, _CacheLocator
+from numba.core.runtime import rtsys
 
 from rigidmd.compile import sources
 from rigidmd.compile.machine import CODE_SETTINGS, SIMD_BITS
@@ -362,6 +365,17 @@ def _is_of_package(module: str) -> bool:
 
 class KernelCache(FunctionCache):
     """The cache of a function, which costs time only if it cannot be written."""
+
+    def load_overload(self, sig, target_context):
+        """A compiled function; None if it is not stored.
+
+        Numba would first load what compiling needs: its support of NumPy, and the extensions of
+        other packages, 300 modules or 0.3 s. Code that is read needs the memory of Numba's arrays
+        only.
+        """
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
     def save_overload(self, sig, data):
         """Store a compiled function, unless that fails."""

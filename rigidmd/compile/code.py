@@ -28,6 +28,7 @@ from rigidmd.compile.kernels import NotStored, chosen_by_type, compile_callback,
 from rigidmd.compile.machine import MOST_THREADS, cast_pointer, pointer_to
 from rigidmd.compile.records import NumbaStruct, by_reference, load_invariant, stored_by_reference
 from rigidmd.core.process import python_process
+from rigidmd.core.signals import SEPARATE_GROUP
 from rigidmd.errors import SettingError
 
 #: Longest time to wait for the code of another process, s.
@@ -333,7 +334,7 @@ def second_process(wanted: Sequence[tuple[str, str, TaskArguments]]) -> Iterator
             **python_process("-c", SECOND_PROGRAM),
             stdin=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C goes to this process, which then ends the other
+            **SEPARATE_GROUP,  # Ctrl-C goes to this process, which then ends the other
         )
         assert process.stdin is not None
         process.stdin.write(content)

@@ -3,6 +3,8 @@
 Private parts of Numba and llvmlite, each tested by tests/test_compile.py:
 
 - A dispatcher uses `_cache` only when it compiles.
+- A dispatcher calls `_compilation_chain_init_hook`, which loads the extensions of other packages,
+  before it reads its cache, and a compilation loads them again.
 - `get_call_template` compiles for the types of its arguments.
 - `no_cpython_wrapper` and `no_cfunc_wrapper` are options of a function: it then has no wrapper for
   Python.
@@ -171,6 +173,10 @@ class KernelDispatcher(CPUDispatcher):
     """A dispatcher with the cache of rigidmd, which is opened at the first compilation."""
 
     _cache = functools.cached_property(lambda self: open_cache(self.py_func))
+
+    def _compilation_chain_init_hook(self):
+        """Load no extensions of Numba before it is known that something has to be compiled, which
+        loads them."""
 
     def get_call_template(self, args, kws):
         """Like Numba's, but not for each value of a constant argument, for which it would compile a

@@ -7,6 +7,8 @@ import os
 import re
 import secrets
 import stat
+import sys
+import time
 import zlib
 from collections.abc import Iterator, Sequence
 from math import inf
@@ -17,6 +19,7 @@ from rigidmd.errors import OutputError
 CHUNK = 1 << 20  # bytes read at a time
 #: Flags to open an existing file for appending; links are not followed, where the system supports
 #: that.
+REPLACE_ATTEMPTS, REPLACE_PAUSE = 20, 0.1  # s, on Windows
 APPEND_FLAGS = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -49,7 +52,7 @@ def untrusted_reason(found: os.stat_result) -> str:
 
     found : of `os.lstat` or `os.fstat`. Systems without user numbers have no such check.
     """
-    if not hasattr(os, "geteuid"):
+    if sys.platform == "win32":
         return ""
     if stat.S_ISLNK(found.st_mode):
         return "is a link"
@@ -84,9 +87,20 @@ def atomic_file(path: Path) -> Iterator[Path]:
         temporary.touch(exist_ok=False)  # with the permissions of any new file
         try:
             yield temporary
-            temporary.replace(path)
+            _replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    """Rename a file over another one. Windows refuses while a program has that one open, such as a
+    virus scanner for a moment."""
+    for _ in range(REPLACE_ATTEMPTS if sys.platform == "win32" else 0):
+        with contextlib.suppress(PermissionError):
+            temporary.replace(path)
+            return
+        time.sleep(REPLACE_PAUSE)
+    temporary.replace(path)
 
 
 def is_temporary(path: Path) -> bool:
@@ -97,7 +111,7 @@ def is_temporary(path: Path) -> bool:
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically. Raises OutputError."""
     with atomic_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def create_empty_file(path: Path) -> None:
@@ -108,8 +122,10 @@ def create_empty_file(path: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Flush a file or a folder to the disk."""
-    handle = os.open(path, os.O_RDONLY)
+    """Flush a file or a folder to the disk; on Windows, which opens no folders, a file."""
+    if sys.platform == "win32" and path.is_dir():
+        return
+    handle = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

@@ -70,10 +70,6 @@ def python_process(*arguments: str) -> Json:
     return {"args": [sys.executable, "-P", *arguments], "env": os.environ | {"PYTHONPATH": path}}
 
 
-try:
-    import resource
-except ImportError:  # on Windows
-    resource = None
 #: Bytes of address space to load all libraries. With less they fail in many ways, and OpenBLAS may
 #: hang.
 LIBRARY_BYTES = 1e9
@@ -83,6 +79,10 @@ RESERVED = 0.05  # fraction of the free memory that is reserved for Python, mach
 def free_memory() -> float:
     """Free bytes of this machine, within the limits of container and process; infinite where the
     system has no data."""
+    if sys.platform != "linux":
+        import psutil
+
+        return min(float(psutil.virtual_memory().available), address_space_left())
     free, group = _system_number("/proc/meminfo", "MemAvailable:") * 1024, "/sys/fs/cgroup/memory"
     for limit, used in ((".max", ".current"), ("/memory.limit_in_bytes", "/memory.usage_in_bytes")):
         free = min(
@@ -109,8 +109,10 @@ def format_gigabytes(size: float) -> str:
 def address_space_left() -> float:
     """Bytes of address space left by the limit of this process (`ulimit -v`); infinite without a
     limit."""
-    if resource is None:
+    if sys.platform == "win32":
         return inf
+    import resource
+
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     used = 1024 * _system_number("/proc/self/status", "VmSize:", 0.0)
     return inf if soft == resource.RLIM_INFINITY else soft - used

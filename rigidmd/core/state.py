@@ -85,6 +85,7 @@ class State(NamedTuple):
         return all(
             bool(np.isfinite(array).all())
             for array in (*self[:4], self.energy_ledger, self.extra_variables)
+            if array.size
         )
 
     def begin_segment(self, time: float | None = None) -> None:

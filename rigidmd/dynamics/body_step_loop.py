@@ -6,9 +6,9 @@ from typing import NamedTuple
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.core.integrators import KICK
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK
+from rigidmd.dynamics.flows import ORTHOGONALITY_INTERVAL
 from rigidmd.dynamics.force_gradient import GradientWorkspace, add_gyration, displace, evaluate
 from rigidmd.dynamics.registers import DONE, LOADED
-from rigidmd.dynamics.step_loop import ORTHOGONALITY_INTERVAL
 from rigidmd.forces.body.resistance import NoResistance, Resistance, kick_with_resistance
 from rigidmd.forces.terms import compute_body_load, total_power, trait
 from rigidmd.mechanics.free_rotor import (
@@ -50,7 +50,7 @@ def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until
     """Take steps of dt of a body until state.step is `until`. Returns a status code, after which
     another call continues exactly where this one stopped.
 
-    terms : a tuple of workspaces; flows : see `step_loop.FlowArrays`; progress : see `registers`
+    terms : a tuple of workspaces; flows : see `flows.FlowArrays`; progress : see `registers`
     gradient_workspace : None compiles no kicks with gradients
     """
     while state.step[NOW] < until:

@@ -9,8 +9,8 @@ import numpy as np
 from rigidmd.core.integrators import RK4, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State
 from rigidmd.dynamics.body_step_loop import Body
-from rigidmd.engines.cpu.engine import CpuEngine
-from rigidmd.engines.system import Sites
+from rigidmd.engines.cpu.body import BodyEngine
+from rigidmd.engines.sites import Sites
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.forces.neighbors.space import Unbounded
@@ -129,9 +129,9 @@ class BodySystem:
         relative, absolute = not_none(run.relative_tolerance), not_none(run.absolute_tolerance)
         return solver._replace(relative_tolerance=relative, absolute_tolerance=absolute)
 
-    def engine(self) -> CpuEngine:
+    def engine(self) -> BodyEngine:
         """A new engine for this body at time 0, which calls the functions in `applied`."""
-        kind = CpuEngine
+        kind = BodyEngine
         if self.scene.run.integrator in SOLVERS:
             from rigidmd.engines.ode.engine import OdeEngine as kind  # SciPy is slow to import
         python_forces = {
@@ -281,9 +281,9 @@ class BodySystem:
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (k, 3) of the points, Å of the trajectory."""
-        pose = self.pose(float(state.time[0]), state)
-        origin = pose.position if self.translates else np.zeros(3)
-        return self.scale * (origin + self.points @ pose.rotation.T)
+        origin = state.position[0] if self.translates else np.zeros(3)
+        rotation = (state.rotation @ self.axes.T)[0] if self.rotates else np.eye(3)
+        return self.scale * (origin + self.points @ rotation.T)
 
     def site_velocities(self, state: State) -> np.ndarray:
         """Velocities (k, 3) of the points, Å/ps of the trajectory."""

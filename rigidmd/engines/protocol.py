@@ -7,14 +7,16 @@ program (LAMMPS or OpenMM) compute.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, Load, State
-from rigidmd.dynamics.observables import LargestValues, StateSums
 from rigidmd.errors import SimulationError
+
+if TYPE_CHECKING:
+    from rigidmd.dynamics.observables import LargestValues, StateSums
 
 
 class Tally(NamedTuple):
@@ -81,11 +83,11 @@ class Engine(Protocol):
         computed."""
         return self.evaluate(state)
 
-    def sums(self, state: State, load: Load) -> StateSums | None:
+    def sums(self, state: State, load: Load) -> "StateSums | None":
         """Sums over the state that was just moved and its load from `evaluate_current`, if its last
         step has added them up."""
 
-    def extent(self, state: State) -> LargestValues | None:
+    def extent(self, state: State) -> "LargestValues | None":
         """Largest values in the state that was just moved and its load, if its last step has found
         them."""
 

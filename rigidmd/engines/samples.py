@@ -12,12 +12,14 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from math import nan
 from operator import attrgetter
-from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
 from rigidmd.core.statistics import least_error_from, steady_from
-from rigidmd.scene.stage import Stage
+
+if TYPE_CHECKING:
+    from rigidmd.scene.stage import Stage
 
 
 class Column(NamedTuple):
@@ -347,7 +349,7 @@ class Samples(SampleTable):
 _VALUES = attrgetter(*NUMBERS)
 
 
-def moving(stages: Sequence[Stage], of: np.ndarray) -> np.ndarray:
+def moving(stages: "Sequence[Stage]", of: np.ndarray) -> np.ndarray:
     """Whether each sample (n,) is of motion and not of a minimisation; `of` has the index of its
     stage."""
     return ~np.isin(of, [k for k, stage in enumerate(stages) if stage.is_minimisation])
@@ -357,7 +359,7 @@ def moving(stages: Sequence[Stage], of: np.ndarray) -> np.ndarray:
 LEAST_SAMPLES = 40
 
 
-def equilibrated_from(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage) -> int:
+def equilibrated_from(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: "Stage") -> int:
     """Index from which on the samples of a stage are of its equilibrium: where the potential energy
     and, if the box moves, the density are steady (`steady_from`). 0 with few samples, and if the
     temperature or pressure changes."""
@@ -365,7 +367,7 @@ def equilibrated_from(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: S
 
 
 def _slow_series(
-    of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage
+    of_stage: Mapping[str, np.ndarray] | SampleTable, stage: "Stage"
 ) -> list[np.ndarray]:
     """The series of a stage that show its equilibration; none where it cannot be detected."""
     if len(of_stage["time"]) < LEAST_SAMPLES or stage.ramps:
@@ -373,7 +375,7 @@ def _slow_series(
     return [of_stage[name] for name in ("potential", *(["density"] if stage.changes_box else []))]
 
 
-def equilibrated(of_stage: Samples, stage: Stage) -> Samples:
+def equilibrated(of_stage: Samples, stage: "Stage") -> Samples:
     """The samples of the equilibrated part of a stage."""
     return Samples(
         of_stage.stages, of_stage.user_terms, of_stage.table()[equilibrated_from(of_stage, stage) :]
@@ -381,7 +383,7 @@ def equilibrated(of_stage: Samples, stage: Stage) -> Samples:
 
 
 def describe_equilibrated(
-    of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage, begin: float
+    of_stage: Mapping[str, np.ndarray] | SampleTable, stage: "Stage", begin: float
 ) -> str:
     """The equilibrated part of a stage that started at a time (ps), such as "the last 14.2 of 20
     ps"."""

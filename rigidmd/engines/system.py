@@ -13,6 +13,7 @@ from rigidmd.core.state_file import SavedState, array_errors
 from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
 from rigidmd.engines.samples import OF_TRAJECTORIES
+from rigidmd.engines.sites import Sites
 from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
@@ -21,19 +22,6 @@ from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
-
-
-class Sites(NamedTuple):
-    """All sites of a system, molecule by molecule, for output and analysis."""
-
-    molecule: np.ndarray  # (s,)
-    offset_body: np.ndarray  # (s, 3)
-    name: np.ndarray  # (s,) text
-    element: np.ndarray  # (s,) text
-    mass: np.ndarray  # (s,)
-
-    def __repr__(self) -> str:
-        return f"<Sites: {len(self.name)} of {len(np.unique(self.molecule))} molecules>"
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,12 @@
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from textwrap import wrap
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import moving
-from rigidmd.engines.system import System
 from rigidmd.figures.style import (
     COLORS,
     FAINT,
@@ -20,6 +19,9 @@ from rigidmd.figures.style import (
     shown_range,
     thin_series,
 )
+
+if TYPE_CHECKING:
+    from rigidmd.engines.system import System
 
 #: Errors of exactly 0 are drawn at this value.
 FLOOR = 1e-17
@@ -90,7 +92,7 @@ class Timeline(NamedTuple):
         return Timeline(shown, self.time[part], self.stage[part], self.unit)
 
 
-def timeline(system: System | BodySystem, columns: Mapping[str, np.ndarray]) -> Timeline:
+def timeline(system: "System | BodySystem", columns: Mapping[str, np.ndarray]) -> Timeline:
     time = columns["time"]
     if isinstance(system, BodySystem):
         return Timeline(np.ones(len(time), bool), time, np.zeros(len(time), int), "s")
@@ -100,14 +102,14 @@ def timeline(system: System | BodySystem, columns: Mapping[str, np.ndarray]) -> 
     return Timeline(shown, time[shown], stage[shown], "ps", names)
 
 
-def panels(system: System | BodySystem, columns: Mapping[str, np.ndarray]) -> list[Panel]:
+def panels(system: "System | BodySystem", columns: Mapping[str, np.ndarray]) -> list[Panel]:
     """The panels of a run that its columns allow."""
     if isinstance(system, BodySystem):
         return [panel for family in body_panels(system, columns).values() for panel in family]
     return molecular_panels(system, columns)
 
 
-def molecular_panels(system: System, columns: Mapping[str, np.ndarray]) -> list[Panel]:
+def molecular_panels(system: "System", columns: Mapping[str, np.ndarray]) -> list[Panel]:
     count = len(system.model.species)
     shown = moving(system.scene.stages, columns["stage"])
 

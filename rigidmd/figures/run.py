@@ -7,11 +7,11 @@ import numpy as np
 from rigidmd.core.statistics import format_signed
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Samples, moving
-from rigidmd.engines.system import System
 from rigidmd.figures.body import body_figures
 from rigidmd.figures.panels import Panel, Timeline, stack, timeline
 
 if TYPE_CHECKING:
+    from rigidmd.engines.system import System
     from rigidmd.figures.picture import Picture
 
 #: Columns of the samples in energy.png.
@@ -22,7 +22,7 @@ MOST_DRIFTS = 4
 
 
 def run_figures(
-    system: System | BodySystem, samples: Any, summary: dict[str, Any]
+    system: "System | BodySystem", samples: Any, summary: dict[str, Any]
 ) -> "dict[str, Picture]":
     """The figures of a run by the names of their files, if there are enough samples."""
     if isinstance(system, BodySystem):
@@ -31,7 +31,7 @@ def run_figures(
     return {"energy": energy_figure(system, samples, summary)} if is_enough else {}
 
 
-def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
+def energy_figure(system: "System", samples: Samples, summary: dict) -> "Picture":
     """The drift of the conserved energy in each stage, each on its own scale; energies and
     temperatures."""
     count = len(system.model.species)
@@ -70,7 +70,7 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
 
 
 def _drift_panel(
-    times: Timeline, k: int, drift: np.ndarray, stages: list[dict], system: System
+    times: Timeline, k: int, drift: np.ndarray, stages: list[dict], system: "System"
 ) -> Panel:
     """The conserved energy since a stage began, kJ/mol per molecule, and the line of its drift, if
     there is a summary of the stage."""

@@ -6,7 +6,7 @@ No other code of rigidmd names an extension. A module in this folder is found by
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from math import inf
 from pathlib import Path
@@ -23,6 +23,18 @@ from rigidmd.formats.atoms import Atoms, Frame
 #: `of_sites(function)` and `centres(state, wrapped)`.
 System = Any
 Encode = Callable[[Frame, int], bytes]
+
+
+class Topology(NamedTuple):
+    """The sites of a system, for a file with their names and first positions."""
+
+    names: Sequence[str]
+    elements: Sequence[str]
+    residues: Sequence[int]  # the number of the residue of each site, from 1
+    residue_names: Sequence[str]  # of each site
+    positions: np.ndarray  # (s, 3) Å
+    cell: np.ndarray | None  # (3, 3) Å; None without a box
+    bonds: Callable[[], np.ndarray]  # pairs (b, 2) of sites that are joined
 
 
 class Format(NamedTuple):
@@ -72,8 +84,8 @@ class Format(NamedTuple):
     even: bool = False  # only times at one interval
     viewer: str = "vmd {topology} {trajectory}"  # the command that shows it
 
-    # As a topology: (path, atoms of MDAnalysis) with names and first positions.
-    write_topology: Callable[[Path, Any], None] | None = None
+    # As a topology: the text of a file with names and first positions.
+    topology: Callable[[Topology], str] | None = None
     limits: tuple[float, float] = (-inf, inf)  # smallest and largest coordinate, Å
 
     @property
@@ -135,6 +147,4 @@ def written(wanted: Callable[[Format], object]) -> tuple[str, ...]:
 
 find_modules()
 #: Names of topology files that are found next to a trajectory, as in the folder of a run.
-TOPOLOGIES = tuple(
-    f"{Path(TOPOLOGY).stem}{name}" for name in written(lambda form: form.write_topology)
-)
+TOPOLOGIES = tuple(f"{Path(TOPOLOGY).stem}{name}" for name in written(lambda form: form.topology))

@@ -5,15 +5,15 @@ A system is an `engines.system.System` or an `engines.body_system.BodySystem`, a
 `scene.models.Molecule`.
 """
 
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 
 from rigidmd.mechanics.inertia import SOLIDS
 
-#: Difference of the normals of two triangles of one flat side of a hull. Thickness relative to the
-#: size below which points lie in a plane or on a line.
+#: Distance from a flat side of a hull, relative to its size, of points on it. Thickness relative to
+#: the size below which points lie in a plane or on a line.
 FLAT, THIN = 1e-6, 1e-9
 
 
@@ -69,13 +69,11 @@ def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
 
     counts : number of points of each solid
     """
-    from scipy.spatial.distance import cdist
-
     starts = np.cumsum([0, *counts])
     edges = [start + _hull(points[start:end]) for start, end in pairwise(starts.tolist())]
     joined, free = np.arange(starts[1]), np.arange(starts[1], len(points))
     while len(free):
-        distance = cdist(points[joined], points[free])
+        distance = np.linalg.norm(points[joined, None] - points[free], axis=-1)
         i, j = np.unravel_index(distance.argmin(), distance.shape)
         edges.append(np.array([[joined[i], free[j]]]))
         solid = int(np.searchsorted(starts, free[j], side="right")) - 1
@@ -85,30 +83,47 @@ def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
-    """Edges of the convex hull of points in space, in a plane or on a line. Points inside have
-    none."""
-    from scipy.spatial import ConvexHull
-
+    """Edges of the convex hull of points in space, in a plane or on a line, the outline of a solid.
+    Points inside, and those between the corners of a side, have none."""
     if len(points) < 2:
         return np.zeros((0, 2), int)
-    _, spread, axes = np.linalg.svd(points - points.mean(axis=0))
-    dimensions = int((spread > THIN * spread[0]).sum())
-    flat = (points - points.mean(axis=0)) @ axes[:dimensions].T
-    if dimensions == 1:
+    flat = _flattened(points)
+    if flat.shape[1] == 1:
         order = flat[:, 0].argsort()
         return np.stack([order[:-1], order[1:]], axis=-1)
-    hull = ConvexHull(flat)
-    if dimensions == 2:
-        return hull.simplices
-    normals: dict[tuple[int, int], list[np.ndarray]] = {}
-    for corners, equation in zip(hull.simplices, hull.equations, strict=True):
-        for i, j in ((0, 1), (1, 2), (2, 0)):
-            pair = tuple(sorted((int(corners[i]), int(corners[j]))))
-            normals.setdefault(pair, []).append(equation[:3])  # pyright: ignore[reportArgumentType]
-    # without the diagonals of flat sides
-    return np.array(
-        [pair for pair, (one, other) in normals.items() if np.abs(one - other).max() > FLAT]
-    )
+    sides = [np.arange(len(points))] if flat.shape[1] == 2 else _sides(flat)
+    edges: dict[tuple[int, int], None] = {}
+    for side in sides:
+        outline = _flattened(points[side])
+        for ends in _sides(outline):
+            along = _flattened(outline[ends])[:, 0]
+            corners = int(side[ends[along.argmin()]]), int(side[ends[along.argmax()]])
+            edges[min(corners), max(corners)] = None
+    return np.array(list(edges))
+
+
+def _flattened(points: np.ndarray) -> np.ndarray:
+    """Coordinates (n, d) of points along the axes in which they extend, d of them."""
+    centred = points - points.mean(axis=0)
+    _, spread, axes = np.linalg.svd(centred)
+    return centred @ axes[: int((spread > THIN * spread[0]).sum())].T
+
+
+def _sides(points: np.ndarray) -> list[np.ndarray]:
+    """Indices of the points on each side of a hull, a line in a plane or a plane in space: all
+    points lie on it or behind it."""
+    chosen = np.array(list(combinations(range(len(points)), points.shape[1])))
+    first = points[chosen[:, 0]]
+    one, other = points[chosen[:, 1]] - first, points[chosen[:, -1]] - first
+    normals = one[:, ::-1] * [-1, 1] if points.shape[1] == 2 else np.cross(one, other)
+    size = np.linalg.norm(normals, axis=1)
+    spans = size > THIN * size.max()
+    normals, first = normals[spans] / size[spans, None], first[spans]
+    heights = normals @ points.T - np.einsum("ti,ti->t", normals, first)[:, None]
+    tolerance = FLAT * np.abs(points).max()
+    supports = (heights.min(axis=1) > -tolerance) | (heights.max(axis=1) < tolerance)
+    masks = np.unique(np.abs(heights[supports]) < tolerance, axis=0)
+    return [np.flatnonzero(mask) for mask in masks]
 
 
 #: Covalent radii, Å (Cordero et al. 2008, Dalton Trans. 2832), of the elements in rigid models.

@@ -26,7 +26,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 class FrameFile:
     """Writes frames to a file, each to the disk at once. For the arguments see
-    `io.trajectory.TrajectoryFile`.
+    `io.trajectory_file.TrajectoryFile`.
 
     The table of frames moves within a growing file. So a resumed run copies the frames up to the
     checkpoint to a new file, which has the same bytes as the file of a run without interruption.

@@ -10,8 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.formats import Format, register
+from rigidmd.formats import Format, Topology, register
 from rigidmd.formats.atoms import Atoms, numbers, structure_error, unexpected
+
+NM_PER_A = 0.1
+#: Numbers with more digits than a column are written without the leading ones.
+MOST_DIGITS = 100_000
+#: Indices in a cell of the numbers after its diagonal: a_y a_z, b_x b_z, c_x c_y.
+OFF_DIAGONAL = [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]
 
 
 def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
@@ -74,11 +80,28 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
     return Atoms(names, [""] * len(names), residue, 10 * position, moving, cell)
 
 
+def gro_text(system: Topology) -> str:
+    """One frame without velocities. The numbers of residues and atoms have five digits, of which
+    the leading ones are left out."""
+    lines = ["Written by rigidmd", f"{len(system.names):5d}"]
+    positions = (NM_PER_A * system.positions).tolist()
+    rows = zip(system.residues, system.residue_names, system.names, positions, strict=True)
+    for k, (residue, residue_name, name, (x, y, z)) in enumerate(rows, 1):
+        lines.append(
+            f"{residue % MOST_DIGITS:5d}{residue_name:<5.5s}{name:>5.5s}{k % MOST_DIGITS:5d}"
+            f"{x:8.3f}{y:8.3f}{z:8.3f}"
+        )
+    cell = NM_PER_A * (np.zeros((3, 3)) if system.cell is None else system.cell)
+    edges = [*np.diag(cell), *cell[OFF_DIAGONAL]]
+    lines.append("".join(f"{edge:10.5f}" for edge in (edges if any(edges[3:]) else edges[:3])))
+    return "".join(f"{line}\n" for line in lines)
+
+
 register(
     Format(
         (".gro",),
         read=read_gro,
-        write_topology=lambda path, sites: sites.write(str(path)),
+        topology=gro_text,
         limits=(-9999.9, 99999.9),  # columns of eight
         content=re.compile(r"\A(?:[ \t]*\n)*.*\n[ \t]*\d+[ \t]*\n.{20}( *-?\d+\.\d+){3}"),
     )

@@ -2,14 +2,14 @@
 
 import contextlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from rigidmd.formats import Encode, Format, System, register
+from rigidmd.formats import Encode, Format, System, Topology, register
 from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
@@ -24,6 +24,9 @@ from rigidmd.formats.through_mdanalysis import FrameFiles, dimensions
 
 #: Columns of the edges and angles in CRYST1.
 CRYST1 = (6, 15, 24, 33, 40, 47, 54)
+#: One more than the largest numbers in their columns.
+MOST_ATOMS, MOST_RESIDUES = 100_000, 10_000
+BONDS_PER_LINE = 4
 SPACE_GROUP = slice(55, 66)
 #: A coordinate in its columns, and three coordinates beyond them, which may follow the last digits
 #: of a residue number.
@@ -160,6 +163,47 @@ def encoder(system: System, interval: float, velocities: bool) -> Encode:
     return encode
 
 
+def pdb_text(system: Topology) -> str:
+    """One model with its bonds. Numbers wider than their columns lose their leading digits. Atoms
+    from 100,000 on have no bonds."""
+    lines = ["TITLE     Written by rigidmd"]
+    if box := dimensions(system.cell):
+        edges, angles = box[:3], box[3:]
+        sizes = "".join(f"{edge:9.3f}" for edge in edges)
+        lines.append(f"CRYST1{sizes}{''.join(f'{angle:7.2f}' for angle in angles)} P 1           1")
+    rows = zip(
+        system.names,
+        system.elements,
+        system.residues,
+        system.residue_names,
+        system.positions.tolist(),
+        strict=True,
+    )
+    for k, (name, element, residue, residue_name, position) in enumerate(rows, 1):
+        # a symbol of one letter stands in the second column of the name
+        aligned = f" {name}" if len(name) < 4 and len(element) < 2 else name
+        x, y, z = position
+        lines.append(
+            f"ATOM  {k % MOST_ATOMS:5d} {aligned:<4.4s} {residue_name:<4.4s}X"
+            f"{residue % MOST_RESIDUES:4d}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00"
+            f"          {element.upper():>2s}"
+        )
+    lines += [f"CONECT{''.join(f'{atom:5d}' for atom in atoms)}" for atoms in _conect(system)]
+    return "".join(f"{line}\n" for line in (*lines, "END"))
+
+
+def _conect(system: Topology) -> Iterator[list[int]]:
+    """Numbers of an atom and of at most four atoms that are joined to it, for each line."""
+    joined: dict[int, list[int]] = {}
+    for one, other in 1 + system.bonds():
+        joined.setdefault(int(one), []).append(int(other))
+        joined.setdefault(int(other), []).append(int(one))
+    for atom in sorted(joined):
+        others = sorted(other for other in joined[atom] if max(atom, other) < MOST_ATOMS)
+        for first in range(0, len(others), BONDS_PER_LINE):
+            yield [atom, *others[first : first + BONDS_PER_LINE]]
+
+
 register(
     Format(
         (".pdb", ".ent"),
@@ -167,7 +211,7 @@ register(
         encoder=encoder,
         times=re.compile(rb"^REMARK +()TIME +(\S+) PS"),
         content=re.compile(r"^(ATOM  |HETATM).{24}( *-?\d+\.\d{3}){3}", re.MULTILINE),
-        write_topology=lambda path, sites: sites.write(str(path), bonds="all"),
+        topology=pdb_text,
         limits=(-999.99, 9999.99),  # columns of eight
     )
 )

@@ -3,6 +3,7 @@
 import html
 import io
 import sys
+import threading
 import time as clock
 from typing import Any
 
@@ -107,6 +108,9 @@ class Bar(tqdm):
         if self.rate > 0:
             return f", {tqdm.format_interval(round((self.total - self.n) / self.rate))} left"
         return ""
+
+
+Bar.set_lock(threading.RLock())  # tqdm's is for several processes too, and slow to import
 
 
 class _NotebookBar(Bar):

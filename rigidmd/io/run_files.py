@@ -83,6 +83,8 @@ class Summary(BaseModel):
     numba_version: str | None = None
     llvmlite_version: str | None = None
     numpy_version: str | None = None
+    scipy_version: str | None = None
+    rocket_fft_version: str | None = None
     python_version: str | None = None
     preparing_s: Bounded | None = None
     computing_s: Bounded | None = None

@@ -13,7 +13,7 @@ from rigidmd.core.files import atomic_file, write_text
 from rigidmd.core.toml import Json, plain_values
 from rigidmd.formats import STRUCTURE
 from rigidmd.io.folder import SCENE
-from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene import Scene, is_molecular
 from rigidmd.scene.base import override
 from rigidmd.scene.models import MoleculeFile
 
@@ -34,7 +34,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
     """Write the scene into the folder of a run, so that it can be run again. Keys without effect
     are left out."""
     data = plain_values(scene.model_dump(exclude_none=True))
-    if isinstance(scene, MolecularScene):
+    if is_molecular(scene):
         for section, table in [
             (scene.forces, data["forces"]),
             *zip(scene.stages, data["stages"], strict=True),

@@ -1,13 +1,11 @@
-"""Trajectories and topologies of runs in files of any format, and as MDAnalysis Universes."""
+"""Trajectories of runs, read from files of any format, and as MDAnalysis Universes."""
 
 import contextlib
 import functools
 import re
-import struct
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -19,16 +17,14 @@ from MDAnalysis.coordinates.memory import MemoryReader
 from MDAnalysis.coordinates.XDR import XDRBaseReader
 from MDAnalysis.lib.distances import minimize_vectors, self_capped_distance
 
-from rigidmd.core.files import AppendedFile, atomic_file, writing
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import State
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
-from rigidmd.errors import OutputError, SimulationError, StructureError
-from rigidmd.formats import BY_EXTENSION, written
+from rigidmd.errors import OutputError, StructureError
+from rigidmd.formats import BY_EXTENSION
 from rigidmd.formats.atoms import Frame
 from rigidmd.formats.bonds import charges, connections
-from rigidmd.formats.frame_file import FrameFile
 from rigidmd.formats.through_mdanalysis import (
     dimensions,
     read_in_process,
@@ -41,10 +37,6 @@ from rigidmd.scene.validation import not_none
 EVEN = 1e-6
 
 T = TypeVar("T")
-
-
-#: Formats of trajectories that hold any positions at any times.
-UNLIMITED = written(lambda form: form.encoder and form.limits == (-inf, inf) and not form.even)
 
 
 def universe(system: System | BodySystem, state: State, wrapped: bool = True) -> mda.Universe:
@@ -360,90 +352,3 @@ def _subclass(mixin: type, reader: Any) -> Any:
     name = f"{reader.__name__}{mixin.__name__}"
     globals()[name] = type(reader)(name, (mixin, reader), {"__module__": __name__})
     return globals()[name]
-
-
-def open_trajectory(
-    path: Path,
-    system: System | BodySystem,
-    interval: float,
-    velocities: bool,
-    wrapped: bool,
-    kept: Sequence[int] | None = None,
-) -> "TrajectoryFile | FrameFile":
-    """The trajectory file for the extension of a path. For the arguments see `TrajectoryFile`."""
-    if (writer := BY_EXTENSION[path.suffix].writer) is not None:
-        return writer(path, system, velocities, wrapped, kept)
-    return TrajectoryFile(path, system, interval, velocities, wrapped, kept)
-
-
-def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
-    """Write names, molecules and first positions for viewers. Raises SimulationError if the format
-    cannot hold one."""
-    positions = system.site_positions(state, wrapped)
-    others = written(lambda form: form.write_topology and form.exceeded(positions) is None)
-    _check_fits(path, positions, "output.topology", others)
-    # warnings of missing attributes (occupancies, ...)
-    with atomic_file(path) as temporary, ignore_warnings():
-        write = not_none(BY_EXTENSION[path.suffix].write_topology)
-        write(temporary, universe(system, state, wrapped).select_atoms("all"))
-
-
-def _check_fits(path: Path, positions: np.ndarray, key: str, others: Sequence[str]) -> None:
-    """Raise SimulationError if the format of a file cannot hold positions (s, 3); `others` are
-    formats that can."""
-    if (bound := BY_EXTENSION[path.suffix].exceeded(positions)) is not None:
-        hint = "output.positions = 'wrapped', or for a body a smaller output.trajectory_A_per_m"
-        hint = f"use {' or '.join(others)}, {hint}" if others else f"set {hint}"
-        raise SimulationError(
-            f"a position is beyond the {bound:g} Å that {path.suffix} ({key}) can hold: {hint}"
-        )
-
-
-class TrajectoryFile(AppendedFile):
-    """Writes frames to a trajectory, in the format of the file's extension.
-
-    The bytes of each frame are appended to the file. So every write is checked, a killed run leaves
-    whole frames, and a resumed run can continue the file.
-
-    interval : time between frames (ps), for formats that store it once for all frames
-    kept : earlier value of the property `kept`, from which `cut` continues the file; None begins a
-        new file
-    Raises OutputError, here and in every method.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        system: System | BodySystem,
-        interval: float,
-        velocities: bool,
-        wrapped: bool,
-        kept: Sequence[int] | None = None,
-    ):
-        self._system, self._velocities, self._wrapped = system, velocities, wrapped
-        form = BY_EXTENSION[path.suffix]
-        self._encode: Any = not_none(form.encoder)(system, interval, velocities)
-        self._counter, self._count = form.counter[0], struct.Struct(form.counter[1])
-        *before, self._frames = kept or (0, 0, 0)
-        first = self._count.pack(1) if self._count.size else b""
-        super().__init__(path, before if kept else None, (self._counter, first))
-
-    @property
-    def kept(self) -> tuple[int, int, int]:
-        """Number of bytes, all on the disk, their checksum, and the number of frames."""
-        return *super().kept, self._frames
-
-    def write(self, state: State, time: float, step: int) -> None:
-        """Add a frame with its own time (ps) and the box."""
-        positions = self._system.site_positions(state, self._wrapped)
-        with np.errstate(over="ignore"):  # infinite positions are beyond every limit
-            rounded = positions.astype(np.float32)
-        _check_fits(self._path, rounded, "output.trajectory", UNLIMITED)
-        velocities = self._system.site_velocities(state) if self._velocities else None
-        cell = state.cell if np.isfinite(state.cell).all() else None
-        with writing(self._path):  # memory for the file of a frame may be insufficient
-            piece = self._encode(Frame(time, positions, cell, velocities, step=step), self._frames)
-        self.append(piece)
-        self._frames += 1
-        if self._count.size:
-            self.patch(self._counter, self._count.pack(self._frames))

@@ -52,17 +52,9 @@ def write_csv(
 
 def write_columns(path: Path, columns: dict[str, np.ndarray]) -> None:
     """Write columns as CSV, one line per sample, numbers with 17 digits, which keep every bit."""
-    with atomic_file(path) as temporary:
-        rows = np.column_stack(list(columns.values()))
-        np.savetxt(
-            temporary,
-            rows,
-            fmt="%.17g",
-            delimiter=",",
-            header=",".join(columns),
-            comments="",
-            encoding="utf-8",
-        )
+    line = ",".join(["%.17g"] * len(columns)) + "\n"
+    rows = np.column_stack(list(columns.values())).tolist()
+    write_text(path, "".join([",".join(columns) + "\n", *(line % tuple(row) for row in rows)]))
 
 
 def write_npz(path: Path, columns: dict[str, np.ndarray]) -> None:

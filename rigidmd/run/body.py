@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from rigidmd.assemble.body import build_body
-from rigidmd.assemble.time_step import stable_angle
+from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.core.toml import Json
@@ -19,21 +19,20 @@ from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import MATRIX
 from rigidmd.errors import SimulationError
-from rigidmd.figures.body import FIGURES
 from rigidmd.forces.body.applied import SteadyForce
 from rigidmd.formats import format_of
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import MOTION, MOTION_NPZ
 from rigidmd.io.write import write_columns, write_npz
 from rigidmd.mechanics.rotation import orthogonality_error
-from rigidmd.run.checks import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
+from rigidmd.run.body_summary import summarise_body
+from rigidmd.run.failed_check import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
 from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
 from rigidmd.run.report import body_summary_text
 from rigidmd.run.resume import Arrays, NotNegative, RunRecord, check_same_scene, state_from
 from rigidmd.run.schedule import Segment, interruptible
 from rigidmd.run.stable_step import body_step_warnings, fastest_body_rate
-from rigidmd.run.summary import summarise_body
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none
 
@@ -350,8 +349,14 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             files = [Frames(interval, not_none(output.topology), output.trajectory, velocities)]
         if self.simulation.folder is not None:
             files = [SceneFile(), *files, MotionFiles(self._sampler, output.npz)]
-            files += [Figures(FIGURES, ("png", "svg"))] if output.figures else []
+            files += self._figures() if output.figures else []
         return [*files, self._sampler, self._watch]
+
+    @staticmethod
+    def _figures() -> list[Observer]:
+        from rigidmd.figures.body import FIGURES  # for runs with figures only
+
+        return [Figures(FIGURES, ("png", "svg"))]
 
     def samples(self) -> Motion:
         return motion(self.system, self._sampler.snapshots)

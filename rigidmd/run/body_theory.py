@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.run.elliptic import complete, rf, rj
+
 
 class TopMotion(NamedTuple):
     """The motion of the axis of a heavy symmetric top: mean rate of precession about the vertical,
@@ -36,8 +38,6 @@ def heavy_top_motion(
     x = u - u0, in which fast tops have no cancellation. The angle of precession is a sum of
     elliptic integrals of the third kind, of 1/(1 - u) and 1/(1 + u), by Carlson's forms.
     """
-    from scipy.special import ellipk, elliprf, elliprj  # slow to import
-
     alpha = 2 * moment / across
     kappa = transverse / across**2
     w = vertical / across
@@ -60,15 +60,16 @@ def heavy_top_motion(
     low, high = np.clip([cosine - 0.5 * p - half, cosine - 0.5 * p + half], -1.0, 1.0)
     top += cosine
     rate, parameter = np.sqrt(alpha * (top - low)) / 2, (high - low) / (top - low)
-    angle = 0.0
+    angle, complement = 0.0, float(1 - parameter)
     for pole in (1.0, -1.0):
         weight, distance = w + c * (cosine - pole), 1 - pole * low
         # without weight the axis does not circle this pole
         if distance > 0 and abs(weight) > np.finfo(float).eps * (abs(w) + abs(c)):
             n = pole * (high - low) / distance
-            third = elliprf(0, 1 - parameter, 1) + n / 3 * elliprj(0, 1 - parameter, 1, 1 - n)
+            third = rf(0, complement, 1) + n / 3 * rj(0, complement, 1, float(1 - n))
             angle += weight / distance * third
-    return TopMotion(float(angle / ellipk(parameter) / 2), float(2 * ellipk(parameter) / rate))
+    first = complete(complement)
+    return TopMotion(float(angle / first / 2), float(2 * first / rate))
 
 
 def free_body_period(inertia: np.ndarray, omega: np.ndarray) -> float:
@@ -78,8 +79,6 @@ def free_body_period(inertia: np.ndarray, omega: np.ndarray) -> float:
         of the middle moment is zero. Infinite for a motion that never returns, such as rotation
         about the middle axis.
     """
-    from scipy.special import ellipkm1
-
     order = np.argsort(inertia)
     (a, b, c), squares = inertia[order], omega[order] ** 2
     # L² - 2 E I_k without cancellation
@@ -92,4 +91,4 @@ def free_body_period(inertia: np.ndarray, omega: np.ndarray) -> float:
         rate, complement = (a - b) * from_high, (a - c) * from_middle
     if not (complement > 0 and rate > 0):
         return float("inf")
-    return float(4 * ellipkm1(complement / rate) / np.sqrt(rate / (a * b * c)))
+    return float(4 * complete(float(complement / rate)) / np.sqrt(rate / (a * b * c)))

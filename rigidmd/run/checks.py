@@ -20,6 +20,7 @@ from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import Sample
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
+from rigidmd.run.failed_check import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.molecules import Watch, name_of
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
@@ -28,35 +29,8 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 #: diameter; the hydrogen of a hydrogen bond stays at half of it. The second fraction is for
 #: molecules without any repulsion.
 CHARGED_OVERLAP, CHARGES_OVERLAP = 0.3, 1.0
-#: A moment of inertia is suspiciously small below this fraction of mass times the square of the
-#: distance of the outermost site (for a body: of its largest moment). For water the fraction is
-#: 0.05.
-MIN_INERTIA_FRACTION = 0.01
-#: Rounding may change a potential energy by this fraction, half of its digits.
-ROUNDING = sqrt(np.finfo(float).eps)
 #: Maximum number of moves of molecules between two checks.
 MOVES_PER_CHECK = 250_000
-
-
-class FailedCheck(SimulationError):
-    """A failed check. Its message is a sentence.
-
-    molecule : index of the molecule concerned
-    factor : by which the step would have to be shorter to stay within the limit, if known
-    rotation_not_orthogonal : whether Q is wrong; evaporated : whether the box has grown too large
-    """
-
-    def __init__(
-        self,
-        message: str,
-        molecule: int | None = None,
-        factor: float | None = None,
-        rotation_not_orthogonal: bool = False,
-        evaporated: bool = False,
-    ):
-        super().__init__(message)
-        self.molecule, self.factor = molecule, factor
-        self.rotation_not_orthogonal, self.evaporated = rotation_not_orthogonal, evaporated
 
 
 def check_interval(system: System) -> int:

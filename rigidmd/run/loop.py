@@ -17,6 +17,7 @@ import numpy as np
 from rigidmd.compile.cache import compiling_announced, describe_cache
 from rigidmd.core.files import LostFileError, writing
 from rigidmd.core.process import PROCESS_LOCK
+from rigidmd.core.signals import CHECKPOINT_SIGNALS
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines.protocol import Halted, NotFiniteError
 from rigidmd.errors import OutputError, RigidMDError, SimulationError, resume_command
@@ -119,10 +120,9 @@ class RunLoop:
         """Let the run advance by at most this number of steps, or to its end."""
         self._progress = progress
         with contextlib.ExitStack() as stack:
-            if hasattr(signal, "SIGUSR1"):
-                stack.enter_context(
-                    signal_handler(self._simulation._ask_for_checkpoint, signal.SIGUSR1)
-                )
+            stack.enter_context(
+                signal_handler(self._simulation._ask_for_checkpoint, *CHECKPOINT_SIGNALS)
+            )
             if self._next == self._open:
                 with self._running():
                     self._open()

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from rigidmd.assemble.build import build, integrator_of_stage
-from rigidmd.assemble.time_step import accuracy_warnings, stable_angle
+from rigidmd.assemble.harmonic import stable_angle
+from rigidmd.assemble.time_step import accuracy_warnings
 from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.assemble.user_code.compiled import check_compiled_code
 from rigidmd.compile.machine import usable_threads

@@ -16,8 +16,6 @@ import numpy as np
 from pydantic import Field
 
 from rigidmd.core.state import NOW, State
-from rigidmd.figures.run import run_figures
-from rigidmd.figures.style import save_files
 from rigidmd.formats.atoms import Frame
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import SCENE
@@ -247,6 +245,9 @@ class Figures(Observer):
         self._names = [f"{stem}.{suffix}" for stem in stems for suffix in suffixes]
 
     def end(self, run: "Simulation", results: "Results") -> None:
+        from rigidmd.figures.run import run_figures
+        from rigidmd.figures.style import save_files
+
         failed = None
         for stem, figure in run_figures(run.system, results.samples, results.summary).items():
             try:
@@ -290,10 +291,7 @@ class Frames(GrowingFile):
         self._run = run
         if run.folder is None:
             return
-        from rigidmd.io.trajectory import (  # MDAnalysis is slow to import
-            open_trajectory,
-            write_topology,
-        )
+        from rigidmd.io.trajectory_file import open_trajectory, write_topology
 
         if self.kept is None:
             write_topology(run.path(self._names[0]), run.system, run._part.state, self._wrapped)

@@ -10,11 +10,7 @@ import numpy as np
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.core.toml import Json
-from rigidmd.engines.body_motion import Motion
-from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.protocol import Engine
-from rigidmd.engines.samples import Samples
-from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.run.observers import Moment, Observer
@@ -22,11 +18,15 @@ from rigidmd.run.resume import RunRecord
 from rigidmd.run.schedule import Segment
 
 if TYPE_CHECKING:
+    from rigidmd.engines.body_motion import Motion
+    from rigidmd.engines.body_system import BodySystem
+    from rigidmd.engines.samples import Samples
+    from rigidmd.engines.system import System
     from rigidmd.run.simulation import Simulation
 
-SystemT = TypeVar("SystemT", System, BodySystem)
+SystemT = TypeVar("SystemT", "System", "BodySystem")
 RecordT = TypeVar("RecordT", bound=RunRecord)
-SamplesT = TypeVar("SamplesT", Samples, Motion)
+SamplesT = TypeVar("SamplesT", "Samples", "Motion")
 
 
 class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):

@@ -8,6 +8,7 @@ import os
 import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -23,10 +24,10 @@ from rigidmd.core.toml import Json, shorten_text
 from rigidmd.errors import CheckpointError, SceneError, option
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import elsewhere
-from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene import Scene, is_molecular
 
 #: Packages that may change the last bits of a result.
-PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy")
+PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy", "scipy", "rocket_fft")
 #: Keys of a summary on programs and machine.
 MADE_WITH = (
     *(f"{package}_version" for package in PACKAGES),
@@ -48,13 +49,18 @@ NOT_COMPARED = (
 )
 
 
+@cache
+def _versions() -> dict[str, str]:
+    return {f"{package}_version": version(package) for package in PACKAGES}
+
+
 def computed_with() -> Json:
     """Everything in addition to the scene that may change the bits of a result, as JSON values."""
     settings = " ".join(
         f"{name}={os.environ[name]}" for name in CODE_SETTINGS if name in os.environ
     )
     return {
-        **{f"{package}_version": version(package) for package in PACKAGES},
+        **_versions(),
         "python_version": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
         "processor": PROCESSOR,
@@ -69,7 +75,7 @@ def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: st
 
     inputs : `input_digests` at the start; engine : the program that computed the motion
     """
-    molecular = isinstance(scene, MolecularScene)
+    molecular = is_molecular(scene)
     return {
         "scene": scene.name,
         **computed_with(),
@@ -162,7 +168,7 @@ def check_same_scene(
     some steps. The last stage of molecules may be longer or shorter than before, but not shorter
     than it has run."""
     excluded = [*scene.inputs, *scene.embedded_files, *NOT_COMPARED]
-    if isinstance(scene, MolecularScene) and not scene.stages[-1].ramps:
+    if is_molecular(scene) and not scene.stages[-1].ramps:
         excluded.append(f"stages.{len(scene.stages) - 1}.duration_ps")
         if sum(stage.steps for stage in scene.stages) < steps:
             raise CheckpointError(
@@ -185,6 +191,7 @@ def describe_changes(before: Mapping[str, object]) -> str | None:
         f"{key.replace('_', ' ').removesuffix(' version')} {then} there, {here} here"
         for key, (then, here) in differences(before, computed_with(), None).items()
         if key not in ("python_version", "processor_features")
+        and (key in before or not key.endswith("_version"))  # earlier versions named fewer packages
     ]
     if not changed:
         return None

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rigidmd.core.integrators import Scheme, Solver
+from rigidmd.core.signals import STOP_SIGNAL
 from rigidmd.io.checkpoint import Checkpoint, write_checkpoint
 from rigidmd.run.observers import Observer, above_zero
 
@@ -145,10 +146,11 @@ def signal_handler(handler: Callable[[int], None], *numbers: int) -> Iterator[No
 
 
 def stop_signals() -> list[int]:
-    """The signals that end runs: Ctrl-C, and SIGTERM unless the program has its own handler."""
+    """The signals that end runs: Ctrl-C, and SIGTERM (on Windows Ctrl-Break) unless the program has
+    its own handler."""
     return [
         signal.SIGINT,
-        *([signal.SIGTERM] if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL else []),
+        *([STOP_SIGNAL] if signal.getsignal(STOP_SIGNAL) == signal.SIG_DFL else []),
     ]
 
 

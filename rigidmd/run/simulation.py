@@ -10,7 +10,6 @@ import time as clock
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from math import inf
 from pathlib import Path
 from typing import (
@@ -29,6 +28,7 @@ import numpy as np
 
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.display import Displayed
+from rigidmd.core.signals import CHECKPOINT_SIGNALS
 from rigidmd.core.state import State
 from rigidmd.core.toml import Json
 from rigidmd.errors import RigidMDError, RigidMDWarning, SceneError
@@ -39,7 +39,7 @@ from rigidmd.run.loop import RunLoop
 from rigidmd.run.observers import as_observer
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import checked_walltime, signal_handler, stop_signals
-from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.scene import BodyScene, Scene
 
 if TYPE_CHECKING:
     import ase
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from rigidmd.run.body import BodyRun
     from rigidmd.run.minimise import OverlapRemoval
     from rigidmd.run.molecular import MolecularRun
+    from rigidmd.scene import MolecularScene
 
     UserForce = Force | PairPotential | HasTerm | NamedTuple
 
@@ -152,7 +153,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         @overload
         def __init__(
             self: "Simulation[System, MolecularScene]",
-            scene: MolecularScene,
+            scene: "MolecularScene",
             folder: str | Path | None = None,
             force: bool = False,
             **options: Unpack[Options],
@@ -563,6 +564,8 @@ def run_together(
     jobs
         Runs at a time; default: the number of cores
     """
+    from concurrent.futures import ThreadPoolExecutor, wait
+
     simulations = list(simulations)
     if wrong := [value for value in simulations if not isinstance(value, Simulation)]:
         raise TypeError(f"{wrong[0]!r:.60} is not a Simulation")
@@ -598,8 +601,7 @@ def run_together(
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(signal_handler(stop, *stop_signals()))
-        if hasattr(signal, "SIGUSR1"):
-            stack.enter_context(signal_handler(ask_for_checkpoints, signal.SIGUSR1))
+        stack.enter_context(signal_handler(ask_for_checkpoints, *CHECKPOINT_SIGNALS))
         pool = stack.enter_context(ThreadPoolExecutor(jobs or MOST_THREADS, "run"))
         futures = [pool.submit(run, simulation) for simulation in simulations]
         running = set(futures)

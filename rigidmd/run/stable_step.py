@@ -2,19 +2,21 @@
 state."""
 
 from math import inf, sqrt
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.time_step import INACCURATE, stable_angle, step_error
+from rigidmd.assemble.harmonic import INACCURATE, stable_angle, step_error
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import Load, State
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.protocol import Engine
-from rigidmd.engines.system import System
 from rigidmd.forces.body.applied import SteadyForce
 from rigidmd.mechanics.free_rotor import SplitRotor
 from rigidmd.mechanics.rotation import from_vector
+
+if TYPE_CHECKING:
+    from rigidmd.engines.system import System
 
 #: Force evaluations for the stiffest motion; its frequency is then exact to a few percent.
 DIRECTIONS = 16
@@ -35,7 +37,7 @@ class StiffestMode(NamedTuple):
 
 
 def stiffest_mode(
-    system: System, state: State, engine: Engine | None = None
+    system: "System", state: State, engine: Engine | None = None
 ) -> StiffestMode | None:
     """The fastest small motion of all molecules together; None if no restoring force acts.
 

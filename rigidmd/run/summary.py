@@ -1,8 +1,7 @@
-"""The summary of a run, of molecules or of a single body: one dictionary with units in its keys,
-and its notes."""
+"""The summary of a run of molecules: one dictionary with units in its keys, and its notes."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from math import hypot, isnan, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,8 +10,6 @@ import numpy as np
 from rigidmd.core.state import REMOVED, State
 from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean_and_error, slope
 from rigidmd.core.toml import Json
-from rigidmd.engines.body_motion import Motion
-from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import (
     COLUMNS,
     LEAST_SAMPLES,
@@ -22,7 +19,6 @@ from rigidmd.engines.samples import (
     equilibrated,
 )
 from rigidmd.engines.system import System
-from rigidmd.run.body_rates import body_rates
 from rigidmd.scene.couplings import THERMOSTATS
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
@@ -51,8 +47,6 @@ COMMON_DRIFT_LIMIT, THERMAL_LIMIT = 1e-4, 16.0
 MOTIONS = ("translation", "rotation")
 #: Growth of the estimated error of Coulomb forces that has a note.
 ERROR_GROWTH_LIMIT = 1.5
-#: Larger relative errors of the energy of a body have a note: the motion is then wrong.
-LARGE_ENERGY_ERROR = 1e-3
 
 
 class Minimum(NamedTuple):
@@ -535,73 +529,3 @@ def describe_minimum(found: Minimum, stage: Stage) -> str:
     )
     how = f"after {found.iterations} iterations ({found.ended_by})"
     return f"the minimisation has not converged {how}: largest {reached}"
-
-
-def summarise_body(
-    system: BodySystem,
-    motion: Motion,
-    planned: int,
-    preparing: float,
-    wall: float,
-    computing: float,
-    interrupted: bool,
-) -> dict:
-    """The summary of a run of a single body, without its `provenance`. planned : steps of a run
-    that ends in time"""
-    run, end = system.scene.run, float(motion["time"][-1])
-    steps = round(end / run.timestep_s) if interrupted else planned
-    notes = system.notes
-    if (
-        "energy" in motion.invariants
-        and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR
-    ):
-        wrong = f"the energy is wrong by {error:.1e} of the largest kinetic energy"
-        notes.append(f"{wrong}: timestep_s is too long for this motion")
-    if system.rotates:
-        speed = np.sqrt(sum(motion[f"omega_body_{k}"] ** 2 for k in (1, 2, 3)))
-        if (speed[1:] * np.diff(motion["time"])).max(initial=0.0) > np.pi:
-            notes.append(
-                "the body rotates by more than 180° between samples; shorten output.interval_s to"
-                " follow its angles"
-            )
-    return {
-        "interrupted": interrupted,
-        "kind": system.kind,
-        "pinned": not system.translates,
-        "degrees_of_freedom": system.degrees_of_freedom,
-        "mass_kg": system.mass,
-        "inertia_kg_m2": system.inertia.tolist(),
-        "integrator": run.integrator,
-        "formulation": getattr(system.method, "formulation", None),
-        "timestep_s": run.timestep_s,
-        "steps": steps,
-        "duration_s": end,
-        "samples": len(motion),
-        "preparing_s": preparing,
-        "wall_s": wall,
-        "computing_s": computing,
-        "steps_per_s": steps / computing if computing > 0 else None,
-        **motion_figures(motion.columns, motion.invariants),
-        "rates": {name: rate._asdict() for name, rate in body_rates(system, motion).items()},
-        "trajectory_A_per_m": system.scale,
-        "notes": notes,
-    }
-
-
-def motion_figures(columns: Mapping[str, np.ndarray], invariants: Iterable[str]) -> dict:
-    """The part of the summary of a body that follows from the columns of its motion."""
-    theta, orthogonality = columns.get("theta"), columns.get("orthogonality_error")
-    return {
-        "energy_start_J": float(columns["energy"][0]),
-        "energy_end_J": float(columns["energy"][-1]),
-        "work_J": float(columns["work"][-1]),
-        "largest_relative_error": {
-            name: float(np.abs(columns[f"{name}_error"]).max()) for name in invariants
-        },
-        "largest_orthogonality_error": (
-            None if orthogonality is None else float(orthogonality.max())
-        ),
-        "theta_range_deg": (
-            None if theta is None else np.degrees([theta.min(), theta.max()]).tolist()
-        ),
-    }

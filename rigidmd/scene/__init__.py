@@ -1,65 +1,30 @@
 """Scenes: `Scene.read(path)` returns the scene of molecules or of a single body."""
 
-from pydantic import BaseModel
-from pydantic.json_schema import (
-    GenerateJsonSchema,
-    JsonSchemaMode,
-    JsonSchemaValue,
-    models_json_schema,
-)
+from typing import TYPE_CHECKING, TypeGuard
 
-from rigidmd.core.toml import Json
 from rigidmd.scene.base import Scene, parse_override
 from rigidmd.scene.body import BodyScene
-from rigidmd.scene.models import available_models
-from rigidmd.scene.molecules import MolecularScene
 
-__all__ = ["BodyScene", "MolecularScene", "Scene", "parse_override", "schema"]
+if TYPE_CHECKING:
+    from rigidmd.scene.json_schema import schema
+    from rigidmd.scene.molecules import MolecularScene
 
-
-def schema() -> Json:
-    """The JSON schema of scene files: `BodyScene` for a file with a table [body], else
-    `MolecularScene`."""
-    kinds: list[tuple[type[BaseModel], JsonSchemaMode]] = [
-        (BodyScene, "validation"),
-        (MolecularScene, "validation"),
-    ]
-    _, document = models_json_schema(kinds, schema_generator=_TomlSchema)
-    document["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
-    # other names need [[integrators]]
-    for kind, section in (("MolecularScene", "Stage"), ("BodyScene", "Run")):
-        enum = document["$defs"][section]["properties"]["integrator"].pop("enum")
-        known = {"properties": {"integrator": {"enum": enum}}}
-        sections = {"run": known} if section == "Run" else {"stages": {"items": known}}
-        document["$defs"][kind] |= {
-            "if": {"required": ["integrators"]},
-            "else": {"properties": sections},
-        }
-    return {
-        "$schema": GenerateJsonSchema.schema_dialect,
-        "title": "A scene of rigidmd",
-        "description": "Moving molecules or a single body, as `rigidmd run` takes them.",
-        "type": "object",
-        "if": {"required": ["body"]},
-        "then": {"$ref": "#/$defs/BodyScene"},
-        "else": {"$ref": "#/$defs/MolecularScene"},
-        **document,
-    }
+__all__ = ["BodyScene", "MolecularScene", "Scene", "is_molecular", "parse_override", "schema"]
 
 
-class _TomlSchema(GenerateJsonSchema):
-    """JSON schema for TOML, which has no null. Only keys have defaults, and only those that JSON
-    can hold."""
+def is_molecular(scene: Scene) -> "TypeGuard[MolecularScene]":
+    """Whether a scene is of molecules."""
+    return not isinstance(scene, BodyScene)
 
-    def nullable_schema(self, schema) -> JsonSchemaValue:
-        return self.generate_inner(schema["schema"])
 
-    def default_schema(self, schema) -> JsonSchemaValue:
-        entry = super().default_schema(schema)
-        default = entry.get("default")
-        if default is None or default == float("inf") or isinstance(default, dict):
-            entry.pop("default", None)
-        return entry
+def __getattr__(name: str) -> object:
+    """What only molecules need, which a run of a single body does not load."""
+    if name == "MolecularScene":
+        from rigidmd.scene.molecules import MolecularScene
 
-    def field_title_should_be_set(self, schema) -> bool:
-        return False  # "Timestep Fs" adds nothing to timestep_fs
+        return MolecularScene
+    if name == "schema":
+        from rigidmd.scene.json_schema import schema
+
+        return schema
+    raise AttributeError(f"module {__name__} has no attribute {name}")

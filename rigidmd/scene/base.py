@@ -240,12 +240,7 @@ class Scene(Section, Displayed):
         """
         folder, data = Path(folder), plain_values(data)
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
-        from rigidmd.scene import BodyScene, MolecularScene
-
-        if issubclass(cls, (BodyScene, MolecularScene)):
-            kind = cls
-        else:
-            kind = _kind_of_scene(data, BodyScene, MolecularScene)
+        kind: Any = _kind_of_scene(data) if cls is Scene else cls
         if kind is None:
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults, overridden = [], []
@@ -434,13 +429,19 @@ def file_name(wanted: Callable[[Format], object]) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _kind_of_scene(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"):
+def _kind_of_scene(data: dict):
     """The class of scenes with these tables; None if no table belongs to either class."""
-    if "body" in data or "molecules" in data:
-        return body if "body" in data else molecules
+    from rigidmd.scene.body import BodyScene
+
+    if "body" in data:
+        return BodyScene
+    from rigidmd.scene.molecules import MolecularScene  # not for single bodies
+
+    if "molecules" in data:
+        return MolecularScene
     count = {
         kind: len(set(data) & set(kind.model_fields) - set(Scene.model_fields))
-        for kind in (body, molecules)
+        for kind in (BodyScene, MolecularScene)
     }
     best = max(count, key=lambda kind: count[kind])
     return best if count[best] > 0 else None

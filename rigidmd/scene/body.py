@@ -443,7 +443,7 @@ class BodyOutput(Section):
     ] = TRAJECTORY
     """Trajectory of points of the body for viewers; the extension sets the format; false for
     none"""
-    topology: Annotated[str | None, file_name(lambda form: form.write_topology)] = None
+    topology: Annotated[str | None, file_name(lambda form: form.topology)] = None
     """Topology file that viewers need for the trajectory (.gro, or .pdb, in which bonds are the
     edges of the body); default: topology.pdb, or topology.gro for a body that starts more than 900
     Å of the trajectory away"""

@@ -97,7 +97,7 @@ class Output(Section):
     none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
-    topology: Annotated[str, file_name(lambda form: form.write_topology)] = TOPOLOGY
+    topology: Annotated[str, file_name(lambda form: form.topology)] = TOPOLOGY
     """File with names and first positions that viewers need for the trajectory (.gro or .pdb)"""
     positions: Literal["wrapped", "unwrapped"] = "unwrapped"
     """unwrapped: continuous paths, for displacements; wrapped: centres of mass inside the box.

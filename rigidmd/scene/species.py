@@ -153,7 +153,7 @@ class Structure(Section):
                 f" {self.file}"
             )
         if self.topology.lower().endswith((*extensions(lambda form: form.is_trajectory), ".npz")):
-            with_names = ", ".join(extensions(lambda form: form.write_topology))
+            with_names = ", ".join(extensions(lambda form: form.topology))
             yield (
                 f"topology = {self.topology!r}: name a structure file with names of atoms"
                 f" ({with_names})"

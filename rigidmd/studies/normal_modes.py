@@ -450,10 +450,7 @@ def animation_files(scene: MolecularScene | BodyScene) -> list[str]:
 def write_animation(folder: Path, modes: NormalModes, number: int) -> None:
     """Write the harmonic motion along a mode, at rest in each frame, with its energies, as a run
     for `view`."""
-    from rigidmd.io.trajectory import (  # MDAnalysis is slow to import
-        open_trajectory,
-        write_topology,
-    )
+    from rigidmd.io.trajectory_file import open_trajectory, write_topology
 
     c, system, scene, output = (
         modes.coordinates,

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rigidmd.engines.system import Sites, System
+from rigidmd.engines.sites import Sites
+from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.figures.space import View, camera
 from rigidmd.formats.bonds import COVALENT, connections

@@ -25,10 +25,11 @@ from rigidmd.figures.style import new_figure
 from rigidmd.formats import BY_EXTENSION
 from rigidmd.io.folder import SCENE
 from rigidmd.run import Simulation
+from rigidmd.run.body_summary import motion_figures
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.report import body_rows, stage_rows, stage_title
 from rigidmd.run.resume import MADE_WITH
-from rigidmd.run.summary import motion_figures, stage_summary
+from rigidmd.run.summary import stage_summary
 from rigidmd.scene import Scene
 from rigidmd.view import plots
 from rigidmd.view.body_animation import BodyAnimation

@@ -29,7 +29,8 @@ from rigidmd.assemble.user_code.trust import trusted_module
 from rigidmd.core.plain_text import did_you_mean, distinct
 from rigidmd.dynamics.model import count_degrees_of_freedom
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
-from rigidmd.engines.cpu.engine import BOX, LOAD, TRAJECTORY, CompileError
+from rigidmd.engines.cpu.compiled import LOAD
+from rigidmd.engines.cpu.engine import BOX, TRAJECTORY, CompileError
 from rigidmd.engines.samples import IN_LOGS
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, describe_error

@@ -8,7 +8,6 @@ need no additional forces.
 import contextlib
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,7 @@ from typing import IO, NamedTuple, cast
 
 import numpy as np
 
+from rigidmd.core.signals import SEPARATE_GROUP, kill_group
 from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.model import Model
 from rigidmd.engines.external import ExternalEngine, same_state
@@ -238,8 +238,8 @@ class Process:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C is for this program, which ends LAMMPS
                 env=os.environ | {"OMP_NUM_THREADS": "1"},
+                **SEPARATE_GROUP,  # Ctrl-C is for this program, which ends LAMMPS
             )
         except OSError as error:
             raise EngineError(
@@ -280,8 +280,7 @@ class Process:
 def _ended(
     process: subprocess.Popen, pipes: list[IO[str]], folder: tempfile.TemporaryDirectory
 ) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)  # a launcher and the processes that it has started
+    kill_group(process)  # a launcher and the processes that it has started
     for pipe in pipes:
         with contextlib.suppress(OSError):  # a command that was not read
             pipe.close()

@@ -16,7 +16,7 @@ from scipy.integrate import Radau
 from rigidmd.core.integrators import DOP853, FORMULATIONS, RADAU, RK4, Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, WORK, State, no_load
 from rigidmd.dynamics.body_step_loop import Body
-from rigidmd.engines.cpu.engine import CpuEngine
+from rigidmd.engines.cpu.body import BodyEngine
 from rigidmd.engines.ode.rates import SINGULAR, is_singular, moment_rates_of, read, rk4, write_rates
 from rigidmd.engines.protocol import Halted, keep_time
 from rigidmd.errors import SimulationError
@@ -39,7 +39,7 @@ FORMS: dict[str, AttitudeForm] = dict(
 STABLE, STIFF, MILD, ROUNDED = 6.1, 200, 6, 1e-14
 
 
-class OdeEngine(CpuEngine):
+class OdeEngine(BodyEngine):
     """An engine that moves a body by a general solver.
 
     The solver's variables are in `state.extra_variables`, and the rest of the state is computed

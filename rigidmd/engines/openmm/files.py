@@ -70,7 +70,7 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
         write_text(folder / name, content)
     with (
         atomic_file(folder / TOPOLOGY) as temporary,
-        open(temporary, "w", encoding="utf-8") as file,
+        open(temporary, "w", encoding="utf-8", newline="\n") as file,
     ):
         from openmm import Vec3, app
 

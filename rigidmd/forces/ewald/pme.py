@@ -10,12 +10,12 @@ number of blocks does not depend on the number of threads, so the result is the 
 This module needs rocket-fft; only scenes with PME import it.
 """
 
-from math import factorial, pi
+from fractions import Fraction
+from math import comb, factorial, pi
 from typing import NamedTuple
 
 import numpy as np
 from rocket_fft import c2c, c2r, r2c
-from scipy.interpolate import BSpline
 
 from rigidmd.compile import (
     BLOCKS,
@@ -52,12 +52,19 @@ def weights(order: int) -> np.ndarray:
     """(order, order) coefficients [j, t] of u'^j in the weight of grid point floor(x) + t, u' = x -
     floor(x) - 1/2. The cardinal B-spline M_p of an order p is a polynomial of degree p - 1 between
     neighbouring points, p points wide and p - 2 times differentiable (Essmann et al. 1995, eq.
-    4.1)."""
-    spline = BSpline.basis_element(np.arange(order + 1), extrapolate=False)
-    middle = order - 0.5 - np.arange(order)
+    4.1). Each is an exact fraction, which is rounded once."""
+    middles = [order - Fraction(1, 2) - t for t in range(order)]
     return np.array(
-        [spline.derivative(j)(middle) / factorial(j) if j else spline(middle) for j in range(order)]
+        [[float(_b_spline_coefficient(order, j, x)) for x in middles] for j in range(order)]
     )
+
+
+def _b_spline_coefficient(order: int, j: int, x: Fraction) -> Fraction:
+    """The j-th derivative of M_p at x over j!, of a sum of truncated powers (eq. 4.1)."""
+    powers = [
+        (-1) ** k * comb(order, k) * (x - k) ** (order - 1 - j) for k in range(order + 1) if k < x
+    ]
+    return comb(order - 1, j) * sum(powers, Fraction(0)) / factorial(order - 1)
 
 
 class Spline(NamedTuple):

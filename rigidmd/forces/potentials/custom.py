@@ -10,7 +10,6 @@ from math import inf, pi
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import quad
 
 from rigidmd.compile import chosen_by_type, implements, is_a
 from rigidmd.compile.simd import evaluate_cubic, inverse, inverse_square_root, load, select, zeros
@@ -165,6 +164,8 @@ def tail_of_pair(
     """The tail correction of one pair of sites, with the constant of the `inner` pairs, which are
     all of these kinds. See `lennard_jones.tail`. Raises ArithmeticError if the energy falls too
     slowly."""
+    from scipy.integrate import quad  # slow to import
+
     cutoff = truncation.cutoff
     far = [abs(radial(factor * cutoff)[0]) * factor**3 for factor in (1.0, 1e3)]
     if far[1] > 0.1 * far[0]:

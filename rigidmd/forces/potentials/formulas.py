@@ -9,7 +9,6 @@ from math import inf
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly
 
 from rigidmd.compile import implements
 from rigidmd.compile.kernels import compile_user_function
@@ -211,6 +210,8 @@ def formula_of_table(
     size = np.abs(u[u <= 0]).max(initial=0.0) or np.abs(u).max()
     if f is not None:
         _check_forces(name, r, u, f, 10 * size)
+
+    from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly  # slow to import
 
     def interpolated(rows: slice) -> PPoly:
         values = KJ_PER_MOL * u[rows]

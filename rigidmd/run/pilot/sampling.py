@@ -8,7 +8,8 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from rigidmd.assemble.build import integrator_of_stage
-from rigidmd.assemble.time_step import fastest_motion, stable_angle
+from rigidmd.assemble.harmonic import stable_angle
+from rigidmd.assemble.time_step import fastest_motion
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, State
 from rigidmd.dynamics.hybrid_monte_carlo import CHANCES, ENDED

@@ -8,7 +8,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from rigidmd.assemble.time_step import stable_angle
+from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error

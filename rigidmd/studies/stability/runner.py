@@ -16,8 +16,8 @@ from rigidmd.core.state_file import write_state
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDError, SceneError
 from rigidmd.run import Simulation
+from rigidmd.run.body_summary import LARGE_ENERGY_ERROR
 from rigidmd.run.results import Results
-from rigidmd.run.summary import LARGE_ENERGY_ERROR
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.stability.cases import (
     BOUND,

@@ -23,6 +23,7 @@ from filelock import FileLock, Timeout
 from rigidmd.assemble.user_code.trust import unused_files
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.process import BY_SIGNAL, OUT_OF_TIME, python_process
+from rigidmd.core.signals import KILL_SIGNAL, SEPARATE_GROUP, STOP_SIGNAL, stop_process
 from rigidmd.errors import OutputError, RigidMDError, SettingError, describe_error, option
 from rigidmd.io.folder import LOCK
 from rigidmd.io.progress import Bar
@@ -45,7 +46,7 @@ FOR_TABLE, FOR_TABLE_FRACTION = 15.0, 0.1
 OUTPUTS = ".points-"  # start of the name of the folder of messages
 STOP = "stop"  # the file that requests a signal, by its number
 #: Exit codes of runs that finished, or were stopped.
-UNEVENTFUL = (0, OUT_OF_TIME, BY_SIGNAL + signal.SIGINT, BY_SIGNAL + signal.SIGTERM)
+UNEVENTFUL = (0, OUT_OF_TIME, BY_SIGNAL + signal.SIGINT, BY_SIGNAL + STOP_SIGNAL)
 THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 PROGRESS = re.compile(r"  (\S+) of (\S+) \S+, ")
 
@@ -86,7 +87,7 @@ def run_point(point: SweepPoint, common: CommonSettings) -> tuple[int, float]:
     began, sweep, outputs = clock.monotonic(), common.sweep, common.outputs
     words, walltime = ["-m", "rigidmd.core.bound_process"], []
     if _requested_signal(outputs):
-        return BY_SIGNAL + signal.SIGTERM, 0.0
+        return BY_SIGNAL + STOP_SIGNAL, 0.0
     if common.ends_at is not None:
         seconds_left = common.ends_at - clock.time()
         if seconds_left <= 0:
@@ -108,14 +109,14 @@ def run_point(point: SweepPoint, common: CommonSettings) -> tuple[int, float]:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=output,
-            start_new_session=True,
+            **SEPARATE_GROUP,
         )
     sent = 0
     with process:
         while process.poll() is None:
             requested = _requested_signal(outputs)
             if requested != sent:
-                process.send_signal(requested)
+                process.kill() if requested == KILL_SIGNAL else stop_process(process)
                 sent = requested
             with suppress(subprocess.TimeoutExpired):
                 process.wait(POLL_INTERVAL)
@@ -138,7 +139,7 @@ def _requested_signal(outputs: Path) -> int:
     stop = outputs / STOP
     if stop.exists():
         return int(stop.read_text())
-    return 0 if outputs.is_dir() else signal.SIGTERM
+    return 0 if outputs.is_dir() else STOP_SIGNAL
 
 
 def wait_for_folder(folder: Path, timeout: float = LOCK_TIMEOUT) -> None:
@@ -214,14 +215,14 @@ def run_points(
             if signals.count(signal.SIGINT) > 2:  # a cluster may not answer
                 raise KeyboardInterrupt
             at_once = signals.count(signal.SIGINT) > 1
-            write_text(outputs / STOP, str(int(signal.SIGKILL if at_once else signal.SIGTERM)))
+            write_text(outputs / STOP, str(int(KILL_SIGNAL if at_once else STOP_SIGNAL)))
 
         alone = replace(manifest, points=[])
         alone.folder = folder
         trusted = [str(Path(path).absolute()) for path in trust]
         common = CommonSettings(alone, trusted, threads, str(Path.cwd()), outputs, ends_at)
         messages = _Messages(outputs, bar, receive)
-        with signal_handler(stop, signal.SIGINT, signal.SIGTERM):
+        with signal_handler(stop, signal.SIGINT, STOP_SIGNAL):
             running = {executor.submit(run_point, p, common): p for p in manifest.unfinished}
             while running:
                 manifest.write()
@@ -292,7 +293,7 @@ def _record_end(
 
 def _failure_reason(lines: list[str], code: int) -> str:
     """Why a process has failed, by its output: the last message, or else the last line."""
-    if code == -signal.SIGKILL:
+    if code == -KILL_SIGNAL:
         advice = f"run fewer points at a time: {option('jobs')}"
         return f"its process was killed, perhaps because memory was full ({advice})"
     last = "\n".join(lines[-1:])

@@ -1,0 +1,49 @@
+"""The engine of a single body that runs compiled code on the CPU."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.integrators import Scheme
+from rigidmd.core.state import Load, State
+from rigidmd.dynamics.body_step_loop import Body, advance_body
+from rigidmd.dynamics.flows import FlowArrays, flow_arrays
+from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
+from rigidmd.dynamics.registers import LOADED
+from rigidmd.engines.cpu.compiled import CompiledEngine, Steps
+from rigidmd.forces.terms import Setup
+
+
+class BodyEngine(CompiledEngine):
+    """An engine of a single body, which has no pairs and one thread. For the arguments see
+    `CompiledEngine`."""
+
+    model: Body
+
+    def __init__(
+        self,
+        model: Body,
+        terms: dict[str, NamedTuple],
+        python_forces: dict[str, Callable] | None = None,
+    ):
+        setup = Setup(np.zeros((3, 3)), np.float64, skin=0.0, needs_virials=False)
+        super().__init__(model, terms, setup, python_forces)
+
+    def _move(
+        self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps
+    ) -> bool:
+        def flows_and_gradient() -> tuple[FlowArrays, GradientWorkspace | None]:
+            return flow_arrays(integrator), (
+                gradient_workspace(state) if integrator.has_gradient else None
+            )
+
+        flows, gradient = self._bind((integrator, state), flows_and_gradient)
+        model, (dt, until, _) = self.model_for(integrator), step
+        progress = np.array([0, self._last.is_current, 0], np.int64)
+        while status := advance_body(
+            model, state, load, workspaces, flows, gradient, dt, until, progress
+        ):
+            workspaces = self._handle_status(status, state)
+        # also False after no step, because then no forces were evaluated
+        return progress[LOADED] != 0
