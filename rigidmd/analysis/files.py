@@ -3,16 +3,16 @@ curve."""
 
 import csv
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from rigidmd.analysis.curve_figure import curve_figure
-from rigidmd.analysis.registry import analysis_order, is_built_in, selected
+from rigidmd.analysis.registry import analysis_order, check_options, is_built_in, selected
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.analysis.runs import Runs, as_runs
@@ -190,6 +190,7 @@ def analyse_folder(
     viscosity: float | None = None,
     progress: Callable[[float, str], object] = lambda fraction, name: None,
     figures: str = FIGURES[0],
+    options: Mapping[str, Any] | None = None,
 ) -> AnalysisOutput:
     """Analyse the run in a folder and write the files into it.
 
@@ -199,8 +200,9 @@ def analyse_folder(
     names : of analyses, all if empty; start : of the frames, ps; viscosity : mPa s
     progress : called with the fraction done and the name of the current work
     figures : type of the figures, one of FIGURES
+    options : other arguments of analyses; each gets those that it takes
     """
-    selected(names)  # before frames are read
+    check_options(selected(names), options or {})  # before frames are read
 
     def reading(fraction):
         return progress(READING * fraction, "reading frames")
@@ -211,7 +213,7 @@ def analyse_folder(
     def rest(fraction, name):
         return progress(READING + (1 - READING) * fraction, name)
 
-    done = analyse_frames(folder, as_runs(frames), names, viscosity, rest, figures)
+    done = analyse_frames(folder, as_runs(frames), names, viscosity, rest, figures, options)
     if not done.results:
         raise OutputError(f"{folder}: {no_result_reason(done.failed)}")
     return done
@@ -224,10 +226,11 @@ def analyse_frames(
     viscosity: float | None,
     progress: Callable[[float, str], object],
     figures: str,
+    options: Mapping[str, Any] | None = None,
 ) -> AnalysisOutput:
     """Analyse frames, and write the files into a folder if there are results. See
     `analyse_folder`."""
-    results, failed = run_analyses(runs, names, viscosity, progress)
+    results, failed = run_analyses(runs, names, viscosity, progress, options)
     used = {
         "stage": runs.first.stage.label,
         "from_ps": min(float(run.time[0]) for run in runs.members),
@@ -250,18 +253,17 @@ def run_analyses(
     names: list[str],
     viscosity: float | None = None,
     progress: Callable[[float, str], object] = lambda fraction, name: None,
+    options: Mapping[str, Any] | None = None,
 ) -> tuple[list[AnalysisResult], dict[str, str]]:
     """The results of analyses, and a sentence on each that has failed: analysis -> why. No analysis
     ends the others."""
-    entries = selected(names)
+    entries, given = selected(names), {"viscosity_mPa_s": viscosity} | dict(options or {})
     results, failed = [], {}
     for k, entry in enumerate(entries):
         progress(k / len(entries), entry.name)
-        takes_viscosity = "viscosity_mPa_s" in signature(entry.function).parameters
+        taken = given.keys() & signature(entry.function).parameters.keys()
         try:
-            results.append(
-                entry.function(runs, **{"viscosity_mPa_s": viscosity} if takes_viscosity else {})
-            )
+            results.append(entry.function(runs, **{key: given[key] for key in taken}))
         except OutputError as error:
             failed[entry.name] = str(error)
         except (

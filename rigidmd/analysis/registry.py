@@ -4,6 +4,7 @@ import runpy
 from collections.abc import Callable, Mapping
 from functools import wraps
 from importlib import import_module
+from inspect import signature
 from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
@@ -23,6 +24,7 @@ from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs, as_runs
 from rigidmd.core.files import unreadable_reason
 from rigidmd.errors import OutputError
+from rigidmd.scene.base import format_override
 from rigidmd.scene.validation import did_you_mean
 
 Function = Callable[..., AnalysisResult]
@@ -36,12 +38,15 @@ class Analysis(NamedTuple):
     function: Function
     position: float  # among all; user-defined ones are at the end
     is_user: bool
+    on_request: bool = False  # not among all, because it takes long or needs options
 
 
 KNOWN: dict[str, Analysis] = {}
 
 
-def built_in(about: str, position: float = inf) -> Callable[[Function], Function]:
+def built_in(
+    about: str, position: float = inf, on_request: bool = False
+) -> Callable[[Function], Function]:
     """Register a built-in analysis under the name of its function of `Runs`, which takes the frames
     of one run too."""
 
@@ -50,7 +55,8 @@ def built_in(about: str, position: float = inf) -> Callable[[Function], Function
         def analysis(frames: RigidFrames | Runs, *arguments: Any, **options: Any) -> AnalysisResult:
             return function(as_runs(frames), *arguments, **options)
 
-        KNOWN[function.__name__] = Analysis(function.__name__, about, analysis, position, False)
+        name = function.__name__
+        KNOWN[name] = Analysis(name, about, analysis, position, False, on_request)
         return analysis
 
     return add
@@ -128,13 +134,31 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
 
 
 def selected(names: list[str]) -> list[Analysis]:
-    """The analyses with these names, or all. Raises OutputError."""
+    """The analyses with these names, or all that need no request. Raises OutputError."""
     known = sorted(KNOWN, key=analysis_order)
     for name in names:
         if name not in KNOWN:
             hint = did_you_mean(name, known) or ";"
             raise OutputError(f"unknown analysis {name!r}{hint} there are {', '.join(known)}")
-    return [KNOWN[name] for name in names or known]
+    return [KNOWN[name] for name in names or known if names or not KNOWN[name].on_request]
+
+
+def check_options(entries: list[Analysis], options: Mapping[str, Any]) -> None:
+    """Raise OutputError for options that none of the analyses takes, or of another type."""
+    known: dict[str, Any] = {}
+    for entry in entries:
+        _, *parameters = signature(entry.function).parameters.values()
+        known |= {parameter.name: parameter.default for parameter in parameters}
+    for key, value in options.items():
+        if key not in known:
+            hint = did_you_mean(key, known) or ";"
+            taken = ", ".join(known) or "none"
+            raise OutputError(f"unknown option {key!r} of these analyses{hint} there are {taken}")
+        default = known[key]
+        kind = (int, float) if default is None or type(default) is float else type(default)
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            example = "1.5" if default is None else format_override(key, default)
+            raise OutputError(f"{key}: {value!r} is not like {example}")
 
 
 def analysis_order(name: str) -> float:

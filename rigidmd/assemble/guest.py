@@ -1,5 +1,5 @@
-"""Energies of a trial molecule in a system, by the forces of the system, of which second virial
-coefficients are made."""
+"""Energies of a trial molecule in a system, by the forces of the system: for second virial
+coefficients and insertion."""
 
 from dataclasses import replace
 from math import inf
@@ -115,8 +115,9 @@ class Guest:
             alone = _total(self._engines[1], host)
             limit = CORE_IN_KT * self._thermal + abs(constant)
             energy[energy > limit] = inf
+            rotates = len(self._with.state.rotation) > 0
             for k in np.flatnonzero(energy < inf):
-                trial = _with_trial(host, position[k], rotation[k])
+                trial = _with_trial(host, position[k], rotation[k], rotates)
                 energy[k] += _total(self._engines[0], trial) - alone
         energy += constant
         if (energy < -DEEPEST_IN_KT * self._thermal).any():
@@ -235,11 +236,8 @@ def _selected(state: State, members: np.ndarray) -> State:
     return state_of(position=state.position[members], rotation=rotation, cell=state.cell)
 
 
-def _with_trial(
-    state: State, position: np.ndarray, rotation: np.ndarray, rotates: bool | None = None
-) -> State:
+def _with_trial(state: State, position: np.ndarray, rotation: np.ndarray, rotates: bool) -> State:
     """A state with one more molecule at the end."""
-    rotates = len(state.rotation) > 0 if rotates is None else rotates
     before = (
         state.rotation if len(state.rotation) else np.tile(np.eye(3), (len(state.position), 1, 1))
     )

@@ -11,9 +11,9 @@ from rigidmd.commands.streams import progress_bar
 class _List(argparse.Action):
     def __call__(self, parser, *_):
         from rigidmd.analysis import mean_force
-        from rigidmd.analysis.registry import selected
+        from rigidmd.analysis.registry import KNOWN, analysis_order, selected
 
-        for entry in selected([]):
+        for entry in selected(sorted(KNOWN, key=analysis_order)):
             print(f"{entry.name:18} {entry.about}")
         print(f"{mean_force.NAME:18} {mean_force.ABOUT}, of a sweep")
         parser.exit()
@@ -28,6 +28,15 @@ class _List(argparse.Action):
         "folder",
         metavar="RUN",
         help="folder of a run, or of a sweep: means and errors over its runs",
+    ),
+    argument(
+        "requests",
+        nargs="*",
+        metavar="NAME",
+        help=(
+            "these analyses, like --only; KEY=VALUE sets an option of theirs, such as"
+            " `insertion model=krypton trials=5000`"
+        ),
     ),
     argument(
         "--only",
@@ -95,15 +104,18 @@ def _analyse(options: Options) -> int:
     from rigidmd.analysis.registry import run_user_file
     from rigidmd.commands.sweep import print_limits
     from rigidmd.errors import OutputError
+    from rigidmd.scene import parse_override
     from rigidmd.studies.sweep.folder import is_sweep, read_manifest
     from rigidmd.studies.sweep.replicas import ANALYSES, analyse_sweep
 
     for path in options.trust:
         run_user_file(Path(path))
+    names = [*options.only, *(text for text in options.requests if "=" not in text)]
+    more = dict(parse_override(text) for text in options.requests if "=" in text)
     with progress_bar() as progress:
-        folder, request = Path(options.folder), (options.only, options.start, options.viscosity)
+        folder, request = Path(options.folder), (names, options.start, options.viscosity)
         if is_sweep(folder):
-            analysed = analyse_sweep(folder, *request, progress, options.figures)
+            analysed = analyse_sweep(folder, *request, progress, options.figures, more)
             progress(1.0, "")
             for of in analysed:
                 runs = f"{of.runs} run{'s' if of.runs > 1 else ''}"
@@ -117,8 +129,8 @@ def _analyse(options: Options) -> int:
             if options.extrapolate is not None:
                 names = print_limits(read_manifest(folder), options.extrapolate)
                 print(f"\n  files in {folder}: {', '.join(names)}")
-            return FAILED if options.only and any(of.failed for of in analysed) else 0
-        if mean_force.NAME in options.only:
+            return FAILED if names and any(of.failed for of in analysed) else 0
+        if mean_force.NAME in names:
             raise OutputError(
                 f"pmf needs a sweep over the distance of a restraint, and {folder} is the folder of"
                 " a run"
@@ -127,7 +139,7 @@ def _analyse(options: Options) -> int:
             raise OutputError(
                 f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run"
             )
-        done = analyse_folder(folder, *request, progress, options.figures)
+        done = analyse_folder(folder, *request, progress, options.figures, more)
     used = done.frames_used
     print(
         f"{options.folder}: {used['frames']} frames from {used['from_ps']:g} to"
@@ -140,7 +152,7 @@ def _analyse(options: Options) -> int:
         f"\n{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd"
         " report` shows them"
     )
-    return FAILED if options.only and done.failed else 0
+    return FAILED if names and done.failed else 0
 
 
 def _print_results(results: list, failed: dict[str, str], verbose: bool) -> None:

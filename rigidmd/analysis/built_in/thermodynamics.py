@@ -237,7 +237,7 @@ def _matter_of(runs: Runs) -> Matter:
     freedom = runs.system.freedom
     count = sum(len(kind.index) for kind in runs.moving)
     return Matter(
-        float(runs.mean([_thermal_energy(run) for run in runs.members])),
+        float(runs.mean([thermal_energy_of(run) for run in runs.members])),
         runs.volume if runs.has_box else inf,
         count,
         sum(kind.molecule.mass * len(kind.index) for kind in runs.moving),
@@ -246,7 +246,7 @@ def _matter_of(runs: Runs) -> Matter:
     )
 
 
-def _thermal_energy(run: RigidFrames) -> float:
+def thermal_energy_of(run: RigidFrames) -> float:
     """kB T of the thermostat, or the measured one without a thermostat."""
     stage = run.stage
     return BOLTZMANN * stage.temperatures[0] if stage.has_thermostat else run.thermal_energy
@@ -263,7 +263,7 @@ def _pair_of(run: RigidFrames) -> np.ndarray:
         freedom = run.system.freedom_in(run.system.scene.stages.index(stage)).translation
         momenta = BOLTZMANN * freedom * columns["temperature_translation"]
         other = BAR * columns["pressure_bar"] - momenta / (3 * run.volume.mean())
-    return np.array([energy / _thermal_energy(run), other])
+    return np.array([energy / thermal_energy_of(run), other])
 
 
 def _hidden_covariances(pairs: list[np.ndarray]) -> np.ndarray:

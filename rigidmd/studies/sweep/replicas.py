@@ -2,14 +2,14 @@
 scatter."""
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_frames
 from rigidmd.analysis.mean_force import NAME as MEAN_FORCE
-from rigidmd.analysis.registry import selected
+from rigidmd.analysis.registry import check_options, selected
 from rigidmd.analysis.result import AnalysisResult
 from rigidmd.analysis.rigid_frames import MOST_NUMBERS, RigidFrames, frames_of_folder
 from rigidmd.analysis.runs import Runs, as_runs
@@ -55,12 +55,13 @@ def analyse_sweep(
     viscosity: float | None,
     progress: Progress,
     figures: str = FIGURES[0],
+    options: Mapping[str, Any] | None = None,
 ) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 
     Results of replicas together are written into the folder of the sweep, or into a folder for each
     combination of the other keys, and all values into analysis.csv. names, start, viscosity,
-    progress, figures : see `analyse_folder`
+    progress, figures, options : see `analyse_folder`
     """
     manifest = read_manifest(folder)
     finished = manifest.points_in("finished")
@@ -71,8 +72,10 @@ def analyse_sweep(
     combinations = []
     if names != [MEAN_FORCE]:
         others = [name for name in names if name != MEAN_FORCE]
-        selected(others)
-        analyse = partial(analyse_frames, names=others, viscosity=viscosity, figures=figures)
+        check_options(selected(others), options or {})
+        analyse = partial(
+            analyse_frames, names=others, viscosity=viscosity, figures=figures, options=options
+        )
         combinations = _analyse_combinations(manifest, start, analyse, progress)
     if MEAN_FORCE in names or (not names and is_of_windows(manifest)):
         result, files = write_mean_force(manifest, figures)

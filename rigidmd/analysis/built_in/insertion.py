@@ -1,0 +1,236 @@
+"""Insertion of trial molecules: excess chemical potential, Henry constant, heat of adsorption
+(Widom 1963, J. Chem. Phys. 39, 2808; Frenkel & Smit, section 7.2). See the guide
+`chemical_potential`."""
+
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.analysis.built_in.interfaces import BIN, slab_of
+from rigidmd.analysis.built_in.thermodynamics import thermal_energy_of
+from rigidmd.analysis.registry import built_in
+from rigidmd.analysis.result import (
+    BLOCKS,
+    AnalysisResult,
+    Curve,
+    Value,
+    converged_value,
+    correlation_time_of,
+    mean_of_series,
+    too_short,
+)
+from rigidmd.analysis.rigid_frames import RigidFrames
+from rigidmd.analysis.runs import Runs
+from rigidmd.assemble.guest import Guest, model_named
+from rigidmd.core.state import state_of
+from rigidmd.core.statistics import error_of_mean
+from rigidmd.errors import InputError, OutputError
+from rigidmd.forces.terms import trait
+from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
+
+TRIALS = 1000  # in each frame
+#: The sum of the weights must be worth this number of equal trials, and of equal frames.
+FEWEST_TRIALS, FEWEST_FRAMES = 100.0, 5.0
+LARGEST = 0.01  # fraction of the trials of which messages give the part of the sum
+#: Å³ u⁻¹ (kT)⁻¹ in mol/(kg Pa): 1 u is 1e-3 kg/mol, and 1 bar is 1e5 Pa.
+PER_KG_PA = 1e3 * BAR * 1e-5
+
+
+class Trials(NamedTuple):
+    """Trials in the frames of a run.
+
+    volume (f,) Å³; weight (f, t) exp(-u/kT); energy (f, t) u/kT, 0 where the weight is; height
+    (f, t) distance along a normal from the middle of a slab, Å, in a profile
+    """
+
+    volume: np.ndarray
+    weight: np.ndarray
+    energy: np.ndarray
+    height: np.ndarray
+
+    @property
+    def moments(self) -> np.ndarray:
+        """V, V w and V w u/kT, with the weights w, of each frame (3, f)."""
+        mean = self.weight.mean(axis=1)
+        product = (self.weight * self.energy).mean(axis=1)
+        return self.volume * np.array([np.ones(len(mean)), mean, product])
+
+
+@built_in("excess chemical potential and Henry constant by insertion", position=97, on_request=True)
+def insertion(
+    runs: Runs,
+    model: str = "",
+    trials: int = TRIALS,
+    zero_loading: bool = False,
+    axis: str = "",
+    seed: int = 1,
+) -> AnalysisResult:
+    """Excess chemical potential of a model by trial insertions into the frames of a run, and its
+    fugacity or Henry constant; in frozen molecules also the heat of adsorption at zero loading.
+
+    Energies are of the forces of the run, with sums over k-vectors and the tail correction.
+
+    model : a species of the run, a shipped model or a .toml file; default: the first species
+    trials : positions and orientations in each frame
+    zero_loading : only the frozen molecules act on the trial molecule
+    axis : x, y or z for the profile along the normal of a slab
+    seed : of the trials
+
+    Raises OutputError.
+    """
+    if not runs.has_box:
+        raise OutputError("insertion needs a box")
+    if trials < 1:
+        raise OutputError("insertion needs one trial or more in each frame")
+    driven = [name for name, term in runs.system.terms.items() if trait(term, "time_dependent")]
+    if driven:
+        raise OutputError(f"the energy depends on time: {', '.join(driven)}")
+    frozen = runs.system.model.inverse_mass[runs.system.model.species] == 0
+    if zero_loading and not frozen.any():
+        raise OutputError("zero loading needs frozen molecules, and the run has none")
+    host = frozen if zero_loading else np.ones(len(frozen), bool)
+    thermal = float(runs.mean([thermal_energy_of(run) for run in runs.members]))
+    try:
+        molecule = model_named(model or runs.moving[0].name, runs.system.species)
+        guest = Guest(runs.system, molecule, thermal / BOLTZMANN, host)
+        sets = [
+            _trials_of(run, guest, thermal, trials, axis, np.random.default_rng([seed, k]))
+            for k, run in enumerate(runs.members)
+        ]
+    except InputError as error:
+        raise OutputError(str(error)) from None
+    result = AnalysisResult("insertion", f"insertion of {molecule.name}")
+    result.values = _values(runs, sets, guest, thermal, host, zero_loading)
+    result.notes = [_note(sets, guest, thermal)]
+    if axis:
+        result.curves = [_profile(sets, thermal, axis)]
+    return result
+
+
+def _trials_of(
+    run: RigidFrames,
+    guest: Guest,
+    thermal: float,
+    count: int,
+    axis: str,
+    rng: np.random.Generator,
+) -> Trials:
+    shape = (len(run), count)
+    energy, height = np.empty(shape), np.zeros(shape)
+    slab = slab_of(run, axis) if axis else None
+    for f in range(len(run)):
+        position = rng.random((count, 3)) @ run.cell[f]
+        rotation = run.Q[f] if run.Q.shape[1] else None
+        state = state_of(position=run.positions[f], rotation=rotation, cell=run.cell[f])
+        energy[f] = guest.energies(state, position, random_rotations(rng, count))
+        if slab is not None:
+            edge = run.cell[f, slab.axis, slab.axis]
+            middle = run.positions[f, 0, slab.axis] - slab.centre[f, 0]
+            height[f] = (position[:, slab.axis] - middle + edge / 2) % edge - edge / 2
+    weight = np.exp(-energy / thermal)
+    return Trials(run.volume, weight, np.where(weight > 0, energy / thermal, 0.0), height)
+
+
+def _values(
+    runs: Runs,
+    sets: list[Trials],
+    guest: Guest,
+    thermal: float,
+    host: np.ndarray,
+    zero_loading: bool,
+) -> list[Value]:
+    """The chemical potential and what follows from it."""
+    moments, name = [trials.moments for trials in sets], guest.molecule.name
+    volume, weight, energy = runs.mean([of_run.mean(axis=1) for of_run in moments])
+    why = _why_refused(sets)
+    if not weight > 0:
+        return [Value(f"mu_ex of {name}", "kJ/mol", None, None, None, why)]
+
+    def value(title: str, unit: str, value: float, size: float, changes: list[np.ndarray]) -> Value:
+        """A value with an error from what each frame changes in it, in units of `size`."""
+        error = mean_of_series(runs, changes)[1]
+        error = None if error is None else error * size
+        if why:
+            return too_short(title, unit, value, error, why)
+        tau = correlation_time_of(runs, changes)
+        return converged_value(title, unit, value, error, runs.span, tau)
+
+    unit = thermal / KJ_PER_MOL
+    ratio = [w / weight - v / volume for v, w, _ in moments]
+    values = [value(f"mu_ex of {name}", "kJ/mol", -np.log(weight / volume) * unit, unit, ratio)]
+    species = runs.system.model.species[host]
+    if zero_loading:
+        henry = weight / (runs.system.model.mass[species].sum() * thermal) * PER_KG_PA
+        heat = [(u - w * energy / weight) / weight for _, w, u in moments]
+        return [
+            *values,
+            value(f"Henry constant of {name}", "mol/(kg Pa)", henry, henry, ratio),
+            value(
+                f"heat of adsorption of {name}",
+                "kJ/mol",
+                (1 - energy / weight) * unit,
+                unit,
+                heat,
+            ),
+        ]
+    if runs.system.model.inverse_mass[species].all():  # nothing is frozen
+        same = np.array([runs.system.species[k].name == name for k in species])
+        title, count = (
+            (f"fugacity of {name}", same.sum())
+            if same.any()
+            else (f"Henry constant of {name}", len(same))
+        )
+        pressure = count * thermal / weight / BAR
+        values.append(value(title, "bar", pressure, pressure, ratio))
+    return values
+
+
+def _why_refused(sets: list[Trials]) -> str:
+    """Why the mean of the weights is not to be trusted; empty if it is."""
+    weight = np.sort(np.concatenate([trials.weight.ravel() for trials in sets]))[::-1]
+    if not weight[0] > 0:
+        return f"the molecule overlaps in all of {len(weight)} trials"
+    frames = np.concatenate([trials.weight.sum(axis=1) for trials in sets])
+    worth, of_frames = (w.sum() ** 2 / (w**2).sum() for w in (weight, frames))
+    if worth >= FEWEST_TRIALS and of_frames >= FEWEST_FRAMES:
+        return ""
+    part = weight[: ceil(LARGEST * len(weight))].sum() / weight.sum()
+    return (
+        f"the largest {LARGEST:.0%} of the trials carry {part:.0%} of the sum, which is worth"
+        f" {worth:.2g} equal trials in {of_frames:.2g} frames; {FEWEST_TRIALS:g} in"
+        f" {FEWEST_FRAMES:g} are needed"
+    ).replace("%", " %")
+
+
+def _note(sets: list[Trials], guest: Guest, thermal: float) -> str:
+    count = sum(trials.weight.size for trials in sets)
+    fits = sum(np.count_nonzero(trials.weight) for trials in sets)
+    return (
+        f"{count} trials at {thermal / BOLTZMANN:.5g} K, of which {100 * fits / count:.2f} % do not"
+        f" overlap; {'with' if guest.has_tail else 'without'} tail correction"
+    )
+
+
+def _profile(sets: list[Trials], thermal: float, axis: str) -> Curve:
+    """The chemical potential against the distance from the middle of a slab, with errors of blocks
+    of frames; NaN where the molecule overlaps in all trials."""
+    height = np.concatenate([trials.height for trials in sets])
+    weight = np.concatenate([trials.weight for trials in sets])
+    half = np.abs(height).max()
+    bins = np.linspace(-half, half, max(2, round(2 * half / BIN)) + 1)
+
+    def potential(rows: slice) -> np.ndarray:
+        sums, _ = np.histogram(height[rows], bins, weights=weight[rows])
+        counts, _ = np.histogram(height[rows], bins)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return -thermal / KJ_PER_MOL * np.log(np.where(sums > 0, sums / counts, np.nan))
+
+    size = len(height) // BLOCKS
+    parts = [potential(slice(k * size, (k + 1) * size)) for k in range(BLOCKS)] if size else []
+    values = potential(slice(None))
+    errors = error_of_mean(parts) if parts else np.full_like(values, np.nan)
+    curve = Curve("insertion", (f"{axis} (A)", (bins[1:] + bins[:-1]) / 2), "mu_ex (kJ/mol)", {})
+    curve.add("mu_ex", values, errors)
+    return curve
