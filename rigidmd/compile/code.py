@@ -13,7 +13,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -26,7 +25,14 @@ from rigidmd.compile import thread_pool
 from rigidmd.compile.cache import is_persistent, lock_in_cache
 from rigidmd.compile.kernels import NotStored, chosen_by_type, compile_callback, compiler_options
 from rigidmd.compile.machine import MOST_THREADS, cast_pointer, pointer_to
-from rigidmd.compile.records import NumbaStruct, by_reference, load_invariant, stored_by_reference
+from rigidmd.compile.records import (
+    NumbaStruct,
+    by_reference,
+    load_invariant,
+    referenced_type,
+    remember_by_structure,
+    stored_by_reference,
+)
 from rigidmd.core.process import python_process
 from rigidmd.errors import SettingError
 
@@ -50,6 +56,12 @@ class TaskArguments(types.Type):
         """The type of the arguments. The name does not identify it: classes of the same name have
         the same."""
         return self.content
+
+
+@remember_by_structure
+def arguments_type(content: object) -> TaskArguments:
+    """The type of the address of a task's arguments."""
+    return TaskArguments(referenced_type(content))
 
 
 register_model(TaskArguments)(models.OpaqueModel)  # the pointers that Numba keeps in variables
@@ -147,7 +159,7 @@ class Code:
     """
 
     def __init__(self, **tasks: tuple[CompiledTask, object]):
-        kinds = {name: TaskArguments(numba.typeof(content)) for name, (_, content) in tasks.items()}
+        kinds = {name: arguments_type(content) for name, (_, content) in tasks.items()}
         self._addresses = addresses_of([(tasks[name][0], kind) for name, kind in kinds.items()])
         self.address_value = self._addresses.ctypes.data
         self.numba_type = CodeType(tuple(kinds.items()))
@@ -160,9 +172,9 @@ class Code:
     def to_struct(self, content: object) -> NumbaStruct:
         """Arguments in memory, for every task. Raises TypingError if one was compiled for another
         type."""
-        struct = NumbaStruct(content)
+        struct, kind = NumbaStruct(content), arguments_type(content)
         for name in self._names:
-            self.numba_type.index_of(name, TaskArguments(struct.kind))
+            self.numba_type.index_of(name, kind)
         return struct
 
 
