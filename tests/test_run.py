@@ -1395,7 +1395,10 @@ FILES_OF = {
 def scene_of_both(request):
     if request.param == "argon":
         return "argon", small_scene(
-            {"argon": 10}, 20.0, stages=[{"duration_ps": 0.01}], output={"log_interval_ps": 0.002}
+            {"argon": 10},
+            20.0,
+            stages=[{"duration_ps": 0.01}],
+            output={"log_interval_ps": 0.002, "figures": True},
         )
     changed = {"run.duration_s": 0.05, "output.npz": True, "output.interval_s": 0.001}
     return "top", Scene.read(ROOT / "systems" / "heavy_top_3.toml", changed)
