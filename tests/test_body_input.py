@@ -179,7 +179,7 @@ def faults(**tables):
             {"body": {"solids": [BALL | {"mass_kg": 1.0, "density": 1.0}]}},
             "did you mean density_kg_m3?",
         ),
-        ({"body": {"mass_kg": 1.0, "centre_of_mass_m": [0.0, 0, 1]}}, "this one is not pinned"),
+        ({"body": {"mass_kg": 1.0, "centre_of_mass_m": [0.0, 0, 1]}}, "This one is not pinned"),
         ({"body": {"mass_kg": 1.0, "pinned": True}}, "cannot move"),
         ({"start": {"rotation": [[1.0, 0.01, 0], [0, 1, 0], [0, 0, 1]]}}, "|Q^T Q - 1| is 0.01"),
         ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]]}}, "a reflection"),

@@ -1383,7 +1383,7 @@ def test_liquid_spce_is_the_published_one():
         ),
         (
             {"electrostatics": "ewald", "ewald_alpha_per_A": 2.0},
-            "far below rounding; at most 1.33 is of use",
+            "far below rounding. At most 1.33 is of use",
         ),
         (
             {"electrostatics": "damped_shifted_force", "damping_per_A": 2.0},
@@ -1419,7 +1419,7 @@ def test_settings_that_make_no_sense(forces, words):
     [
         ("ewald", "needs a periodic box; use coulomb"),
         ("pme", "needs a periodic box; use coulomb"),
-        ("damped_shifted_force", "needs a cutoff; give forces.cutoff_A"),
+        ("damped_shifted_force", "needs a cutoff. Give forces.cutoff_A"),
     ],
 )
 def test_what_needs_a_box_or_a_cut_off_says_so(method, words):

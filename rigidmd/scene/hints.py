@@ -125,7 +125,7 @@ def _similarity(name: str, key: str) -> float:
 
 
 def _foreign(name: str, model: type[BaseModel]) -> str:
-    """What a scene has for a setting of another program; empty for other names."""
+    """What a scene has for a setting of another program. Empty for other names."""
     for table, entries in tomllib.loads(FOREIGN_KEYS.read_text(encoding="utf-8")).items():
         section, path = model.model_fields.get(table), [] if table == "scene" else [table]
         for key, text in entries.items():
@@ -133,7 +133,7 @@ def _foreign(name: str, model: type[BaseModel]) -> str:
             if plain_letters(name) not in map(plain_letters, names.split()):
                 continue
             if table == "none" and "stages" in model.model_fields:
-                return f"; not needed: {note}"
+                return f". Not needed: {note}"
             if (section or not path) and key in known_keys(model, path):
                 if "tuple" in str(section):
                     where = f" in [[{table}]]"
@@ -141,7 +141,7 @@ def _foreign(name: str, model: type[BaseModel]) -> str:
                     where = f" in [{table}]"
                 else:
                     where = ""
-                return f"; in rigidmd this is {key}{where}{note and f' ({note})'}"
+                return f". In rigidmd this is {key}{where}{note and f' ({note})'}"
     return ""
 
 
