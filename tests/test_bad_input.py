@@ -486,7 +486,7 @@ def test_a_setting_of_another_program_names_the_key_of_a_scene(table, key, text)
             ]
             assert note in found
             if table != "none":
-                assert f"in rigidmd this is {key}" in found
+                assert f"In rigidmd this is {key}" in found
 
 
 @pytest.mark.parametrize(
@@ -530,6 +530,8 @@ LIQUID = {
         ({"run": {"seed": 3}}, "run.seed: unknown key; seed is a key of the top level"),
         ({"stages": [{"cutoff_A": 9.0}]}, "cutoff_A is a key of [forces]"),
         ({"forces": {"integrator": "baoab"}}, "integrator is a key of [[stages]]"),
+        ({"forces": {"coulomb": "pme"}}, "In rigidmd this is electrostatics in [forces]"),
+        ({"molecules": [{"model": "N2"}]}, "did you mean nitrogen or nitrogen_2cljq or"),
     ],
 )
 def test_a_hint_on_units_tables_and_keys_of_other_tables(changes, expected):

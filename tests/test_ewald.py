@@ -653,7 +653,7 @@ def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
     }
     system = build(Scene.from_dict(data, tmp_path))
     assert cell_of(system.space) == pytest.approx(14.0 * np.eye(3))
-    assert any("rotated, contents included" in note for note in system.notes)
+    assert any("Rotated, contents included" in note for note in system.notes)
 
     def inside(n):
         return (np.abs(n) <= (4, 2, 3)).all(axis=1)
@@ -1387,7 +1387,7 @@ def test_liquid_spce_is_the_published_one():
         ),
         (
             {"electrostatics": "damped_shifted_force", "damping_per_A": 2.0},
-            "at most 1.33 is of use",
+            "At most 1.33 is of use",
         ),
         (
             {

@@ -409,7 +409,7 @@ def test_displacements_over_time_are_speeds(name, tmp_path):
 
 def test_the_summary_says_when_positions_are_wrapped():
     scene = small_scene({"argon": 20}, 20.0, output={"positions": "wrapped"})
-    assert "displacements need unwrapped frames" in summary_text(Simulation(scene).run().summary)
+    assert "Displacements need unwrapped frames" in summary_text(Simulation(scene).run().summary)
     for without in (
         {"output": {"trajectory": False}},
         {"box": {"lengths_A": 20.0, "periodic": False}},

@@ -1166,7 +1166,7 @@ def test_words_for_slurm():
             ["--set", "seed=1..1000", "--set", "start.temperature_K=1..1000"],
             "these are 1000000 points",
         ),
-        (["--replicas", "3", "--set", "seed=1..3"], "leave out one of them"),
+        (["--replicas", "3", "--set", "seed=1..3"], "Leave out one of them"),
         (["--set", "seed=1..3", "--to", "slurm"], "needs --walltime"),
         (
             ["--set", "seed=1..3", "--to", "slurm", "--walltime", "1:00:00", "--collect"],

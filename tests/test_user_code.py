@@ -642,7 +642,7 @@ WRONG_TABLES = {
     "\n".join(ROWS.splitlines()[:60]): r"ends at 5.95 Å, before the cutoff of 9 Å$",
     "\n".join(
         f"{float(row.split()[0]) / 10} {row.split()[1]}" for row in ROWS.splitlines()
-    ): r"is it in nm\?",
+    ): r"Is it in nm\?",
     "\n".join(ROWS.splitlines()[20:]): r"begins at 4 Å, where it does not repel",
     "\n".join(
         f"{row} {-argon_energy(float(row.split()[0]))[1]:.6g}" for row in ROWS.splitlines()
@@ -773,7 +773,7 @@ def test_a_run_with_forces_from_python_is_repeated_by_python_only(tmp_path, caps
     assert main(["resume", str(folder), "--until", "0.04ps"]) == 2
     assert "from_python: this run had spring from Python" in capsys.readouterr().err
     scene = rigidmd.Scene.read(folder / "scene.toml")
-    with pytest.raises(SceneError, match="this has field"):
+    with pytest.raises(SceneError, match="This has field"):
         rigidmd.Simulation(scene, forces=[Field()])
     results = rigidmd.Simulation(scene.with_end(0.04), folder, forces=[Spring()], resume=True).run()
     assert np.array_equal(results.state.position, whole.state.position)

@@ -107,7 +107,7 @@ def read_record(folder: Path) -> Record:
         system = build(scene, user_code=False)
         columns = _log(folder, scene)
     if not columns or len(next(iter(columns.values()))) == 0:
-        raise OutputError(f"{folder}: the run has not written samples yet; {resume}")
+        raise OutputError(f"{folder}: the run has not written samples yet. {resume}")
     return Record(
         folder, scene, system, summary and summary.model_dump(exclude_unset=True), columns, missing
     )

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from rigidmd.core.plain_text import did_you_mean, plain_letters
+from rigidmd.core.plain_text import did_you_mean, plain_letters, suggestion
 
 FOREIGN_KEYS = Path(__file__).with_name("foreign_keys.toml")
 #: Names that readers give to tables -> the table of a scene.
@@ -69,6 +69,8 @@ def hint_on_key(name: str, keys: list, value: Any, model: type[BaseModel]) -> st
     is_start = any(re.fullmatch(f"{re.escape(name)}_[a-zA-Z0-9_]+", key) for key in known)
     if converted := _other_unit(name, value, known):
         return converted
+    if longer := _with_its_words(name, known):
+        return suggestion(longer)
     if not is_start and (foreign := _foreign(name, model) or _foreign(bare, model)):
         return foreign
     if not keys and (table := _table_of(name, known)):
@@ -89,6 +91,12 @@ def _other_unit(name: str, value: Any, known: list[str]) -> str:
             is_number = isinstance(value, int | float) and not isinstance(value, bool)
             return f"; write {key} = {value * size:.12g}" if is_number else f"; write {key}"
     return ""
+
+
+def _with_its_words(name: str, known: list[str]) -> list[str]:
+    """Longer keys with all words of a key: angular_velocity_lab_rad_s of angular_velocity_rad_s."""
+    words = set(name.split("_"))
+    return [key for key in known if len(words) > 2 and words < set(key.split("_"))]
 
 
 def _table_of(name: str, known: list[str]) -> str:

@@ -1,6 +1,7 @@
 """Molecular models: rigid bodies in their principal frames from lists of sites. `models/` has
 published ones."""
 
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
+from rigidmd.core.plain_text import did_you_mean, suggestion
 from rigidmd.core.toml import impossible_values, read_toml, shorten_repr
 from rigidmd.errors import MoleculeError
 from rigidmd.mechanics.inertia import BodyKind, principal_frame, rotational_freedom
@@ -20,7 +22,6 @@ from rigidmd.scene.validation import (
     Section,
     ShortName,
     Vector,
-    did_you_mean,
     location_of,
     numbers_out_of_range,
     validation_messages,
@@ -39,6 +40,7 @@ COINCIDENT = 1e-6
 #: any inertia.
 OFF_AXIS = 1e-4
 MOST_PARAMETERS = 100  # of a site
+MOST_SUGGESTED = 3  # models, in the message on an unknown one
 #: Keys of the well depth, of which a Lennard-Jones site has one, and their units; it also has
 #: sigma_A.
 DEPTHS = {
@@ -397,10 +399,18 @@ def model_error(name: str) -> str:
     known = available_models()
     if name in known:
         return ""
-    return (
-        f"unknown model {name!r}{did_you_mean(name, known) or ';'} `rigidmd models` lists all"
-        f" {len(known)}"
-    )
+    meant = did_you_mean(name, known) or suggestion(_models_called(name, known)) or "."
+    return f"unknown model {name!r}{meant} `rigidmd models` lists all {len(known)}"
+
+
+def _models_called(name: str, known: list[str]) -> list[str]:
+    """The first models with this word as the name of a residue, such as N2, or in their title."""
+    tables = {model: read_toml(MODELS / f"{model}.toml", MoleculeError)[0] for model in known}
+    words = {
+        model: {*table.get("residue_names", []), *re.findall(r"\w+", table["title"])}
+        for model, table in tables.items()
+    }
+    return [m for m in known if name.lower() in map(str.lower, words[m])][:MOST_SUGGESTED]
 
 
 def load_model(name: str) -> Molecule:
