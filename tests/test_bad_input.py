@@ -473,16 +473,20 @@ FOREIGN = tomllib.loads((ROOT / "rigidmd/scene/foreign_keys.toml").read_text(enc
     [(table, *item) for table, entries in FOREIGN.items() for item in entries.items()],
 )
 def test_a_setting_of_another_program_names_the_key_of_a_scene(table, key, text):
-    section = "body" if key.endswith("_s") else "forces"
+    section = "body" if key.endswith("_s") or table == "body" else "forces"
+    where = "wheels.0" if table == "wheels" else section
     names, _, note = text.partition(": ")
     for name in names.split():
         for asked in (name, name.upper().replace("_", "-")):
             with pytest.raises(SceneError) as raised:
-                Scene.from_dict({section: {asked: 1}})
+                unknown = {asked: 1}
+                Scene.from_dict(
+                    {"body": {}, "wheels": [unknown]} if table == "wheels" else {section: unknown}
+                )
             (found,) = [
                 line
                 for line in raised.value.errors
-                if line.startswith(f"{section}.{asked}: unknown key")
+                if line.startswith(f"{where}.{asked}: unknown key")
             ]
             assert note in found
             if table != "none":
