@@ -18,7 +18,7 @@ from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
 from rigidmd.errors import SceneError
 from rigidmd.forces.poses.formulas import formula_of_poses
-from rigidmd.forces.poses.gay_berne import PARAMETERS, gay_berne
+from rigidmd.forces.poses.gay_berne import PARAMETERS, GayBerne
 from rigidmd.forces.poses.multipoles import dipole, quadrupole
 from rigidmd.forces.poses.patch import patch
 from rigidmd.forces.poses.trace import Graph, TraceError, code_of, slopes_of
@@ -149,7 +149,7 @@ def named(values: dict) -> SimpleNamespace:
 
 def test_gay_berne_of_two_rods_has_the_wells_of_its_paper():
     """Side by side epsilon_0 / sqrt(1 - chi²) = 5/3 deep, end to end a fifth of it."""
-    z, energy = np.array([0.0, 0.0, 1.0]), gay_berne()
+    z, energy = np.array([0.0, 0.0, 1.0]), GayBerne()
     side = 4.0 * 2 ** (1 / 6) * np.array([1.0, 0.0, 0.0])
     end = (8.0 + 4.0 * 2 ** (1 / 6)) * z
     assert energy(side, z, z, named(ROD), named(ROD)) == pytest.approx(-5 / 3, rel=1e-12)
@@ -179,7 +179,7 @@ def from_matrices(r, u, v, p, q, upsilon, mu, gamma):
 
 @pytest.mark.parametrize("exponents", [(1.0, 2.0, 1.0), (3.0, 1.0, 0.8)])
 def test_unlike_ellipsoids_are_those_of_the_general_form(exponents):
-    rng, energy = np.random.default_rng(1), gay_berne(*exponents)
+    rng, energy = np.random.default_rng(1), GayBerne(*exponents)
     kinds = [named(ROD), named(DISC), named(BALL)]
     for p, q in product(kinds, kinds):
         u, v, direction = (x / np.linalg.norm(x) for x in rng.standard_normal((3, 3)))
@@ -255,7 +255,7 @@ def test_a_thousand_pairs_have_the_energies_forces_and_torques_of_lammps(tmp_pat
         folder=tmp_path,
     )
     table = np.loadtxt(tmp_path / "forces.txt", skiprows=9).reshape(pairs, 2, 8)
-    formula = formula_of_poses(gay_berne(), PARAMETERS, "z")
+    formula = formula_of_poses(GayBerne(), PARAMETERS, "z")
     evaluate = evaluated(formula)
     matrices = rotation.as_matrix().reshape(pairs, 2, 3, 3)
     for k in range(pairs):
@@ -320,7 +320,7 @@ def simulation(tables: dict, counts=None, **more) -> Simulation:
 
 def brute_force(system, state, forces: dict) -> float:
     """The Gay-Berne energy (kJ/mol) by a loop over all pairs and their nearest images."""
-    cutoff, cell, energy = forces["cutoff_A"], state.cell, gay_berne()
+    cutoff, cell, energy = forces["cutoff_A"], state.cell, GayBerne()
     shifts = np.array(list(product((-1, 0, 1), repeat=3))) @ cell
     models, names = system.species, [m.name for m in system.species]
     frames = [state.rotation[k] @ models[s].axes.T for k, s in enumerate(system.model.species)]

@@ -176,6 +176,7 @@ def with_user_code(system: System) -> System:
         tail=sum_of_tails(tails),
         python_forces=functions,
         user_terms={name: one.description for name, one in bound.items()},
+        body_pairs={name: one.body_pairs for name, one in bound.items() if one.body_pairs},
     )
 
 

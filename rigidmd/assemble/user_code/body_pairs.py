@@ -2,7 +2,6 @@
 are cut off."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,35 +11,17 @@ from rigidmd.assemble.user_code.cutoffs import PairPotentialError, check_cutoff
 from rigidmd.assemble.user_code.force import BoundTerm
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.engines.system import System
+from rigidmd.forces.poses.potential import BodyPairPotential, Parameters, Vector
 from rigidmd.scene.forces import BodyForce
 from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
     from rigidmd.forces.poses.formulas import PoseFormula
 
-Parameters = Mapping[str, float]
-Vector = tuple[float, float, float]
 #: In the log, for a function without a name, or with the name of a column.
 DEFAULT_NAME, UNNAMED = "body_pairs", ("", "<lambda>", "energy")
 #: The switch begins at this fraction of the cutoff.
 SWITCH_START = 0.9
-
-
-@dataclass(frozen=True)
-class BodyPairPotential:
-    """A potential of pairs of bodies for `Simulation(scene, forces=[...])`, made by
-    `body_pair_potential`."""
-
-    function: Callable[..., Any]
-    parameters: Mapping[str, Parameters]  # by species
-    species: tuple[str, ...]  # on which it acts; none: on all
-    pairs: Mapping[tuple[str, str], Parameters]
-    axis: Literal["x", "y", "z"] | None
-    references: Mapping[str, Vector]
-    truncation: Literal["switch", "plain"]
-    cutoff_A: float | None
-    switch_start_A: float | None
-    name: str
 
 
 def body_pair_potential(
@@ -195,7 +176,6 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         reference=np.array(references, float).reshape(-1, 3),
         frame=np.ascontiguousarray([models[name].axes.T for name in kinds]),
         parameters=rows,
-        interacts=np.ones((len(kinds), len(kinds)), bool),
         switch_start=float(start),
         cutoff=float(cutoff),
     )
@@ -205,7 +185,7 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         f"pairs of {', '.join(kinds)}, {formula.operations} operations, force and torques {source},"
         f" {ends}"
     )
-    return BoundTerm(term, text)
+    return BoundTerm(term, text, body_pairs=potential)
 
 
 def _unknown_species(potential: BodyPairPotential, species: list[str]) -> list[str]:
@@ -235,7 +215,7 @@ def _rows(potential: BodyPairPotential, kinds: list[str]) -> "tuple[PoseFormula,
     try:
         formula = formula_of_poses(potential.function, names, potential.axis)
         rows = [
-            [formula.numbers(*_parameters_of(potential, names, one, other)) for other in kinds]
+            [formula.numbers(*_complete(potential, names, one, other)) for other in kinds]
             for one in kinds
         ]
     except TraceError as error:
@@ -243,13 +223,12 @@ def _rows(potential: BodyPairPotential, kinds: list[str]) -> "tuple[PoseFormula,
     return formula, np.array(rows, float).reshape(len(kinds), len(kinds), -1)
 
 
-def _parameters_of(
+def _complete(
     potential: BodyPairPotential, names: list[str], one: str, other: str
 ) -> tuple[Parameters, Parameters]:
     """The parameters of two species. Raises PairPotentialError if one is missing."""
-    of_pair = potential.pairs.get((one, other)) or potential.pairs.get((other, one)) or {}
-    both = [{**potential.parameters.get(name, {}), **of_pair} for name in (one, other)]
+    both = potential.parameters_of(one, other)
     for name, values in zip((one, other), both, strict=True):
         if missing := [key for key in names if key not in values]:
             raise PairPotentialError(f"{name} has no parameter {', '.join(missing)}")
-    return both[0], both[1]
+    return both
