@@ -17,12 +17,16 @@ import rigidmd
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
 from rigidmd.errors import SceneError
+from rigidmd.figures.space import View, camera
+from rigidmd.figures.style import new_figure
 from rigidmd.forces.poses.formulas import formula_of_poses
 from rigidmd.forces.poses.gay_berne import PARAMETERS, GayBerne
 from rigidmd.forces.poses.multipoles import dipole, quadrupole
 from rigidmd.forces.poses.patch import patch
 from rigidmd.forces.poses.trace import Graph, TraceError, code_of, slopes_of
+from rigidmd.run.rigid_fit import Bodies
 from rigidmd.units import COULOMB, DEBYE, KJ_PER_MOL
+from rigidmd.view.solids import solids_of
 
 ROD = {"length_A": 12.0, "width_A": 4.0, "epsilon_kJ_mol": 1.0, "side": 1.0, "end": 0.2}
 DISC = {"length_A": 3.0, "width_A": 8.0, "epsilon_kJ_mol": 1.5, "side": 0.5, "end": 1.2}
@@ -545,3 +549,40 @@ def test_a_potential_of_a_module_needs_trust(tmp_path):
         build(untrusted)
     rigidmd.trust(tmp_path / "own.py")
     assert list(build(Scene.from_dict(data, tmp_path)).terms) == ["own"]
+
+
+# --- pictures -------------------------------------------------------------------------------------
+
+
+def test_bodies_are_drawn_as_ellipsoids_where_they_are():
+    """Rods along their axis z, discs about a reference point, and the silhouettes of two rods."""
+    system = build(scene(GAY_BERNE))
+    solids, state = solids_of(system), system.state
+    assert solids is not None and len(solids.molecule) == 32
+    load = np.zeros((0, 3))
+    centres, rotation = solids.poses(Bodies(state.position, state.rotation, load, load))
+    for k in (0, 30):  # a rod and a disc
+        species = system.species[system.model.species[k]]
+        frame = state.rotation[k] @ species.axes.T
+        reference = np.array(GAY_BERNE["references"].get(species.name, species.centre))
+        assert centres[k] == pytest.approx(state.position[k] + frame @ (reference - species.centre))
+        assert rotation[k, :, 2] == pytest.approx(frame[:, 2])
+    assert solids.semi_axes[[0, 30]] == pytest.approx(np.array([[2, 2, 6], [4, 4, 1.5]]))
+    axis = new_figure(4, 4, layout=None).add_axes((0, 0, 1, 1))
+    view = View(axis, camera(np.array([0.0, -1.0, 0.0])), 10.0)
+    about_y = Rotation.from_rotvec([0, 0.7, 0]).as_matrix()
+    view.solids(
+        np.array([[0.0, 0, 0], [0.0, 20, 0]]),  # the second one is behind the first
+        np.array([about_y, np.eye(3)]),
+        np.array([[2.0, 2, 6], [2, 2, 3]]),
+        np.array([[1.0, 0, 0], [0, 0, 1]]),
+    )
+    image = axis.images[0].get_array()
+    pixel = (20.0 / image.shape[0]) ** 2
+    red, blue = image[..., 0] > image[..., 2], image[..., 2] > image[..., 0]
+    assert red.sum() * pixel == pytest.approx(np.pi * 12, rel=0.01)
+    assert 0 < blue.sum() * pixel < np.pi * 6 - np.pi * 4 * 0.6
+    row = np.argwhere(red).max(axis=0)[0]
+    assert (row / image.shape[0] - 0.5) * 20 == pytest.approx(
+        np.hypot(6 * np.cos(0.7), 2 * np.sin(0.7)), abs=0.05
+    )

@@ -38,7 +38,7 @@ def nematic(runs: Runs, axis: Literal["", "x", "y", "z"] = "") -> AnalysisResult
     ----------
     axis
         In the coordinates of the models' files; default: the axis of linear molecules, and of
-        potentials of two bodies
+        the potentials of two bodies of the scene
 
     Raises
     ------
@@ -88,16 +88,16 @@ def nematic(runs: Runs, axis: Literal["", "x", "y", "z"] = "") -> AnalysisResult
 def _axis_body(runs: Runs, kind: Kind, axis: str) -> np.ndarray | None:
     """The axis of a species in its body frame; None without one."""
     molecule = kind.molecule
-    of_potentials = [
-        potential.axis
-        for potential in runs.system.body_pairs.values()
-        if potential.axis and molecule.name in (potential.parameters or potential.species)
+    of_scene = [
+        entry.axis
+        for entry in runs.system.scene.forces.bodies
+        if entry.module is None and molecule.name in entry.parameters
     ]
     if axis not in ("", *"xyz"):
         raise OutputError(f"axis is {axis!r}, must be x, y or z")
     if molecule.kind == "linear":
         return np.eye(3)[0]
-    if not molecule.inertia.any() or not (named := [axis] if axis else of_potentials):
+    if not molecule.inertia.any() or not (named := [axis] if axis else of_scene):
         return None
     return molecule.axes["xyz".index(named[0])]
 
