@@ -1151,7 +1151,7 @@ def test_structure_files_with_other_faults(capsys, tmp_path):
     (tmp_path / "b.xyz").write_text(
         '3\nLattice="20 0 0 0 20 0 0 0 20"\nO 0 0 0\nH 0.8165 0.5774 0\nH -0.8165 0.5774 0\n'
     )
-    assert "has no velocities" in refused(capsys, tmp_path, text)
+    assert "lacks velocities for some atoms" in refused(capsys, tmp_path, text)
     (tmp_path / "c.npz").write_bytes(b"not a zip file")
     assert "not a state that rigidmd wrote" in refused(
         capsys, tmp_path, text.replace("b.xyz", "c.npz")

@@ -36,7 +36,12 @@ from rigidmd.compile import (
 )
 from rigidmd.compile.cache import CacheIndex, cache_folder, compiling_announced
 from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
-from rigidmd.compile.records import array_struct
+from rigidmd.compile.records import (
+    array_struct,
+    by_reference,
+    referenced_type,
+    structure_of,
+)
 
 ROOT = Path(__file__).parents[1]  # processes import this file, and should import no more for it
 
@@ -269,6 +274,29 @@ def test_values_are_stored_as_in_compiled_code():
     assert ctypes.sizeof(struct._memory) == context.get_abi_sizeof(
         context.get_value_type(struct.kind)
     )
+
+
+class OtherMixed(NamedTuple):
+    x: object
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [np.zeros(3), np.zeros(3, np.float32), np.zeros((3, 1)), np.zeros(6)[::2], 0.0, None],
+        [np.zeros((2, 3)), np.zeros((2, 3)).T, np.zeros((4, 3))[::2], np.zeros((2, 3), "<i4")],
+        [1, 1.0, True, np.int8(1), np.int16(1), np.float32(1), np.bool_(True), 2**63, -(2**62)],
+        [(1, 2), (1, 2.0), (1,), (), ((1,),), ((1, 2),), Mixed(*range(11)), OtherMixed(1)],
+        [OtherMixed(np.zeros(2)), OtherMixed(np.zeros((2, 2))), OtherMixed(1), (np.zeros(2),)],
+    ],
+)
+def test_remembered_types_are_those_of_numba(values):
+    """Also of values that were seen before."""
+    read_only = np.zeros(3)
+    read_only.flags.writeable = False
+    for value in 2 * [*values, read_only]:
+        assert referenced_type(value) == by_reference(numba.typeof(value))
+    assert len({*map(structure_of, values)}) >= len({*map(referenced_type, values)})
 
 
 def test_what_cannot_be_stored_or_has_another_type_is_named():

@@ -224,7 +224,7 @@ def test_compare_reports_where_two_runs_diverge(again, stopped, tmp_path, capsys
     assert cli.main(["compare", one, str(other)]) == 1
     said = capsys.readouterr().out
     assert "7 and 11 samples, 7 in common, the same to the last bit" in said
-    assert "position by up to" in said and "as far as both have samples" in said
+    assert "position by up to" in said and "over their common samples" in said
     log = other / "log.csv"
     lines = [line.split(",") for line in log.read_text().splitlines()]
     column = lines[0].index('"Kinetic Energy (kJ/mole)"')

@@ -33,11 +33,12 @@ from rigidmd.engines.external import compare_at
 from rigidmd.engines.samples import COLUMNS, Sample, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError, RigidMDWarning, SceneError, SimulationError
+from rigidmd.figures import style
 from rigidmd.figures.body import FIGURES
 from rigidmd.forces.neighbors.lists import BUILDS
 from rigidmd.io import progress, run_files
 from rigidmd.io.run_files import columns
-from rigidmd.run import Every, Observer, Simulation, molecular, observers, run_together
+from rigidmd.run import Every, Observer, Simulation, molecular, run_together
 from rigidmd.run.minimise import minimise
 from rigidmd.run.molecular import MolecularRecord, MolecularRun
 from rigidmd.run.report import summary_text
@@ -1435,7 +1436,7 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
     def fail(*given, **options):
         raise ValueError("ParseException: no mathematics")
 
-    monkeypatch.setattr(observers, "save_files", fail)
+    monkeypatch.setattr(style, "save_files", fail)
     pictures = [Failing("see", draws=True), Failing("end", draws=True)]
     notes = []
     results = Simulation(scene, tmp_path / "out", observers=pictures, warn=notes.append).run()
@@ -1458,12 +1459,12 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
 
 
 def test_one_figure_of_a_body_that_fails_leaves_the_others(tmp_path, monkeypatch):
-    def fails_first(figure, stem, suffixes, write=observers.save_files):
+    def fails_first(figure, stem, suffixes, write=style.save_files):
         if stem.name == "axis":
             raise ValueError("no axis")
         return write(figure, stem, suffixes)
 
-    monkeypatch.setattr(observers, "save_files", fails_first)
+    monkeypatch.setattr(style, "save_files", fails_first)
     scene = Scene.read(
         ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.interval_s": 0.001}
     )

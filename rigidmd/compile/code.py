@@ -12,8 +12,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
+from functools import cache
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -26,7 +26,14 @@ from rigidmd.compile import thread_pool
 from rigidmd.compile.cache import is_persistent, lock_in_cache
 from rigidmd.compile.kernels import NotStored, chosen_by_type, compile_callback, compiler_options
 from rigidmd.compile.machine import MOST_THREADS, cast_pointer, pointer_to
-from rigidmd.compile.records import NumbaStruct, by_reference, load_invariant, stored_by_reference
+from rigidmd.compile.records import (
+    NumbaStruct,
+    by_reference,
+    load_invariant,
+    referenced_type,
+    remember_by_structure,
+    stored_by_reference,
+)
 from rigidmd.core.process import python_process
 from rigidmd.core.signals import SEPARATE_GROUP
 from rigidmd.errors import SettingError
@@ -45,12 +52,24 @@ class TaskArguments(types.Type):
     def __init__(self, content):
         self.content = by_reference(content)
         super().__init__(f"task_arguments({self.content})")
+        # The same in every process, because types are pickled. To hash forty arrays takes a
+        # millisecond, and every search for the code of a task needs the hash.
+        self._hash = int(hashlib.sha256(repr(self.content).encode()).hexdigest()[:15], 16)
+
+    def __hash__(self):
+        return self._hash
 
     @property
     def key(self):
         """The type of the arguments. The name does not identify it: classes of the same name have
         the same."""
         return self.content
+
+
+@remember_by_structure
+def arguments_type(content: object) -> TaskArguments:
+    """The type of the address of a task's arguments."""
+    return TaskArguments(referenced_type(content))
 
 
 register_model(TaskArguments)(models.OpaqueModel)  # the pointers that Numba keeps in variables
@@ -148,10 +167,10 @@ class Code:
     """
 
     def __init__(self, **tasks: tuple[CompiledTask, object]):
-        kinds = {name: TaskArguments(numba.typeof(content)) for name, (_, content) in tasks.items()}
+        kinds = {name: arguments_type(content) for name, (_, content) in tasks.items()}
         self._addresses = addresses_of([(tasks[name][0], kind) for name, kind in kinds.items()])
         self.address_value = self._addresses.ctypes.data
-        self.numba_type = CodeType(tuple(kinds.items()))
+        self.numba_type = code_type(tuple(kinds.items()))
         self._names = list(tasks)
 
     def address(self, name: str) -> int:
@@ -161,9 +180,9 @@ class Code:
     def to_struct(self, content: object) -> NumbaStruct:
         """Arguments in memory, for every task. Raises TypingError if one was compiled for another
         type."""
-        struct = NumbaStruct(content)
+        struct, kind = NumbaStruct(content), arguments_type(content)
         for name in self._names:
-            self.numba_type.index_of(name, TaskArguments(struct.kind))
+            self.numba_type.index_of(name, kind)
         return struct
 
 
@@ -200,6 +219,12 @@ class CodeType(types.Type):
                 f"{name} was compiled for {self.task_types[names.index(name)][1]}, not for {kind}"
             )
         return names.index(name)
+
+
+@cache
+def code_type(task_types: tuple[tuple[str, TaskArguments], ...]) -> CodeType:
+    """The type of a `Code` with these tasks."""
+    return CodeType(task_types)
 
 
 @typeof_impl.register(Code)

@@ -10,10 +10,9 @@ code of a pass, and nothing above it.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from rigidmd.compile.code import CompiledTask, TaskArguments, addresses_of
+from rigidmd.compile.code import CompiledTask, addresses_of, arguments_type
 from rigidmd.compile.kernels import kernel
 from rigidmd.compile.records import NumbaStruct
 from rigidmd.compile.thread_pool import call_address, run_on_all_threads
@@ -54,7 +53,7 @@ class Program:
     def __init__(self, passes: Sequence[Pass], uses: int, status: np.ndarray):
         self._uses = uses
         used = self._used(passes)
-        self._kinds = [TaskArguments(numba.typeof(one.content)) for one in used]
+        self._kinds = [arguments_type(one.content) for one in used]
         addresses = addresses_of(
             [(one.task, kind) for one, kind in zip(used, self._kinds, strict=True)]
         )
@@ -68,15 +67,14 @@ class Program:
         Raises TypeError if the arguments of a pass have another type than the example.
         """
         target = self.rows.arguments if arguments is None else arguments
-        structs = [NumbaStruct(one.content) for one in self._used(passes)]
-        for one, struct, kind in zip(self._used(passes), structs, self._kinds, strict=True):
-            if TaskArguments(struct.kind) != kind:
+        used = self._used(passes)
+        structs = [NumbaStruct(one.content) for one in used]
+        for one, kind in zip(used, self._kinds, strict=True):
+            if (other := arguments_type(one.content)) is not kind and other != kind:
                 name = one.task.name[1]
-                raise TypeError(
-                    f"{name} was compiled for {kind}, not for {TaskArguments(struct.kind)}"
-                )
+                raise TypeError(f"{name} was compiled for {kind}, not for {other}")
         target[:] = [struct.address for struct in structs]
-        self.rows.blocks[:] = [one.blocks for one in self._used(passes)]
+        self.rows.blocks[:] = [one.blocks for one in used]
         self._bound[id(target)] = structs
 
     def _used(self, passes: Sequence[Pass]) -> list[Pass]:

@@ -13,10 +13,12 @@ would run all of it.
 """
 
 import ctypes
-from functools import cache
-from typing import Any
+from collections.abc import Callable, Hashable
+from functools import cache, wraps
+from typing import Any, TypeVar
 
 import numba
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -82,6 +84,51 @@ def by_reference(kind: types.Type) -> types.Type:
     return kind
 
 
+T = TypeVar("T")
+
+
+def remember_by_structure(function: Callable[[Any], T]) -> Callable[[Any], T]:
+    """Call a function of a value, whose result depends on the Numba type alone, once for each
+    structure of values.
+
+    Numba builds and hashes the types of the forty arrays of a term anew for each pass, which took
+    0.1 s of the start of a run.
+    """
+    results: dict[Hashable, T] = {}
+
+    @wraps(function)
+    def remembered(value: Any) -> T:
+        structure = structure_of(value)
+        if structure not in results:
+            results[structure] = function(value)
+        return results[structure]
+
+    return remembered
+
+
+def structure_of(value: Any) -> Hashable:
+    """What decides on the Numba type of a value: the classes of its parts, and the layout of its
+    arrays."""
+    kind = type(value)
+    if kind is np.ndarray:
+        flags = value.flags
+        layout = flags.c_contiguous, flags.f_contiguous, flags.aligned, flags.writeable
+        return value.dtype, value.ndim, *layout
+    if isinstance(value, tuple):
+        return kind, *map(structure_of, value)
+    if value is None or kind in (bool, float) or issubclass(kind, np.number | np.bool_):
+        return kind
+    if kind is int and value.bit_length() < 64:
+        return kind
+    return numba.typeof(value)
+
+
+@remember_by_structure
+def referenced_type(value: Any) -> types.Type:
+    """The type of task arguments whose named tuples are records."""
+    return by_reference(numba.typeof(value))
+
+
 @infer_getattr
 class _RecordAttributes(AttributeTemplate):
     key = Record
@@ -133,7 +180,7 @@ class NumbaStruct:
     """
 
     def __init__(self, value: Any):
-        self.value, self.kind = value, by_reference(numba.typeof(value))
+        self.value, self.kind = value, referenced_type(value)
         self._records: list[Any] = []
         self._memory = self._reference(self.kind, value)
         self.address = ctypes.addressof(self._memory)

@@ -239,9 +239,8 @@ def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
         else:
             plain_types[name] = kind
     values = {name: getattr(owner, name) for name in plain_types}
-    dumped = (
-        _model_of(plain_types).model_construct(**values).model_dump(mode="json", exclude_none=True)
-    )
+    model = _model_of(tuple(plain_types.items()))
+    dumped = model.model_construct(**values).model_dump(mode="json", exclude_none=True)
     return Checkpoint({name: dumped.get(name) for name in plain_types}, arrays)
 
 
@@ -261,7 +260,7 @@ def restored(
             if key.startswith(start)
         }
     try:
-        model = _model_of({name: types[name] for name in types if name not in arrays})
+        model = _model_of(tuple((name, types[name]) for name in types if name not in arrays))
         values = model.model_validate(kept.values, context=rows)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
@@ -269,11 +268,12 @@ def restored(
     return {name: getattr(values, name) for name in types if name not in arrays} | arrays
 
 
-def _model_of(types: Mapping[str, Any]) -> type[BaseModel]:
+@cache
+def _model_of(types: tuple[tuple[str, Any], ...]) -> type[BaseModel]:
     config = ConfigDict(
         extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants", protected_namespaces=()
     )
-    fields: Any = {name: (kind, ...) for name, kind in types.items()}
+    fields: Any = {name: (kind, ...) for name, kind in types}
     return create_model("Stored", __config__=config, **fields)
 
 

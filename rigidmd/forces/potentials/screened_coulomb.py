@@ -7,6 +7,7 @@ and one multiply-add per term. In vectors of 16 float32 the force is a table of 
 lookups run in parallel with the multiply-adds. See the theory chapter `interactions`.
 """
 
+from functools import lru_cache
 from math import exp, inf, pi, sqrt
 from typing import NamedTuple
 
@@ -54,6 +55,7 @@ class Screening(NamedTuple):
     force: tuple[float, ...]  # coefficients of -(d/dr erf(alpha r)/r)/r, 1/Å³
 
 
+@lru_cache(maxsize=64)
 def screening(
     alpha: float, cutoff: float, dtype: type = np.float64, error: float = 0.0
 ) -> Screening:
