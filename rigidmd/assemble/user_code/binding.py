@@ -68,7 +68,7 @@ def custom_forces(scene: MolecularScene) -> list[Any]:
 
 def _custom(scene: MolecularScene, entry: CustomForce | BodyForce, key: str) -> Any:
     if entry.module is None and isinstance(entry, BodyForce):
-        return potential_of_scene(entry)
+        return potential_of_scene(entry, scene.path)
     if entry.module is None and isinstance(entry, CustomForce):
         pairs = {pair.sites: pair.parameters for pair in entry.pairs}
         table = None if entry.table is None else scene.path(entry.table)

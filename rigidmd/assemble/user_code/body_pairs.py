@@ -3,6 +3,7 @@ are cut off."""
 
 from collections.abc import Callable, Mapping
 from math import inf
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -25,7 +26,7 @@ SWITCH_START = 0.9
 
 
 def body_pair_potential(
-    function: Callable[..., Any],
+    function: Callable[..., Any] | str | Path,
     parameters: Mapping[str, Parameters] | None = None,
     *,
     species: tuple[str, ...] = (),
@@ -57,7 +58,8 @@ def body_pair_potential(
         gives a tuple of the energy, the force (3,) on the second body in kJ/mol/Å, and the torques
         (3,) on the first and on the second body in kJ/mol, along the axes of the lab. An exchange
         of both bodies must not change the energy. If their species differ, the one that is first in
-        the scene is a
+        the scene is a. Or it is the path of a table of linear bodies, an .npz file with the arrays
+        r_A, theta_1_deg, theta_2_deg, phi_deg and energy_kJ_mol
     parameters
         Species -> numbers by name, the attributes of p and q. It acts on these species
     species
@@ -83,7 +85,14 @@ def body_pair_potential(
     ------
     ValueError
     """
-    if not callable(function):
+    if isinstance(function, str | Path):
+        from rigidmd.forces.poses.table import read_body_table
+
+        if parameters or pairs:
+            raise ValueError("parameters and pairs would have no effect on a table: give species")
+        path = Path(function)
+        function, name = read_body_table(path), name or DEFAULT_NAME
+    elif not callable(function):
         raise ValueError(f"{function!r:.60} is not a function of (r, a, b)")
     if axis not in (None, "x", "y", "z"):
         raise ValueError(f"axis is {axis!r}, must be 'x', 'y' or 'z'")
@@ -112,17 +121,23 @@ def body_pair_potential(
     )
 
 
-def potential_of_scene(entry: BodyForce) -> BodyPairPotential:
-    """The potential of one of [[forces.bodies]] without a module. Raises ValueError."""
+def potential_of_scene(entry: BodyForce, path: Callable[[str], Path]) -> BodyPairPotential:
+    """The potential of one of [[forces.bodies]] without a module. Raises ValueError.
+
+    path : of the file of a table
+    """
     from rigidmd.forces.poses.shipped import function_of_text, shipped_function
 
     if entry.potential is not None:
         function = shipped_function(entry.potential, entry.options, entry.parameters)
+    elif entry.table is not None:
+        function = path(entry.table)
     else:
         function = function_of_text(not_none(entry.energy), entry.mixing)
     return body_pair_potential(
         function,
         entry.parameters,
+        species=entry.species,
         pairs={pair.species: pair.parameters for pair in entry.pairs},
         axis=entry.axis,
         references=entry.references,
@@ -153,6 +168,9 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         raise PairPotentialError(*faults)
     cutoff = potential.cutoff_A or system.cutoff
     check_cutoff(cutoff, system)
+    if not cutoff <= (reach := getattr(potential.function, "last", inf)):
+        message = f"the table ends at {reach:g} Å, before the cutoff of {cutoff:g} Å"
+        raise PairPotentialError(message)
     start = cutoff
     if potential.truncation == "switch" and cutoff < inf:
         start = potential.switch_start_A or SWITCH_START * cutoff
