@@ -12,7 +12,7 @@ from rigidmd.view.molecule_figure import color_of
 #: Colours of ellipsoids along x, y and z; in between they are mixed.
 DIRECTIONS = np.array([[0.80, 0.32, 0.22], [0.20, 0.60, 0.36], [0.20, 0.42, 0.76]])
 BALL, PATCH = np.array([0.72, 0.76, 0.82]), np.array([0.85, 0.35, 0.20])
-#: A patch is a smaller sphere with its centre off that of the ball: both in its radius.
+#: A patch is a smaller sphere off the centre of the ball: both in the radius of the ball.
 PATCH_RADIUS, PATCH_OFFSET = 0.9, 0.2
 #: Radius of a sphere in covalent radii, by which bonded spheres touch; default radius, Å.
 SPHERE_SCALE, DEFAULT_RADIUS = 1.15, 1.2
