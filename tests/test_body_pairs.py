@@ -577,13 +577,14 @@ def test_bodies_are_drawn_as_ellipsoids_where_they_are():
     axis = new_figure(4, 4, layout=None).add_axes((0, 0, 1, 1))
     view = View(axis, camera(np.array([0.0, -1.0, 0.0])), 10.0)
     about_y = Rotation.from_rotvec([0, 0.7, 0]).as_matrix()
-    view.solids(
+    image = view.solids(
         np.array([[0.0, 0, 0], [0.0, 20, 0]]),  # the second one is behind the first
         np.array([about_y, np.eye(3)]),
         np.array([[2.0, 2, 6], [2, 2, 3]]),
         np.array([[1.0, 0, 0], [0, 0, 1]]),
     )
-    image = axis.images[0].get_array()
+    view.image(image)
+    assert np.array_equal(axis.images[0].get_array(), image)
     pixel = (20.0 / image.shape[0]) ** 2
     red, blue = image[..., 0] > image[..., 2], image[..., 2] > image[..., 0]
     assert red.sum() * pixel == pytest.approx(np.pi * 12, rel=0.01)

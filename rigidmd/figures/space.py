@@ -18,7 +18,7 @@ AT_ONCE = 5000
 #: Lines with more points are images in an .svg.
 MOST_POINTS = 10_000
 #: Pixels across a picture of ellipsoids.
-PIXELS = 900
+PIXELS = 700
 
 
 def camera(eye: np.ndarray, up: np.ndarray = UP) -> np.ndarray:
@@ -189,9 +189,9 @@ class View:
 
     def solids(
         self, centres: np.ndarray, rotation: np.ndarray, semi: np.ndarray, colors: np.ndarray
-    ) -> None:
-        """Draw lit ellipsoids (n,), which may intersect: centres (n, 3), rotation (n, 3, 3) from
-        their axes, semi-axes (n, 3), colors (n, 3)."""
+    ) -> np.ndarray:
+        """A picture (rows, columns, 4) for `image` of lit ellipsoids (n,), which may intersect:
+        centres (n, 3), rotation (n, 3, 3) from their axes, semi-axes (n, 3), colors (n, 3)."""
         seen = self.matrix @ rotation
         middles = centres @ self.matrix.T
         spread = np.einsum("nik,nk,njk->nij", seen, semi**2, seen)
@@ -223,7 +223,12 @@ class View:
             shine = 0.35 * (normal @ light).clip(0)[:, None] ** 12
             image[part][visible] = np.insert((color * bright + shine).clip(0, 1), 3, 1.0, axis=1)
             nearest[part][visible] = (middle[2] + z)[visible]
-        box = (low[0], low[0] + size[0], low[1], low[1] + size[1])
+        return image
+
+    def image(self, image: np.ndarray) -> None:
+        """Draw a picture that fills the axes."""
+        (left, bottom), (right, top) = self.centre - self.half, self.centre + self.half
+        box = (left, right, bottom, top)
         self.axis.imshow(image, origin="lower", extent=box, interpolation="bilinear", zorder=2)
 
     def arrow(

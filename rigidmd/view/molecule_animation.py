@@ -17,6 +17,7 @@ from rigidmd.formats.bonds import COVALENT, connections
 from rigidmd.io.trajectory import Frames, read_frames
 from rigidmd.run.record import Record
 from rigidmd.run.rigid_fit import RigidFit
+from rigidmd.scene.validation import not_none
 from rigidmd.view.molecule_figure import color_of
 from rigidmd.view.page import PagePart, read_asset
 from rigidmd.view.solids import DEFAULT_RADIUS, SPHERE_SCALE, solids_of
@@ -115,6 +116,7 @@ class MoleculeAnimation:
         self._radius, self._view = np.array(radii), camera(EYE)
         self._colors = np.array([color_of(element) for element in self._elements])
         self._solids, self._fit = solids_of(record.system), RigidFit(record.system)
+        self._kept: tuple[int, np.ndarray] | None = None  # a frame, and its picture
         self._corners, points = None, frames.positions
         if frames.cells is not None:
             points = self._corners = np.array([*product((0, 1), repeat=3)]) @ frames.cells
@@ -139,15 +141,20 @@ class MoleculeAnimation:
             positions = self._frames.positions[k, self._shown]
             view.spheres(positions, self._radius, self._hazy(view, positions, self._colors))
         else:
-            centres, rotation = self._solids.poses(
-                self._fit.bodies(self._frames.positions[k], None)
-            )
-            colors = self._hazy(view, centres, self._solids.colors(rotation))
-            view.solids(centres, rotation, self._solids.semi_axes, colors)
+            view.image(self._image(view, k))
         if self._corners is not None:
             view.box(self._corners[k])
         length = next(x for x in SCALES if x < 0.6 * self._half or x == 1)
         view.scale(length, f"{length} Å")
+
+    def _image(self, view: View, k: int) -> np.ndarray:
+        """The picture of the solids in a frame, kept because an animation shows it for a while."""
+        if self._kept is None or self._kept[0] != k:
+            solids = not_none(self._solids)
+            centres, rotation = solids.poses(self._fit.bodies(self._frames.positions[k], None))
+            colors = self._hazy(view, centres, solids.colors(rotation))
+            self._kept = k, view.solids(centres, rotation, solids.semi_axes, colors)
+        return self._kept[1]
 
     def _hazy(self, view: View, positions: np.ndarray, colors: np.ndarray) -> np.ndarray:
         """Colours, paler for things that are further away."""
