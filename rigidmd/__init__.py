@@ -8,7 +8,7 @@ Examples
     print(results["temperature"].mean(), results.units["temperature"], results.universe())
 
     with rigidmd.Simulation("water.toml") as simulation:
-        simulation.step(100)  # the first 100 steps; simulation.run() would run the rest
+        simulation.step(100)  # the first 100 steps. simulation.run() would run the rest
         print(simulation.state.time, simulation.state.position)
 
     results = rigidmd.read_run("runs/water")  # of an earlier run

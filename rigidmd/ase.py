@@ -71,7 +71,7 @@ class RigidMD(Calculator):
     ----------
     models
         Names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene
-        file; or a scene, whose species, [forces], [fields], precision and forces from Python
+        file, or a scene, whose species, [forces], [fields], precision and forces from Python
         (`with_user_code`) are used
     atom_forces
         "gradient" of the energy of the fitted molecules, or of "sites": each atom has the forces of
@@ -125,7 +125,7 @@ class RigidMD(Calculator):
             if not isinstance(models, MolecularScene):
                 faults.append(f"the scene {models.name} is of a single body, which has no atoms")
             elif given:
-                faults.append(f"{', '.join(given)}: set by the scene; change the scene")
+                faults.append(f"{', '.join(given)}: set by the scene. Change the scene")
             else:
                 self._user_forces = models.user_code.forces
                 models, given = _parts_of(models)
@@ -143,7 +143,7 @@ class RigidMD(Calculator):
     def calculate(
         self, atoms: Atoms | None = None, properties=("energy",), system_changes=all_changes
     ) -> None:
-        """Energy, forces and, in a box, stress; called by ASE."""
+        """Energy, forces and, in a box, stress. Called by ASE."""
         super().calculate(atoms, properties, system_changes)
         fitted = self._fit_atoms(not_none(self.atoms))
         if not self._warned and fitted.bent > self._bend:
@@ -167,7 +167,7 @@ class RigidMD(Calculator):
             self.results["stress"] = full_3x3_to_voigt_6_stress(full)
 
     def make_rigid(self, atoms: Atoms) -> float:
-        """Move atoms to their positions in the fitted rigid molecules; returns the largest
+        """Move atoms to their positions in the fitted rigid molecules. Returns the largest
         displacement, Å."""
         fitted = self._fit_atoms(atoms)
         before = atoms.get_positions()
@@ -178,7 +178,7 @@ class RigidMD(Calculator):
         """Move rigid molecules to a near minimum of the energy, or of the enthalpy with
         pressure_bar.
 
-        Sets positions, and the cell with pressure_bar. Constraints of the atoms are ignored; models
+        Sets positions, and the cell with pressure_bar. Constraints of the atoms are ignored. Models
         set what is frozen. Returns the values of the minimum, as in summary.json.
 
         Parameters
@@ -358,7 +358,7 @@ class CalculatorForce(Force):
 
     The calculator is called once for each new set of positions, with one `ase.Atoms` of all sites
     with mass, molecules whole, in the order of `system.sites`. Forces within molecules have no
-    effect. Its stress gives the molecular virial W = -V sigma - sum_i f_i (x) (r_i - R); the page
+    effect. Its stress gives the molecular virial W = -V sigma - sum_i f_i (x) (r_i - R). The page
     `calculators` (`rigidmd help calculators`) has the derivation.
 
     Parameters
@@ -367,10 +367,10 @@ class CalculatorForce(Force):
         With energies (eV) and forces (eV/Å) of periodic or free atoms, as the scene has them, and
         for a barostat or the pressure with a stress (eV/Å³)
     name
-        In logs and messages; default: the name of the calculator's class
+        In logs and messages. Default: the name of the calculator's class
     energy_noise_eV
-        Random error of its energies, as of self-consistent iterations or of single precision;
-        larger differences between forces and differences of the energy are rejected at the start of
+        Random error of its energies, as of self-consistent iterations or of single precision.
+        Larger differences between forces and differences of the energy are rejected at the start of
         a run
     changes_momentum
         Which components of the total momentum it may change: True for external fields and
@@ -381,7 +381,7 @@ class CalculatorForce(Force):
     SceneError
         If a calculator without stress is used with a barostat.
     SimulationError
-        If the calculator fails; it names the step and the closest atoms.
+        If the calculator fails. The message names the step and the closest atoms.
     """
 
     def __init__(
@@ -494,7 +494,7 @@ class CalculatorForce(Force):
 
 
 def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:
-    """Frames of a run for `ase.io.read`; `name` is its folder, or the trajectory in it. Raises
+    """Frames of a run for `ase.io.read`. `name` is its folder, or the trajectory in it. Raises
     OutputError."""
     record = read_record(Path(name) if Path(name).is_dir() else Path(name).parent)
     if record.is_body:
@@ -511,7 +511,7 @@ def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:
 
 
 def _parts_of(scene: MolecularScene) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The tables of a scene's species without numbers of molecules, and the other TABLES; paths are
+    """The tables of a scene's species without numbers of molecules, and the other TABLES. Paths are
     absolute."""
     tables = with_absolute_paths(scene.model_dump(exclude_defaults=True), scene.path(""))
     for table in tables["molecules"]:

@@ -63,7 +63,7 @@ def resume_command(folder: Path) -> str:
 
 
 class RigidMDWarning(UserWarning):
-    """Something that the user should know before a run ends; the summary of the run repeats it."""
+    """Something that the user should know before a run ends. The summary of the run repeats it."""
 
 
 class RigidMDError(Exception):

@@ -47,6 +47,7 @@ RANKS = {f"test_{name}.py": rank for rank, name in enumerate(LONGEST)}
 #: file -> patterns of names. They have the marker `extended`, and .ci/run runs them too.
 EXTENDED = {
     "test_accuracy.py": ("the_command_writes_a_table_a_figure_and_a_page",),
+    "test_auto.py": ("a_crude_error_is_kept_crudely*",),
     "test_bodies.py": (
         "free_bodies_of_others",
         "the_sleeping_top_wakes_where_it_should",
@@ -58,6 +59,7 @@ EXTENDED = {
         "the_textbook_systems_are_the_same_motion*matrix*",
         "wheels_drives_and_friction_in_a_turning_accelerated_frame",
     ),
+    "test_body_pairs.py": ("a_text_has_the_same_energy_as_its_function*",),
     "test_dispersion.py": (
         "forces_are_as_accurate_as_asked_for*",
         "mixed_precision*",
@@ -67,7 +69,12 @@ EXTENDED = {
     "test_docs.py": tuple(
         f"what_a_document_says_can_be_done[[]{page}]"
         for page in (
+            "analysis",
+            "body_pairs",
+            "crystals",
             "extending",
+            "five_minutes",
+            "mixtures",
             "molecule",
             "normal_modes",
             "npt",
@@ -75,9 +82,14 @@ EXTENDED = {
             "slab",
             "studies",
             "tables",
+            "top",
+            "water",
         )
     ),
-    "test_dynamics.py": ("adding_an_integrator_*",),
+    "test_dynamics.py": (
+        "a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid[[]chin_4a*",
+        "adding_an_integrator_*",
+    ),
     "test_engine_settings.py": ("adding_an_engine_takes_a_folder_and_a_file",),
     "test_ewald.py": (
         "lennard_jones_and_real_space_end_apart*",
@@ -85,9 +97,14 @@ EXTENDED = {
         "total_momentum_is_taken_out_at_steps_that_the_scene_decides",
         "waves_of_a_cell_that_a_file_describes_otherwise",
     ),
+    "test_fault_driver.py": ("runs_survive_mixed_faults",),
     "test_faults.py": ("a_run_that_is_stopped_by_signals_goes_on*",),
     "test_fields.py": ("adding_a_field_*",),
     "test_forces.py": (
+        "a_list_with_almost_no_skin_is_built_at_every_step[[]mixed*",
+        "energies_are_those_of_the_oracle[[]s[mw]*",
+        "everything_follows_a_cell_that_changes[[]ewald*",
+        "slanted_boxes*",
         "a_list_with_little_room_grows_and_misses_nothing[[]mixed]",
         "adding_a_pair_potential_takes_two_files",
         "energies_are_those_of_the_oracle[[]force_switch*",
@@ -123,6 +140,9 @@ EXTENDED = {
         "the_narrowest_vectors*",
         "the_same_bits_for_any_number_of_threads[[]mixed]",
     ),
+    "test_stability.py": ("quick*",),
+    "test_strangers.py": ("analyses_execute_and_obey_nothing*",),
+    "test_sweep.py": ("energy_at_a_step_of_zero_has_a_joint_fit*",),
     "test_threads.py": ("simulations_on_all_threads_at_once_have_the_bits_of_each_alone",),
     "test_trajectory_structures.py": ("a_run_goes_on_from_a_trajectory",),
     "test_user_code.py": (

@@ -49,14 +49,16 @@ def pinned(tables: dict) -> dict:
 
 
 def small_scene(counts: dict[str, int], edge: float | None, folder=".", **sections) -> Scene:
-    """A scene of shipped models in a cube (no periodic box if edge is None), two NVE steps."""
+    """A scene of shipped models in a cube (no periodic box if edge is None), two NVE steps, and no
+    figures unless they are requested."""
     data = {
         "box": {"lengths_A": edge} if edge else {"lengths_A": 15.0, "periodic": False},
         "molecules": [{"model": name, "count": count} for name, count in counts.items()],
         "start": {"temperature_K": 300.0},
         "stages": [{"duration_ps": 0.004}],
     }
-    return Scene.from_dict(pinned(data | sections), folder)
+    output = {"figures": False} | sections.get("output", {})
+    return Scene.from_dict(pinned(data | sections | {"output": output}), folder)
 
 
 def system_of(counts, edge=40.0, cutoff=5.0, **sections) -> System:

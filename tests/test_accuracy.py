@@ -300,7 +300,7 @@ def test_no_advantage_is_claimed_within_the_spread_of_the_timings(slow, fast):
     )
     (line,) = (line for line in recommendations(found) if line.startswith("for an energy error"))
     assert ("1.2 times faster than velocity_verlet" in line) == fast
-    assert ("equally fast within timing noise: velocity_verlet at 0.001 s" in line) != fast
+    assert ("Equally fast within timing noise: velocity_verlet at 0.001 s" in line) != fast
 
 
 @pytest.mark.parametrize(
@@ -953,7 +953,7 @@ def test_averages_need_a_thermostat_at_one_temperature(capsys):
     assert len([line for line in said.splitlines() if "averages" in line]) == 1
     assert main(["accuracy", water, "--sample-ps", "3"]) == 2
     assert "it needs --averages" in capsys.readouterr().err
-    with pytest.raises(SceneError, match="a single body has no thermostat"):
+    with pytest.raises(SceneError, match="A single body has no thermostat"):
         measure_averages(Scene.read(TOP))
     with pytest.raises(SceneError, match="one temperature and one pressure"):
         measure_averages(springs(temperature_K=[300.0, 200.0]))

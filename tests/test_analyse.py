@@ -148,7 +148,7 @@ def test_wrapped_paths_become_continuous(mixture):
         < 1e-10
     )
     assert np.ptp(whole[0].position, axis=0).max() > 30.0
-    assert wrapped[1] == ["molecules are wrapped in the frames; their paths were made continuous"]
+    assert wrapped[1] == ["molecules are wrapped in the frames. Their paths were made continuous"]
     assert wrapped[0].velocity is None and wrapped[0].L is None
     far = np.array([mixture.site_positions(now, True) for now in moved[::12]])
     with pytest.raises(
@@ -213,7 +213,7 @@ def test_times_of_files_are_even_though_rounded():
     time = (10_000 + 0.004 * np.arange(50)).astype(np.float32).astype(float)
     assert history(system, time, None).interval == pytest.approx(0.004, rel=0.01)
     assert history(system, [0.0, 1.0, 3.0], None).interval is None
-    with pytest.raises(OutputError, match=r"needs frames at equal intervals; these are 1 to 2 ps"):
+    with pytest.raises(OutputError, match=r"needs frames at equal intervals. These are 1 to 2 ps"):
         msd(history(system, [0.0, 1.0, 3.0], None))
     with pytest.raises(OutputError, match="needs at least 20 frames; there are 19"):
         msd(history(system, np.arange(19.0), None))
@@ -468,7 +468,7 @@ def test_what_does_not_diffuse_gives_no_value():
     for path in (flight, cage):
         (told,) = diffusion(history(system, time, path, SLANTED)).values
         assert (
-            told.value is None and "too short for a value; a run of 798 ps follows it" in told.note
+            told.value is None and "too short for a value. A run of 798 ps follows it" in told.note
         )
         assert re.search(r"So far: -?\d.* 1e-9 m²/s$", told.note)
     (told,) = diffusion(history(system, time, brownian(rng, 400, 16, 0.25, 0.5), SLANTED)).values
@@ -559,7 +559,7 @@ def test_what_hardly_turns_or_turns_too_fast_gives_no_time():
         "tau1 of ccl4, axis 1"
     )
     assert told.value is None and told.note == (
-        "C1 is still 1.00 after 10 ps, too short for a value; it needs more than 8e+03 ps. So far: 10 ps"
+        "C1 is still 1.00 after 10 ps, too short for a value. It needs more than 8e+03 ps. So far: 10 ps"
     )
     wild = random_rotations(rng, 800).reshape(100, 8, 3, 3)
     told = orientation(history(system, time, None, np.eye(3) * 40, wild)).value(
@@ -904,7 +904,7 @@ def test_a_viscosity_needs_stresses_long_enough_and_close_enough():
         viscosity(history(system, time, None, tensor=tensor))
     slow = stresses(np.random.default_rng(0), 2000, 0.85, 20.0, 0.02, 25.0**3)
     told = viscosity(history(system, time, None, box, tensor=slow)).value()
-    assert told.value is None and "too short for a value; a run of 160 ps follows it" in told.note
+    assert told.value is None and "too short for a value. A run of 160 ps follows it" in told.note
     assert re.search(r"So far: [\d.]+ ± [\d.]+ mPa s$", told.note)
 
 

@@ -437,7 +437,7 @@ def test_the_total_dipole_is_that_of_gromacs(water, topology):
         (["--only", "viscosty"], "did you mean viscosity?"),
         (
             ["--from", "1ns"],
-            "from 1000 ps on there are 0 of 56 frames; an analysis needs at least two",
+            "from 1000 ps on there are 0 of 56 frames. An analysis needs at least two",
         ),
         (["--from", "0.22ps"], "from 0.22 ps on there is 1 of 56 frames"),
         (
@@ -489,7 +489,7 @@ def test_names_of_sites_are_suggested(water):
     ):
         with pytest.raises(OutputError, match=r"is not possible: half the box is 9\.3"):
             rdf(history, "OW", largest=largest, width=width)
-    with pytest.raises(OutputError, match="unknown axis 'w'; name x, y or z"):
+    with pytest.raises(OutputError, match=r"unknown axis 'w'. Name x, y or z"):
         registry.selected(["density_profile"])[0].function(history, "w")
     with pytest.raises(OutputError, match="at least one bin"):
         registry.selected(["density_profile"])[0].function(history, "z", bins=0)
@@ -560,7 +560,7 @@ def test_a_damaged_table_is_told_and_kept(text, copy, capsys):
     path.write_text(text, encoding="latin-1")
     before = names(copy)
     found = said(capsys, copy, "--only", "msd", "--from", "0.02ps")
-    assert str(path) in found and "remove it, and analyse again" in found
+    assert str(path) in found and "Remove it, and analyse again" in found
     assert path.read_text(encoding="latin-1") == text and names(copy) == before
 
 
@@ -748,7 +748,7 @@ def test_adding_an_analysis_takes_one_file(tmp_path, monkeypatch, copy, capsys):
     ]
     assert cli.main(["analyse", str(copy), "--only", "mean_cosine"]) == 0
     with pytest.raises(
-        OutputError, match="mean_cosine is an analysis of rigidmd; rename your function"
+        OutputError, match=r"mean_cosine is an analysis of rigidmd. Rename your function"
     ):
         rigidmd.analysis.register(_named("mean_cosine"))
 
@@ -829,11 +829,11 @@ def text_run(tmp_path_factory):
         ),
         (
             lambda frames: frames[:6],
-            "from 0.02 ps on there is 1 of 6 frames; an analysis needs at least two",
+            "from 0.02 ps on there is 1 of 6 frames. An analysis needs at least two",
         ),
         (
             lambda frames: [*frames[:9], *frames[10:]],
-            "needs frames at equal intervals; these are 0.004 to 0.008 ps",
+            "needs frames at equal intervals. These are 0.004 to 0.008 ps",
         ),
     ],
     ids=["number", "nan", "torn", "one", "uneven"],

@@ -296,7 +296,7 @@ def test_atoms_that_cannot_be_used_are_told(what, said):
         ({"molecules": []}, "molecules is given by the atoms and models"),
         (
             {"atoms": [molecule("H2O")]},
-            "are of the type list, must be one ase.Atoms; ase.io.read returns a list",
+            "are of the type list, must be one ase.Atoms. ase.io.read returns a list",
         ),
         ({"stages": [{"duration_ps": 1.0}]}, r"start\.temperature_K is missing"),
     ],

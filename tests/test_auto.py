@@ -223,7 +223,7 @@ def test_a_walk_that_no_step_makes_smaller_is_reported_with_what_helps(known):
     assert found.error == pytest.approx(error(found), rel=0.5)
     assert found.error > 2e-5
     assert (
-        "no step tried keeps the target over that time: truncation = 'smooth_switch', a longer"
+        "No step tried keeps the target over that time: truncation = 'smooth_switch', a longer"
         in found.reason
     )
 

@@ -418,11 +418,11 @@ def test_an_interval_beyond_all_steps_is_never(key):
         ),
         (
             "start.xsf",
-            "a scene is a TOML file; one that starts from a structure names it by [structure] file",
+            "a scene is a TOML file. One that starts from a structure names it by [structure] file",
         ),
-        ("folder", "is a folder; a scene is a file, such as "),
-        ("empty", "is a folder; a scene is a TOML file"),
-        ("run", "is a folder; `rigidmd resume "),
+        ("folder", "is a folder. A scene is a file, such as "),
+        ("empty", "is a folder. A scene is a TOML file"),
+        ("run", "is a folder. `rigidmd resume "),
     ],
 )
 @pytest.mark.parametrize("command", ["run", "check", "energy"])
@@ -473,20 +473,24 @@ FOREIGN = tomllib.loads((ROOT / "rigidmd/scene/foreign_keys.toml").read_text(enc
     [(table, *item) for table, entries in FOREIGN.items() for item in entries.items()],
 )
 def test_a_setting_of_another_program_names_the_key_of_a_scene(table, key, text):
-    section = "body" if key.endswith("_s") else "forces"
+    section = "body" if key.endswith("_s") or table == "body" else "forces"
+    where = "wheels.0" if table == "wheels" else section
     names, _, note = text.partition(": ")
     for name in names.split():
         for asked in (name, name.upper().replace("_", "-")):
             with pytest.raises(SceneError) as raised:
-                Scene.from_dict({section: {asked: 1}})
+                unknown = {asked: 1}
+                Scene.from_dict(
+                    {"body": {}, "wheels": [unknown]} if table == "wheels" else {section: unknown}
+                )
             (found,) = [
                 line
                 for line in raised.value.errors
-                if line.startswith(f"{section}.{asked}: unknown key")
+                if line.startswith(f"{where}.{asked}: unknown key")
             ]
             assert note in found
             if table != "none":
-                assert f"in rigidmd this is {key}" in found
+                assert f"In rigidmd this is {key}" in found
 
 
 @pytest.mark.parametrize(
@@ -501,7 +505,7 @@ def test_what_stands_for_a_setting_of_another_program_is_a_key(table, names):
 def test_a_hint_names_the_table_and_the_unit():
     with pytest.raises(
         SceneError,
-        match=r"forces.rcut: unknown key; in rigidmd this is cutoff_A in \[forces\] \(in Å\)",
+        match=r"forces.rcut: unknown key. In rigidmd this is cutoff_A in \[forces\] \(in Å\)",
     ):
         small_scene({"spce": 20}, 20.0, forces={"rcut": 9.0})
     with pytest.raises(
@@ -530,6 +534,8 @@ LIQUID = {
         ({"run": {"seed": 3}}, "run.seed: unknown key; seed is a key of the top level"),
         ({"stages": [{"cutoff_A": 9.0}]}, "cutoff_A is a key of [forces]"),
         ({"forces": {"integrator": "baoab"}}, "integrator is a key of [[stages]]"),
+        ({"forces": {"coulomb": "pme"}}, "In rigidmd this is electrostatics in [forces]"),
+        ({"molecules": [{"model": "N2"}]}, "did you mean nitrogen or nitrogen_2cljq or"),
     ],
 )
 def test_a_hint_on_units_tables_and_keys_of_other_tables(changes, expected):
@@ -710,12 +716,12 @@ def test_all_faults_at_once(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("path", "expected"),
     [
-        ("nowhere.toml", "nowhere.toml: there is no such file; `rigidmd examples` lists scenes"),
-        ("water", "water: there is no such file; `rigidmd new water` copies a shipped scene"),
-        ("systems/water.toml", "there is no such file; `rigidmd new water` copies a shipped scene"),
+        ("nowhere.toml", "nowhere.toml: there is no such file. `rigidmd examples` lists scenes"),
+        ("water", "water: there is no such file. `rigidmd new water` copies a shipped scene"),
+        ("systems/water.toml", "there is no such file. `rigidmd new water` copies a shipped scene"),
         (
             "heavy_top.toml",
-            "there is no such file; `rigidmd new heavy_top_1` copies a shipped scene",
+            "there is no such file. `rigidmd new heavy_top_1` copies a shipped scene",
         ),
         ("mien.toml", "there is no such file; did you mean mine.toml?"),
     ],
@@ -734,7 +740,7 @@ def test_a_missing_scene(command, path, expected, capsys, monkeypatch, tmp_path)
     [
         (["analyze", "runs/x"], "unknown command 'analyze'; did you mean analyse?"),
         (["acuracy", "x.toml"], "unknown command 'acuracy'; did you mean accuracy?"),
-        (["foo"], "unknown command 'foo'; `rigidmd --help` lists them"),
+        (["foo"], "unknown command 'foo'. `rigidmd --help` lists them"),
         (
             ["run", "x.toml", "--forse"],
             "rigidmd run: error: unknown argument '--forse'; did you mean --force?",

@@ -179,7 +179,7 @@ def faults(**tables):
             {"body": {"solids": [BALL | {"mass_kg": 1.0, "density": 1.0}]}},
             "did you mean density_kg_m3?",
         ),
-        ({"body": {"mass_kg": 1.0, "centre_of_mass_m": [0.0, 0, 1]}}, "this one is not pinned"),
+        ({"body": {"mass_kg": 1.0, "centre_of_mass_m": [0.0, 0, 1]}}, "This one is not pinned"),
         ({"body": {"mass_kg": 1.0, "pinned": True}}, "cannot move"),
         ({"start": {"rotation": [[1.0, 0.01, 0], [0, 1, 0], [0, 0, 1]]}}, "|Q^T Q - 1| is 0.01"),
         ({"start": {"rotation": [[1.0, 0, 0], [0, 1, 0], [0, 0, -1.0]]}}, "a reflection"),
@@ -324,6 +324,12 @@ def faults(**tables):
             "start.euler_angles_deg: has 2 entries, needs more",
         ),
         ({"wheels": {"axis": [0.0, 0, 1]}}, "write [[wheels]]"),
+        ({"body": {"fixed_point": True}}, "In rigidmd this is pinned in [body]"),
+        ({"wheels": [{"inertia_kg_m2": 1.0}]}, "In rigidmd this is momentum_kg_m2_s in [[wheels]]"),
+        (
+            {"start": {"angular_velocity_rad_s": [0.0, 0, 1]}},
+            "did you mean angular_velocity_body_rad_s or angular_velocity_lab_rad_s?",
+        ),
         (
             {
                 "body": {
@@ -407,7 +413,7 @@ def test_all_faults_of_solids_come_at_once_with_their_lines(tmp_path, capsys):
 def test_the_energy_of_a_body_is_in_joule(capsys):
     scene = str(ROOT / "systems" / "fast_heavy_top.toml")
     assert main(["energy", scene, "--unit", "K"]) == 2
-    assert "the energy of a body is in J" in capsys.readouterr().err
+    assert "The energy of a body is in J" in capsys.readouterr().err
     assert main(["energy", scene]) == 0
     assert "5435.696790865" in capsys.readouterr().out
 

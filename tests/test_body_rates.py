@@ -219,7 +219,7 @@ def test_a_run_that_is_too_short_has_the_theory_only(tmp_path, capsys):
     ]
     assert main(["run", str(SYSTEMS / "heavy_top_3.toml"), *short]) == 0
     assert (
-        "every 0.3387657 s in theory; fewer than two periods in the samples"
+        "every 0.3387657 s in theory. Fewer than two periods in the samples"
         in capsys.readouterr().out
     )
 

@@ -666,7 +666,7 @@ def test_models_and_alternatives_of_mmcif(tmp_path):
         [7, 5.0, 6.0], abs=0.1
     )
     rows = [(*row[:5], "AB"[k % 2], *row[6:]) for k, row in enumerate(waters())]
-    with pytest.raises(StructureError, match="has alternate locations A, B; keep one of them"):
+    with pytest.raises(StructureError, match=r"has alternate locations A, B. Keep one of them"):
         read(tmp_path, mmcif(rows))
     assert read(tmp_path, mmcif(waters(), cell=False)).cell is None
 

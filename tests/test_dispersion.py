@@ -210,7 +210,7 @@ def test_the_note_has_the_error_that_was_asked_for(asked, box):
     }
     system, _, _ = mixture(forces, box, molecules=[{"model": "argon", "count": 90}])
     (argon,) = system.species
-    (note,) = [note for note in system.notes if "estimated rms error of its force" in note]
+    (note,) = [note for note in system.notes if "Estimated rms error of its force" in note]
     expected = asked * 24 * argon.epsilon[0] / argon.sigma[0] / KJ_PER_MOL
     assert float(note.split(": ")[-1].split()[0]) == pytest.approx(expected, rel=0.02)
 

@@ -176,7 +176,7 @@ def test_values_without_an_error_are_printed_as_such():
     found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, quantities, [run])
     (told,) = describe_failures(found)
     assert told == (
-        "baoab + langevin at 2 fs: U: 5 ps are too short for an error; sample longer (--sample-ps)"
+        "baoab + langevin at 2 fs: U: 5 ps are too short for an error. Sample longer (--sample-ps)"
     )  # of what is reported
     assert brief_table(found).shown()[1][0][-2:] == ["-", "+0.5 ± 1.0"]
 

@@ -450,7 +450,7 @@ def test_a_platform_with_one_precision_has_no_other():
             )
     with pytest.raises(
         SceneError,
-        match=r"precision would have no effect with engine.name = 'lammps'; it is for openmm",
+        match=r"precision would have no effect with engine.name = 'lammps'. It is for openmm",
     ):
         small_scene({"argon": 2}, 20.0, engine={"name": "lammps", "precision": "mixed"})
 
@@ -609,7 +609,7 @@ def test_adding_an_engine_takes_a_folder_and_a_file(tmp_path):
         "engine.name = 'mirror': stages.0.thermostat = 'andersen': Mirror has langevin"
         in refused[2]
     )
-    assert "tilt would have no effect with engine.name = 'lammps'; it is for mirror" in foreign[2]
+    assert "tilt would have no effect with engine.name = 'lammps'. It is for mirror" in foreign[2]
     assert (tmp_path / "exported" / "mirror.txt").read_text() == "1 kinds"
     assert '"mirror"' in schema[1] and '"Angle of mirror; default: 2"' in schema[1]
     assert "rigidmd, lammps, openmm or mirror" in text[1] and "--tilt N" in text[1]

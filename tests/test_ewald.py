@@ -653,7 +653,7 @@ def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
     }
     system = build(Scene.from_dict(data, tmp_path))
     assert cell_of(system.space) == pytest.approx(14.0 * np.eye(3))
-    assert any("rotated, contents included" in note for note in system.notes)
+    assert any("Rotated, contents included" in note for note in system.notes)
 
     def inside(n):
         return (np.abs(n) <= (4, 2, 3)).all(axis=1)
@@ -1383,11 +1383,11 @@ def test_liquid_spce_is_the_published_one():
         ),
         (
             {"electrostatics": "ewald", "ewald_alpha_per_A": 2.0},
-            "far below rounding; at most 1.33 is of use",
+            "far below rounding. At most 1.33 is of use",
         ),
         (
             {"electrostatics": "damped_shifted_force", "damping_per_A": 2.0},
-            "at most 1.33 is of use",
+            "At most 1.33 is of use",
         ),
         (
             {
@@ -1419,7 +1419,7 @@ def test_settings_that_make_no_sense(forces, words):
     [
         ("ewald", "needs a periodic box; use coulomb"),
         ("pme", "needs a periodic box; use coulomb"),
-        ("damped_shifted_force", "needs a cutoff; give forces.cutoff_A"),
+        ("damped_shifted_force", "needs a cutoff. Give forces.cutoff_A"),
     ],
 )
 def test_what_needs_a_box_or_a_cut_off_says_so(method, words):

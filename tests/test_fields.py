@@ -555,7 +555,7 @@ def test_what_is_frozen_is_left_alone():
 def test_check_tells_of_fields_and_of_what_is_left_out():
     text = describe(slit(OSCILLATING | {"gravity_m_s2": [0.0, 0.0, -9.81]}))
     assert (
-        "electric field: (0.3, -0.2, 0.6) V/nm cos(2 pi f t + 40°), f = 2.5/ps; its work is in the energy ledger"
+        "electric field: (0.3, -0.2, 0.6) V/nm cos(2 pi f t + 40°), f = 2.5/ps. Its work is in the energy ledger"
         in text
     )
     assert "gravity: (0, 0, -9.81) m/s²" in text
@@ -685,7 +685,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
                     {"name": "bare", "count": 2, "sites": [site("Q", 5.0, [0, 0, 0], 1.0)]}
                 ]
             },
-            "bare has no site with Lennard-Jones parameters, and would pass the walls; use acts_on = 'centres'",
+            "bare has no site with Lennard-Jones parameters, and would pass the walls. Use acts_on = 'centres'",
         ),
         ({"walls": [LJ]}, {"forces": {"tail_correction": True}}, "omit it between walls"),
         ({"restraints": [{}]}, {}, "fields.restraints.0.stiffness_kJ_mol_A2: is missing"),
@@ -1022,7 +1022,7 @@ def test_a_restrained_distance_in_a_run():
         (PAIR | {"distance_A": 9.5}, "may come near half the smallest height of the box, 10 Å"),
         (
             PAIR | {"distance_A": 8.0, "stiffness_kJ_mol_A2": 0.01},
-            "use a larger box or a higher stiffness",
+            "Use a larger box or a higher stiffness",
         ),
         (PAIR | {"between": [[1, 6], 2]}, "Å from its first one, more than a quarter"),
     ],

@@ -296,7 +296,7 @@ def _start_potential(scene: Path) -> float:
         (["engine.platform=CUDA"], "platform would have no effect with engine.name = 'lammps'"),
         (["engine.ranks=0"], "engine.ranks"),
         (["engine.ranks=1000"], "engine.ranks: 1000 ranks for "),
-        ([f"engine.ranks={2**31}"], "some would have nothing to move; use fewer"),
+        ([f"engine.ranks={2**31}"], "some would have nothing to move. Use fewer"),
         (["engine.nam=lammps"], "engine.nam: unknown key"),
     ],
 )

@@ -565,11 +565,11 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
     assert main(["check", str(tmp_path / "scene.toml")]) == 0
     said = capsys.readouterr().out
     assert (
-        "0: minimise: to a minimum of the potential energy; no time passes and momenta do not change"
+        "0: minimise: to a minimum of the potential energy. No time passes and momenta do not change"
         in said
     )
     assert "1: cell: to a minimum of the enthalpy at 1 bar, the cell isotropic" in said
-    assert "torques of 0.1 kJ/mol and a pressure within 1 bar; at most 5000 iterations" in said
+    assert "torques of 0.1 kJ/mol and a pressure within 1 bar. At most 5000 iterations" in said
     command = ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out"), "-v"]
     assert main(command) == 0
     said = capsys.readouterr().out

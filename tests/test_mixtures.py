@@ -175,7 +175,7 @@ def test_the_profile_of_a_mixture_is_that_of_its_rotated_sites(axis):
 
 @pytest.mark.parametrize(("distance", "angle"), [(3.5, 30.0), (5.0, 60.0)])
 def test_hydrogen_bonds_of_a_mixture_are_those_of_its_geometry(distance, angle):
-    """Every O-H against every O and N of other molecules and their images; each bond counts for
+    """Every O-H against every O and N of other molecules and their images. Each bond counts for
     both molecules."""
     found = mixed(frames=30, breath=0.02)
     bonds = np.zeros((len(found), sum(COUNTS.values())))

@@ -985,7 +985,7 @@ CUT = '2\nLattice="5 0 0 0 5 0 0 0 5"\nN 0.3 0 0\nN 4.3 0 0\n'
         ),
         (
             ["--from", "benzene.xyz", "--draw"],
-            "draw it afterwards: rigidmd models benzene.toml --draw",
+            "Draw it afterwards: rigidmd models benzene.toml --draw",
         ),
         (["spce", "--from", "benzene.xyz"], "leave out spce"),
         (["spce", "--parameters", "aromatic.toml"], "--parameters belongs to --from FILE"),

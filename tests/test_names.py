@@ -201,7 +201,7 @@ def tokens(text):
 def test_paths_change_no_word_of_the_script_of_a_job(tmp_path, name, folder, scene, trust):
     usual = script(tmp_path / "usual", "water", "water.toml", ["force.py"])
     if re.search(r"[\x00-\x1f\"\\]", folder + scene + trust):
-        with pytest.raises(OutputError, match=r"rename it, or folder=\.\.\. names another"):
+        with pytest.raises(OutputError, match=r"Rename it, or folder=\.\.\. names another"):
             script(tmp_path / folder, name, scene, [trust])
         return
     text = script(tmp_path / folder, name, scene, [trust])

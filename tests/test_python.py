@@ -557,7 +557,7 @@ def test_a_simulation_takes_what_its_kind_of_scene_has():
     with pytest.raises(SceneError, match="forces and thermostat: for molecules"):
         heavy_top(forces=[], thermostat=3)
     for method in ("_start", "_settle", "atoms"):
-        with pytest.raises(TypeError, match="is a single body; this method is for molecules"):
+        with pytest.raises(TypeError, match=r"is a single body. This method is for molecules"):
             getattr(heavy_top(), method)()
 
 

@@ -410,7 +410,7 @@ def test_displacements_over_time_are_speeds(name, tmp_path):
 
 def test_the_summary_says_when_positions_are_wrapped():
     scene = small_scene({"argon": 20}, 20.0, output={"positions": "wrapped"})
-    assert "displacements need unwrapped frames" in summary_text(Simulation(scene).run().summary)
+    assert "Displacements need unwrapped frames" in summary_text(Simulation(scene).run().summary)
     for without in (
         {"output": {"trajectory": False}},
         {"box": {"lengths_A": 20.0, "periodic": False}},
@@ -693,7 +693,7 @@ def test_constant_energy_after_a_thermostat_explains_its_temperature():
     text = summary_text(results.summary)
     off = two["temperature_K"] - 100.0
     assert (
-        f"{off:+.2g} K from the 100 K before: this stage keeps the energy of one moment; such"
+        f"{off:+.2g} K from the 100 K before: this stage keeps the energy of one moment. Such"
         in text
     )
     assert ("equilibrate longer" in text) == (abs(off) > 3 * two["temperature_scatter_K"])
@@ -1395,7 +1395,10 @@ FILES_OF = {
 def scene_of_both(request):
     if request.param == "argon":
         return "argon", small_scene(
-            {"argon": 10}, 20.0, stages=[{"duration_ps": 0.01}], output={"log_interval_ps": 0.002}
+            {"argon": 10},
+            20.0,
+            stages=[{"duration_ps": 0.01}],
+            output={"log_interval_ps": 0.002, "figures": True},
         )
     changed = {"run.duration_s": 0.05, "output.npz": True, "output.interval_s": 0.001}
     return "top", Scene.read(ROOT / "systems" / "heavy_top_3.toml", changed)

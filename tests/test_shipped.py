@@ -103,7 +103,7 @@ def test_the_name_of_a_series_is_its_first_scene(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["new", "heavy_top"]) == 0
     said = capsys.readouterr().out
-    assert "heavy_top_7); this is heavy_top_1" in said
+    assert "heavy_top_7). This is heavy_top_1" in said
     assert (tmp_path / "heavy_top_1.toml").read_bytes() == (
         ROOT / "systems" / "heavy_top_1.toml"
     ).read_bytes()

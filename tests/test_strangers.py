@@ -246,7 +246,7 @@ def test_a_scene_that_is_a_pipe_or_too_large(tmp_path):
     with pytest.raises(SceneError, match="is a pipe, a socket or a device"):
         Scene.read(tmp_path / "pipe.toml")
     (tmp_path / "large.toml").write_bytes(b"#" * 5_000_000)
-    with pytest.raises(SceneError, match=r"has 5 MB; files of up to 4 MB are read"):
+    with pytest.raises(SceneError, match=r"has 5 MB. Files of up to 4 MB are read"):
         Scene.read(tmp_path / "large.toml")
 
 

@@ -956,7 +956,7 @@ def test_what_was_made_of_a_cell_is_said(tmp_path):
 
 
 def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
-    """The state has the box as it was described again; the scene still has its own words for it."""
+    """The state has the box as it was described again. The scene still has its own words for it."""
     box = {"lengths_A": 24.0, "angles_deg": [90.0, 59.0, 90.0]}
     system = build(small_scene({"argon": 4}, None, box=box))
     assert any(

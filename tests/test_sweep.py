@@ -492,7 +492,7 @@ def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):
     for arguments, expected in (
         (
             [*steps, "--extrapolate", "stages.nve.timestep_fs"],
-            "is not varied; this sweep varies stages.0.timestep_fs",
+            "is not varied. This sweep varies stages.0.timestep_fs",
         ),
         (
             ["--set", "seed=1,2", "--extrapolate", "seed"],
@@ -1166,7 +1166,7 @@ def test_words_for_slurm():
             ["--set", "seed=1..1000", "--set", "start.temperature_K=1..1000"],
             "these are 1000000 points",
         ),
-        (["--replicas", "3", "--set", "seed=1..3"], "leave out one of them"),
+        (["--replicas", "3", "--set", "seed=1..3"], "Leave out one of them"),
         (["--set", "seed=1..3", "--to", "slurm"], "needs --walltime"),
         (
             ["--set", "seed=1..3", "--to", "slurm", "--walltime", "1:00:00", "--collect"],
@@ -1230,7 +1230,7 @@ def test_folders_that_are_none(argon, tmp_path, copied, capsys):
     assert cli.main(["sweep", str(argon), "-o", str(tmp_path / "none"), "--collect"]) == 2
     assert "holds no sweep" in capsys.readouterr().err
     assert cli.main(["report", str(copied)]) == 2
-    assert "is the folder of a sweep; name one of the runs in it" in capsys.readouterr().err
+    assert "is the folder of a sweep. Name one of the runs in it" in capsys.readouterr().err
     for text in (
         "",
         "{}",

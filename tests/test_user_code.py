@@ -629,20 +629,20 @@ def test_a_run_with_a_table_resumes_with_the_same_bits_and_keeps_a_copy(tmp_path
 ROWS = "\n".join(f"{r:.3f} {argon_energy(r)[0]:.6g}" for r in np.arange(3.0, 9.3, 0.05))
 WRONG_TABLES = {
     "r_nm energy_kJ_mol\n"
-    + ROWS: r"argon.csv: line 1: the columns are r_nm, energy_kJ_mol; they must be r_A \(Å\)",
+    + ROWS: r"argon.csv: line 1: the columns are r_nm, energy_kJ_mol. They must be r_A \(Å\)",
     ROWS
     + "\n9.4": r"argon.csv: line 128: has 1 numbers, must have the same columns in all lines: r_A",
     ROWS + "\n9.4 nan": r"argon.csv: line 128: 9.4 nan has something else than finite numbers",
     ROWS + "\n9.4 abc": r"argon.csv: line 128: 9.4 abc has something else than finite numbers",
     ROWS
-    + "\n9.0 -0.1": r"argon.csv: line 128: r_A = 9 must be above 9.3 Å of the row before; sort the rows",
+    + "\n9.0 -0.1": r"argon.csv: line 128: r_A = 9 must be above 9.3 Å of the row before. Sort the rows",
     "-1 5\n" + ROWS: r"argon.csv: line 1: r_A = -1 must be above 0",
     "\n".join(ROWS.splitlines()[:7]): r"argon.csv: has 7 rows, needs 8 or more",
     "# nothing": r"argon.csv: has 0 rows",
     "\n".join(ROWS.splitlines()[:60]): r"ends at 5.95 Å, before the cutoff of 9 Å$",
     "\n".join(
         f"{float(row.split()[0]) / 10} {row.split()[1]}" for row in ROWS.splitlines()
-    ): r"is it in nm\?",
+    ): r"Is it in nm\?",
     "\n".join(ROWS.splitlines()[20:]): r"begins at 4 Å, where it does not repel",
     "\n".join(
         f"{row} {-argon_energy(float(row.split()[0]))[1]:.6g}" for row in ROWS.splitlines()
@@ -773,7 +773,7 @@ def test_a_run_with_forces_from_python_is_repeated_by_python_only(tmp_path, caps
     assert main(["resume", str(folder), "--until", "0.04ps"]) == 2
     assert "from_python: this run had spring from Python" in capsys.readouterr().err
     scene = rigidmd.Scene.read(folder / "scene.toml")
-    with pytest.raises(SceneError, match="this has field"):
+    with pytest.raises(SceneError, match="This has field"):
         rigidmd.Simulation(scene, forces=[Field()])
     results = rigidmd.Simulation(scene.with_end(0.04), folder, forces=[Spring()], resume=True).run()
     assert np.array_equal(results.state.position, whole.state.position)
@@ -814,7 +814,7 @@ class Faulty(rigidmd.Force):
         ),
         ("shape", r"the force faulty returned forces of the shape \(3,\), not \(100, 3\)"),
         ("energy", "returned 'much' as its energy"),
-        ("tuple", "returned ndarray; it must return a tuple"),
+        ("tuple", "returned ndarray. It must return a tuple"),
         ("virial", r"returned \[1.0, 2.0\] as its virial"),
         (
             "nan",
@@ -901,7 +901,7 @@ def test_forces_from_python_exclude_what_they_cannot_go_with():
     ):
         rigidmd.Simulation(points(stages=[stage]), forces=[Spring()])
     top = rigidmd.Scene.read(ROOT / "systems" / "heavy_top_3.toml")
-    with pytest.raises(SceneError, match="forces: for molecules; a single body takes applied"):
+    with pytest.raises(SceneError, match=r"forces: for molecules. A single body takes applied"):
         rigidmd.Simulation(top, forces=[Spring()])
     with pytest.raises(SceneError, match="energy is a column of the log"):
         rigidmd.Simulation(points(), forces=[rigidmd.pair_potential("1/r**9", name="energy")])

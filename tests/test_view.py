@@ -432,10 +432,10 @@ def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
-        ("nothing", "is not there; name the folder of a run"),
-        ("a file", "is a file; name the folder of a run"),
+        ("nothing", "is not there. Name the folder of a run"),
+        ("a file", "is a file. Name the folder of a run"),
         ("no run", "is not the folder of a run"),
-        ("no samples", "the run has not written samples yet; `rigidmd resume"),
+        ("no samples", "the run has not written samples yet. `rigidmd resume"),
         ("no log", "log.csv cannot be read"),
     ],
 )
@@ -514,7 +514,7 @@ def test_a_body_that_was_killed_shows_its_last_checkpoint(top, tmp_path, capsys)
     for name in ("summary.json", "motion.csv"):
         (folder / name).unlink()
     assert cli.main(["view", str(folder)]) == 0
-    assert "the motion shown ends at the last checkpoint" in capsys.readouterr().out
+    assert "The motion shown ends at the last checkpoint" in capsys.readouterr().out
     assert np.array_equal(read_record(folder).columns["q11"], whole)
 
 

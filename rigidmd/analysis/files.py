@@ -35,7 +35,7 @@ def write_results(
     failed: dict[str, str],
     figures: str = FIGURES[0],
 ) -> list[Path]:
-    """Write results; entries of other analyses in the folder stay. Returns the files. Raises
+    """Write results. Entries of other analyses in the folder stay. Returns the files. Raises
     OutputError.
 
     frames_used : see `AnalysisOutput`; failed : analysis -> a sentence on why it has failed
@@ -54,13 +54,13 @@ def write_results(
                 result.name
             }:
                 raise OutputError(
-                    f"{folder / name} is a file of the analysis {others.pop()}; rename"
+                    f"{folder / name} is a file of the analysis {others.pop()}. Rename"
                     f" {result.name}"
                 )
             is_ours = name in owner or (is_built_in(result.name) and name in marked)
             if (folder / name).exists() and not is_ours:
                 raise OutputError(
-                    f"{folder / name} exists and is not of an analysis; rename {result.name}"
+                    f"{folder / name} exists and is not of an analysis. Rename {result.name}"
                 )
     add_to_folder(folder, [ANALYSIS, *new])
     entries, curves = {}, [curve for result in results for curve in result.curves]
@@ -135,7 +135,7 @@ class _Analyses(BaseModel):
 
 def read_table(folder: Path) -> dict[str, _Entry]:
     """The entries of analysis.json by analysis, if there are any. Raises OutputError."""
-    analyses = read_json(folder / ANALYSIS, _Analyses, "; remove it, and analyse again")
+    analyses = read_json(folder / ANALYSIS, _Analyses, ". Remove it, and analyse again")
     return {} if analyses is None else analyses.analyses
 
 
@@ -149,7 +149,7 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
             path = folder / f"{Path(described.file).name}.csv"
             read = read_columns(path)
             if read is None or not read.cells:
-                raise OutputError(f"{path} cannot be read: it has no curve; analyse again")
+                raise OutputError(f"{path} cannot be read: it has no curve. Analyse again")
             head, *titles = read.cells
             table = {title: read.numbers(title) for title in read.cells}
             columns = {

@@ -102,8 +102,8 @@ def potential_of_mean_force(
     )
     total = sum(len(window.samples) for window in windows)
     notes.append(
-        f"{len(windows)} windows, {sum(map(len, samples))} decorrelated of {total} samples; the"
-        f" zero is the mean from {r[outer][0]:.4g} to {r[-1]:.4g} Å; W = -kT ln(P(r)/r²), without"
+        f"{len(windows)} windows, {sum(map(len, samples))} decorrelated of {total} samples. The"
+        f" zero is the mean from {r[outer][0]:.4g} to {r[-1]:.4g} Å. W = -kT ln(P(r)/r²), without"
         " r² it is the free energy of r"
     )
     return AnalysisResult(NAME, ABOUT, [value], [curve], notes)
@@ -157,7 +157,7 @@ def _profile(
     edges: np.ndarray,
     filled: np.ndarray,
 ) -> np.ndarray:
-    """W (b,) in the kept bins, kJ/mol; not finite where samples are missing."""
+    """W (b,) in the kept bins, kJ/mol. Not finite where samples are missing."""
     x = np.concatenate(samples)
     count = np.array([len(some) for some in samples], float)
     bias = _biases(windows, x, thermal_energy)

@@ -22,7 +22,7 @@ def _count(code, content):
 @task()
 def _count_part(task_arguments, part):
     """Add to counts (PARTS, bins) the pairs (i of first, j of second) of different owners that are
-    closer than edge * bins; fractions of the box, second sorted by cells of the grid, `start` where
+    closer than edge * bins. Fractions of the box, second sorted by cells of the grid, `start` where
     each starts."""
     first, owner, second, owner_2, cell, grid, start, reach, edge, counts = load_arguments(
         task_arguments

@@ -65,7 +65,7 @@ def load_built_in() -> None:
 
 
 def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], Any]:
-    """Register a user-defined analysis under the name of its function; `rigidmd analyse --only
+    """Register a user-defined analysis under the name of its function. `rigidmd analyse --only
     NAME` runs it.
 
     The function gets a `rigidmd.analysis.rigid_frames.RigidFrames` (time, positions, Q, L,
@@ -87,7 +87,7 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
     """
     name = getattr(function, "__name__", "")
     if is_built_in(name):
-        raise OutputError(f"{name} is an analysis of rigidmd; rename your function")
+        raise OutputError(f"{name} is an analysis of rigidmd. Rename your function")
     if not name.isidentifier():
         raise OutputError(
             f"an analysis has the name of its function; {name or function!r} is not a name: use def"

@@ -37,7 +37,7 @@ def _row(value: Value) -> tuple[str, str, str, str]:
 
 
 def _section(title: str, reasons: Mapping[str, str]) -> list[str]:
-    """A title and a line for each name; names with the same reason share a line."""
+    """A title and a line for each name. Names with the same reason share a line."""
     if not reasons:
         return []
     names: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""Results of analyses: values with errors, curves, notes; and how errors are estimated."""
+"""Results of analyses: values with errors, curves, notes, and how errors are estimated."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -65,7 +65,7 @@ class Curve:
 
     file : stem of its files
     axis : header and values (p,)
-    columns, errors : header -> values (p,); errors under the same headers, where there are any
+    columns, errors : header -> values (p,). Errors under the same headers, where there are any
     log : whether axes are logarithmic: of x, of y
     level : a level to draw, such as 1 of g(r)
     bars : whether the axis is of whole numbers, and bars are drawn
@@ -105,7 +105,7 @@ class Curve:
 class AnalysisResult(Displayed):
     """The result of an analysis: values, curves, notes. A notebook displays them with a figure.
 
-    result["g OW-OW"] is a column of its curves, result.value("D of spce") a value; result.plot() is
+    result["g OW-OW"] is a column of its curves, result.value("D of spce") a value. result.plot() is
     a figure, result.to_dataframe() a table.
     """
 
@@ -125,7 +125,7 @@ class AnalysisResult(Displayed):
         return known[column]
 
     def value(self, name: str = "") -> Value:
-        """The value of this name; without a name the first. Raises KeyError with all names."""
+        """The value of this name. Without a name the first. Raises KeyError with all names."""
         for value in self.values:
             if name in ("", value.name):
                 return value
@@ -137,7 +137,7 @@ class AnalysisResult(Displayed):
         """A Matplotlib figure of its curves, which a notebook displays and `savefig` writes, as
         PNG, SVG or PDF by the extension. Bands are of one standard error.
 
-        curve : name of one of `curves`; default: a panel for each. Raises KeyError, ValueError
+        curve : name of one of `curves`. Default: a panel for each. Raises KeyError, ValueError
             without curves
         """
         from rigidmd.analysis.curve_figure import (  # Matplotlib is slow to import
@@ -157,7 +157,7 @@ class AnalysisResult(Displayed):
         """The columns of a curve with their errors, as in its CSV file; of an analysis without
         curves its values.
 
-        curve : name of one of `curves`; default: the first. Raises KeyError, ImportError without
+        curve : name of one of `curves`. Default: the first. Raises KeyError, ImportError without
             pandas
         """
         try:
@@ -169,7 +169,7 @@ class AnalysisResult(Displayed):
         return pandas.DataFrame(self.values, columns=list(Value._fields))
 
     def _curve(self, name: str) -> Curve:
-        """The curve of this name; without a name the first. Raises KeyError with all names."""
+        """The curve of this name. Without a name the first. Raises KeyError with all names."""
         for curve in self.curves:
             if name in ("", curve.file):
                 return curve

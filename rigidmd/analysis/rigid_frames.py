@@ -34,13 +34,13 @@ MAX_WRAPPED_MOVE = 0.4
 class RigidFrames:
     """Frames of a part of a run, for analyses. Molecules are whole and their paths continuous.
 
-    f frames, n molecules; Å, ps, u:
+    f frames, n molecules. Å, ps, u:
     time (f,), cell (f, 3, 3) rows a, b, c, infinite edges without a box
-    positions (f, n, 3) centres of mass, lab frame; Q (f, n, 3, 3) body to lab, principal axes
-    velocities (f, n, 3) lab frame, L (f, n, 3) angular momentum along the body's axes; None where
+    positions (f, n, 3) centres of mass, lab frame. Q (f, n, 3, 3) body to lab, principal axes
+    velocities (f, n, 3) lab frame, L (f, n, 3) angular momentum along the body's axes. None where
     no frame has them
     columns : samples of the same time by their names in `results[...]`
-    tensor : (l, 7) rows of pressure_tensor.csv, ps and bar, of the same time; None if the run wrote
+    tensor : (l, 7) rows of pressure_tensor.csv, ps and bar, of the same time. None if the run wrote
         none
     notes : on the choice and the correction of frames
     """
@@ -76,7 +76,7 @@ class RigidFrames:
 
     @cached_property
     def interval(self) -> float | None:
-        """Time between frames, ps; None if they are not evenly spaced."""
+        """Time between frames, ps. None if they are not evenly spaced."""
         gaps = np.diff(self.time)
         # files hold times in single precision
         rounding = 2 * float(np.spacing(np.float32(np.abs(self.time).max())))
@@ -197,7 +197,7 @@ def fit_frames(
 ) -> tuple[Bodies, list[str]]:
     """Bodies of frames, each array with a first axis (f,), and notes. Raises OutputError.
 
-    sites (f, s, 3); velocities alike or None; cells (f, 3, 3)
+    sites (f, s, 3). Velocities alike or None. Cells (f, 3, 3)
     wrapped : whether centres are wrapped into the box. Their paths are made continuous
     progress : called with the fraction done
     """
@@ -229,7 +229,7 @@ def fit_frames(
             )
         inside[1:] = inside[0] + np.cumsum(moves, axis=0)
         position = np.einsum("fni,fij->fnj", inside, cells)
-        notes.append("molecules are wrapped in the frames; their paths were made continuous")
+        notes.append("molecules are wrapped in the frames. Their paths were made continuous")
     return Bodies(position, Q, velocity, L), notes
 
 
@@ -249,7 +249,7 @@ def frames_of_folder(
     """
     if record.is_body:
         what = "a run of a single body, and analyses are for molecules"
-        raise OutputError(f"{record.folder} is {what}; `rigidmd report` shows it")
+        raise OutputError(f"{record.folder} is {what}. `rigidmd report` shows it")
     system, path = record.system, record.trajectory
     frame_limit = max(2, MOST_NUMBERS // (3 * system.site_count + 18 * len(system.model.species)))
     frames = read_frames(path, system.site_count, frame_limit)
@@ -333,7 +333,7 @@ def _rigid_frames(
     if not stage.keeps_momentum:
         notes.append(
             f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and"
-            " rotation, and changes spectra and viscosity; use nve or velocity_rescaling for these"
+            " rotation, and changes spectra and viscosity. Use nve or velocity_rescaling for these"
         )
     slack = 1e-6 * max(abs(last), 1.0)
     keep = np.flatnonzero((stored.time >= begin - slack) & (stored.time <= last + slack))
@@ -342,7 +342,7 @@ def _rigid_frames(
     if len(keep) < 2:
         raise OutputError(
             f"from {begin:g} ps on there {'is' if len(keep) == 1 else 'are'} {len(keep)} of"
-            f" {len(stored.time)} frames; an analysis needs at least two: run longer, or write"
+            f" {len(stored.time)} frames. An analysis needs at least two: run longer, or write"
             " frames more often (trajectory_interval_ps)"
         )
     velocities = None if stored.velocities is None else stored.velocities[keep]

@@ -19,7 +19,7 @@ Measured = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """The frames of independent runs of one system; at least one.
+    """The frames of independent runs of one system. At least one.
 
     Averages are over the frames of all runs, and limits of length apply to the sum of their
     lengths.
@@ -74,7 +74,7 @@ class Runs:
 
     @cached_property
     def interval(self) -> float | None:
-        """Time between frames, ps; None if they are not evenly spaced, or differently in different
+        """Time between frames, ps. None if they are not evenly spaced, or differently in different
         runs."""
         intervals = [run.interval for run in self.members]
         known = [interval for interval in intervals if interval is not None]

@@ -107,7 +107,7 @@ class Orders:
 
     An order is found from an orientation: two atoms that may be two sites of the template (one, if
     it is linear) and the mean position of all atoms give one, and the atoms are assigned to the
-    sites at the least sum of squares (the linear assignment problem); orientation and order are
+    sites at the least sum of squares (the linear assignment problem). Orientation and order are
     refined in turn. All pairs of atoms are tried at which distances agree within the limit.
     Symmetric templates fit in several orders.
 
@@ -313,7 +313,7 @@ class Orders:
 
     def _starts(self, centred: np.ndarray, slack: float) -> Iterator[np.ndarray]:
         """Orientations (k, 3, 3) of the template in which its anchors point at atoms (s, 3), whose
-        distances differ by no more than `slack`; the most likely ones first."""
+        distances differ by no more than `slack`. The most likely ones first."""
         anchors = self._anchors
         radii = np.linalg.norm(self._centred, axis=1)[anchors]
         off = np.abs(np.linalg.norm(centred, axis=1) - radii[:, None])  # (anchors, s)

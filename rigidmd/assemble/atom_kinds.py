@@ -29,7 +29,7 @@ def labels_of(molecule: Molecule) -> list[str]:
 
 
 def kinds_of(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """The label of every atom: its element, or the name of a site; X for massless ones. "?" marks a
+    """The label of every atom: its element, or the name of a site. X for massless ones. "?" marks a
     guess.
 
     An element in the file is accepted. A name counts if it is the name of a site or starts with an
@@ -62,7 +62,7 @@ def kinds_of(atoms: Atoms, species: list[Molecule]) -> list[str]:
         return element
 
     def without_element(mass: float) -> str:
-        """The site of this mass that has no element, such as a united atom; X, without mass, if
+        """The site of this mass that has no element, such as a united atom. X, without mass, if
         there is none."""
         near = {
             label

@@ -82,7 +82,7 @@ def build_body(
         "origin_acceleration",
         *(f"applied_{k}" for k in range(len(scene.applied))),
     }
-    why = "is the name of a force of the scene; choose another"
+    why = "is the name of a force of the scene. Choose another"
     faults += [f"applied: {name!r} {why}" for name in applied if name in taken]
     faults += _torque_errors(scene, axes, moments)
     if faults:
@@ -139,7 +139,7 @@ def has_finite_energy(system: BodySystem) -> bool:
 
 
 def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
-    """The state at the start; spin (3,) along the principal axes, relative to the frame."""
+    """The state at the start. Spin (3,) along the principal axes, relative to the frame."""
     start, time = scene.start, np.zeros(1)
     if isinstance(body.frame, InertialFrame):
         frame = np.zeros(3)
@@ -175,9 +175,9 @@ def _body_errors(
     if not rotates:
         yield from _rotation_keys_of_point(scene)
         if scene.body.pinned:
-            yield "body: a point at the pivot cannot move; set its inertia or its centre_of_mass_m"
+            yield "body: a point at the pivot cannot move. Set its inertia or its centre_of_mass_m"
         if added_mass.any():
-            yield "fluid.added_mass_kg: a point carries no fluid along; leave it out"
+            yield "fluid.added_mass_kg: a point carries no fluid along. Leave it out"
         for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m"):
             if fluid is not None and len(set(getattr(fluid, key))) > 1:
                 yield f"fluid.{key}: a point has no axes: give three equal numbers"
@@ -191,7 +191,7 @@ def _body_errors(
         at_centre, _ = principal(inertia_at_centre(scene))
         if axis_of_symmetry(at_centre) is None:
             these = (
-                f"these are {', '.join(f'{x:.4g}' for x in at_centre)} kg m²; name 'cuboid',"
+                f"these are {', '.join(f'{x:.4g}' for x in at_centre)} kg m². Name 'cuboid',"
                 " 'ellipsoid' or a solid"
             )
             yield (
@@ -203,13 +203,13 @@ def _body_errors(
             yield "changing_inertia: the centre of mass must be at the pivot of a pinned body"
         if scene.gravity is not None and not centre.any() and rotates:
             yield (
-                "gravity has no effect on a body pinned at its centre of mass; give"
+                "gravity has no effect on a body pinned at its centre of mass. Give"
                 " body.centre_of_mass_m"
             )
         for k, entry in enumerate(scene.applied):
             if entry.force_N is not None and not any(entry.at_m or ()):
                 yield (
-                    f"applied.{k}.force_N has no effect at the pivot; give its point of action,"
+                    f"applied.{k}.force_N has no effect at the pivot. Give its point of action,"
                     " at_m"
                 )
 
@@ -296,7 +296,7 @@ def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) ->
             name for name, other in SCHEMES.items() if other.order > 2 and not other.has_gradient
         ]
         what = "the gradient of the forces, which resistance and applied forces do not have"
-        return [f"run: {run.integrator} needs {what}; use one of {', '.join(plain)}"]
+        return [f"run: {run.integrator} needs {what}. Use one of {', '.join(plain)}"]
     frame = frame_of(scene)
     axis_changes = isinstance(frame, RotatingFrame) and not has_constant_direction(
         frame.angular_velocity
@@ -310,7 +310,7 @@ def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) ->
     split = [name for name, other in SCHEMES.items() if not other.exact_rotor]
     return [
         f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be"
-        f" of order 2; use one of {', '.join(split)} with rotor = 'split'"
+        f" of order 2. Use one of {', '.join(split)} with rotor = 'split'"
         for what, is_present in why.items()
         if is_present and scheme.exact_rotor
     ]
@@ -379,7 +379,7 @@ def inertia_at_centre(scene: BodyScene) -> np.ndarray:
 
 
 def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
-    """Centre and vertices (7, 3) of the homogeneous ellipsoid with this inertia tensor; one point
+    """Centre and vertices (7, 3) of the homogeneous ellipsoid with this inertia tensor. One point
     without inertia."""
     moments, axes = np.linalg.eigh(tensor)
     half = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))

@@ -161,7 +161,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         )
     check_memory(system)
     system.notes.extend([*scene.rounded_times(), *set_momenta(scene, model, state, start)])
-    stuck = "nothing moves and no temperature is defined; use thermostat = 'langevin'"
+    stuck = "nothing moves and no temperature is defined. Use thermostat = 'langevin'"
     system.notes.extend(
         f"stages.{k}: the total momentum is conserved and zero, so that {stuck}"
         for k, stage in enumerate(scene.stages)
@@ -181,7 +181,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     file = scene.structure.file
     off = f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å"
     system.notes.append(
-        f"{len(index)} molecules read from {file}; distances of atoms from rigid templates: {off}"
+        f"{len(index)} molecules read from {file}. Distances of atoms from rigid templates: {off}"
     )
     system.notes.extend(f"{file}: {note}" for note in start.notes)
     if faults := overlaps(system):
@@ -227,7 +227,7 @@ def field_terms(parts: SystemParts) -> dict[str, NamedTuple]:
         and parts.scene.run.remove_momentum_interval_ps
         and not conserved_momentum(parts.model, terms).any()
     ):
-        why = "fields or frozen molecules change all components of the total momentum; leave it out"
+        why = "fields or frozen molecules change all components of the total momentum. Leave it out"
         faults.append(f"run.remove_momentum_interval_ps: {why}")
     if faults:
         raise SceneError(parts.scene.source, faults)
@@ -235,7 +235,7 @@ def field_terms(parts: SystemParts) -> dict[str, NamedTuple]:
 
 
 def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndarray) -> np.ndarray:
-    """Positions (n, 3) wrapped to between the walls; unchanged without walls or box."""
+    """Positions (n, 3) wrapped to between the walls. Unchanged without walls or box."""
     if not isinstance(space, Orthorhombic):
         return position
     moved = position.copy()
@@ -251,7 +251,7 @@ def left_out(
     """What is not compiled for this scene, and why.
 
     charged : whether a site has a charge
-    without_tail : why the tail correction is omitted; empty if it is included
+    without_tail : why the tail correction is omitted. Empty if it is included
     """
     forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
     has_sums = any(name.endswith("_reciprocal") for name in terms)

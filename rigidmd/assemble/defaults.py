@@ -2,7 +2,7 @@
 in.
 
 A resolved scene runs to the same bits as the original scene. Three values stay open in it: an
-integrator "auto", which a pilot run chooses. The number of threads, on which results do not depend;
+integrator "auto", which a pilot run chooses. The number of threads, on which results do not depend,
 and the grid of PME where another cell of the same lattice replaces a cell with a large tilt (see
 `SceneWithDefaults.pme_grid`).
 """
@@ -159,7 +159,7 @@ def _with_electrostatics(
 
 
 def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
-    """Why a scene has no tail correction by default; empty if it has one."""
+    """Why a scene has no tail correction by default. Empty if it has one."""
     forces = scene.forces
     if not forces.lennard_jones:
         return "forces.lennard_jones is false"
@@ -194,7 +194,7 @@ def is_homogeneous(composition: Composition) -> bool:
 
 
 def electrostatics_module(forces: Forces) -> ModuleType | None:
-    """The module of `forces` with the method of electrostatics; None for electrostatics =
+    """The module of `forces` with the method of electrostatics. None for electrostatics =
     "none"."""
     name = ELECTROSTATICS[forces.electrostatics or "none"].module
     return import_module(f"rigidmd.forces.{name}") if name else None

@@ -246,7 +246,7 @@ class _Matcher:
         known: int,
     ) -> dict[int, str]:
         """Write the species of molecules `members`, of which `groups` are the possible ones, into
-        `matched`. Returns error messages by molecule; `known` is the number of earlier ones."""
+        `matched`. Returns error messages by molecule. `known` is the number of earlier ones."""
         faults = {}
         # (groups, m)
         rms = np.array([np.where(g.fits, g.assigned.fit.rms, np.inf) for g in groups])

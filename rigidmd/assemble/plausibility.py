@@ -43,7 +43,7 @@ class Quantity(NamedTuple):
     heaviest_site: float = inf  # u, of models for which the limits hold: those of atoms
 
     def outside(self, value: float, where: str) -> str:
-        """A sentence on a value outside the limits; empty for a plausible one and for 0."""
+        """A sentence on a value outside the limits. Empty for a plausible one and for 0."""
         size = abs(value)
         if size == 0 or self.least <= size <= self.most:
             return ""
@@ -104,7 +104,7 @@ def scene_errors(
     elif cutoff is not None and scene.forces.tail_correction and cutoff < contact < inf:
         faults.append(
             "forces.tail_correction needs a cutoff beyond the contact of two molecules,"
-            f" {contact:.3g} Å; cutoff_A is {cutoff:g}"
+            f" {contact:.3g} Å. cutoff_A is {cutoff:g}"
         )
     return faults
 

@@ -61,7 +61,7 @@ def scene_from_atoms(
     """The scene of an `ase.Atoms`, whose atoms become molecules like the atoms of a structure file.
 
     Cell, periodicity (along all axes or none) and momenta are used. Massless sites, such as M of
-    TIP4P, need not be among the atoms. The scene contains the atoms; a run in a folder writes them
+    TIP4P, need not be among the atoms. The scene contains the atoms. A run in a folder writes them
     there.
 
     Atoms that do not match the models are found when the system is built.
@@ -133,7 +133,7 @@ def atoms_errors(atoms: Any) -> list[str]:
     import ase
 
     if not isinstance(atoms, ase.Atoms):
-        hint = "; ase.io.read returns a list of them for ':'" if isinstance(atoms, list) else ""
+        hint = ". ase.io.read returns a list of them for ':'" if isinstance(atoms, list) else ""
         return [f"are of the type {type(atoms).__name__}, must be one ase.Atoms{hint}"]
     if len(atoms) == 0:
         return ["there are no atoms"]

@@ -43,7 +43,7 @@ def species_of(scene: MolecularScene) -> list[Molecule]:
     names = [m.name for m in species]
     twice = sorted({name for name in names if names.count(name) > 1})
     faults += [
-        f"molecules: {name} appears twice; give these species different names" for name in twice
+        f"molecules: {name} appears twice. Give these species different names" for name in twice
     ]
     if faults:
         raise SceneError(scene.source, faults)
@@ -131,7 +131,7 @@ def split_frozen(
             species.append(species[k])
             frozen.append(True)
     if frozen and all(frozen[k] for k in np.unique(index)):
-        faults.append("molecules: all are frozen; nothing would move")
+        faults.append("molecules: all are frozen. Nothing would move")
     return species, index, np.array(frozen), faults
 
 
@@ -254,7 +254,7 @@ def _one_molecule(path: Path, atoms: Atoms, elements: list[str]) -> list[str]:
 
 
 def _parts(symbols: list[str], position: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
-    """Number (n,) of the part of each atom; atoms within bonding distance are in one part."""
+    """Number (n,) of the part of each atom. Atoms within bonding distance are in one part."""
     from ase import Atoms as AseAtoms
     from ase.neighborlist import natural_cutoffs, neighbor_list
     from scipy.sparse import coo_array

@@ -19,8 +19,8 @@ DISTRIBUTIONS = {
 
 
 def describe_stage(stage: Stage) -> list[str]:
-    """Two lines: steps, thermostat and barostat; sampled distribution and conserved quantities. For
-    a minimisation: the minimised quantity; the limits of convergence."""
+    """Two lines: steps, thermostat and barostat. Sampled distribution and conserved quantities. For
+    a minimisation: the minimised quantity. The limits of convergence."""
     if stage.is_minimisation:
         what = "the potential energy"
         limits = [f"forces of {stage.force_limit_kJ_mol_A:g} kJ/(mol Å)"]
@@ -32,9 +32,9 @@ def describe_stage(stage: Stage) -> list[str]:
             )
             limits.append(f"a pressure within {stage.pressure_limit_bar:g} bar")
         return [
-            f"{stage.label}: to a minimum of {what}; no time passes and momenta do not change",
+            f"{stage.label}: to a minimum of {what}. No time passes and momenta do not change",
             (
-                f"limits: {', '.join(limits[:-1])} and {limits[-1]}; at most"
+                f"limits: {', '.join(limits[:-1])} and {limits[-1]}. At most"
                 f" {stage.most_iterations} iterations"
             ),
         ]
@@ -82,7 +82,7 @@ def _barostat(stage: Stage) -> str:
             f", a move every {f'{stage.moves_every} steps' if stage.moves_every > 1 else 'step'}"
         )
     water = ", of water" if stage.compressibility == COMPRESSIBILITY else ""
-    return f"{text}; compressibility {stage.compressibility:g}/bar{water}"
+    return f"{text}. Compressibility {stage.compressibility:g}/bar{water}"
 
 
 def _pressure(stage: Stage) -> str:

@@ -1,4 +1,4 @@
-"""The start of a scene of molecules: positions, orientations and momenta; overlaps of molecules."""
+"""The start of a scene of molecules: positions, orientations and momenta. Overlaps of molecules."""
 
 from collections.abc import Callable
 from math import inf
@@ -35,7 +35,7 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
     if not np.array_equal(configuration.basis, SAME_BASIS):
         raise SceneError(
             scene.source,
-            ["box.vacuum_A: the cell has a large tilt; give an equivalent cell without"],
+            ["box.vacuum_A: the cell has a large tilt. Give an equivalent cell without"],
         )
     k, cell = "xyz".index(scene.box.vacuum_axis), configuration.cell.copy()
     added = length / np.linalg.norm(cell[k]) * cell[k]

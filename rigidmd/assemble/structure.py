@@ -121,7 +121,7 @@ def read_structure(
 
 
 def with_reduced_cell(configuration: Configuration, whose: str, may_rotate: bool) -> Configuration:
-    """The same configuration in a cell with small tilts; rotated, if this allows a longer cutoff.
+    """The same configuration in a cell with small tilts. Rotated, if this allows a longer cutoff.
     `whose` is the owner of the lattice, for the note."""
     if configuration.cell is None:
         return configuration
@@ -138,7 +138,7 @@ def with_reduced_cell(configuration: Configuration, whose: str, may_rotate: bool
         f"{whose} lattice is given by the cell with {used}, in place of {describe_cell(given_cell)}"
     )
     if not np.array_equal(rotation, np.eye(3)):
-        note += "; rotated, contents included"
+        note += ". Rotated, contents included"
         configuration = configuration._replace(
             position=configuration.position @ rotation.T,
             rotation=rotation @ configuration.rotation,
@@ -371,7 +371,7 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _other_model(molecule: Molecule, saved: np.ndarray) -> str:
-    """The difference between a molecule and a saved one with this `Molecule.fingerprint`; empty if
+    """The difference between a molecule and a saved one with this `Molecule.fingerprint`. Empty if
     there is none."""
     fingerprint = np.array(molecule.fingerprint)
     names = ("mass, u", "moment of inertia 1, u Å²", "moment 2", "moment 3", "number of sites")
@@ -390,7 +390,7 @@ def _read_state(path: Path, species: list[Molecule]) -> Configuration:
     known = [molecule.name for molecule in species]
     if missing := [name for name in saved.names if name not in known]:
         raise StructureError(
-            str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"]
+            str(path), [f"holds {', '.join(missing)}. The scene has {', '.join(known)}"]
         )
     of_name = {molecule.name: molecule for molecule in species}
     models = () if saved.models is None else zip(saved.names, saved.models, strict=True)

@@ -56,7 +56,7 @@ MARGIN = 30
 def error_of_step(
     species: list[Molecule], temperature: float, scheme: Scheme, timestep_fs: float
 ) -> float:
-    """`step_error` for the fastest motion of these molecules at a temperature, K; 0 without one."""
+    """`step_error` for the fastest motion of these molecules at a temperature, K, 0 without one."""
     fastest = fastest_motion(species, temperature)
     return 0.0 if fastest is None else step_error(scheme, timestep_fs * FEMTOSECOND / fastest.time)
 
@@ -76,7 +76,7 @@ class FastMotion(NamedTuple):
 
 
 def fastest_motion(species: list[Molecule], temperature: float) -> FastMotion | None:
-    """The fastest motion at a temperature, K; None without molecules or temperature."""
+    """The fastest motion at a temperature, K. None without molecules or temperature."""
     motions, thermal = [], BOLTZMANN * temperature
     for m in species if thermal > 0 else ():
         diameter = max(
@@ -156,7 +156,7 @@ def with_time_steps(
 
 
 def describe_step(scene: MolecularScene, species: list[Molecule], k: int) -> str:
-    """The motion that limits the step of stage k, and the bias that is expected; empty if there is
+    """The motion that limits the step of stage k, and the bias that is expected. Empty if there is
     no such motion."""
     given = {index: (stage, temperature) for index, stage, temperature in _given_steps(scene)}
     if k not in given:
@@ -173,10 +173,10 @@ def describe_step(scene: MolecularScene, species: list[Molecule], k: int) -> str
         f" {100 * error:.1g} %"
     )
     if stage.is_hybrid:
-        return f"{text}; averages have none"
+        return f"{text}. Averages have none"
     if stage.has_thermostat:
         bias = _bias_per_error(stage) * error
-        text += f"; bias of U about {bias:.1g} kT per degree of freedom"
+        text += f". Bias of U about {bias:.1g} kT per degree of freedom"
     return text
 
 
@@ -187,7 +187,7 @@ def _moving(scene: MolecularScene, species: list[Molecule]) -> list[Molecule]:
 
 
 def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
-    """The stages other than minimisations with a given step: index, stage and temperature, K; 0 if
+    """The stages other than minimisations with a given step: index, stage and temperature, K, 0 if
     it is not known."""
     temperature = scene.start.temperature_K or 0.0
     for k, stage in enumerate(scene.stages):
@@ -234,7 +234,7 @@ def _sentences_on_steps(
 
 
 def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
-    """What is wrong with the step of a stage for a motion at a temperature, K; empty if nothing
+    """What is wrong with the step of a stage for a motion at a temperature, K. Empty if nothing
     is."""
     time, size, unit, name, does = fastest
     longest, dt = fastest.longest_step(stage), stage.step
@@ -284,7 +284,7 @@ def with_precision(
     """A scene with its precision and, for "auto", the reason: mixed if the time-step error
     hides that of single precision in every stage, else double.
 
-    species : those that are not frozen; temperature : of velocities from a file, K; force_error :
+    species : those that are not frozen; temperature : of velocities from a file, K. force_error :
     of an Ewald sum, of the force on a site, u Å/ps²
     """
     if scene.precision != "auto":

@@ -40,7 +40,7 @@ from rigidmd.commands.arguments import (
         type=int,
         default=3,
         metavar="N",
-        help="timings of each run (default: 3); 1 shows no spread",
+        help="timings of each run (default: 3), 1 shows no spread",
     ),
     argument(
         "--averages",

@@ -34,7 +34,7 @@ class _List(argparse.Action):
         type=lambda text: [name.strip() for name in text.split(",") if name.strip()],
         default=[],
         metavar="NAMES",
-        help="these analyses, separated by commas (default: all); `--list` names them",
+        help="these analyses, separated by commas (default: all). `--list` names them",
     ),
     argument(
         "--from",
@@ -76,7 +76,7 @@ class _List(argparse.Action):
         metavar="FILE.py",
         help=(
             "run this Python file first, which may define analyses with"
-            " @rigidmd.analysis.register; may be repeated"
+            " @rigidmd.analysis.register, may be repeated"
         ),
     ),
     argument(
@@ -137,7 +137,7 @@ def _analyse(options: Options) -> int:
         print(f"  {note}")
     _print_results(done.results, done.failed, options.verbose)
     print(
-        f"\n{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd"
+        f"\n{len(done.files)} files in {options.folder}, values in {done.files[0].name}. `rigidmd"
         " report` shows them"
     )
     return FAILED if options.only and done.failed else 0

@@ -106,8 +106,8 @@ TRUST = argument(
     default=[],
     metavar="FILE.py",
     help=(
-        "let [[forces.custom]] of the scene run this Python file, or a copy of it; it is code and"
-        " can do whatever you can; may be repeated"
+        "let [[forces.custom]] of the scene run this Python file, or a copy of it. It is code and"
+        " can do whatever you can, may be repeated"
     ),
 )
 #: SCENE, --set and --trust, which `read_scene` reads.
@@ -121,7 +121,7 @@ SCENE = (
         dest="overrides",
         help=(
             "override a key of the scene by its dotted path (an entry of a list by its number,"
-            " counted from 0, or a stage by its name); KEY= without a value removes the key; may be"
+            " counted from 0, or a stage by its name). KEY= without a value removes the key, may be"
             " repeated"
         ),
     ),
@@ -221,6 +221,6 @@ def print_page(path: Path, notes: list[str]) -> None:
     for note in notes:
         print(note)
     print(
-        f"{path}: {path.stat().st_size / 1e6:.2g} MB; open it in a browser:"
+        f"{path}: {path.stat().st_size / 1e6:.2g} MB. Open it in a browser:"
         f" {shlex.quote(str(path.resolve()))}"
     )

@@ -39,7 +39,7 @@ def _check(options: Options) -> int:
         if options.program or options.profile:
             option = "--program" if options.program else "--profile"
             raise SceneError(
-                scene.source, [f"{option} is for molecules; the step of a body is one loop"]
+                scene.source, [f"{option} is for molecules. The step of a body is one loop"]
             )
         body = build_body(scene)
         print(describe_system(body))

@@ -26,7 +26,7 @@ from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError, Wordin
 EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
   rigidmd check water.toml                  describe the run without running it
-  rigidmd run water.toml                    run it; results go to runs/water
+  rigidmd run water.toml                    run it. Results go to runs/water
   rigidmd run water.toml --set stages.production.timestep_fs=4 -o runs/water4
   rigidmd energy water.toml --unit kcal/mol
   rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml    one body: a top, with figures
@@ -102,13 +102,13 @@ def main(arguments: list[str] | None = None) -> int:
         ):  # zipfile, too, raises another one instead
             what = getattr(options, "scene", "this")
             print(
-                f"rigidmd: {what}: not enough memory{_free()}; take fewer molecules or samples",
+                f"rigidmd: {what}: not enough memory{_free()}. Take fewer molecules or samples",
                 file=sys.stderr,
             )
             return BAD_INPUT
         if any(words in str(cause) for cause in causes for words in OUT_OF_MEMORY):
             print(
-                "rigidmd: not enough memory to load the program; raise the limit (ulimit -v)",
+                "rigidmd: not enough memory to load the program. Raise the limit (ulimit -v)",
                 file=sys.stderr,
             )
             return BAD_INPUT
@@ -116,7 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _free() -> str:
-    """How much memory is free, for messages; empty if not even that can be found out."""
+    """How much memory is free, for messages. Empty if not even that can be found out."""
     from rigidmd.core.process import format_gigabytes, free_memory
 
     try:
@@ -126,12 +126,12 @@ def _free() -> str:
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
-    """The options of a command line; an unknown command or option ends the process with a
+    """The options of a command line. An unknown command or option ends the process with a
     suggestion."""
     parser, commands = _parser(words[0] if words else "")
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in commands:
-        suggestion = did_you_mean(name, commands) or "; `rigidmd --help` lists them"
+        suggestion = did_you_mean(name, commands) or ". `rigidmd --help` lists them"
         parser.error(f"unknown command {name!r}{suggestion}")
     options, unknown = parser.parse_known_args(words)
     if unknown and name is not None:

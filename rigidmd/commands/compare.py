@@ -9,7 +9,7 @@ from rigidmd.commands.arguments import Options, argument, command
 
 @command(
     50,
-    "report where two runs diverge and how their inputs and versions differ; exit code 0 if they"
+    "report where two runs diverge and how their inputs and versions differ. Exit code 0 if they"
     " are the same to the last bit, else 1",
     "rigidmd compare runs/water runs/water2",
     argument("first", metavar="RUN", help="folder of a run"),

@@ -36,7 +36,7 @@ def _energy(options: Options) -> int:
         if options.unit is not None:
             raise SceneError(
                 scene.source,
-                [f"--unit {options.unit} is for molecules; the energy of a body is in J"],
+                [f"--unit {options.unit} is for molecules. The energy of a body is in J"],
             )
         energies, unit = Simulation(scene)._start_energy(), "J"
     else:

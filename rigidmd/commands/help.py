@@ -11,7 +11,7 @@ from rigidmd.commands.arguments import Options, argument, command
         "chapter",
         nargs="?",
         metavar="CHAPTER",
-        help="chapter to print, on a terminal with $PAGER; or a word",
+        help="chapter to print, on a terminal with $PAGER, or a word",
     ),
 )
 def _help(options: Options) -> int:

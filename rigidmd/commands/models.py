@@ -43,7 +43,7 @@ from rigidmd.errors import MoleculeError
         "--output",
         metavar="FILE",
         help=(
-            "picture file: .png, .svg or .pdf; with --from the file of the model (default: the"
+            "picture file: .png, .svg or .pdf. With --from the file of the model (default: the"
             " structure's, .toml)"
         ),
     ),
@@ -66,7 +66,7 @@ def _models(options: Options) -> int:
         if draws:
             raise MoleculeError("models", ["--draw and -o need the NAME of a model"])
         print(models_table([load_model(name) for name in available_models()]))
-        print("\n`rigidmd models NAME` shows one in full; --draw draws it")
+        print("\n`rigidmd models NAME` shows one in full. --draw draws it")
         return 0
     molecule = (
         read_molecule(Path(options.model))
@@ -103,7 +103,7 @@ def _write_model(options: Options) -> int:
     path = Path(options.output or f"{geometry.stem}.toml")
     if options.draw:
         raise MoleculeError(
-            "models", [f"--from writes a model; draw it afterwards: rigidmd models {path} --draw"]
+            "models", [f"--from writes a model. Draw it afterwards: rigidmd models {path} --draw"]
         )
     file, molecule, notes = model_from_geometry(geometry, parameters, options.custom_name)
     check_target(
@@ -114,6 +114,6 @@ def _write_model(options: Options) -> int:
     for note in [*notes, *molecule_warnings(molecule)]:
         warn(note)
     print("next:")
-    print(f"  rigidmd models {shlex.quote(str(path))}    shows it; --draw draws it")
+    print(f"  rigidmd models {shlex.quote(str(path))}    shows it. --draw draws it")
     print(f'a scene uses it by a line of its [[molecules]]: file = "{path.name}"')
     return 0

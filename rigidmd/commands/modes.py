@@ -124,7 +124,7 @@ def _describe(modes: "NormalModes") -> Iterator[str]:
     )
     if len(unstable):
         yield (
-            f"  unstable: {', '.join(f'{x:.4g}' for x in unstable)} cm⁻¹; displace the molecules"
+            f"  unstable: {', '.join(f'{x:.4g}' for x in unstable)} cm⁻¹. Displace the molecules"
             " and repeat"
         )
     for kind in ("translation", "libration"):

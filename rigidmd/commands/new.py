@@ -10,7 +10,7 @@ from rigidmd.commands.arguments import Options, argument, command
     20,
     "copy a shipped scene, notebook or script to start from",
     "rigidmd new water -o mine.toml",
-    argument("name", metavar="NAME", help="which one; `rigidmd examples` lists them"),
+    argument("name", metavar="NAME", help="which one. `rigidmd examples` lists them"),
     argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)"),
     argument("--force", action="store_true", help="replace that file"),
 )
@@ -24,7 +24,7 @@ def _new(options: Options) -> int:
     written = copy_example(example, path, options.force, read)
     if example.name != options.name:
         print(
-            f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}); this is"
+            f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}). This is"
             f" {example.name}"
         )
     print(f"{path}: {example.about}")
@@ -33,7 +33,7 @@ def _new(options: Options) -> int:
     print("next:")
     quoted = shlex.quote(str(path))
     if example.kind == "script":
-        print(f"  python {quoted}    runs it; `rigidmd help extending` explains it")
+        print(f"  python {quoted}    runs it. `rigidmd help extending` explains it")
         return 0
     if example.kind == "notebook":
         print(
@@ -43,6 +43,6 @@ def _new(options: Options) -> int:
         print(f"  jupyter lab {quoted}")
         return 0
     print(f"  rigidmd check {quoted}    describes the run without running it")
-    print(f"  rigidmd run {quoted}      runs it; results go to {Path('runs') / path.stem}")
-    print("its comment describes what to look at; `rigidmd help scene` explains every table")
+    print(f"  rigidmd run {quoted}      runs it. Results go to {Path('runs') / path.stem}")
+    print("its comment describes what to look at. `rigidmd help scene` explains every table")
     return 0

@@ -33,7 +33,7 @@ DURATION = (
         type=time_ps,
         metavar="TIME",
         help=(
-            "let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a"
+            "let the last stage end at this time of the run, such as 200ps or 1.5ns. Lengthens a"
             " finished run"
         ),
     ),
@@ -57,8 +57,8 @@ DURATION = (
         "--resume",
         action="store_true",
         help=(
-            "continue from the last checkpoint in that folder, with bitwise identical results;"
-            " without one, start"
+            "continue from the last checkpoint in that folder, with bitwise identical results."
+            " Without one, start"
         ),
     ),
     add_engine,
@@ -72,7 +72,7 @@ def run(options: Options) -> int:
     if options.threads is not None:
         if isinstance(scene, BodyScene):
             raise SceneError(
-                scene.source, ["--threads is for molecules; a single body uses one thread"]
+                scene.source, ["--threads is for molecules. A single body uses one thread"]
             )
         scene = read_scene(options, threads=options.threads)
     if options.until is not None:

@@ -8,11 +8,11 @@ from rigidmd.commands.arguments import Options, argument, command, output_folder
 
 @command(
     110,
-    "run the built-in stress tests, each compared with a known answer; exit code 1 if an"
+    "run the built-in stress tests, each compared with a known answer. Exit code 1 if an"
     " error is undetected",
     "rigidmd stability --quick --case near_linear --case water_steps",
     argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes"),
-    argument("--case", action="append", metavar="NAME", help="only this case; may be repeated"),
+    argument("--case", action="append", metavar="NAME", help="only this case, may be repeated"),
     argument("-v", "--verbose", action="store_true", help="list the warnings of the runs"),
     *output_folder("runs/stability"),
     scene="stability",

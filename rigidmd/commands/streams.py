@@ -62,7 +62,7 @@ def checked_streams(lasting: bool) -> Iterator[None]:
     """Within it a stream that cannot be written raises OutputError, or BrokenPipeError if its
     reader has gone.
 
-    lasting : raise neither; the stream goes silent
+    lasting : raise neither. The stream goes silent
     """
     stdout: Any = _Checked(sys.stdout, lasting)
     stderr: Any = _Checked(sys.stderr, lasting)

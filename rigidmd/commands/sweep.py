@@ -41,8 +41,8 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
         metavar="KEY=A,B,...",
         dest="sets",
         help=(
-            "values of a key of the scene (entries of a list are counted from 0); KEY=1..8 for"
-            " whole numbers; KEY=VALUE the same for all; KEY,KEY=A,B for keys that vary together;"
+            "values of a key of the scene (entries of a list are counted from 0). KEY=1..8 for"
+            " whole numbers. KEY=VALUE the same for all. KEY,KEY=A,B for keys that vary together,"
             " may be repeated: all combinations run"
         ),
     ),
@@ -70,7 +70,7 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
         type=seconds,
         metavar="H:MM:SS",
         help=(
-            "stop shortly before this time is up, with checkpoints and exit code 75; with --to"
+            "stop shortly before this time is up, with checkpoints and exit code 75. With --to"
             " slurm of each job"
         ),
     ),
@@ -83,7 +83,7 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
         "--to",
         choices=["slurm", "commands"],
         help=(
-            "run nothing, and write a script for an array of jobs, a point each; or print the"
+            "run nothing, and write a script for an array of jobs, a point each, or print the"
             " commands that run the points, a line each, for any scheduler"
         ),
     ),
@@ -97,7 +97,7 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
         metavar="KEY",
         help=(
             "extrapolate all averages to a step of 0, with their errors, over this time step of the"
-            " last stage, which --set varies; `rigidmd analyse` has the same option for what it"
+            " last stage, which --set varies. `rigidmd analyse` has the same option for what it"
             " measures"
         ),
     ),
@@ -135,17 +135,17 @@ def _check(options: Options) -> None:
     if options.to == "slurm" and options.walltime is None:
         raise OutputError("--to slurm needs --walltime, the time of each job: --walltime 4:00:00")
     if options.to == "commands" and options.walltime is not None:
-        raise OutputError("--to commands starts no run; add --walltime to the commands themselves")
+        raise OutputError("--to commands starts no run. Add --walltime to the commands themselves")
     alone = [name for name in ("to", "collect", "scheduler") if getattr(options, name)]
     if len(alone) > 1:
         raise OutputError(f"--{alone[0]} and --{alone[1]} cannot be combined")
     if options.extrapolate is not None and options.to is not None:
         raise OutputError(
-            "--extrapolate needs results; when all points have ended, use it with --collect"
+            "--extrapolate needs results. When all points have ended, use it with --collect"
         )
     if options.collect and options.force:
         raise OutputError(
-            "--collect only reads existing results; leave out --force, which removes them"
+            "--collect only reads existing results. Leave out --force, which removes them"
         )
 
 
@@ -157,7 +157,7 @@ def _write_commands(options: Options, manifest: "Manifest") -> None:
         return
     threads = options.threads or 1
     path, count = write_slurm_script(manifest, options.walltime, threads, options.trust)
-    print(f"{path}: {count} points; submit it: sbatch {shlex.quote(str(path))}")
+    print(f"{path}: {count} points. Submit it: sbatch {shlex.quote(str(path))}")
     words = ["rigidmd", "sweep", options.scene, "-o", str(manifest.folder), "--collect"]
     print(f"  when all have ended: {shlex.join(words)}")
 
@@ -252,7 +252,7 @@ def _print_results(manifest: "Manifest", step: str | None) -> None:
 
 
 def print_limits(manifest: "Manifest", step: str) -> list[str]:
-    """Write and print what the averages of a sweep are at a step of 0; the names of the files."""
+    """Write and print what the averages of a sweep are at a step of 0. The names of the files."""
     from rigidmd.studies.sweep.limits import extrapolate_sweep, write_limits
 
     limits = extrapolate_sweep(manifest, step)

@@ -20,8 +20,8 @@ def _engine(parser: argparse.ArgumentParser) -> None:
 
 @command(
     90,
-    "compute a scene on two engines and compare energies by term, forces, virial, and a short run;"
-    " exit code 0 if they agree, else 1",
+    "compute a scene on two engines and compare energies by term, forces, virial, and a short run."
+    " Exit code 0 if they agree, else 1",
     "rigidmd verify water_pme.toml --engine lammps --ranks 2",
     *SCENE,
     _engine,

@@ -56,7 +56,7 @@ def _temperatures(text: str) -> list[float]:
         dest="overrides",
         help=(
             "key of [forces] of a scene, such as forces.mixing=geometric, or forces.custom with"
-            " pair potentials; may be repeated"
+            " pair potentials, may be repeated"
         ),
     ),
     TRUST,

@@ -1,6 +1,6 @@
 """Display of values in notebooks. Packages above register functions for values of packages below.
 
-A module in `PROVIDERS` is imported when a value is first displayed; `rigidmd` names
+A module in `PROVIDERS` is imported when a value is first displayed. `rigidmd` names
 `rigidmd.view.notebook`.
 """
 
@@ -12,7 +12,7 @@ PROVIDERS: list[str] = []
 
 @singledispatch
 def html(value: object) -> str | None:
-    """HTML of a value, by a function registered for its type; None without one."""
+    """HTML of a value, by a function registered for its type. None without one."""
     return None
 
 

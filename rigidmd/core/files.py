@@ -24,7 +24,7 @@ APPEND_FLAGS = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY"
 
 
 def unreadable_reason(path: Path, largest: float = inf) -> str:
-    """Why a file cannot be read; empty if it can be. Pipes and devices are rejected, because they
+    """Why a file cannot be read. Empty if it can be. Pipes and devices are rejected, because they
     may never end.
 
     largest : greatest size in bytes
@@ -42,12 +42,12 @@ def unreadable_reason(path: Path, largest: float = inf) -> str:
     if not stat.S_ISREG(status.st_mode):
         return "is a pipe, a socket or a device, not a file"
     if status.st_size > largest:
-        return f"has {status.st_size / 1e6:.4g} MB; files of up to {largest / 1e6:.4g} MB are read"
+        return f"has {status.st_size / 1e6:.4g} MB. Files of up to {largest / 1e6:.4g} MB are read"
     return ""
 
 
 def untrusted_reason(found: os.stat_result) -> str:
-    """Why a file or folder may have been written by others than this user and root; empty if it
+    """Why a file or folder may have been written by others than this user and root. Empty if it
     cannot.
 
     found : of `os.lstat` or `os.fstat`. Systems without user numbers have no such check.
@@ -122,7 +122,7 @@ def create_empty_file(path: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Flush a file or a folder to the disk; on Windows, which opens no folders, a file."""
+    """Flush a file or a folder to the disk. On Windows, which opens no folders, a file."""
     if sys.platform == "win32" and path.is_dir():
         return
     handle = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
@@ -139,7 +139,7 @@ class AppendedFile:
     A new file replaces an existing one. An existing file is continued after `cut` has been called.
     Links are not followed.
 
-    kept : an earlier value of the property `kept`, at which the file is continued; None starts a
+    kept : an earlier value of the property `kept`, at which the file is continued. None starts a
         new file
     patched : offset and original value of bytes that `patch` replaces
     """
@@ -155,7 +155,7 @@ class AppendedFile:
                 create_empty_file(path)
             elif path.is_symlink() or (reason := unreadable_reason(path)):
                 raise OutputError(
-                    f"{path}: {'is a link' if path.is_symlink() else reason}; the run cannot"
+                    f"{path}: {'is a link' if path.is_symlink() else reason}. The run cannot"
                     " continue it"
                 )
             self._file = os.fdopen(os.open(path, APPEND_FLAGS), "r+b", buffering=0)
@@ -220,7 +220,7 @@ class AppendedFile:
             self._file.close()
 
     def _difference(self, offset: int, first: bytes) -> str:
-        """How the file differs from its size and checksum; empty if it does not."""
+        """How the file differs from its size and checksum. Empty if it does not."""
         checksum, left = 0, self._size
         while left and (piece := bytearray(self._file.read(min(left, CHUNK)))):
             if left == self._size:

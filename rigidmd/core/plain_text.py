@@ -12,7 +12,7 @@ UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\"\\]")
 
 
 def in_comment(text: str) -> str:
-    """A text in one line for comments and titles; characters with a meaning in some language become
+    """A text in one line for comments and titles. Characters with a meaning in some language become
     underscores."""
     return re.sub(r"[^\w .,:;=()+/@-]", "_", text)
 
@@ -45,18 +45,18 @@ LONGEST_NAME, MOST_NAMES = 60, 1000
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """'; did you mean ...?' for an unknown name; empty if no known name is similar."""
+    """'; did you mean ...?' for an unknown name. Empty if no known name is similar."""
     return suggestion(similar_names(name, known))
 
 
 def suggestion(names: list[str]) -> str:
-    """'; did you mean ...?' for these names; empty for none."""
+    """'; did you mean ...?' for these names. Empty for none."""
     return f"; did you mean {' or '.join(names)}?" if names else ""
 
 
 def similar_names(name: str, known: Iterable[str]) -> list[str]:
     """Known names that an unknown one may stand for: those that differ only in case and
-    punctuation; else those that start with it, such as a key without its unit, or end with it; else
+    punctuation, else those that start with it, such as a key without its unit, or end with it, else
     the one with the most similar spelling."""
     known = list(known)
     if len(name) > LONGEST_NAME or len(known) > MOST_NAMES:

@@ -77,7 +77,7 @@ RESERVED = 0.05  # fraction of the free memory that is reserved for Python, mach
 
 
 def free_memory() -> float:
-    """Free bytes of this machine, within the limits of container and process; infinite where the
+    """Free bytes of this machine, within the limits of container and process. Infinite where the
     system has no data."""
     if sys.platform != "linux":
         import psutil
@@ -92,7 +92,7 @@ def free_memory() -> float:
 
 
 def memory_shortage(needed: float, what: str) -> str:
-    """Why `what` cannot have this many bytes of memory; empty if it can."""
+    """Why `what` cannot have this many bytes of memory. Empty if it can."""
     free = free_memory()
     if needed <= (1 - RESERVED) * free:
         return ""
@@ -107,7 +107,7 @@ def format_gigabytes(size: float) -> str:
 
 
 def address_space_left() -> float:
-    """Bytes of address space left by the limit of this process (`ulimit -v`); infinite without a
+    """Bytes of address space left by the limit of this process (`ulimit -v`). Infinite without a
     limit."""
     if sys.platform == "win32":
         return inf
@@ -125,13 +125,13 @@ def check_address_space() -> None:
         return
     raise SettingError(
         f"not enough memory: the program and its libraries need {format_gigabytes(LIBRARY_BYTES)}"
-        f" of addresses, and the limit of this process leaves {format_gigabytes(left)}; raise it"
+        f" of addresses, and the limit of this process leaves {format_gigabytes(left)}. Raise it"
         " (ulimit -v)"
     )
 
 
 def _system_number(file: str, label: str = "", absent: float = inf) -> float:
-    """The number after a label in a system file; `absent` if there is none."""
+    """The number after a label in a system file. `absent` if there is none."""
     try:
         words = Path(file).read_text(encoding="ascii", errors="replace").split()
         return float(words[words.index(label) + 1 if label else 0])

@@ -70,7 +70,7 @@ class Example(NamedTuple):
 
 
 def examples(files: str = "*.toml") -> list[Example]:
-    """The shipped scenes, or the examples among other files, sorted by name; numbers within names
+    """The shipped scenes, or the examples among other files, sorted by name. Numbers within names
     by their value."""
     shipped = []
     for path in SYSTEMS.glob(files):
@@ -107,7 +107,7 @@ def find_example(name: str) -> Example:
 
 
 def series_of(name: str) -> list[str]:
-    """The scenes NAME_1, NAME_2, ...; empty if there are none."""
+    """The scenes NAME_1, NAME_2, .... Empty if there are none."""
     return [
         example.name
         for example in examples()
@@ -154,7 +154,7 @@ def contents() -> dict[str, dict[str, str]]:
 
 
 def chapter_text(name: str) -> str:
-    """A chapter as plain text, without comments; pictures become name and path. Raises
+    """A chapter as plain text, without comments. Pictures become name and path. Raises
     InputError."""
     if name not in CHAPTERS:
         word = re.compile(rf"\b{re.escape(name)}", re.IGNORECASE)

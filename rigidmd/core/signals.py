@@ -40,7 +40,7 @@ def stop_this_process() -> None:
 
 
 def kill_group(process: subprocess.Popen) -> None:
-    """End a process of `SEPARATE_GROUP` at once, with those that it has started; on Windows without
+    """End a process of `SEPARATE_GROUP` at once, with those that it has started. On Windows without
     them."""
     if sys.platform == "win32":
         process.kill()

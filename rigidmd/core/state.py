@@ -34,7 +34,7 @@ TALLY_SIZE = 10
 
 
 class State(NamedTuple):
-    """Everything that evolves. float64 except `step`; n bodies; molecules in Å, ps, u, single
+    """Everything that evolves. float64 except `step`; n bodies. Molecules in Å, ps, u, single
     bodies in SI.
 
     A scene of points has rotation (0, 3, 3) and angular_momentum_body (0, 3), because points do not
@@ -75,7 +75,7 @@ class State(NamedTuple):
 
     @property
     def volume(self) -> float:
-        """Volume of the cell, Å³; infinite without a box."""
+        """Volume of the cell, Å³. Infinite without a box."""
         (a, _, _), (_, b, _), (_, _, c) = self.cell.tolist()
         return a * b * c
 
@@ -89,7 +89,7 @@ class State(NamedTuple):
         )
 
     def begin_segment(self, time: float | None = None) -> None:
-        """Begin a segment of equal steps, in place; `time` is the current time if it is known
+        """Begin a segment of equal steps, in place. `time` is the current time if it is known
         exactly."""
         self.time[:] = self.time[NOW] if time is None else time
         self.step[ORIGIN] = self.step[NOW]
@@ -118,10 +118,10 @@ def state_of(
     angular_momentum_body: np.ndarray | None = None,
     cell: np.ndarray | None = None,
 ) -> State:
-    """A state at time 0 with contiguous copies of these arrays; by default at rest and without a
+    """A state at time 0 with contiguous copies of these arrays. By default at rest and without a
     box.
 
-    Without position it is a pinned body; without rotation, points.
+    Without position it is a pinned body. Without rotation, points.
     """
     position = _array(np.zeros((0, 3)) if position is None else position)
     rotation = _array(np.zeros((0, 3, 3)) if rotation is None else rotation)

@@ -160,7 +160,7 @@ def are_rotations(matrices: np.ndarray) -> bool:
 
 
 def is_cell(cell: np.ndarray) -> bool:
-    """Whether a state may have this cell (3, 3): a along x, b in the xy plane; or the infinite
+    """Whether a state may have this cell (3, 3): a along x, b in the xy plane, or the infinite
     edges of NO_CELL."""
     if not np.isfinite(cell).all():
         return np.array_equal(cell, NO_CELL)

@@ -28,7 +28,7 @@ CUT_CHANCE, CUT_FREEDOM = 1e-4, 2.0
 
 
 def mean_and_error(values: ArrayLike) -> tuple[float | None, float | None]:
-    """Mean and standard error of evenly spaced samples (n,); None, None if a value is NaN. The
+    """Mean and standard error of evenly spaced samples (n,). None, None if a value is NaN. The
     error accounts for correlation (theory chapter `errors`). It is None if the samples are too few,
     or all of them correlated."""
     array = np.array(values, dtype=float)
@@ -110,7 +110,7 @@ def correlation_time(values: np.ndarray, interval: float) -> float:
 def steady_from(values: np.ndarray) -> int:
     """Index in the first half of a series (n,) from which on it is steady: that of
     `least_error_from`, if the mean of the samples before it differs from the mean of the others by
-    more than their errors explain; else 0."""
+    more than their errors explain, else 0."""
     start = least_error_from(values)
     return start if start and _begins_elsewhere(values, start) else 0
 

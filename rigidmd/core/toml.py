@@ -125,7 +125,7 @@ def shorten_repr(value: object) -> str:
 
 
 def parse_whole_number(text: str) -> int | None:
-    """The number in a text of up to 18 ASCII digits; None for any other text."""
+    """The number in a text of up to 18 ASCII digits. None for any other text."""
     return int(text) if re.fullmatch(r"[0-9]{1,18}", text) else None
 
 
@@ -156,11 +156,11 @@ def describe_toml_error(error: TOMLDecodeError, text: str) -> str:
             return f"{where}is {bare}, must be written {bare.lower()}"
         case "None" | "null":
             return f"{where}is {bare}, which TOML does not have: omit the key"
-    return f'{where}is {bare} without quotes; a text needs them: "{bare}"'
+    return f'{where}is {bare} without quotes. A text needs them: "{bare}"'
 
 
 def line_of(keys: list, text: str) -> int | None:
-    """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it;
+    """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it,
     else None."""
     entries, tables = _index(text)
     heads = [tuple(keys[:n]) for n in range(1, len(keys) + 1)]

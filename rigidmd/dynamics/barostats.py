@@ -173,7 +173,7 @@ def needed_tallies(barostat: tuple | None) -> int:
 
 @kernel(inline=True)
 def compute_step_load(terms, state, load, registers, flows, which):
-    """Forces and torques at the current positions; a status code.
+    """Forces and torques at the current positions. A status code.
 
     which : FORCES_ONLY or WITH_ENERGIES (and virials). A step in which the barostat acts always
         computes virials, and energies if the move depends on them
@@ -217,7 +217,7 @@ def move_piston(barostat, state, h):
 
 @chosen_by_type
 def apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
-    """The flow of a barostat over a time h, in place; a status code. progress : see `registers`."""
+    """The flow of a barostat over a time h, in place. A status code. progress : see `registers`."""
     return _kick_piston if is_a(barostat, Piston) else _try_move
 
 
@@ -318,7 +318,7 @@ def target_pressure(pressure, state, k):
 
 def propose_strain(barostat, model, state, workspace, h, draw):
     """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and
-    its inverse. Returns whether the move is possible; one that is not counts as rejected."""
+    its inverse. Returns whether the move is possible. One that is not counts as rejected."""
     raise TypeError("compiled code only")
 
 
@@ -350,7 +350,7 @@ def propose_rescaling(barostat, model, state, workspace, h, draw):
 
 @kernel
 def drift(barostat, model, state, workspace, h, mean, variance):
-    """Write mean and variance of the strain of a move, by component (6,); 0 for a component that
+    """Write mean and variance of the strain of a move, by component (6,), 0 for a component that
     does not move."""
     volume = volume_of(state.cell)
     thermal = ramp_value(barostat.thermal_energy, state)
@@ -487,7 +487,7 @@ def set_matrices(workspace):
 
 @kernel
 def apply_strain(barostat, state, workspace):
-    """Multiply centres and cell by T; momenta, if the barostat changes them, by its inverse."""
+    """Multiply centres and cell by T. Momenta, if the barostat changes them, by its inverse."""
     matrix = workspace.matrices[0]
     multiply_rows(state.position, matrix)
     multiply_rows(state.cell, matrix)

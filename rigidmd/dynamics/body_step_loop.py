@@ -37,7 +37,7 @@ from rigidmd.mechanics.translation import (
 
 
 class Body(NamedTuple):
-    """The constant part of a single body, in SI units; the counterpart of `Model` for molecules."""
+    """The constant part of a single body, in SI units. The counterpart of `Model` for molecules."""
 
     translation: FreeTranslation | NoTranslation | FluidTranslation
     rotor: SplitRotor | ExactRotor | DrivenRotor | NoRotor
@@ -100,7 +100,7 @@ def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until
 
 @chosen_by_type
 def _evaluate(model, state, load, terms, flows, gradient_workspace, k, dt, known):
-    """The forces before kick k; or, if they are known, the addition of their gradient. A status
+    """The forces before kick k, or, if they are known, the addition of their gradient. A status
     code."""
     if not is_a(gradient_workspace, GradientWorkspace):
         return lambda model, state, load, terms, flows, gradient_workspace, k, dt, known: (
@@ -160,7 +160,7 @@ def accumulate_work(model, terms, state, h):
 
 @kernel
 def relative_motion(model, state):
-    """(velocity along lab axes, omega along body axes) relative to the frame, as tuples; 0 where
+    """(velocity along lab axes, omega along body axes) relative to the frame, as tuples, 0 where
     the body has none."""
     W = frame_rate(model.frame, state.time[NOW])
     velocity = omega = (0.0, 0.0, 0.0)

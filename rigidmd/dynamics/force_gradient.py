@@ -45,7 +45,7 @@ def add_gyration(model, load, tau, gain):
 @kernel
 def evaluate(model, state, load, terms, displaced, tau, known):
     """One evaluation of forces: the load, or, if the load is known, the addition of the gradient to
-    it; a status code. One function does both, because the forces take long to compile. The state is
+    it. A status code. One function does both, because the forces take long to compile. The state is
     restored bit for bit."""
     if known:
         copy(state.position, displaced.position)
@@ -67,6 +67,6 @@ def evaluate(model, state, load, terms, displaced, tau, known):
 @kernel
 def extrapolate(value, elsewhere):
     """Extrapolate from `value` through `elsewhere`, at FRACTION of the distance, to the full
-    distance; in place."""
+    distance. In place."""
     for n, there in enumerate(elsewhere.flat):
         value.flat[n] += (there - value.flat[n]) / FRACTION

@@ -69,7 +69,7 @@ def potential_energy(terms, state, load, progress):
 def start_or_test_trajectory(
     thermostat, model, code, terms, state, load, blocks, workspace, registers, starts, draw
 ):
-    """Keep the current state as the start of a trajectory; or accept it as its end, or return to
+    """Keep the current state as the start of a trajectory, or accept it as its end, or return to
     the start. A status
     code. blocks : see `thermostat_workspace`"""
     progress = registers.progress
@@ -158,8 +158,8 @@ def trajectory_passes(
     registers: Registers,
     status: np.ndarray,
 ) -> dict[int, Pass]:
-    """Kind of a flow -> its pass: the start and the test of a trajectory; what follows a move of
-    the box; and, as FAILED, what follows forces that failed."""
+    """Kind of a flow -> its pass: the start and the test of a trajectory. What follows a move of
+    the box, and, as FAILED, what follows forces that failed."""
     everything = (thermostat, model, code, terms, state, load, blocks, workspace)
     return {
         BEGIN_TRAJECTORY: Pass(

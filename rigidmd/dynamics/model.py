@@ -65,7 +65,7 @@ def mobile(model: Model) -> np.ndarray:
 
 def remove_momentum(model: Model, velocity: np.ndarray) -> float:
     """Subtract one velocity from all molecules, in place, so that conserved components of the total
-    momentum are zero. Returns the kinetic energy that this removes, u Å²/ps²; 0 if the momentum was
+    momentum are zero. Returns the kinetic energy that this removes, u Å²/ps², 0 if the momentum was
     zero already."""
     mass = model.mass[model.species]
     each = mass[:, None] * velocity

@@ -83,7 +83,7 @@ def normals(key, draw, molecule, step):
 @kernel(from_python=True)
 def chi_square(key, draw, molecule, step, freedom):
     """The sum of squares of `freedom` normal numbers, from draws `draw`, draw + 1, ... (Marsaglia &
-    Tsang 2000). It is twice a Gamma variate of shape freedom/2; for a shape below 1, from one of
+    Tsang 2000). It is twice a Gamma variate of shape freedom/2. For a shape below 1, from one of
     shape + 1 (their section 6)."""
     if freedom == 0:
         return 0.0

@@ -32,7 +32,7 @@ SUM_COUNT = 18
 
 
 class LargestValues(NamedTuple):
-    """The largest absolute value in each array of a state and a load; NaN if one is NaN, 0 for an
+    """The largest absolute value in each array of a state and a load. NaN if one is NaN, 0 for an
     empty array."""
 
     position: float

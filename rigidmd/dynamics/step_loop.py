@@ -83,7 +83,7 @@ def move_code(model: Model) -> Code:
 
 
 class CouplingWorkspaces(NamedTuple):
-    """What the flows of a scheme besides kicks and drifts remember; None of what it has not."""
+    """What the flows of a scheme besides kicks and drifts remember. None of what it has not."""
 
     heat: np.ndarray  # see `thermostat_workspace`
     box: BarostatWorkspace | None
@@ -276,7 +276,7 @@ class Advance:
         self._registers.progress[:] = 0, loaded, 0
 
     def __call__(self) -> int:
-        """Start or continue; a status code."""
+        """Start or continue. A status code."""
         self._call()
         return int(self._integers[STATUS])
 
@@ -292,7 +292,7 @@ class Advance:
 
     @property
     def sums(self) -> StateSums | None:
-        """The sums over the state and its load; None if the last call was not `observed`."""
+        """The sums over the state and its load. None if the last call was not `observed`."""
         return unpack_sums(self._sums) if self._integers[OBSERVED] else None
 
 
@@ -415,7 +415,7 @@ def _move_all(model, code, state, load, pending, h, drifts):
 
 @task()
 def _move(arguments, block):
-    """The pending kicks; then, if there is a drift, free flight and free rotation."""
+    """The pending kicks. Then, if there is a drift, free flight and free rotation."""
     rotor, species, inverse_mass, inverse_inertia, state, load, pending, h, drifts = load_arguments(
         arguments
     )

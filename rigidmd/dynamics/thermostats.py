@@ -1,4 +1,4 @@
-"""Thermostats: flows on the momenta that keep a temperature, each a pass of the step; NVE has none.
+"""Thermostats: flows on the momenta that keep a temperature, each a pass of the step. NVE has none.
 
 `apply_thermostat` acts where a scheme has the flow THERMOSTAT. The heat that a thermostat adds is
 summed in `state.energy_ledger[HEAT]`, its own variables are in `state.extra_variables`. Its random

@@ -70,7 +70,7 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
 
     The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and
     adds the change of the kinetic energy to `state.energy_ledger[0]`, so that energy less heat is
-    conserved. It acts in the middle of each step of "baoab", the default of nvt and npt; with
+    conserved. It acts in the middle of each step of "baoab", the default of nvt and npt. With
     other integrators half before and half after each step (`halved = False` in the class: all of
     it after the step).
 
@@ -79,13 +79,13 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     Parameters
     ----------
     model
-        `rigidmd.dynamics.model.Model`; masses and moments are by species,
+        `rigidmd.dynamics.model.Model`. Masses and moments are by species,
         `model.mass[model.species[m]]`
     state
         `rigidmd.core.state.State`
     draw
         An integer, the first of the random numbers of this call. `rigidmd.dynamics.noise` has
-        `normals(thermostat.key, draw, m, state.step[0])`, two normal numbers for molecule m; draw +
+        `normals(thermostat.key, draw, m, state.step[0])`, two normal numbers for molecule m. Draw +
         1, ... gives more. The key is a field of the class, from `key_of(seed, THERMOSTAT, stage)`
 
     Examples

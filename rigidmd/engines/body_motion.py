@@ -31,7 +31,7 @@ class Snapshot(NamedTuple):
 class Motion(SampleTable):
     """The samples of a run as columns.
 
-    columns : name -> array (t,) in SI units; `described` explains them. Position, velocity,
+    columns : name -> array (t,) in SI units. `described` explains them. Position, velocity,
         attitude and omega are relative to the frame. L is the angular momentum relative to
         non-rotating axes, wheels (h) included, along the axes of the frame (lab) or of the body.
         The kinetic energy is without that of wheels about their axes.

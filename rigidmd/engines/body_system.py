@@ -42,8 +42,8 @@ class BodySystem:
     scene's body axes.
 
     inertia (3,): principal moments at the start, kg m², about the pivot or the centre of mass, with
-    the added inertia of a fluid. centre (3,): centre of mass from there; points (k, 3): points of
-    the trajectory; both in the body axes.
+    the added inertia of a fluid. centre (3,): centre of mass from there. Points (k, 3): points of
+    the trajectory, both in the body axes.
     """
 
     scene: BodyScene

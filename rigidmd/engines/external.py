@@ -113,7 +113,7 @@ def checked_view(
 
 
 def moves(title: str, bodies: str) -> tuple[Key, Limit]:
-    """What holds for all programs: one step, for `velocity_verlet` and baoab; one friction."""
+    """What holds for all programs: one step, for `velocity_verlet` and baoab. One friction."""
     by = f"{title} moves {bodies} by velocity_verlet"
     return (
         Key("integrator", {"velocity_verlet": "", "baoab": ""}, by),
@@ -189,7 +189,7 @@ def same_state(one: State | None, other: State) -> bool:
 
 
 def external_engine(system: System, stage: int = 0) -> ExternalEngine:
-    """The external engine for a stage. Raises SceneError with all that it lacks; EngineError if not
+    """The external engine for a stage. Raises SceneError with all that it lacks. EngineError if not
     installed."""
     program = _supporting_program(system)
     return program.load(program.engine)(system, stage, **system.scene.engine.options)
@@ -312,7 +312,7 @@ def _energy(name: str, ours: float, theirs: float, tolerance: float) -> Comparis
 
 
 def describe_comparison(lines: list[Comparison], name: str) -> str:
-    """A table of comparisons; `name` : of the other engine."""
+    """A table of comparisons. `name` : of the other engine."""
     wide = max(len(line.name) for line in lines)
     rows = [f"  {'':<{wide}}  {'rigidmd':>20}  {name:>20}  {'difference':>10}  {'tolerance':>9}"]
     for line in lines:

@@ -93,7 +93,7 @@ class ForceFieldView(NamedTuple):
 
     @property
     def electrostatics(self) -> str:
-        """The electrostatics of the scene; "none" if no site has a charge."""
+        """The electrostatics of the scene. "none" if no site has a charge."""
         return (self.scene.forces.electrostatics or "none") if self.coulomb else "none"
 
     @property
@@ -195,7 +195,7 @@ def _potential(system: System, name: str, kind: type[Potential]) -> Potential | 
 
 
 def _lennard_jones_kinds(system: System) -> list[list[int]]:
-    """The Lennard-Jones kind of each site of each species; -1 for sites without Lennard-Jones
+    """The Lennard-Jones kind of each site of each species. -1 for sites without Lennard-Jones
     forces."""
     kinds = [[-1] * len(m.masses) for m in system.species]
     term, potential = (

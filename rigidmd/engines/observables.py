@@ -56,7 +56,7 @@ class Observation(NamedTuple):
 
     @property
     def torque_body(self) -> np.ndarray:
-        """Torque (n, 3) on each molecule, body frame; (0, 3) of points."""
+        """Torque (n, 3) on each molecule, body frame. (0, 3) of points."""
         return self.load.torque_body / self.energy_unit
 
 
@@ -79,7 +79,7 @@ def observe(
     stage : index of the stage, which may remove momentum from the degrees of freedom of the
         temperatures
     time : ps, by default of the state
-    origin : conserved energy at the start of the stage, from which its drift is counted; by default
+    origin : conserved energy at the start of the stage, from which its drift is counted. By default
         the current one
     correction : of the kinetic energy in temperatures and pressures, for each (ps²) of the squares
         of forces and torques, see `Scheme.kinetic_correction`
@@ -200,7 +200,7 @@ def describe_quantities(system: System) -> dict[str, str]:
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
     if system.external:
         virial += (
-            ", of the forces between molecules; fields, walls and restraints do not contribute"
+            ", of the forces between molecules. Fields, walls and restraints do not contribute"
         )
     if system.tail is not None:
         virial += ", without the tail correction"
@@ -233,10 +233,10 @@ def _describe_ewald(system: System) -> dict[str, str]:
     real, self_energy = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
     if system.scene.forces.ewald_truncation == "plain":
         return {"coulomb_real": f"{real}, plain at the cutoff", "coulomb_self": self_energy}
-    of_shift = "; shifted energies add nothing to it, as every molecule is neutral"
+    of_shift = ". Shifted energies add nothing to it, as every molecule is neutral"
     if any(abs(m.charge) > NEUTRAL * np.abs(m.charges).sum() for m in system.species):
         of_shift = (
-            ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted; R is"
+            ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted. R is"
             " the cutoff"
         )
     return {

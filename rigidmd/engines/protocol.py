@@ -53,8 +53,8 @@ class Engine(Protocol):
     it is true"""
 
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
-        """The extra variables of an integrator (`state.extra_variables`) at the start of a segment;
-        by default none."""
+        """The extra variables of an integrator (`state.extra_variables`) at the start of a segment.
+        By default none."""
         return np.zeros(0)
 
     def begin(self, state: State, integrator: Scheme | Solver) -> State:
@@ -71,7 +71,7 @@ class Engine(Protocol):
         observed: bool = False,
     ) -> None:
         """Move the state in place, in steps of dt, until its step counter is `until`. Raises
-        SimulationError. `observed`: whether `evaluate_current` follows; affects speed only."""
+        SimulationError. `observed`: whether `evaluate_current` follows. Affects speed only."""
 
     @abstractmethod
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
@@ -106,7 +106,7 @@ class Engine(Protocol):
 
     @abstractmethod
     def memory(self) -> dict[str, np.ndarray] | None:
-        """The arrays besides the state on which the next steps depend; None if arrays cannot hold
+        """The arrays besides the state on which the next steps depend. None if arrays cannot hold
         all of it."""
 
     @abstractmethod

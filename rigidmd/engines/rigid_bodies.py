@@ -48,7 +48,7 @@ class RigidBodies:
     def state(
         self, before: State, position: np.ndarray, velocity: np.ndarray, cell: np.ndarray
     ) -> State:
-        """The state with sites (s, 3) at these positions, molecules whole and not wrapped; all else
+        """The state with sites (s, 3) at these positions, molecules whole and not wrapped. All else
         as in `before`. Frozen molecules do not move. The spin of a linear body about its axis has
         no meaning, so its rotation is the one nearest to `before`."""
         centre, drift = self._mean(position), self._mean(velocity)
@@ -198,7 +198,7 @@ class MassPoints(NamedTuple):
 
 
 def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:
-    """The mass points of a molecule; all sites of a frozen one. `sites`: they may be sites, if
+    """The mass points of a molecule. All sites of a frozen one. `sites`: they may be sites, if
     enough have mass."""
     if frozen:
         return MassPoints(

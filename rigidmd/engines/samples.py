@@ -129,7 +129,7 @@ _ENDED = "the trajectories of hybrid Monte Carlo since the line before"
 OF_TRAJECTORIES = {
     "acceptance": Column("Acceptance", "1", f"fraction of {_ENDED} that was accepted"),
     "abs_dH_kT": Column("abs(dH) (kT)", "kT", f"mean size of the change of the energy in {_ENDED}"),
-    "exp_minus_dH": Column("exp(-dH/kT)", "1", f"mean over {_ENDED}; in equilibrium 1 on average"),
+    "exp_minus_dH": Column("exp(-dH/kT)", "1", f"mean over {_ENDED}. In equilibrium 1 on average"),
 }
 IN_LOGS = COLUMNS | OF_TRAJECTORIES
 
@@ -196,7 +196,7 @@ BODY = {
         tuple(f"L_lab_{k}" for k in "xyz"), "kg m²/s", "angular momentum with wheels, lab axes"
     ),
     "kinetic": Family(
-        ("kinetic",), "J", "kinetic energy of I omega; less Omega · J in a rotating frame"
+        ("kinetic",), "J", "kinetic energy of I omega. Less Omega · J in a rotating frame"
     ),
     "potential": Family(("potential",), "J", "potential energy"),
     "energy": Family(("energy",), "J", "kinetic and potential energy"),
@@ -216,7 +216,7 @@ MATRIX = "Q"
 
 
 def _with_unit(name: str, unit: str) -> str:
-    """The header of a column of motion.csv, such as "phi (rad)"; in ASCII, as the headers of
+    """The header of a column of motion.csv, such as "phi (rad)". In ASCII, as the headers of
     log.csv."""
     return name if unit == "1" else f"{name} ({unit.replace('²', '^2')})"
 
@@ -309,7 +309,7 @@ class Samples(SampleTable):
         return list(self)
 
     def row(self, k: int) -> Sample:
-        """Sample k; -1 for the last one."""
+        """Sample k. -1 for the last one."""
         first, width = range(len(self))[k] * len(self._numbers), len(NUMBERS)
         values: dict[str, Any] = dict(
             zip(NUMBERS, self._values[first : first + width], strict=True)
@@ -350,7 +350,7 @@ _VALUES = attrgetter(*NUMBERS)
 
 
 def moving(stages: "Sequence[Stage]", of: np.ndarray) -> np.ndarray:
-    """Whether each sample (n,) is of motion and not of a minimisation; `of` has the index of its
+    """Whether each sample (n,) is of motion and not of a minimisation. `of` has the index of its
     stage."""
     return ~np.isin(of, [k for k, stage in enumerate(stages) if stage.is_minimisation])
 
@@ -369,7 +369,7 @@ def equilibrated_from(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: "
 def _slow_series(
     of_stage: Mapping[str, np.ndarray] | SampleTable, stage: "Stage"
 ) -> list[np.ndarray]:
-    """The series of a stage that show its equilibration; none where it cannot be detected."""
+    """The series of a stage that show its equilibration. None where it cannot be detected."""
     if len(of_stage["time"]) < LEAST_SAMPLES or stage.ramps:
         return []
     return [of_stage[name] for name in ("potential", *(["density"] if stage.changes_box else []))]

@@ -93,7 +93,7 @@ class System:
 
     @property
     def density(self) -> float:
-        """Mass density, g/cm³; 0 without a box."""
+        """Mass density, g/cm³, 0 without a box."""
         return self.mass / self.space.volume / GRAM_PER_CM3
 
     @property
@@ -102,7 +102,7 @@ class System:
         return self.scene.forces.cutoff_A or inf
 
     def user_thermostat(self, k: int) -> Any:
-        """The user-defined thermostat in stage k; None without one."""
+        """The user-defined thermostat in stage k. None without one."""
         if hasattr(self.thermostat, "for_stage"):
             return self.thermostat.for_stage(self, k)
         return self.thermostat
@@ -138,7 +138,7 @@ class System:
 
     @property
     def removes_momentum_every(self) -> float | None:
-        """Time between removals of the total momentum, ps; None for never, also where every
+        """Time between removals of the total momentum, ps. None for never, also where every
         thermostat changes it."""
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
         if any(map(self.keeps_momentum_in, moving)):
@@ -231,7 +231,7 @@ class System:
         )
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
-        """Values of all sites (s,); `of` returns the values of one molecule."""
+        """Values of all sites (s,). `of` returns the values of one molecule."""
         return gather_per_molecule([of(m) for m in self.species], self.model.species)
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:

@@ -35,7 +35,7 @@ SIDE, SERIES = 4.6, 4.4
 
 
 def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Picture]":
-    """The figures of FIGURES that the columns allow, under a title with the name of the run; none
+    """The figures of FIGURES that the columns allow, under a title with the name of the run. None
     for two samples."""
     if len(samples) <= 2:
         return {}
@@ -102,7 +102,7 @@ class _Figures:
         if "omega_body_1" in self.columns:
             speed = np.linalg.norm(self.omega, axis=1)
             if (speed[1:] * np.diff(self.times.time)).max() > np.pi:
-                return "; the body rotates by more than 180° between samples: not all are counted"
+                return ". The body rotates by more than 180° between samples: not all are counted"
         if np.abs(np.diff(np.unwrap(self.columns["phi"]))).max() > np.pi / 2:
             return "; φ and ψ jump where θ passes 0° or 180°: they are undefined there"
         return ""
@@ -128,7 +128,7 @@ class _Figures:
             sphere.curve(ring, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED)
         sphere.path(path, COOL)
         sphere.triad("xyz", self.down)
-        left.set_title(f"from 25° {word} the horizon; the dot is the start", y=1.0, **NOTE)
+        left.set_title(f"from 25° {word} the horizon. The dot is the start", y=1.0, **NOTE)
         view = camera(side * UP, np.eye(3)[1])
         flat = path @ view[:2].T
         near = 0.625 * np.ptp(flat, axis=0).max()
@@ -219,7 +219,7 @@ class _Figures:
 def _draw_plane(
     axis: Any, title: str, position: np.ndarray, plane: np.ndarray, least: float
 ) -> None:
-    """The path in one plane, with equal scales if possible; otherwise the title states the
+    """The path in one plane, with equal scales if possible. Otherwise the title states the
     distortion."""
     flat = position @ plane.T
     span, centre = np.ptp(flat, axis=0), (flat.max(0) + flat.min(0)) / 2

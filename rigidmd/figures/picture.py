@@ -21,8 +21,8 @@ SVG_DPI = 100
 
 class Picture(Figure):
     """A figure of Matplotlib that is not known to pyplot, so that a notebook shows it once, as the
-    value of its cell. Texts are not parsed as formulas, as names of users may contain dollar signs;
-    numbers at ticks are."""
+    value of its cell. Texts are not parsed as formulas, as names of users may contain dollar signs.
+    Numbers at ticks are."""
 
     def draw(self, renderer) -> None:
         self._take_texts_as_written()

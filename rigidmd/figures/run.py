@@ -32,7 +32,7 @@ def run_figures(
 
 
 def energy_figure(system: "System", samples: Samples, summary: dict) -> "Picture":
-    """The drift of the conserved energy in each stage, each on its own scale; energies and
+    """The drift of the conserved energy in each stage, each on its own scale. Energies and
     temperatures."""
     count = len(system.model.species)
     column = {name: samples[name] for name in (*DRAWN, *TEMPERATURES)}

@@ -277,7 +277,7 @@ class View:
         self.axis.annotate(label, (x, y), (0, 3), color=INK, fontsize=10, zorder=4, **where)
 
     def box(self, corners: np.ndarray) -> None:
-        """Draw the edges of a box of eight corners (8, 3) in binary order; those at the furthest
+        """Draw the edges of a box of eight corners (8, 3) in binary order. Those at the furthest
         corner are faint."""
         furthest = int(self.depth(corners).argmin())
         for i in range(8):

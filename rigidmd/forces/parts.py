@@ -194,8 +194,8 @@ def select_by_number(
 
 
 def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
-    """values[k], an array (s_k, ...) of each species k, repeated for each molecule in order;
-    species (n,)."""
+    """values[k], an array (s_k, ...) of each species k, repeated for each molecule in order.
+    Species (n,)."""
     sizes = np.array([len(array) for array in values])
     begin, count = np.cumsum(sizes) - sizes, sizes[species]
     rows = np.repeat(begin[species] - np.cumsum(count) + count, count)
@@ -204,7 +204,7 @@ def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.nda
 
 
 def sites_named(species: list[Any], name: str) -> list[np.ndarray]:
-    """Masks of the sites of each species with this name, or else this element; SPECIES.NAME for one
+    """Masks of the sites of each species with this name, or else this element. SPECIES.NAME for one
     species."""
     owner, _, site = name.rpartition(".")
     for attribute in ("site_names", "elements"):

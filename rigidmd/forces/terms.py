@@ -107,7 +107,7 @@ class Term:
 
 
 def trait(term: Any, name: str) -> Any:
-    """An attribute of a term, of its workspace or of a class of these; else that of `Term`."""
+    """An attribute of a term, of its workspace or of a class of these, else that of `Term`."""
     if hasattr(term, name):
         return getattr(term, name)
     default = getattr(Term, name)
@@ -125,8 +125,8 @@ def with_common_scratch(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple,
 
 
 def add_forces(term, state, load, tally):
-    """Add the forces and torques of a term to `load`, its energy and virial to `tally` unless None;
-    a status code."""
+    """Add the forces and torques of a term to `load`, its energy and virial to `tally` unless None.
+    A status code."""
     raise TypeError(
         f"{type(term).__name__} is not a term, or this was called outside compiled code"
     )
@@ -140,7 +140,7 @@ def worse_status(status, other):
 
 @chosen_by_type
 def power(term, state, velocity, omega):
-    """Power of a term whose class has `time_dependent = True`; 0 for any other, since its energy
+    """Power of a term whose class has `time_dependent = True`, 0 for any other, since its energy
     includes its work.
 
     velocity, omega : tuples, along the axes of the lab and of the body, relative to the frame
@@ -151,14 +151,14 @@ def power(term, state, velocity, omega):
 
 @chosen_by_type
 def energy_rate(term, state):
-    """dU/dt at fixed positions of a term of molecules whose class has `time_dependent = True`; 0
+    """dU/dt at fixed positions of a term of molecules whose class has `time_dependent = True`, 0
     for any other."""
     if not trait(term.instance_class, "time_dependent"):
         return lambda term, state: 0.0
 
 
 class NoForce(NamedTuple):
-    """No forces; Numba cannot loop over an empty tuple of terms."""
+    """No forces. Numba cannot loop over an empty tuple of terms."""
 
     force: float = 0.0
 
@@ -284,16 +284,16 @@ def _shapes(state: State) -> list[tuple[int, ...]]:
 
 @kernel(from_python=True)
 def compute_load_with_energies(table, force, torque_body):
-    """Write forces and torques of all terms, and energies and virials into the table; a status
+    """Write forces and torques of all terms, and energies and virials into the table. A status
     code. force, torque_body : the arrays of the load to which the table is bound"""
     return compute_load(table, None, Load(force, torque_body), WITH_ENERGIES)
 
 
 @chosen_by_type
 def compute_load(terms, state, load, which):
-    """Write the forces and torques of all terms at the current positions; the worst status code.
+    """Write the forces and torques of all terms at the current positions. The worst status code.
     terms : a tuple of terms, which gives forces only, or a `TermTable`, which gets energies and
-    virials. which : FORCES_ONLY, WITH_ENERGIES, INTO_OTHER_LOAD or WITH_VIRIALS; `load` must be the
+    virials. which : FORCES_ONLY, WITH_ENERGIES, INTO_OTHER_LOAD or WITH_VIRIALS. `load` must be the
     load that it means."""
     if not is_a(terms, TermTable):
         return lambda terms, state, load, which: compute_body_load(terms, state, load)
@@ -330,7 +330,7 @@ def copy(source, target):
 
 @kernel(inline=True)
 def compute_body_load(terms, state, load):
-    """Write the forces and torques of all terms (a tuple) at the current positions; the worst
+    """Write the forces and torques of all terms (a tuple) at the current positions. The worst
     status code."""
     load.force[:] = 0.0
     load.torque_body[:] = 0.0

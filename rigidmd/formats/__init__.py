@@ -1,7 +1,7 @@
 """File formats of structures and trajectories: a module here registers its formats, and states
 everything about them.
 
-No other code of rigidmd names an extension. A module in this folder is found by being there;
+No other code of rigidmd names an extension. A module in this folder is found by being there.
 `register` adds a format from outside.
 """
 
@@ -94,7 +94,7 @@ class Format(NamedTuple):
         return self.read_frame is not None or self.read_arrays is not None
 
     def exceeded(self, positions: np.ndarray) -> float | None:
-        """The limit, Å, beyond which a position (s, 3) is; None if the format can hold all of
+        """The limit, Å, beyond which a position (s, 3) is. None if the format can hold all of
         them."""
         least, largest = self.limits
         return least if positions.min() < least else largest if positions.max() > largest else None
@@ -125,7 +125,7 @@ def find_modules() -> None:
 
 
 def format_of(path: str | Path) -> Format | None:
-    """The format of a file by its extension; None for one that only ASE may know, or nobody."""
+    """The format of a file by its extension. None for one that only ASE may know, or nobody."""
     return BY_EXTENSION.get(Path(path).suffix.lower())
 
 

@@ -57,7 +57,7 @@ def structure_error(path: Path, message: str) -> StructureError:
 
 
 def element_of(name: str, vocabulary: frozenset[str] = frozenset()) -> str:
-    """The element at the start of an atom's name, one of `vocabulary` if possible; X for massless
+    """The element at the start of an atom's name, one of `vocabulary` if possible. X for massless
     sites, "" if none."""
     letters = re.split(r"[^A-Za-z]", name.lstrip("0123456789 "), maxsplit=1)[0]
     one, two = letters[:1].upper(), letters[:2].capitalize()
@@ -80,7 +80,7 @@ def is_element(symbol: str) -> bool:
 
 
 def element_of_mass(mass: float) -> str:
-    """The element, or heavy hydrogen, of this mass (u); "" if there is none, as for united
+    """The element, or heavy hydrogen, of this mass (u). "" if there is none, as for united
     atoms."""
     from ase.data import atomic_masses, chemical_symbols
 

@@ -48,7 +48,7 @@ def connections(system: Any, massless: bool = False) -> np.ndarray:
 
 
 def charges(system: Any) -> np.ndarray:
-    """Charges (s,) of all sites, e; 0 for a single body."""
+    """Charges (s,) of all sites, e, 0 for a single body."""
     if hasattr(system, "species"):
         return system.of_sites(lambda m: m.charges)
     return np.zeros(len(system.points))

@@ -28,7 +28,7 @@ THINNEST, LONGEST = 0.5, 1e9
 
 
 def cell_error(cell: np.ndarray) -> str:
-    """Why a cell (3, 3) of finite numbers cannot hold molecules; empty if it can."""
+    """Why a cell (3, 3) of finite numbers cannot hold molecules. Empty if it can."""
     if np.abs(cell).max() > LONGEST:
         return f"it must not be longer than {LONGEST:g} Å"
     edges = np.linalg.norm(cell, axis=1)
@@ -160,7 +160,7 @@ def right_angled(cell: np.ndarray) -> bool:
 
 
 def cell_of(parameters: list[float]) -> np.ndarray | None:
-    """The cell (3, 3) with these edges and angles; None if no cell has them."""
+    """The cell (3, 3) with these edges and angles. None if no cell has them."""
     from ase.geometry import cellpar_to_cell
 
     edges, angles = np.array(parameters).reshape(2, 3)
@@ -199,7 +199,7 @@ def make_whole(points: np.ndarray, cell: np.ndarray | None, reach: np.ndarray) -
     keep their images.
 
     Each molecule is walked from its first atom along bonds, to the nearest image at each of them,
-    so that it may be longer than the cell. reach (s, s): largest lengths of bonds between atoms, Å;
+    so that it may be longer than the cell. reach (s, s): largest lengths of bonds between atoms, Å,
     0 for atoms that are not bonded. Atoms that no bond connects are joined to the nearest atoms (a
     minimum spanning tree by Prim's algorithm).
     """

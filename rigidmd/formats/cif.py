@@ -1,4 +1,4 @@
-"""CIF of crystals and mmCIF of molecules. gemmi reads the syntax; the module `crystal` applies the
+"""CIF of crystals and mmCIF of molecules. gemmi reads the syntax. The module `crystal` applies the
 symmetry."""
 
 import re
@@ -78,7 +78,7 @@ RESIDUE = (
 
 
 class Block:
-    """The values of a data block by tag, in lower case and with _ for the . of mmCIF; None for
+    """The values of a data block by tag, in lower case and with _ for the . of mmCIF. None for
     values not given."""
 
     def __init__(self, block):
@@ -94,7 +94,7 @@ class Block:
         return tag in self._raw
 
     def column(self, tag: str) -> list[str | None]:
-        """All values of a tag; none if the block does not have it."""
+        """All values of a tag. None if the block does not have it."""
         import gemmi
 
         return [
@@ -112,7 +112,7 @@ def _tag(tag: str) -> str:
 
 
 def number_of(text: str | None) -> tuple[float, float]:
-    """A number and its standard uncertainty, as of 0.1185(5); NaN and 0 if the text is not one."""
+    """A number and its standard uncertainty, as of 0.1185(5). NaN and 0 if the text is not one."""
     match = re.fullmatch(
         r"([-+]?(?:\d+\.?(\d*)|\.(\d+))(?:[eE][-+]?\d+)?)(?:\((\d+)\))?", text or ""
     )
@@ -208,7 +208,7 @@ class AtomSites:
         return f"_atom_site_{part}" in self._block
 
     def column(self, part: str) -> list[str | None]:
-        """The values of the tag _atom_site_{part}; None where it has none."""
+        """The values of the tag _atom_site_{part}. None where it has none."""
         values = self._block.column(f"_atom_site_{part}")
         return [values[row] for row in self._rows] if values else [None] * len(self)
 
@@ -243,7 +243,7 @@ class AtomSites:
 
 
 def _element(symbol: str) -> str:
-    """The element of a type such as C, Cl, O2- or D; X for massless sites; "" if it may be two
+    """The element of a type such as C, Cl, O2- or D. X for massless sites. "" if it may be two
     elements or none."""
     match = re.fullmatch(r"([A-Za-z]{1,2})[\d.]*[-+]?\d*", symbol)
     letters = match[1] if match else ""
@@ -269,7 +269,7 @@ def _check_order(path: Path, sites: AtomSites) -> None:
     """Raise StructureError for a disordered crystal."""
     if len(alternatives := sorted({x for x in sites.column("label_alt_id") if x})) > 1:
         raise structure_error(
-            path, f"has alternate locations {', '.join(alternatives)}; keep one of them"
+            path, f"has alternate locations {', '.join(alternatives)}. Keep one of them"
         )
     texts = sites.column("occupancy")
     occupancies = [(1.0, 0.0) if text is None else number_of(text) for text in texts]
@@ -322,7 +322,7 @@ def _coordinates(path: Path, sites: AtomSites, names: list[str], axes: str) -> n
 
 
 def _cell(path: Path, block: Block) -> np.ndarray | None:
-    """The cell (3, 3) in the standard orientation; None if the file has none. Raises
+    """The cell (3, 3) in the standard orientation. None if the file has none. Raises
     StructureError."""
     texts = [block.first(tag) for tag in CELL]
     if not any(texts):
@@ -518,7 +518,7 @@ def _contents(
 
 
 def _formula(text: str) -> dict[str, float]:
-    """Numbers of atoms in a formula such as C6 H6; empty if it is unreadable."""
+    """Numbers of atoms in a formula such as C6 H6. Empty if it is unreadable."""
     words = [re.fullmatch(r"([A-Z][a-z]?)(\d*\.?\d*)", word) for word in text.split()]
     if not all(words):
         return {}

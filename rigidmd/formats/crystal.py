@@ -135,7 +135,7 @@ def settings_of_number(number: int) -> list[Setting]:
 
 
 def settings_of_system(system: str) -> list[Setting]:
-    """Settings of a crystal system; hexagonal, trigonal and rhombohedral ones are not distinguished
+    """Settings of a crystal system. Hexagonal, trigonal and rhombohedral ones are not distinguished
     in files."""
     alike = ("hexagonal", "trigonal", "rhombohedral")
     systems = alike if system.lower() in alike else (system.lower(),)
@@ -148,7 +148,7 @@ def settings_of_code(code: str) -> list[Setting]:
 
 
 def settings_of_hall(symbol: str) -> list[Setting]:
-    """The setting of a Hall symbol; none if it is unreadable."""
+    """The setting of a Hall symbol. None if it is unreadable."""
     import gemmi
 
     try:
@@ -158,7 +158,7 @@ def settings_of_hall(symbol: str) -> list[Setting]:
 
 
 def settings_of_name(name: str) -> list[Setting]:
-    """The settings that a Hermann-Mauguin symbol may mean; none if it is unknown.
+    """The settings that a Hermann-Mauguin symbol may mean. None if it is unknown.
 
     Spaces, underscores, 2(1) and 2~1~ are understood, also full symbols (P 2/m 2/m 2/m), and
     symbols of monoclinic groups without their 1s (P 21/n). A code after a colon, or ICSD's Z, S, H
@@ -200,7 +200,7 @@ def _short(key: str) -> str:
 
 
 def name_of(operations: np.ndarray) -> str:
-    """The space group of operations (g, 3, 4); empty if it is in no table."""
+    """The space group of operations (g, 3, 4). Empty if it is in no table."""
     same = settings_where(lambda entry: np.array_equal(entry.setting.operations, operations))
     return same[0].name if same else ""
 

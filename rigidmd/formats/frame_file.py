@@ -16,7 +16,7 @@ from rigidmd.formats import System
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Device and number of a file; None without a file."""
+    """Device and number of a file. None without a file."""
     try:
         status = path.lstat()
     except OSError:

@@ -44,7 +44,7 @@ def read_g96(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
 
 
 def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atoms:
-    """A frame; names are in its block POSITION, or else in the first frame."""
+    """A frame. Names are in its block POSITION, or else in the first frame."""
     named = frame.get("POSITION", first.get("POSITION"))
     if named is None:
         raise structure_error(path, "has no block POSITION, and so no names of atoms")
@@ -70,7 +70,7 @@ def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atom
 
 
 def _vectors(path: Path, frame: dict[str, Lines], blocks: tuple[str, ...]) -> np.ndarray:
-    """Vectors (n, 3) of a block in Å or Å/ps; (0, 3) without one."""
+    """Vectors (n, 3) of a block in Å or Å/ps. (0, 3) without one."""
     name = next((block for block in blocks if block in frame), "")
     start = 0 if name.endswith("RED") else HEAD
     rows = []

@@ -21,7 +21,7 @@ OFF_DIAGONAL = [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]
 
 
 def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
-    """The frames of a .gro: title, number of atoms, atoms, box; once or more."""
+    """The frames of a .gro: title, number of atoms, atoms, box. Once or more."""
     while lines and not lines[-1].strip():
         lines.pop()
     frames, first = [], 0

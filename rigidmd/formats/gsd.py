@@ -3,7 +3,7 @@
 A molecule of several sites is a rigid body as in HOOMD: a central particle with mass, moments of
 inertia, orientation and angular momentum, and its sites as constituent particles. A molecule of one
 site is a free particle. In a file the box is centred at the origin and particles are wrapped, with
-their image numbers; here the box starts at the origin and positions are unwrapped. Files are read
+their image numbers. Here the box starts at the origin and positions are unwrapped. Files are read
 chunk by chunk, and sizes are checked before arrays are allocated.
 """
 
@@ -179,7 +179,7 @@ class GsdReader:
         return len(self.read(0).sites)
 
     def _chunk(self, frame: int, name: str) -> np.ndarray | None:
-        """A chunk of a frame, else of the first frame (see the schema); None without either."""
+        """A chunk of a frame, else of the first frame (see the schema). None without either."""
         with _refusals():
             for k in (frame, 0):
                 if self._file.chunk_exists(frame=k, name=name):
@@ -203,7 +203,7 @@ class GsdReader:
 def _owners(body: np.ndarray, position: np.ndarray, inertia: np.ndarray) -> np.ndarray:
     """The central particle (N,) of each particle, itself without one. A body has one if the
     particle of its number has moments of inertia, or is where one of the others is, which then has
-    all mass; else it consists of sites alone."""
+    all mass, else it consists of sites alone."""
     index = np.arange(len(body))
     others = index[body != index]
     nearest = np.full(len(body), np.inf)
@@ -226,7 +226,7 @@ def _whole_bodies(position: np.ndarray, body: np.ndarray, cell: np.ndarray) -> n
 
 
 def box_of(cell: np.ndarray) -> list[float]:
-    """A cell (3, 3) as edges along the axes and tilts; all 0 without a cell."""
+    """A cell (3, 3) as edges along the axes and tilts. All 0 without a cell."""
     if not np.isfinite(cell).all():
         return [0.0] * 6
     (lx, _, _), (bx, ly, _), (cx, cy, lz) = cell
@@ -248,7 +248,7 @@ def _vector_part(orientation: np.ndarray, momentum: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Within it, errors of the library become ValueError; it allocates arrays before it checks the
+    """Within it, errors of the library become ValueError. It allocates arrays before it checks the
     size of the file."""
     try:
         yield

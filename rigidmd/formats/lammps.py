@@ -221,7 +221,7 @@ def _fits(columns: list[str], rows: list[Row], known: set[str]) -> bool:
 
 
 def _box(path: Path, head: list[Row]) -> np.ndarray | None:
-    """The cell (3, 3); None without one."""
+    """The cell (3, 3). None without one."""
     by_name = {
         " ".join(words[k:]): (row.line, words[:k])
         for row in head

@@ -106,7 +106,7 @@ def _pdb_model(
         residue.append((int(digits[1]) if digits else None, line[17:21].strip(), count))
     if len(locations := locations - {""}) > 1:
         raise structure_error(
-            path, f"has alternate locations {', '.join(sorted(locations))}; keep one of them"
+            path, f"has alternate locations {', '.join(sorted(locations))}. Keep one of them"
         )
     if count == 1 and not residue[0][1]:
         residue = [()] * len(names)
@@ -141,7 +141,7 @@ def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[flo
 
 
 def encoder(system: System, interval: float, velocities: bool) -> Encode:
-    """Models, each with its time in a remark and its box before it; bonds are in the topology."""
+    """Models, each with its time in a remark and its box before it. Bonds are in the topology."""
     files = FrameFiles(system, velocities, "PDB", {"multiframe": True, "bonds": None})
 
     def encode(frame: Frame, k: int) -> bytes:

@@ -175,7 +175,7 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
 
 
 def _residues(atoms) -> list[tuple] | None:
-    """Residues from ASE's arrays of them; None without."""
+    """Residues from ASE's arrays of them. None without."""
     names, numbers = (atoms.arrays.get(key) for key in (RESIDUE_NAMES, RESIDUE_NUMBERS))
     if names is None or numbers is None or numbers.dtype.kind != "i":
         return None

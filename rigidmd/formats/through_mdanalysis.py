@@ -30,7 +30,7 @@ from rigidmd.formats.atoms import Frame, structure_error
 
 
 def dimensions(cell: np.ndarray | None) -> list[float] | None:
-    """A cell (3, 3) in MDAnalysis' form; None without a box."""
+    """A cell (3, 3) in MDAnalysis' form. None without a box."""
     return None if cell is None or cell[0, 0] == inf else edges_and_angles(cell)
 
 
@@ -178,7 +178,7 @@ XTC_MAGIC, MOST_PLAIN = 1995, 9
 
 
 def xtc_encoder(system: System, interval: float, velocities: bool) -> Encode:
-    """The same bytes as from MDAnalysis' writer, in half the time; for the few points of a body
+    """The same bytes as from MDAnalysis' writer, in half the time. For the few points of a body
     without MDAnalysis, which is slow to import."""
 
     def encode(frame: Frame, k: int) -> bytes:

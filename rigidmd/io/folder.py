@@ -37,7 +37,7 @@ def check_folder(
     marker: str = MARKER,
 ) -> None:
     """Raise OutputError if a run, or another `what`, cannot be written to a folder, or would remove
-    one of its inputs. Changes nothing. `names`: files that it will write; existing ones must have
+    one of its inputs. Changes nothing. `names`: files that it will write. Existing ones must have
     been written by an earlier one."""
     try:
         exists = folder.exists()
@@ -76,7 +76,7 @@ def check_names(folder: Path, names: Iterable[str], marker: str = MARKER) -> Non
     known = {*written_by_runs(folder, marker), marker, LOCK}
     if foreign := [name for name in names if name not in known and os.path.lexists(folder / name)]:
         problem = f"{folder / foreign[0]} exists, was not written by rigidmd, and would be replaced"
-        raise OutputError(f"{problem}; move it away, or {elsewhere()}")
+        raise OutputError(f"{problem}. Move it away, or {elsewhere()}")
 
 
 def write_marker(folder: Path, names: Iterable[str], marker: str = MARKER) -> None:
@@ -101,9 +101,9 @@ def check_is_run(folder: Path) -> None:
     """Raise OutputError unless a run has written to a folder."""
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "is not there"
-        raise OutputError(f"{folder} {what}; name the folder of a run, such as runs/water")
+        raise OutputError(f"{folder} {what}. Name the folder of a run, such as runs/water")
     if (folder / SWEEP).is_file():
-        raise OutputError(f"{folder} is the folder of a sweep; name one of the runs in it")
+        raise OutputError(f"{folder} is the folder of a sweep. Name one of the runs in it")
     if not (folder / MARKER).is_file() or not (folder / SCENE).is_file():
         raise OutputError(
             f"{folder} is not the folder of a run: `rigidmd run` wrote no {SCENE} there"
@@ -126,7 +126,7 @@ def check_inside(path: Path) -> None:
         inside = False
     if not inside:
         raise OutputError(
-            f"{path} is a link out of its folder, which is not followed; put a copy of the file"
+            f"{path} is a link out of its folder, which is not followed. Put a copy of the file"
             " there"
         )
 

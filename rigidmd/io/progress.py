@@ -98,13 +98,13 @@ class Bar(tqdm):
 
     @property
     def rate(self) -> float:
-        """Amount per second; 0 before the first advance."""
+        """Amount per second, 0 before the first advance."""
         elapsed = clock.monotonic() - self.start_t
         return (self.n - self.initial) / elapsed if elapsed > 0 else 0.0
 
     @property
     def left(self) -> str:
-        """The remaining time as text; empty before the first advance."""
+        """The remaining time as text. Empty before the first advance."""
         if self.rate > 0:
             return f", {tqdm.format_interval(round((self.total - self.n) / self.rate))} left"
         return ""

@@ -149,7 +149,7 @@ class Columns(NamedTuple):
 
 
 def read_columns(path: Path) -> Columns | None:
-    """A CSV file; None without a file. An incomplete last line is left out. Raises OutputError."""
+    """A CSV file. None without a file. An incomplete last line is left out. Raises OutputError."""
     if not _is_there(path, LARGEST_TABLE):
         return None
     try:
@@ -206,7 +206,7 @@ class Log(AppendedFile):
     """Writes samples to log.csv, numbers with all significant digits, missing values empty. Raises
     OutputError.
 
-    kept : earlier value of the property `kept`, from which the file is continued; None begins a new
+    kept : earlier value of the property `kept`, from which the file is continued. None begins a new
         file
     tensor, user_terms : see `columns`
     """
@@ -286,7 +286,7 @@ class TensorFile(AppendedFile):
 
 
 def read_tensor(path: Path) -> np.ndarray | None:
-    """Complete lines (n, 7) of pressure_tensor.csv; None without a file. Raises OutputError."""
+    """Complete lines (n, 7) of pressure_tensor.csv. None without a file. Raises OutputError."""
     if (columns_read := read_columns(path)) is None:
         return None
     if list(columns_read.cells) != HEADER:

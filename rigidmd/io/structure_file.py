@@ -40,7 +40,7 @@ def read_atoms(
 ) -> Atoms:
     """The atoms of a file, or of one of several structures in it. Raises StructureError.
 
-    frame: 1 for the first, -1 for the last; None for the only structure of a file, or the last of a
+    frame: 1 for the first, -1 for the last. None for the only structure of a file, or the last of a
     trajectory. atom_types: names of types, for formats with types. topology: a file with the names
     that a trajectory lacks. content: the content of the file, if it is not read from `path`, which
     is then only its name.

@@ -49,7 +49,7 @@ def universe(system: System | BodySystem, state: State, wrapped: bool = True) ->
 
 
 def _connect(u: mda.Universe, system: System | BodySystem, massless: bool = True) -> None:
-    """Add charges and bonds; earlier bonds are replaced."""
+    """Add charges and bonds. Earlier bonds are replaced."""
     if hasattr(u.atoms, "bonds"):
         u.del_TopologyAttr("bonds")
     u.add_TopologyAttr("charges", charges(system))
@@ -93,7 +93,7 @@ def _checked(times: list[float]) -> list[float]:
     if len(gaps) and np.ptp(gaps) > EVEN * gaps.max():
         spacing = f"frames are not evenly spaced ({gaps.min():g} to {gaps.max():g} ps)"
         warnings.warn(
-            f"{spacing}: dt is the first of these; use the time of each frame (ts.time)",
+            f"{spacing}: dt is the first of these. Use the time of each frame (ts.time)",
             stacklevel=4,
         )
     return times
@@ -116,7 +116,7 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
 
 
 def read_times(path: Path, sites: int) -> np.ndarray:
-    """Times (f,) of the frames of a trajectory, ps, without the rounding of files; for errors see
+    """Times (f,) of the frames of a trajectory, ps, without the rounding of files. For errors see
     `read_frames`."""
     return without_rounding(np.array(_read(_times, path, sites)))
 
@@ -246,7 +246,7 @@ def near_pairs(
     at: np.ndarray, cell: np.ndarray | None, distance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (p, 2) of points (k, 3) closer than `distance`, in a cell (3, 3) or without a box, and
-    the vectors (p, 3) from the first to the second; Å, single precision."""
+    the vectors (p, 3) from the first to the second. Å, single precision."""
     box = None if cell is None else np.array(dimensions(cell), np.float32)
     pairs = self_capped_distance(at.astype(np.float32), distance, box=box, return_distances=False)
     vectors = (at[pairs[:, 1]] - at[pairs[:, 0]]).astype(np.float32)

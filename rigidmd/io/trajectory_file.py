@@ -59,7 +59,7 @@ def write_topology(path: Path, system: "System | BodySystem", state: State, wrap
 
 
 def _check_fits(path: Path, positions: np.ndarray, key: str, others: Sequence[str]) -> None:
-    """Raise SimulationError if the format of a file cannot hold positions (s, 3); `others` are
+    """Raise SimulationError if the format of a file cannot hold positions (s, 3). `others` are
     formats that can."""
     if (bound := BY_EXTENSION[path.suffix].exceeded(positions)) is not None:
         hint = "output.positions = 'wrapped', or for a body a smaller output.trajectory_A_per_m"
@@ -76,7 +76,7 @@ class TrajectoryFile(AppendedFile):
     whole frames, and a resumed run can continue the file.
 
     interval : time between frames (ps), for formats that store it once for all frames
-    kept : earlier value of the property `kept`, from which `cut` continues the file; None begins a
+    kept : earlier value of the property `kept`, from which `cut` continues the file. None begins a
         new file
     Raises OutputError, here and in every method.
     """

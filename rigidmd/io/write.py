@@ -26,7 +26,7 @@ def check_target(
     if path.suffix not in extensions:
         raise OutputError(f"{path}: the name of this {what} ends in {' or '.join(extensions)}")
     if path.is_dir():
-        raise OutputError(f"{path} is a folder; name a file")
+        raise OutputError(f"{path} is a folder. Name a file")
     if not path.parent.is_dir():
         raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
     if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
@@ -79,7 +79,7 @@ def columns_text(lines: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> 
 
 
 def format_cell(value: Any) -> str:
-    """A value with three digits; "-" for None."""
+    """A value with three digits. "-" for None."""
     if value is None or isinstance(value, str):
         return "-" if value is None else value
     return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e5 else f"{value:.1e}"

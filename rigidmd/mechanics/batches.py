@@ -36,7 +36,7 @@ AXIS_A, AXIS_B, COMMON, RATE, LARGEST_RATE2, HANDEDNESS, ROWS = 0, 1, 2, 3, 6, 7
 
 @kernel
 def kick_group(species, inverse_mass, inverse_inertia, state, body_load, first, end, h):
-    """V += h F/m, L += h n_body of molecules first ... end - 1; axes without inertia keep their
+    """V += h F/m, L += h n_body of molecules first ... end - 1. Axes without inertia keep their
     momentum."""
     velocity, momentum = state.velocity, state.angular_momentum_body
     force, torque = body_load.force, body_load.torque_body
@@ -123,7 +123,7 @@ def apply_langevin_group(model, state, keep, keep_momentum, noise, numbers, firs
     ... end - 1.
 
     noise (species, 4) : sizes along each axis of a body, and that of a velocity. numbers (6 k,) :
-    number j of molecule first + m is numbers[k j + m]; three for its velocity, then three for its
+    number j of molecule first + m is numbers[k j + m]. Three for its velocity, then three for its
     angular momentum. Returns the kinetic energy gained.
     """
     species, velocity, momentum = model.species, state.velocity, state.angular_momentum_body
@@ -254,7 +254,7 @@ def _species_changed(kinds, species, first):
 
 @kernel
 def _set_constants(constants, kinds, rotor, h):
-    """Fill the rows of constants; returns whether any body rotates about each of the axes a, b,
+    """Fill the rows of constants. Returns whether any body rotates about each of the axes a, b,
     c."""
     about_a = about_b = about_c = False
     for n in range(LANES):

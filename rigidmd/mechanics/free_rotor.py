@@ -18,7 +18,7 @@ class SplitRotor(NamedTuple):
     H = g |L|²/2 + sum (1/I_k - g) L_k²/2. The first part rotates about L and commutes with the
     rest, which is Ra(h/2) Rb(h/2) Rc(h) Rb(h/2) Ra(h/2). a is the axis of the middle 1/I, b the
     axis whose 1/I is farther from it, c the third; g = (2/I_a + 1/I_c)/3. See the theory chapter
-    `dynamics` for the energy that it conserves. Bodies with two equal moments move exactly; for
+    `dynamics` for the energy that it conserves. Bodies with two equal moments move exactly. For
     linear and spherical bodies only g remains.
     """
 
@@ -33,7 +33,7 @@ class SplitRotor(NamedTuple):
 class ExactRotor(NamedTuple):
     """The exact free motion, to rounding, for any body and any time step, by a closed form or by
     Taylor series: see the theory chapter `dynamics`. A rotation by 0.03 to 0.3 rad takes 0.23 to
-    0.46 µs; longer ones are divided into parts.
+    0.46 µs. Longer ones are divided into parts.
     """
 
     inverse_inertia: np.ndarray  # all five as in SplitRotor
@@ -63,7 +63,7 @@ def split_rotor(inertia: np.ndarray) -> SplitRotor:
 
 
 def _parts(inverse: np.ndarray) -> tuple[float, tuple[int, int, int]]:
-    """g and the axes a, b, c of SplitRotor; a symmetric body rotates once about its axis of
+    """g and the axes a, b, c of SplitRotor. A symmetric body rotates once about its axis of
     symmetry, c."""
     low, middle, high = np.argsort(inverse)
     far, near = (
@@ -119,7 +119,7 @@ def rotate(rotor, species, rotation, angular_momentum_body, m, h):
 
 @kernel(inline=True)
 def rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h):
-    """Rotate about L, which is constant, by the angle h g |L|, then about the axes; the two flows
+    """Rotate about L, which is constant, by the angle h g |L|, then about the axes. The two flows
     commute."""
     L, rate = angular_momentum_body[m], h * rotor.common[species]
     rotate_by_vector(rotation[m], rate * L[0], rate * L[1], rate * L[2])
@@ -223,7 +223,7 @@ def rotate_rows(rotation, x, y, z, first, second):
 
 @kernel(inline=True)
 def rotate_about_axes(rotation, angular_momentum_body, m, order, rate, offset, h):
-    """Five exact rotations about the axes `order`, by angles h rate (L_k - offset); offset:
+    """Five exact rotations about the axes `order`, by angles h rate (L_k - offset). offset:
     momentum of wheels."""
     L = angular_momentum_body
     a, b, c = order
@@ -353,7 +353,7 @@ def driven_energy(rotor, angular_momentum_body, time):
 
 @chosen_by_type(inline=True)
 def moments(rotor, time, k):
-    """(1/I_k, h_k) of a single body's rotor at a time; 1/I_k is 0 for an axis without inertia."""
+    """(1/I_k, h_k) of a single body's rotor at a time, 1/I_k is 0 for an axis without inertia."""
     if is_a(rotor, DrivenRotor):
         return lambda rotor, time, k: (
             1 / value(rotor.inertia, time, k),

@@ -46,7 +46,7 @@ def shifted_inertia(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.n
 
 
 def inertia_error(tensor: np.ndarray, scale: float = 0.0) -> str:
-    """Why no mass distribution has this inertia tensor (3, 3); empty if one exists. The tolerance
+    """Why no mass distribution has this inertia tensor (3, 3). Empty if one exists. The tolerance
     for rounding is 1e-12 of the largest moment, or of `scale` if the tensor is a difference of
     larger ones."""
     low, middle, high = np.linalg.eigvalsh(tensor)
@@ -66,7 +66,7 @@ def principal_frame(
 ) -> PrincipalFrame:
     """Principal frame of masses (s,) at positions (s, 3).
 
-    `size` is the length scale for the decision that all masses are at one point; by default, the
+    `size` is the length scale for the decision that all masses are at one point. By default, the
     largest distance of a position from the centre of mass.
     """
     masses = np.asarray(masses, dtype=float)
@@ -136,7 +136,7 @@ class Shape(NamedTuple):
     volume: float
 
     def scale(self, dimensions: Mapping[str, float | Sequence[float]]) -> np.ndarray:
-        """Factors (3,) of the unit solid along its axes; 0 along an axis without a dimension."""
+        """Factors (3,) of the unit solid along its axes, 0 along an axis without a dimension."""
         factors = np.zeros(3)
         for name, axes in self.dimensions.items():
             factors[axes] = dimensions[name]
@@ -256,7 +256,7 @@ def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.nd
     """Added mass (3,) and added inertia (3,) along and about the axes of an ellipsoid in an ideal
     fluid at rest.
 
-    semi_axes (3,), all positive; density of the fluid. See the theory chapter `bodies` (Lamb, art.
+    semi_axes (3,), all positive. Density of the fluid. See the theory chapter `bodies` (Lamb, art.
     114-115). Lamb's differences are written as integrals of one sign, (b² - c²)² near/(alpha + 2
     far), which has no cancellation for nearly equal axes.
     """

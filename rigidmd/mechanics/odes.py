@@ -15,14 +15,14 @@ from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
 
 
 class Matrix(NamedTuple):
-    """Nine direction cosines, Q' = Q hat(omega). Q^T Q = 1 is not enforced; its error measures the
+    """Nine direction cosines, Q' = Q hat(omega). Q^T Q = 1 is not enforced. Its error measures the
     accuracy."""
 
     variables: int = 9
 
 
 class Quaternion(NamedTuple):
-    """w, x, y, z with q' = q (0, omega) / 2. |q| = 1 is not enforced; its error measures the
+    """w, x, y, z with q' = q (0, omega) / 2. |q| = 1 is not enforced. Its error measures the
     accuracy."""
 
     variables: int = 4

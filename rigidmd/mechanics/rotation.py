@@ -1,6 +1,6 @@
 """Rotation matrices Q (body to lab, x_lab = Q x_body) in NumPy, for code that is not performance
 critical: conversions from and to quaternions (w, x, y, z), 3-1-3 Euler angles, 3-2-1 yaw, pitch and
-roll, and attitude matrices; rad."""
+roll, and attitude matrices, in rad."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,7 +63,7 @@ def from_vector(vector: np.ndarray) -> np.ndarray:
 
 
 def from_axis(direction: ArrayLike) -> np.ndarray:
-    """The smallest rotation (3, 3) that takes axis 3 to a direction (3,) of any length; from 3 to
+    """The smallest rotation (3, 3) that takes axis 3 to a direction (3,) of any length. From 3 to
     -3
     it rotates by 180° about axis 1. It has no rounding for a direction along an axis."""
     x, y, z = unit_vector(direction)
@@ -136,7 +136,7 @@ def euler_rates(euler_angles: np.ndarray, angular_velocity_body: np.ndarray) -> 
     if np.any(np.abs(st) <= 4 * np.finfo(float).eps):
         raise ValueError(
             "the rates of the 3-1-3 Euler angles are singular at theta = 0 and theta = pi (sin"
-            " theta = 0), where phi and psi rotate about the same axis; use the angular velocity"
+            " theta = 0), where phi and psi rotate about the same axis. Use the angular velocity"
             " instead"
         )
     w1, w2, w3 = np.moveaxis(np.asarray(angular_velocity_body, dtype=float), -1, 0)
@@ -162,7 +162,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def orthogonality_error(rotation: np.ndarray) -> float:
-    """Largest entry of |Q^T Q - 1| over a stack (..., 3, 3); 0 for an empty stack."""
+    """Largest entry of |Q^T Q - 1| over a stack (..., 3, 3), 0 for an empty stack."""
     if len(rotation) == 0:
         return 0.0
     # entry by entry over the stack, because NumPy is seven times as slow for products of many small
@@ -179,7 +179,7 @@ def align(points_body: np.ndarray, points_lab: np.ndarray, weights: np.ndarray) 
     """Best proper rotations Q (n, 3, 3) with Q points_body ~ points_lab (Kabsch 1976, Acta Cryst.
     A32, 922).
 
-    points_body (s, 3) and points_lab (n, s, 3) relative to their weighted centres; weights (s,), in
+    points_body (s, 3) and points_lab (n, s, 3) relative to their weighted centres. Weights (s,), in
     practice masses. Linear and planar bodies are allowed. A mirror image is not matched, because
     the rotations are proper.
     """

@@ -32,7 +32,7 @@ def constant_function(vector) -> TimeFunction:
 
 
 def interpolated_function(times, values) -> TimeFunction:
-    """Linear interpolation of values (k, 3) at increasing times (k,) >= 0; constant before and
+    """Linear interpolation of values (k, 3) at increasing times (k,) >= 0. Constant before and
     after these times."""
     times, values = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
     if times[0] > 0:
@@ -43,7 +43,7 @@ def interpolated_function(times, values) -> TimeFunction:
 
 
 def pulse_function(vector, begin: float, end: float) -> TimeFunction:
-    """A vector (3,) from time `begin` to time `end`, which may be infinite; zero outside."""
+    """A vector (3,) from time `begin` to time `end`, which may be infinite. Zero outside."""
     on, off = np.asarray(vector, dtype=float), np.zeros(3)
     pieces = [(0.0, off)] * (begin > 0) + [(max(begin, 0.0), on)] + [(end, off)] * (end < inf)
     times, values = (np.array(column) for column in zip(*pieces, strict=True))

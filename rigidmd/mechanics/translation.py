@@ -1,4 +1,4 @@
-"""The translation of a single body: free, none, or through an ideal fluid with added mass; frames
+"""The translation of a single body: free, none, or through an ideal fluid with added mass. Frames
 of reference. `translate(translation, ...)` is chosen by the type at compile time, so a pinned body
 compiles no translation. See the theory chapter `bodies`."""
 
@@ -19,7 +19,7 @@ class FreeTranslation(NamedTuple):
 
 
 class NoTranslation(NamedTuple):
-    """A pinned body: one point is fixed at the origin; position and velocity are not stored."""
+    """A pinned body: one point is fixed at the origin. Position and velocity are not stored."""
 
     mass: float
 

@@ -8,7 +8,7 @@ PROGRAM = Program(
     "files:TRANSLATIONS",
     engine="engine:LammpsEngine",
     installed="engine:installed",
-    options={"ranks": Option(int, 1, "Number of MPI processes of lammps; default: 1")},
+    options={"ranks": Option(int, 1, "Number of MPI processes of lammps. Default: 1")},
     describe=lambda ranks: f"LAMMPS on {ranks} rank{'' if ranks == 1 else 's'}",
     thermostat="nose_hoover",
     writer="files:write_lammps",

@@ -19,8 +19,8 @@ def _errors(platform: str, precision: str | None) -> str:
     if fixed is None or precision in (None, fixed):
         return ""
     return (
-        f"precision = {precision!r} is for GPUs: the platform {platform} has {fixed} precision;"
-        " leave it out"
+        f"precision = {precision!r} is for GPUs: the platform {platform} has {fixed} precision."
+        " Leave it out"
     )
 
 
@@ -39,11 +39,11 @@ PROGRAM = Program(
     engine="engine:OpenmmEngine",
     installed="engine:installed",
     options={
-        "platform": Option(PLATFORMS, "CPU", "Platform of openmm; default: CPU"),
+        "platform": Option(PLATFORMS, "CPU", "Platform of openmm. Default: CPU"),
         "precision": Option(
             ("double", "mixed", "single"),
             None,
-            "Arithmetic of openmm on a GPU; default: mixed, with forces in single "
+            "Arithmetic of openmm on a GPU. Default: mixed, with forces in single "
             "precision and motion in double. CPU has mixed, Reference has double precision",
         ),
     },

@@ -1,11 +1,11 @@
-"""Runs of molecules as `ase.Atoms`; forces on atoms, in two forms with the same totals on each
+"""Runs of molecules as `ase.Atoms`. Forces on atoms, in two forms with the same totals on each
 molecule.
 
 `gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's
 force and torque, minus the gradient of the energy as a function of atoms to which rigid molecules
 are fitted. The guide `ase` has the formula. `site_forces`: each atom has the forces on its site.
-Forces on massless sites are distributed over the atoms. Forces inside molecules are included;
-constraints have to balance them.
+Forces on massless sites are distributed over the atoms. Forces inside molecules are included.
+Constraints have to balance them.
 """
 
 import contextlib
@@ -84,7 +84,7 @@ def atoms_of_results(
         return final()
     if not frames:
         raise ValueError(
-            "this run has no frames (output.trajectory = false); atoms() is the final state"
+            "this run has no frames (output.trajectory = false). atoms() is the final state"
         )
     indices, sites = _frame_indices(frame, len(frames)), _sites_of_frames(results)
     frames_read, last = [], results._state

@@ -276,7 +276,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             self.simulation._note(
                 f"{' and '.join(names)}: depends on velocities, so that {run.integrator} is of"
                 " order 1. For friction and resistance use [friction] and [fluid], which keep"
-                " order 2; otherwise integrator = 'dop853'"
+                " order 2. Otherwise integrator = 'dop853'"
             )
         rate, angle = fastest_body_rate(system), stable_angle(system.method)
         # some solvers choose their own steps
@@ -371,7 +371,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         summary["stable_timestep_s"] = self.record.stable
         if self.engine.is_stiff:
             self.simulation._note(
-                "the motion is stiff: stability, not accuracy, limits the steps of dop853;"
+                "the motion is stiff: stability, not accuracy, limits the steps of dop853."
                 " integrator = 'radau' takes much longer ones"
             )
         summary["notes"] = [

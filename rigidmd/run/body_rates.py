@@ -27,7 +27,7 @@ FLIP_COSINE = np.cos(np.radians(30))
 
 
 class Rate(NamedTuple):
-    """A rate or period, in the unit of its key; None if the samples do not show it, or if there is
+    """A rate or period, in the unit of its key. None if the samples do not show it, or if there is
     no closed form."""
 
     measured: float | None
@@ -174,7 +174,7 @@ def _path_of_axis(motion: Motion, axis_body: np.ndarray) -> np.ndarray:
 
 
 def _angles(path: np.ndarray, pole: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Polar angle (t,) of directions (t, 3) from a pole, and their azimuth about it, continuous;
+    """Polar angle (t,) of directions (t, 3) from a pole, and their azimuth about it, continuous.
     None where samples do not show how far it went: near the pole, or with too few of them."""
     first = np.cross(pole, np.eye(3)[np.abs(pole).argmin()])
     first /= np.linalg.norm(first)
@@ -189,7 +189,7 @@ def _periods(
     time: np.ndarray, values: np.ndarray, level: float, other: np.ndarray, both_ways: bool = False
 ) -> tuple[float | None, float | None]:
     """The mean time between passages of samples (t,) through a level, and the mean rate of another
-    series (t,) from the first to the last of them; None if there are less than two, or a period has
+    series (t,) from the first to the last of them. None if there are less than two, or a period has
     too few samples.
 
     both_ways : passages upwards and downwards, not upwards alone

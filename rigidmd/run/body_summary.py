@@ -36,7 +36,7 @@ def summarise_body(
         speed = np.sqrt(sum(motion[f"omega_body_{k}"] ** 2 for k in (1, 2, 3)))
         if (speed[1:] * np.diff(motion["time"])).max(initial=0.0) > np.pi:
             notes.append(
-                "the body rotates by more than 180° between samples; shorten output.interval_s to"
+                "the body rotates by more than 180° between samples. Shorten output.interval_s to"
                 " follow its angles"
             )
     return {

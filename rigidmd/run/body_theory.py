@@ -13,7 +13,7 @@ from rigidmd.run.elliptic import complete, rf, rj
 
 class TopMotion(NamedTuple):
     """The motion of the axis of a heavy symmetric top: mean rate of precession about the vertical,
-    over whole periods of nutation, and this period; for steady precession the period of a small
+    over whole periods of nutation, and this period. For steady precession the period of a small
     nutation."""
 
     precession: float
@@ -23,7 +23,7 @@ class TopMotion(NamedTuple):
 def heavy_top_motion(
     across: float, moment: float, momentum: float, cosine: float, transverse: float, vertical: float
 ) -> TopMotion:
-    """The motion of a heavy symmetric top from its state at one time; NaN where numbers are too
+    """The motion of a heavy symmetric top from its state at one time. NaN where numbers are too
     large or small for it.
 
     across : moment of inertia across the axis, about the pivot

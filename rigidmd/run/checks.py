@@ -224,7 +224,7 @@ def site_labels(system: System, pair: OverlappingPair) -> list[str]:
 def most_overlapping_pair(
     system: System, state: State, molecule: int | None
 ) -> OverlappingPair | None:
-    """The pair of sites that overlaps most, preferably one of this molecule; None without such a
+    """The pair of sites that overlaps most, preferably one of this molecule. None without such a
     pair."""
     if not np.abs(state.position).max() * np.finfo(float).eps < 1e-3 * system.smallest_diameter:
         return None  # a coordinate is too large to resolve distances
@@ -306,7 +306,7 @@ def explain(
 
 
 def _user_code(system: System) -> str:
-    """What a user has added to the steps themselves, as a possible cause; empty without it."""
+    """What a user has added to the steps themselves, as a possible cause. Empty without it."""
     rows = {row.name for row in system.scene.integrators} & {
         stage.integrator for stage in system.scene.stages
     }
@@ -366,7 +366,7 @@ def _cause(
     if failed.rotation_not_orthogonal:
         return (
             "Q was not a rotation at the start or was changed from outside: a run only multiplies"
-            " rotations. Try the start from which the last good state came; a very long run may"
+            " rotations. Try the start from which the last good state came. A very long run may"
             " raise watch.orthogonality"
         )
     return f"timestep_fs is too long for this motion. Try {shorter}, or an nvt stage first"

@@ -27,8 +27,8 @@ def rf(x: float, y: float, z: float) -> float:
 
 
 def rj(x: float, y: float, z: float, p: float) -> float:
-    """R_J of three numbers of which at most one is 0, and p > 0: the integral of the third kind;
-    infinite for other p."""
+    """R_J of three numbers of which at most one is 0, and p > 0: the integral of the third kind.
+    Infinite for other p."""
     if p <= 0 or [x, y, z].count(0.0) > 1:
         return inf
     mean = start = (x + y + z + 2 * p) / 5

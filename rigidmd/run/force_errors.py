@@ -49,7 +49,7 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
     scene, method = system.scene, system.scene.forces.electrostatics
     if system.force_error is None:
         problem = (
-            f"--accuracy needs Ewald sums; forces.electrostatics is {method!r}, or no site has a"
+            f"--accuracy needs Ewald sums. forces.electrostatics is {method!r}, or no site has a"
             " charge"
         )
         raise SceneError(scene.source, [problem])
@@ -104,7 +104,7 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
 
 
 def single_precision_errors(system: System, state: State) -> tuple[float, float] | None:
-    """Relative rms errors of forces and torques with `precision = "mixed"`; None for a scene with
+    """Relative rms errors of forces and torques with `precision = "mixed"`. None for a scene with
     "double"."""
     if system.precision == "double" and not system.precision_reason:
         return None
@@ -207,7 +207,7 @@ def velocity_notes(system: System, state: State) -> list[str]:
             notes.append(
                 f"{name}: its forces depend on velocities. Integrators take them as forces of"
                 " positions, with an error of order 1 in the step, and such forces have no energy"
-                " that is conserved. For friction use thermostat = 'langevin'; otherwise test with"
+                " that is conserved. For friction use thermostat = 'langevin'. Otherwise test with"
                 " shorter steps"
             )
     return notes
@@ -252,7 +252,7 @@ def _error_of_force(system: System, state: State, name: str) -> str:
 
 
 def _check_molecules(system: System, state: State, load: Load, difference: _Difference) -> str:
-    """The error of a force or torque, on the molecules with the two largest and a median one; empty
+    """The error of a force or torque, on the molecules with the two largest and a median one. Empty
     without one."""
     rng = np.random.default_rng(0)
     species = [system.species[k] for k in system.model.species]
@@ -303,7 +303,7 @@ def _moved(state: State, kind: str, m: int, along: np.ndarray, by: float) -> Sta
 
 
 def _check_virial(state: State, virial: np.ndarray, size: float, difference: _Difference) -> str:
-    """The error of the virial in a box; empty without one."""
+    """The error of the virial in a box. Empty without one."""
     for i, j in COMPONENTS:
 
         def strained(by: float, i=i, j=j) -> State:

@@ -64,7 +64,7 @@ def _observers_by_name(
 class RunLoop:
     """A run of a simulation, from its starting to its end.
 
-    drive : advances it; the run pauses in between, and then holds its folder and its files
+    drive : advances it. The run pauses in between, and then holds its folder and its files
     advanced : steps of the last call of `drive`
     results : of the run, after its end
 
@@ -325,7 +325,7 @@ class RunLoop:
             if isinstance(error, LostFileError):
                 with contextlib.suppress(OutputError):
                     return OutputError(
-                        f"{where}{error}; the run cannot continue it{self._last_words()}"
+                        f"{where}{error}. The run cannot continue it{self._last_words()}"
                     )
             advice = ""
             if self._folder is not None and any(
@@ -533,7 +533,7 @@ class RunLoop:
         self.interrupted = True
 
     def _stop_by_signal(self, number: int) -> None:
-        """Stop; a second Ctrl-C ends the run at once."""
+        """Stop. A second Ctrl-C ends the run at once."""
         if self.interrupted and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.stop(number)

@@ -54,8 +54,8 @@ def remove_overlaps(
     """Steepest descent with bounded moves, in place, until the kicks of the first step are small
     enough.
 
-    Moves are limited by the smallest diameter; radii of molecules convert angles to moves. After a
-    move that lowers the energy the next is longer by a fifth; any other move is undone and halved.
+    Moves are limited by the smallest diameter. Radii of molecules convert angles to moves. After a
+    move that lowers the energy the next is longer by a fifth. Any other move is undone and halved.
 
     thermal, dt : scale of energies (u Å²/ps²) and time step (ps) of the kicks; stop : called before
     each step. The removal ends if it is true
@@ -107,7 +107,7 @@ def remove_overlaps(
 
 
 def _rotations(system: System, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """Which principal axes (n, 3) rotate; radii (n, 1) of molecules, Å, 1 for points."""
+    """Which principal axes (n, 3) rotate. Radii (n, 1) of molecules, Å, 1 for points."""
     species = system.model.species[: len(state.rotation)]
     radius = np.array([m.radius for m in system.species])
     return (system.model.inertia > 0)[species], np.where(radius > 0, radius, 1.0)[species, None]
@@ -148,7 +148,7 @@ class Enthalpy:
     virial W = sum F (x) R, dU/dT_ij = -W_ji.
 
     state : its volume scales the strain
-    precision : of the forces between sites; energies near a minimum need the digits of double
+    precision : of the forces between sites. Energies near a minimum need the digits of double
         precision
     """
 
@@ -231,7 +231,7 @@ class Enthalpy:
 
     def largest(self, point: EnthalpyPoint) -> tuple[float, float, float]:
         """Largest force (u Å/ps²), torque about a principal axis (u Å²/ps²) and deviation of the
-        pressure (u/(Å ps²)). Pressures are averaged over the components that share a coordinate; 0
+        pressure (u/(Å ps²)). Pressures are averaged over the components that share a coordinate, 0
         if the cell does not relax."""
         force = np.linalg.norm(point.load.force[self.free], axis=1).max(initial=0.0)
         torque = np.abs(point.load.torque_body * self.rotates).max(initial=0.0)
@@ -309,8 +309,8 @@ def minimise(
     stop: Callable[[], bool] = lambda: False,
     advanced: Callable[[float], object] = lambda iterations: None,
 ) -> Minimum:
-    """Move a state, in place, to a minimum of energy or enthalpy with the limits of a stage;
-    momenta and time stay.
+    """Move a state, in place, to a minimum of energy or enthalpy with the limits of a stage.
+    Momenta and time stay.
 
     The method is L-BFGS (Nocedal & Wright 2006, algorithm 7.5) with moves of bounded length.
     Forces, torques and pressure alone decide on convergence. The change of energy is added to the
@@ -413,7 +413,7 @@ class _Descent:
         self._fraction = FIRST_MOVE  # of the longest move, while no curvature is known
 
     def step(self, point: EnthalpyPoint) -> EnthalpyPoint | None:
-        """The next point, lower than this one; None if there is none. Raises SimulationError."""
+        """The next point, lower than this one. None if there is none. Raises SimulationError."""
         move_and_point = self._along(point, self._direction(point.gradient))
         if move_and_point is None and self._memory:
             self._memory.clear()
@@ -430,7 +430,7 @@ class _Descent:
         return other
 
     def _direction(self, gradient: np.ndarray) -> np.ndarray:
-        """The quasi-Newton move, or one along the negative gradient; no longer than allowed."""
+        """The quasi-Newton move, or one along the negative gradient. No longer than allowed."""
         if self._memory:
             direction = gradient.copy()
             weights = []
@@ -450,7 +450,7 @@ class _Descent:
     def _along(
         self, point: EnthalpyPoint, direction: np.ndarray
     ) -> tuple[np.ndarray, EnthalpyPoint] | None:
-        """An accepted move along a direction, and the point it leads to; None without one. Raises
+        """An accepted move along a direction, and the point it leads to. None without one. Raises
         SimulationError."""
         slope = float(direction @ point.gradient)
         length = 1.0

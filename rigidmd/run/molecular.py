@@ -250,7 +250,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return self.state._replace(extra_variables=self.engine.variables(self.state, method))
 
     def _engine_of(self, k: int) -> Engine:
-        """The engine of stage k; minimisations are always by rigidmd."""
+        """The engine of stage k. Minimisations are always by rigidmd."""
         if not self.scene.engine.is_external or self.scene.stages[k].is_minimisation:
             return self.system.engine()
         from rigidmd.engines.external import external_engine
@@ -516,7 +516,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return checks.explain(self.system, error, self._states_to_search(), self.segment.dt, stable)
 
     def _states_to_search(self) -> Iterator[tuple[str, State]]:
-        """States of a run that failed, with words for their times: now; the last good one; states
+        """States of a run that failed, with words for their times: now. The last good one. States
         in between, which are computed again if this is cheap, because a collapse has moved
         everything by now."""
         yield "", self.state
@@ -574,7 +574,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return (form is not None and form.crystals) or structure.repeat != (1, 1, 1)
 
     def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
-        """Energies, virial, pressure and largest force at the start; energies in a unit of `size` u
+        """Energies, virial, pressure and largest force at the start. Energies in a unit of `size` u
         Å²/ps².
 
         measure_accuracy : also the errors of Coulomb forces against a more accurate Ewald sum

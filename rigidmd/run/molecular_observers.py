@@ -43,7 +43,7 @@ class LogFile(GrowingFile):
 
 
 class PressureTensor(GrowingFile):
-    """pressure_tensor.csv: the pressure tensor at its own interval; without a folder in memory."""
+    """pressure_tensor.csv: the pressure tensor at its own interval. Without a folder in memory."""
 
     once = reads_energies = True
     _names = (TENSOR_FILE,)

@@ -1,6 +1,6 @@
 """Observers are called between the steps of a run. They read its state and never change it.
 
-An observer is any object with an `interval` and a method `see`; `Observer` has all other methods,
+An observer is any object with an `interval` and a method `see`. `Observer` has all other methods,
 which have no effect. `see` is called every `interval` of time, counted in steps of each segment, or
 every `steps` steps, independent of the interval of results, and with `ends` also at the last moment
 of every segment. A time at which a minimisation starts has two states: with `once` only the second
@@ -64,7 +64,7 @@ class Moment:
 
     @property
     def sample(self) -> "Sample":
-        """The line of the log; for molecules only."""
+        """The line of the log. For molecules only."""
         return self.observation.sample
 
     @property
@@ -74,7 +74,7 @@ class Moment:
 
 
 def above_zero(interval: float, name: str) -> float:
-    """An interval between observations; ValueError unless it is a finite time above 0."""
+    """An interval between observations. ValueError unless it is a finite time above 0."""
     if not 0 < interval < inf:
         raise ValueError(f"{name} is {interval!r}, must be a finite time above 0")
     return interval
@@ -108,7 +108,7 @@ class Observer:
         return list(self._names)
 
     def begin(self, run: "Simulation") -> None:
-        """Called before the first step; the folder exists."""
+        """Called before the first step. The folder exists."""
 
     def see(self, moment: Moment) -> None:
         """Observe a moment.
@@ -158,7 +158,7 @@ def as_observer(value: object) -> Observer:
     is_timed = any(hasattr(value, name) for name in ("interval", "steps", "ends"))
     if not is_timed or not callable(getattr(value, "see", None)):
         raise TypeError(
-            f"{value!r:.60} is not an observer: it needs an interval and a method see(moment); "
+            f"{value!r:.60} is not an observer: it needs an interval and a method see(moment). "
             "rigidmd.Every(interval, function) makes one of a function"
         )
     # its name is in messages and checkpoints
@@ -186,7 +186,7 @@ class Every(Observer):
 
 
 class GrowingFile(Observer):
-    """An observer whose file grows during the run; None without a folder."""
+    """An observer whose file grows during the run. None without a folder."""
 
     remembers: ClassVar[dict[str, Any]] = {"kept": list[Annotated[int, Field(ge=0, strict=True)]]}
     kept: list[int] | None = (
@@ -259,7 +259,7 @@ class Figures(Observer):
 
 
 class Frames(GrowingFile):
-    """Topology and trajectory; without a folder, frames in memory."""
+    """Topology and trajectory. Without a folder, frames in memory."""
 
     remembers: ClassVar[dict[str, Any]] = GrowingFile.remembers | {"times": np.ndarray}
     once = True

@@ -1,4 +1,4 @@
-"""The part of a simulation that depends on the kind of its system; `molecular` and `body` implement
+"""The part of a simulation that depends on the kind of its system. `molecular` and `body` implement
 it."""
 
 from abc import ABC, abstractmethod
@@ -73,7 +73,7 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
 
     @abstractmethod
     def durations(self) -> list[float]:
-        """Durations of all segments, ps or s; 0 without steps."""
+        """Durations of all segments, ps or s, 0 without steps."""
 
     @abstractmethod
     def enter_segment(self, k: int) -> Segment:

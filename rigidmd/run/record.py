@@ -55,7 +55,7 @@ class Record:
 
     @property
     def log(self) -> samples.Samples:
-        """The samples of a run of molecules; NaN in columns that log.csv does not have."""
+        """The samples of a run of molecules. NaN in columns that log.csv does not have."""
         names, unknown = self.system.more_columns, np.full(len(self.time), np.nan)
         table = np.column_stack(
             [self.columns.get(name, unknown) for name in (*samples.NUMBERS, *names)]
@@ -99,7 +99,7 @@ def read_record(folder: Path) -> Record:
         ended = f"This run has not ended: there is no {SUMMARY}"
         missing.append(f"{ended}. These are its results so far; {resume}.")
     elif summary.interrupted:
-        missing.append("This run was interrupted; these are its results so far.")
+        missing.append("This run was interrupted. These are its results so far.")
     if isinstance(scene, BodyScene):
         system = build_body(scene)
         columns = _motion(folder, system, missing)
@@ -107,7 +107,7 @@ def read_record(folder: Path) -> Record:
         system = build(scene, user_code=False)
         columns = _log(folder, scene)
     if not columns or len(next(iter(columns.values()))) == 0:
-        raise OutputError(f"{folder}: the run has not written samples yet; {resume}")
+        raise OutputError(f"{folder}: the run has not written samples yet. {resume}")
     return Record(
         folder, scene, system, summary and summary.model_dump(exclude_unset=True), columns, missing
     )
@@ -184,7 +184,7 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
             times = part["stacked/t"].tolist()
             snapshots = [Snapshot(t, State(*state)) for t, state in zip(times, states, strict=True)]
             missing.append(
-                f"{MOTION} is written at the end; the motion shown ends at the last checkpoint."
+                f"{MOTION} is written at the end. The motion shown ends at the last checkpoint."
             )
             return motion(system, snapshots).columns
     return {}

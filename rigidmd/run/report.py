@@ -7,7 +7,7 @@ from rigidmd.core.statistics import NO_ERROR, format_signed, format_with_error
 
 POSITIONS = {
     "unwrapped": "molecules follow continuous paths",
-    "wrapped": "molecules are wrapped into the box; displacements need unwrapped frames",
+    "wrapped": "molecules are wrapped into the box. Displacements need unwrapped frames",
 }
 
 
@@ -95,7 +95,7 @@ def _rate(rate: dict, pattern: str) -> str:
     if measured is None:
         theory = math.nan if theory is None else theory
         return (
-            f"{pattern.format(f'{theory:.7g}')} in theory; fewer than two periods in the samples,"
+            f"{pattern.format(f'{theory:.7g}')} in theory. Fewer than two periods in the samples,"
             " or too few samples"
         )
     return pattern.format(f"{measured:.7g}") + (
@@ -174,7 +174,7 @@ def _minimum_rows(stage: dict, minimum: dict) -> list[tuple[str, str]]:
 
 
 def stage_rows(stage: dict) -> list[tuple[str, str]]:
-    """Names and values of a stage; a row without a name belongs to the row before it."""
+    """Names and values of a stage. A row without a name belongs to the row before it."""
     if stage["minimum"]:
         return _minimum_rows(stage, stage["minimum"])
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
@@ -196,7 +196,7 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         if (scatter := stage.get("temperature_scatter_K")) is not None:
             off = stage["temperature_K"] - stage["temperature_before_K"]
             before = stage["temperature_before_K"]
-            moment = "this stage keeps the energy of one moment; such temperatures scatter by"
+            moment = "this stage keeps the energy of one moment. Such temperatures scatter by"
             hint = "" if abs(off) < 3 * scatter else ", less than this: equilibrate longer"
             rows.append(
                 ("", f"{off:+.2g} K from the {before:g} K before: {moment} {scatter:.2g} K{hint}")
@@ -231,7 +231,7 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         rows.append(("trajectories", f"{stage['trajectories']}, {accepted:.0f} % accepted"))
         balance = _with_error(stage["exp_minus_dH_mean"], stage["exp_minus_dH_error_mean"], 3)
         rows.append(
-            ("", f"mean abs(dH) {size:.2g} kT; mean exp(-dH/kT) {balance}, 1 in equilibrium")
+            ("", f"mean abs(dH) {size:.2g} kT. Mean exp(-dH/kT) {balance}, 1 in equilibrium")
         )
     elif stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
@@ -265,7 +265,7 @@ def _with_error(value: float, error: float | None, places: int, unit: str = "") 
 
 
 def _set_point(set_point: float | Sequence[float] | None, unit: str) -> str:
-    """The set point of a thermostat or barostat, two values if it changes; empty without one."""
+    """The set point of a thermostat or barostat, two values if it changes. Empty without one."""
     if set_point is None:
         return ""
     values = set_point if isinstance(set_point, Sequence) else [set_point]

@@ -1,4 +1,4 @@
-"""Results of a run: samples, summary, final state, frames; the value that `Simulation.run`
+"""Results of a run: samples, summary, final state, frames. The value that `Simulation.run`
 returns."""
 
 from collections.abc import Iterator, Sequence
@@ -103,7 +103,7 @@ class Results(Displayed):
 
     @property
     def units(self) -> dict[str, str]:
-        """Name -> unit of each column; "1" for numbers, empty for text."""
+        """Name -> unit of each column. "1" for numbers, empty for text."""
         return {name: column.unit for name, column in self.samples.described.items()}
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -129,7 +129,7 @@ class Results(Displayed):
         """The trajectory as an MDAnalysis Universe, from the files if there are any, or else from
         memory.
 
-        Lengths in Å, times in ps; for a body a second becomes a picosecond. Every frame has its
+        Lengths in Å, times in ps. For a body a second becomes a picosecond. Every frame has its
         time in the run, also where the file format has none. Warns if frames are not evenly spaced.
 
         Raises

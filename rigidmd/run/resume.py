@@ -1,4 +1,4 @@
-"""What a checkpoint has of a run: its record, the memories of observers; checks that both belong to
+"""What a checkpoint has of a run: its record, the memories of observers. Checks that both belong to
 the scene."""
 
 import contextlib
@@ -185,7 +185,7 @@ def check_same_scene(
 
 
 def describe_changes(before: Mapping[str, object]) -> str | None:
-    """A sentence if the run so far was computed with other versions or on another processor; None
+    """A sentence if the run so far was computed with other versions or on another processor. None
     otherwise."""
     changed = [
         f"{key.replace('_', ' ').removesuffix(' version')} {then} there, {here} here"

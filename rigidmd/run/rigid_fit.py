@@ -12,7 +12,7 @@ from rigidmd.scene.models import Molecule
 
 
 class Bodies(NamedTuple):
-    """Rigid bodies of a frame: centres (n, 3), Q (n, 3, 3); velocities and L (n, 3) or None."""
+    """Rigid bodies of a frame: centres (n, 3), Q (n, 3, 3). Velocities and L (n, 3) or None."""
 
     position: np.ndarray
     Q: np.ndarray

@@ -84,7 +84,7 @@ RESERVED_CHECKPOINTS, RESERVED_SECONDS = 3.0, 2.0
 
 
 def checked_walltime(seconds: float) -> float:
-    """Seconds until a run has to end; ValueError unless they are finite and not negative."""
+    """Seconds until a run has to end. ValueError unless they are finite and not negative."""
     if not 0 <= seconds < inf:
         raise ValueError(
             f"walltime is {seconds!r}, must be a finite number of seconds, not negative"

@@ -78,7 +78,7 @@ def _measured(name: str, unit: str, places: int) -> Callable[[dict], str | None]
 
 
 def _set_point(key: str) -> Callable[[dict], str | None]:
-    """The cell of the set point of a thermostat or barostat; several values if it changes."""
+    """The cell of the set point of a thermostat or barostat. Several values if it changes."""
 
     def cell(stage: dict) -> str | None:
         value = stage[key]

@@ -1,4 +1,4 @@
-"""The simulation of a scene, of molecules or of a single body; several of them at once in one
+"""The simulation of a scene, of molecules or of a single body. Several of them at once in one
 process."""
 
 import atexit
@@ -98,7 +98,7 @@ def _as_scene(scene: object) -> Scene:
 
 
 class Simulation(Displayed, Generic[SystemT, SceneT]):
-    """A scene, ready to run: `run()` runs it to its end, `step(n)` advances it by n steps; both can
+    """A scene, ready to run: `run()` runs it to its end, `step(n)` advances it by n steps, both can
     be mixed.
 
     Parameters
@@ -106,7 +106,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     scene
         The scene, or the path of its TOML file
     folder
-        Folder for the files; None writes nothing and keeps the frames in memory
+        Folder for the files. None writes nothing and keeps the frames in memory
     force
         Replace an earlier run in that folder
     observers
@@ -116,13 +116,13 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         Called with a sentence before something slow (compiling, pilot runs). Default: printed with
         the progress
     warn
-        Called with each warning; the summary repeats them. Default: a `RigidMDWarning` of Python's
+        Called with each warning. The summary repeats them. Default: a `RigidMDWarning` of Python's
         `warnings`
     resume
-        Continue from the last checkpoint in the folder, to the same bits; begin if the folder is
+        Continue from the last checkpoint in the folder, to the same bits. Begin if the folder is
         empty or absent
     walltime
-        Seconds from now until the run has to have ended; it stops shortly before, with a checkpoint
+        Seconds from now until the run has to have ended. It stops shortly before, with a checkpoint
     forces
         For molecules, user-defined forces, in addition to the forces of the scene: `rigidmd.Force`,
         `rigidmd.pair_potential`, terms of classes with `rigidmd.compiled_force`, or objects whose
@@ -218,7 +218,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
             if set_keys := [key for key, value in of_molecules.items() if value is not None]:
                 problem = (
-                    f"{' and '.join(set_keys)}: for molecules; a single body takes applied={{name:"
+                    f"{' and '.join(set_keys)}: for molecules. A single body takes applied={{name:"
                     " function}"
                 )
                 raise SceneError(scene.source, [problem])
@@ -228,7 +228,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
             if applied is not None:
                 raise SceneError(
-                    scene.source, ["applied: for a single body; molecules take forces=[...]"]
+                    scene.source, ["applied: for a single body. Molecules take forces=[...]"]
                 )
             self._part = MolecularRun(self, cast(Any, scene), forces, thermostat)
 
@@ -284,7 +284,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """Observables of the current state, before, within and after a run. Each use evaluates the
         forces.
 
-        An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log; the `Pose` of a body,
+        An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log. The `Pose` of a body,
         in SI units.
 
         Raises
@@ -296,13 +296,13 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
     @property
     def energy(self) -> float:
-        """Potential plus kinetic energy of the current state, kJ/mol, for a body J; `observation`
+        """Potential plus kinetic energy of the current state, kJ/mol, for a body J. `observation`
         has both."""
         return self._part.energy_now()
 
     @property
     def forces(self) -> np.ndarray:
-        """Forces (n, 3) on the centres of mass at the current state, lab frame, kJ/mol/Å; on a body
+        """Forces (n, 3) on the centres of mass at the current state, lab frame, kJ/mol/Å. On a body
         (1, 3) in N, empty if it is pinned."""
         return self._part.forces_now()
 
@@ -347,7 +347,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     def _before_run(self) -> "MolecularRun | BodyRun":
         """The part, which is changed before a run. Raises RuntimeError within a run."""
         if self._loop is not None:
-            raise RuntimeError("the run has begun; close() ends it")
+            raise RuntimeError("the run has begun. close() ends it")
         return self._part
 
     def _molecules(self, begun: bool = False) -> "MolecularRun":
@@ -355,7 +355,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         may have `begun`."""
         part = self._part if begun else self._before_run()
         if isinstance(part.scene, BodyScene):
-            raise TypeError(f"{part.scene.name} is a single body; this method is for molecules")
+            raise TypeError(f"{part.scene.name} is a single body. This method is for molecules")
         return cast("MolecularRun", part)
 
     def start_from(self, state: State) -> None:
@@ -411,14 +411,14 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     def run(self, progress: bool | None = None) -> Results:
         """Run the scene, or what remains of it after `step`, and complete all files.
 
-        After the end of a run, a call repeats it; in a folder it replaces the files of that run. A
+        After the end of a run, a call repeats it. In a folder it replaces the files of that run. A
         run in a folder that was interrupted is continued from its last checkpoint. Without a folder
         there is none, and it starts again.
 
         Parameters
         ----------
         progress
-            Whether to show progress, by a bar or, if not on a terminal, lines every 30 s; default:
+            Whether to show progress, by a bar or, if not on a terminal, lines every 30 s. Default:
             in notebooks
 
         Raises
@@ -444,7 +444,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         The first call starts the run: it compiles and writes the first files. A minimisation is
         done with the next step after it. `run` or `close` completes the run. A signal such as
-        Ctrl-C completes all files; the exception is then re-raised.
+        Ctrl-C completes all files. The exception is then re-raised.
 
         Raises
         ------
@@ -485,7 +485,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
             self._loop.checkpoints.requested = True
 
     def _note(self, warning: str) -> None:
-        """Issue a warning; the summary repeats it."""
+        """Issue a warning. The summary repeats it."""
         self._part.record.notes.append(warning)
         self._issued.append(warning)
         self._warn(warning)
@@ -520,7 +520,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         loop = self._loop
         if loop.is_running:
             raise RuntimeError(
-                "this simulation is running already; its observers cannot run it again"
+                "this simulation is running already. Its observers cannot run it again"
             )
         self._progress, self._spot = progress, DisplayArea()
         try:
@@ -548,13 +548,13 @@ POLL_INTERVAL = 0.2
 def run_together(
     simulations: Sequence[Simulation], jobs: int | None = None
 ) -> list[Results | None]:
-    """Run simulations at once, each on one thread; their results in the same order, with the bits
+    """Run simulations at once, each on one thread. Their results in the same order, with the bits
     of `run`.
 
     For many small systems this is faster than one run after another on all cores: no thread waits
     for another, and the steps of one run continue while the observers of another are called.
 
-    Ctrl-C and SIGTERM stop all runs at their next observations; a run that had not begun is None in
+    Ctrl-C and SIGTERM stop all runs at their next observations. A run that had not begun is None in
     the list. A second Ctrl-C then raises KeyboardInterrupt. If a run fails, the others continue,
     and the first error is raised at the end, with a note on the runs that failed. Summaries and
     scenes of the simulations have one thread.
@@ -562,7 +562,7 @@ def run_together(
     Parameters
     ----------
     jobs
-        Runs at a time; default: the number of cores
+        Runs at a time. Default: the number of cores
     """
     from concurrent.futures import ThreadPoolExecutor, wait
 
@@ -570,7 +570,7 @@ def run_together(
     if wrong := [value for value in simulations if not isinstance(value, Simulation)]:
         raise TypeError(f"{wrong[0]!r:.60} is not a Simulation")
     if len(set(map(id, simulations))) < len(simulations):
-        raise ValueError("a simulation is given twice; make one for each run")
+        raise ValueError("a simulation is given twice. Make one for each run")
     if jobs is not None and jobs < 1:
         raise ValueError(f"jobs = {jobs}: at least one run at a time")
     for simulation in simulations:
@@ -615,7 +615,7 @@ def run_together(
     if failed:
         error, which = next(iter(failed.values())), ", ".join(map(str, failed))
         error.add_note(
-            f"of {len(futures)} runs at once these failed: {which}; this is the error of the first"
+            f"of {len(futures)} runs at once these failed: {which}. This is the error of the first"
         )
         raise error
     return [future.result() for future in futures]

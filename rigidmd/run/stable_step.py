@@ -39,13 +39,13 @@ class StiffestMode(NamedTuple):
 def stiffest_mode(
     system: "System", state: State, engine: Engine | None = None
 ) -> StiffestMode | None:
-    """The fastest small motion of all molecules together; None if no restoring force acts.
+    """The fastest small motion of all molecules together. None if no restoring force acts.
 
     The largest eigenvalue of the mass-weighted matrix of force differences, in the Krylov space of
     one random vector (Arnoldi). The state is unchanged. Each of `DIRECTIONS` directions takes one
     force evaluation. In large systems only a slab of `MOST_DISPLACED` molecules moves.
 
-    engine : of this system; a new one if not given
+    engine : of this system. A new one if not given
     """
     model, engine = system.model, engine or system.engine()
     moving = np.arange(len(state.position))
@@ -132,7 +132,7 @@ def fastest_body_rate(system: BodySystem) -> float:
     weight, or spin.
 
     The exact rotor is exact for a free body at any spin, the split rotor only for a symmetric body.
-    With a weight on the axis of symmetry only the nutation has to be resolved; with general
+    With a weight on the axis of symmetry only the nutation has to be resolved. With general
     solvers, the whole spin.
     """
     if not system.rotates:

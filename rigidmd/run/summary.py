@@ -76,7 +76,7 @@ def summarise(
     wall: float,
     interrupted: bool,
 ) -> dict:
-    """The summary of a run of molecules, without its `provenance`; seconds as in
+    """The summary of a run of molecules, without its `provenance`. Seconds as in
     `RunPart.summary`."""
     scene = system.scene
     minima = record.minima
@@ -144,7 +144,7 @@ def summarise(
 
 
 def _choice(system: System, samples: Samples, k: int, text: str | None) -> str | None:
-    """The text of the choice for a stage; where it was for an error of the energy, also the error
+    """The text of the choice for a stage. Where it was for an error of the energy, also the error
     that was reached."""
     thermal = (
         BOLTZMANN
@@ -173,7 +173,7 @@ def _common_drift_notes(system: System, state: State, last: Sample) -> list[str]
         usual = sqrt(3 * float(mass.sum()) * BOLTZMANN * last.temperature_translation)
         return [
             f"{together}, where thermal motion has {usual:.3g}: the thermostat has not stopped it"
-            " yet; run longer"
+            " yet. Run longer"
         ]
     gain = 2 * energy / system.freedom.translation
     if gain <= COMMON_DRIFT_LIMIT * last.temperature_translation:
@@ -231,7 +231,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         else:
             smooth = " or truncation = 'smooth_switch'"
         if stage.has_thermostat:
-            hides = "; the thermostat hides this and leaves temperatures wrong"
+            hides = ". The thermostat hides this and leaves temperatures wrong"
         else:
             hides = ""
         notes.append(
@@ -352,7 +352,7 @@ def _drift_limit(time: float) -> float:
 def _drift_verdict(
     drift: float, error: float, limit: float, expected: tuple[float, float]
 ) -> str | None:
-    """Whether a drift is significant, against its standard error and the largest small drift; None
+    """Whether a drift is significant, against its standard error and the largest small drift. None
     without an error. expected : the drift by heat between thermostats, and its error"""
     if not error > 0:
         return None
@@ -457,7 +457,7 @@ def stage_summary(
 def _minimised(
     system: System, samples: Samples, k: int, computing: float, minimum: Minimum
 ) -> dict:
-    """Values of a minimisation, at its end; None for those that only a stage of motion has."""
+    """Values of a minimisation, at its end. None for those that only a stage of motion has."""
     stage = system.scene.stages[k]
     minimum_values = minimum_figures(minimum, len(system.model.species))
     end = Samples(samples.stages, samples.user_terms, samples.of_stage(k).table()[-1:])
@@ -492,7 +492,7 @@ def _finite_or_none(value: float) -> float | None:
 
 
 def minimum_figures(found: Minimum, molecules: int) -> Json:
-    """The values of a minimum with units in their keys. Pressures are without the kinetic part;
+    """The values of a minimum with units in their keys. Pressures are without the kinetic part.
     None without a box."""
     pressure = None if found.pressure is None else np.array(found.pressure) / BAR
     return {

@@ -55,7 +55,7 @@ class TrialSystem:
     can_continue : whether timing may continue beyond the span instead of starting again
     rejected : name -> reason, of methods that cannot move this system; singular : names of those
         singular at the start
-    rounding : relative rms errors of forces and torques in mixed precision; None in double
+    rounding : relative rms errors of forces and torques in mixed precision. None in double
     chooses_precision : whether each trial has the precision that suits the error of its step
     """
 
@@ -113,7 +113,7 @@ class Trial:
 
     @property
     def spread(self) -> float | None:
-        """Range of the seconds over their median; None if timed once."""
+        """Range of the seconds over their median. None if timed once."""
         return (
             (max(self.seconds) - min(self.seconds)) / self.time if len(self.seconds) > 1 else None
         )
@@ -157,7 +157,7 @@ def final_state(system: TrialSystem, steps: int) -> State:
 
 
 def state_difference(a: State, b: State) -> tuple[float, float]:
-    """Largest differences of rotations and positions; NaN if a state has none."""
+    """Largest differences of rotations and positions. NaN if a state has none."""
     position = float(np.abs(a.position - b.position).max()) if len(a.position) else np.nan
     return (float(np.abs(a.rotation - b.rotation).max()) if len(a.rotation) else np.nan), position
 

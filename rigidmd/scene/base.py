@@ -78,7 +78,7 @@ class Scene(Section, Displayed):
     `MolecularScene`."""
 
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
-    """Name of the run; default: the name of the file"""
+    """Name of the run. Default: the name of the file"""
 
     integrators: tuple[IntegratorRow, ...] = Field(default=(), max_length=MOST_TABLES)
     """Integrators of users, for stages, [run] of a body and `rigidmd accuracy`"""
@@ -138,7 +138,7 @@ class Scene(Section, Displayed):
         """
         raise SceneError(
             self.source,
-            [f"{option('until')} is for molecules; set run.duration_s of a single body"],
+            [f"{option('until')} is for molecules. Set run.duration_s of a single body"],
         )
 
     def path(self, file: str) -> Path:
@@ -177,7 +177,7 @@ class Scene(Section, Displayed):
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}.
 
         An override of None removes the key. Files named in the scene must lie in its folder or
-        below; files named in `overrides` may be anywhere, and are taken relative to the working
+        below. Files named in `overrides` may be anywhere, and are taken relative to the working
         directory.
 
         Raises
@@ -231,7 +231,7 @@ class Scene(Section, Displayed):
         source, text
             Path of the TOML file, for messages, and its text, for the numbers of lines in them
         embedded_files
-            See `embedded_files`; with them, files may be outside `folder`
+            See `embedded_files`. With them, files may be outside `folder`
 
         Raises
         ------
@@ -294,9 +294,9 @@ def read_tables(path: Path) -> tuple[Json, str]:
     if fault.startswith("there is no such file"):
         shipped = similar_names(path.stem, [example.name for example in examples()])
         if shipped:
-            new = f"; `rigidmd new {shipped[0]}` copies a shipped scene"
+            new = f". `rigidmd new {shipped[0]}` copies a shipped scene"
         else:
-            new = "; `rigidmd examples` lists scenes"
+            new = ". `rigidmd examples` lists scenes"
         raise SceneError(str(path), [fault + (_similar_files(path, ".toml") or new)])
     if path.is_dir():
         raise SceneError(str(path), [fault + _scenes_in(path)])
@@ -308,7 +308,7 @@ def read_tables(path: Path) -> tuple[Json, str]:
         if path.suffix in (".toml", ""):
             raise error
         advice = (
-            "a scene is a TOML file; one that starts from a structure names it by [structure] file"
+            "a scene is a TOML file. One that starts from a structure names it by [structure] file"
         )
         raise SceneError(str(path), [f"{fault}; {advice}" for fault in error.errors]) from None
 
@@ -323,16 +323,16 @@ def _scenes_in(folder: Path) -> str:
     if "scene.toml" in names:
         run = shlex.quote(str(folder))
         return (
-            f"; `rigidmd resume {run}` continues the run in it, and {folder / 'scene.toml'} is its"
+            f". `rigidmd resume {run}` continues the run in it, and {folder / 'scene.toml'} is its"
             " scene"
         )
     if names:
-        return f"; a scene is a file, such as {folder / names[0]}"
-    return "; a scene is a TOML file"
+        return f". A scene is a file, such as {folder / names[0]}"
+    return ". A scene is a TOML file"
 
 
 def _other_kind_of_file(path: Path) -> str:
-    """What a file that is not TOML is by its name, and where it belongs; empty for other names."""
+    """What a file that is not TOML is by its name, and where it belongs. Empty for other names."""
     name = path.name.lower()
     for program, pattern in FOREIGN_INPUTS.items():
         if pattern.fullmatch(name):
@@ -352,7 +352,7 @@ def _other_kind_of_file(path: Path) -> str:
 
 
 def _working_directory() -> Path:
-    """The working directory; empty if it has been removed."""
+    """The working directory. Empty if it has been removed."""
     try:
         return Path.cwd()
     except OSError:
@@ -391,7 +391,7 @@ def is_inside(path: Path, folder: Path) -> bool:
 
 
 def _similar_files(path: Path, suffix: str = "") -> str:
-    """'; did you mean ...?' for files of similar names in the folder of a path; empty if there are
+    """'; did you mean ...?' for files of similar names in the folder of a path. Empty if there are
     none."""
     try:
         neighbours = [
@@ -420,7 +420,7 @@ def file_name(wanted: Callable[[Format], object]) -> AfterValidator:
             )
         if name.startswith("input_"):
             raise ValueError(
-                f"is {name!r}; names beginning with input_ are reserved for copies of input files"
+                f"is {name!r}. Names beginning with input_ are reserved for copies of input files"
             )
         if not name.endswith(extensions := written(wanted)):
             raise ValueError(f"is {name!r}, must end in one of {' '.join(extensions)}")
@@ -430,7 +430,7 @@ def file_name(wanted: Callable[[Format], object]) -> AfterValidator:
 
 
 def _kind_of_scene(data: dict):
-    """The class of scenes with these tables; None if no table belongs to either class."""
+    """The class of scenes with these tables. None if no table belongs to either class."""
     from rigidmd.scene.body import BodyScene
 
     if "body" in data:
@@ -448,7 +448,7 @@ def _kind_of_scene(data: dict):
 
 
 def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
-    """How to remove the keys that contradict overridden ones on the command line; empty for any
+    """How to remove the keys that contradict overridden ones on the command line. Empty for any
     other error."""
     if not re.search("not both|omit one|contradict", fault):
         return ""
@@ -474,7 +474,7 @@ def _has_key(data: object, key: str) -> bool:
 
 
 def override(data: dict, key: str, value: object) -> tuple[str, list[str]]:
-    """Set one dotted key in nested tables and lists in place; None removes it. Returns the key,
+    """Set one dotted key in nested tables and lists in place. None removes it. Returns the key,
     with numbers for names of entries of lists, and error messages."""
     *parents, last = key.split(".", DEEPEST + 1)
     where = f"{option('overrides')} {key}"
@@ -524,7 +524,7 @@ def override(data: dict, key: str, value: object) -> tuple[str, list[str]]:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """KEY=VALUE of the command line. The value is read as TOML, else as text; None if empty. Raises
+    """KEY=VALUE of the command line. The value is read as TOML, else as text. None if empty. Raises
     SceneError."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
@@ -545,7 +545,7 @@ def format_override(key: str, value: object) -> str:
 
 
 def _format_toml(value: Any) -> str:
-    """A value in one line of TOML; empty for None."""
+    """A value in one line of TOML. Empty for None."""
     match value:
         case None:
             return ""

@@ -88,13 +88,13 @@ EQUAL_MOMENTS = 1e-6
 
 def axis_of_symmetry(moments: np.ndarray) -> int | None:
     """The axis about which a body with these principal moments is symmetric: 2 (axis 3) if all are
-    equal; or None."""
+    equal, or None."""
     near = EQUAL_MOMENTS * moments.max()
     return next((k for k in (2, 0, 1) if abs(moments[k - 1] - moments[k - 2]) <= near), None)
 
 
 class Solid(Section):
-    """A homogeneous solid; axis 3 is its axis of symmetry; a cone stands on its tip."""
+    """A homogeneous solid. Axis 3 is its axis of symmetry. A cone stands on its tip."""
 
     shape: Literal[tuple(SOLIDS)]  # type: ignore[valid-type]
     """Shape"""
@@ -136,11 +136,11 @@ class SolidPart(Solid):
     density_kg_m3: Positive | None = None
     """Density of this solid, instead of its mass"""
     position_m: Vector = (0.0, 0.0, 0.0)
-    """Position of its centre of mass, along the body axes, from any origin; from the pivot if the
+    """Position of its centre of mass, along the body axes, from any origin. From the pivot if the
     body is pinned"""
     axis: Vector | None = None
     """Direction of its axis 3, along the body axes, of any length; of a cone from its tip to its
-    base; default: axis 3 of the body"""
+    base. Default: axis 3 of the body"""
     euler_angles_deg: Vector | None = None
     """Its orientation in the body axes: phi, theta, psi (3-1-3), x_body = Rz(phi) Rx(theta) Rz(psi)
     x_solid"""
@@ -193,14 +193,14 @@ class PointMass(Section):
     mass_kg: Positive
     """Mass"""
     position_m: Vector
-    """Position along the body axes, from any origin; from the pivot if the body is pinned"""
+    """Position along the body axes, from any origin. From the pivot if the body is pinned"""
 
 
 class BodyTable(Section):
     """The body: mass, inertia and pivot. Without inertia it is a point."""
 
     mass_kg: Positive | None = None
-    """Mass; with solids or points the sum of their masses"""
+    """Mass. With solids or points the sum of their masses"""
     solid: Solid | None = None
     """Inertia of a homogeneous solid"""
     solids: tuple[SolidPart, ...] | None = Field(default=None, min_length=1, max_length=MOST_TABLES)
@@ -210,7 +210,7 @@ class BodyTable(Section):
     inertia_kg_m2: NonNegativeVector | None = None
     """Principal moments, along the body's axes"""
     inertia_tensor_kg_m2: Matrix | None = None
-    """Inertia tensor along the body's axes; off-diagonal entries with the sign of the tensor"""
+    """Inertia tensor along the body's axes. Off-diagonal entries with the sign of the tensor"""
     inertia_about: Literal["centre_of_mass", "pivot"] = "centre_of_mass"
     """Reference point of the given inertia"""
     pinned: Flag = False
@@ -227,7 +227,7 @@ class BodyTable(Section):
             f"give one of {', '.join(ways)}": len(ways) > 1,
             "mass_kg is missing": not (has_parts or has_mass),
             f"mass_kg would have no effect: the {parts} have masses": has_parts and has_mass,
-            "centre_of_mass_m is for a pinned body, from its pivot; this one is not pinned": (
+            "centre_of_mass_m is for a pinned body, from its pivot. This one is not pinned": (
                 has_centre and not self.pinned
             ),
             f"centre_of_mass_m would have no effect: it follows from the {parts}": (
@@ -327,7 +327,7 @@ class BodyStart(Section):
                 else:
                     what = f"|Q^T Q - 1| is {error:.2g}"
                 limit = (
-                    f"must be below {LARGEST_ORTHOGONALITY_ERROR:g}; project = true uses the"
+                    f"must be below {LARGEST_ORTHOGONALITY_ERROR:g}. project = true uses the"
                     " nearest rotation"
                 )
                 yield f"the matrix is not a rotation: {what}, {limit}"
@@ -338,7 +338,7 @@ class BodyStart(Section):
                 yield "euler_rates_rad_s needs euler_angles_deg"
             elif self.euler_angles_deg[1] % 180 == 0:
                 why = (
-                    "phi' and psi' rotate about the same axis there; give"
+                    "phi' and psi' rotate about the same axis there. Give"
                     " angular_velocity_body_rad_s"
                 )
                 yield f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: {why}"
@@ -370,27 +370,27 @@ class Run(MovedByScheme):
     duration_s: Positive
     """Duration"""
     timestep_s: Positive
-    """Time step; with dop853 and radau, whose steps are adaptive, the interval between
-    observations; with auto the longest step"""
+    """Time step. With dop853 and radau, whose steps are adaptive, the interval between
+    observations. With auto the longest step"""
     integrator: Annotated[str, NameIn((*SCHEMES, AUTO, *SOLVERS), in_scene=True)] = (
         "velocity_verlet"
     )
-    """A scheme of flows; auto: the scheme and step that keep the requested error with the fewest
-    force evaluations; or a general ODE solver for the textbook equations: rk4, dop853, radau"""
+    """A scheme of flows. auto: the scheme and step that keep the requested error with the fewest
+    force evaluations, or a general ODE solver for the textbook equations: rk4, dop853, radau"""
     energy_error: Positive | None = None
     """With auto: rms error of the energy over the run, as a fraction of the largest kinetic
     energy"""
     trajectory_error: TrajectoryError | None = None
-    """With auto: largest error of Q at the end; for a point the error of X in m"""
+    """With auto: largest error of Q at the end. For a point the error of X in m"""
     rotor: Rotor | None = None
-    """Free rotation by the split or the exact flow; default: the flow that the integrator needs"""
+    """Free rotation by the split or the exact flow. Default: the flow that the integrator needs"""
     formulation: Literal[tuple(FORMULATIONS)] | None = None  # type: ignore[valid-type]
-    """Variables of the attitude for rk4, dop853 and radau; default: matrix"""
+    """Variables of the attitude for rk4, dop853 and radau. Default: matrix"""
     relative_tolerance: Annotated[float, Strict(), Field(ge=1e-13, lt=1)] | None = None
-    """Relative tolerance of dop853 and radau; default: 1e-10"""
+    """Relative tolerance of dop853 and radau. Default: 1e-10"""
     absolute_tolerance: Positive | None = None
     """Absolute tolerance of dop853 and radau, as a fraction of the size of each variable in the
-    run; default: 1e-10"""
+    run. Default: 1e-10"""
 
     @field_validator("integrator", mode="before")
     @classmethod
@@ -434,52 +434,52 @@ class BodyOutput(Section):
     """Files in the folder of the run."""
 
     interval_s: Positive | None = None
-    """Time between samples in motion.csv and the trajectory; default: the duration divided by
+    """Time between samples in motion.csv and the trajectory. Default: the duration divided by
     2000"""
     npz: Flag = False
     """Also write motion.npz, the same columns as arrays"""
     trajectory: Annotated[
         str | Literal[False], file_name(lambda form: form.encoder and not form.even)
     ] = TRAJECTORY
-    """Trajectory of points of the body for viewers; the extension sets the format; false for
+    """Trajectory of points of the body for viewers. The extension sets the format, false for
     none"""
     topology: Annotated[str | None, file_name(lambda form: form.topology)] = None
     """Topology file that viewers need for the trajectory (.gro, or .pdb, in which bonds are the
-    edges of the body); default: topology.pdb, or topology.gro for a body that starts more than 900
+    edges of the body). Default: topology.pdb, or topology.gro for a body that starts more than 900
     Å of the trajectory away"""
     trajectory_A_per_m: Positive | None = None
-    """Ångström in the trajectory per metre; default: the body has a radius of 10 Å. A second
+    """Ångström in the trajectory per metre. Default: the body has a radius of 10 Å. A second
     becomes a ps"""
     figures: Flag = True
     """Draw the motion"""
     checkpoint_minutes: Annotated[float, Strict(), Field(gt=0, le=1e9)] | Literal[False] = 5.0
-    """Wall time between checkpoints, from which `rigidmd resume` continues a run; false for none.
+    """Wall time between checkpoints, from which `rigidmd resume` continues a run, false for none.
     Runs with radau have none"""
     axis: Vector | None = None
-    """Body axis whose path is drawn; default: towards the centre of mass, else the axis of
+    """Body axis whose path is drawn. Default: towards the centre of mass, else the axis of
     symmetry, else axis 3"""
     drawn_as: Literal["top", "ellipsoid", "cuboid"] | Solid | None = None
-    """Shape in animations and pages; no effect on the motion. "top", "ellipsoid" or "cuboid" with
+    """Shape in animations and pages. No effect on the motion. "top", "ellipsoid" or "cuboid" with
     the mass and inertia of the body, or a solid with its dimensions, such as { shape = "cone",
-    radius_m = 0.03, height_m = 0.06 }. Default: the solids or the points of the body; else a
-    cylinder or ball of its inertia if two moments are equal, on a stem if it is pinned outside;
+    radius_m = 0.03, height_m = 0.06 }. Default: the solids or the points of the body, else a
+    cylinder or ball of its inertia if two moments are equal, on a stem if it is pinned outside,
     else a cuboid"""
 
     def _errors(self):
         if self.trajectory and self.trajectory == (self.topology or BODY_TOPOLOGY):
-            yield f"topology and trajectory are both {self.trajectory}; give them different names"
+            yield f"topology and trajectory are both {self.trajectory}. Give them different names"
         if self.axis is not None and not any(self.axis):
             yield "axis is zero, which is not a direction"
 
 
 class BodyWatch(Section):
-    """Limits beyond which a run of a single body stops; false switches a check off."""
+    """Limits beyond which a run of a single body stops, false switches a check off."""
 
     energy: LimitOfEnergy = 1.0
     """Largest change of the energy less the work done, in units of the largest energy exchanged so
     far: the kinetic energy at the start and changes of potential energy and work"""
     orthogonality: LimitOfRounding | None = None
-    """Largest entry of abs(QᵀQ - 1); default: 1e-9, or 0.1 with rk4, dop853 and radau, which do not
+    """Largest entry of abs(QᵀQ - 1). Default: 1e-9, or 0.1 with rk4, dop853 and radau, which do not
     preserve it"""
     turn_rad: Limit = False
     """Largest rotation of the body in a step"""

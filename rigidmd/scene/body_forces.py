@@ -29,11 +29,11 @@ class Timed(Section):
     table."""
 
     times_s: Times | None = None
-    """Increasing times; each quantity is then a list of as many values"""
+    """Increasing times. Each quantity is then a list of as many values"""
     from_s: NonNegative | None = None
-    """Begin of the window of time; default: 0"""
+    """Begin of the window of time. Default: 0"""
     to_s: NonNegative | None = None
-    """End of the window of time; default: none"""
+    """End of the window of time. Default: none"""
 
     @field_validator("times_s")
     @classmethod
@@ -80,7 +80,7 @@ class Applied(Timed):
     """Torque in addition to the torque of the force"""
     at_m: Vector | None = None
     """Point of action, along the body axes, from the centre of mass, or from the pivot of a pinned
-    body; default: that point itself"""
+    body. Default: that point itself"""
 
     def _errors(self):
         yield from self.timing_errors(
@@ -118,7 +118,7 @@ class Fluid(Section):
     """Mass of the fluid displaced: buoyancy is its weight"""
     centre_of_buoyancy_m: Vector | None = None
     """Point where buoyancy acts, along the body axes, from the centre of mass, or from the pivot of
-    a pinned body; default: the centre of mass"""
+    a pinned body. Default: the centre of mass"""
     added_mass_kg: NonNegativeVector | None = None
     """Mass of fluid carried along each axis"""
     added_inertia_kg_m2: NonNegativeVector | None = None
@@ -133,7 +133,7 @@ class Frame(Timed):
     angular_acceleration_rad_s2: Vector | None = None
     """Angular acceleration of the frame, along its own axes, constant from the start"""
     origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
-    """Acceleration of the frame's origin, along the frame's axes; the body has the opposite
+    """Acceleration of the frame's origin, along the frame's axes. The body has the opposite
     acceleration"""
 
     def _errors(self):
@@ -143,7 +143,7 @@ class Frame(Timed):
         }
         yield from self.timing_errors(timed, tuple)
         if self.from_s is not None or self.to_s is not None:
-            yield "from_s and to_s are not supported here; use times_s"
+            yield "from_s and to_s are not supported here. Use times_s"
         if self.angular_acceleration_rad_s2 is not None and self.times_s is not None:
             yield "angular_acceleration_rad_s2 and times_s contradict each other"
         if (
@@ -165,7 +165,7 @@ class Wheel(Timed):
     momentum_kg_m2_s: Number = 0.0
     """Initial angular momentum along the axis, relative to the lab"""
     motor_torque_N_m: Number | tuple[Number, ...] | None = None
-    """Torque of the motor on the wheel; the opposite torque acts on the body"""
+    """Torque of the motor on the wheel. The opposite torque acts on the body"""
 
     def _errors(self):
         yield from self.timing_errors({"motor_torque_N_m": self.motor_torque_N_m}, float)
@@ -177,8 +177,8 @@ class Wheel(Timed):
 
 
 class ChangingInertia(Timed):
-    """Principal moments about the centre of mass as given functions of time, along fixed body axes;
-    mass and centre of mass do not change. The pivot of a pinned body must be its centre of mass."""
+    """Principal moments about the centre of mass as given functions of time, along fixed body axes.
+    Mass and centre of mass do not change. The pivot of a pinned body must be its centre of mass."""
 
     inertia_kg_m2: tuple[PositiveVector, ...]
     """Principal moments at each time"""
@@ -189,7 +189,7 @@ class ChangingInertia(Timed):
             ["times_s is missing"] if self.times_s is None else self.timing_errors(timed, tuple)
         )
         if self.from_s is not None or self.to_s is not None:
-            yield "from_s and to_s are not supported here; use times_s"
+            yield "from_s and to_s are not supported here. Use times_s"
         for k, moments in enumerate(self.inertia_kg_m2):
             if why := inertia_error(np.diag(moments)):
                 yield f"no body has the inertia of entry {k}: {why}"

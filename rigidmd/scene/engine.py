@@ -28,7 +28,7 @@ class _Engine(Section):
             for key in program.options.keys() - self.options.keys():
                 if getattr(self, key) is not None:
                     yield (
-                        f"{key} would have no effect with engine.name = {self.name!r}; it is for"
+                        f"{key} would have no effect with engine.name = {self.name!r}. It is for"
                         f" {name}"
                     )
         if self.program and (fault := self.program.option_errors(**self.options)):
@@ -36,7 +36,7 @@ class _Engine(Section):
 
     @property
     def program(self) -> Program | None:
-        """The program that computes the run; None for rigidmd itself."""
+        """The program that computes the run. None for rigidmd itself."""
         return _PROGRAMS.get(self.name)
 
     @property

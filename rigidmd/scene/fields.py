@@ -38,18 +38,18 @@ class Walls(Section):
     axis: Literal["x", "y", "z"]
     """Axis of the lab to which the walls are perpendicular"""
     kind: Literal["lj93", "harmonic"]
-    """lj93: (2/15) (sigma/d)^9 - (sigma/d)^3, times epsilon, at a distance d; harmonic: stiffness/2
+    """lj93: (2/15) (sigma/d)^9 - (sigma/d)^3, times epsilon, at a distance d. harmonic: stiffness/2
     d² at a depth d behind the wall, 0 in front of it"""
     positions_A: tuple[Edge, Edge]
-    """Positions along the axis, the lower one first; without a box -inf or inf for no wall"""
+    """Positions along the axis, the lower one first. Without a box -inf or inf for no wall"""
     acts_on: Literal["sites", "centres"] = "sites"
-    """sites: sites with Lennard-Jones parameters; centres: centres of mass"""
+    """sites: sites with Lennard-Jones parameters. centres: centres of mass"""
     sigma_A: Positive | None = None
     """Diameter of lj93"""
     epsilon_kJ_mol: Positive | None = None
-    """Strength of lj93; the well is 1.054 times as deep"""
+    """Strength of lj93. The well is 1.054 times as deep"""
     cutoff_A: Cutoff | None = None
-    """Cutoff distance of lj93; its energy is shifted to 0 there. Default: none"""
+    """Cutoff distance of lj93. Its energy is shifted to 0 there. Default: none"""
     stiffness_kJ_mol_A2: Positive | None = None
     """Stiffness of harmonic"""
 
@@ -80,13 +80,13 @@ Group = Annotated[int, Strict(), Field(ge=1)] | Numbers
 
 
 class Restraint(Section):
-    """Springs between centres of mass and their positions at the start or one given position; or,
+    """Springs between centres of mass and their positions at the start or one given position, or,
     with `between`, a spring on the distance of two molecules or groups."""
 
     species: str | None = None
-    """Species that is restrained; required if there are several"""
+    """Species that is restrained. Required if there are several"""
     molecules: Numbers | None = None
-    """Numbers of the restrained molecules, [1, 2, 5] or "1-10, 15", as for `frozen`; default:
+    """Numbers of the restrained molecules, [1, 2, 5] or "1-10, 15", as for `frozen`. Default:
     all"""
     between: tuple[Group, Group] | None = None
     """Two molecules, or groups of them, whose distance is restrained: [1, 2], [[1, 2], "3-5"]. The
@@ -95,15 +95,15 @@ class Restraint(Section):
     distance_A: Positive | None = None
     """With between: the distance at which the spring has no energy"""
     stiffness_kJ_mol_A2: NonNegative | tuple[NonNegative, NonNegative, NonNegative]
-    """Stiffness; three numbers for x, y, z; with between one number"""
+    """Stiffness. Three numbers for x, y, z. With between one number"""
     position_A: Vector | None = None
-    """Position to which all are restrained; default: the position of each at the start"""
+    """Position to which all are restrained. Default: the position of each at the start"""
 
     @field_validator("stiffness_kJ_mol_A2")
     @classmethod
     def _does_something(cls, stiffness: float | tuple[float, float, float]):
         if not any(stiffness if isinstance(stiffness, tuple) else (stiffness,)):
-            raise ValueError("is 0: it would have no effect; omit the restraint")
+            raise ValueError("is 0: it would have no effect. Omit the restraint")
         return stiffness
 
     def _errors(self):
@@ -123,7 +123,7 @@ class Restraint(Section):
 
     @property
     def groups(self) -> tuple[list[int], ...]:
-        """The numbers of the molecules of both groups; empty without `between`."""
+        """The numbers of the molecules of both groups. Empty without `between`."""
         groups = []
         for group in self.between or ():
             ranges = [(group, group)] if isinstance(group, int) else spans(group)
@@ -132,7 +132,7 @@ class Restraint(Section):
 
     @property
     def spans(self) -> list[tuple[int, int]]:
-        """Ranges (first, last) of the numbers of molecules; empty if all are restrained."""
+        """Ranges (first, last) of the numbers of molecules. Empty if all are restrained."""
         return [] if self.molecules is None else spans(self.molecules)
 
     @property
@@ -149,7 +149,7 @@ class Fields(Section):
     """Uniform electric field, which acts on all charges, whatever `electrostatics` is"""
     electric_frequency_per_ps: Positive | None = None
     """Frequency f of a field that oscillates as cos(2 pi f t + phase), with t from the start of the
-    run; default: a constant field"""
+    run. Default: a constant field"""
     electric_phase_deg: Number = 0.0
     """Phase of the oscillating field"""
     gravity_m_s2: Vector | None = None
@@ -186,7 +186,7 @@ class Fields(Section):
         return entries
 
     def bounds(self, axis: int) -> tuple[float, float] | None:
-        """Range of positions between the walls perpendicular to an axis, Å; None without walls."""
+        """Range of positions between the walls perpendicular to an axis, Å. None without walls."""
         ranges = [walls.positions_A for walls in self.walls if walls.direction == axis]
         if ranges:
             return max(lower for lower, _ in ranges), min(upper for _, upper in ranges)
@@ -206,7 +206,7 @@ class FieldKind(NamedTuple):
 def _electric_sentence(fields: Fields, term: Any) -> str:
     if fields.electric_frequency_per_ps is None:
         return f"{_vector(fields.electric_V_per_nm)} V/nm"
-    frequency = f"f = {fields.electric_frequency_per_ps:g}/ps; its work is in the energy ledger"
+    frequency = f"f = {fields.electric_frequency_per_ps:g}/ps. Its work is in the energy ledger"
     return (
         f"{_vector(fields.electric_V_per_nm)} V/nm cos(2 pi f t + {fields.electric_phase_deg:g}°),"
         f" {frequency}"
@@ -271,7 +271,7 @@ def field_notes(scene: "MolecularScene") -> list[str]:
     if not (scene.fields.walls and method and ELECTROSTATICS[method].sums_images):
         return []
     effect = (
-        "act on the layer between the walls across the empty part of the box; a longer box reduces"
+        "act on the layer between the walls across the empty part of the box. A longer box reduces"
         " this effect"
     )
     return [f"fields.walls: {method} includes the periodic images beyond the walls, which {effect}"]

@@ -70,7 +70,7 @@ class UnlikePair(Section):
     """Lennard-Jones parameters of two kinds of sites, in place of the mixing rule."""
 
     sites: tuple[str, str]
-    """The two kinds: a site name or else an element; `SPECIES.NAME` for sites of one species"""
+    """The two kinds: a site name or else an element. `SPECIES.NAME` for sites of one species"""
     sigma_A: Positive
     """Lennard-Jones diameter"""
     epsilon_kJ_mol: NonNegative
@@ -83,7 +83,7 @@ class PairParameters(Section):
     sites: tuple[str, str]
     """The two kinds, by site, SPECIES.SITE or element"""
     parameters: dict[str, Number] = Field(default={}, max_length=MOST_TABLES)
-    """Parameters by name; a table needs none"""
+    """Parameters by name. A table needs none"""
 
 
 #: Keys of a custom force that name a file.
@@ -95,36 +95,36 @@ class CustomForce(Section):
     file."""
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)]
-    """Name in the log; with `module` also the name of the object in it"""
+    """Name in the log. With `module` also the name of the object in it"""
     module: Line | None = None
     """Python file in the folder of the scene. Its code runs only with --trust FILE"""
     energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
     """Without a module: energy of a pair of sites (kJ/mol) as a function of their distance r (Å)
-    and named parameters, such as A*exp(-B*r) - C/r**6; with exp, log, sqrt, sin, cos"""
+    and named parameters, such as A*exp(-B*r) - C/r**6. With exp, log, sqrt, sin, cos"""
     table: Line | None = None
     """Instead of an energy: a file in the folder of the scene with the columns r_A, energy_kJ_mol
     and perhaps force_kJ_mol_A (-dE/dr), in lines of ascending r up to the cutoff. All keys of an
-    energy are also those of a table; its one parameter is scale, a factor of the energy; default:
+    energy are also those of a table. Its one parameter is scale, a factor of the energy. Default:
     1"""
     parameters: dict[str, Any] = Field(default={}, max_length=MOST_TABLES)
     """With a module: arguments with which its object is called. With an energy: numbers, the same
-    for all sites, or a table of numbers for each kind of sites, by site, SPECIES.SITE or element;
-    default: `parameters` in the models' files"""
+    for all sites, or a table of numbers for each kind of sites, by site, SPECIES.SITE or element.
+    Default: `parameters` in the models' files"""
     sites: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
-    """With an energy: the sites that it acts on; default: all with parameters"""
+    """With an energy: the sites that it acts on. Default: all with parameters"""
     pairs: tuple[PairParameters, ...] = Field(default=(), max_length=MOST_TABLES)
     """With an energy: parameters of particular pairs, in place of mixed parameters"""
     mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(
         default={}, max_length=MOST_TABLES
     )
-    """With an energy: the mean of each parameter for unlike sites; default: arithmetic for names
+    """With an energy: the mean of each parameter for unlike sites. Default: arithmetic for names
     that begin with sig, else geometric"""
     truncation: Truncation | None = None
-    """With an energy: its cutoff scheme; default: forces.truncation"""
+    """With an energy: its cutoff scheme. Default: forces.truncation"""
     cutoff_A: Cutoff | None = None
-    """With an energy: its cutoff; default: forces.cutoff_A"""
+    """With an energy: its cutoff. Default: forces.cutoff_A"""
     switch_start_A: Positive | None = None
-    """With an energy: where a switch begins; default: forces.switch_start_A"""
+    """With an energy: where a switch begins. Default: forces.switch_start_A"""
 
     @property
     def label(self) -> str:
@@ -163,10 +163,10 @@ class BodyForce(Section):
     orientations."""
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)] | None = None
-    """Name in the log; default: the name of the potential; with `module` also the name of the
+    """Name in the log. Default: the name of the potential. With `module` also the name of the
     object in it"""
     potential: Literal["gay_berne", "dipole", "quadrupole", "patch"] | None = None
-    """gay_berne: ellipsoids; dipole, quadrupole: at a point; patch: spheres with an attractive
+    """gay_berne: ellipsoids. Dipole, quadrupole: at a point. patch: spheres with an attractive
     patch"""
     energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
     """Instead of a potential: the energy (kJ/mol) as a function of the distance r (Å), of the
@@ -182,28 +182,28 @@ class BodyForce(Section):
     """Instead of a potential: Python file in the folder of the scene with a
     `rigidmd.body_pair_potential`. Its code runs only with --trust FILE"""
     parameters: dict[str, dict[str, Number]] = Field(default={}, max_length=MOST_TABLES)
-    """Species -> parameters by name; it acts on these species"""
+    """Species -> parameters by name. It acts on these species"""
     pairs: tuple[SpeciesPair, ...] = Field(default=(), max_length=MOST_TABLES)
     """Parameters of particular pairs of species"""
     mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(
         default={}, max_length=MOST_TABLES
     )
-    """With an energy: the mean of each parameter for unlike species; default: arithmetic for names
+    """With an energy: the mean of each parameter for unlike species. Default: arithmetic for names
     that begin with sig, else geometric"""
     options: dict[str, Number] = Field(default={}, max_length=MOST_TABLES)
-    """gay_berne: upsilon (default: 1), mu (2), gamma (1); dipole: reaction_field_A, the radius of a
+    """gay_berne: upsilon (default: 1), mu (2), gamma (1). dipole: reaction_field_A, the radius of a
     conductor's reaction field (default: none)"""
     axis: Literal["x", "y", "z"] = "z"
     """Axis of the bodies, in the coordinates of the models' files"""
     references: dict[str, tuple[Number, Number, Number]] = Field(default={}, max_length=MOST_TABLES)
     """Species -> the point of the body between which distances count, in the coordinates of the
-    model's file, Å; default: the centre of mass"""
+    model's file, Å. Default: the centre of mass"""
     truncation: Literal["switch", "plain"] = "switch"
-    """switch: from switch_start_A the energy is switched to 0 at the cutoff; plain: it jumps"""
+    """switch: from switch_start_A the energy is switched to 0 at the cutoff. plain: it jumps"""
     cutoff_A: Cutoff | None = None
-    """Cutoff between the points; default: forces.cutoff_A"""
+    """Cutoff between the points. Default: forces.cutoff_A"""
     switch_start_A: Positive | None = None
-    """Where the switch begins; default: 0.9 of the cutoff"""
+    """Where the switch begins. Default: 0.9 of the cutoff"""
 
     def _errors(self):
         sources = [self.potential, self.energy, self.table, self.module]
@@ -233,16 +233,16 @@ class Forces(Section):
     """Forces between sites of different molecules."""
 
     cutoff_A: Cutoff | None = None
-    """Cutoff between sites; default: 9 Å in a periodic box, none without a box"""
+    """Cutoff between sites. Default: 9 Å in a periodic box, none without a box"""
     truncation: Truncation = "shift"
-    """Cutoff scheme of Lennard-Jones forces; smooth_switch suits integrators of order 4 and more,
+    """Cutoff scheme of Lennard-Jones forces. smooth_switch suits integrators of order 4 and more,
     which forces that jump at the cutoff bring down. Charges follow reaction_field_truncation and
     ewald_truncation"""
     switch_start_A: Positive | None = None
-    """Where force_switch and switch begin; default: 1 Å before the cutoff, or at 0.9 of it if that
-    is larger. Where smooth_switch begins; default: at 0.6 of the cutoff"""
+    """Where force_switch and switch begin. Default: 1 Å before the cutoff, or at 0.9 of it if that
+    is larger. Where smooth_switch begins. Default: at 0.6 of the cutoff"""
     lennard_jones: Flag = True
-    """Whether Lennard-Jones sites interact; false where `custom` replaces Lennard-Jones forces"""
+    """Whether Lennard-Jones sites interact, false where `custom` replaces Lennard-Jones forces"""
     mixing: Mixing = "lorentz-berthelot"
     """Mixing rule of Lennard-Jones parameters between unlike sites"""
     pairs: tuple[UnlikePair, ...] = Field(default=(), max_length=MOST_TABLES)
@@ -252,8 +252,8 @@ class Forces(Section):
     bodies: tuple[BodyForce, ...] = Field(default=(), max_length=MOST_TABLES)
     """Potentials of two bodies"""
     tail_correction: Flag | None = None
-    """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it,
-    `virial` does not. Default: true in a periodic box that the molecules fill evenly; false with
+    """Add the energy and pressure of Lennard-Jones beyond the cutoff. `pressure` includes it,
+    `virial` does not. Default: true in a periodic box that the molecules fill evenly, false with
     walls, frozen molecules, custom forces or empty space"""
     dispersion: Literal["cutoff", "ewald", "pme"] = "cutoff"
     """Attraction -C6/r⁶ of Lennard-Jones sites: within the cutoff, or also of all periodic images
@@ -261,7 +261,7 @@ class Forces(Section):
     for C6 there"""
     dispersion_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
     """With a sum of dispersion: rms error of its force on a site, relative to the largest 24
-    epsilon/sigma of a site, the attraction at sigma; sets the keys below; default: 5e-5"""
+    epsilon/sigma of a site, the attraction at sigma. Sets the keys below. Default: 5e-5"""
     dispersion_beta_per_A: Positive | None = None
     """With a sum of dispersion: splitting parameter"""
     dispersion_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
@@ -270,20 +270,20 @@ class Forces(Section):
     """With dispersion = pme: grid points, as for pme_grid"""
     electrostatics: Literal[tuple(ELECTROSTATICS)] | None = None  # type: ignore[valid-type]
     """Coulomb forces: ewald and pme act on all periodic images, reaction_field and
-    damped_shifted_force within the cutoff, coulomb on all pairs without a periodic box; none
+    damped_shifted_force within the cutoff, coulomb on all pairs without a periodic box. None
     ignores charges. Default: pme in a periodic box, coulomb in an open one"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cutoff; inf for a conductor"""
     reaction_field_truncation: Truncation | None = None
     """Cutoff scheme of charges with a reaction field. A conductor's field leaves no force at the
-    cutoff, so that a shifted energy suffices. switch and smooth_switch multiply the shifted energy;
-    they make the random walk of the energy smaller and steps slower. Default: plain or
+    cutoff, so that a shifted energy suffices. switch and smooth_switch multiply the shifted energy.
+    They make the random walk of the energy smaller and steps slower. Default: plain or
     smooth_switch if `truncation` is, else shift"""
     damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
-    """Damping of damped_shifted_force; 0 for none"""
+    """Damping of damped_shifted_force, 0 for none"""
     ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
     """With ewald and pme: rms error of the force on a site, relative to the force between two
-    charges e at 1 Å; sets the keys below; default: 5e-5, somewhat better than the defaults of
+    charges e at 1 Å. Sets the keys below. Default: 5e-5, somewhat better than the defaults of
     GROMACS and OpenMM"""
     ewald_cutoff_A: Cutoff | None = None
     """With ewald and pme: cutoff of the real-space part. Default: with pme the one that makes a
@@ -306,15 +306,15 @@ class Forces(Section):
     ewald_surface_permittivity: Permittivity = inf
     """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
     ewald_slab: Literal["x", "y", "z"] | None = None
-    """With ewald and pme: the normal of a slab between empty parts of the box; images along it then
+    """With ewald and pme: the normal of a slab between empty parts of the box. Images along it then
     do not act"""
     pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
-    """With pme: order of the B-splines; 4 is cubic"""
+    """With pme: order of the B-splines, 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
-    """With pme: grid points along each edge of the cell of box or file; three equal numbers if its
+    """With pme: grid points along each edge of the cell of box or file. Three equal numbers if its
     tilt is more than half an edge, because an equivalent cell then replaces it"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.9
-    """Extra radius of the neighbour list; affects only the speed"""
+    """Extra radius of the neighbour list. Affects only the speed"""
 
     @property
     def added(self) -> dict[str, CustomForce | BodyForce]:
@@ -367,7 +367,7 @@ class Forces(Section):
         grid = self.dispersion_order or self.dispersion_grid
         return (
             (
-                "only Lennard-Jones forces have such a sum; lennard_jones is false",
+                "only Lennard-Jones forces have such a sum. lennard_jones is false",
                 not self.lennard_jones,
             ),
             (
@@ -378,11 +378,11 @@ class Forces(Section):
                 self.custom,
             ),
             (
-                "tail_correction would count what lies beyond the cutoff twice; leave it out",
+                "tail_correction would count what lies beyond the cutoff twice. Leave it out",
                 self.tail_correction,
             ),
             (
-                f"truncation = {self.truncation!r} would change the sum; take 'shift' or 'plain'",
+                f"truncation = {self.truncation!r} would change the sum. Take 'shift' or 'plain'",
                 self.truncation not in ("shift", "plain"),
             ),
             (

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from rigidmd.core.plain_text import did_you_mean, plain_letters
+from rigidmd.core.plain_text import did_you_mean, plain_letters, suggestion
 
 FOREIGN_KEYS = Path(__file__).with_name("foreign_keys.toml")
 #: Names that readers give to tables -> the table of a scene.
@@ -69,6 +69,8 @@ def hint_on_key(name: str, keys: list, value: Any, model: type[BaseModel]) -> st
     is_start = any(re.fullmatch(f"{re.escape(name)}_[a-zA-Z0-9_]+", key) for key in known)
     if converted := _other_unit(name, value, known):
         return converted
+    if longer := _with_its_words(name, known):
+        return suggestion(longer)
     if not is_start and (foreign := _foreign(name, model) or _foreign(bare, model)):
         return foreign
     if not keys and (table := _table_of(name, known)):
@@ -89,6 +91,12 @@ def _other_unit(name: str, value: Any, known: list[str]) -> str:
             is_number = isinstance(value, int | float) and not isinstance(value, bool)
             return f"; write {key} = {value * size:.12g}" if is_number else f"; write {key}"
     return ""
+
+
+def _with_its_words(name: str, known: list[str]) -> list[str]:
+    """Longer keys with all words of a key: angular_velocity_lab_rad_s of angular_velocity_rad_s."""
+    words = set(name.split("_"))
+    return [key for key in known if len(words) > 2 and words < set(key.split("_"))]
 
 
 def _table_of(name: str, known: list[str]) -> str:
@@ -125,7 +133,7 @@ def _similarity(name: str, key: str) -> float:
 
 
 def _foreign(name: str, model: type[BaseModel]) -> str:
-    """What a scene has for a setting of another program; empty for other names."""
+    """What a scene has for a setting of another program. Empty for other names."""
     for table, entries in tomllib.loads(FOREIGN_KEYS.read_text(encoding="utf-8")).items():
         section, path = model.model_fields.get(table), [] if table == "scene" else [table]
         for key, text in entries.items():
@@ -133,7 +141,7 @@ def _foreign(name: str, model: type[BaseModel]) -> str:
             if plain_letters(name) not in map(plain_letters, names.split()):
                 continue
             if table == "none" and "stages" in model.model_fields:
-                return f"; not needed: {note}"
+                return f". Not needed: {note}"
             if (section or not path) and key in known_keys(model, path):
                 if "tuple" in str(section):
                     where = f" in [[{table}]]"
@@ -141,7 +149,7 @@ def _foreign(name: str, model: type[BaseModel]) -> str:
                     where = f" in [{table}]"
                 else:
                     where = ""
-                return f"; in rigidmd this is {key}{where}{note and f' ({note})'}"
+                return f". In rigidmd this is {key}{where}{note and f' ({note})'}"
     return ""
 
 

@@ -35,24 +35,24 @@ class IntegratorRow(Section):
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$", max_length=60)]
     """Name for stages, [run] of a body and --integrators"""
     steps: Coefficients | None = None
-    """Lengths of successive velocity Verlet steps, as fractions of the time step; such a row works
+    """Lengths of successive velocity Verlet steps, as fractions of the time step. Such a row works
     with any rotor"""
     kicks: Coefficients | None = None
-    """Instead of steps: fractions of the kicks, of which the first and the last may be 0; needs the
+    """Instead of steps: fractions of the kicks, of which the first and the last may be 0. Needs the
     exact rotor"""
     drifts: Coefficients | None = None
     """Fractions of the drifts between the kicks, one fewer than kicks"""
     gradients: Coefficients | None = None
-    """Coefficients of the force gradient of each kick, in squares of the time step; default:
+    """Coefficients of the force gradient of each kick, in squares of the time step. Default:
     none"""
     order: Annotated[int, Strict(), Field(ge=2, le=20)]
-    """Order of convergence; it is compared with the order for an anharmonic oscillator"""
+    """Order of convergence. It is compared with the order for an anharmonic oscillator"""
     source: Line = ""
     """Where the coefficients are from"""
 
     def _errors(self):
         if exact_names(self.name, Literal[RESERVED]) in RESERVED:
-            yield f"name: {self.name} is an integrator of rigidmd; choose another name"
+            yield f"name: {self.name} is an integrator of rigidmd. Choose another name"
         if (self.steps is None) == (self.kicks is None or self.drifts is None):
             yield "needs steps, or kicks and drifts"
         elif self.steps is not None and (self.kicks or self.drifts or self.gradients):
@@ -109,7 +109,7 @@ def integrator(
     Parameters
     ----------
     steps
-        Lengths of successive velocity Verlet steps, as fractions of the time step; or
+        Lengths of successive velocity Verlet steps, as fractions of the time step, or
     kicks, drifts
         Fractions of kick, drift, ..., drift, kick
     gradients
@@ -149,7 +149,7 @@ def integrator(
 
 
 def with_registered_rows(data: Json) -> tuple[Json, dict[str, Scheme]]:
-    """Tables of a scene with those registered rows that it names and does not have; and its names
+    """Tables of a scene with those registered rows that it names and does not have, and its names
     of rows, each with a scheme that stands for an invalid row, so that only the row is an error."""
     tables, stages = (
         [*entries] if isinstance(entries := data.get(key), list) else []

@@ -1,6 +1,7 @@
 """Molecular models: rigid bodies in their principal frames from lists of sites. `models/` has
 published ones."""
 
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
+from rigidmd.core.plain_text import did_you_mean, suggestion
 from rigidmd.core.toml import impossible_values, read_toml, shorten_repr
 from rigidmd.errors import MoleculeError
 from rigidmd.mechanics.inertia import BodyKind, principal_frame, rotational_freedom
@@ -20,7 +22,6 @@ from rigidmd.scene.validation import (
     Section,
     ShortName,
     Vector,
-    did_you_mean,
     location_of,
     numbers_out_of_range,
     validation_messages,
@@ -39,6 +40,7 @@ COINCIDENT = 1e-6
 #: any inertia.
 OFF_AXIS = 1e-4
 MOST_PARAMETERS = 100  # of a site
+MOST_SUGGESTED = 3  # models, in the message on an unknown one
 #: Keys of the well depth, of which a Lennard-Jones site has one, and their units; it also has
 #: sigma_A.
 DEPTHS = {
@@ -79,11 +81,11 @@ class Site(Section):
     name: SiteName
     """Name in trajectories and topology files, at most five characters"""
     element: Annotated[str, AfterValidator(_checked_element)] = "X"
-    """Chemical symbol; X for a site without mass"""
+    """Chemical symbol. X for a site without mass"""
     mass_u: NonNegative | None = None
-    """Mass; 0 for a massless site. Default with `file`: the mass of the element"""
+    """Mass, 0 for a massless site. Default with `file`: the mass of the element"""
     position_A: Vector | None = None
-    """Position in any frame fixed in the molecule; default with `file`: the position there"""
+    """Position in any frame fixed in the molecule. Default with `file`: the position there"""
     charge_e: Number | None = None
     """Charge in elementary charges"""
     sigma_A: Positive | None = None
@@ -91,7 +93,7 @@ class Site(Section):
     epsilon_kJ_mol: NonNegative | None = None
     """Lennard-Jones well depth"""
     epsilon_kcal_mol: NonNegative | None = None
-    """Lennard-Jones well depth; 1 kcal is 4.184 kJ"""
+    """Lennard-Jones well depth, 1 kcal is 4.184 kJ"""
     epsilon_K: NonNegative | None = None
     """Lennard-Jones well depth divided by Boltzmann's constant"""
     parameters: dict[ShortName, Number] = Field(default={}, max_length=MOST_PARAMETERS)
@@ -107,7 +109,7 @@ class Site(Section):
 
     @property
     def epsilon(self) -> float:
-        """Well depth in u Å²/ps²; 0 without one."""
+        """Well depth in u Å²/ps², 0 without one."""
         return sum(unit * (getattr(self, key) or 0.0) for key, unit in DEPTHS.items())
 
 
@@ -135,7 +137,7 @@ class MoleculeFile(Section):
 
 
 class ParameterFile(Section):
-    """A table of parameters for several molecules; the key `parameters` of a scene names it."""
+    """A table of parameters for several molecules. The key `parameters` of a scene names it."""
 
     title: str = ""
     source: str = ""
@@ -147,8 +149,8 @@ class ParameterFile(Section):
 class Molecule:
     """A rigid molecule in its principal frame, centre of mass at the origin.
 
-    masses (s,) u, positions_body (s, 3) Å, charges (s,) e, sigma (s,) Å, epsilon (s,) u Å²/ps²;
-    inertia (3,) u Å², ascending, 0 about an axis on which the whole mass lies.
+    masses (s,) u, positions_body (s, 3) Å, charges (s,) e, sigma (s,) Å, epsilon (s,) u Å²/ps².
+    Inertia (3,) u Å², ascending, 0 about an axis on which the whole mass lies.
     centre (3,), axes (3, 3): centre of mass, Å, and principal axes (columns) in the coordinates of
     the model's file.
     """
@@ -195,7 +197,7 @@ class Molecule:
 
     @property
     def charge(self) -> float:
-        """Net charge in e; exactly 0 if the charges of the sites cancel to rounding."""
+        """Net charge in e. Exactly 0 if the charges of the sites cancel to rounding."""
         total = float(self.charges.sum())
         return 0.0 if abs(total) <= 1e-12 * np.abs(self.charges).sum() else total
 
@@ -272,7 +274,7 @@ class Molecule:
 def molecule(
     name: str, sites: tuple[Site, ...], residue_names: tuple[str, ...] = (), **about: Any
 ) -> Molecule:
-    """The rigid body of these sites, each of which needs a position and a mass; about: more fields
+    """The rigid body of these sites, each of which needs a position and a mass. about: more fields
     of `Molecule`. Raises MoleculeError."""
     missing = [
         (s, key) for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
@@ -285,7 +287,7 @@ def molecule(
     masses, positions = np.array([s.mass_u for s in sites]), np.array([s.position_A for s in sites])
     if masses.sum() == 0:
         raise MoleculeError(
-            f"molecule {name}", ["all sites are massless; a body needs mass to move"]
+            f"molecule {name}", ["all sites are massless. A body needs mass to move"]
         )
     size = float(np.linalg.norm(positions - masses @ positions / masses.sum(), axis=1).max())
     frame = principal_frame(masses, positions, size)
@@ -393,14 +395,22 @@ def available_models() -> list[str]:
 
 @cache
 def model_error(name: str) -> str:
-    """The message on an unknown model; empty for a known one."""
+    """The message on an unknown model. Empty for a known one."""
     known = available_models()
     if name in known:
         return ""
-    return (
-        f"unknown model {name!r}{did_you_mean(name, known) or ';'} `rigidmd models` lists all"
-        f" {len(known)}"
-    )
+    meant = did_you_mean(name, known) or suggestion(_models_called(name, known)) or "."
+    return f"unknown model {name!r}{meant} `rigidmd models` lists all {len(known)}"
+
+
+def _models_called(name: str, known: list[str]) -> list[str]:
+    """The first models with this word as the name of a residue, such as N2, or in their title."""
+    tables = {model: read_toml(MODELS / f"{model}.toml", MoleculeError)[0] for model in known}
+    words = {
+        model: {*table.get("residue_names", []), *re.findall(r"\w+", table["title"])}
+        for model, table in tables.items()
+    }
+    return [m for m in known if name.lower() in map(str.lower, words[m])][:MOST_SUGGESTED]
 
 
 def load_model(name: str) -> Molecule:

@@ -57,7 +57,7 @@ def name_of(thing: object) -> str:
 
 def missing_user_code(wanted: Sequence[str], given: Sequence[str]) -> str:
     """The error message of a scene without the user code that its `from_python` lists."""
-    hint = f"; this has {', '.join(given)}" if given else ""
+    hint = f". This has {', '.join(given)}" if given else ""
     advice = "Run it from Python with the same: Simulation(scene, forces=[...], thermostat=...)"
     return (
         f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{hint}."
@@ -73,9 +73,9 @@ class RunSettings(Section):
     """Settings for all stages."""
 
     remove_momentum_interval_ps: Interval | Literal[False] | None = None
-    """Time between removals of the total momentum; false for never. Default: 1 ps with pme, whose
+    """Time between removals of the total momentum, false for never. Default: 1 ps with pme, whose
     forces do not add up to zero exactly, and with a thermostat that scales all velocities, which
-    can make rounding errors of the momentum grow; else never. The energy removed counts as heat, as
+    can make rounding errors of the momentum grow, else never. The energy removed counts as heat, as
     with a thermostat"""
 
 
@@ -87,27 +87,27 @@ class Output(Section):
     pressure_tensor: Flag = False
     """Write the six components of the pressure into log.csv"""
     pressure_tensor_interval_ps: Interval | Literal[False] = False
-    """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for
+    """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water, false for
     none. Each line needs an evaluation of forces with the virial"""
     trajectory: Annotated[
         str | Literal[False], file_name(lambda form: form.encoder or form.writer)
     ] = TRAJECTORY
-    """Trajectory file; the extension sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb);
-    .gsd stores rotations and angular momenta, .traj is ASE's and has double precision; false for
+    """Trajectory file. The extension sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb).
+    .gsd stores rotations and angular momenta, .traj is ASE's and has double precision, false for
     none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
     topology: Annotated[str, file_name(lambda form: form.topology)] = TOPOLOGY
     """File with names and first positions that viewers need for the trajectory (.gro or .pdb)"""
     positions: Literal["wrapped", "unwrapped"] = "unwrapped"
-    """unwrapped: continuous paths, for displacements; wrapped: centres of mass inside the box.
+    """unwrapped: continuous paths, for displacements. wrapped: centres of mass inside the box.
     Molecules are whole in both cases"""
     velocities: Flag | None = None
-    """Write velocities; default: true if the format can store them"""
+    """Write velocities. Default: true if the format can store them"""
     figures: Flag = True
     """Draw energy.png"""
     checkpoint_minutes: Minutes = 5.0
-    """Wall time between checkpoints, from which `rigidmd resume` continues a run; false for none"""
+    """Wall time between checkpoints, from which `rigidmd resume` continues a run, false for none"""
 
     def _errors(self):
         if self.velocities and not self.can_store_velocities:
@@ -117,7 +117,7 @@ class Output(Section):
                 f" {formats}"
             )
         if self.topology == self.trajectory:
-            yield f"topology and trajectory are both {self.topology}; give them different names"
+            yield f"topology and trajectory are both {self.topology}. Give them different names"
 
     @property
     def can_store_velocities(self) -> bool:
@@ -125,7 +125,7 @@ class Output(Section):
 
 
 class Watch(Section):
-    """Limits beyond which a run stops, relative to scales of the system; false switches a check
+    """Limits beyond which a run stops, relative to scales of the system, false switches a check
     off."""
 
     move: Limit = 0.25
@@ -175,11 +175,11 @@ class MolecularScene(Scene):
     seed: Annotated[int, Strict(), Field(ge=0)] = 1
     """Seed of all random numbers"""
     precision: Literal["auto", "double", "mixed"] = "auto"
-    """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in
-    double; auto: mixed where the time-step error hides the error of single precision, else
+    """Arithmetic of the forces between sites. mixed: pairs in single precision, sums and motion in
+    double. auto: mixed where the time-step error hides the error of single precision, else
     double. Minimisations with tight limits, or with a pressure, are in double"""
     threads: Count | None = None
-    """Number of threads; default: all cores. Results do not depend on it"""
+    """Number of threads. Default: all cores. Results do not depend on it"""
     engine: EngineChoice = EngineChoice.model_construct()
     structure: Structure | None = None
     box: Box = Box.model_construct()
@@ -280,7 +280,7 @@ class MolecularScene(Scene):
 
     @property
     def structure_source(self) -> str:
-        """Path of the structure file, or "atoms", for messages; empty without a structure."""
+        """Path of the structure file, or "atoms", for messages. Empty without a structure."""
         if self.structure is None:
             return ""
         if "structure.file" in self.embedded_files:
@@ -306,7 +306,7 @@ class MolecularScene(Scene):
         path = self.path(topology)
         if not any(is_inside(path, folder) for folder in (self.path("."), path.parent)):
             problem = (
-                f"{topology} next to the trajectory is a link out of the scene's folder; name it by"
+                f"{topology} next to the trajectory is a link out of the scene's folder. Name it by"
                 " --set"
             )
             raise SceneError(
@@ -423,7 +423,7 @@ class MolecularScene(Scene):
         ):
             yield (
                 "run.remove_momentum_interval_ps: the total momentum is not conserved with frozen"
-                " molecules; omit it"
+                " molecules. Omit it"
             )
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:

@@ -1,4 +1,4 @@
-"""Tables of a scene of molecules: [[molecules]], the species and their numbers; [structure], [box]
+"""Tables of a scene of molecules: [[molecules]], the species and their numbers. [structure], [box]
 and [start]."""
 
 import re
@@ -57,14 +57,14 @@ class Molecules(Section):
     """A species and its number of molecules."""
 
     model: str | None = None
-    """A shipped model; `rigidmd models` lists them"""
+    """A shipped model. `rigidmd models` lists them"""
     file: Line | None = None
     """A .toml file with a molecule, like those models, or a geometry in a format of ASE, with
     `sites` for its atoms"""
     name: ShortName | None = None
-    """Name of the species; default: the name of the model or file"""
+    """Name of the species. Default: the name of the model or file"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
-    """Sites of a custom molecule; with a geometry `file`, their parameters by atom name or
+    """Sites of a custom molecule. With a geometry `file`, their parameters by atom name or
     element"""
     parameters: Line | None = None
     """A .toml file with entries like `sites` that several molecules may use. It supplies missing
@@ -74,10 +74,10 @@ class Molecules(Section):
     residue_names: tuple[SiteName, ...] | None = None
     """Residue names of this species in structure files"""
     count: Count | None = None
-    """Number of molecules; required without a structure file"""
+    """Number of molecules. Required without a structure file"""
     frozen: Flag | Numbers = False
     """Molecules that do not move. They act on all others but not on each other. True for all, or
-    numbers of some, [1, 2, 5] or "1-10, 15": residue numbers of the structure file; or, without a
+    numbers of some, [1, 2, 5] or "1-10, 15": residue numbers of the structure file, or, without a
     file or if its residues are not the molecules, 1, 2, ... within this species"""
 
     @field_validator("model")
@@ -125,13 +125,13 @@ class Structure(Section):
 
     file: Line
     """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), a trajectory (.xtc .trr
-    .gsd .traj .dcd .nc), or `final.npz` of an earlier run; in the folder of the scene or below"""
+    .gsd .traj .dcd .nc), or `final.npz` of an earlier run. In the folder of the scene or below"""
     topology: Line | None = None
     """Structure file with the names of the atoms, in the same order, for trajectories without names
     (all but .gsd). Default: topology.gro or topology.pdb in the folder of the trajectory"""
     frame: Annotated[int, Strict()] | None = None
     """Number of the structure in a file with several: 1 is the first, -1 the last. Required for
-    such files, except trajectories; default for trajectories: the last"""
+    such files, except trajectories. Default for trajectories: the last"""
     repeat: tuple[Count, Count, Count] = (1, 1, 1)
     """Repetitions of the file's cell along a, b, c, to make a crystal of its unit cell"""
     velocities: Flag = False
@@ -141,7 +141,7 @@ class Structure(Section):
     template's radius"""
     atom_types: dict[str, SiteName] | None = Field(default=None, min_length=1)
     """Site name or element of each atom type in LAMMPS data files, dumps and .xyz files: { 1 = "O",
-    2 = "H" }; X has no mass. Default: labels or elements in the file, else masses"""
+    2 = "H" }. X has no mass. Default: labels or elements in the file, else masses"""
 
     def _errors(self):
         if self.topology is None:
@@ -164,9 +164,9 @@ class Box(Section):
     """The periodic box."""
 
     lengths_A: Positive | tuple[Positive, Positive, Positive] | None = None
-    """Lengths of the edges; one number for a cube"""
+    """Lengths of the edges. One number for a cube"""
     angles_deg: tuple[Angle, Angle, Angle] | None = None
-    """Angles between b and c, c and a, a and b; default: right angles"""
+    """Angles between b and c, c and a, a and b. Default: right angles"""
     density_g_cm3: Positive | None = None
     """Mass density, which sets the edge of a cube"""
     vacuum_A: Positive | None = None
@@ -174,7 +174,7 @@ class Box(Section):
     vacuum_axis: Literal["x", "y", "z"] = "z"
     """The edge a, b or c to which vacuum_A is added"""
     periodic: Flag = True
-    """Periodic boundary conditions; false: molecules in vacuum without a box"""
+    """Periodic boundary conditions, false: molecules in vacuum without a box"""
 
     def _errors(self):
         if self.lengths_A is not None and self.density_g_cm3 is not None:
@@ -190,7 +190,7 @@ class Box(Section):
 
     @property
     def cell(self) -> np.ndarray | None:
-        """Rows (3, 3) a along x, b in the xy plane and c, Å; None if the scene does not set it."""
+        """Rows (3, 3) a along x, b in the xy plane and c, Å. None if the scene does not set it."""
         if self.lengths_A is None:
             return None
         lengths = self.lengths_A if isinstance(self.lengths_A, tuple) else (self.lengths_A,) * 3
@@ -203,5 +203,5 @@ class Start(Section):
     """Momenta at the start."""
 
     temperature_K: NonNegative | None = None
-    """Temperature at which momenta are drawn; default: the temperature of the first stage that is
+    """Temperature at which momenta are drawn. Default: the temperature of the first stage that is
     not a minimisation"""

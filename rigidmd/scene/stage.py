@@ -62,9 +62,9 @@ REFUSED = {
         " slowest motions"
     ),
     "parrinello_rahman": (
-        "Parrinello-Rahman is not available; cell_rescaling samples the same ensemble"
+        "Parrinello-Rahman is not available. cell_rescaling samples the same ensemble"
     ),
-    "mttk": "MTTK is not available; cell_rescaling samples the same ensemble",
+    "mttk": "MTTK is not available. cell_rescaling samples the same ensemble",
     "c_rescale": "C-rescale is called cell_rescaling in rigidmd",
     "v_rescale": "V-rescale is called velocity_rescaling in rigidmd",
 }
@@ -87,21 +87,21 @@ class Timing(Section):
     """The first keys of a stage."""
 
     name: ShortName | None = None
-    """Name of the stage; default: the name of the ensemble"""
+    """Name of the stage. Default: the name of the ensemble"""
     ensemble: Ensemble = "nve"
     """Constant: nve energy and volume; nvt temperature and volume; npt temperature and pressure;
-    nph enthalpy and pressure. minimise: no time passes; molecules move and rotate to a minimum of
+    nph enthalpy and pressure. minimise: no time passes. Molecules move and rotate to a minimum of
     the potential energy, or, if pressure_bar is given, molecules and cell to a minimum of the
     enthalpy"""
     duration_ps: Positive | None = Field(default=None, validate_default=True)
-    """Duration; required except with minimise"""
+    """Duration. Required except with minimise"""
     timestep_fs: Positive | None = None
     """Time step. Default: one of 1, 2, 2.5, 4, 5, 10 fs and their tenths, from the fastest motion
     of the molecules and the temperature. With baoab it is the longest whose bias of U stays below
-    0.002 kT per degree of freedom, 4 fs for water at 300 K; at constant energy it is half as long.
+    0.002 kT per degree of freedom, 4 fs for water at 300 K. At constant energy it is half as long.
     `rigidmd check` prints it"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
-    """Temperature of the thermostat; two for a linear change over the stage, [300, 240]"""
+    """Temperature of the thermostat. Two for a linear change over the stage, [300, 240]"""
     volume: Literal["mean"] | None = None
     """With nve and nvt, mean: the box is scaled at the start to the mean, over its equilibrated
     part, of the npt or nph stage just before. Default: the box as it is at the end of that stage"""
@@ -113,10 +113,10 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     integrator: Annotated[str, NameIn((*SCHEMES, *WITH_THERMOSTAT, AUTO), in_scene=True)] = (
         "velocity_verlet"
     )
-    """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift; auto: the
+    """Scheme of kicks and drifts. baoab: the thermostat acts in the middle of the drift. auto: the
     scheme and step that keep the requested error with the fewest force evaluations. Default: baoab
     with nvt and npt, whose averages have almost no time-step error, except with
-    hybrid_monte_carlo, which corrects it; else velocity_verlet"""
+    hybrid_monte_carlo, which corrects it, else velocity_verlet"""
     energy_error_kT: Positive | None = None
     """With auto: rms error of the energy over the whole stage, as pilot runs predict it, in kT per
     degree of freedom"""
@@ -127,14 +127,14 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     """With auto in nvt: estimated bias of the average potential energy, in kT per degree of
     freedom"""
     rotor: Rotor | None = None
-    """Free rotation by the split or the exact flow; default: the flow that the integrator needs"""
+    """Free rotation by the split or the exact flow. Default: the flow that the integrator needs"""
     force_limit_kJ_mol_A: Positive = 0.1
     """With minimise: largest force on a molecule at convergence. Forces in a liquid are of the
     order of 10 kJ/mol/Å, and force constants between 1 (argon) and 100 kJ/mol/Å² (hydrogen bonds):
     with 0.1 positions are good to 0.1 and 0.001 Å and energies to 0.005 kJ/mol per molecule, 0.002
     kT at 300 K"""
     torque_limit_kJ_mol: Positive = 0.1
-    """With minimise: largest torque on a molecule about a principal axis at convergence; for a
+    """With minimise: largest torque on a molecule about a principal axis at convergence. For a
     molecule with a radius of 1 Å as strict as the default limit of forces"""
     pressure_limit_bar: Positive = 1.0
     """With minimise and pressure_bar: largest deviation of the pressure at convergence. At the
@@ -356,7 +356,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def steps_together(self) -> int:
-        """Steps of a trajectory of hybrid Monte Carlo, between which nothing is observed; else
+        """Steps of a trajectory of hybrid Monte Carlo, between which nothing is observed, else
         1."""
         return int(self.thermostat_values["trajectory_steps"]) if self.is_hybrid else 1
 
@@ -367,14 +367,14 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def refreshment_rate(self) -> float:
-        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo again in one step;
-        infinite for all of it."""
+        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo again in one step.
+        Infinite for all of it."""
         kept_fraction = 1 - self.momentum_refreshment
         return -log(kept_fraction) / (2 * self.step) if kept_fraction else inf
 
     @property
     def duration(self) -> float:
-        """Duration, ps; 0 for a minimisation."""
+        """Duration, ps, 0 for a minimisation."""
         return self.duration_ps or 0.0
 
     @property
@@ -447,7 +447,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def thermostat_time(self) -> float:
-        """Time constant of the thermostat, ps; the longer one of langevin."""
+        """Time constant of the thermostat, ps. The longer one of langevin."""
         return THERMOSTATS[self.thermostat_kind].time(self.thermostat_values)
 
     @property
@@ -491,7 +491,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
 
 def _users(key: str) -> set[str]:
-    """The ensembles, thermostats and barostats that use a key; none for the keys of every stage."""
+    """The ensembles, thermostats and barostats that use a key. None for the keys of every stage."""
     return USED.get(key, set()) | {
         name for name, kind in (THERMOSTATS | BAROSTATS).items() if key in kind.keys
     }

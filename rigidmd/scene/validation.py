@@ -61,7 +61,7 @@ def _add_docstrings(schema: Json, kind: type[BaseModel]) -> None:
 
 
 class Section(BaseModel):
-    """A frozen table of a TOML file; unknown keys are errors."""
+    """A frozen table of a TOML file. Unknown keys are errors."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", defer_build=True, json_schema_extra=_add_docstrings
@@ -220,7 +220,7 @@ WITH_UNIT = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za
 
 
 def _as_number(text: str, keys: list) -> str:
-    """Advice on a text where a number is expected: the number in the unit of the key; empty for
+    """Advice on a text where a number is expected: the number in the unit of the key. Empty for
     other texts."""
     match = WITH_UNIT.fullmatch(text)
     if not match:

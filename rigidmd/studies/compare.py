@@ -88,7 +88,7 @@ def compare(first: Path, second: Path) -> RunComparison:
         return (first / name).exists() or (second / name).exists()
 
     def both(name: str, read: Callable[[Path], Any]) -> list[Any]:
-        """The content of this file in both folders; empty, which `missing` explains, if one of them
+        """The content of this file in both folders. Empty, which `missing` explains, if one of them
         cannot be read."""
         contents = []
         for path in (first / name, second / name):
@@ -190,7 +190,7 @@ def _rows_by_value(values: list[str]) -> dict[tuple[str, int], int]:
 
 
 def last_bits(first: str, second: str) -> int | None:
-    """Number of last bits that differ: bits of the count of floats between two numbers, at most 53;
+    """Number of last bits that differ: bits of the count of floats between two numbers, at most 53.
     None for text."""
     try:
         numbers = np.array([float(first), float(second)]).view(np.int64)
@@ -253,7 +253,7 @@ def _describe_samples(samples: SampleComparison) -> list[str]:
     lines = [f"a column of one run only: {name}" for name in samples.only]
     if samples.at is None:
         return [f"{lengths}, the same to the last bit", *lines]
-    first = f"{lengths}; the first that differs, at {samples.clock} {samples.at}:"
+    first = f"{lengths}. The first that differs, at {samples.clock} {samples.at}:"
     lines = [first, *_describe_cells(samples.first), *lines]
     if samples.last and samples.common - 1 > samples.index:
         lines += ["the last in common:", *_describe_cells(samples.last)]

@@ -124,7 +124,7 @@ def means_of_runs(
     runs: Mapping[float, Sequence[tuple[float, float | None]]],
     together: Mapping[float, Together] | None = None,
 ) -> list[MeanAtStep]:
-    """Means over the runs at each step, with errors; none where the runs are too few and too short
+    """Means over the runs at each step, with errors. None where the runs are too few and too short
     for an error.
 
     runs : step (fs) -> value and error of each of its runs

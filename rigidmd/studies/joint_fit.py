@@ -205,7 +205,7 @@ def _evaluate(blocks: np.ndarray, at: Conditions, has_barostat: bool) -> dict[st
 
 
 def _heating(mean: _Samples, at: Conditions) -> float:
-    """(T' - T)/T over dt², with the temperature T' of the shadow Hamiltonian; 1/ps²."""
+    """(T' - T)/T over dt², with the temperature T' of the shadow Hamiltonian, 1/ps²."""
     set_energy = at.freedom * at.thermal_energy / 2
     return float(mean.squares * (1 / 12 - at.correction) / set_energy)
 
@@ -274,7 +274,7 @@ def _with_errors(
 ) -> dict[float, list[tuple[float, float | None]]]:
     """The values of a result at each step with their errors.
 
-    of_series : whether each error is that of its run; else all runs have the same one for the same
+    of_series : whether each error is that of its run, else all runs have the same one for the same
         length, as errors from few blocks scatter, and are smaller where fluctuations are
     """
     every = [of for found in runs.values() for of in found]

@@ -68,8 +68,8 @@ class Coordinates:
     """The mass-weighted coordinates q (d,) about a state. Frozen molecules and axes without inertia
     have none.
 
-    The order is: shifts sqrt(m) X along x, y, z of molecule 1, of molecule 2, ...; then rotations
-    sqrt(I_k) theta_k about the principal axes 1, 2, 3 of molecule 1, of molecule 2, ...; those that
+    The order is: shifts sqrt(m) X along x, y, z of molecule 1, of molecule 2, .... Then rotations
+    sqrt(I_k) theta_k about the principal axes 1, 2, 3 of molecule 1, of molecule 2, .... Those that
     do not move are omitted.
 
     scale : (d,) length of a move of `Enthalpy`, Å, for a unit of q
@@ -151,7 +151,7 @@ class NormalModes:
 
     def free_energy(self, temperature: float, quantum: bool = True) -> float:
         """Helmholtz energy (kJ/mol) of the vibrations of the rigid molecules, from the energy of
-        the minimum on, at a temperature (K); at 0 the zero-point energy. Raises ValueError if there
+        the minimum on, at a temperature (K). At 0 the zero-point energy. Raises ValueError if there
         are only some of the modes."""
         if len(self.rate) < len(self.coordinates.index):
             raise ValueError("a sum over all modes needs all of them: leave out count and gamma")
@@ -175,7 +175,7 @@ class NormalModes:
         return bool(self.rate[self.number == number].any())
 
     def table(self) -> Table:
-        """The modes with their properties; zero modes, which mix freely, have none."""
+        """The modes with their properties. Zero modes, which mix freely, have none."""
 
         def of(values: np.ndarray) -> Callable[[int], float | None]:
             return lambda k: float(values[k]) if self.rate[k] else None
@@ -218,7 +218,7 @@ def normal_modes(
     minimise
         False requires that the start is a minimum
     count
-        Of the lowest and of the highest modes, by Lanczos; default: all, or 20 if there are more
+        Of the lowest and of the highest modes, by Lanczos. Default: all, or 20 if there are more
         than 6000
     gamma
         Only modes with the period of the unit cell that `structure.repeat` repeats (k = 0)
@@ -318,7 +318,7 @@ def _numbers(c: Coordinates, count: int | None, gamma: bool) -> np.ndarray:
 
 
 def _last_temperature(scene: MolecularScene) -> float:
-    """The temperature at the end of the last stage that sets one, K; without one the one of the
+    """The temperature at the end of the last stage that sets one, K. Without one the one of the
     start, or 0."""
     temperature = scene.start.temperature_K or 0.0
     for stage in scene.stages:
@@ -359,7 +359,7 @@ def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, 
 
 def _stiffness(enthalpy: Enthalpy, system: System, state: State) -> float:
     """The force, kJ/(mol Å), with which the stiffest motion opposes a displacement by the smallest
-    diameter; at least the deepest well over this diameter, as far from each other molecules barely
+    diameter. At least the deepest well over this diameter, as far from each other molecules barely
     attract. Raises SimulationError."""
     fastest = stiffest_mode(system, state, enthalpy.engine) if enthalpy.free.any() else None
     if fastest is None:
@@ -406,7 +406,7 @@ def _periodic_modes(
 
 
 def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of uniform translations and of the lowest and highest modes, by Lanczos; errors by
+    """The same of uniform translations and of the lowest and highest modes, by Lanczos. Errors by
     residuals."""
     shape, size = (len(c.index),) * 2, min(len(c.index), max(2 * count + 1, KRYLOV))
     start = c.relative(np.random.default_rng(0).standard_normal(len(c.index)))

@@ -68,7 +68,7 @@ def write_film(
     kind = path.suffix
     if kind == ".mp4" and ffmpeg() is None:
         advice = "install the program, or `pip install imageio-ffmpeg`, which contains it"
-        raise OutputError(f"{path}: .mp4 needs ffmpeg: {advice}; a .gif needs no other program")
+        raise OutputError(f"{path}: .mp4 needs ffmpeg: {advice}. A .gif needs no other program")
     record = read_record(folder)
     animation = animation_of(record, MOST_FRAMES)
     begin, (end, notes) = float(animation.time[0]), animation.loop_end()

@@ -34,7 +34,7 @@ VECTORS = {
     "ω": ("omega_lab", "rad/s", "amber", "angular velocity ω", -0.05),
 }
 USAGE = (
-    "Drag to rotate, wheel or pinch to zoom, double click to reset; space plays. A click on a plot"
+    "Drag to rotate, wheel or pinch to zoom, double click to reset. Space plays. A click on a plot"
     " jumps to it."
 )
 #: Rotations between two frames beyond which a body seems to rotate backwards.
@@ -47,12 +47,12 @@ EXACT_RETURN = 0.02
 
 
 class BodyAnimation:
-    """Lengths are in units of the picture's half width, about its centre; (t,) samples.
+    """Lengths are in units of the picture's half width, about its centre. (t,) samples.
 
     position : (t, 3) of the pivot or the centre of mass
     centre : (3,) centre of mass in the body's axes
     quaternion : (t, 4) w, x, y, z, without jumps of sign
-    angles : (t, 3) phi, theta, psi, degrees; empty for a point
+    angles : (t, 3) phi, theta, psi, degrees. Empty for a point
     path, when : (p, 3) and (p,) the body axis on the sphere, or the centre of mass
     sphere : its radius, 0 without one
     vectors : name -> (t, 3)

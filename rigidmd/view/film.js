@@ -16,7 +16,7 @@ function rigidmdPlayer(film) {
   let now = first, playing = false, before = 0, busy = false;
   const seconds = [1, 2, 5, 10, 20, 40, 80, 160, 320, 640];
   const words = (s) => {
-    if (film.unit !== "s") return `${(span / s).toPrecision(2) * 1} ${film.unit} a second`;
+    if (film.unit !== "s") return `${(span / s).toPrecision(2) * 1} ${film.unit} per second`;
     const rate = span / s;
     if (Math.abs(rate - 1) < 0.02) return "real time";
     return rate < 1 ? `${(1 / rate).toPrecision(2) * 1} times slower` : `${rate.toPrecision(2) * 1} times faster`;

@@ -208,7 +208,7 @@ def _cut(mesh: Mesh) -> Mesh:
 
 
 def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:
-    """A solid of revolution about axis 3 from circles (radius, z), from below; a quarter of its
+    """A solid of revolution about axis 3 from circles (radius, z), from below. A quarter of its
     side is painted. A `closed` one is a ring, without discs at its ends."""
     n, corner = CIRCLE_CORNERS, np.arange(CIRCLE_CORNERS)
     angle = 2 * np.pi * corner / n

@@ -35,7 +35,7 @@ EYE, HAZE = np.array([0.45, -1.0, 0.33]), 0.5
 #: Lengths of the scale, Å.
 SCALES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1)
 USAGE = (
-    "Drag to rotate, wheel or pinch to zoom; the ☰ of the picture has its style, the box, labels"
+    "Drag to rotate, wheel or pinch to zoom. The ☰ of the picture has its style, the box, labels"
     " and axes. Space plays. A click on a plot jumps to its time. Drawn by chemiscope"
     " (chemiscope.org)."
 )
@@ -73,7 +73,7 @@ def frames_of(record: Record, max_frames: int) -> Frames:
 
 
 def inside(frames: Frames, sites: Sites) -> Frames:
-    """The frames with the centre of each molecule inside the box; molecules stay whole."""
+    """The frames with the centre of each molecule inside the box. Molecules stay whole."""
     if frames.cells is None:
         return frames
     count, columns = np.bincount(sites.molecule), np.swapaxes(frames.cells, 1, 2)

@@ -86,7 +86,7 @@ def molecule_text(m: Molecule) -> str:
 
 
 def _geometry(m: Molecule) -> list[str]:
-    """Lengths and angles of the links; equal ones are counted."""
+    """Lengths and angles of the links. Equal ones are counted."""
     stems = [re.sub(r"(?<=\D)\d+$", "", name) for name in m.site_names]
     kind = [
         stem if stems.count(stem) > 1 else name

@@ -89,7 +89,7 @@ def analysis_html(result: AnalysisResult) -> str:
 
 
 def _measured(value: Value) -> str:
-    """A value with its error and unit; empty without one, as its note has the reason."""
+    """A value with its error and unit. Empty without one, as its note has the reason."""
     unit = "" if value.unit in ("", "1") else f" {value.unit}"
     return "" if value.value is None else f"{format_with_error(value.value, value.error)}{unit}"
 
@@ -100,7 +100,7 @@ def _sides(left: str, right: str) -> str:
 
 
 def _drawing(drawing: "Picture | None", salt: str, about: str) -> str:
-    """A figure in the colours of the notebook, or on white if it has a shaded solid; empty without
+    """A figure in the colours of the notebook, or on white if it has a shaded solid. Empty without
     one."""
     if drawing is None:
         return ""
@@ -135,7 +135,7 @@ HEIGHT = 720
 
 
 class AnimationPage:
-    """A page with an animation, which a notebook shows in a frame; `page` is its HTML."""
+    """A page with an animation, which a notebook shows in a frame. `page` is its HTML."""
 
     def __init__(self, page: str):
         self.page = page

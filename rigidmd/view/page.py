@@ -59,7 +59,7 @@ def write_page(path: Path, title: str, parts: Iterable[str], style: str = "") ->
 
 
 def section(title: str, *parts: str, anchor: str = "") -> str:
-    """A heading (plain text) and HTML parts; empty without any part."""
+    """A heading (plain text) and HTML parts. Empty without any part."""
     if not any(parts):
         return ""
     name = f' id="{html.escape(anchor)}"' if anchor else ""

@@ -64,8 +64,8 @@ def plot(results: Results, *columns: str, log: bool = False) -> Picture:
     Parameters
     ----------
     columns
-        Names of columns, drawn against time, with one panel for each unit; default: the main figure
-        of the run (energy.png, or the path of the axis of a body); or the name of another figure of
+        Names of columns, drawn against time, with one panel for each unit. Default: the main figure
+        of the run (energy.png, or the path of the axis of a body), or the name of another figure of
         a body ("angles", "ellipsoids", "path", "invariants")
     log
         Absolute values on a logarithmic axis. Raises KeyError
@@ -119,15 +119,15 @@ TIME_FRACTION = 0.2
 
 
 class LivePlot(Observer):
-    """Draws columns of the samples so far in the output of a notebook cell; elsewhere it does
+    """Draws columns of the samples so far in the output of a notebook cell. Elsewhere it does
     nothing.
 
     Parameters
     ----------
     columns
-        names, as in `results[...]`; default: temperature and drift, for a body energy_error
+        names, as in `results[...]`. Default: temperature and drift, for a body energy_error
     interval
-        Of the run (ps, s for a body) between two drawings; default: the interval of its samples
+        Of the run (ps, s for a body) between two drawings. Default: the interval of its samples
     pause
         Least seconds between two drawings, which take at most a fifth of the time
     """

@@ -7,7 +7,7 @@ errors.
 thread each, both at once. rigidmd: baoab with Langevin friction, stochastic cell rescaling, mixed
 precision. GROMACS: leap-frog, v-rescale, C-rescale. Both measure the kinetic energy where harmonic
 motions leave no time-step error in positions. Errors are standard errors by pymbar's statistical
-inefficiency; the first tenth of each run is omitted.
+inefficiency. The first tenth of each run is omitted.
 """
 
 import argparse

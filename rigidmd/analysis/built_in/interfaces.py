@@ -48,7 +48,7 @@ class Slab(NamedTuple):
 def slab_of(frames: RigidFrames, axis: str) -> Slab:
     """A slab, centred in each frame. Raises OutputError."""
     if axis not in ("x", "y", "z"):
-        raise OutputError(f"unknown axis {axis!r}; name x, y or z")
+        raise OutputError(f"unknown axis {axis!r}. Name x, y or z")
     if not frames.has_box:
         raise OutputError("a slab needs a box")
     k = "xyz".index(axis)
@@ -202,7 +202,7 @@ def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
 
 
 def _mean_cosine(runs: Runs, profiles: Profiles, kind: Kind) -> np.ndarray:
-    """Mean cosine (bins,) of the dipoles of a species with the outward normal; NaN where there are
+    """Mean cosine (bins,) of the dipoles of a species with the outward normal. NaN where there are
     few."""
     dipole = kind.molecule.charges @ kind.molecule.positions_body
     count, total = np.zeros(len(profiles.z)), np.zeros(len(profiles.z))

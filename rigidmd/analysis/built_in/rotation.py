@@ -1,5 +1,5 @@
 """Rotation, spectra and dipoles: orientational correlation, rotational diffusion, densities of
-states; the dielectric constant from the fluctuation of the total dipole."""
+states. The dielectric constant from the fluctuation of the total dipole."""
 
 from collections.abc import Callable
 from typing import Any
@@ -98,14 +98,14 @@ def orientation(runs: Runs) -> AnalysisResult:
                     about = "about" if C[-1] < SLOWEST else "more than"
                     why = (
                         f"C{l + 1} is still {C[-1]:.2f} after {time[-1]:.3g} ps, too short for a"
-                        f" value; it needs {about} {need:.2g} ps"
+                        f" value. It needs {about} {need:.2g} ps"
                     )
                     result.values.append(too_short(name, "ps", tau, None, why))
                     continue
                 low, note = int(C.argmin()), ""
                 if C[low] < -max(TAIL, 3 * float(np.nan_to_num(doubt[low]))):
                     note = (
-                        f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is"
+                        f"to where C{l + 1} first falls below {TAIL:g}. At {time[low]:.3g} ps it is"
                         f" {C[low]:.2f}"
                     )
                 result.values.append(
@@ -217,7 +217,7 @@ def spectrum(runs: Runs) -> AnalysisResult:
             if not correlations[1] > CLOSE:
                 raise OutputError(
                     f"frames every {interval:g} ps are not enough for a spectrum: {title} decays"
-                    " between them; output.trajectory_interval_ps = 0.004 suits water"
+                    " between them. output.trajectory_interval_ps = 0.004 suits water"
                 )
             memory.add(f"correlation {title}", correlations, errors)
 
@@ -225,7 +225,7 @@ def spectrum(runs: Runs) -> AnalysisResult:
                 part: RigidFrames, group: Kind, of=of, weight=weight / runs.thermal_energy
             ) -> np.ndarray:
                 """2 weight times the power of series (f, n, d) a wave number, sum over d and mean
-                over n; cm."""
+                over n. Cm."""
                 values, total = of(part, group), 0.0
                 for first in range(0, values.shape[1], 256):
                     some = values[:, first : first + 256].reshape(len(values), -1)
@@ -340,7 +340,7 @@ def dielectric(runs: Runs) -> AnalysisResult:
     surroundings = "tin foil" if np.isinf(around) else f"a permittivity of {around:g}"
     electrostatics = runs.system.scene.forces.electrostatics
     note = (
-        f"{surroundings} around, {electrostatics}; correlation time of the dipole"
+        f"{surroundings} around, {electrostatics}. Correlation time of the dipole"
         f" {correlation:.3g} ps"
     )
     name, value = "dielectric constant", float(epsilon)
@@ -369,7 +369,7 @@ def dielectric(runs: Runs) -> AnalysisResult:
 
 
 def _permittivity_around(runs: Runs) -> float:
-    """Permittivity around the sphere of Ewald sums or the cavity of a reaction field; infinity for
+    """Permittivity around the sphere of Ewald sums or the cavity of a reaction field. Infinity for
     tin foil. Raises OutputError where the fluctuation of the dipole gives no dielectric
     constant."""
     forces = runs.system.scene.forces
@@ -393,12 +393,12 @@ def _permittivity_around(runs: Runs) -> float:
         return forces.reaction_field_permittivity
     raise OutputError(
         f"electrostatics = {forces.electrostatics!r} has no known boundary for the fluctuation of"
-        " the dipole; use pme, ewald or reaction_field"
+        " the dipole. Use pme, ewald or reaction_field"
     )
 
 
 def _broken_symmetry(runs: Runs) -> str:
-    """What distinguishes a dipole of the system from the opposite one; empty if nothing does."""
+    """What distinguishes a dipole of the system from the opposite one. Empty if nothing does."""
     if any(not kind.moves and kind.molecule.has_dipole for kind in runs.kinds):
         return "frozen molecules have dipoles"
     if runs.system.scene.fields.entries:

@@ -52,7 +52,7 @@ def rdf(
     largest: float | None = None,
     width: float = WIDTH,
 ) -> AnalysisResult:
-    """g(r) of two sites, elements or species (centres of mass); default: all pairs of elements, in
+    """g(r) of two sites, elements or species (centres of mass). Default: all pairs of elements, in
     mixtures of species.
 
     g is normalised by the number of pairs of different molecules, so it tends to 1 in a small box
@@ -61,7 +61,7 @@ def rdf(
     Parameters
     ----------
     largest
-        Largest distance, Å; default: half the box, at most 10 Å
+        Largest distance, Å. Default: half the box, at most 10 Å
     width
         Width of a bin, Å
 
@@ -130,7 +130,7 @@ def _thinned(runs: Runs, enough: int) -> tuple[Runs, list[str]]:
 
 def _mean_of_frames(runs: Runs, values: list[np.ndarray]) -> Measured | tuple[np.ndarray, None]:
     """Mean of arrays (f, p) of the frames of each run, and its error: of one run from blocks, of
-    several from their scatter; None with few frames."""
+    several from their scatter. None with few frames."""
     means = [of_run.mean(axis=0) for of_run in values]
     if runs.are_several:
         return runs.estimate(means, lambda mean: mean)
@@ -167,7 +167,7 @@ def _peaks(
     """Position and height of the first peak, and neighbours up to the first minimum, if there is a
     peak.
 
-    frames : g(r) of each frame (f, bins) of each run; filled (bins,) : neighbours where g is 1
+    frames : g(r) of each frame (f, bins) of each run. Filled (bins,) : neighbours where g is 1
     """
     width = r[1] - r[0]
     edges = np.append(r - 0.5 * width, r[-1] + 0.5 * width)
@@ -231,7 +231,7 @@ def _peaks(
 
 
 def _shift_of_vertex(low: float, middle: float, high: float) -> float:
-    """Where the parabola through three points at -1, 0, 1 has its highest point; 0 if it has
+    """Where the parabola through three points at -1, 0, 1 has its highest point, 0 if it has
     none."""
     bend = low - 2 * middle + high
     return float(0.5 * (low - high) / bend) if bend < 0 else 0.0
@@ -278,7 +278,7 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
     Parameters
     ----------
     name
-        A site, an element or a species; default: the centres of all molecules
+        A site, an element or a species. Default: the centres of all molecules
     largest
         Largest wave vector, 1/Å
 
@@ -293,7 +293,7 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
     shortest = float(heights(reciprocal).min())
     if not largest > shortest:
         why = f"this box has no wave vector shorter than {largest:g} 1/Å"
-        raise OutputError(f"{why}; the shortest is {shortest:.3g} 1/Å")
+        raise OutputError(f"{why}. The shortest is {shortest:.3g} 1/Å")
     vectors, bin_of = _k_vectors(reciprocal, largest)
     bins = int(bin_of.max()) + 1
     used, members = np.unique(bin_of, return_inverse=True)
@@ -331,7 +331,7 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
 
 
 def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Integer wave vectors (w, 3), one of k and -k, and the bin of each; evenly chosen in bins with
+    """Integer wave vectors (w, 3), one of k and -k, and the bin of each. Evenly chosen in bins with
     many."""
     reach = np.ceil(largest / heights(reciprocal)).astype(int)
     vector_blocks, bin_index = [], []
@@ -362,7 +362,7 @@ def density_profile(runs: Runs, axis: str = "z", bins: int = 100) -> AnalysisRes
     Raises OutputError."""
     if axis not in ("x", "y", "z"):
         raise OutputError(
-            f"unknown axis {axis!r}; name x, y or z (the edges a, b and c of the box)"
+            f"unknown axis {axis!r}. Name x, y or z (the edges a, b and c of the box)"
         )
     if not runs.has_box:
         raise OutputError("a profile of the density needs a box")
@@ -426,7 +426,7 @@ def hydrogen_bonds(
         {"share": thinned.mean(fractions)},
         bars=True,
     )
-    about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
+    about = f"{distance:g} Å, {angle:g}°. Each bond counts for both of its molecules"
     tau = correlation_time_of(thinned, each)
     mean_bonds = Value("hydrogen bonds of a molecule", "1", value, error, tau, about)
     return AnalysisResult(

@@ -166,7 +166,7 @@ class Samples:
 @built_in("heat capacities, compressibility, thermal expansion, pressure coefficient", position=95)
 def response(runs: Runs) -> AnalysisResult:
     """Response functions from fluctuations: in nvt and nve c_v and the thermal pressure coefficient
-    gamma_V = (dp/dT)_V; in npt also c_p, the compressibility kappa_T and the thermal expansion
+    gamma_V = (dp/dT)_V. In npt also c_p, the compressibility kappa_T and the thermal expansion
     alpha_p.
 
     Heat capacities are classical. The error of one run is from the series of what each sample
@@ -226,7 +226,7 @@ def _check_conditions(runs: Runs) -> None:
 
 
 def _why_no_pressure(runs: Runs) -> str:
-    """Why the run has no pressure that follows from its energy; empty if it has one."""
+    """Why the run has no pressure that follows from its energy. Empty if it has one."""
     if not runs.has_box:
         return "the run has no periodic box"
     names = ", ".join(runs.system.position_dependent)

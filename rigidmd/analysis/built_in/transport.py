@@ -1,4 +1,4 @@
-"""Correlation functions; mean squared displacement, diffusion and viscosity, each with its
+"""Correlation functions. Mean squared displacement, diffusion and viscosity, each with its
 error."""
 
 from typing import Any
@@ -42,7 +42,7 @@ def correlation(series: np.ndarray, lags: int) -> np.ndarray:
 
 
 def squared_displacement(path: np.ndarray, lags: int) -> np.ndarray:
-    """<|x(t) - x(0)|²> at the first `lags` lags, mean over origins and molecules; path (f, n, d).
+    """<|x(t) - x(0)|²> at the first `lags` lags, mean over origins and molecules. Path (f, n, d).
     From sums of squares and the correlation of positions (Calandrini et al. 2011, Collection SFN
     12, 201)."""
     path = path - path.mean(axis=0)
@@ -70,7 +70,7 @@ def interval_and_lags(runs: Runs, what: str) -> tuple[float, int]:
     if runs.interval is None:
         gaps = np.concatenate([np.diff(run.time) for run in runs.members])
         raise OutputError(
-            f"{what} needs frames at equal intervals; these are {gaps.min():g} to {gaps.max():g} ps"
+            f"{what} needs frames at equal intervals. These are {gaps.min():g} to {gaps.max():g} ps"
         )
     lags = int(min(runs.frame_count // BLOCKS, runs.shortest) * FIT_TO) + 1
     if lags < 3:
@@ -105,7 +105,7 @@ def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResul
     Parameters
     ----------
     viscosity_mPa_s
-        For the correction of Yeh and Hummer; default: from the pressure tensor of the run, if any
+        For the correction of Yeh and Hummer. Default: from the pressure tensor of the run, if any
 
     Raises
     ------
@@ -163,7 +163,7 @@ def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResul
         if D <= 0 or abs(bend) > BEND * D + 2 * np.nan_to_num(doubt):
             why = (
                 f"the slope of its displacement changes from {time[0]:.3g} to {time[-1]:.3g} ps,"
-                f" too short for a value; a run of {4 * runs.span:.3g} ps follows it four times"
+                f" too short for a value. A run of {4 * runs.span:.3g} ps follows it four times"
                 " as far"
             )
             result.values.append(
@@ -241,7 +241,7 @@ def viscosity(runs: Runs) -> AnalysisResult:
     if limit is None:
         raise OutputError(
             f"an interval of {interval:.3g} ps of the pressure tensor is too long for a viscosity:"
-            " stresses decay in it; output.pressure_tensor_interval_ps = 0.01 suits water"
+            " stresses decay in it. output.pressure_tensor_interval_ps = 0.01 suits water"
         )
     slowest = float(limit.best.times.max())
     lags = int(max(8, min(SHOWN_TIMES * slowest / interval, min(map(len, stresses)) // 2)))
@@ -253,7 +253,7 @@ def viscosity(runs: Runs) -> AnalysisResult:
     if slowest > LONGEST_SEEN * longest or error > LARGEST_DOUBT * value:
         why = (
             f"the integral of the stress correlation still grows after {longest:.3g} ps, too short"
-            f" for a value; a run of {4 * (length - interval * len(stresses)):.3g} ps follows it"
+            f" for a value. A run of {4 * (length - interval * len(stresses)):.3g} ps follows it"
             " four times as far"
         )
         result.values.append(too_short("viscosity", "mPa s", value, error, why))

@@ -128,7 +128,7 @@ def with_user_code(system: System) -> System:
     force_names = [*(entry.label for entry in scene.forces.added.values()), *map(name_of, added)]
     names = distinct(force_names, [*system.terms, *system.constants])
     errors = [
-        f"{name} is {RESERVED[name]}; name the force otherwise"
+        f"{name} is {RESERVED[name]}. Name the force otherwise"
         for name in names
         if name in RESERVED
     ]

@@ -1,5 +1,5 @@
 """Checks of users' compiled forces and thermostats before the first step: what cannot be compiled,
-indices beyond an array, and momenta that are not finite or whose energy is not in the ledger; each
+indices beyond an array, and momenta that are not finite or whose energy is not in the ledger. Each
 message names the function and its line."""
 
 import linecache

@@ -60,7 +60,7 @@ class ValuesAtCutoff(NamedTuple):
         text = (
             f"is {energy} kJ/mol ({self.energy / thermal:.2g} {scale}) at its cutoff of"
             f" {self.cutoff:g} Å with truncation = {truncation}, between {between}, and its force"
-            f" is {force} kJ/mol/Å; beyond it does not act"
+            f" is {force} kJ/mol/Å. Beyond it does not act"
         )
         if self.change > abs(self.energy):
             text += f", where it would change by {self.change / thermal:.2g} {scale}"
@@ -69,7 +69,7 @@ class ValuesAtCutoff(NamedTuple):
 
 def energy_scale(system: System) -> tuple[float, str]:
     """The smallest kT of a scene, or else its deepest well between two sites (u Å²/ps²), and its
-    name; 0 without."""
+    name, 0 without."""
     scene = system.scene
     temperatures = [x for stage in scene.stages for x in stage.temperatures if x > 0]
     temperature = min(temperatures, default=scene.start.temperature_K or 0.0)

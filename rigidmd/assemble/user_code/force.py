@@ -64,9 +64,9 @@ class Force:
     Parameters
     ----------
     name
-        In logs and messages; default: the name of the class
+        In logs and messages. Default: the name of the class
     changes_momentum
-        Which components of the total momentum it may change; False for forces between molecules
+        Which components of the total momentum it may change. False for forces between molecules
     tied_to_places
         Whether its energy depends on absolute positions, which excludes a barostat. If False, its
         virial must be the last of the returned values
@@ -120,7 +120,7 @@ class BoundForce:
 
     calls, seconds : how often it was called, and the time that this took
     may_diverge : whether values that are not finite are passed to the steps, as in trajectories of
-        hybrid Monte Carlo, which are then rejected; else they are an error
+        hybrid Monte Carlo, which are then rejected, else they are an error
     """
 
     may_diverge = False
@@ -194,7 +194,7 @@ class BoundForce:
             optional = (
                 " and perhaps torques and a virial" if largest == 4 else " and perhaps a virial"
             )
-            raise self._error(f"{kind}; it must return a tuple of an energy, forces{optional}")
+            raise self._error(f"{kind}. It must return a tuple of an energy, forces{optional}")
         try:
             energy = float(returned[0])
         except (TypeError, ValueError):
@@ -209,7 +209,7 @@ class BoundForce:
         molecule: np.ndarray | None = None,
         unit: float = KJ_PER_MOL,
     ) -> None:
-        """Copy given values times a unit to an array of the workspace; None is 0."""
+        """Copy given values times a unit to an array of the workspace. None is 0."""
         if returned is None:
             target[:] = 0.0
             return
@@ -244,7 +244,7 @@ class BoundForce:
 
 
 def real_numbers(values: Any) -> np.ndarray | None:
-    """An array of real numbers; None for anything else, such as complex numbers and masked
+    """An array of real numbers. None for anything else, such as complex numbers and masked
     values."""
     try:
         if np.iscomplexobj(values) or np.ma.is_masked(values):

@@ -85,8 +85,8 @@ def pair_potential(
     ----------
     energy
         The energy in kJ/mol of the distance r in Å and of named parameters, as a text: + - * / **
-        and exp, log, sqrt, sin, cos; its force is its derivative. Or a function f(p, r) that gives
-        (energy, -dE/dr), where p has the parameters; it may also have the arguments r2 (r²) and
+        and exp, log, sqrt, sin, cos. Its force is its derivative. Or a function f(p, r) that gives
+        (energy, -dE/dr), where p has the parameters. It may also have the arguments r2 (r²) and
         inverse (1/r), and is compiled for vectors
     parameters
         Site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a
@@ -94,7 +94,7 @@ def pair_potential(
         sites. Default: `parameters` of the sites in the models' files
     table
         Instead of an energy, distances in Å, energies in kJ/mol and perhaps forces -dE/dr in
-        kJ/mol/Å, which a spline interpolates; or a file with these columns. Nearer than the first
+        kJ/mol/Å, which a spline interpolates, or a file with these columns. Nearer than the first
         distance the energy rises as r⁻¹²
     sites
         The only sites that it acts on
@@ -102,7 +102,7 @@ def pair_potential(
         (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it acts
         on them only
     mixing
-        Parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites; default:
+        Parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites. Default:
         arithmetic for names that begin with sig, else geometric
     truncation, switch_start_A, cutoff_A
         As in [forces] of the scene, which are the defaults
@@ -189,7 +189,7 @@ def _columns(table: Any) -> Columns:
 def _constants_and_tables(
     parameters: Any,
 ) -> tuple[dict[str, float], dict[str, dict[str, float]] | None]:
-    """Parameters of all sites, and parameters by site; None without either. Raises ValueError."""
+    """Parameters of all sites, and parameters by site. None without either. Raises ValueError."""
     if parameters is None:
         return {}, None
     parameters = _mapping("parameters", parameters)
@@ -224,7 +224,7 @@ def _numbers(where: str, table: Any) -> dict[str, float]:
             raise ValueError(f"{where}: {key} is {value!r}, must be a finite number")
     if taken := [key for key in table if key in (DISTANCE, "pi")]:
         raise ValueError(
-            f"{where}: {taken[0]} is the {'distance' if taken[0] == DISTANCE else 'number pi'};"
-            " rename it"
+            f"{where}: {taken[0]} is the {'distance' if taken[0] == DISTANCE else 'number pi'}."
+            " Rename it"
         )
     return {str(key): float(value) for key, value in table.items()}

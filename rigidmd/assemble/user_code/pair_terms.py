@@ -91,7 +91,7 @@ def bound_pair(
 ) -> BoundPair:
     """The potential with the parameters of a pair.
 
-    tail_without : the pairs inside molecules, which a tail correction omits; None without a
+    tail_without : the pairs inside molecules, which a tail correction omits. None without a
         tail correction
 
     Raises FormulaError, ArithmeticError, ValueError or TypeError, from the formula.
@@ -324,7 +324,7 @@ class SiteTypes:
         return self._first[self.all[k]]
 
     def _kind(self, k: int, m: Molecule, i: int) -> tuple | None:
-        """Parameters of a site, and whether it is each site of `pairs`; None if the potential does
+        """Parameters of a site, and whether it is each site of `pairs`. None if the potential does
         not act on it."""
         parameters = self._parameters(k, m, i)
         sides = tuple(

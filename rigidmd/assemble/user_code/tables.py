@@ -48,7 +48,7 @@ def read_columns(path: Path) -> Columns:
                 " kJ/mol/Å)"
             )
             raise PairPotentialError(
-                f"{path}: line {number}: the columns are {', '.join(names)}; they must be {known}"
+                f"{path}: line {number}: the columns are {', '.join(names)}. They must be {known}"
             )
     for number, words in lines:
         values = [float(word) if _is_number(word) else inf for word in words]
@@ -68,7 +68,7 @@ def read_columns(path: Path) -> Columns:
             )
         elif not row["r_A"] > (rows[-1]["r_A"] if rows else 0.0):
             if rows:
-                least = f"{rows[-1]['r_A']:g} Å of the row before; sort the rows by distance"
+                least = f"{rows[-1]['r_A']:g} Å of the row before. Sort the rows by distance"
             else:
                 least = "0"
             faults.append(f"line {number}: r_A = {row['r_A']:g} must be above {least}")

@@ -53,7 +53,7 @@ def page() -> str:
         "# API reference",
         "This page lists every public class and function with its docstring."
         " [Python](python.md) is a shorter overview. The modules after `rigidmd.errors` define what"
-        " these functions return; you do not import them.",
+        " these functions return. You do not import them.",
     ]
     for name, names in MODULES.items():
         module = import_module(name)
@@ -138,7 +138,7 @@ def _docstring(doc: str) -> list[str]:
             parts += ["**Examples**", f"```python\n{textwrap.dedent(body).strip()}\n```"]
         else:
             rows = [_row(entry) for entry in ENTRY.split(body) if entry.strip()]
-            parts += [f"**{title}**", "\n".join(["| | |", "|---|---|", *rows])]
+            parts.append("\n".join([f"| {title} | |", "|---|---|", *rows]))
     return [part for part in parts if part.strip()]
 
 

@@ -25,6 +25,8 @@ LIVE = {
         "output.trajectory_interval_ps=0.1",
     ),
 }
+#: Live pages whose picture the build makes.
+WITH_PICTURE = ("intermediate_axis", "dry_ice")
 SITE = Path(__file__).parent
 #: Pages with keys of scenes, each of which has an anchor.
 WITH_KEYS = ("reference/scene.md", "reference/body.md")
@@ -56,22 +58,27 @@ def on_files(files, config):
     for name in ("site.css", "math.woff2", "math.OFL.txt"):
         files.append(File.generated(config, name, abs_src_path=str(SITE / name)))
     for name in LIVE:
-        files.append(
-            File.generated(config, f"live/{name}.html", abs_src_path=str(_live_page(name)))
-        )
+        for path in _live_files(name):
+            files.append(
+                File.generated(config, f"live/{name}{path.suffix}", abs_src_path=str(path))
+            )
     return files
 
 
-def _live_page(name: str) -> Path:
-    """The page that `rigidmd view` writes of a run of a shipped scene."""
+def _live_files(name: str) -> list[Path]:
+    """The page that `rigidmd view` writes of a run of a shipped scene, and a picture of the run
+    unless the documentation has one."""
     folder = Path(tempfile.mkdtemp())
-    for command in (
+    commands = [
         ("new", name),
         ("run", f"{name}.toml", "-o", "run", *LIVE[name]),
         ("view", "run"),
-    ):
+    ]
+    if name in WITH_PICTURE:
+        commands.append(("film", "run", "-o", "run/film.gif", "--seconds", "4"))
+    for command in commands:
         subprocess.run([sys.executable, "-P", "-m", "rigidmd", *command], cwd=folder, check=True)
-    return next((folder / "run").glob("*.html"))
+    return [*(folder / "run").glob("view.html"), *(folder / "run").glob("film.gif")]
 
 
 def on_page_markdown(markdown, page, config, files):

@@ -42,12 +42,12 @@ DTYPES = {"double": np.float64, "mixed": np.float32}
 class CpuEngine(CompiledEngine):
     """An engine of molecules. For the first arguments see `CompiledEngine`.
 
-    precision : arithmetic between sites; "mixed": pairs in single precision, sums and motion in
+    precision : arithmetic between sites. "mixed": pairs in single precision, sums and motion in
         double
-    skin : extra radius of neighbour lists, Å; affects speed only
-    threads : number of threads, at most `NUMBA_NUM_THREADS`; None for all of them; affects speed
+    skin : extra radius of neighbour lists, Å. Affects speed only
+    threads : number of threads, at most `NUMBA_NUM_THREADS`. None for all of them. Affects speed
         only
-    needs_virials : whether every step needs virials and no energies, as for a piston; affects speed
+    needs_virials : whether every step needs virials and no energies, as for a piston. Affects speed
         only
     """
 
@@ -92,7 +92,7 @@ class CpuEngine(CompiledEngine):
         return advance.loaded
 
     def _couplings_of(self, integrator: Scheme, state: State) -> CouplingWorkspaces:
-        """What thermostat, barostat and trajectories of an integrator remember; made at their first
+        """What thermostat, barostat and trajectories of an integrator remember. Made at their first
         use."""
         heat, box, trajectory = self._couplings
         if integrator.barostat is not None:

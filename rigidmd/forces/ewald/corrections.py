@@ -1,4 +1,4 @@
-"""Correction terms of an Ewald sum; `direct_sum` has the whole formula."""
+"""Correction terms of an Ewald sum. `direct_sum` has the whole formula."""
 
 from math import pi, sqrt
 from typing import NamedTuple
@@ -108,7 +108,7 @@ def self_energy(charge: np.ndarray, alpha: float) -> float:
 
 
 def intramolecular_energy(charge: np.ndarray, position: np.ndarray, alpha: float) -> float:
-    """Energy that removes the pairs inside one molecule from the sum over k, a constant; position
+    """Energy that removes the pairs inside one molecule from the sum over k, a constant. Position
     (s, 3) in Å."""
     i, j = np.triu_indices(len(charge), 1)
     r = np.linalg.norm(position[i] - position[j], axis=1)

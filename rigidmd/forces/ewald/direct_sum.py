@@ -1,8 +1,8 @@
 """Ewald sums: charges in a periodic box with all their images, and the direct sum over k-vectors.
 
 See the theory chapter `interactions` for the six terms of the energy. They are, in its order: the
-pairs inside the cutoff, `screened_coulomb.ScreenedCoulomb`; the sum over k-vectors, `EwaldSum` or
-`pme.Pme`; and of `corrections`: `self_energy`, `intramolecular_energy`, `Background`,
+pairs inside the cutoff, `screened_coulomb.ScreenedCoulomb`. The sum over k-vectors, `EwaldSum` or
+`pme.Pme`, and of `corrections`: `self_energy`, `intramolecular_energy`, `Background`,
 `SurfaceDipole`. Charges are in units where q²/r is an energy. The cell may have any shape.
 """
 
@@ -178,7 +178,7 @@ class EwaldWorkspace(NamedTuple):
         return self.sums.force
 
     def passes(self, into: Evaluation) -> list[Pass]:
-        """Positions; strengths, if the cell has changed; phases, structure factors, and forces."""
+        """Positions. Strengths, if the cell has changed. Phases, structure factors, and forces."""
         sums, content = self.sums, (self.smooth, self.k_vectors, self.sums)
         blocks = len(sums.tallies)
         return [
@@ -197,7 +197,7 @@ class EwaldWorkspace(NamedTuple):
 
 @kernel
 def invert_cell(cell, reciprocal):
-    """Write 2 pi times the reciprocal edges of a cell (3, 3) into the rows of `reciprocal`; returns
+    """Write 2 pi times the reciprocal edges of a cell (3, 3) into the rows of `reciprocal`. Returns
     the volume."""
     volume = 0.0
     for k in range(3):
@@ -274,7 +274,7 @@ def _times(a, b):
 
 @task(count_references=False)
 def _sum_structure_factors(arguments, block):
-    """S(k) of the columns of a block, with energy and virial; then S(k) is multiplied by 2 strength
+    """S(k) of the columns of a block, with energy and virial. Then S(k) is multiplied by 2 strength
     for the forces."""
     smooth, k_vectors, sums = load_arguments(arguments)
     column, width = k_vectors.column, lanes_of(sums.charge)

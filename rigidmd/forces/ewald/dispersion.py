@@ -48,9 +48,9 @@ def settings(forces: Any, composition: Composition, cutoff: float | None) -> Set
     space, species, counts = composition.space, composition.species, composition.counts
     where, sites = f"forces.dispersion = {forces.dispersion!r}", dispersing_in(species, counts)
     if space.volume == inf or cutoff is None:
-        return Settings({}, [f"{where} needs a periodic box; use cutoff"])
+        return Settings({}, [f"{where} needs a periodic box. Use cutoff"])
     if sites.count == 0:
-        return Settings({}, [f"{where}, and no site has Lennard-Jones parameters; use cutoff"])
+        return Settings({}, [f"{where}, and no site has Lennard-Jones parameters. Use cutoff"])
     accuracy = forces.dispersion_accuracy or ACCURACY
     cell = cell_of(space)
     # of the real-space and of the reciprocal error
@@ -63,7 +63,7 @@ def settings(forces: Any, composition: Composition, cutoff: float | None) -> Set
     if beta * cutoff > MAX_ALPHA_CUTOFF:
         return Settings(
             numbers,
-            [f"{unreachable} with a cutoff of {cutoff:g} Å; use a longer one or a smaller beta"],
+            [f"{unreachable} with a cutoff of {cutoff:g} Å. Use a longer one or a smaller beta"],
         )
     if forces.dispersion == "ewald":
         radius = k_cutoff_for(sites, beta, 2 * pi * np.linalg.inv(cell).T, part)
@@ -84,7 +84,7 @@ def settings(forces: Any, composition: Composition, cutoff: float | None) -> Set
         grid_and_order = pme_grid_for(sites, beta, cell, part, order, grid)
         if grid_and_order is None:
             return Settings(
-                numbers, [f"{unreachable} on a grid; use a lower accuracy or a longer cutoff"]
+                numbers, [f"{unreachable} on a grid. Use a lower accuracy or a longer cutoff"]
             )
         grid, order = grid_and_order
         grid = grid if is_given_cell else (max(grid),) * 3
@@ -152,7 +152,7 @@ def interactions(parts: SystemParts) -> Interactions:
         / KJ_PER_MOL
     )
     note = (
-        f"dispersion by {forces.dispersion}: beta {beta:.6g} 1/Å, {how}; "
-        f"estimated rms error of its force on a site: {error:.2g} kJ/(mol Å)"
+        f"dispersion by {forces.dispersion}: beta {beta:.6g} 1/Å, {how}. "
+        f"Estimated rms error of its force on a site: {error:.2g} kJ/(mol Å)"
     )
     return Interactions(terms, constants, notes=(note,))

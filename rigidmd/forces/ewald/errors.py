@@ -137,7 +137,7 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
 def filled_fraction(
     species: list[Any], counts: np.ndarray, space: Space, position: np.ndarray
 ) -> float:
-    """The part of a periodic box that contains the molecules, at most 1; 1 for charges without
+    """The part of a periodic box that contains the molecules, at most 1, 1 for charges without
     size. The density of this part decides on the errors.
 
     It is not larger than the molecules are where they touch each other: a dilute box may contain
@@ -255,7 +255,7 @@ def pme_grid_for(
     order: int | None = None,
     grid: tuple[int, int, int] | None = None,
 ) -> tuple[tuple[int, int, int], int] | None:
-    """The fastest grid and spline order with at most this error; None if none has. order, grid :
+    """The fastest grid and spline order with at most this error. None if none has. order, grid :
     fixed, if given"""
     return _fastest_grid(charges, alpha, cell, error, order, grid, MAX_PROXY_POINTS)[1]
 
@@ -270,7 +270,7 @@ def _fastest_grid(
     proxy_points: int = SEARCH_PROXY_POINTS,
 ) -> tuple[float, tuple[tuple[int, int, int], int] | None]:
     """Approximate time (ns) of the reciprocal part on one core with the fastest grid and order, and
-    these; infinite and None without any."""
+    these. Infinite and None without any."""
     edges = np.linalg.norm(cell, axis=1)
     sensible = SPACINGS[edges.max() / SPACINGS <= MAX_GRID_POINTS]
     grids = (
@@ -293,7 +293,7 @@ def fastest_cutoff(
     charges: Charges, cell: np.ndarray, longest: float, error: float, filled: float
 ) -> float | None:
     """The real-space cutoff (Å), at most `longest`, with which PME is fastest if real and
-    reciprocal space each have this error; None if no cutoff reaches it.
+    reciprocal space each have this error. None if no cutoff reaches it.
 
     filled : see `filled_fraction`
     """

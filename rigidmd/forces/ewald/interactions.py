@@ -90,7 +90,7 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
         forces.ewald_alpha_per_A or alpha_for(charges, cutoff, composition.space.volume, part)
     )
     if alpha * cutoff > MAX_ALPHA_CUTOFF:
-        return Settings(numbers, [f"{unreachable} with a cutoff of {cutoff:g} Å; use a longer one"])
+        return Settings(numbers, [f"{unreachable} with a cutoff of {cutoff:g} Å. Use a longer one"])
     numbers |= {"ewald_alpha_per_A": alpha, "ewald_accuracy": None}
     longest = np.linalg.norm(cell, axis=1).max()
     if forces.electrostatics == "ewald":
@@ -123,7 +123,7 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
     has_given_cell = np.array_equal(composition.basis, direct_sum.SAME_BASIS)
     if grid is not None and len(set(grid)) > 1 and not has_given_cell:
         fault = (
-            f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt; the"
+            f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt. The"
             f" box is the equivalent cell with {composition.cell}. Give this cell as the box, or"
             " three equal numbers, or leave pme_grid out"
         )
@@ -136,7 +136,7 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
         if grid_and_order is None:
             settings_used = " with the given forces.pme_order or pme_grid" if order or grid else ""
             fault = (
-                f"{unreachable}{settings_used} at alpha = {alpha:.3g} 1/Å; use a lower accuracy or"
+                f"{unreachable}{settings_used} at alpha = {alpha:.3g} 1/Å. Use a lower accuracy or"
                 " a longer cutoff"
             )
             return Settings(numbers, [fault])
@@ -221,7 +221,7 @@ def interactions(parts: SystemParts) -> Interactions:
         if forces.ewald_k_max is not None and not np.array_equal(
             parts.basis, direct_sum.SAME_BASIS
         ):
-            how += "; they are the k-vectors that ewald_k_max means in the given cell"
+            how += ". They are the k-vectors that ewald_k_max means in the given cell"
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 
@@ -256,14 +256,14 @@ def interactions(parts: SystemParts) -> Interactions:
     if not neutral:
         terms["coulomb_background"] = corrections.background(net**2 - net_frozen**2, alpha)
         notes.append(
-            f"the box has a net charge of {charge_e.sum():+.6g} e; an even background of the"
+            f"the box has a net charge of {charge_e.sum():+.6g} e. An even background of the"
             " opposite charge makes it neutral, and energies and pressure depend on the size of"
             " the box"
         )
     if any(strength := _surface_strength(forces)):
         key = "ewald_slab" if forces.ewald_slab else "ewald_surface_permittivity"
         if not neutral:
-            why = "the dipole of a box with a net charge is not defined; leave it out"
+            why = "the dipole of a box with a net charge is not defined. Leave it out"
             raise SceneError(parts.scene.source, [f"forces.{key}: {why}"])
         terms["coulomb_surface"] = corrections.SurfaceDipole(strength, charge, sites)
         if forces.ewald_slab:

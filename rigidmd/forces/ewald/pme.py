@@ -7,7 +7,7 @@ transforms.
 See the theory chapter `interactions`. The work is divided into blocks of planes, of rows of Fourier
 components, and of sites. Sites are sorted by plane, and each plane is written by one block. The
 number of blocks does not depend on the number of threads, so the result is the same bit for bit.
-This module needs rocket-fft; only scenes with PME import it.
+This module needs rocket-fft. Only scenes with PME import it.
 """
 
 from fractions import Fraction
@@ -177,7 +177,7 @@ class PmeWorkspace(NamedTuple):
         return self._replace(code=Code(influence=(_set_influence, self._content)))
 
     def passes(self, into: Evaluation) -> list[Pass]:
-        """Positions. The influence function, if the cell has changed; charges on the grid, and the
+        """Positions. The influence function, if the cell has changed. Charges on the grid, and the
         forces."""
         mesh, content = self.mesh, self._content
         blocks = len(mesh.tallies)
@@ -397,7 +397,7 @@ def _convolve(arguments, block):
 
 @kernel(inline=True, count_references=False)
 def convolve_block(smooth, mesh, tallies, block):
-    """Multiply a block of rows by the influence function; energy and virial into `tallies` unless
+    """Multiply a block of rows by the influence function. Energy and virial into `tallies` unless
     None."""
     low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
     spectrum, of, b = mesh.spectrum, mesh.alias, mesh.reciprocal

@@ -1,10 +1,10 @@
 """External forces on molecules: electric fields, gravity, walls, restraints.
 
 Each module has the terms of one kind of field, and a function `term` that makes one of them from
-the parts of a system and a table of the scene; `scene.fields.FIELDS` names the module.
+the parts of a system and a table of the scene. `scene.fields.FIELDS` names the module.
 
 They do not act between molecules, so none of them adds to the molecular virial, from which the
 pressure of a box is computed. The attribute `changes_momentum` of a term lists the components of
-the total momentum that it changes; `tied_to_places` is whether its energy depends on the positions
+the total momentum that it changes. `tied_to_places` is whether its energy depends on the positions
 of molecules in the lab.
 """

@@ -42,8 +42,8 @@ class DistanceRestraint(NamedTuple):
 
 
 def nearest_images(vectors: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) to nearest images in a cell (3, 3), exact up to half its smallest height;
-    unchanged if its edges are infinite."""
+    """Vectors (..., 3) to nearest images in a cell (3, 3), exact up to half its smallest height.
+    Unchanged if its edges are infinite."""
     images = np.array(vectors, float)
     if np.isfinite(cell[0, 0]):
         for k in (2, 1, 0):
@@ -90,7 +90,7 @@ def _faults_in_box(term: DistanceRestraint, parts: SystemParts, where: str) -> l
     if barrier <= LEAST_BARRIER * BOLTZMANN * max(temperatures):
         faults.append(
             f"{where}.distance_A = {term.distance:g}: the distance may come near half the smallest"
-            f" height of the box, {half:.6g} Å, where the nearest image changes; use a larger box"
+            f" height of the box, {half:.6g} Å, where the nearest image changes. Use a larger box"
             " or a higher stiffness_kJ_mol_A2"
         )
     for group in (term.first, term.second):

@@ -29,7 +29,7 @@ class PythonForces(NamedTuple):
 
 
 class PythonForcesWorkspace(NamedTuple):
-    """Workspace of a `PythonForces`; it requests new values (NEEDS_PYTHON_FORCES) whenever
+    """Workspace of a `PythonForces`. It requests new values (NEEDS_PYTHON_FORCES) whenever
     positions have changed."""
 
     fresh: np.ndarray  # (1,) 1 if the values are those at the current positions

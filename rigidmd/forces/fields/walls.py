@@ -41,7 +41,7 @@ class LennardJonesWalls(NamedTuple):
         return np.arange(3) == self.axis
 
     def behind(self, state: State) -> tuple[int, str] | None:
-        """The molecule of the site that is furthest behind a wall, or on it, and where; None if all
+        """The molecule of the site that is furthest behind a wall, or on it, and where. None if all
         are in front."""
         m = self.sites.molecule
         x = state.position[m, self.axis]  # of the sites
@@ -82,8 +82,8 @@ def term(
     last of them."""
     points, index = _acted_on(walls, parts.species, parts.moves), parts.model.species
     faults += [
-        f"{where}: {m.name} has no site with Lennard-Jones parameters, and would pass the walls; "
-        "use acts_on = 'centres'"
+        f"{where}: {m.name} has no site with Lennard-Jones parameters, and would pass the walls. "
+        "Use acts_on = 'centres'"
         for m, offsets, free in zip(parts.species, points, parts.moves, strict=True)
         if free and not len(offsets)
     ]
@@ -105,7 +105,7 @@ def term(
 
 
 def _acted_on(walls: Any, species: list[Any], moves: np.ndarray) -> list[np.ndarray]:
-    """Points (k, 3) of each species on which walls act, body frame, Å; none of frozen species."""
+    """Points (k, 3) of each species on which walls act, body frame, Å. None of frozen species."""
     offsets = [
         np.zeros((1, 3)) if walls.acts_on == "centres" else m.positions_body[m.epsilon > 0]
         for m in species
@@ -203,7 +203,7 @@ def _add_lennard_jones_walls(term, state, load, tally):
 
 @kernel(inline=True)
 def _lj93(s):
-    """(2/15) s^9 - s^3 with s = sigma/d; and -d times its derivative by d."""
+    """(2/15) s^9 - s^3 with s = sigma/d, and -d times its derivative by d."""
     s3 = s * s * s
     s9 = s3 * s3 * s3
     return 2 / 15 * s9 - s3, 6 / 5 * s9 - 3 * s3

@@ -4,9 +4,9 @@ loop over them.
 The terms, from small to large, for vectors of 4 lanes (float64 with AVX2; float32 with AVX-512 has
 16):
 
-    site      an interaction point of a molecule, with index i; `sites`: first, molecule, offsets
+    site      an interaction point of a molecule, with index i. `sites`: first, molecule, offsets
     slot      a position in the spatial order of the sites: order[slot] = i, slot[i] = slot
-    cluster   4 consecutive slots, one vector of sites; `clusters`
+    cluster   4 consecutive slots, one vector of sites. `clusters`
 
                   cluster c                    cluster c + 1
         slot    | 4c   4c+1 4c+2 4c+3        | ...

@@ -3,7 +3,7 @@ one instruction.
 
 A slot is a position in that order. Coordinates are stored relative to the origin of their cluster,
 so that float32 is accurate enough: 2e-7 Å for sites within reach of one another. Arrays of
-positions and forces hold x, y, z of a cluster as three consecutive vectors; slot k of cluster c has
+positions and forces hold x, y, z of a cluster as three consecutive vectors. Slot k of cluster c has
 its x at `3 * width * c + k`. Tasks have the arguments (pairs, sites, state) with a
 `lists.PairList`, or `pairs` alone.
 """
@@ -108,7 +108,7 @@ def wrap_sites(arguments, block):
     """Write positions in the brick of the sites of a block of molecules into `local`, for
     `bin_sites`.
 
-    The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space
+    The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3). It tiles space
     like the cell. The positions are predicted for the lead time of the list, see `predict_site`.
     `extent` gets their extent, or NaN if a coordinate is farther from the origin than MAX_DISTANCE,
     or is not finite.
@@ -157,7 +157,7 @@ def bin_sites(arguments, block):
 
 @kernel
 def sort_into_clusters(clusters):
-    """Sort sites by bin and height; `set_origins` must follow. False if the extent is not
+    """Sort sites by bin and height. `set_origins` must follow. False if the extent is not
     finite."""
     s = len(clusters.slot)
     _, extent, (nx, ny, nz) = _bins(clusters)
@@ -284,7 +284,7 @@ def _ahead_in_brick(clusters, cell, sites, state, i, lead):
 
 @kernel(inline=True)
 def _ahead(sites, state, m, i, lead):
-    """`predict_site`; for lead = 0 the current position, which does not need finite velocities."""
+    """`predict_site`. For lead = 0 the current position, which does not need finite velocities."""
     return (
         predict_site(sites, state, m, i, lead) if lead != 0.0 else locate_site(sites, state, m, i)
     )
@@ -322,7 +322,7 @@ def restore_half_squares(clusters):
 
 @task(count_references=False)
 def set_local(arguments, block):
-    """Set `local` of the sites of a block of molecules to the current positions; padding stays at
+    """Set `local` of the sites of a block of molecules to the current positions. Padding stays at
     its reference."""
     pairs, sites, state = load_arguments(arguments)
     clusters, cell = pairs.clusters, pairs.cell

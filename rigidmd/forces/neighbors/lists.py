@@ -7,7 +7,7 @@ and an entry of a row is an index in that list. The clusters of each row are sor
 distance. The displacements of the sites determine how many shells can matter. See the theory
 chapter `interactions` for when a list is valid.
 
-This module has the list and how it is read; `update` decides when it is rebuilt, `rows` fills it.
+This module has the list and how it is read. `update` decides when it is rebuilt, `rows` fills it.
 """
 
 from math import ceil, inf, nan, pi
@@ -42,7 +42,7 @@ class PairList(NamedTuple):
 
     Cluster c of block b has the neighbours neighbors[b, first:end] with end = neighbor_end[c],
     first = neighbor_end[c - 1], or 0 for the first cluster of a block. A neighbour is an image of a
-    cluster, stored as the integer IMAGES * cluster + image number; `shift` has its displacement. An
+    cluster, stored as the integer IMAGES * cluster + image number. `shift` has its displacement. An
     entry of a row is an index in these.
     """
 
@@ -92,7 +92,7 @@ def image_number(image):
 
 @kernel(inline=True)
 def behind_block(bounds, block, cluster):
-    """Number of clusters on the ring from the end of a block to a cluster; -1 for a cluster of the
+    """Number of clusters on the ring from the end of a block to a cluster. -1 for a cluster of the
     block."""
     first, end = bounds[block], bounds[block + 1]
     if first <= cluster < end:
@@ -104,7 +104,7 @@ def empty_list(
     cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type
 ) -> PairList:
     """A list that is built at its first use, with the capacity that evenly distributed sites need.
-    cell : (3, 3). reach : largest distance between sites of one group, Å; infinite if it is not
+    cell : (3, 3). reach : largest distance between sites of one group, Å. Infinite if it is not
     known"""
     clusters = clusters_of(len(group), dtype)
     blocks, slots = len(clusters.largest_displacement), len(clusters.order)
@@ -147,7 +147,7 @@ def empty_list(
 
 
 def _origin_vector_buffer(blocks: int, neighbors: int, dtype: type) -> np.ndarray:
-    """An array for `PairList.origin_vector`; empty in float64, where it would need much memory and
+    """An array for `PairList.origin_vector`. Empty in float64, where it would need much memory and
     save no time."""
     return np.empty((blocks, 3 * neighbors if dtype == np.float32 else 0), dtype)
 
@@ -159,7 +159,7 @@ def _fitting_skin(cell: np.ndarray, cutoff: float, skin: float) -> float:
 
 
 def _expected_neighbors(cell: np.ndarray, count: int, radius: float, size: float) -> float:
-    """Half the expected number of clusters within a radius of sites; 0 if the density is not known.
+    """Half the expected number of clusters within a radius of sites, 0 if the density is not known.
     size : 1 for a row, which is small, 1.75 for a whole cluster: water needs 1.6 to 1.7"""
     if radius == inf:
         return count / 2 + 1
@@ -201,7 +201,7 @@ def checkpoint_arrays(pairs: PairList) -> dict[str, np.ndarray]:
 def restored(
     pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: float, now: float
 ) -> PairList:
-    """The new list with the clusters and the skin of a checkpoint; `update.refill` must follow if
+    """The new list with the clusters and the skin of a checkpoint. `update.refill` must follow if
     there are clusters.
     requested_skin : in Å. now : the current time, ps. Raises ValueError if the arrays do not fit
         such a list."""
@@ -285,7 +285,7 @@ def most_needed(pairs, k):
 
 @kernel(inline=True)
 def largest_displacement(pairs):
-    """The largest displacement of an image of a site from its reference, Å; infinite if the list is
+    """The largest displacement of an image of a site from its reference, Å. Infinite if the list is
     not valid."""
     found = 0.0
     for block in range(len(pairs.needed)):
@@ -295,7 +295,7 @@ def largest_displacement(pairs):
 
 @kernel(inline=True)
 def end_of_row(pairs, r, displacement):
-    """End of the entries of row r that can have a site inside the cutoff; `displacement` as above,
+    """End of the entries of row r that can have a site inside the cutoff. `displacement` as above,
     Å."""
     moved = max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
     shell = min(SHELLS - 1, ceil((moved + displacement) * pairs.shells_per_A))

@@ -142,7 +142,7 @@ class PairWorkspace(NamedTuple):
         return self._replace(list_code=list_code(self.pairs, self.sites))
 
     def passes(self, into: Evaluation) -> list[Pass]:
-        """Update of the list; forces of rows, with what else is needed; their sums on sites and
+        """Update of the list. Forces of rows, with what else is needed. Their sums on sites and
         molecules."""
         pairs, sums, sites, tallies = self.pairs, self.sums, self.sites, self.sums.tallies
         blocks, content = len(tallies), (self.slot_potential, pairs, sums)
@@ -178,7 +178,7 @@ class PairWorkspace(NamedTuple):
         return lists.checkpoint_arrays(self.pairs)
 
     def restore(self, arrays: dict[str, np.ndarray], skin: float, now: float) -> "PairWorkspace":
-        """With the list of a checkpoint; needs machine code. Raises ValueError if the arrays do not
+        """With the list of a checkpoint. Needs machine code. Raises ValueError if the arrays do not
         fit this term."""
         restored = self._replace(pairs=lists.restored(self.pairs, arrays, skin, now))
         while "order" in arrays and restored._refill() != OK:
@@ -186,7 +186,7 @@ class PairWorkspace(NamedTuple):
         return restored
 
     def _refill(self) -> int:
-        """Build the list again from its clusters; a status code."""
+        """Build the list again from its clusters. A status code."""
         status = np.zeros(1, np.int64)
         BoundTask(_refill_list, (self.list_code, self.pairs, status))()
         if status[0] == OK:
@@ -205,7 +205,7 @@ def _buffer_behind(pairs: PairList, blocks: int, clusters: int) -> np.ndarray:
 def pair_forces(
     potential: NamedTuple, sites: BodySites | CentralSites, group: np.ndarray | None = None
 ) -> PairForces:
-    """The term of a potential with a `cutoff`; by default, sites of one molecule do not
+    """The term of a potential with a `cutoff`. By default, sites of one molecule do not
     interact."""
     return PairForces(potential, sites, sites.molecule if group is None else group)
 
@@ -222,7 +222,7 @@ def _diameter(sites: BodySites | CentralSites) -> float:
 
 def pair(potential, i, j, r2):
     """(energy, force/r) of the site in slot i with those in slots j, j + 1, ... at squared
-    distances r2, as vectors. Valid below cutoff²; a positive force repels."""
+    distances r2, as vectors. Valid below cutoff². A positive force repels."""
     raise TypeError(
         f"{type(potential).__name__} is not a pair potential, or this was called outside compiled"
         " code"
@@ -231,7 +231,7 @@ def pair(potential, i, j, r2):
 
 @chosen_by_type
 def arrange(slot_potential, potential, order):
-    """Write the numbers of the site in each slot into `slot_potential`; `order` has the site in
+    """Write the numbers of the site in each slot into `slot_potential`. `order` has the site in
     each slot. Potentials with other numbers of sites than a charge implement it."""
     if "charge" in slot_potential.fields:
 
@@ -393,7 +393,7 @@ def block_forces(potential, pairs, into, tallies, energies, block):
 
 @kernel(inline=True)
 def _change_image(pairs, number, now, sums, force_at_change, tally):
-    """Account for the shift of an image, if the next entry has another image; returns the next
+    """Account for the shift of an image, if the next entry has another image. Returns the next
     image number. The force on the row since the last change (x) the shift of the image is
     subtracted from the tally."""
     if now != number:
@@ -507,7 +507,7 @@ def _interact(
 
 @kernel(inline=True)
 def _masked_pair(potential, i, j, r2, mask):
-    """Force over distance on a site from each of a vector of others, and the energies; 0 where
+    """Force over distance on a site from each of a vector of others, and the energies, 0 where
     there is none."""
     counts = r2 < potential.cutoff * potential.cutoff
     if mask is not None:

@@ -224,7 +224,7 @@ def _store_neighbors(pairs, block, c, scratch, count):
 
 @kernel(inline=True)
 def _sort_by_kind(pairs, c, scratch, count):
-    """Write the entries of each row of a cluster by their kinds; `kind_end` then has the end of
+    """Write the entries of each row of a cluster by their kinds. `kind_end` then has the end of
     each kind. The rows are done together: while an entry of one row waits for the entry before it,
     the other rows proceed."""
     rows = lanes_of(pairs.clusters.local) // 2
@@ -244,7 +244,7 @@ def _sort_by_kind(pairs, c, scratch, count):
 
 @kernel(inline=True)
 def _begin_kinds(beyond, kind_end):
-    """Where the entries of each kind start in a row, from their numbers; how many are beyond each
+    """Where the entries of each kind start in a row, from their numbers. How many are beyond each
     shell. `beyond` is limited by its type: entries above the limit are treated as if they were
     inside the shell."""
     inside = 0
@@ -261,7 +261,7 @@ def _begin_kinds(beyond, kind_end):
 
 @kernel(inline=True)
 def _find_kinds(pairs, c, scratch, candidates):
-    """Reduce the candidates to those that a row of the cluster needs, and find their kinds; returns
+    """Reduce the candidates to those that a row of the cluster needs, and find their kinds. Returns
     their number. There are no unpredictable branches, so the processor works on several candidates
     at a time."""
     rows = lanes_of(pairs.clusters.local) // 2
@@ -348,7 +348,7 @@ def _mark_entries_to_mask(pairs, c, kind, candidate, at):
 
 @kernel(inline=True)
 def _mask_of_lanes(pairs, i, candidate, radius2):
-    """The sites of a candidate that interact with the site in slot i, as bits; 0 if none is inside
+    """The sites of a candidate that interact with the site in slot i, as bits, 0 if none is inside
     the radius."""
     if i >= len(pairs.group):
         return 0

@@ -130,7 +130,7 @@ class InSlots(NamedTuple):
 
 @kernel(inline=True)
 def index_of_x(slot, width):
-    """Index of the x of a slot in an array of x, y, z in slots; `width` is a power of two."""
+    """Index of the x of a slot in an array of x, y, z in slots. `width` is a power of two."""
     return 3 * slot - 2 * (slot & (width - 1))
 
 
@@ -262,7 +262,7 @@ def load_molecule(sites, state, load, m, site_force):
 
 @kernel(from_python=True)
 def compute_site_positions(sites, state, site_position):
-    """Write the positions of all sites into site_position (s, 3), lab frame; molecules are not
+    """Write the positions of all sites into site_position (s, 3), lab frame. Molecules are not
     wrapped."""
     for m in range(len(state.position)):
         for i in range(sites.first[m], sites.first[m + 1]):

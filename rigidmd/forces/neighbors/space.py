@@ -57,7 +57,7 @@ Space = Orthorhombic | Triclinic | Unbounded
 
 
 def space_of(cell: np.ndarray | None) -> Space:
-    """The space with this cell matrix (3, 3), rows a, b, c with a along x and b in the xy plane, Å;
+    """The space with this cell matrix (3, 3), rows a, b, c with a along x and b in the xy plane, Å.
     None for no box."""
     if cell is None or cell[0, 0] == inf:
         return Unbounded()
@@ -74,7 +74,7 @@ def cell_of(space: Space) -> np.ndarray:
 
 
 def wrap(space: Space, position: np.ndarray) -> np.ndarray:
-    """Positions (n, 3) shifted by whole edges into the cell; unchanged without a box."""
+    """Positions (n, 3) shifted by whole edges into the cell. Unchanged without a box."""
     if isinstance(space, Unbounded):
         return position
     return position - np.floor(fractions(space, position)) @ cell_of(space)
@@ -105,7 +105,7 @@ def volume_of(cell):
 
 @kernel
 def follow_cell(cell, known):
-    """Copy a cell (3, 3) into `known`; whether that has changed."""
+    """Copy a cell (3, 3) into `known`. Whether that has changed."""
     changed = False
     for k in range(3):
         for n in range(3):

@@ -2,7 +2,7 @@
 for any shape.
 
 A node has as many children as a vector of float64 has lanes, so one vector comparison tests all of
-them. The tree is searched once for some clusters near one another, down to families; each of the
+them. The tree is searched once for some clusters near one another, down to families. Each of the
 clusters then tests their boxes.
 """
 
@@ -64,7 +64,7 @@ def families_within_reach(tree, low, high, radius2, first, end, clusters, stack,
 
     Family f has clusters arity * f ... arity * (f + 1) - 1. Only those are taken that have a
     cluster at most half way round the ring ahead of one of clusters first ... end - 1. Returns the
-    new count, which may exceed len(found); stack (levels, 2) is scratch.
+    new count, which may exceed len(found). Stack (levels, 2) is scratch.
     """
     arity = lanes_of(tree.low)
     top = len(tree.level) - 2

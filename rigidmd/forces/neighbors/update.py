@@ -61,7 +61,7 @@ def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
 
 @kernel(count_references=False)
 def update_list(pairs, code, sites, state):
-    """Move the clusters with the molecules, and rebuild the list if it is not valid; a status
+    """Move the clusters with the molecules, and rebuild the list if it is not valid. A status
     code."""
     blocks = len(pairs.needed)
     arguments = pack_arguments(pairs)
@@ -122,7 +122,7 @@ def update_pair_list(arguments, block):
 
 @kernel(count_references=False)
 def refill(pairs, code):
-    """Build the list again from the clusters that `lists.restored` has set; a status code."""
+    """Build the list again from the clusters that `lists.restored` has set. A status code."""
     restore_half_squares(pairs.clusters)
     _find_images(pairs)
     arguments = pack_arguments(pairs)
@@ -133,7 +133,7 @@ def refill(pairs, code):
 
 @kernel(count_references=False)
 def _finish_build(pairs):
-    """Check that a list has not exceeded its capacities, and set its counters; a status code."""
+    """Check that a list has not exceeded its capacities, and set its counters. A status code."""
     if (
         most_needed(pairs, ENTRIES) > pairs.entries.shape[1]
         or most_needed(pairs, MASKED) > pairs.masked.shape[1]
@@ -171,7 +171,7 @@ def _max_slack(pairs):
 
 @kernel
 def _move_images(pairs):
-    """Move the images with the cell. Whether the list is still valid; `update_origin_vectors` must
+    """Move the images with the cell. Whether the list is still valid. `update_origin_vectors` must
     follow."""
     farthest2 = 0.0
     for n in range(pairs.counters[IMAGES_FOUND]):
@@ -197,7 +197,7 @@ def _displacement(cell, multiple, k):
 
 @task()
 def _sort_sites(arguments, block):
-    """Sort the sites for a new list; a status code into counters[STATUS]."""
+    """Sort the sites for a new list. A status code into counters[STATUS]."""
     pairs = load_arguments(arguments)
     pairs.counters[STATUS] = OK if sort_into_clusters(pairs.clusters) else NOT_FINITE
     _find_images(pairs)

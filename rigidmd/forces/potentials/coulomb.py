@@ -62,7 +62,7 @@ def reaction_field(
     name: TruncationName = "plain",
     start: float = 0.0,
 ) -> ReactionField:
-    """The potential for sites with charges (s,) in e; a permittivity of `inf` means a conductor."""
+    """The potential for sites with charges (s,) in e. A permittivity of `inf` means a conductor."""
     truncation = truncation_of(name, cutoff, start)
     strength = 0.5 if permittivity == inf else (permittivity - 1) / (2 * permittivity + 1)
     field = strength / cutoff**3
@@ -95,7 +95,7 @@ def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
     """Messages on keys of [forces] that this box does not allow."""
     if forces.electrostatics == "coulomb" and space.volume < inf:
         return [
-            "forces.electrostatics = 'coulomb' is for open boxes; in a periodic one use pme, ewald"
+            "forces.electrostatics = 'coulomb' is for open boxes. In a periodic one use pme, ewald"
             " or reaction_field"
         ]
     return []
@@ -103,7 +103,7 @@ def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
 
 @chosen_by_type(inline=True)
 def powers(truncation, switched, r2):
-    """1/r, and two factors of 1/r³; found without 1/r if the force does not need it."""
+    """1/r, and two factors of 1/r³. Found without 1/r if the force does not need it."""
     if not needs_root(truncation, switched):
         return lambda truncation, switched, r2: inverse_root_and_cube(r2)
 

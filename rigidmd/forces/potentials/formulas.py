@@ -1,4 +1,4 @@
-"""Formulas of user pair potentials: from a function, from a table; `text_formulas` has those from a
+"""Formulas of user pair potentials: from a function, from a table. `text_formulas` has those from a
 text."""
 
 import contextlib
@@ -68,7 +68,7 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
     It is compiled for vectors of distances: arithmetic, and exp, log, pow, sin, cos, sqrt, fabs of
     Python's `math`. It may also have arguments named r2 (r²) and inverse (1/r), which save a
     division.
-    kind : NamedTuple class of the parameters; default: the annotation of p. Raises FormulaError.
+    kind : NamedTuple class of the parameters. Default: the annotation of p. Raises FormulaError.
     """
     function = getattr(function, "py_func", function)
     name = getattr(function, "__name__", "a pair potential")
@@ -78,7 +78,7 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
     strange = [one.name for one in arguments[1:] if one.name not in ARGUMENTS]
     if not arguments or len(arguments) < 2 or strange:
         raise FormulaError(
-            f"{name} has the arguments ({', '.join(one.name for one in arguments)}); it needs the"
+            f"{name} has the arguments ({', '.join(one.name for one in arguments)}). It needs the"
             " parameters, then r, and may have r2 and inverse"
         )
     if kind is None:
@@ -188,7 +188,7 @@ def formula_of_table(
         or (f is not None and f.shape != r.shape)
     ):
         raise FormulaError(
-            f"{name} needs {LEAST_ROWS} distances or more, with one energy each; these are"
+            f"{name} needs {LEAST_ROWS} distances or more, with one energy each. These are"
             f" {r.shape} and {u.shape}"
         )
     finite = np.isfinite(r).all() and np.isfinite(u).all() and (f is None or np.isfinite(f).all())
@@ -203,7 +203,7 @@ def formula_of_table(
             f" {least}"
         )
     if cutoff == inf or r[-1] < cutoff * (1 - 1e-12):
-        unit = "; is it in nm?" if r[-1] < 3 < cutoff <= 10 * r[-1] * 1.01 else ""
+        unit = ". Is it in nm?" if r[-1] < 3 < cutoff <= 10 * r[-1] * 1.01 else ""
         raise FormulaError(f"{name} ends at {r[-1]:g} Å, before the cutoff of {cutoff:g} Å{unit}")
 
     _check_intervals(name, r, cutoff)

@@ -350,7 +350,7 @@ def energy_and_force(potential, c12, c6, r2):
 
 @chosen_by_type(inline=True)
 def inverses(truncation, switched, r2):
-    """(1/r², 1/r) at squared distances r2; 1/r is 0 if it is not needed, to save the square
+    """(1/r², 1/r) at squared distances r2, 1/r is 0 if it is not needed, to save the square
     root."""
     if not needs_root(truncation, switched):
         return lambda truncation, switched, r2: (inverse(r2), 0.0)
@@ -398,7 +398,7 @@ def _arrange_strengths(in_slots, dispersion, order):
 def tail(potential: LennardJones, inner: InnerPairs | None = None) -> Tail:
     """The tail correction, for g(r) = 1 where the truncation changes the potential, see the theory
     chapter `interactions` (Allen & Tildesley 2017, 2.8). inner : the pairs that are not
-    interactions; None of points without"""
+    interactions. None of points without"""
     count = np.bincount(potential.kind, minlength=len(potential.c6))
     energy = pressure = constant = 0.0
     for sign, c, p, terms in (

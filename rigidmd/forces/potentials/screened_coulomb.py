@@ -209,7 +209,7 @@ def screened_coulomb(
 
 class DampedShiftedForce(NamedTuple):
     """Damped shifted force (Fennell & Gezelter 2006, J. Chem. Phys. 124, 234104, eq. 18), see the
-    theory chapter `interactions`; the same as coul/dsf of LAMMPS."""
+    theory chapter `interactions`. The same as coul/dsf of LAMMPS."""
 
     cutoff: float  # Å
     alpha: float  # 1/Å
@@ -241,7 +241,7 @@ def setting_errors(forces, space: Space, cutoff: float) -> list[str]:
     """Messages on the keys of [forces] of electrostatics = "damped_shifted_force"."""
     if cutoff == inf:
         return [
-            "forces.electrostatics = 'damped_shifted_force' needs a cutoff; give forces.cutoff_A"
+            "forces.electrostatics = 'damped_shifted_force' needs a cutoff. Give forces.cutoff_A"
         ]
     return screening_errors("damping_per_A", forces.damping_per_A, cutoff)
 
@@ -253,7 +253,7 @@ def screening_errors(key: str, alpha: float | None, cutoff: float) -> list[str]:
         return []
     return [
         f"forces.{key} = {alpha:g} with a cutoff of {cutoff:g} Å screens charges there by"
-        f" erfc({alpha * cutoff:.3g}), far below rounding; at most {MAX_ALPHA_CUTOFF / cutoff:.3g}"
+        f" erfc({alpha * cutoff:.3g}), far below rounding. At most {MAX_ALPHA_CUTOFF / cutoff:.3g}"
         " is of use"
     ]
 

@@ -28,20 +28,20 @@ TRUNCATIONS: tuple[str, ...] = get_args(TruncationName)
 
 
 class Unmodified(NamedTuple):
-    """The force inside the cutoff is not changed; `plain` and `shift`."""
+    """The force inside the cutoff is not changed. `plain` and `shift`."""
 
     cutoff: float  # Å, may be infinite
 
 
 class ForceShifted(NamedTuple):
-    """A polynomial is added to the force beyond the start; `force_shift` and `force_switch`."""
+    """A polynomial is added to the force beyond the start. `force_shift` and `force_switch`."""
 
     cutoff: float  # Å
     start: float  # Å
 
 
 class Switched(NamedTuple):
-    """The energy is multiplied by a polynomial of degree 5, from 1 at the start to 0 at the cutoff;
+    """The energy is multiplied by a polynomial of degree 5, from 1 at the start to 0 at the cutoff.
     `switch`."""
 
     cutoff: float  # Å
@@ -49,7 +49,7 @@ class Switched(NamedTuple):
 
 
 class SmoothlySwitched(NamedTuple):
-    """The energy is multiplied by a polynomial of degree 9, from 1 at the start to 0;
+    """The energy is multiplied by a polynomial of degree 9, from 1 at the start to 0.
     `smooth_switch`."""
 
     cutoff: float  # Å
@@ -62,7 +62,7 @@ SWITCHES = {"switch": Switched, "smooth_switch": SmoothlySwitched}
 
 
 def truncation_of(name: TruncationName, cutoff: float, start: float) -> Truncation:
-    """The truncation with this name; `start` (Å) matters for force_switch, switch and smooth_switch
+    """The truncation with this name. `start` (Å) matters for force_switch, switch and smooth_switch
     only."""
     if cutoff == inf or name in ("plain", "shift"):
         return Unmodified(cutoff)
@@ -76,7 +76,7 @@ def truncation_terms(
     truncation: Truncation,
     at_cutoff: Callable[[float], tuple[float, float, float]],
 ) -> TruncationTerms:
-    """(constant, linear, quadratic, cubic) for a radial part; at_cutoff(r) gives its energy v,
+    """(constant, linear, quadratic, cubic) for a radial part. at_cutoff(r) gives its energy v,
     force -v' and -v''."""
     if truncation.cutoff == inf or name == "plain" or name in SWITCHES:
         return (0.0, 0.0, 0.0, 0.0)
@@ -181,7 +181,7 @@ def switch_correction_of(
 
 @chosen_by_type(inline=True)
 def switch_term(truncation, switched, r):
-    """A `SwitchTerm` at distances r; 0 below the start, and for anything else."""
+    """A `SwitchTerm` at distances r, 0 below the start, and for anything else."""
     if not is_a(switched, SwitchTerm):
         return lambda truncation, switched, r: 0.0
     is_quintic = is_a(truncation, Switched)
@@ -196,7 +196,7 @@ def switch_term(truncation, switched, r):
 
 @chosen_by_type(inline=True)
 def correction(truncation, switched, r2):
-    """A `SwitchCorrection` at squared distances r2; 0 below the start, and for anything else."""
+    """A `SwitchCorrection` at squared distances r2, 0 below the start, and for anything else."""
     if not is_a(switched, SwitchCorrection):
         return lambda truncation, switched, r2: 0.0
 
@@ -221,10 +221,10 @@ def needs_root(truncation, switched) -> bool:
 
 @chosen_by_type(inline=True)
 def truncated(truncation, terms, switched, r2, inverse, u, w):
-    """(energy, force/r) with the truncation, from u, w without it at squared distances r2; scalars
+    """(energy, force/r) with the truncation, from u, w without it at squared distances r2. Scalars
     or vectors. u
     already includes the constant of `terms`. inverse : 1/r, if `needs_root`. switched : the switch
-    term or correction that w already includes; without one, a switch multiplies the energy here,
+    term or correction that w already includes. Without one, a switch multiplies the energy here,
     for any potential"""
     if is_a(truncation, Unmodified):
         return lambda truncation, terms, switched, r2, inverse, u, w: (u, w)

@@ -76,7 +76,7 @@ class _Search:
         self._tried: dict[tuple[str, float, float | None], Trial] = {}
 
     def best(self) -> Trial | None:
-        """The trial with the fewest forces; None if no trial is within the target."""
+        """The trial with the fewest forces. None if no trial is within the target."""
         best, cheapest = None, inf
         for name in CANDIDATES:
             trial = self._longest_step(name, cheapest) if name in self.longest else None
@@ -96,7 +96,7 @@ class _Search:
         return self.energy_walk.square(scheme, timestep * self.system.time_size, time)
 
     def expected(self, trial: Trial, timestep: float | None = None) -> float:
-        """Error over the time; at another step by the order of the integrator."""
+        """Error over the time. At another step by the order of the integrator."""
         name, step = trial.integrator, timestep or trial.timestep
         regular = self.slow_factor.get(name, 1.0) * getattr(trial, self.error)
         regular *= (step / trial.timestep) ** self.system.methods[name].order
@@ -200,7 +200,7 @@ def choose(
         fewer = search.cost(common) * common.timestep / step / cost
         reason += f", {fewer:.1f} times fewer than velocity_verlet at {step:.2g} {system.time_unit}"
     if value > target:
-        reason += f"; no step tried keeps the target over that time: {REMEDIES}"
+        reason += f". No step tried keeps the target over that time: {REMEDIES}"
     elif (
         cost > 1.5 * before
         and search.walk_square(best.integrator, best.timestep, search.time) > 0.1 * value**2

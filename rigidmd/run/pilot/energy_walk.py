@@ -75,7 +75,7 @@ def measure_energy_walk(system: TrialSystem, timestep: float) -> EnergyWalk:
 
 
 def _rate(system: TrialSystem, timestep: float, steps: int) -> float | None:
-    """D in a run: the least of all lags, as a regular error adds to short ones; None if the run
+    """D in a run: the least of all lags, as a regular error adds to short ones. None if the run
     diverges."""
     trial = Trial(PILOT_INTEGRATOR, timestep, steps, 0)
     trials.measure_errors(system, trial, None, STEPS)

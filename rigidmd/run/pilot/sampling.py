@@ -72,7 +72,7 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
 
     def square_rates(now: State) -> np.ndarray:
         """Sums of w² over translation and rotation. By equipartition <F²/m> = kT sum w², likewise
-        for torques; exact in the mean over the canonical distribution."""
+        for torques. Exact in the mean over the canonical distribution."""
         sums = sums_of_state(system.model, now, engine.evaluate(now)[0])
         return np.array([sums.force, sums.torque]) / thermal
 
@@ -150,7 +150,7 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
     stiffest, rate = stiffest_mode(system, now), mean_square_rate(system, now, k)
     if stiffest is None or rate == 0:
         raise SimulationError(
-            f"stages.{k}: nothing sets a step for integrator = 'auto'; name an integrator and a"
+            f"stages.{k}: nothing sets a step for integrator = 'auto'. Name an integrator and a"
             " step"
         )
     best = (0.0, 0.0, stage)
@@ -168,7 +168,7 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
     motion, chance, decided = best
     if motion == 0:
         raise SimulationError(
-            f"stages.{k}: no pilot trajectory was accepted; name an integrator and a shorter step"
+            f"stages.{k}: no pilot trajectory was accepted. Name an integrator and a shorter step"
         )
     return decided.with_defaults, (
         f"the longest accepted motion per force evaluation of {', '.join(TRIED)}; {chance:.0%}"

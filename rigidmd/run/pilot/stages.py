@@ -36,8 +36,8 @@ def choose_for_stage(system: System, state: State, k: int) -> tuple[Stage, str]:
 
 
 def natural_time(system: System, state: State) -> float | None:
-    """Time (ps) of one radian of the faster of vibration and libration; None at rest. Its inverse
-    squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion; likewise for
+    """Time (ps) of one radian of the faster of vibration and libration. None at rest. Its inverse
+    squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion. Likewise for
     torques."""
     sums = sums_of_state(system.model, state, system.engine().evaluate(state)[0])
     pairs = (sums.force, sums.translation), (sums.torque, sums.rotation)
@@ -86,7 +86,7 @@ def choose_for_body(
 
 
 def _fit_step(timestep: float, duration: float, interval: float | None) -> float:
-    """The longest step up to this one that divides the duration and the interval of samples; or the
+    """The longest step up to this one that divides the duration and the interval of samples, or the
     duration alone, if the interval or their common divisor would make it much shorter. Each step is
     then a sample."""
     if interval is not None and interval < MIN_STEP_FRACTION * timestep:

@@ -1,5 +1,5 @@
 """`rigidmd accuracy`: the errors and run times of integrators at several time steps, from the start
-of a scene; as a table, recommendations, accuracy.csv, .png and a self-contained page."""
+of a scene. As a table, recommendations, accuracy.csv, .png and a self-contained page."""
 
 from collections.abc import Callable, Iterator
 from math import inf
@@ -59,15 +59,15 @@ def measure_accuracy(
     """Error against run time of integrators at time steps, on the start of a scene. Raises
     SceneError.
 
-    integrators : names; default: the scene's and those that suit it. The others are in `left_out`.
-        rk4, dop853 and radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion
+    integrators : names. Default: the scene's and those that suit it. The others are in `left_out`.
+        rk4, dop853 and radau use the scene's formulation, or matrix. A suffix _matrix, _quaternion
         or _euler_angles sets another
-    timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost
+    timesteps : fs for molecules, s for a body, the same for all. Default: steps of equal cost
         around the scene's
     span : ps or s
     progress : called with the fraction that is done. At 0, after all arguments have been checked
 
-    Molecules start where the last stage starts, after the earlier stages have run; no thermostat
+    Molecules start where the last stage starts, after the earlier stages have run. No thermostat
     acts.
     """
     check_engine_is_rigidmd(scene)
@@ -221,7 +221,7 @@ def recommendations(measured: IntegratorAccuracy) -> list[str]:
     s, lines = measured.trial_system, []
     for error, best, faster, rivals in cheapest(measured):
         faster = f": {faster}" if faster else ""
-        rivals = f"; equally fast within timing noise: {rivals}" if rivals else ""
+        rivals = f". Equally fast within timing noise: {rivals}" if rivals else ""
         lines.append(f"for {error} over {_span(measured)} the fastest is {best}{faster}{rivals}")
     if lines and s.time_unit == "fs":
         lines.append(
@@ -379,7 +379,7 @@ def _label_steps(axis, points: list[tuple[float, float, float]], unit: str) -> N
 
 
 def accuracy_figure(measured: IntegratorAccuracy):
-    """Log error against log run time, a curve for each integrator; rings mark the best trials, bars
+    """Log error against log run time, a curve for each integrator. Rings mark the best trials, bars
     the time spread."""
     s = measured.trial_system
     per = "ps" if s.time_unit == "fs" else "s"

@@ -105,7 +105,7 @@ class Averages:
         return self._fits.get(quantity.name)
 
     def bias(self, run: AverageRun, quantity: AveragedQuantity) -> tuple[float, float] | None:
-        """Mean less limit and its error, in the quantity's unit of biases; None without a mean."""
+        """Mean less limit and its error, in the quantity's unit of biases. None without a mean."""
         point, fit = self.point(run, quantity), self.fit(quantity)
         if point is None or fit is None:
             return None
@@ -162,7 +162,7 @@ def check_engine_is_rigidmd(scene: MolecularScene | BodyScene) -> None:
     """Raise SceneError if a scene names another engine: only the integrators of rigidmd are
     measured."""
     if isinstance(scene, MolecularScene) and scene.engine.is_external:
-        error = f"engine.name = {scene.engine.name!r}: accuracy measures rigidmd; leave it out"
+        error = f"engine.name = {scene.engine.name!r}: accuracy measures rigidmd. Leave it out"
         raise SceneError(scene.source, [error])
 
 
@@ -176,9 +176,9 @@ def measure_averages(
     """Means of U, temperatures, and pressure or density in the last stage, by methods at time
     steps. Raises SceneError.
 
-    methods : "integrator" or "integrator+thermostat"; default: the method of the stage and
+    methods : "integrator" or "integrator+thermostat". Default: the method of the stage and
         `DEFAULT_METHODS`
-    timesteps : fs, the same for all; default: fractions of the longest stable step of each method
+    timesteps : fs, the same for all. Default: fractions of the longest stable step of each method
     sample : ps that each is sampled, after a fifth of that
     progress : called with the fraction that is done. At 0, after all arguments have been checked
 
@@ -187,7 +187,7 @@ def measure_averages(
     if isinstance(scene, BodyScene):
         raise SceneError(
             scene.source,
-            [f"{option('averages')} is for molecules; a single body has no thermostat"],
+            [f"{option('averages')} is for molecules. A single body has no thermostat"],
         )
     check_engine_is_rigidmd(scene)
     stage = _with_thermostat(scene)
@@ -302,7 +302,7 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
         stage.has_barostat and stage.pressures[0] != stage.pressures[1]
     ):
         error = (
-            f"{option('averages')} needs one temperature and one pressure in the last stage; here"
+            f"{option('averages')} needs one temperature and one pressure in the last stage. Here"
             " they change"
         )
         raise SceneError(scene.source, [error])
@@ -310,7 +310,7 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
 
 
 def _parse_method(text: str, stage: Stage, known: Iterable[str]) -> tuple[str, str]:
-    """Integrator and thermostat of "integrator+thermostat"; default: Langevin for baoab, else the
+    """Integrator and thermostat of "integrator+thermostat". Default: Langevin for baoab, else the
     stage's."""
     integrator, _, thermostat = (part.strip() for part in text.partition("+"))
     thermostat = thermostat or (

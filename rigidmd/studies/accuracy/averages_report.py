@@ -107,7 +107,7 @@ def describe_failures(averages: Averages) -> list[str]:
     """Sentences: which runs failed or were too short."""
     names = {quantity.name for quantity in averages.main}
     failed = [(run, run.failure) for run in averages.runs if run.failure]
-    why = f"{averages.sampled:g} ps are too short for an error; sample longer (--sample-ps)"
+    why = f"{averages.sampled:g} ps are too short for an error. Sample longer (--sample-ps)"
     short = [(run, [name for name in run.short if name in names]) for run in averages.runs]
     failed += [(run, f"{', '.join(missing)}: {why}") for run, missing in short if missing]
     return [f"{run.method} at {run.timestep:g} fs: {reason}" for run, reason in failed]

@@ -67,7 +67,7 @@ class IntegratorAccuracy:
         return fastest
 
     def time_for(self, integrator: str, error: str, target: float) -> "ReachedError | None":
-        """Where an integrator reaches an error, between its trials; None if its shortest step is
+        """Where an integrator reaches an error, between its trials. None if its shortest step is
         not exact enough. At most its longest step, or `STABLE_FRACTION` of it where a longer one
         diverges."""
         tried = [
@@ -120,7 +120,7 @@ def measure(
     progress: Callable[[float], object] = lambda fraction: None,
     extend: bool = False,
 ) -> IntegratorAccuracy:
-    """Run all trials and the reference; time the trials alternately `repeats` times.
+    """Run all trials and the reference. Time the trials alternately `repeats` times.
 
     progress : called with the fraction done
     extend : whether longer steps than the longest one of each integrator are tried, doubled until

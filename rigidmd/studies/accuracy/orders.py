@@ -22,7 +22,7 @@ LAST = 3  # local orders whose median is the measured order
 class Convergence:
     """How an error of an integrator falls with its step.
 
-    order : median of the last local orders, between successive steps above the floor; None with
+    order : median of the last local orders, between successive steps above the floor. None with
         fewer than two steps
     floor : trials at the floor
     """

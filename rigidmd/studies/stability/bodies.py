@@ -63,7 +63,7 @@ def free_rotation(inertia: np.ndarray, omega: np.ndarray, span: float) -> np.nda
 
 @builder
 def invariants(trial: Trial, x: float) -> Trials:
-    """The largest relative error of L along the lab's axes and of |L|, and orthogonality error; not
+    """The largest relative error of L along the lab's axes and of |L|, and orthogonality error. Not
     of the energy."""
 
     def error(results: Results) -> float:
@@ -158,7 +158,7 @@ def sleeping_top(trial: Trial, gap: float) -> Trials:
     """The largest tilt of a top that begins upright at rest but for omega_1 = e, at a relative gap
     from the threshold.
 
-    theta = e t sinh(r t)/(r t) with r² = M g l/I1 - (L3/2 I1)²; above the threshold with the sine.
+    theta = e t sinh(r t)/(r t) with r² = M g l/I1 - (L3/2 I1)². Above the threshold with the sine.
     """
     nudge = trial.scene["start"]["angular_velocity_body_rad_s"][0]
     rate = abs(1 - (1 + gap) ** 2) ** 0.5
@@ -172,7 +172,7 @@ def sleeping_top(trial: Trial, gap: float) -> Trials:
 
 @builder
 def decay(trial: Trial, c: float) -> Trials:
-    """Omega or v against a decay, relative to its start; infinite if it changes sign or grows."""
+    """Omega or v against a decay, relative to its start. Infinite if it changes sign or grows."""
     resistances = [*trial.scene.get("friction", {}), *trial.scene.get("fluid", {})]
     times = np.arange(trial.steps + 1.0)
     column = "omega_body_3" if "friction" in trial.scene else "vx"

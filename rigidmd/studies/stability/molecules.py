@@ -1,5 +1,5 @@
 """Known answers of stability cases: molecules that collide, overlap, lack repulsion or are far
-away; water and its thermostat; invalid input."""
+away. Water and its thermostat. Invalid input."""
 
 import sys
 from collections.abc import Iterator
@@ -86,7 +86,7 @@ def tip4p(trial: Trial, step: float) -> Trials:
 
 
 def water_at(trial: Trial, temperature: float) -> State:
-    """Liquid water at a temperature: at 298 K after 0.5 ps from a lattice, else from there; at 0 K
+    """Liquid water at a temperature: at 298 K after 0.5 ps from a lattice, else from there. At 0 K
     at rest in a minimum of its energy."""
     key = str(trial.scene["molecules"]), temperature
     if key not in STATES:
@@ -170,7 +170,7 @@ def far_away_in_file(trial: Trial, shift: float) -> Trials:
 def far_away(trial: Trial, shift: float) -> Trials:
     """The change of energy and forces, relative. Without a shift the first molecule is on a face.
 
-    Positions have an error of eps times the distance; forces vary relatively by about ten per Å.
+    Positions have an error of eps times the distance. Forces vary relatively by about ten per Å.
     """
     system, state, away = shifted(trial, shift)
     if shift == 0:
@@ -198,7 +198,7 @@ def memory(trial: Trial, x: float) -> Trials:
 
 
 def memory_error(trial: Trial, integrator: str, warn: Warn, step: float) -> Outcome:
-    """The relative error of the memory that `rigidmd check` predicts; on Linux only."""
+    """The relative error of the memory that `rigidmd check` predicts. On Linux only."""
     assert sys.platform == "linux"
     import resource
 

@@ -85,7 +85,7 @@ class TrialResult(NamedTuple):
 
     @property
     def failure(self) -> str:
-        """A description of an undetected error or crash; empty without one."""
+        """A description of an undetected error or crash. Empty without one."""
         if self.verdict in FAILURES:
             return f"{self.name}: {self.outcome.crash or UNDETECTED}"
         if self.limit is not None and self.limit.beyond in FAILURES:
@@ -191,7 +191,7 @@ def system_of(trial: Trial) -> System:
 
 
 def conserved_error(trial: Trial, results: Results) -> float:
-    """Largest error of conserved quantities, relative; for molecules the error of the energy,
+    """Largest error of conserved quantities, relative. For molecules the error of the energy,
     relative to the scale of the trial."""
     if "largest_relative_error" in results.summary:
         orthogonality = results.summary["largest_orthogonality_error"] or 0.0

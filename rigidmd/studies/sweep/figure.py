@@ -121,7 +121,7 @@ def _is_number(value: Any) -> bool:
 
 
 def draw_table(table: Table, columns: list[str], connected: bool = True):
-    """A panel for each column against the first key with numbers, else the first key; without keys
+    """A panel for each column against the first key with numbers, else the first key. Without keys
     against the seed."""
     rows = [row for row in table.rows if row.runs]
     numbers = [key for key in table.keys if all(_is_number(row.values[key]) for row in rows)]

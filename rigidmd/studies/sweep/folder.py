@@ -125,7 +125,7 @@ def read_manifest(folder: Path) -> Manifest:
     remedy = f"; {option('force')} starts the sweep again"
     manifest = read_json(folder / MANIFEST, Manifest, remedy)
     if manifest is None:
-        raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
+        raise OutputError(f"{folder} holds no sweep. `rigidmd sweep SCENE --set ...` makes one")
     keys, points = manifest.keys, manifest.points
     names = {point.folder for point in points if Path(point.folder).name == point.folder}
     problem = ""
@@ -208,7 +208,7 @@ def readable_key(key: str) -> str:
 
 
 def value_name(value: Any) -> str:
-    """A value in the name of a folder: letters, digits and . + - only; equal values have equal
+    """A value in the name of a folder: letters, digits and . + - only. Equal values have equal
     names."""
     match value:
         case bool():

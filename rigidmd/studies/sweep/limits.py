@@ -56,7 +56,7 @@ class Limit(NamedTuple):
     kind: str = INDEPENDENT
 
     def bias(self, step: float) -> tuple[float, float] | None:
-        """Mean at a step less limit, with its error; that of a joint fit by its slope. None without
+        """Mean at a step less limit, with its error. That of a joint fit by its slope. None without
         a mean there."""
         if self.kind == JOINT:
             slope, error = self.fit.slopes[""]
@@ -151,7 +151,7 @@ def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
         return first, last
     if first is None:
         varied = ", ".join(key for keys in manifest.keys.values() for key in keys)
-        problem = f"is not varied; this sweep varies {varied}"
+        problem = f"is not varied. This sweep varies {varied}"
     elif key.startswith("stages.") and key.endswith(".timestep_fs"):
         problem = f"is not the step of the stage whose averages are taken, the last one, {label}"
     else:
@@ -285,7 +285,7 @@ def _values_together(folder: Path) -> dict[str, Together]:
 
 
 def write_limits(folder: Path, limits: Limits, command: str) -> list[str]:
-    """Write table, figure and page of limits; the names of the files. Raises OutputError."""
+    """Write table, figure and page of limits. The names of the files. Raises OutputError."""
     if not limits.limits:
         return []
     add_to_folder(folder, FILES)

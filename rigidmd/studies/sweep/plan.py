@@ -73,7 +73,7 @@ def _error(text: str, problem: str) -> SceneError:
 
 
 def parse_axis(text: str) -> Axis:
-    """KEY=A,B,... of the command line; KEY=1..8 for whole numbers; KEY,KEY=A,B for keys that vary
+    """KEY=A,B,... of the command line. KEY=1..8 for whole numbers. KEY,KEY=A,B for keys that vary
     together. `parse_override` reads the values. Commas in brackets or quotes do not separate
     values. Raises SceneError."""
     name, equals, listed = text.partition("=")
@@ -117,16 +117,16 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
 
 
 def _parse_range(piece: str, text: str) -> range | None:
-    """The whole numbers of 1..8, both ends included; None for another text. Raises SceneError."""
+    """The whole numbers of 1..8, both ends included. None for another text. Raises SceneError."""
     ends = re.fullmatch(r"(-?\d+(?:\.\d+)?)\s*\.\.\s*(-?\d+(?:\.\d+)?)", piece)
     if ends is None:
         return None
     if any(parse_whole_number(end.removeprefix("-")) is None for end in ends.groups()):
-        problem = "is not a range of whole numbers; list the values: 0.1,0.2"
+        problem = "is not a range of whole numbers. List the values: 0.1,0.2"
         raise _error(text, f": {piece} {problem}")
     first, last = map(int, ends.groups())
     if last < first:
-        raise _error(text, f": the range {piece} is empty; begin with the smaller number")
+        raise _error(text, f": the range {piece} is empty. Begin with the smaller number")
     if last - first >= MOST_POINTS:
         raise _error(text, f": the range {piece} has more than {MOST_POINTS} values")
     return range(first, last + 1)
@@ -161,7 +161,7 @@ def with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, 
         if axis.keys == (SEED,) and not axis.swept:
             seed = axis.values[0]
         elif SEED in axis.keys:
-            problem = f"sets seeds, and {option('sets')} sets them too; leave out one of them"
+            problem = f"sets seeds, and {option('sets')} sets them too. Leave out one of them"
             raise SceneError(option("replicas"), [problem])
     if not isinstance(seed, int):
         raise SceneError(str(scene), [f"seed is {shorten_repr(seed)}, must be an integer"])
@@ -169,7 +169,7 @@ def with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, 
 
 
 def settings(axes: Sequence[Axis]) -> list[dict[str, Any]]:
-    """The values of the swept keys at each point, the last axis fastest; only the first of keys
+    """The values of the swept keys at each point, the last axis fastest. Only the first of keys
     that vary together."""
     swept = {axis.keys[0]: axis.values for axis in axes if axis.swept}
     return [dict(zip(swept, values, strict=True)) for values in product(*swept.values())]
@@ -179,7 +179,7 @@ def _check_axes(axes: Sequence[Axis]) -> None:
     """Raise SceneError with all errors of axes that make no sweep."""
     keys = Counter(key for axis in axes for key in axis.keys)
     errors = [
-        f"{key} is set {times} times; give its values in one list: {key}=A,B"
+        f"{key} is set {times} times. Give its values in one list: {key}=A,B"
         for key, times in keys.items()
         if times > 1
     ]
@@ -195,7 +195,7 @@ def _check_axes(axes: Sequence[Axis]) -> None:
         errors.append(f"no key has several values: give it a list or a range, such as {example}")
     count = prod(len(axis.values) for axis in swept)
     if count > MOST_POINTS:
-        errors.append(f"these are {count} points; a sweep has {MOST_POINTS} at most")
+        errors.append(f"these are {count} points. A sweep has {MOST_POINTS} at most")
     if errors:
         raise SceneError(option("sets"), errors)
 

@@ -2,7 +2,7 @@
 
 The threads of an executor wait for these processes, in this process or in the workers of a cluster
 of dask.distributed with a common file system. Messages of points are in files, which this module
-reads; another file requests that points stop.
+reads. Another file requests that points stop.
 """
 
 import re
@@ -135,7 +135,7 @@ def _is_unchanged(point: SweepPoint, common: CommonSettings) -> bool:
 
 
 def _requested_signal(outputs: Path) -> int:
-    """The signal that points have to get; 0 for none. Without the folder their sweep has ended."""
+    """The signal that points have to get, 0 for none. Without the folder their sweep has ended."""
     stop = outputs / STOP
     if stop.exists():
         return int(stop.read_text())
@@ -174,8 +174,8 @@ def cluster(address: str) -> Iterator[Executor]:
         client: Any = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise SettingError(
-            f"{option('scheduler')} {address}: no scheduler of dask.distributed answers ({error});"
-            " start one with `dask scheduler` and workers with `dask worker`"
+            f"{option('scheduler')} {address}: no scheduler of dask.distributed answers ({error})."
+            " Start one with `dask scheduler` and workers with `dask worker`"
         ) from None
     with client:
         yield client.get_executor(pure=False)

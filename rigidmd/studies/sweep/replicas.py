@@ -66,7 +66,7 @@ def analyse_sweep(
     finished = manifest.points_in("finished")
     if not finished:
         raise OutputError(
-            f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` continues it"
+            f"{folder}: no point of this sweep has finished yet. `rigidmd sweep` continues it"
         )
     combinations = []
     if names != [MEAN_FORCE]:
@@ -120,7 +120,7 @@ def _analyse_combinations(
 def _analyse_replicas(
     folders: list[Path], together: Path, start: float | None, analyse: Analyse, progress: Progress
 ) -> tuple[int, AnalysisOutput]:
-    """Analyses of each run of a combination, written into its folder; and of all of them together,
+    """Analyses of each run of a combination, written into its folder, and of all of them together,
     written into another folder if there are several. What fails of one run or of one analysis does
     not end the others. Returns the number of runs too."""
     members: list[RigidFrames] = []

@@ -39,7 +39,7 @@ SLURM_SCRIPT = """#!/bin/bash
 # A job whose time is up submits itself again, and continues from its checkpoint. When all have
 # ended,
 #   {collect}
-# writes table and figure; `rigidmd sweep` with --to slurm writes a script of the points that have
+# writes table and figure. `rigidmd sweep` with --to slurm writes a script of the points that have
 # not finished.
 #SBATCH --job-name={job}
 #SBATCH --array={array}
@@ -141,21 +141,21 @@ def sweep(
     Parameters
     ----------
     sets
-        Dotted key -> list, tuple or range of values, or one value for all points; all combinations
+        Dotted key -> list, tuple or range of values, or one value for all points. All combinations
         run
     folder
         default: runs/NAME-sweep. Points that have finished there are not run again
     jobs, threads
-        Points at a time, threads of each; default: so that all cores have work
+        Points at a time, threads of each. Default: so that all cores have work
     progress
-        Whether to show progress, as `Simulation.run` does; default: in notebooks
+        Whether to show progress, as `Simulation.run` does. Default: in notebooks
 
     Raises
     ------
     SceneError, OutputError
         Before anything runs.
     SimulationError
-        If points failed; `sweep.json` has the reasons.
+        If points failed. `sweep.json` has the reasons.
     KeyboardInterrupt
         After Ctrl-C.
 
@@ -207,7 +207,7 @@ def write_slurm_script(
         if UNSAFE.search(text):
             raise OutputError(
                 f"{text!r} has a control character, a quotation mark or a backslash in its name,"
-                f" which the script of a job cannot have; rename it, or {elsewhere()}"
+                f" which the script of a job cannot have. Rename it, or {elsewhere()}"
             )
     lines = commands(manifest, trust)
     inner = format_walltime(walltime - min(SPARE, SPARE_FRACTION * walltime))

@@ -62,7 +62,7 @@ class SweepRow:
         return self.together or len(self.runs)
 
     def __getitem__(self, column: str) -> Measured:
-        """Mean over the runs and its standard error; for one run its value and error. NaN without a
+        """Mean over the runs and its standard error. For one run its value and error. NaN without a
         value."""
         measured = [run[column] for run in self.runs.values() if column in run]
         if len(measured) < 2:
@@ -105,7 +105,7 @@ class Table(Displayed):
         return self._measured(column)[:, 0]
 
     def error(self, column: str) -> np.ndarray:
-        """Standard errors of a column of means: over the runs of a row, or of its single run; NaN
+        """Standard errors of a column of means: over the runs of a row, or of its single run. NaN
         without one."""
         return self._measured(column)[:, 1]
 

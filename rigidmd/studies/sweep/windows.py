@@ -64,7 +64,7 @@ def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, dict[str, Any]]:
     elif others:
         problem = f"windows that differ by their restraint alone, not by {others[0]}"
     elif len(restraints) > 1:
-        problem = f"windows of one restraint; the sweep varies {len(restraints)}"
+        problem = f"windows of one restraint. The sweep varies {len(restraints)}"
     if problem:
         raise OutputError(f"{folder}: pmf needs {problem}")
     k = int(restraints.pop())
