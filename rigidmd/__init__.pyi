@@ -5,7 +5,6 @@ from . import view as view
 from .assemble.scenes import atoms_of as atoms_of
 from .assemble.scenes import resolve as resolve
 from .assemble.scenes import scene_from_atoms as scene_from_atoms
-from .assemble.user_code.body_pairs import BodyPairPotential as BodyPairPotential
 from .assemble.user_code.body_pairs import body_pair_potential as body_pair_potential
 from .assemble.user_code.force import Force as Force
 from .assemble.user_code.pair_potential import PairPotential as PairPotential
@@ -14,6 +13,7 @@ from .assemble.user_code.pair_potential import pair_potential as pair_potential
 from .assemble.user_code.trust import trust as trust
 from .dynamics.user_kernels import compiled_force as compiled_force
 from .dynamics.user_kernels import compiled_thermostat as compiled_thermostat
+from .forces.poses.potential import BodyPairPotential as BodyPairPotential
 from .run import Every as Every
 from .run import Moment as Moment
 from .run import Observer as Observer

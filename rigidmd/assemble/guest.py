@@ -208,6 +208,7 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
         residue_number=number,
         python_forces={},
         user_terms={},
+        body_pairs={},
     )
     return with_user_code(made) if scene.forces.added or scene.from_python else made
 

@@ -8,6 +8,7 @@ until a table has it.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from rigidmd.engines.observables import kinetic_energies, observe
 from rigidmd.engines.protocol import Engine, keep_time
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError
+from rigidmd.forces.poses.potential import BodyPairPotential
 from rigidmd.programs import Program
 from rigidmd.scene.validation import not_none
 from rigidmd.units import KJ_PER_MOL
@@ -68,6 +70,10 @@ class Translations(NamedTuple):
     stage: tuple[Key, ...]
     limits: tuple[Limit, ...]  # of a `ForceFieldView`
     stage_limits: tuple[Limit, ...]
+    #: Class of the function of a potential of two bodies -> messages on what is lacking of it
+    body_pairs: Mapping[type, Callable[[BodyPairPotential, System], Iterator[str]]] = (
+        MappingProxyType({})
+    )
 
     def of(self, name: str) -> Mapping[Any, Any]:
         """The translations of a key."""
@@ -75,7 +81,7 @@ class Translations(NamedTuple):
 
     def refusals(self, view: ForceFieldView) -> Iterator[str]:
         """Messages on all that a system has and the engine lacks."""
-        yield from unknown_terms(view.system, self.title)
+        yield from unknown_terms(view.system, self.title, self.body_pairs)
         for key in self.scene:
             table, name = key.name.split(".")
             if key.matters(view) and (

@@ -6,7 +6,7 @@ It is read from the terms that rigidmd itself runs, so that mixing rules, specia
 truncation are decided once. `unknown_terms` lists what no other program can express.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import combinations_with_replacement, pairwise, product
 from math import inf
 from typing import Any, NamedTuple, TypeVar
@@ -155,9 +155,20 @@ def force_field_of(system: System) -> ForceFieldView:
     )
 
 
-def unknown_terms(system: System, title: str) -> Iterator[str]:
-    """Messages on what acts on a system and is not in its view, for the engine with a title."""
+def unknown_terms(
+    system: System, title: str, body_pairs: Mapping[type, Callable[..., Iterator[str]]]
+) -> Iterator[str]:
+    """Messages on what acts on a system and is not in its view, for the engine with a title.
+
+    body_pairs : see `external.Translations`
+    """
     for name, term in system.terms.items():
+        if potential := system.body_pairs.get(name):
+            if limits := body_pairs.get(type(potential.function)):
+                yield from (f"{name}: {message}" for message in limits(potential, system))
+            else:
+                yield f"{name}: a potential of two bodies has no translation for {title}"
+            continue
         kind = type(term.potential if isinstance(term, PairForces) else term)
         what = "a user-defined force"
         if name not in system.user_terms:

@@ -78,15 +78,20 @@ class RigidBodies:
         omega = np.einsum("nij,nj->ni", state.rotation, state.angular_momentum_body * self._inverse)
         return centre + arm, drift + np.cross(omega[self._molecule], arm)
 
-    def load(self, state: State, position: np.ndarray, force: np.ndarray) -> Load:
-        """Forces and torques on bodies from forces on sites (s, 3)."""
+    def load(
+        self,
+        state: State,
+        position: np.ndarray,
+        force: np.ndarray,
+        torque: np.ndarray | None = None,
+    ) -> Load:
+        """Forces and torques on bodies from forces, and torques if there are any, on sites
+        (s, 3)."""
         arm = position - self._mean(position)[self._molecule]
         if not len(state.rotation):
             return Load(self._sum(force), np.zeros((0, 3)))
-        return Load(
-            self._sum(force),
-            np.einsum("nij,ni->nj", state.rotation, self._sum(np.cross(arm, force))),
-        )
+        moment = np.cross(arm, force) + (0.0 if torque is None else torque)
+        return Load(self._sum(force), np.einsum("nij,ni->nj", state.rotation, self._sum(moment)))
 
     def intramolecular_virial(self, position: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Sum (3, 3) of F (x) d, d from the centre of mass. The atomic virial less this is the

@@ -18,6 +18,7 @@ from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.parts import Tail, gather_per_molecule
+from rigidmd.forces.poses.potential import BodyPairPotential
 from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
@@ -58,6 +59,8 @@ class System:
     thermostat: Any = None  # user-defined, in place of the thermostat of every stage
     #: Name of a user-defined term -> description
     user_terms: dict[str, str] = field(default_factory=dict)
+    #: Those that are potentials of pairs of bodies
+    body_pairs: dict[str, BodyPairPotential] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<System of {self.scene.in_short}>"

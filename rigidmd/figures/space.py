@@ -17,6 +17,8 @@ DISCS = ((1.0, 0.0, -0.35), (0.93, 0.03, 0.0), (0.62, 0.2, 0.12), (0.3, 0.34, 0.
 AT_ONCE = 5000
 #: Lines with more points are images in an .svg.
 MOST_POINTS = 10_000
+#: Pixels across a picture of ellipsoids.
+PIXELS = 700
 
 
 def camera(eye: np.ndarray, up: np.ndarray = UP) -> np.ndarray:
@@ -184,6 +186,50 @@ class View:
             draw_line(self.axis, rim, color=color, lw=0.8, alpha=0.6)
         box = (x[0], x[-1], y[0], y[-1])
         self.axis.imshow(image, origin="lower", extent=box, interpolation="bilinear", zorder=0)
+
+    def solids(
+        self, centres: np.ndarray, rotation: np.ndarray, semi: np.ndarray, colors: np.ndarray
+    ) -> np.ndarray:
+        """A picture (rows, columns, 4) for `image` of lit ellipsoids (n,), which may intersect:
+        centres (n, 3), rotation (n, 3, 3) from their axes, semi-axes (n, 3), colors (n, 3)."""
+        seen = self.matrix @ rotation
+        middles = centres @ self.matrix.T
+        spread = np.einsum("nik,nk,njk->nij", seen, semi**2, seen)
+        weights = np.einsum("nik,nk,njk->nij", seen, semi**-2.0, seen)
+        reach = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+        low, size = self.centre - self.half, 2 * self.half
+        count = (PIXELS * self.half / self.half.max()).astype(int)
+        image, nearest = np.zeros((count[1], count[0], 4)), np.full(count[::-1], -np.inf)
+        light = LIGHT / np.linalg.norm(LIGHT)
+        for middle, extent, weight, color in zip(middles, reach, weights, colors, strict=True):
+            first = np.floor((middle[:2] - extent[:2] - low) / size * count).astype(int)
+            last = np.ceil((middle[:2] + extent[:2] - low) / size * count).astype(int)
+            first, last = np.clip(first, 0, count), np.clip(last, 0, count)
+            x, y = (
+                low[k] + (np.arange(first[k], last[k]) + 0.5) * size[k] / count[k] - middle[k]
+                for k in (0, 1)
+            )
+            x, y = np.meshgrid(x, y)
+            flat = np.stack([x, y], axis=-1)
+            b = flat @ weight[:2, 2]
+            c = np.einsum("...i,ij,...j->...", flat, weight[:2, :2], flat) - 1
+            root = b * b - weight[2, 2] * c
+            z = (np.sqrt(root.clip(0)) - b) / weight[2, 2]
+            part = (slice(first[1], last[1]), slice(first[0], last[0]))
+            visible = (root >= 0) & (middle[2] + z > nearest[part])
+            normal = np.concatenate([flat, z[..., None]], axis=-1)[visible] @ weight
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            bright = 0.45 + 0.55 * (normal @ light).clip(0)[:, None]
+            shine = 0.35 * (normal @ light).clip(0)[:, None] ** 12
+            image[part][visible] = np.insert((color * bright + shine).clip(0, 1), 3, 1.0, axis=1)
+            nearest[part][visible] = (middle[2] + z)[visible]
+        return image
+
+    def image(self, image: np.ndarray) -> None:
+        """Draw a picture that fills the axes."""
+        (left, bottom), (right, top) = self.centre - self.half, self.centre + self.half
+        box = (left, right, bottom, top)
+        self.axis.imshow(image, origin="lower", extent=box, interpolation="bilinear", zorder=2)
 
     def arrow(
         self,

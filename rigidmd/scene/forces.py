@@ -173,6 +173,11 @@ class BodyForce(Section):
     cosines a_r and b_r of the angles of the axes of the first and the second body with the vector
     from the first to the second, of the cosine a_b of the angle between the axes, and of named
     parameters"""
+    table: Line | None = None
+    """Instead of a potential: .npz file in the folder of the scene with the energies of pairs of
+    linear bodies"""
+    species: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
+    """With a table: species on which it acts; default: all"""
     module: Line | None = None
     """Instead of a potential: Python file in the folder of the scene with a
     `rigidmd.body_pair_potential`. Its code runs only with --trust FILE"""
@@ -201,14 +206,15 @@ class BodyForce(Section):
     """Where the switch begins. Default: 0.9 of the cutoff"""
 
     def _errors(self):
-        sources = [self.potential, self.energy, self.module]
+        sources = [self.potential, self.energy, self.table, self.module]
         if sum(source is not None for source in sources) != 1:
-            yield "give one of potential, energy and module"
+            yield "give one of potential, energy, table and module"
         if self.module is not None and self.name is None:
             yield "name is missing: with a module it is the name of the object in it"
         given = {
             "mixing": self.energy is None and self.mixing,
             "options": self.potential is None and self.options,
+            "species": self.table is None and self.species,
         }
         if self.module is not None:
             keys = ("parameters", "pairs", "references", "cutoff_A", "switch_start_A")

@@ -7,6 +7,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rigidmd.engines.sites import Sites
 from rigidmd.engines.system import System
@@ -15,8 +16,11 @@ from rigidmd.figures.space import View, camera
 from rigidmd.formats.bonds import COVALENT, connections
 from rigidmd.io.trajectory import Frames, read_frames
 from rigidmd.run.record import Record
+from rigidmd.run.rigid_fit import RigidFit
+from rigidmd.scene.validation import not_none
 from rigidmd.view.molecule_figure import color_of
 from rigidmd.view.page import PagePart, read_asset
+from rigidmd.view.solids import DEFAULT_RADIUS, SPHERE_SCALE, solids_of
 
 #: Most coordinates in a page, of 2 bytes each: with base64 about 21 MB, plus 3 MB of chemiscope.
 MOST_COORDINATES = 8_000_000
@@ -26,8 +30,6 @@ SCRIPT = ("sphinx", "static", "chemiscope.min.js")
 MAX_DEVIATION = 0.05
 #: Largest 16-bit number.
 LARGEST_INTEGER = 32_767
-#: Radius of a sphere in covalent radii, by which bonded spheres touch; default radius, Å.
-SPHERE_SCALE, DEFAULT_RADIUS = 1.15, 1.2
 #: Direction of the eye; fraction of white in the atoms that are furthest away.
 EYE, HAZE = np.array([0.45, -1.0, 0.33]), 0.5
 #: Lengths of the scale, Å.
@@ -113,12 +115,15 @@ class MoleculeAnimation:
         radii = [SPHERE_SCALE * COVALENT.get(e, 0.0) or DEFAULT_RADIUS for e in self._elements]
         self._radius, self._view = np.array(radii), camera(EYE)
         self._colors = np.array([color_of(element) for element in self._elements])
+        self._solids, self._fit = solids_of(record.system), RigidFit(record.system)
+        self._kept: tuple[int, np.ndarray] | None = None  # a frame, and its picture
         self._corners, points = None, frames.positions
         if frames.cells is not None:
             points = self._corners = np.array([*product((0, 1), repeat=3)]) @ frames.cells
         seen = points.reshape(-1, 3) @ self._view.T
         self._low, self._high = seen.min(0), seen.max(0)
-        self._half = 0.54 * (self._high - self._low)[:2].max() + 1.0  # the picture is square
+        reach = 1.0 if self._solids is None else self._solids.semi_axes.max()
+        self._half = 0.54 * (self._high - self._low)[:2].max() + reach  # the picture is square
 
     def loop_end(self) -> tuple[float, list[str]]:
         """End of an animation, and notes."""
@@ -132,20 +137,51 @@ class MoleculeAnimation:
         rounding = 1e-9 * (self.time[-1] - self.time[0])
         k = max(0, int(np.searchsorted(self.time, time + rounding, "right")) - 1)
         view = View(axes, self._view, self._half, (self._low + self._high)[:2] / 2)
-        positions = self._frames.positions[k, self._shown]
-        far = (self._high[2] - view.depth(positions)) / (self._high[2] - self._low[2] + 1.0)
-        haze = HAZE * far.clip(0, 1)[:, None]
-        view.spheres(positions, self._radius, self._colors * (1 - haze) + haze)
+        if self._solids is None:
+            positions = self._frames.positions[k, self._shown]
+            view.spheres(positions, self._radius, self._hazy(view, positions, self._colors))
+        else:
+            view.image(self._image(view, k))
         if self._corners is not None:
             view.box(self._corners[k])
         length = next(x for x in SCALES if x < 0.6 * self._half or x == 1)
         view.scale(length, f"{length} Å")
 
+    def _image(self, view: View, k: int) -> np.ndarray:
+        """The picture of the solids in a frame, kept because an animation shows it for a while."""
+        if self._kept is None or self._kept[0] != k:
+            solids = not_none(self._solids)
+            centres, rotation = solids.poses(self._fit.bodies(self._frames.positions[k], None))
+            colors = self._hazy(view, centres, solids.colors(rotation))
+            self._kept = k, view.solids(centres, rotation, solids.semi_axes, colors)
+        return self._kept[1]
+
+    def _hazy(self, view: View, positions: np.ndarray, colors: np.ndarray) -> np.ndarray:
+        """Colours, paler for things that are further away."""
+        far = (self._high[2] - view.depth(positions)) / (self._high[2] - self._low[2] + 1.0)
+        haze = HAZE * far.clip(0, 1)[:, None]
+        return colors * (1 - haze) + haze
+
     def page_part(self) -> PagePart:
         """The animation by chemiscope. Raises OutputError."""
         code, frames, molecules = chemiscope_script(), self._frames, self._record.system
-        positions = frames.positions[:, self._shown]
-        if len(self._shown) < len(molecules.sites.mass):
+        positions, elements = frames.positions[:, self._shown], self._elements
+        bonds, solids = massive_bonds(molecules), None
+        if self._solids is not None:
+            poses = [
+                self._solids.poses(self._fit.bodies(frame, None)) for frame in frames.positions
+            ]
+            positions = np.array([centres for centres, _ in poses])
+            rotation = np.array([of_frame for _, of_frame in poses])
+            colors = np.array([self._solids.colors(of_frame) for of_frame in rotation])
+            quaternion = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()
+            solids = {
+                "semiaxes": self._solids.semi_axes.tolist(),
+                "orientation": np.round(LARGEST_INTEGER * quaternion).astype("<i2"),
+                "color": np.round(255 * colors).astype("u1"),
+            }
+            elements, bonds = ["X"] * positions.shape[1], []
+        elif len(self._shown) < len(molecules.sites.mass):
             self.notes.append("Sites without mass are not drawn.")
         low, high = positions.min(), positions.max()
         scale = max(float(high - low), 1e-9) / (2 * LARGEST_INTEGER)
@@ -155,8 +191,9 @@ class MoleculeAnimation:
             "low": float(low),
             "scale": scale,
             "steps": LARGEST_INTEGER,
-            "elements": self._elements,
-            "bonds": massive_bonds(molecules),
+            "elements": elements,
+            "bonds": bonds,
+            "solids": solids,
             "cells": None if frames.cells is None else frames.cells.reshape(-1, 9).astype("<f4"),
             "name": self._record.scene.name,
         }

@@ -5,8 +5,14 @@
   const packed = rigidmdArray(data.positions, Int16Array), cells = data.cells && rigidmdArray(data.cells, Float32Array);
   const size = data.elements.length, names = data.elements, readout = document.getElementById("film-readout");
   const column = (k, axis) => Array.from({ length: size }, (_, i) => data.low + data.scale * (packed[3 * (k * size + i) + axis] + data.steps));
+  const solids = data.solids, orientations = solids && rigidmdArray(solids.orientation, Int16Array), colors = solids && rigidmdArray(solids.color, Uint8Array);
+  const solid = (at, semiaxes) => ({
+    semiaxes, orientation: [...orientations.subarray(4 * at, 4 * at + 4)].map((x) => x / data.steps),
+    color: colors[3 * at] * 65536 + colors[3 * at + 1] * 256 + colors[3 * at + 2],
+  });
   const structure = (k) => {
     const found = { size, names, x: column(k, 0), y: column(k, 1), z: column(k, 2), bonds: data.bonds };
+    if (solids) found.shapes = { bodies: { kind: "ellipsoid", parameters: { global: {}, atom: solids.semiaxes.map((semiaxes, i) => solid(k * size + i, semiaxes)) } } };
     if (cells) found.cell = [...cells.subarray(9 * k, 9 * k + 9)];
     return found;
   };
@@ -14,7 +20,7 @@
     meta: { name: data.name },
     structures: times.map((_, k) => ({ size, data: k })),
     properties: { time: { target: "structure", values: times, units: "ps" } },
-    settings: { structure: [{ unitCell: !!cells, keepOrientation: true, spaceFilling: false, axes: "off" }] },
+    settings: { structure: [{ unitCell: !!cells, keepOrientation: true, spaceFilling: false, axes: "off", ...(solids && { shape: "bodies", bonds: false }) }] },
   };
   const config = {
     meta: "film-meta", info: "film-info", structure: "film-picture", maxStructureViewers: 1,

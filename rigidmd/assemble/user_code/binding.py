@@ -68,7 +68,7 @@ def custom_forces(scene: MolecularScene) -> list[Any]:
 
 def _custom(scene: MolecularScene, entry: CustomForce | BodyForce, key: str) -> Any:
     if entry.module is None and isinstance(entry, BodyForce):
-        return potential_of_scene(entry)
+        return potential_of_scene(entry, scene.path)
     if entry.module is None and isinstance(entry, CustomForce):
         pairs = {pair.sites: pair.parameters for pair in entry.pairs}
         table = None if entry.table is None else scene.path(entry.table)
@@ -176,6 +176,7 @@ def with_user_code(system: System) -> System:
         tail=sum_of_tails(tails),
         python_forces=functions,
         user_terms={name: one.description for name, one in bound.items()},
+        body_pairs={name: one.body_pairs for name, one in bound.items() if one.body_pairs},
     )
 
 

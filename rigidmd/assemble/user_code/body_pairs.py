@@ -2,8 +2,8 @@
 are cut off."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from math import inf
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -12,39 +12,21 @@ from rigidmd.assemble.user_code.cutoffs import PairPotentialError, check_cutoff
 from rigidmd.assemble.user_code.force import BoundTerm
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.engines.system import System
+from rigidmd.forces.poses.potential import BodyPairPotential, Parameters, Vector
 from rigidmd.scene.forces import BodyForce
 from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
     from rigidmd.forces.poses.formulas import PoseFormula
 
-Parameters = Mapping[str, float]
-Vector = tuple[float, float, float]
 #: In the log, for a function without a name, or with the name of a column.
 DEFAULT_NAME, UNNAMED = "body_pairs", ("", "<lambda>", "energy")
 #: The switch begins at this fraction of the cutoff.
 SWITCH_START = 0.9
 
 
-@dataclass(frozen=True)
-class BodyPairPotential:
-    """A potential of pairs of bodies for `Simulation(scene, forces=[...])`, made by
-    `body_pair_potential`."""
-
-    function: Callable[..., Any]
-    parameters: Mapping[str, Parameters]  # by species
-    species: tuple[str, ...]  # on which it acts; none: on all
-    pairs: Mapping[tuple[str, str], Parameters]
-    axis: Literal["x", "y", "z"] | None
-    references: Mapping[str, Vector]
-    truncation: Literal["switch", "plain"]
-    cutoff_A: float | None
-    switch_start_A: float | None
-    name: str
-
-
 def body_pair_potential(
-    function: Callable[..., Any],
+    function: Callable[..., Any] | str | Path,
     parameters: Mapping[str, Parameters] | None = None,
     *,
     species: tuple[str, ...] = (),
@@ -76,7 +58,8 @@ def body_pair_potential(
         gives a tuple of the energy, the force (3,) on the second body in kJ/mol/Å, and the torques
         (3,) on the first and on the second body in kJ/mol, along the axes of the lab. An exchange
         of both bodies must not change the energy. If their species differ, the one that is first in
-        the scene is a
+        the scene is a. Or it is the path of a table of linear bodies, an .npz file with the arrays
+        r_A, theta_1_deg, theta_2_deg, phi_deg and energy_kJ_mol
     parameters
         Species -> numbers by name, the attributes of p and q. It acts on these species
     species
@@ -102,7 +85,14 @@ def body_pair_potential(
     ------
     ValueError
     """
-    if not callable(function):
+    if isinstance(function, str | Path):
+        from rigidmd.forces.poses.table import read_body_table
+
+        if parameters or pairs:
+            raise ValueError("parameters and pairs would have no effect on a table: give species")
+        path = Path(function)
+        function, name = read_body_table(path), name or DEFAULT_NAME
+    elif not callable(function):
         raise ValueError(f"{function!r:.60} is not a function of (r, a, b)")
     if axis not in (None, "x", "y", "z"):
         raise ValueError(f"axis is {axis!r}, must be 'x', 'y' or 'z'")
@@ -131,17 +121,23 @@ def body_pair_potential(
     )
 
 
-def potential_of_scene(entry: BodyForce) -> BodyPairPotential:
-    """The potential of one of [[forces.bodies]] without a module. Raises ValueError."""
+def potential_of_scene(entry: BodyForce, path: Callable[[str], Path]) -> BodyPairPotential:
+    """The potential of one of [[forces.bodies]] without a module. Raises ValueError.
+
+    path : of the file of a table
+    """
     from rigidmd.forces.poses.shipped import function_of_text, shipped_function
 
     if entry.potential is not None:
         function = shipped_function(entry.potential, entry.options, entry.parameters)
+    elif entry.table is not None:
+        function = path(entry.table)
     else:
         function = function_of_text(not_none(entry.energy), entry.mixing)
     return body_pair_potential(
         function,
         entry.parameters,
+        species=entry.species,
         pairs={pair.species: pair.parameters for pair in entry.pairs},
         axis=entry.axis,
         references=entry.references,
@@ -172,6 +168,9 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         raise PairPotentialError(*faults)
     cutoff = potential.cutoff_A or system.cutoff
     check_cutoff(cutoff, system)
+    if not cutoff <= (reach := getattr(potential.function, "last", inf)):
+        message = f"the table ends at {reach:g} Å, before the cutoff of {cutoff:g} Å"
+        raise PairPotentialError(message)
     start = cutoff
     if potential.truncation == "switch" and cutoff < inf:
         start = potential.switch_start_A or SWITCH_START * cutoff
@@ -195,7 +194,6 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         reference=np.array(references, float).reshape(-1, 3),
         frame=np.ascontiguousarray([models[name].axes.T for name in kinds]),
         parameters=rows,
-        interacts=np.ones((len(kinds), len(kinds)), bool),
         switch_start=float(start),
         cutoff=float(cutoff),
     )
@@ -205,7 +203,7 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         f"pairs of {', '.join(kinds)}, {formula.operations} operations, force and torques {source},"
         f" {ends}"
     )
-    return BoundTerm(term, text)
+    return BoundTerm(term, text, body_pairs=potential)
 
 
 def _unknown_species(potential: BodyPairPotential, species: list[str]) -> list[str]:
@@ -235,7 +233,7 @@ def _rows(potential: BodyPairPotential, kinds: list[str]) -> "tuple[PoseFormula,
     try:
         formula = formula_of_poses(potential.function, names, potential.axis)
         rows = [
-            [formula.numbers(*_parameters_of(potential, names, one, other)) for other in kinds]
+            [formula.numbers(*_complete(potential, names, one, other)) for other in kinds]
             for one in kinds
         ]
     except TraceError as error:
@@ -243,13 +241,12 @@ def _rows(potential: BodyPairPotential, kinds: list[str]) -> "tuple[PoseFormula,
     return formula, np.array(rows, float).reshape(len(kinds), len(kinds), -1)
 
 
-def _parameters_of(
+def _complete(
     potential: BodyPairPotential, names: list[str], one: str, other: str
 ) -> tuple[Parameters, Parameters]:
     """The parameters of two species. Raises PairPotentialError if one is missing."""
-    of_pair = potential.pairs.get((one, other)) or potential.pairs.get((other, one)) or {}
-    both = [{**potential.parameters.get(name, {}), **of_pair} for name in (one, other)]
+    both = potential.parameters_of(one, other)
     for name, values in zip((one, other), both, strict=True):
         if missing := [key for key in names if key not in values]:
             raise PairPotentialError(f"{name} has no parameter {', '.join(missing)}")
-    return both[0], both[1]
+    return both

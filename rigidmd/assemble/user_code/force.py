@@ -12,6 +12,7 @@ from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError, describe_error
 from rigidmd.forces.fields.python_forces import PythonForces, PythonForcesWorkspace
 from rigidmd.forces.parts import Tail
+from rigidmd.forces.poses.potential import BodyPairPotential
 from rigidmd.units import KJ_PER_MOL
 
 EVERY = (True, True, True)
@@ -42,6 +43,7 @@ class BoundTerm(NamedTuple):
     tail: Tail | None = None  # of a pair potential, where the scene has forces.tail_correction
     notes: Sequence[str] = ()
     warnings: Sequence[str] = ()
+    body_pairs: BodyPairPotential | None = None  # of which the term was made
 
 
 class UserForceError(SimulationError):

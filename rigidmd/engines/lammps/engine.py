@@ -23,6 +23,7 @@ from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.model import Model
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.lammps import files
+from rigidmd.engines.lammps.ellipsoids import atoms, ellipsoids
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.rigid_bodies import RigidBodies
@@ -38,6 +39,7 @@ from rigidmd.programs.lammps import PROGRAM
 NUMBERS = "rigidmd:"
 #: Columns of a dump.
 COLUMNS = ("id", "x", "y", "z", "ix", "iy", "iz", "vx", "vy", "vz", "fx", "fy", "fz")
+TORQUE = ("tqx", "tqy", "tqz")
 PER_PS = 1e3  # Å/fs in Å/ps
 DUMP = "state.dump"
 #: Number of lines of output that are searched for an error.
@@ -77,7 +79,8 @@ class LammpsEngine(ExternalEngine):
         super().__init__(system, stage)
         self._styles = files.pair_styles(self._view)
         self._fixes = files.fixes(self._view, stage)
-        self._bodies = RigidBodies(system)
+        self._bodies = RigidBodies(system, atoms(self._view))
+        self._has_ellipsoids = bool(ellipsoids(self._view))
         self._process = Process(command(ranks))
         date, rank_count = self._process.run_commands(
             f'print "{NUMBERS} $(version) $(extract_setting(world_size))"'
@@ -163,9 +166,10 @@ class LammpsEngine(ExternalEngine):
         energies = [f"c_e{n}" for n in range(len(self._styles))] + (
             ["elong"] if view.has_ewald_sum else []
         )
+        columns = (*COLUMNS, *TORQUE) if self._has_ellipsoids else COLUMNS
         names = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]
         printed = self._process.run_commands(
-            f"write_dump all custom {DUMP} {' '.join(COLUMNS)} modify sort id format float %.17g",
+            f"write_dump all custom {DUMP} {' '.join(columns)} modify sort id format float %.17g",
             f'print "{NUMBERS} {" ".join(f"$({name}:%.17g)" for name in names)}"',
         )
         cell, rows = read_dump(self._process.folder / DUMP)
@@ -186,7 +190,8 @@ class LammpsEngine(ExternalEngine):
                 - (intramolecular + intramolecular.T) / 2
             )
         tallies = self._tallies(np.array(printed[:n]) * files.KCAL, virial, state.volume)
-        self._evaluated = self._bodies.load(state, position, force), tallies
+        torque = rows[:, 13:16] * files.KCAL if self._has_ellipsoids else None
+        self._evaluated = self._bodies.load(state, position, force, torque), tallies
         # the conserved energy that LAMMPS' fix rigid prints is not conserved: for 512 SPC/E under
         # rigid/nvt it changed by 1 % in 0.6 ps, at 0.5 fs as at 2 fs
         heat = 0.0
@@ -200,7 +205,9 @@ class LammpsEngine(ExternalEngine):
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
         view = self._view
         charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # with LAMMPS' constant
-        names = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None))
+        names = [*view.system.body_pairs]
+        others = len(self._styles) - len(names) - (view.coulomb is not None)
+        names += ["lennard_jones"] * others
         potential = view.coulomb
         names += (
             ["coulomb_real", "coulomb_reciprocal"]

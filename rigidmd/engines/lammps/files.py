@@ -2,7 +2,8 @@
 stages of a run."""
 
 from collections.abc import Mapping
-from math import inf, pi
+from itertools import combinations_with_replacement
+from math import inf, pi, sqrt
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -19,10 +20,13 @@ from rigidmd.engines.force_field import (
     lennard_jones_formula,
     table,
 )
+from rigidmd.engines.lammps.ellipsoids import atoms, ellipsoids, limits, orientations
+from rigidmd.engines.rigid_bodies import RigidBodies
+from rigidmd.forces.poses.gay_berne import GayBerne
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import TRUNCATIONS, Unmodified
 from rigidmd.scene.stage import Stage
-from rigidmd.units import BAR, COULOMB, ENERGY_UNITS
+from rigidmd.units import BAR, COULOMB, ENERGY_UNITS, KJ_PER_MOL
 
 KCAL = ENERGY_UNITS["kcal/mol"]
 #: LAMMPS' constant of Coulomb's law, kcal Å/mol.
@@ -40,8 +44,8 @@ ENTRIES, INNERMOST = 8000, 0.3
 SEEDS = 900_000_000
 
 DATA, SETTINGS, INPUT, TABLES = "data.lammps", "settings.lammps", "in.lammps", "tables.lammps"
-#: Names of groups, and of the fixes that move two of them.
-BODIES, POINTS, FROZEN = "bodies", "points", "frozen"
+#: Names of groups, and of the fixes that move the first two.
+BODIES, POINTS, FROZEN, SITES = "bodies", "points", "frozen", "sites"
 
 _INTEGRATOR, *_LIMITS = moves("LAMMPS", "rigid bodies")
 #: What LAMMPS can express, and how.
@@ -124,6 +128,7 @@ TRANSLATIONS = Translations(
             lambda stage: is_langevin(stage) and stage.has_barostat,
         ),
     ),
+    body_pairs={GayBerne: limits},
 )
 
 
@@ -142,39 +147,61 @@ class PairStyle(NamedTuple):
 
 def write_data(path: Path, view: ForceFieldView, state: State) -> None:
     """Write the data file: box, masses, atoms with images, velocities. Site k of the system is atom
-    k + 1."""
-    system = view.system
-    position, velocity = system.site_positions(state), system.site_velocities(state)
+    k + 1, and ellipsoids follow."""
+    system, added = view.system, ellipsoids(view)
+    points = atoms(view)
+    position, velocity = RigidBodies(system, points).points(state)
     image = np.zeros(position.shape, int)
     # the first line may name the units of velocities for readers; those of LAMMPS are chosen by its
     # script
     lines = [f"LAMMPS data file, units = real, of {system.scene.name}, written by rigidmd", ""]
-    lines += [f"{len(position)} atoms", f"{len(view.kinds)} atom types", ""]
+    lines += [f"{len(position)} atoms", f"{len(view.kinds) + len(added)} atom types"]
+    lines += [f"{len(position) - system.site_count} ellipsoids"] if added else []
     low, high, tilt = position.min(axis=0) - 1, position.max(axis=0) + 1, ()
     if view.is_periodic:
         image = np.floor(position @ np.linalg.inv(state.cell)).astype(int)
         position = position - image @ state.cell
         low, high = np.zeros(3), state.cell.diagonal()
         tilt = (state.cell[1, 0], state.cell[2, 0], state.cell[2, 1])
+    lines += [""]
     lines += [
         f"{_num(a)} {_num(b)} {axis}lo {axis}hi"
         for a, b, axis in zip(low, high, "xyz", strict=True)
     ]
     lines += [f"{' '.join(map(_num, tilt))} xy xz yz"] if any(tilt) else []
-    lines += ["", "Masses", ""]
-    lines += [
-        f"{k + 1} {_num(kind.mass or NO_MASS)} # {in_comment(kind.name)}"
-        for k, kind in enumerate(view.kinds)
-    ]
-    lines += ["", "Atoms # full", ""]
-    rows = zip(system.sites.molecule + 1, view.kind + 1, view.charge, position, image, strict=True)
-    lines += [
-        f"{i} {m} {k} {_num(q)} {_num(x)} {_num(y)} {_num(z)} {nx} {ny} {nz}"
-        for i, (m, k, q, (x, y, z), (nx, ny, nz)) in enumerate(rows, 1)
-    ]
+    if added:  # atoms have masses of their own
+        lines += ["", "Atoms # hybrid", ""]
+    else:
+        lines += ["", "Masses", ""]
+        lines += [
+            f"{k + 1} {_num(kind.mass or NO_MASS)} # {in_comment(kind.name)}"
+            for k, kind in enumerate(view.kinds)
+        ]
+        lines += ["", "Atoms # full", ""]
+    of_added = [np.full(len(e.molecule), k) for k, e in enumerate(added, len(view.kinds) + 1)]
+    kinds = np.concatenate([view.kind + 1, *of_added])
+    charge = np.append(view.charge, np.zeros(len(position) - system.site_count))
+    rows = zip(points.molecule + 1, kinds, charge, points.mass, position, image, strict=True)
+    for i, (molecule, kind, q, mass, (x, y, z), (nx, ny, nz)) in enumerate(rows, 1):
+        at, images = f"{_num(x)} {_num(y)} {_num(z)}", f"{nx} {ny} {nz}"
+        if added:  # whether it is an ellipsoid, then its density, or the mass of a point
+            flag = int(i > system.site_count)
+            of_atom = f"{molecule} {_num(q)} {flag} {_num(mass or NO_MASS)}"
+            lines.append(f"{i} {kind} {at} {of_atom} {images}")
+        else:
+            lines.append(f"{i} {molecule} {kind} {_num(q)} {at} {images}")
+    if added:
+        lines += ["", "Ellipsoids", ""]
+        diameters = np.concatenate([np.tile(e.diameters, (len(e.molecule), 1)) for e in added])
+        numbers = np.hstack([diameters, orientations(view, state)])
+        lines += [
+            f"{i} {' '.join(map(_num, row))}"
+            for i, row in enumerate(numbers, system.site_count + 1)
+        ]
     per_fs = velocity * 1e-3  # Å/ps to Å/fs
+    spin = " 0 0 0" if added else ""  # angular momentum
     lines += ["", "Velocities", ""]
-    lines += [f"{i} {_num(x)} {_num(y)} {_num(z)}" for i, (x, y, z) in enumerate(per_fs, 1)]
+    lines += [f"{i} {_num(x)} {_num(y)} {_num(z)}{spin}" for i, (x, y, z) in enumerate(per_fs, 1)]
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -192,7 +219,9 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
         " ".join(f"{style.name} {style.arguments}" for style in styles)
         or f"zero {_cutoff(system.cutoff):g}"
     )
-    lines = ["units real", "atom_style full", f"boundary {boundary}"]
+    kinds = len(view.kinds) + len(ellipsoids(view))
+    atom_style = "hybrid full ellipsoid" if kinds > len(view.kinds) else "full"
+    lines = ["units real", f"atom_style {atom_style}", f"boundary {boundary}"]
     lines += [f"pair_style {'hybrid/overlay ' if styles else ''}{names}", f"read_data {data}"]
     for n, style in enumerate(styles):
         which = style_name(styles, n)
@@ -201,7 +230,7 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
             for (i, j), text in style.coefficients.items()
         ]
     touched = {pair for style in styles for pair in style.coefficients}
-    pairs = [(i, j) for i in range(len(view.kinds)) for j in range(i, len(view.kinds))]
+    pairs = [(i, j) for i in range(kinds) for j in range(i, kinds)]
     if styles:
         lines += [f"pair_coeff {i + 1} {j + 1} none" for i, j in pairs if (i, j) not in touched]
     else:
@@ -233,6 +262,8 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
                 f"{run[0]}:{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs
             )
             lines += [f"group {name} molecule {ranges}"]
+    if ellipsoids(view):
+        lines += [f"group {SITES} id 1:{system.site_count}"]
     if view.frozen.any():
         lines += [f"neigh_modify exclude group {FROZEN} {FROZEN}"]
     return lines
@@ -243,7 +274,8 @@ def _cutoff(cutoff: float) -> float:
 
 
 def pair_styles(view: ForceFieldView) -> list[PairStyle]:
-    return [style for style in (_lennard_jones(view), _coulomb(view)) if style is not None]
+    styles = [style for style in (_lennard_jones(view), _coulomb(view)) if style is not None]
+    return [_gay_berne(view, name) for name in view.system.body_pairs] + styles
 
 
 def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
@@ -295,6 +327,20 @@ def _coulomb(view: ForceFieldView) -> PairStyle | None:
         (i, j): coulomb_formula(potential, COULOMB_REAL * charge[i] * charge[j]) for i, j in pairs
     }
     return _tables("coulomb", of_pairs, cutoff)
+
+
+def _gay_berne(view: ForceFieldView, name: str) -> PairStyle:
+    potential, coefficients = view.system.body_pairs[name], {}
+    kinds = enumerate(ellipsoids(view), len(view.kinds))
+    members = [(k, kind) for k, kind in kinds if kind.potential == name]
+    for (i, one), (j, other) in combinations_with_replacement(members, 2):
+        p, q = potential.parameters_of(one.species, other.species)
+        epsilon = sqrt(p["epsilon_kJ_mol"] * q["epsilon_kJ_mol"]) * KJ_PER_MOL / KCAL
+        numbers = [epsilon, (p["width_A"] + q["width_A"]) / 2, *one.wells, *other.wells]
+        coefficients[(i, j)] = " ".join(map(_num, numbers))
+    gamma, upsilon, mu = (getattr(potential.function, x) for x in ("gamma", "upsilon", "mu"))
+    arguments = (gamma, upsilon, mu, _cutoff(view.system.terms[name].cutoff))
+    return PairStyle("gayberne", " ".join(map(_num, arguments)), coefficients)
 
 
 def _tables(what: str, formulas: dict[tuple[int, int], str], cutoff: str) -> PairStyle:
@@ -415,8 +461,8 @@ def input_script(view: ForceFieldView) -> str:
         lines += [*stage_fixes, f"thermo {every}"]
         if output.trajectory:
             lines += [
-                f"dump frames all custom {frames} trajectory_{k}.lammpstrj id mol type xu yu zu vx"
-                " vy vz"
+                f"dump frames {SITES if ellipsoids(view) else 'all'} custom {frames}"
+                f" trajectory_{k}.lammpstrj id mol type xu yu zu vx vy vz"
             ]
             lines += ["dump_modify frames sort id"]
         lines += [f"run {stage.steps}"]

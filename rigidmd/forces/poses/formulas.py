@@ -10,12 +10,15 @@ import numpy as np
 
 from rigidmd.core.user_modules import module_of
 from rigidmd.errors import describe_error
+from rigidmd.forces.poses.table import BodyTable, TableFormula
 from rigidmd.forces.poses.trace import Graph, Hoisted, Traced, TraceError, code_of, slopes_of
 from rigidmd.units import KJ_PER_MOL
 
 AXES = "xyz"
 #: What a function may return: an energy, or also the force on the second body and both torques.
 ENERGY, WITH_FORCES = 1, 4
+#: Of the energy of a table with its slopes, about.
+TABLE_OPERATIONS = 1800
 
 
 class PoseFormula(NamedTuple):
@@ -29,17 +32,20 @@ class PoseFormula(NamedTuple):
 
 
 def formula_of_poses(
-    function: Callable, parameters: Sequence[str] = (), axis: str | None = None
+    function: Callable | BodyTable, parameters: Sequence[str] = (), axis: str | None = None
 ) -> PoseFormula:
     """The formula of a function of two poses.
 
-    function(r, a, b) or function(r, a, b, p, q), see `body_pair_potential`.
+    function(r, a, b) or function(r, a, b, p, q), see `body_pair_potential`; or a table.
 
     parameters : names of the parameters of a kind
     axis : x, y or z, a body axis that a and b then are, instead of rotation matrices
 
     Raises TraceError.
     """
+    if isinstance(function, BodyTable):
+        row = function.row(axis).tolist()
+        return PoseFormula(TableFormula, lambda first, second: row, TABLE_OPERATIONS, True)
     name = getattr(function, "__name__", "a potential")
     graph = Graph()
     r = np.array([graph.leaf(letter) for letter in AXES], object)

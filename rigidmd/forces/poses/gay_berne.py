@@ -10,7 +10,7 @@ Phys. Rev. E 54, 559, for the contact, and Everaers & Ejtehadi 2003, Phys. Rev. 
 the strength.
 """
 
-from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,14 +19,15 @@ import numpy as np
 PARAMETERS = ("length_A", "width_A", "epsilon_kJ_mol", "side", "end")
 
 
-def gay_berne(upsilon: float = 1.0, mu: float = 2.0, gamma: float = 1.0) -> Callable:
-    """The energy (kJ/mol) as a function of r, of the axes of both bodies and of their parameters.
+class GayBerne(NamedTuple):
+    """The energy (kJ/mol) as a function of r, of the axes of both bodies and of their
+    parameters."""
 
-    upsilon, mu : exponents of the strength
-    gamma : shift of the distance
-    """
+    upsilon: float = 1.0  # exponents of the strength
+    mu: float = 2.0
+    gamma: float = 1.0  # shift of the distance
 
-    def energy(r, u, v, p, q):
+    def __call__(self, r, u, v, p, q):
         distance = np.sqrt(r @ r)
         along = (u @ r) / distance, (v @ r) / distance, u @ v
         # radii squared, across and along the axis
@@ -35,15 +36,14 @@ def gay_berne(upsilon: float = 1.0, mu: float = 2.0, gamma: float = 1.0) -> Call
         shape, determinant = _inverse(wide, long, other_wide, other_long, along)
         contact = np.sqrt(2.0) / np.sqrt(shape)
         sizes = (wide + long) * p.width_A / 2 * ((other_wide + other_long) * q.width_A / 2)
-        strength = (2 * sizes / determinant) ** (upsilon / 2)
-        wells = [x.side ** (-1 / mu) for x in (p, q)], [x.end ** (-1 / mu) for x in (p, q)]
-        depth, _ = _inverse(wells[0][0], wells[1][0], wells[0][1], wells[1][1], along)
+        strength = (2 * sizes / determinant) ** (self.upsilon / 2)
+        power = -1 / self.mu
+        side, end = ([x**power for x in both] for both in ((p.side, q.side), (p.end, q.end)))
+        depth, _ = _inverse(side[0], end[0], side[1], end[1], along)
         width = (p.width_A + q.width_A) / 2
-        ratio = width / (distance - contact + gamma * width)
+        ratio = width / (distance - contact + self.gamma * width)
         epsilon = np.sqrt(p.epsilon_kJ_mol * q.epsilon_kJ_mol)
-        return 4 * epsilon * strength * (2 * depth) ** mu * (ratio**12 - ratio**6)
-
-    return energy
+        return 4 * epsilon * strength * (2 * depth) ** self.mu * (ratio**12 - ratio**6)
 
 
 def _inverse(across, along_axis, other_across, other_along, cosines):

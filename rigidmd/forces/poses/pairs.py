@@ -35,7 +35,6 @@ class BodyPairs(NamedTuple):
     reference: np.ndarray  # (kinds, 3) reference point from the centre of mass, body frame, Å
     frame: np.ndarray  # (kinds, 3, 3) from the coordinates of the model's file to the body frame
     parameters: np.ndarray  # (kinds, kinds, parameters) of the first kind with the second
-    interacts: np.ndarray  # (kinds, kinds) bool
     switch_start: float  # Å, where the energy begins to be switched to 0; `cutoff` for a jump
     cutoff: float  # Å, between reference points
 
@@ -355,11 +354,7 @@ def _list_pairs(arguments, block):
                         j = pairs.order[k]
                         if i == j or (j > i) != ((i + j) % 2 == 0):
                             continue
-                        if (
-                            term.kind[j] < 0
-                            or term.group[i] == term.group[j]
-                            or not term.interacts[kind, term.kind[j]]
-                        ):
+                        if term.kind[j] < 0 or term.group[i] == term.group[j]:
                             continue
                         rx, ry, rz = nearest_image(
                             cell,

@@ -7,6 +7,7 @@ import numpy as np
 
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.forces.poses import gay_berne, multipoles, patch
+from rigidmd.forces.poses.gay_berne import GayBerne
 
 
 class Shipped(NamedTuple):
@@ -18,7 +19,7 @@ class Shipped(NamedTuple):
 
 
 SHIPPED = {
-    "gay_berne": Shipped(gay_berne.gay_berne, gay_berne.PARAMETERS, ("upsilon", "mu", "gamma")),
+    "gay_berne": Shipped(GayBerne, gay_berne.PARAMETERS, GayBerne._fields),
     "dipole": Shipped(multipoles.dipole, multipoles.DIPOLE, ("reaction_field_A",)),
     "quadrupole": Shipped(multipoles.quadrupole, multipoles.QUADRUPOLE),
     "patch": Shipped(patch.patch, patch.PARAMETERS),
