@@ -102,7 +102,8 @@ EXTENDED = {
     "test_fields.py": ("adding_a_field_*",),
     "test_forces.py": (
         "a_list_with_almost_no_skin_is_built_at_every_step[[]mixed*",
-        "energies_are_those_of_the_oracle[[]s[mw]*",
+        "energies_are_those_of_the_oracle[[]smooth_switch*",
+        "energies_are_those_of_the_oracle[[]switch*",
         "everything_follows_a_cell_that_changes[[]ewald*",
         "slanted_boxes*",
         "a_list_with_little_room_grows_and_misses_nothing[[]mixed]",

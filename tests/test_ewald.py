@@ -653,7 +653,7 @@ def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
     }
     system = build(Scene.from_dict(data, tmp_path))
     assert cell_of(system.space) == pytest.approx(14.0 * np.eye(3))
-    assert any("Rotated, contents included" in note for note in system.notes)
+    assert any("rotated, contents included" in note for note in system.notes)
 
     def inside(n):
         return (np.abs(n) <= (4, 2, 3)).all(axis=1)

@@ -40,7 +40,7 @@ def argon(folder=None, **options):
         {"ensemble": "nvt", "duration_ps": 0.02, "temperature_K": 90.0},
         {"duration_ps": 0.02},
     ]
-    output = {"log_interval_ps": 0.004, "trajectory_interval_ps": 0.01}
+    output = {"log_interval_ps": 0.004, "trajectory_interval_ps": 0.01, "figures": True}
     return Simulation(
         small_scene({"argon": 20}, 20.0, stages=stages, output=output), folder, **options
     )

@@ -141,7 +141,7 @@ def body_trial_system(
         except SceneError as error:
             # without advice
             reasons = (
-                re.split("[:;] use ", text.removeprefix("run: "))[0] for text in error.errors
+                re.split(r"[:.] [Uu]se ", text.removeprefix("run: "))[0] for text in error.errors
             )
             refused[name] = "; ".join(reasons).replace(solver, "it")
     if not fits:

@@ -79,8 +79,8 @@ def nematic(runs: Runs, axis: Literal["", "x", "y", "z"] = "") -> AnalysisResult
         result.curves[0].columns |= columns
     if not result.curves:
         raise OutputError(
-            "no molecule of this run is linear: name an axis of the model's file, x, y or z, by"
-            " rigidmd.analysis.nematic(results, 'z')"
+            "no molecule of this run is linear. Name an axis of the model's file, such as"
+            " `rigidmd analyse RUN nematic axis=z`"
         )
     return result
 
