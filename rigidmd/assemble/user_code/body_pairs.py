@@ -90,10 +90,11 @@ def body_pair_potential(
 
         if parameters or pairs:
             raise ValueError("parameters and pairs would have no effect on a table: give species")
-        path = Path(function)
-        function, name = read_body_table(path), name or DEFAULT_NAME
+        energy, name = read_body_table(Path(function)), name or DEFAULT_NAME
     elif not callable(function):
         raise ValueError(f"{function!r:.60} is not a function of (r, a, b)")
+    else:
+        energy = function
     if axis not in (None, "x", "y", "z"):
         raise ValueError(f"axis is {axis!r}, must be 'x', 'y' or 'z'")
     if truncation not in ("switch", "plain"):
@@ -106,9 +107,9 @@ def body_pair_potential(
     for key in pairs or {}:
         if not (isinstance(key, tuple) and [type(one) for one in key] == [str, str]):
             raise ValueError(f"pairs: {key!r} is not a pair of names of species")
-    called = getattr(function, "__name__", "")
+    called = getattr(energy, "__name__", "")
     return BodyPairPotential(
-        function=function,
+        function=energy,
         parameters=dict(parameters or {}),
         species=tuple(species),
         pairs=dict(pairs or {}),

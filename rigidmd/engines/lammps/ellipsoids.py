@@ -2,7 +2,7 @@
 without mass, which is fixed in it as its sites are."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,6 +11,7 @@ from rigidmd.core.state import State
 from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.rigid_bodies import Points
 from rigidmd.engines.system import System
+from rigidmd.forces.poses.pairs import BodyPairs
 from rigidmd.forces.poses.potential import BodyPairPotential
 
 
@@ -48,14 +49,14 @@ def ellipsoids(view: ForceFieldView) -> list[Ellipsoids]:
     """All ellipsoids of a system."""
     kinds = []
     for name, potential in view.system.body_pairs.items():
-        term = view.system.terms[name]
+        term = cast(BodyPairs, view.system.terms[name])
         for k in range(len(term.reference)):
             molecule = np.flatnonzero(term.kind == k)
             if not len(molecule):
                 continue
             species = view.system.species[view.system.model.species[molecule[0]]].name
             values = potential.parameters[species]
-            along = np.arange(3) == "xyz".index(potential.axis)
+            along = np.arange(3) == "xyz".index(str(potential.axis))
             kinds.append(
                 Ellipsoids(
                     name,

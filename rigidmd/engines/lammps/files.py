@@ -6,7 +6,7 @@ from itertools import combinations_with_replacement
 from math import inf, pi, sqrt
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from rigidmd.engines.force_field import (
 from rigidmd.engines.lammps.ellipsoids import atoms, ellipsoids, limits, orientations
 from rigidmd.engines.rigid_bodies import RigidBodies
 from rigidmd.forces.poses.gay_berne import GayBerne
+from rigidmd.forces.poses.pairs import BodyPairs
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import TRUNCATIONS, Unmodified
 from rigidmd.scene.stage import Stage
@@ -339,7 +340,8 @@ def _gay_berne(view: ForceFieldView, name: str) -> PairStyle:
         numbers = [epsilon, (p["width_A"] + q["width_A"]) / 2, *one.wells, *other.wells]
         coefficients[(i, j)] = " ".join(map(_num, numbers))
     gamma, upsilon, mu = (getattr(potential.function, x) for x in ("gamma", "upsilon", "mu"))
-    arguments = (gamma, upsilon, mu, _cutoff(view.system.terms[name].cutoff))
+    term = cast(BodyPairs, view.system.terms[name])
+    arguments = (gamma, upsilon, mu, _cutoff(term.cutoff))
     return PairStyle("gayberne", " ".join(map(_num, arguments)), coefficients)
 
 

@@ -1,6 +1,6 @@
 """A potential of pairs of bodies as it is specified, before it is bound to a system."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ class BodyPairPotential:
     """A potential of pairs of bodies for `Simulation(scene, forces=[...])`, made by
     `body_pair_potential`."""
 
-    function: Callable[..., Any]
+    function: Any  # of (r, a, b), or a table
     parameters: Mapping[str, Parameters]  # by species
     species: tuple[str, ...]  # on which it acts; none: on all
     pairs: Mapping[tuple[str, str], Parameters]
