@@ -91,8 +91,7 @@ def remember_by_structure(function: Callable[[Any], T]) -> Callable[[Any], T]:
     """Call a function of a value, whose result depends on the Numba type alone, once for each
     structure of values.
 
-    Numba builds and hashes the types of the forty arrays of a term anew for each pass, which took
-    0.1 s of the start of a run.
+    Numba would build and hash the types of the forty arrays of a term anew for each pass.
     """
     results: dict[Hashable, T] = {}
 

@@ -17,9 +17,11 @@ from pathlib import Path
 from rigidmd.errors import OutputError
 
 CHUNK = 1 << 20  # bytes read at a time
-#: Flags to open an existing file for appending; links are not followed, where the system supports
+#: Attempts to replace a file that another program holds open, and the pause between them (s), on
+#: Windows.
+REPLACE_ATTEMPTS, REPLACE_PAUSE = 20, 0.1
+#: Flags to open an existing file for appending. Links are not followed, where the system supports
 #: that.
-REPLACE_ATTEMPTS, REPLACE_PAUSE = 20, 0.1  # s, on Windows
 APPEND_FLAGS = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
 
 

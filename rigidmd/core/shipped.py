@@ -107,7 +107,7 @@ def find_example(name: str) -> Example:
 
 
 def series_of(name: str) -> list[str]:
-    """The scenes NAME_1, NAME_2, .... Empty if there are none."""
+    """The scenes NAME_1, NAME_2 and so on. Empty if there are none."""
     return [
         example.name
         for example in examples()

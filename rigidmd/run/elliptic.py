@@ -13,8 +13,7 @@ def rf(x: float, y: float, z: float) -> float:
         return inf
     mean = start = (x + y + z) / 3
     spread = (3 * SERIES_ERROR) ** (-1 / 6) * max(abs(start - one) for one in (x, y, z))
-    a, b, scale = x, y, 1.0
-    c = z
+    a, b, c, scale = x, y, z, 1.0
     while scale * spread > abs(mean):
         shift = sqrt(a) * sqrt(b) + sqrt(a) * sqrt(c) + sqrt(b) * sqrt(c)
         a, b, c, mean = ((one + shift) / 4 for one in (a, b, c, mean))

@@ -166,7 +166,7 @@ class BodyForce(Section):
     """Name in the log. Default: the name of the potential. With `module` also the name of the
     object in it"""
     potential: Literal["gay_berne", "dipole", "quadrupole", "patch"] | None = None
-    """gay_berne: ellipsoids. Dipole, quadrupole: at a point. patch: spheres with an attractive
+    """gay_berne: ellipsoids, dipole and quadrupole: at a point, patch: spheres with an attractive
     patch"""
     energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
     """Instead of a potential: the energy (kJ/mol) as a function of the distance r (Å), of the
@@ -270,7 +270,7 @@ class Forces(Section):
     """With dispersion = pme: grid points, as for pme_grid"""
     electrostatics: Literal[tuple(ELECTROSTATICS)] | None = None  # type: ignore[valid-type]
     """Coulomb forces: ewald and pme act on all periodic images, reaction_field and
-    damped_shifted_force within the cutoff, coulomb on all pairs without a periodic box. None
+    damped_shifted_force within the cutoff, coulomb on all pairs without a periodic box, none
     ignores charges. Default: pme in a periodic box, coulomb in an open one"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cutoff; inf for a conductor"""
