@@ -1,11 +1,10 @@
 """Analyses of all runs of a sweep: of each run, and of replicas together with errors from their
 scatter."""
 
-import csv
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_frames
 from rigidmd.analysis.mean_force import NAME as MEAN_FORCE
@@ -55,7 +54,7 @@ def analyse_sweep(
     viscosity: float | None,
     progress: Progress,
     figures: str = FIGURES[0],
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
 ) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 
@@ -114,7 +113,7 @@ def _analyse_combinations(
     table.keys[:] = table.rows[0].values
     if table.columns:
         add_to_folder(manifest.folder, [ANALYSES])
-        report_of(table.lines()).write(manifest.folder / ANALYSES, csv.QUOTE_NONNUMERIC)
+        report_of(table.lines()).write(manifest.folder / ANALYSES, quote_text=True)
     if table.keys and len(table) > 1:
         write_analyses_figure(table, manifest.name)
     return combinations

@@ -2,12 +2,12 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 from rigidmd.analysis.files import write_results
 from rigidmd.analysis.mean_force import Window, potential_of_mean_force
 from rigidmd.analysis.result import AnalysisResult
 from rigidmd.analysis.rigid_frames import production_samples
+from rigidmd.core.toml import Json
 from rigidmd.engines.samples import distance_column
 from rigidmd.errors import OutputError
 from rigidmd.run.record import read_record
@@ -50,7 +50,7 @@ def write_mean_force(manifest: Manifest, figures: str) -> tuple[AnalysisResult, 
     return result, write_results(manifest.folder, used, [result], {}, figures)
 
 
-def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, dict[str, Any]]:
+def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, Json]:
     """The potential of mean force, and the samples used, as analysis.json has them."""
     folder, points = manifest.folder, manifest.points_in("finished")
     if not points:
@@ -82,7 +82,7 @@ def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, dict[str, Any]]:
     return potential_of_mean_force(windows, thermal_energy), used
 
 
-def _window(folder: Path, k: int) -> tuple[Window, float, dict[str, Any]]:
+def _window(folder: Path, k: int) -> tuple[Window, float, Json]:
     """The window of a run, its temperature (K), and the samples used."""
     record = read_record(folder)
     if not isinstance(record.scene, MolecularScene):
