@@ -175,6 +175,7 @@ class Molecule:
     note: str = ""
     mixing: Mixing | None = None
     parameters: tuple[dict[str, float], ...] = ()  # of each site, for custom pair potentials
+    cell: np.ndarray | None = None  # (3, 3) Å, of a framework, in the coordinates of its file
 
     def __repr__(self) -> str:
         return f"<Molecule {self.name}: {self.description}>"
