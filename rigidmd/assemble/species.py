@@ -81,8 +81,8 @@ def _framework(
     path: Path, name: str, sites: tuple[Site, ...], repeat: tuple[int, int, int]
 ) -> Molecule:
     """One body of the sites in the repeated cell of a crystal. Raises StructureError."""
-    cell = read_atoms(path).cell
-    if cell is None:
+    atoms = read_atoms(path)
+    if (cell := atoms.cell) is None:
         raise StructureError(str(path), ["has no cell to repeat"])
     steps = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ cell
     repeated = tuple(
@@ -90,7 +90,8 @@ def _framework(
         for step in steps
         for site in sites
     )
-    return replace(molecule(name, repeated), cell=cell * np.array(repeat)[:, None])
+    cell = cell * np.array(repeat)[:, None]
+    return replace(molecule(name, repeated), cell=cell, note="; ".join(atoms.notes))
 
 
 def sites_of_geometry(

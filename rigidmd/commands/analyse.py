@@ -8,7 +8,6 @@ from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import Options, argument, command, number, time_ps
 from rigidmd.commands.streams import progress_bar
 
-
 FRAMES = 100  # equal ones, for insertion without a run
 
 
@@ -181,6 +180,8 @@ def _insert(path: str, names: list[str], more: dict[str, Any], verbose: bool) ->
     check_options(selected(names), more)
     runs = Runs((frames_of_start(MolecularScene.read(path), FRAMES),))
     results, failed = run_analyses(runs, names, options={"zero_loading": True} | more)
+    for result in results:  # trials at rest have no time
+        result.values = [value._replace(correlation_ps=None) for value in result.values]
     _print_results(results, failed, verbose)
     return FAILED if failed else 0
 
