@@ -211,11 +211,13 @@ def interactions(parts: SystemParts) -> Interactions:
         for m, c in zip(species, indices, strict=True)
     ]
     positions = [m.positions_body[i] for m, i in zip(species, indices, strict=True)]
-    inner = inner_pairs(of_species, positions, parts.counts)
+    correction = None
+    if forces.tail_correction:
+        correction = tail(potential, inner_pairs(of_species, positions, parts.counts))
     return Interactions(
         {"lennard_jones": parts.pair_forces(potential, parts.sites(indices))},
         {},
-        tail=tail(potential, inner) if forces.tail_correction else None,
+        tail=correction,
         notes=_short_cutoff_notes(potential, gather_per_molecule(names, index)),
     )
 
