@@ -24,7 +24,7 @@ from rigidmd.forces.poses.formulas import formula_of_poses
 from rigidmd.forces.poses.gay_berne import PARAMETERS, GayBerne
 from rigidmd.forces.poses.multipoles import dipole, quadrupole
 from rigidmd.forces.poses.pairs import pair_slopes
-from rigidmd.forces.poses.patch import patch
+from rigidmd.forces.poses.patch import Patch
 from rigidmd.forces.poses.table import read_body_table
 from rigidmd.forces.poses.trace import Graph, TraceError, code_of, slopes_of
 from rigidmd.run.rigid_fit import Bodies
@@ -311,7 +311,7 @@ def test_dipoles_and_quadrupoles_are_limits_of_charges():
 
 
 def test_patches_attract_where_they_face_each_other():
-    x, energy = np.array([1.0, 0.0, 0.0]), patch()
+    x, energy = np.array([1.0, 0.0, 0.0]), Patch()
     kind = named({"sigma_A": 4.0, "epsilon_kJ_mol": 2.0, "width": 0.2})
     contact = 4.0 * 2 ** (1 / 6) * x
     assert energy(contact, x, -x, kind, kind) == pytest.approx(-2.0, rel=1e-12)

@@ -396,7 +396,7 @@ def _finish_list(arguments, block):
 
 
 @kernel(inline=True)
-def _switch(term, r):
+def switch(term, r):
     """Factor of the energy at a distance, and its slope: 1 up to `switch_start`, from there a
     polynomial of degree 5 with two continuous derivatives to 0 at the cutoff."""
     if r <= term.switch_start:
@@ -450,7 +450,7 @@ def _pairs_of_block(work, state, tallies, block):
                 pairs.pose[one],
                 pairs.pose[other],
             )
-            factor, change = _switch(term, r)
+            factor, change = switch(term, r)
             along = change * energy / r
             force = (
                 factor * slope[0] + along * x,

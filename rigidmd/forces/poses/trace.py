@@ -407,7 +407,9 @@ def _expression(node: Traced, names: dict[int, str]) -> str:
     if node.kind == "power":
         exponent = node.parts[1]
         if exponent == round(exponent) and abs(exponent) <= 64:
-            return f"{parts[0]} ** {int(exponent)}"
+            whole = f"{parts[0]} ** {int(abs(exponent))}"
+            # a negative power of 0 would raise ZeroDivisionError in compiled code
+            return whole if exponent > 0 else f"1.0 / {whole}"
         return f"pow({parts[0]}, {exponent!r})"
     if node.kind in _CODE:
         return _CODE[node.kind].format(*parts)
