@@ -6,7 +6,8 @@ import numpy as np
 
 from rigidmd.compile import kernel
 from rigidmd.core.state import State
-from rigidmd.forces.poses.pairs import BodyPairs, nearest_image, pair_slopes, switch
+from rigidmd.forces.poses.pair_list import nearest_image
+from rigidmd.forces.poses.pairs import BodyPairs, pair_slopes, switch
 
 
 def add_trial_energies(
