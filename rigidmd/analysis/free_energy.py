@@ -2,6 +2,7 @@
 Phys. 129, 124105)."""
 
 import logging
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -99,7 +100,9 @@ def _mbar(energies: np.ndarray, counts: np.ndarray) -> Any:
         raise OutputError(
             f"{NAME} needs pymbar: pip install pymbar, or rigidmd[free-energy]"
         ) from None
-    return MBAR(energies, counts)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of SciPy, which no longer knows some options of pymbar
+        return MBAR(energies, counts)
 
 
 def _matrix(lambdas: Sequence[float], overlap: np.ndarray) -> str:
