@@ -97,9 +97,7 @@ def _mbar(energies: np.ndarray, counts: np.ndarray) -> Any:
     try:
         from pymbar import MBAR
     except ImportError:
-        raise OutputError(
-            f"{NAME} needs pymbar: pip install pymbar, or rigidmd[free-energy]"
-        ) from None
+        raise OutputError(f"{NAME} needs pymbar: pip install pymbar, or '.[free-energy]'") from None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of SciPy, which no longer knows some options of pymbar
         return MBAR(energies, counts)

@@ -165,6 +165,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
             scene.source, [f"{fault}: {why}: choose another thermostat" for fault in faults]
         )
     check_memory(system)
+    if scene.coupling is not None:
+        system.notes.append(scene.coupling.in_short)
     system.notes.extend([*scene.rounded_times(), *set_momenta(scene, model, state, start)])
     stuck = "nothing moves and no temperature is defined. Use thermostat = 'langevin'"
     system.notes.extend(

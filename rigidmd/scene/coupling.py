@@ -44,5 +44,11 @@ class Coupling(_WithLambda):
         begin = self.charges_from or 1.0
         return max(0.0, (self.value - begin) / (1 - begin)) if begin < 1 else float(self.value == 1)
 
+    @property
+    def in_short(self) -> str:
+        """What is scaled, in a resolved scene."""
+        factors = f"Lennard-Jones at {self.lennard_jones:g}, charges times {self.charges:g}"
+        return f"lambda {self.value:g} of {self.species}: {factors}"
+
     def at(self, value: float) -> "Coupling":
         return self.model_copy(update={"lambda": value})
