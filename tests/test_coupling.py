@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from reference import nearest
 from scipy.integrate import quad
-from support import built, move, observe, shaken, small_scene
+from support import ROOT, built, move, observe, shaken, small_scene
 
 import rigidmd
 from rigidmd.analysis.free_energy import SampledLambda, free_energy_of
@@ -375,3 +375,21 @@ def test_values_that_the_log_lacks_are_named(tmp_path, monkeypatch):
     rigidmd.sweep(tmp_path / "two.toml", points, tmp_path / "sweep", jobs=2)
     with pytest.raises(OutputError, match=r"no energy at lambda = 0\.8\. List all values"):
         rigidmd.free_energy(tmp_path / "sweep")
+
+
+@pytest.mark.soak
+def test_water_in_water_has_the_published_free_energy(tmp_path, monkeypatch, capsys):
+    """-7.05 kcal/mol (Wang et al. 2009, table 3), within 0.1 kcal/mol and the error; the scene of
+    the guide."""
+    monkeypatch.chdir(tmp_path)
+    guide = (ROOT / "rigidmd/docs/guides/chemical_potential.md").read_text(encoding="utf-8")
+    scene = guide.partition("file hydration.toml -->\n```toml\n")[2].partition("```")[0]
+    (tmp_path / "hydration.toml").write_text(scene)
+    values = "0,0.1,0.2,0.3,0.5,0.625,0.75,0.875,1"
+    sets = ["--set", f"coupling.lambda={values}", "--set", "stages.0.duration_ps=200"]
+    assert main(["sweep", "hydration.toml", "-o", "sweep", *sets]) == 0
+    value = rigidmd.free_energy(tmp_path / "sweep").value("free energy of coupling")
+    with capsys.disabled():
+        print(value)
+    assert abs(value.value + 7.05 * 4.184) < 0.1 * 4.184 + 2 * value.error
+    assert value.error < 0.1 * 4.184
