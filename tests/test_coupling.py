@@ -222,7 +222,7 @@ def test_energies_of_other_lambdas_do_not_depend_on_earlier_states():
 
 def test_what_cannot_be_coupled_is_refused():
     for coupling, tables, message in (
-        ({"species": "neon"}, {}, "there is no species neon: argon, guest"),
+        ({"species": "neon"}, {}, "neon is not among the species, argon, guest"),
         ({"species": "guest", "lambda": 1.5}, {}, "coupling.lambda: is 1.5"),
         (
             {"species": "guest"},
@@ -386,7 +386,7 @@ def test_water_in_water_has_the_published_free_energy(tmp_path, monkeypatch, cap
     scene = guide.partition("file hydration.toml -->\n```toml\n")[2].partition("```")[0]
     (tmp_path / "hydration.toml").write_text(scene)
     values = "0,0.1,0.2,0.3,0.5,0.625,0.75,0.875,1"
-    sets = ["--set", f"coupling.lambda={values}", "--set", "stages.0.duration_ps=200"]
+    sets = ["--set", f"coupling.lambda={values}"]
     assert main(["sweep", "hydration.toml", "-o", "sweep", *sets]) == 0
     value = rigidmd.free_energy(tmp_path / "sweep").value("free energy of coupling")
     with capsys.disabled():

@@ -17,7 +17,7 @@ def with_coupling(
     named = [m for m in species if m.name == coupling.species]
     entries = [k for k, m in enumerate(species[: len(scene.molecules)]) if m in named]
     reasons = {
-        f"there is no species {coupling.species}: {', '.join({m.name: 0 for m in species})}": (
+        f"{coupling.species} is not among the species, {', '.join({m.name: 0 for m in species})}": (
             not named
         ),
         "its molecules are frozen": any(scene.molecules[k].frozen for k in entries),

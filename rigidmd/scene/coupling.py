@@ -26,7 +26,7 @@ class Coupling(_WithLambda):
     0.5, and 1 for a species without charges"""
     lambdas: tuple[Fraction, ...] = Field(default=(), max_length=MOST_TABLES)
     """Values of lambda at which the log also has the energy, for `rigidmd analyse SWEEP
-    free_energy`: those of a sweep"""
+    free_energy`: all values of the sweep"""
 
     @property
     def value(self) -> float:
