@@ -156,6 +156,7 @@ def observe(
         user_energies=(
             *(components[name] / energy_unit for name in system.user_terms),
             *(term.distance_in(state) for term in system.distances.values()),
+            *(change / energy_unit for change in _changes_with_lambda(system, state, potential)),
             *trajectories,
         ),
     )
@@ -170,6 +171,21 @@ def observe(
         load,
         energy_unit,
     )
+
+
+def _changes_with_lambda(system: System, state: State, potential: float) -> list[float]:
+    """Energies at each of coupling.lambdas less the present one, u Å²/ps²."""
+    changes = []
+    for value, engine in system.engines_at_lambda.items():
+        if value == system.scene.coupling.value:
+            changes.append(0.0)
+            continue
+        at = system.at_lambda[value]
+        engine.renew_lists()  # so that the bits do not depend on earlier states
+        energy = sum(tally.energy for tally in engine.evaluate(state)[1].values())
+        energy += 0.0 if at.tail is None else at.tail.energy(state.volume)
+        changes.append(energy + sum(at.constants.values()) - potential)
+    return changes
 
 
 def kinetic_energies(system: System, state: State) -> tuple[float, float]:
