@@ -14,7 +14,7 @@ from rigidmd.errors import OutputError
 from rigidmd.io.write import columns_text
 
 NAME = "free_energy"
-ABOUT = "free energy of the molecules in [coupling], by MBAR"
+ABOUT, OVER = "free energy of the molecules in [coupling], by MBAR", "coupling.lambda"
 LEAST_SAMPLES = 10  # decorrelated ones at a lambda
 #: kT. Energies of states that do not occur; exp(-u) is 0.
 MOST = 1e5

@@ -139,16 +139,12 @@ def _analyse(options: Options) -> int:
                 names = print_limits(read_manifest(folder), options.extrapolate)
                 print(f"\n  files in {folder}: {', '.join(names)}")
             return FAILED if names and any(of.failed for of in analysed) else 0
-        if mean_force.NAME in names:
-            raise OutputError(
-                f"pmf needs a sweep over the distance of a restraint, and {folder} is the folder of"
-                " a run"
-            )
-        if free_energy.NAME in names:
-            raise OutputError(
-                f"{free_energy.NAME} needs a sweep over coupling.lambda, and {folder} is the folder"
-                " of a run"
-            )
+        for of_sweep in (mean_force, free_energy):
+            if of_sweep.NAME in names:
+                raise OutputError(
+                    f"{of_sweep.NAME} needs a sweep over {of_sweep.OVER}, and {folder} is the"
+                    " folder of a run"
+                )
         if options.extrapolate is not None:
             raise OutputError(
                 f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run"

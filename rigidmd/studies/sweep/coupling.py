@@ -15,7 +15,7 @@ from rigidmd.scene.coupling import Coupling
 from rigidmd.scene.validation import not_none
 from rigidmd.studies.sweep.folder import SEED, Manifest, read_manifest
 from rigidmd.studies.sweep.table import Table
-from rigidmd.studies.sweep.windows import production_of, used_samples
+from rigidmd.studies.sweep.windows import production_of, used_samples, used_together
 from rigidmd.units import AVOGADRO, BOLTZMANN, KJ_PER_MOL
 
 KEY = "coupling.lambda"
@@ -85,12 +85,7 @@ def _free_energy(manifest: Manifest) -> tuple[AnalysisResult, dict[str, Any]]:
     result = free_energy_of(lambdas, sampled, thermal, _parts(system.scene.coupling, lambdas))
     value = result.values[0]
     result.values[0] = value._replace(note=_standard_state(system, 1e3 * float(np.mean(volumes))))
-    used = uses[-1] | {
-        "from_ps": min(use["from_ps"] for use in uses),
-        "to_ps": max(use["to_ps"] for use in uses),
-        "frames": sum(use["frames"] for use in uses),
-    }
-    return result, used
+    return result, used_together(uses)
 
 
 def _parts(coupling: Coupling, lambdas: list[float]) -> list[tuple[str, float, float]]:

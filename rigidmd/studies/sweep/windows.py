@@ -1,6 +1,7 @@
 """The windows of a sweep over a restrained distance, and their potential of mean force."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -76,13 +77,8 @@ def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, Json]:
     )
     if len({*temperatures}) > 1:
         raise OutputError(f"{folder}: the windows have different temperatures")
-    used = uses[-1] | {
-        "from_ps": min(use["from_ps"] for use in uses),
-        "to_ps": max(use["to_ps"] for use in uses),
-        "frames": sum(use["frames"] for use in uses),
-    }
     thermal_energy = BOLTZMANN * temperatures[0] / KJ_PER_MOL
-    return potential_of_mean_force(windows, thermal_energy), used
+    return potential_of_mean_force(windows, thermal_energy), used_together(uses)
 
 
 def production_of(folder: Path) -> tuple[Record, Stage, np.ndarray]:
@@ -103,6 +99,15 @@ def used_samples(record: Record, stage: Stage, production: np.ndarray) -> Json:
         "to_ps": float(time[-1]),
         "frames": len(time),
         "notes": [],
+    }
+
+
+def used_together(uses: Sequence[Json]) -> Json:
+    """The samples used of several runs."""
+    return uses[-1] | {
+        "from_ps": min(use["from_ps"] for use in uses),
+        "to_ps": max(use["to_ps"] for use in uses),
+        "frames": sum(use["frames"] for use in uses),
     }
 
 
