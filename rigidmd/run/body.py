@@ -394,7 +394,9 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             f" {run.integrator.replace('_', ' ')}"
         )
 
-    def start_energy(self) -> dict:
+    def start_energy(
+        self, size: float = 1.0, unit: str = "J", measure_accuracy: bool = False
+    ) -> Json:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the
         body's."""
         self.reset()
