@@ -292,7 +292,8 @@ def frames_of_results(results: Results, start: float | None = None) -> RigidFram
     if not isinstance(system, System):
         raise OutputError("this is a run of a single body, and analyses are for molecules")
     if results.files:
-        return frames_of_folder(read_record(results.files[0].parent), start)
+        record = replace(read_record(results.files[0].parent), system=system)
+        return frames_of_folder(record, start)
     frames = results._frames
     if not frames:
         raise OutputError("this run has no frames (output.trajectory = false) to analyse")

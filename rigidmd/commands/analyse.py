@@ -13,12 +13,13 @@ FRAMES = 100  # equal ones, for insertion without a run
 
 class _List(argparse.Action):
     def __call__(self, parser, *_):
-        from rigidmd.analysis import mean_force
+        from rigidmd.analysis import free_energy, mean_force
         from rigidmd.analysis.registry import KNOWN, analysis_order, selected
 
         for entry in selected(sorted(KNOWN, key=analysis_order)):
             print(f"{entry.name:18} {entry.about}")
-        print(f"{mean_force.NAME:18} {mean_force.ABOUT}, of a sweep")
+        for of_sweep in (mean_force, free_energy):
+            print(f"{of_sweep.NAME:18} {of_sweep.ABOUT}, of a sweep")
         parser.exit()
 
 
@@ -105,7 +106,7 @@ class _List(argparse.Action):
     writes=True,
 )
 def _analyse(options: Options) -> int:
-    from rigidmd.analysis import mean_force
+    from rigidmd.analysis import free_energy, mean_force
     from rigidmd.analysis.files import analyse_folder
     from rigidmd.analysis.registry import run_user_file
     from rigidmd.commands.sweep import print_limits
@@ -138,11 +139,12 @@ def _analyse(options: Options) -> int:
                 names = print_limits(read_manifest(folder), options.extrapolate)
                 print(f"\n  files in {folder}: {', '.join(names)}")
             return FAILED if names and any(of.failed for of in analysed) else 0
-        if mean_force.NAME in names:
-            raise OutputError(
-                f"pmf needs a sweep over the distance of a restraint, and {folder} is the folder of"
-                " a run"
-            )
+        for of_sweep in (mean_force, free_energy):
+            if of_sweep.NAME in names:
+                raise OutputError(
+                    f"{of_sweep.NAME} needs a sweep over {of_sweep.OVER}, and {folder} is the"
+                    " folder of a run"
+                )
         if options.extrapolate is not None:
             raise OutputError(
                 f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run"

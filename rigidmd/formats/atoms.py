@@ -136,7 +136,7 @@ class Frame(NamedTuple):
     step: int = 0
 
     @property
-    def sites(self) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+    def sites(self) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
         return self.positions, self.velocities, self.cell
 
 

@@ -5,11 +5,14 @@ import io
 import sys
 import threading
 import time as clock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
 from rigidmd.core.toml import Json
+
+if TYPE_CHECKING:
+    from IPython.display import DisplayHandle
 
 #: Seconds between two lines.
 PAUSE = 30.0
@@ -29,7 +32,7 @@ class DisplayArea:
     """A part of the output of a notebook cell, whose content can be replaced."""
 
     def __init__(self):
-        self._handle: Any = None
+        self._handle: DisplayHandle | None = None
 
     def show(self, bundle: Json, metadata: Json | None = None) -> None:
         if self._handle is None:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from math import isfinite, nan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -85,7 +85,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     summary_text, short_summary = staticmethod(summary_text), staticmethod(short_summary)
 
     def __init__(
-        self, simulation: "Simulation", scene: MolecularScene, forces: Any, thermostat: Any
+        self, simulation: "Simulation", scene: MolecularScene, forces: object, thermostat: object
     ):
         super().__init__(simulation)
         user_forces = (

@@ -12,6 +12,7 @@ from rigidmd.core.toml import Json
 from rigidmd.errors import SceneError, option
 from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
+from rigidmd.scene.coupling import Coupling
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
@@ -159,6 +160,7 @@ class Settings(TypedDict, total=False):
     box: Json
     forces: Json
     fields: Json
+    coupling: Json
     start: Json
     integrators: list[Json]
     stages: list[Json]
@@ -186,6 +188,7 @@ class MolecularScene(Scene):
     molecules: tuple[Molecules, ...] = Field(min_length=1, max_length=MOST_TABLES)
     forces: Forces = Forces.model_construct()
     fields: Fields = Fields.model_construct()
+    coupling: Coupling | None = None
     start: Start = Start.model_construct()
     stages: tuple[Stage, ...] = Field(min_length=1, max_length=MOST_TABLES)
     run: RunSettings = RunSettings.model_construct()
