@@ -637,6 +637,12 @@ def test_means_are_over_the_equilibrated_part():
         (KEPT, np.zeros(100), "all 4.95 ps", 0.0),
         (KEPT, np.linspace(0.0, 1e3, 100), "all 4.95 ps, not yet steady", 0.0),
         (
+            KEPT,
+            8 * np.exp(-np.arange(100) / 8) + 1.4 * abs(np.arange(100) % 28 / 14 - 1),
+            "all 4.95 ps, perhaps not yet steady",
+            0.0,
+        ),
+        (
             KEPT | {"temperature_K": [300.0, 200.0]},
             np.linspace(0.0, 1e3, 100),
             "all 4.95 ps, in which the set point changes",

@@ -77,7 +77,8 @@ def _describe_trajectories(values: Values) -> str:
     return f"trajectories of {steps:g} step{'s' if steps > 1 else ''}{drawn}"
 
 
-def _interval(stage: Any) -> float:
+def default_interval(stage: Any) -> float:
+    """Time between two moves of the box, ps."""
     return (stage.barostat_time_ps or BAROSTAT_TIME) / MOVES_PER_TIME
 
 
@@ -130,7 +131,7 @@ BAROSTATS = {
     "cell_rescaling": Coupling(
         "stochastic cell rescaling, made exact by a Metropolis test",
         "Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107",
-        {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": _interval},
+        {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": default_interval},
         ("npt",),
         relaxes_in_moves=True,
         reads_momenta=True,
@@ -138,7 +139,7 @@ BAROSTATS = {
     "monte_carlo": Coupling(
         "random changes of the volume",
         "Åqvist et al. 2004, Chem. Phys. Lett. 384, 288",
-        {"barostat_interval_ps": _interval},
+        {"barostat_interval_ps": default_interval},
         ("npt",),
         shapes=("isotropic",),
     ),

@@ -13,6 +13,7 @@ from rigidmd.errors import SceneError, option
 from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
 from rigidmd.scene.coupling import Coupling
+from rigidmd.scene.couplings import default_interval
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
@@ -473,10 +474,9 @@ class MolecularScene(Scene):
             stage = self.stages[k]
             if stage.is_minimisation or stage.is_auto:
                 continue
-            of_stage = [
-                (f"stages.{k}.{key}", getattr(stage, key))
-                for key in ("duration_ps", "barostat_interval_ps")
-            ]
+            of_stage = [(f"stages.{k}.duration_ps", stage.duration_ps)]
+            if stage.barostat_interval_ps != default_interval(stage):
+                of_stage.append((f"stages.{k}.barostat_interval_ps", stage.barostat_interval_ps))
             if stage.keeps_momentum:  # elsewhere nothing is removed
                 of_stage.insert(
                     0, ("run.remove_momentum_interval_ps", self.run.remove_momentum_interval_ps)
