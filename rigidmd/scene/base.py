@@ -81,7 +81,7 @@ class Scene(Section, Displayed):
     """Name of the run. Default: the name of the file"""
 
     integrators: tuple[IntegratorRow, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Integrators of users, for stages, [run] of a body and `rigidmd accuracy`"""
+    """User-defined integrators, for stages, [run] of a single body and `rigidmd accuracy`"""
 
     SIZES: ClassVar[tuple[float, float]] = (1e-100, 1e100)
     """Smallest and largest absolute value of numbers other than 0, so that squares and products
