@@ -141,7 +141,7 @@ class NormalModes:
     error: np.ndarray
     # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
     vector: np.ndarray
-    # (k,) fraction of the kinetic energy that is of translation, not of libration
+    # (k,) translational fraction of the kinetic energy. The rest is librational
     translation: np.ndarray
     weight: np.ndarray  # (k, n) fraction of the kinetic energy in each molecule
     # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges

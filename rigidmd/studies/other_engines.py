@@ -60,7 +60,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
     engine = EngineChoice.model_validate({"name": to}) if program.engine else EngineChoice()
     system = build(scene.model_copy(update={"engine": engine}))
     later = [
-        f"stages.{k}: a minimisation after other stages stays with rigidmd"
+        f"stages.{k}: export does not support a minimisation after other stages"
         for k, stage in enumerate(system.scene.stages)
         if stage.is_minimisation
         and any(not before.is_minimisation for before in system.scene.stages[:k])

@@ -22,7 +22,8 @@ from rigidmd.view.molecule_figure import color_of
 from rigidmd.view.page import PagePart, read_asset
 from rigidmd.view.solids import DEFAULT_RADIUS, SPHERE_SCALE, solids_of
 
-#: Most coordinates in a page, of 2 bytes each: with base64 about 21 MB, plus 3 MB of chemiscope.
+#: Maximum number of coordinates in a page, 2 bytes each: with base64 about 21 MB, plus 3 MB for
+#: chemiscope.
 MOST_COORDINATES = 8_000_000
 #: The JavaScript of chemiscope inside its package.
 SCRIPT = ("sphinx", "static", "chemiscope.min.js")

@@ -27,8 +27,7 @@ from rigidmd.run.rigid_fit import Kind
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
 
-#: Molecules in all frames together for g(r) and hydrogen bonds, and for S(k); more frames add
-#: little.
+#: Enough molecules x frames for g(r) and hydrogen bonds, and for S(k). Further frames add little.
 ENOUGH_MOLECULES, ENOUGH_MOLECULES_K = 200_000, 100_000
 FEWEST, MOST = 20, 500  # frames
 #: Å: largest distance and width of bins of g(r), unless others are given.
@@ -89,7 +88,8 @@ def rdf(
             result.notes.append(f"g(r) of {a} and {b}: no two different molecules have these sites")
             continue
         g = [_g_of_frames(run, a, b, pair_count, width, shells) for run in thinned.members]
-        # of the others that each a has, so that two molecules have one neighbour each
+        # density of b around each a, without its own molecule: two molecules have one neighbour
+        # each
         density = pair_count / len(thinned.first.sites(a, slice(0, 1))[1]) / thinned.volume
         title = f"g {a}-{b}"
         mean, error = _mean_of_frames(thinned, g)
