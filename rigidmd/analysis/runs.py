@@ -21,8 +21,7 @@ Measured = tuple[np.ndarray, np.ndarray]
 class Runs:
     """The frames of independent runs of one system. At least one.
 
-    Averages are over the frames of all runs, and limits of length apply to the sum of their
-    lengths.
+    Averages are over the frames of all runs, and minimum lengths apply to their total length.
     """
 
     members: tuple[RigidFrames, ...]
@@ -98,7 +97,7 @@ class Runs:
         return float(self.mean([run.thermal_energy for run in self.members]))
 
     def mean(self, values: Sequence[Any]) -> np.ndarray:
-        """Mean of a value (...) of each run, weighted by the number of its frames."""
+        """Mean over runs, whose values are (...), weighted by their numbers of frames."""
         return np.average(
             np.asarray(values, float), axis=0, weights=[len(run) for run in self.members]
         )

@@ -102,7 +102,7 @@ def _longest_angle(scheme: Scheme, error: float) -> float:
 
 
 def _bias_per_error(stage: Stage) -> float:
-    """Bias of U per time-step error, kT per degree of freedom, of a stage with a thermostat."""
+    """Bias of U per time-step error, kT per degree of freedom, in a stage with a thermostat."""
     if stage.is_hybrid:
         return 0.0
     return BIAS_IN_MIDDLE if stage.integrator in WITH_THERMOSTAT else BIAS_AT_ENDS

@@ -144,7 +144,7 @@ def distance_column(k: int) -> tuple[str, Column]:
 
 
 def more_columns(names: Sequence[str]) -> dict[str, Column]:
-    """The columns of user-defined forces, of restrained distances and of the trajectories of hybrid
+    """The columns for user-defined forces, restrained distances and the trajectories of hybrid
     Monte Carlo."""
 
     def energy(name):

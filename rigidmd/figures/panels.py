@@ -58,7 +58,7 @@ class Panel(NamedTuple):
         return max(1, int(width / (0.45 + LETTER * longest)))
 
     def head(self, width: float) -> tuple[list[str], int]:
-        """Lines of the title above an axis of this width, and the number of rows of the legend."""
+        """Lines of the title above an axis with this width, and the number of legend rows."""
         labels = sum(bool(label) for label, _ in self.curves)
         rows = -(-labels // self.columns(width)) if labels > 1 else 0
         return wrap(self.title, int(width / LETTER)), rows
@@ -290,8 +290,8 @@ def stack(rows: Sequence[Sequence[tuple[Timeline, Panel]]], title: str, height: 
 
 
 def _label_stages(axis: Any, starts: Sequence[tuple[float, str]], width: float) -> None:
-    """Write the names of stages above the curves where they begin, each in the first free row of an
-    axis of this width."""
+    """Write the names of stages above the curves where they start, each in the first free row of an
+    axis with this width."""
     left, right = axis.get_xlim()
     ends: list[float] = []  # inches at which the last name of each row ends
     for start, label in starts:

@@ -61,8 +61,8 @@ def draw_line(axis: Any, flat: np.ndarray, **style: Any) -> None:
 
 
 def path_style(flat: np.ndarray, half: Any) -> tuple[np.ndarray, dict[str, Any]]:
-    """Indices of the points of a path (n, 2) to draw, about one per pixel of a picture of this half
-    width, and the style of its line: longer ones are thinner."""
+    """Indices of the points of a path (n, 2) to draw, about one per pixel in a picture with this
+    half width, and the style of its line: longer ones are thinner."""
     length = np.linalg.norm(np.diff(flat, axis=0) / half, axis=1).sum()
     shown = thin_path(flat / half, int(800 * length) + 2)
     width = max(0.25, 1.7 / (1 + length / 60))

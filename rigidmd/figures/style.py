@@ -106,7 +106,7 @@ def new_figure(
 def panel_grid(
     count: int, across: int, width: float, height: float, margin: float
 ) -> "tuple[Picture, list[Any]]":
-    """A figure of panels in rows of at most `across`, and the axes of the panels. Inches: of a
+    """A figure with panels in rows of at most `across`, and the axes of the panels. Inches: of a
     panel, and below all."""
     across = min(across, max(1, count))
     down = max(1, -(-count // across))
@@ -143,14 +143,14 @@ def thin_series(
 def largest_of_parts(
     time: np.ndarray, values: np.ndarray, bins: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A long series of errors reduced to the largest value of each of its parts."""
+    """A long series of errors reduced to the largest value in each part."""
     size = -(-len(time) // bins)
     return time[::size], np.fmax.reduceat(values, np.arange(0, len(time), size))
 
 
 def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | None:
-    """Limits of the axis of a curve (n,): the range of the second halves of the stages, and as much
-    above and below, as the starts of stages would flatten the rest. None if the range is 0."""
+    """Limits of the axis of a curve (n,): the range in the second halves of the stages, and as much
+    above and below, because the starts of stages would flatten the rest. None if the range is 0."""
     late = np.concatenate(
         [part[len(part) // 2 :] for part in (values[stage == k] for k in np.unique(stage))]
     )

@@ -104,7 +104,7 @@ def _rate(rate: dict, pattern: str) -> str:
 
 
 def body_rows(summary: dict) -> list[tuple[str, str]]:
-    """Names and values of the summary of a run of a single body."""
+    """Names and values in the summary of a single-body run."""
     rows = [
         (
             "energy",

@@ -221,7 +221,7 @@ class Scene(Section, Displayed):
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
     ) -> "MolecularScene | BodyScene":
-        """The scene in a nested dictionary like the one of a TOML file.
+        """The scene as a nested dictionary, as a TOML file gives it.
 
         Numbers and arrays of NumPy and paths are accepted as numbers, lists and texts. The
         dictionary is not changed.

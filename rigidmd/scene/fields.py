@@ -134,7 +134,8 @@ class Restraint(Section):
 
     @property
     def spans(self) -> list[tuple[int, int]]:
-        """Ranges (first, last) of the numbers of molecules. Empty if all are restrained."""
+        """Ranges (first, last) of molecule numbers. The list is empty if all molecules are
+        restrained."""
         return [] if self.molecules is None else spans(self.molecules)
 
     @property

@@ -67,7 +67,7 @@ POTENTIALS = {"lennard_jones": ("Lennard-Jones", "lennard_jones is false")}
 
 
 class UnlikePair(Section):
-    """Lennard-Jones parameters of two kinds of sites, in place of the mixing rule."""
+    """Lennard-Jones parameters for two kinds of sites, which replace the mixing rule."""
 
     sites: tuple[str, str]
     """The two kinds: a site name or else an element. `SPECIES.NAME` for sites of one species"""
@@ -321,7 +321,7 @@ class Forces(Section):
 
     @property
     def added(self) -> dict[str, CustomForce | BodyForce]:
-        """The tables of custom forces and of potentials of two bodies, by their keys."""
+        """The tables of custom forces and pair potentials of bodies, by their keys."""
         tables = {"custom": self.custom, "bodies": self.bodies}
         return {
             f"forces.{key}.{k}": entry

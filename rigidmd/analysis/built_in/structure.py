@@ -129,8 +129,8 @@ def _thinned(runs: Runs, enough: int) -> tuple[Runs, list[str]]:
 
 
 def _mean_of_frames(runs: Runs, values: list[np.ndarray]) -> Measured | tuple[np.ndarray, None]:
-    """Mean of arrays (f, p) of the frames of each run, and its error: of one run from blocks, of
-    several from their scatter. None with few frames."""
+    """Mean over the frames of each run, whose arrays are (f, p), and its error: of one run from
+    blocks, of several from their scatter. None with few frames."""
     means = [of_run.mean(axis=0) for of_run in values]
     if runs.are_several:
         return runs.estimate(means, lambda mean: mean)
@@ -240,9 +240,9 @@ def _shift_of_vertex(low: float, middle: float, high: float) -> float:
 def _errors_over_blocks(
     frames: np.ndarray, conclude: Callable[[np.ndarray], np.ndarray], samples: float
 ) -> Measured:
-    """Two estimates of the standard errors of what follows from the mean of frames (f, ...): the
-    scatter of blocks of frames, whose means are noisy, and that of omitting one block after
-    another, which sees few of the jumps.
+    """Two estimates of standard errors, for quantities that follow from a mean over frames (f,
+    ...): the scatter between blocks of frames, whose means are noisy, and the scatter when one
+    block after another is omitted, which includes few jumps.
 
     samples : frames for each independent one
     """

@@ -20,8 +20,7 @@ PARAMETERS = ("length_A", "width_A", "epsilon_kJ_mol", "side", "end")
 
 
 class GayBerne(NamedTuple):
-    """The energy (kJ/mol) as a function of r, of the axes of both bodies and of their
-    parameters."""
+    """The energy (kJ/mol) as a function of r, the axes of both bodies and their parameters."""
 
     upsilon: float = 1.0  # exponents of the strength
     mu: float = 2.0

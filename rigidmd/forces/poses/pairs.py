@@ -257,7 +257,7 @@ def _sort_points(arguments, block):
 
 @kernel(inline=True)
 def _bounds(point, cell):
-    """Range of fractions along the edges of a box, 0 to 1, or of positions without one."""
+    """Range of fractions along the box edges, 0 to 1, or without a box the range of positions."""
     if cell[0, 0] < inf:
         return (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
     low, high = (inf, inf, inf), (-inf, -inf, -inf)

@@ -1,4 +1,4 @@
-"""The shipped potentials of pairs of bodies, and those of a text, for scenes."""
+"""The shipped pair potentials of bodies, and pair potentials from an expression, for scenes."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple

@@ -49,7 +49,7 @@ Measured = tuple[float, float | None]
 
 @dataclass
 class SweepRow:
-    """A combination of values of all keys but the seed, and the results of its runs."""
+    """A combination of values for all keys except the seed, and the results of its runs."""
 
     values: dict[str, Any]
     #: Value of the seed, None if it is not swept -> column -> value and error of that run.
@@ -171,7 +171,7 @@ def report_of(lines: Sequence[dict[str, Any]]) -> ReportTable:
 
 
 def key_cells(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of the keys of a combination, as cells of a file."""
+    """The key values of a combination, as cells of a file."""
     return {
         key: value if type(value) in (int, float, str) else value_name(value)
         for key, value in values.items()
