@@ -8,15 +8,14 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager
 from numba.core.types.functions import BaseFunction
 
-#: Passes for what no kernel contains: `with`, closures, functions that Numba itself inlines, loops
-#: over tuples of several types, exceptions with arguments; and those that only check or describe.
+#: Passes for what no kernel contains: `with`, closures, functions that Numba itself inlines,
+#: `literally`, exceptions with arguments; and those that only check or describe.
 UNUSED_PASSES = (
     untyped_passes.WithLifting,
     untyped_passes.InlineClosureLikes,
     untyped_passes.RewriteDynamicRaises,
     untyped_passes.InlineInlinables,
     untyped_passes.FindLiterallyCalls,
-    untyped_passes.LiteralUnroll,
     untyped_passes.LiteralPropagationSubPipelinePass,
     typed_passes.InlineOverloads,
     typed_passes.NoPythonSupportedFeatureValidation,

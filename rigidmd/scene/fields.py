@@ -41,8 +41,8 @@ class Walls(Section):
     """lj93: (2/15) (sigma/d)^9 - (sigma/d)^3, times epsilon, at a distance d. harmonic: stiffness/2
     d² at a depth d behind the wall, 0 in front of it"""
     positions_A: tuple[Edge, Edge]
-    """Positions along the axis, the lower position first. Without a box, use -inf or inf if there
-    is no wall on that side"""
+    """Positions along the axis, the lower position first. Without a box, use -inf or inf for a
+    side without a wall"""
     acts_on: Literal["sites", "centres"] = "sites"
     """sites: sites with Lennard-Jones parameters. centres: centres of mass"""
     sigma_A: Positive | None = None
