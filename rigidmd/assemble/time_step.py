@@ -1,9 +1,9 @@
 """Estimates for time steps without compiled code: the fastest motions in a liquid, steps that are
 too long for them, and the precision of forces that suits the error of a step.
 
-A motion of angular frequency w has the rms amplitude sqrt(kT/m)/w at a temperature T. The
-amplitudes of the fastest motions of molecules in liquids are much alike, so w follows from masses,
-moments of inertia and temperature.
+A motion of angular frequency w has the rms amplitude sqrt(kT/m)/w at a temperature T. The fastest
+molecular motions in liquids have similar amplitudes, so w follows from masses, moments of inertia
+and temperature.
 """
 
 from collections.abc import Callable, Iterator

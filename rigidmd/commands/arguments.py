@@ -1,4 +1,4 @@
-"""The registry of commands, arguments that several of them have, and the reading of scenes."""
+"""The command registry, arguments that several commands have, and the reading of scenes."""
 
 import argparse
 import re

@@ -84,8 +84,8 @@ def read_atoms(
 
 
 def _without_placeholder(atoms: Atoms) -> Atoms:
-    """The atoms without a cell that stands for none: a cell of no volume, or the cube of 1 Å of
-    PDB."""
+    """The atoms without a cell that stands for none: a cell without volume, or the cube of 1 Å in
+    PDB files."""
     if atoms.cell is None:
         return atoms
     longest = np.linalg.norm(atoms.cell, axis=1).max()

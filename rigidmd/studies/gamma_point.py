@@ -67,8 +67,8 @@ def periodic_basis(system: System, state: State, index: np.ndarray) -> np.ndarra
 
 
 def _translated_copies(system: System, state: State) -> list[np.ndarray]:
-    """Indices of the molecules that are copies of each other by translations of the unit cell.
-    Raises SceneError, SimulationError."""
+    """Indices of the molecules that are copies of each other by unit-cell translations. Raises
+    SceneError, SimulationError."""
     repeat = np.array(cells_of(system))
     in_cells = state.position @ np.linalg.inv(state.cell) * repeat
     unit_cell = state.cell / repeat[:, None]

@@ -198,7 +198,7 @@ def _short_run(system: System, state: State, other: ExternalEngine) -> list[Comp
 
 
 def _sites_after(system: System, engine: Engine, state: State, steps: int) -> np.ndarray:
-    """Positions of sites (s, 3) after the span of the short run, in this number of steps."""
+    """Site positions (s, 3) after the span of the short run, in this number of steps."""
     scheme, dt = SCHEMES["velocity_verlet"], STEPS * STEP * FEMTOSECOND / steps
     moved = engine.begin(state, scheme)
     moved.begin_segment(0.0)

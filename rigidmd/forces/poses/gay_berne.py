@@ -52,7 +52,7 @@ class GayBerne(NamedTuple):
 
 
 def _inverse(across, along_axis, other_across, other_along, cosines):
-    """r G⁻¹ r of a unit vector r, and det G, of G = sum of two matrices with these values across
+    """r G⁻¹ r for a unit vector r, and det G, with G = sum of two matrices with these values across
     and along the axes u and v. cosines : u r, v r, u v"""
     to_u, to_v, between = cosines
     whole = across + other_across
