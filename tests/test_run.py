@@ -699,7 +699,7 @@ def test_constant_energy_after_a_thermostat_explains_its_temperature():
     text = summary_text(results.summary)
     off = two["temperature_K"] - 100.0
     assert (
-        f"{off:+.2g} K from the 100 K before: this stage keeps the energy of one moment. Such"
+        f"{off:+.2g} K from the 100 K before: an NVE stage keeps the energy at its start. Such"
         in text
     )
     assert ("equilibrate longer" in text) == (abs(off) > 3 * two["temperature_scatter_K"])

@@ -159,7 +159,8 @@ def _with_electrostatics(
 
 
 def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
-    """Why a scene has no tail correction by default. Empty if it has one."""
+    """Why a scene has no tail correction by default, or an empty text if it has a tail
+    correction."""
     forces = scene.forces
     if not forces.lennard_jones:
         return "forces.lennard_jones is false"

@@ -33,7 +33,7 @@ COLDEST_LIQUID = 100.0  # K, of water that starts without a file
 
 
 class Quantity(NamedTuple):
-    """Plausible values of a quantity, and the likely cause of smaller and of larger ones."""
+    """Plausible values of a quantity, and the likely cause if a value is smaller or larger."""
 
     unit: str
     least: float
@@ -110,8 +110,8 @@ def scene_errors(
 
 
 def shortest_contact(species: "list[Molecule]") -> float:
-    """Smallest distance of the minimum of the energy of two like molecules, by their largest sites,
-    Å; inf without."""
+    """Smallest distance at which two like molecules have minimum energy, by their largest sites, Å;
+    inf without."""
     largest = [float(m.sigma.max(where=m.epsilon > 0, initial=0.0)) for m in species]
     return MINIMUM * min((x for x in largest if x > 0), default=inf)
 

@@ -1,4 +1,4 @@
-"""The registry of commands, arguments that several of them have, and the reading of scenes."""
+"""The command registry, arguments that several commands have, and the reading of scenes."""
 
 import argparse
 import re
@@ -109,8 +109,8 @@ TRUST = argument(
     default=[],
     metavar="FILE.py",
     help=(
-        "let [[forces.custom]] of the scene run this Python file, or a copy of it. It is code and"
-        " can do whatever you can, may be repeated"
+        "let [[forces.custom]] of the scene run this Python file, or a copy of it. It is code"
+        " and can do whatever you can. Can be repeated"
     ),
 )
 #: SCENE, --set and --trust, which `read_scene` reads.
@@ -124,8 +124,8 @@ SCENE = (
         dest="overrides",
         help=(
             "override a key of the scene by its dotted path (an entry of a list by its number,"
-            " counted from 0, or a stage by its name). KEY= without a value removes the key, may be"
-            " repeated"
+            " counted from 0, or a stage by its name). KEY= without a value removes the key. Can"
+            " be repeated"
         ),
     ),
     TRUST,

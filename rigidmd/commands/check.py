@@ -25,10 +25,7 @@ if TYPE_CHECKING:
     argument(
         "--profile",
         action="store_true",
-        help=(
-            "also measure how much of the time of a step each row of the forces takes, from the"
-            " start"
-        ),
+        help="also measure which fraction of a step each row of the forces takes, from the start",
     ),
 )
 def _check(options: Options) -> int:

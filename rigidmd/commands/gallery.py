@@ -12,7 +12,10 @@ from rigidmd.commands.streams import announce
     "run shipped bodies and write a page with a picture of each, which links to its animation",
     "rigidmd gallery heavy_top_3 intermediate_axis",
     argument(
-        "names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)"
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help="bodies from `rigidmd examples` (default: eleven of them)",
     ),
     argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)"),
     argument("--force", action="store_true", help="replace an earlier gallery in that folder"),

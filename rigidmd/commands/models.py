@@ -33,8 +33,8 @@ from rigidmd.errors import MoleculeError
         "--parameters",
         metavar="TABLE",
         help=(
-            "with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom"
-            " or element"
+            "with --from: a .toml file with charges and Lennard-Jones parameters by atom name or"
+            " element"
         ),
     ),
     argument("--name", metavar="NAME", dest="custom_name", help="with --from: name of the model"),
@@ -43,8 +43,8 @@ from rigidmd.errors import MoleculeError
         "--output",
         metavar="FILE",
         help=(
-            "picture file: .png, .svg or .pdf. With --from the file of the model (default: the"
-            " structure's, .toml)"
+            "picture file: .png, .svg or .pdf. With --from: the model file (default: the name of"
+            " the structure file, with .toml)"
         ),
     ),
     argument("--force", action="store_true", help="replace that file"),

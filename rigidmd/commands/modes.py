@@ -36,14 +36,17 @@ ROWS = 8
         type=COUNT,
         metavar="N",
         help=(
-            "only the N lowest and N highest modes, by Lanczos (default: all, or 20 if there are"
-            " more than 6000)"
+            "compute only the N lowest and N highest modes, by Lanczos (default: all, or 20 if"
+            " there are more than 6000)"
         ),
     ),
     argument(
         "--gamma",
         action="store_true",
-        help="only the modes at the Gamma point of the unit cell that structure.repeat repeats",
+        help=(
+            "compute only the modes at the Gamma point of the unit cell that structure.repeat"
+            " repeats"
+        ),
     ),
     argument(
         "--animate",

@@ -33,8 +33,8 @@ DURATION = (
         type=time_ps,
         metavar="TIME",
         help=(
-            "let the last stage end at this time of the run, such as 200ps or 1.5ns. Lengthens a"
-            " finished run"
+            "let the last stage end at this time of the run, such as 200ps or 1.5ns. This"
+            " lengthens a finished run"
         ),
     ),
     argument(
@@ -58,7 +58,7 @@ DURATION = (
         action="store_true",
         help=(
             "continue from the last checkpoint in that folder, with bitwise identical results."
-            " Without one, start"
+            " Without a checkpoint, start the run"
         ),
     ),
     add_engine,

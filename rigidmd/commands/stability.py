@@ -11,7 +11,11 @@ from rigidmd.commands.arguments import Options, argument, command, output_folder
     "run the built-in stress tests, each compared with a known answer. Exit code 1 if an"
     " error is undetected",
     "rigidmd stability --quick --case near_linear --case water_steps",
-    argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes"),
+    argument(
+        "--quick",
+        action="store_true",
+        help="use fewer settings, integrators and steps, which takes minutes",
+    ),
     argument("--case", action="append", metavar="NAME", help="only this case, may be repeated"),
     argument("-v", "--verbose", action="store_true", help="list the warnings of the runs"),
     *output_folder("runs/stability"),

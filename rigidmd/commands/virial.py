@@ -30,7 +30,10 @@ def _temperatures(text: str) -> list[float]:
         "models",
         nargs="+",
         metavar="MODEL",
-        help="shipped model, or the .toml file of a custom one; of several all pairs are computed",
+        help=(
+            "shipped model, or the .toml file of a custom model. With several models, all pairs"
+            " are computed"
+        ),
     ),
     argument(
         "--temperatures",
@@ -56,7 +59,7 @@ def _temperatures(text: str) -> list[float]:
         dest="overrides",
         help=(
             "key of [forces] of a scene, such as forces.mixing=geometric, or forces.custom with"
-            " pair potentials, may be repeated"
+            " pair potentials. Can be repeated"
         ),
     ),
     TRUST,

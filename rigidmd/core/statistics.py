@@ -157,9 +157,9 @@ def _difference_of_beginning(values: np.ndarray, start: int) -> tuple[float, flo
 
 
 def _window(centred: np.ndarray) -> tuple[float, int]:
-    """1 + 2 sum C(k) of samples (n,) of mean zero, and the last k of the sum: the initial monotone
-    sequence (Geyer 1992), corrected for the sample mean (Wolff 2004, eq. 49). See the theory
-    chapter `errors`."""
+    """1 + 2 sum C(k) for samples (n,) with mean zero, and the last k of the sum: the initial
+    monotone sequence (Geyer 1992), corrected for the sample mean (Wolff 2004, eq. 49). See the
+    theory chapter `errors`."""
     n = len(centred)
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2
     correlation = np.fft.irfft(power)[:n]
@@ -174,8 +174,8 @@ def _window(centred: np.ndarray) -> tuple[float, int]:
 
 
 def _batch_variance(centred: np.ndarray) -> float:
-    """n times the variance of the mean, from means of batches and the correlation of neighbouring
-    ones."""
+    """n times the variance of the mean, from batch means and the correlation between neighbouring
+    batches."""
     size = len(centred) // BATCHES
     means = centred[len(centred) - size * BATCHES :].reshape(BATCHES, size).mean(axis=1)
     means -= means.mean()
@@ -229,6 +229,7 @@ def slope(time: ArrayLike, value: ArrayLike) -> Slope:
 
 
 def _allan(value: np.ndarray, m: int) -> float:
-    """Allan variance: half the variance of the differences of successive means of m samples."""
+    """Allan variance: half the variance of the difference between successive means over m
+    samples."""
     blocks = len(value) // m
     return float(0.5 * np.diff(value[: blocks * m].reshape(blocks, m).mean(axis=1)).var(ddof=1))

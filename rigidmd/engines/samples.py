@@ -1,4 +1,4 @@
-"""The columns of log.csv (molecules) and motion.csv (a body), and the samples of a run of
+"""The columns of log.csv (molecules) and motion.csv (a body), and the samples in a run of
 molecules.
 
 One table serves files, displays and documentation. For molecules it is the record `Sample`: each

@@ -81,7 +81,7 @@ class Scene(Section, Displayed):
     """Name of the run. Default: the name of the file"""
 
     integrators: tuple[IntegratorRow, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Integrators of users, for stages, [run] of a body and `rigidmd accuracy`"""
+    """User-defined integrators, for stages, [run] of a single body and `rigidmd accuracy`"""
 
     SIZES: ClassVar[tuple[float, float]] = (1e-100, 1e100)
     """Smallest and largest absolute value of numbers other than 0, so that squares and products
@@ -221,7 +221,7 @@ class Scene(Section, Displayed):
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
     ) -> "MolecularScene | BodyScene":
-        """The scene in a nested dictionary like the one of a TOML file.
+        """The scene as a nested dictionary, as a TOML file gives it.
 
         Numbers and arrays of NumPy and paths are accepted as numbers, lists and texts. The
         dictionary is not changed.

@@ -176,7 +176,7 @@ def _check_names(name: Any, truncation: Any, mixing: Any, pairs: Any) -> None:
 
 
 def _columns(table: Any) -> Columns:
-    """The table of a file, or of lists of numbers. Raises ValueError."""
+    """The table from a file, or from lists of numbers. Raises ValueError."""
     if isinstance(table, str | Path):
         return read_columns(Path(table))
     if not (isinstance(table, tuple | list) and len(table) in (2, 3)):
