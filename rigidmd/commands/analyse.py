@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import Options, argument, command, number, time_ps
+from rigidmd.commands.arguments import Options, argument, command, flag, number, repeated, time_ps
 from rigidmd.commands.streams import progress_bar
 
 
@@ -78,22 +78,15 @@ class _List(argparse.Action):
             " which the sweep varies, such as stages.1.timestep_fs"
         ),
     ),
-    argument(
+    repeated(
         "--trust",
-        action="append",
-        default=[],
-        metavar="FILE.py",
+        "FILE.py",
         help=(
             "run this Python file first, which may define analyses with"
             " @rigidmd.analysis.register, may be repeated"
         ),
     ),
-    argument(
-        "-v",
-        "--verbose",
-        action="store_true",
-        help="also print the notes of each analysis, and what its curves are",
-    ),
+    flag("-v", "--verbose", help="also print the notes of each analysis, and what its curves are"),
     argument("--list", action=_List, nargs=0, help="list the analyses"),
     scene="this run",
     writes=True,

@@ -3,7 +3,7 @@
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import Options, argument, command, print_page
+from rigidmd.commands.arguments import Options, argument, command, flag, print_page
 from rigidmd.commands.streams import announce
 
 
@@ -15,7 +15,7 @@ from rigidmd.commands.streams import announce
         "names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)"
     ),
     argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)"),
-    argument("--force", action="store_true", help="replace an earlier gallery in that folder"),
+    flag("--force", help="replace an earlier gallery in that folder"),
     scene="the gallery",
     writes=True,
 )

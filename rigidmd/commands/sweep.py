@@ -13,8 +13,10 @@ from rigidmd.commands.arguments import (
     Options,
     argument,
     command,
+    flag,
     number,
     output_folder,
+    repeated,
     seconds,
 )
 from rigidmd.errors import OutputError, visible
@@ -34,17 +36,15 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
     " stages.2.timestep_fs=1,2,4 --extrapolate stages.2.timestep_fs --replicas 8\n  rigidmd sweep"
     " water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
     argument("scene", metavar="SCENE", help="scene file (TOML)"),
-    argument(
+    repeated(
         "--set",
-        action="append",
-        default=[],
-        metavar="KEY=A,B,...",
-        dest="sets",
+        "KEY=A,B,...",
         help=(
             "values of a key of the scene (entries of a list are counted from 0). KEY=1..8 for"
             " whole numbers. KEY=VALUE the same for all. KEY,KEY=A,B for keys that vary together,"
             " may be repeated: all combinations run"
         ),
+        dest="sets",
     ),
     argument(
         "--replicas",
@@ -87,11 +87,7 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
             " commands that run the points, a line each, for any scheduler"
         ),
     ),
-    argument(
-        "--collect",
-        action="store_true",
-        help="run nothing, and write table and figure of existing results",
-    ),
+    flag("--collect", help="run nothing, and write table and figure of existing results"),
     argument(
         "--extrapolate",
         metavar="KEY",

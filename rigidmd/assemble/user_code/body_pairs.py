@@ -4,7 +4,7 @@ are cut off."""
 from collections.abc import Callable, Mapping
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -26,7 +26,7 @@ SWITCH_START = 0.9
 
 
 def body_pair_potential(
-    function: Callable[..., Any] | str | Path,
+    function: Callable[..., object] | str | Path,
     parameters: Mapping[str, Parameters] | None = None,
     *,
     species: tuple[str, ...] = (),
