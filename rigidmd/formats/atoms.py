@@ -49,6 +49,7 @@ class Atoms(NamedTuple):
     cell: np.ndarray | None = None  # (3, 3), rows a, b, c, Å
     masses: np.ndarray | None = None  # (n,) u, if the file has masses
     notes: Sequence[str] = ()
+    charges: np.ndarray | None = None  # (n,) e, if the file has charges of all atoms
 
 
 def structure_error(path: Path, message: str) -> StructureError:

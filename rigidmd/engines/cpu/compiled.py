@@ -117,6 +117,11 @@ class CompiledEngine(Engine):
     def forget(self) -> None:
         self._last.is_current = False
 
+    def renew_lists(self) -> None:
+        """Make the next evaluation independent of earlier ones: it builds all neighbour lists."""
+        for workspace in self._workspaces or ():
+            trait(workspace, "renew_list")()
+
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """The variables of the thermostat and the barostat of a scheme, at rest."""
         return np.zeros(as_scheme(integrator).variables)

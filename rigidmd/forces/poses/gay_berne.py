@@ -19,6 +19,11 @@ import numpy as np
 PARAMETERS = ("length_A", "width_A", "epsilon_kJ_mol", "side", "end")
 
 
+#: The shifted distance, in widths, below which the energy is constant: it would diverge, and nearer
+#: ellipsoids would attract each other.
+SHORTEST = 0.1
+
+
 class GayBerne(NamedTuple):
     """The energy (kJ/mol) as a function of r, of the axes of both bodies and of their
     parameters."""
@@ -41,7 +46,8 @@ class GayBerne(NamedTuple):
         side, end = ([x**power for x in both] for both in ((p.side, q.side), (p.end, q.end)))
         depth, _ = _inverse(side[0], end[0], side[1], end[1], along)
         width = (p.width_A + q.width_A) / 2
-        ratio = width / (distance - contact + self.gamma * width)
+        shifted = distance - contact + self.gamma * width
+        ratio = width / np.maximum(shifted, SHORTEST * width)
         epsilon = np.sqrt(p.epsilon_kJ_mol * q.epsilon_kJ_mol)
         return 4 * epsilon * strength * (2 * depth) ** self.mu * (ratio**12 - ratio**6)
 
