@@ -6,7 +6,7 @@ numbers that are warned of, `REFUSED` of numbers that no scene can mean.
 
 from collections.abc import Iterable, Iterator
 from math import degrees, inf, pi
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -227,7 +227,7 @@ def body_warnings(scene: "BodyScene") -> list[str]:
     else:
         warnings = gravity_warnings("gravity.acceleration_m_s2", scene.gravity.acceleration_m_s2)
     for key in ("euler_angles_deg", "yaw_pitch_roll_deg"):
-        angles: Any = getattr(scene.start, key)
+        angles = getattr(scene.start, key)
         if angles is not None and any(map(in_radians, angles)) and max(map(abs, angles)) <= 2 * pi:
             shown = ", ".join(f"{x:g}" for x in angles)
             inside = ", ".join(f"{degrees(x):.4g}" for x in angles)

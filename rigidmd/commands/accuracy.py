@@ -7,6 +7,7 @@ from rigidmd.commands.arguments import (
     Options,
     argument,
     command,
+    flag,
     output_folder,
     read_scene,
     write_study,
@@ -45,9 +46,8 @@ from rigidmd.commands.arguments import (
         metavar="N",
         help="number of timings of each run (default: 3). With 1 there is no spread",
     ),
-    argument(
+    flag(
         "--averages",
-        action="store_true",
         help=(
             "molecules only: measure the bias of averages instead. The last stage is sampled"
             " under its thermostat (nvt, npt) with every integrator at every step. --integrators"
@@ -66,11 +66,8 @@ from rigidmd.commands.arguments import (
             " of it (default: 20)"
         ),
     ),
-    argument(
-        "-v",
-        "--verbose",
-        action="store_true",
-        help="also print which integrators are equally fast within timing noise",
+    flag(
+        "-v", "--verbose", help="also print which integrators are equally fast within timing noise"
     ),
     *output_folder("runs/NAME-accuracy"),
     writes=True,

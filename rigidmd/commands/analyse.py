@@ -2,10 +2,9 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import Options, argument, command, number, time_ps
+from rigidmd.commands.arguments import Options, argument, command, flag, number, repeated, time_ps
 from rigidmd.commands.streams import progress_bar
 
 FRAMES = 100  # equal ones, for insertion without a run
@@ -84,22 +83,15 @@ class _List(argparse.Action):
             " time step that the sweep varies, such as stages.1.timestep_fs"
         ),
     ),
-    argument(
+    repeated(
         "--trust",
-        action="append",
-        default=[],
-        metavar="FILE.py",
+        "FILE.py",
         help=(
             "run this Python file first. It may define analyses with @rigidmd.analysis.register."
             " Can be repeated"
         ),
     ),
-    argument(
-        "-v",
-        "--verbose",
-        action="store_true",
-        help="also print the notes of each analysis, and what its curves show",
-    ),
+    flag("-v", "--verbose", help="also print the notes of each analysis, and what its curves show"),
     argument("--list", action=_List, nargs=0, help="list the analyses"),
     scene="this run",
     writes=True,
@@ -164,7 +156,7 @@ def _analyse(options: Options) -> int:
     return FAILED if names and done.failed else 0
 
 
-def _insert(path: str, names: list[str], more: dict[str, Any], verbose: bool) -> int:
+def _insert(path: str, names: list[str], more: dict[str, object], verbose: bool) -> int:
     """Print the results of insertion into the frozen molecules of a scene."""
     from rigidmd.analysis.files import run_analyses
     from rigidmd.analysis.registry import check_options, selected

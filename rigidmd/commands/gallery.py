@@ -3,7 +3,7 @@
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import Options, argument, command, print_page
+from rigidmd.commands.arguments import Options, argument, command, flag, print_page
 from rigidmd.commands.streams import announce
 
 
@@ -18,7 +18,7 @@ from rigidmd.commands.streams import announce
         help="bodies from `rigidmd examples` (default: eleven of them)",
     ),
     argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)"),
-    argument("--force", action="store_true", help="replace an earlier gallery in that folder"),
+    flag("--force", help="replace an earlier gallery in that folder"),
     scene="the gallery",
     writes=True,
 )

@@ -3,7 +3,7 @@
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import Options, argument, command
+from rigidmd.commands.arguments import Options, argument, command, flag
 from rigidmd.commands.streams import warn
 from rigidmd.errors import MoleculeError
 
@@ -19,7 +19,7 @@ from rigidmd.errors import MoleculeError
         metavar="NAME",
         help="model to show, or the .toml file of a custom model",
     ),
-    argument("--draw", action="store_true", help="draw it to NAME.png"),
+    flag("--draw", help="draw it to NAME.png"),
     argument(
         "--from",
         dest="geometry",
@@ -47,7 +47,7 @@ from rigidmd.errors import MoleculeError
             " the structure file, with .toml)"
         ),
     ),
-    argument("--force", action="store_true", help="replace that file"),
+    flag("--force", help="replace that file"),
 )
 def _models(options: Options) -> int:
     from rigidmd.assemble.plausibility import molecule_warnings

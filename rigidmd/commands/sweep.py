@@ -13,8 +13,10 @@ from rigidmd.commands.arguments import (
     Options,
     argument,
     command,
+    flag,
     number,
     output_folder,
+    repeated,
     seconds,
 )
 from rigidmd.errors import OutputError, visible
@@ -34,17 +36,15 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
     " stages.2.timestep_fs=1,2,4 --extrapolate stages.2.timestep_fs --replicas 8\n  rigidmd sweep"
     " water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
     argument("scene", metavar="SCENE", help="scene file (TOML)"),
-    argument(
+    repeated(
         "--set",
-        action="append",
-        default=[],
-        metavar="KEY=A,B,...",
-        dest="sets",
+        "KEY=A,B,...",
         help=(
             "values of a scene key (entries of a list are counted from 0). KEY=1..8 sets whole"
             " numbers, KEY=VALUE one value for all runs, and KEY,KEY=A,B keys that vary together."
             " With several --set, all combinations run"
         ),
+        dest="sets",
     ),
     argument(
         "--replicas",
@@ -87,11 +87,7 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
             " commands prints one line per point with the command that runs it, for any scheduler"
         ),
     ),
-    argument(
-        "--collect",
-        action="store_true",
-        help="run nothing, and write table and figure of existing results",
-    ),
+    flag("--collect", help="run nothing, and write table and figure of existing results"),
     argument(
         "--extrapolate",
         metavar="KEY",

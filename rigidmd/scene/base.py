@@ -359,7 +359,7 @@ def _working_directory() -> Path:
         return Path()
 
 
-def with_absolute_paths(data: Mapping[str, Any], folder: PathName = "") -> Json:
+def with_absolute_paths(data: Mapping[str, object], folder: PathName = "") -> Json:
     """A copy of the tables of a scene in which every path, relative to a folder, is absolute.
 
     folder : default: the working directory
@@ -523,7 +523,7 @@ def override(data: dict, key: str, value: object) -> tuple[str, list[str]]:
     return ".".join(map(str, indices)), []
 
 
-def parse_override(text: str) -> tuple[str, Any]:
+def parse_override(text: str) -> tuple[str, object]:
     """KEY=VALUE of the command line. The value is read as TOML, else as text. None if empty. Raises
     SceneError."""
     key, equals, value = text.partition("=")
@@ -544,7 +544,7 @@ def format_override(key: str, value: object) -> str:
     return f"{key}={_format_toml(value)}"
 
 
-def _format_toml(value: Any) -> str:
+def _format_toml(value: object) -> str:
     """A value in one line of TOML. Empty for None."""
     match value:
         case None:

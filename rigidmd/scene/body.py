@@ -4,7 +4,7 @@ throughout.
 The equations contain no physical constants, so any other consistent units work as well.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, Strict, field_validator
@@ -110,7 +110,7 @@ class Solid(Section):
     """Semi-axes of an ellipsoid"""
 
     @property
-    def dimensions(self) -> dict[str, Any]:
+    def dimensions(self) -> dict[str, float]:
         """The dimensions given."""
         return {
             key: value
@@ -394,7 +394,7 @@ class Run(MovedByScheme):
 
     @field_validator("integrator", mode="before")
     @classmethod
-    def _moves_bodies(cls, name: Any):
+    def _moves_bodies(cls, name: object):
         if name in WITH_THERMOSTAT:
             known = ", ".join((*SCHEMES, AUTO, *SOLVERS))
             raise ValueError(

@@ -52,7 +52,7 @@ UNIT = re.compile(
 )
 
 
-def hint_on_key(name: str, keys: list, value: Any, model: type[BaseModel]) -> str:
+def hint_on_key(name: str, keys: list, value: object, model: type[BaseModel]) -> str:
     """What a scene has instead of an unknown key.
 
     Parameters
@@ -169,7 +169,7 @@ def known_keys(model: type[BaseModel], keys: list) -> list[str]:
     return list(model.model_fields)
 
 
-def models_in(annotation: Any) -> list[type[BaseModel]]:
+def models_in(annotation: object) -> list[type[BaseModel]]:
     """The models in the type of a key."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]

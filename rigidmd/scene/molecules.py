@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
+from typing import Annotated, ClassVar, Literal, NamedTuple, TypedDict
 
 from pydantic import Field, PrivateAttr, Strict
 
@@ -209,7 +209,7 @@ class MolecularScene(Scene):
         return self._user_code
 
     def with_user_code(
-        self, forces: Sequence[Any] = (), thermostat: object = None
+        self, forces: Sequence[object] = (), thermostat: object = None
     ) -> "MolecularScene":
         """The same scene with forces and a thermostat from Python, see `Simulation`.
 

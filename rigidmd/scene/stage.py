@@ -156,7 +156,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @field_validator("thermostat", "barostat", mode="before")
     @classmethod
-    def _is_available(cls, name: Any, field: ValidationInfo):
+    def _is_available(cls, name: object, field: ValidationInfo):
         plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
         if plain in REFUSED:
             known = THERMOSTATS if field.field_name == "thermostat" else BAROSTATS
@@ -165,7 +165,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @field_validator("integrator", mode="before")
     @classmethod
-    def _moves_molecules(cls, name: Any, info: ValidationInfo):
+    def _moves_molecules(cls, name: object, info: ValidationInfo):
         plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
         if plain in OTHER_INTEGRATORS and name not in (info.context or ()):
             known = ", ".join((*SCHEMES, *WITH_THERMOSTAT, AUTO))
@@ -390,7 +390,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def with_defaults(self) -> "Stage":
         """This stage with the defaults of all keys that it uses."""
-        defaults: dict[str, Any] = {}
+        defaults: dict[str, object] = {}
         if self.has_thermostat:
             defaults |= {"thermostat": self.thermostat_kind} | self.thermostat_values
         if self.has_barostat:
