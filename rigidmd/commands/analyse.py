@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import Options, argument, command, number, time_ps
@@ -165,7 +164,7 @@ def _analyse(options: Options) -> int:
     return FAILED if names and done.failed else 0
 
 
-def _insert(path: str, names: list[str], more: dict[str, Any], verbose: bool) -> int:
+def _insert(path: str, names: list[str], more: dict[str, object], verbose: bool) -> int:
     """Print the results of insertion into the frozen molecules of a scene."""
     from rigidmd.analysis.files import run_analyses
     from rigidmd.analysis.registry import check_options, selected
