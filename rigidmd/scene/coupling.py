@@ -8,11 +8,10 @@ from rigidmd.scene.validation import MOST_TABLES, Section, ShortName
 
 Fraction = Annotated[float, Strict(), Field(ge=0, le=1)]
 #: `lambda` is a word of Python, which no class body can have as a name.
-_WithLambda: type[Any] = create_model(
-    "_WithLambda",
-    __base__=Section,
-    **{"lambda": (Fraction, Field(1.0, description="0: the species is absent, 1: it is complete"))},
-)
+_FIELDS: dict[str, Any] = {
+    "lambda": (Fraction, Field(1.0, description="0: the species is absent, 1: it is complete"))
+}
+_WithLambda: Any = create_model("_WithLambda", __base__=Section, **_FIELDS)
 
 
 class Coupling(_WithLambda):
