@@ -26,6 +26,7 @@ from .scene import Scene as Scene
 from .scene.integrators import integrator as integrator
 from .studies.normal_modes import normal_modes as normal_modes
 from .studies.stored_runs import read_run as read_run
+from .studies.sweep.coupling import free_energy as free_energy
 from .studies.sweep.sweeping import sweep as sweep
 from .studies.sweep.windows import pmf as pmf
 from .studies.virial import second_virial as second_virial

@@ -89,6 +89,7 @@ EXTENDED = {
             "water",
         )
     ),
+    "test_coupling.py": ("a_sweep_has_a_free_energy",),
     "test_dynamics.py": (
         "a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid[[]chin_4a*",
         "adding_an_integrator_*",

@@ -286,6 +286,17 @@ VARIANTS = {
             "fields.electric_phase_deg": 30.0,
         },
     ),
+    "coupled": (
+        ARGON,
+        {
+            "coupling": {
+                "species": "argon",
+                "lambda": 0.3,
+                "charges_from": 0.6,
+                "lambdas": [0.2, 0.8],
+            },
+        },
+    ),
     "energy": (
         ARGON,
         {

@@ -18,7 +18,7 @@ from rigidmd.core.statistics import inefficiency
 from rigidmd.errors import OutputError
 
 NAME = "pmf"
-ABOUT = "potential of mean force along a restrained distance"
+ABOUT, OVER = "potential of mean force along a restrained distance", "the distance of a restraint"
 #: Width of bins, Å; least decorrelated samples of a window and in a bin; samples of the bootstrap.
 WIDTH, LEAST_SAMPLES, LEAST_IN_BIN, RESAMPLED = 0.1, 10, 6, 50
 #: Fraction of the bins, at the largest distances, whose mean is the zero of the energy.

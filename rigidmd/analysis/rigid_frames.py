@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from rigidmd.assemble.build import build
 from rigidmd.core.state import NO_CELL
 from rigidmd.engines.samples import equilibrated_from, moving
 from rigidmd.engines.system import System
@@ -20,9 +21,10 @@ from rigidmd.io.trajectory import Frames, read_frames, without_rounding
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.results import Results
 from rigidmd.run.rigid_fit import Bodies, Kind, RigidFit, kinds_of
+from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.stage import Stage
-from rigidmd.scene.validation import did_you_mean
+from rigidmd.scene.validation import did_you_mean, not_none
 from rigidmd.units import BOLTZMANN
 
 EVEN = 1e-3  # two intervals between frames that differ by less than this fraction are equal
@@ -263,6 +265,25 @@ def frames_of_folder(
         return _rigid_frames(system, record.columns, frames, tensor, start, notes, progress)
     except OutputError as error:
         raise OutputError(f"{path}: {error}") from None
+
+
+def frames_of_start(scene: MolecularScene, count: int) -> RigidFrames:
+    """The start of a scene as a number of frames, for molecules that do not move. Raises
+    SceneError."""
+    system = build(scene)
+    state, stage = system.state, system.scene.stages[-1]
+    shape = (count, len(system.model.species))
+    return RigidFrames(
+        system,
+        stage,
+        np.arange(count, dtype=float),
+        np.broadcast_to(state.cell, (count, 3, 3)),
+        np.broadcast_to(state.position, (*shape, 3)),
+        np.broadcast_to(state.rotation, (count, *state.rotation.shape)),
+        None,
+        None,
+        {"temperature": np.full(count, not_none(system.scene.start.temperature_K))},
+    )
 
 
 def frames_of_results(results: Results, start: float | None = None) -> RigidFrames:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.coupling import at_lambda, coupled, with_coupling
 from rigidmd.assemble.defaults import (
     with_defaults,
     with_engine_defaults,
@@ -76,9 +77,10 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         raise SceneError(scene.source, implausible)
     composition = Composition(species, counts, space, start.basis, cell, start.position)
     resolved = with_defaults(scene, composition)
-    if faults := [*faults, *resolved.errors]:
+    written = scene
+    scene, coupling_errors = with_coupling(resolved.scene, species)
+    if faults := [*faults, *resolved.errors, *coupling_errors]:
         raise SceneError(scene.source, faults)
-    written, scene = scene, resolved.scene
     mass = np.array([m.mass for m in species])
     inertia = np.where(frozen[:, None], 0.0, [m.inertia for m in species])
     rotor = split_rotor(inertia)
@@ -95,9 +97,11 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         rotation=start.rotation if any(m.inertia.any() for m in species) else None,
         cell=start.cell,
     )
-    parts = SystemParts(scene, species, model, space, state, number, start.basis, resolved.pme_grid)
-    acting = interactions(parts)
-    acting.terms.update(field_terms(parts))
+    whole = SystemParts(scene, species, model, space, state, number, start.basis, resolved.pme_grid)
+    acting = acting_in(whole)
+    others = () if scene.coupling is None else scene.coupling.lambdas
+    at = {x: acting_in(whole._replace(scene=at_lambda(scene, x))) for x in others}
+    species = coupled(scene, species)
     model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
     free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
@@ -127,6 +131,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         ),
         precision_reason=precision_reason,
         force_error=acting.force_error,
+        at_lambda=at,
         notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
         warnings=warnings,
     )
@@ -165,6 +170,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
             scene.source, [f"{fault}: {why}: choose another thermostat" for fault in faults]
         )
     check_memory(system)
+    if scene.coupling is not None:
+        system.notes.append(scene.coupling.in_short)
     system.notes.extend([*scene.rounded_times(), *set_momenta(scene, model, state, start)])
     stuck = "nothing moves and no temperature is defined. Use thermostat = 'langevin'"
     system.notes.extend(
@@ -194,6 +201,17 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
             raise StructureError(scene.structure_source, faults)
         system.notes.append(f"{file}: {'; '.join(faults)}: the minimisation separates them")
     return system
+
+
+def acting_in(whole: SystemParts) -> Interactions:
+    """The interactions and fields of a resolved scene. Raises SceneError.
+
+    whole : its parts, with the whole charges of the species in [coupling]
+    """
+    parts = whole._replace(species=coupled(whole.scene, whole.species))
+    acting = interactions(parts)
+    acting.terms.update(field_terms(parts))
+    return acting
 
 
 def interactions(parts: SystemParts) -> Interactions:

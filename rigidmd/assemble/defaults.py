@@ -215,11 +215,14 @@ def _cutoff_and_switch(
     for key, value in (("cutoff_A", cutoff), ("ewald_cutoff_A", forces.ewald_cutoff_A or 0.0)):
         if value > half:
             default = "" if getattr(forces, key) else " (the default)"
-            why = (
-                "which violates the minimum-image convention. Use a larger box or a shorter cutoff"
-            )
+            larger = "a larger box"
+            if any(m.cell is not None for m in composition.species):
+                factors = np.ceil(2 * value / np.array(space.edges)).astype(int).tolist()
+                larger = f"{' x '.join(map(str, factors))} times the repeats of the cell"
+            why = f"which violates the minimum-image convention. Use {larger} or a shorter cutoff"
             faults.append(f"forces.{key} = {value:g}{default} is longer than {limit}, {why}")
-    extents = {m.name: pdist(m.positions_body).max(initial=0.0) for m in composition.species}
+    bodies = [m for m in composition.species if m.cell is None]  # a framework fills the box
+    extents = {m.name: pdist(m.positions_body).max(initial=0.0) for m in bodies}
     faults += [
         f"a molecule of {m} is {x:.2f} Å long, more than {limit}"
         for m, x in extents.items()

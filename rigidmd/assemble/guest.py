@@ -189,8 +189,9 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
         rotor if inertia.any() else NoRotor(),
     )
     state = _selected(system.state, host)
+    rotates = len(system.state.rotation) > 0 or bool(inertia.any())  # also of frozen molecules
     for _ in added:
-        state = _with_trial(state, np.zeros(3), np.eye(3), rotates=bool(inertia.any()))
+        state = _with_trial(state, np.zeros(3), np.eye(3), rotates)
     scene = system.scene
     if scene.from_python != scene.user_code.names:
         missing = missing_user_code(scene.from_python, scene.user_code.names)

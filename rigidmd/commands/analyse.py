@@ -2,20 +2,24 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import Options, argument, command, number, time_ps
 from rigidmd.commands.streams import progress_bar
 
+FRAMES = 100  # equal ones, for insertion without a run
+
 
 class _List(argparse.Action):
     def __call__(self, parser, *_):
-        from rigidmd.analysis import mean_force
+        from rigidmd.analysis import free_energy, mean_force
         from rigidmd.analysis.registry import KNOWN, analysis_order, selected
 
         for entry in selected(sorted(KNOWN, key=analysis_order)):
             print(f"{entry.name:18} {entry.about}")
-        print(f"{mean_force.NAME:18} {mean_force.ABOUT}, of a sweep")
+        for of_sweep in (mean_force, free_energy):
+            print(f"{of_sweep.NAME:18} {of_sweep.ABOUT}, of a sweep")
         parser.exit()
 
 
@@ -27,7 +31,10 @@ class _List(argparse.Action):
     argument(
         "folder",
         metavar="RUN",
-        help="folder of a run, or of a sweep: means and errors over its runs",
+        help=(
+            "folder of a run, or of a sweep: means and errors over its runs. For `insertion` also a"
+            " scene, into whose frozen molecules a model is inserted without a run"
+        ),
     ),
     argument(
         "requests",
@@ -99,7 +106,7 @@ class _List(argparse.Action):
     writes=True,
 )
 def _analyse(options: Options) -> int:
-    from rigidmd.analysis import mean_force
+    from rigidmd.analysis import free_energy, mean_force
     from rigidmd.analysis.files import analyse_folder
     from rigidmd.analysis.registry import run_user_file
     from rigidmd.commands.sweep import print_limits
@@ -112,6 +119,8 @@ def _analyse(options: Options) -> int:
         run_user_file(Path(path))
     names = [*options.only, *(text for text in options.requests if "=" not in text)]
     more = dict(parse_override(text) for text in options.requests if "=" in text)
+    if options.folder.endswith(".toml"):
+        return _insert(options.folder, names, more, options.verbose)
     with progress_bar() as progress:
         folder, request = Path(options.folder), (names, options.start, options.viscosity)
         if is_sweep(folder):
@@ -130,11 +139,12 @@ def _analyse(options: Options) -> int:
                 names = print_limits(read_manifest(folder), options.extrapolate)
                 print(f"\n  files in {folder}: {', '.join(names)}")
             return FAILED if names and any(of.failed for of in analysed) else 0
-        if mean_force.NAME in names:
-            raise OutputError(
-                f"pmf needs a sweep over the distance of a restraint, and {folder} is the folder of"
-                " a run"
-            )
+        for of_sweep in (mean_force, free_energy):
+            if of_sweep.NAME in names:
+                raise OutputError(
+                    f"{of_sweep.NAME} needs a sweep over {of_sweep.OVER}, and {folder} is the"
+                    " folder of a run"
+                )
         if options.extrapolate is not None:
             raise OutputError(
                 f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run"
@@ -153,6 +163,29 @@ def _analyse(options: Options) -> int:
         " report` shows them"
     )
     return FAILED if names and done.failed else 0
+
+
+def _insert(path: str, names: list[str], more: dict[str, Any], verbose: bool) -> int:
+    """Print the results of insertion into the frozen molecules of a scene."""
+    from rigidmd.analysis.files import run_analyses
+    from rigidmd.analysis.registry import check_options, selected
+    from rigidmd.analysis.rigid_frames import frames_of_start
+    from rigidmd.analysis.runs import Runs
+    from rigidmd.errors import OutputError
+    from rigidmd.scene import MolecularScene
+
+    if names != ["insertion"]:
+        raise OutputError(
+            f"{path} is a scene, and only insertion needs no run: `rigidmd analyse {path} insertion"
+            " model=NAME`, or `rigidmd run` first"
+        )
+    check_options(selected(names), more)
+    runs = Runs((frames_of_start(MolecularScene.read(path), FRAMES),))
+    results, failed = run_analyses(runs, names, options={"zero_loading": True} | more)
+    for result in results:  # trials at rest have no time
+        result.values = [value._replace(correlation_ps=None) for value in result.values]
+    _print_results(results, failed, verbose)
+    return FAILED if failed else 0
 
 
 def _print_results(results: list, failed: dict[str, str], verbose: bool) -> None:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from math import inf, nan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rigidmd.commands.streams import progress_bar
 from rigidmd.programs import engine_options, runnable
@@ -15,6 +15,7 @@ from rigidmd.programs import engine_options, runnable
 #: Adds an argument to the parser of a command.
 Argument = Callable[[argparse.ArgumentParser], object]
 Options = argparse.Namespace
+Result = TypeVar("Result")
 
 
 class Command(NamedTuple):
@@ -22,7 +23,7 @@ class Command(NamedTuple):
     about: str
     example: str
     arguments: tuple[Argument, ...]
-    options: dict[str, Any]  # that no argument sets
+    options: dict[str, object]  # that no argument sets
     call: Callable[[Options], int]
 
 
@@ -30,7 +31,7 @@ COMMANDS: dict[str, Command] = {}  # the commands of the imported modules, by na
 
 
 def command(
-    position: int, about: str, example: str, *arguments: Argument, **options: Any
+    position: int, about: str, example: str, *arguments: Argument, **options: object
 ) -> Callable:
     """Register a function as the command of its name, without underscores around it.
 
@@ -54,10 +55,12 @@ def argument(*names: str, **settings: Any) -> Argument:
     return lambda parser: parser.add_argument(*names, **settings)
 
 
-def number(kind: type, lowest: float, highest: float, description: str) -> Callable[[str], Any]:
+def number(
+    kind: type[int] | type[float], lowest: float, highest: float, description: str
+) -> Callable[[str], float]:
     """A reader for argparse of int or float numbers in a range."""
 
-    def read(text: str) -> Any:
+    def read(text: str) -> float:
         try:
             value = kind(text) if kind is float or text.isdigit() else nan
         except ValueError:
@@ -194,10 +197,10 @@ def write_study(
     force: bool,
     files: tuple[str, ...],
     begins: str,
-    measure: Callable[[Callable], Any],
-    describe: Callable[[Any], list[str]],
-    write: Callable[[Path, Any, str], list[Path]],
-) -> Any:
+    measure: Callable[[Callable], Result],
+    describe: Callable[[Result], list[str]],
+    write: Callable[[Path, Result, str], list[Path]],
+) -> Result:
     """Measure something, print it and write its files into a folder, which is locked meanwhile.
     Returns what was found.
 

@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Iterator
 from math import inf
 from pathlib import Path
-from typing import Any
 
 from rigidmd.core.toml import Json
 from rigidmd.errors import SettingError
@@ -49,7 +48,7 @@ def without_local_settings() -> Iterator[None]:
     """
     exists = os.path.exists
 
-    def exists_elsewhere(path: Any) -> bool:
+    def exists_elsewhere(path: int | str | bytes | os.PathLike) -> bool:
         return path not in LOCAL_SETTINGS and exists(path)
 
     os.path.exists = exists_elsewhere

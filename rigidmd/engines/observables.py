@@ -117,6 +117,8 @@ def observe(
         pressure, (a, b, c, alpha, beta, gamma) = np.full((3, 3), nan), [nan] * 6
     tensor_bar = pressure / BAR
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor_bar.tolist()
+    # not in pilot runs, whose samples are in no log
+    changes = [] if stage is None else _changes_with_lambda(system, state, potential)
     energy, ledger = (potential + kinetic) / energy_unit, state.energy_ledger / energy_unit
     conserved = energy - float(ledger.sum())
     sample = Sample(
@@ -156,6 +158,7 @@ def observe(
         user_energies=(
             *(components[name] / energy_unit for name in system.user_terms),
             *(term.distance_in(state) for term in system.distances.values()),
+            *(change / energy_unit for change in changes),
             *trajectories,
         ),
     )
@@ -170,6 +173,21 @@ def observe(
         load,
         energy_unit,
     )
+
+
+def _changes_with_lambda(system: System, state: State, potential: float) -> list[float]:
+    """Energies at each of coupling.lambdas less the present one, u Å²/ps²."""
+    coupling, changes = system.scene.coupling, []
+    for value, engine in system.engines_at_lambda.items():
+        if coupling is not None and value == coupling.value:
+            changes.append(0.0)
+            continue
+        at = system.at_lambda[value]
+        engine.renew_lists()  # so that the bits do not depend on earlier states
+        energy = sum(tally.energy for tally in engine.evaluate(state)[1].values())
+        energy += 0.0 if at.tail is None else at.tail.energy(state.volume)
+        changes.append(energy + sum(at.constants.values()) - potential)
+    return changes
 
 
 def kinetic_energies(system: System, state: State) -> tuple[float, float]:

@@ -143,17 +143,31 @@ def distance_column(k: int) -> tuple[str, Column]:
     return f"distance_{k}", Column(f"Distance {k} (A)", "Å", about)
 
 
+LAMBDA = re.compile(r"energy_to_lambda_(.+)")
+
+
+def lambda_column(value: float) -> tuple[str, Column]:
+    """Name and column of the energy at a lambda of coupling.lambdas."""
+    about = f"potential energy at lambda = {value:g} less the present one, of the same state"
+    return f"energy_to_lambda_{value:g}", Column(
+        f"Energy to lambda {value:g} (kJ/mole)", "kJ/mol", about
+    )
+
+
 def more_columns(names: Sequence[str]) -> dict[str, Column]:
-    """The columns of user-defined forces, of restrained distances and of the trajectories of hybrid
-    Monte Carlo."""
+    """The columns of user-defined forces, of restrained distances, of other values of lambda and of
+    the trajectories of hybrid Monte Carlo."""
 
     def energy(name):
         return Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")
 
-    distances = dict(
+    known = OF_TRAJECTORIES | dict(
         distance_column(int(match[1])) for name in names if (match := DISTANCE.fullmatch(name))
     )
-    return {name: (OF_TRAJECTORIES | distances).get(name) or energy(name) for name in names}
+    known |= dict(
+        lambda_column(float(match[1])) for name in names if (match := LAMBDA.fullmatch(name))
+    )
+    return {name: known.get(name) or energy(name) for name in names}
 
 
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]

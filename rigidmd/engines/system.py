@@ -12,12 +12,12 @@ from rigidmd.core.state import State
 from rigidmd.core.state_file import SavedState, array_errors
 from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
-from rigidmd.engines.samples import OF_TRAJECTORIES
+from rigidmd.engines.samples import OF_TRAJECTORIES, lambda_column
 from rigidmd.engines.sites import Sites
 from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
-from rigidmd.forces.parts import Tail, gather_per_molecule
+from rigidmd.forces.parts import Interactions, Tail, gather_per_molecule
 from rigidmd.forces.poses.potential import BodyPairPotential
 from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
@@ -52,6 +52,8 @@ class System:
     force_error: float | None = (
         None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     )
+    #: lambda -> the interactions at it, see coupling.lambdas
+    at_lambda: dict[float, Interactions] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)  # of what is allowed and probably not meant
     #: Name of a term that Python computes -> function
@@ -133,6 +135,7 @@ class System:
         return (
             *self.user_terms,
             *distances,
+            *(lambda_column(value)[0] for value in self.at_lambda),
             *(OF_TRAJECTORIES if any(stage.is_hybrid for stage in self.scene.stages) else ()),
         )
 
@@ -229,6 +232,11 @@ class System:
             scene.threads,
             virials,
         )
+
+    @cached_property
+    def engines_at_lambda(self) -> dict[float, CpuEngine]:
+        """An engine of the interactions at each of coupling.lambdas."""
+        return {x: self.engine_of(at.terms, self.precision) for x, at in self.at_lambda.items()}
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values of all sites (s,). `of` returns the values of one molecule."""

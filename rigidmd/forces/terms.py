@@ -80,6 +80,9 @@ class Term:
         SimulationError."""
         return self
 
+    def renew_list(self) -> None:
+        """Have the next evaluation build its neighbour list as the first one did."""
+
     def checkpoint_arrays(self) -> dict[str, np.ndarray]:
         """Arrays on which the next forces depend in addition to the state."""
         return {}

@@ -185,6 +185,7 @@ def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
         contents.fractional @ cell,
         cell=cell,
         notes=notes,
+        charges=None if (charges := sites.charges()) is None else charges[owner],
     )
 
 
@@ -211,6 +212,11 @@ class AtomSites:
         """The values of the tag _atom_site_{part}. None where it has none."""
         values = self._block.column(f"_atom_site_{part}")
         return [values[row] for row in self._rows] if values else [None] * len(self)
+
+    def charges(self) -> np.ndarray | None:
+        """Charges (n,) in e. None if an atom has none."""
+        charges = np.array([number_of(text)[0] for text in self.column("charge")])
+        return None if np.isnan(charges).any() else charges
 
     def names(self) -> tuple[list[str], list[str]]:
         """Names and elements. A type that is not an element, such as OW or M, is the name."""

@@ -125,9 +125,8 @@ def _no_types() -> str:
     return f"structure.atom_types is for formats whose atoms have types: {', '.join(names)}"
 
 
-def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndarray]:
-    """Names, elements, masses (s,) and positions (s, 3) of the atoms of a file with one
-    molecule."""
+def read_geometry(path: Path) -> Atoms:
+    """The atoms of a file with one molecule, with elements and masses of all."""
     from ase.data import atomic_masses, atomic_numbers
 
     if (form := format_of(path)) is not None and form.is_trajectory:
@@ -144,7 +143,7 @@ def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndar
         masses = np.array(
             [known[e] if e in known else atomic_masses[atomic_numbers[e]] for e in elements]
         )
-    return atoms.names, elements, masses, atoms.position
+    return atoms._replace(elements=elements, masses=masses)
 
 
 def _choose(

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, inf
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -48,7 +48,7 @@ EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 1_000_000, 512
 class Sampler(Observer):
     """Keeps snapshots, of which columns are made at the end."""
 
-    remembers: ClassVar[dict[str, Any]] = {"stacked": Arrays}
+    remembers: ClassVar[dict[str, object]] = {"stacked": Arrays}
     ends = True
 
     def __init__(self, interval: float):
@@ -102,7 +102,7 @@ class BodyWatch(Observer):
     exchanged : the largest energy exchanged so far (J), to which errors of the energy are relative
     """
 
-    remembers: ClassVar[dict[str, Any]] = {"exchanged": NotNegative}
+    remembers: ClassVar[dict[str, object]] = {"exchanged": NotNegative}
     ends = True
 
     def __init__(self, run: "Simulation"):
@@ -394,7 +394,9 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             f" {run.integrator.replace('_', ' ')}"
         )
 
-    def start_energy(self) -> dict:
+    def start_energy(
+        self, size: float = 1.0, unit: str = "J", measure_accuracy: bool = False
+    ) -> Json:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the
         body's."""
         self.reset()

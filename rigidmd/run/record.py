@@ -119,7 +119,9 @@ def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
     if read is None:
         raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
     distances = dict(samples.distance_column(k) for k in range(len(scene.fields.restraints)))
-    known = HEADERS | {column.header: name for name, column in distances.items()}
+    lambdas = () if scene.coupling is None else scene.coupling.lambdas
+    more = distances | dict(map(samples.lambda_column, lambdas))
+    known = HEADERS | {column.header: name for name, column in more.items()}
     headers = {known[header]: header for header in read.cells if header in known}
     if lacking := [name for name in ("step", "time", "stage_name") if name not in headers]:
         header = samples.COLUMNS[lacking[0]].header

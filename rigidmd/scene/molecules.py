@@ -12,6 +12,7 @@ from rigidmd.core.toml import Json
 from rigidmd.errors import SceneError, option
 from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
+from rigidmd.scene.coupling import Coupling
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
@@ -159,6 +160,7 @@ class Settings(TypedDict, total=False):
     box: Json
     forces: Json
     fields: Json
+    coupling: Json
     start: Json
     integrators: list[Json]
     stages: list[Json]
@@ -186,6 +188,7 @@ class MolecularScene(Scene):
     molecules: tuple[Molecules, ...] = Field(min_length=1, max_length=MOST_TABLES)
     forces: Forces = Forces.model_construct()
     fields: Fields = Fields.model_construct()
+    coupling: Coupling | None = None
     start: Start = Start.model_construct()
     stages: tuple[Stage, ...] = Field(min_length=1, max_length=MOST_TABLES)
     run: RunSettings = RunSettings.model_construct()
@@ -315,13 +318,29 @@ class MolecularScene(Scene):
         return topology
 
     def _errors(self):
-        if self.structure is None:
-            missing = [k for k, species in enumerate(self.molecules) if species.count is None]
+        frameworks = [species for species in self.molecules if species.repeat is not None]
+        if frameworks and (
+            len(frameworks) > 1
+            or self.structure is not None
+            or not self.box.periodic
+            or self.box.lengths_A is not None
+            or self.box.density_g_cm3 is not None
+        ):
+            yield (
+                "molecules.repeat: the cell of one framework is the box: omit [structure], other"
+                " frameworks, box.lengths_A, box.density_g_cm3 and periodic = false"
+            )
+        elif self.structure is None:
+            missing = [
+                k
+                for k, species in enumerate(self.molecules)
+                if species.count is None and species.repeat is None
+            ]
             yield from [
                 f"molecules.{k}.count is missing (required without a structure file)"
                 for k in missing
             ]
-            if self.box.lengths_A is None and self.box.density_g_cm3 is None:
+            if self.box.lengths_A is None and self.box.density_g_cm3 is None and not frameworks:
                 yield "box needs lengths_A or density_g_cm3, or there must be a structure file"
         elif self.box.density_g_cm3 is not None:
             yield "box.density_g_cm3 and a structure file contradict each other: omit one"

@@ -75,6 +75,9 @@ class Molecules(Section):
     """Residue names of this species in structure files"""
     count: Count | None = None
     """Number of molecules. Required without a structure file"""
+    repeat: tuple[Count, Count, Count] | None = None
+    """Repetitions of the cell of a crystal `file` along a, b, c. Its atoms are one frozen body, a
+    framework, and its repeated cell is the box"""
     frozen: Flag | Numbers = False
     """Molecules that do not move. They act on all others but not on each other. True for all, or
     numbers of some, [1, 2, 5] or "1-10, 15": residue numbers of the structure file, or, without a
@@ -108,6 +111,10 @@ class Molecules(Section):
                 file and not (is_complete or sites or table)
             ),
             "a custom molecule needs a name": sites and not file and self.name is None,
+            "repeat needs the file of a crystal": self.repeat and (is_complete or not file),
+            "repeat makes a framework, which does not move: set frozen = true, and count = 1": (
+                self.repeat and not (self.frozen is True and self.count in (None, 1))
+            ),
         }
         return [fault for fault, is_there in faults.items() if is_there][:1]
 

@@ -6,7 +6,7 @@ import tempfile
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from rigidmd.assemble.build import build
 from rigidmd.core.files import writing
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW, State
+from rigidmd.core.toml import Json
 from rigidmd.engines.external import (
     ERRORS,
     Comparison,
@@ -135,7 +136,7 @@ class Verification(NamedTuple):
         ]
         return "\n".join(parts)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         lines = {
             part: [line._asdict() for line in getattr(self, part)] for part in ("start", "run")
         }

@@ -27,6 +27,7 @@ from rigidmd.errors import OutputError
 from rigidmd.formats import written
 from rigidmd.mechanics.inertia import rotational_freedom
 from rigidmd.run.rigid_fit import Kind
+from rigidmd.scene.validation import not_none
 from rigidmd.units import COULOMB, DEBYE
 
 #: correlation at which the integral of a correlation function is continued by an exponential
@@ -247,12 +248,15 @@ def spectrum(runs: Runs) -> AnalysisResult:
     return result
 
 
-def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[RigidFrames, Kind], Any]]]:
+def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[RigidFrames, Kind], np.ndarray]]]:
     """The velocities of a species by name: mass or moment of inertia, and a function that returns
     their series."""
     name, moments = kind.name, kind.molecule.inertia.tolist()
-    rates: dict[str, Any] = {
-        f"V {name}": (kind.molecule.mass, lambda part, group: part.velocities[:, group.index])
+    rates: dict[str, tuple[float, Callable[[RigidFrames, Kind], np.ndarray]]] = {
+        f"V {name}": (
+            kind.molecule.mass,
+            lambda part, group: not_none(part.velocities)[:, group.index],
+        )
     }
     if kind.molecule.degrees_of_freedom <= 3:
         return rates

@@ -82,7 +82,7 @@ class CompiledEngine(Engine):
 
     def __init__(
         self,
-        model: Any,
+        model: NamedTuple,
         terms: dict[str, NamedTuple],
         setup: Setup,
         python_forces: dict[str, Callable] | None,
@@ -109,13 +109,18 @@ class CompiledEngine(Engine):
         """Name of a term -> its present workspace. Empty before the first use."""
         return dict(zip(self.names, self._workspaces or (), strict=False))
 
-    def change(self, model: Any, terms: dict[str, NamedTuple]) -> None:
+    def change(self, model: NamedTuple, terms: dict[str, NamedTuple]) -> None:
         self.model, self.terms = model, terms
         self._workspaces = None
         self.forget()
 
     def forget(self) -> None:
         self._last.is_current = False
+
+    def renew_lists(self) -> None:
+        """Make the next evaluation independent of earlier ones: it builds all neighbour lists."""
+        for workspace in self._workspaces or ():
+            trait(workspace, "renew_list")()
 
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """The variables of the thermostat and the barostat of a scheme, at rest."""

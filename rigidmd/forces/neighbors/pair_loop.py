@@ -3,7 +3,7 @@ their images, sums energies, virial and forces, and adds the forces to the bodie
 `@implements(pair)` for its NamedTuple, which puts its numbers for each site into the order of the
 slots (`arrange`)."""
 
-from math import inf
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from rigidmd.compile.simd import (
 )
 from rigidmd.core.state import LIST_FULL, OK, TALLY_SIZE
 from rigidmd.forces.neighbors import lists
+from rigidmd.forces.neighbors.clusters import BUILT
 from rigidmd.forces.neighbors.lists import (
     BUILDS,
     MASK_BITS,
@@ -173,6 +174,9 @@ class PairWorkspace(NamedTuple):
         if 3 * lane_count(forces_behind.dtype) * clusters > forces_behind.shape[1]:
             forces_behind = _buffer_behind(pairs, len(forces_behind), int(1.1 * clusters) + 1)
         return self._replace(pairs=pairs, sums=self.sums._replace(forces_behind=forces_behind))
+
+    def renew_list(self) -> None:
+        self.pairs.counters[USABLE], self.pairs.times[BUILT] = 0, nan
 
     def checkpoint_arrays(self) -> dict[str, np.ndarray]:
         return lists.checkpoint_arrays(self.pairs)

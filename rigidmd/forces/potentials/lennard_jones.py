@@ -3,7 +3,7 @@ correction."""
 
 from collections.abc import Callable
 from math import inf, pi
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numba import types
@@ -13,6 +13,8 @@ from rigidmd.compile.simd import inverse, inverse_square_root, load, polynomial,
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.smooth import InverseR6
 from rigidmd.forces.neighbors import pair_loop as pairs
+from rigidmd.forces.neighbors.pair_loop import PairForces
+from rigidmd.forces.neighbors.sites import exclusion_groups
 from rigidmd.forces.parts import (
     InnerPairs,
     Interactions,
@@ -21,8 +23,10 @@ from rigidmd.forces.parts import (
     gather_per_molecule,
     inner_pairs,
     sites_named,
+    sum_of_tails,
 )
 from rigidmd.forces.potentials.screened_coulomb import Screening, dispersion_screening
+from rigidmd.forces.potentials.soft_core import soft_core, tail_of_soft_core
 from rigidmd.forces.potentials.truncation import (
     MINIMUM_TOLERANCE,
     NO_SWITCH,
@@ -170,8 +174,9 @@ def interactions(parts: SystemParts) -> Interactions:
     ]
     if not forces.lennard_jones or not any(len(c) for c in indices):
         return Interactions({}, {})
+    soft = [_is_soft(parts.scene.coupling, m) for m in species]
     entries = [
-        [(m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
+        [(soft[k], m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
         for k, (m, c) in enumerate(zip(species, indices, strict=True))
     ]
     kinds = sorted({entry for of_species in entries for entry in of_species})
@@ -179,12 +184,12 @@ def interactions(parts: SystemParts) -> Interactions:
         np.array([kinds.index(entry) for entry in of_sites], np.int32) for of_sites in entries
     ]
     kind = gather_per_molecule(of_species, index)
-    sigma, epsilon = np.array([entry[:2] for entry in kinds]).T
+    sigma, epsilon = np.array([entry[1:3] for entry in kinds]).T
     special = {
         (i, j): (entry.sigma_A, entry.epsilon_kJ_mol * KJ_PER_MOL)
         for n, entry in enumerate(forces.pairs)
-        for i, (_, _, one) in enumerate(kinds)
-        for j, (_, _, other) in enumerate(kinds)
+        for i, (*_, one) in enumerate(kinds)
+        for j, (*_, other) in enumerate(kinds)
         if one[2 * n] and other[2 * n + 1]
     }
     cutoff = forces.cutoff_A or inf
@@ -211,13 +216,69 @@ def interactions(parts: SystemParts) -> Interactions:
         for m, c in zip(species, indices, strict=True)
     ]
     positions = [m.positions_body[i] for m, i in zip(species, indices, strict=True)]
-    inner = inner_pairs(of_species, positions, parts.counts)
+    notes = _short_cutoff_notes(potential, gather_per_molecule(names, index))
+    inner = None
+    if forces.tail_correction:
+        inner = inner_pairs(of_species, positions, parts.counts)
+    whole = np.array([not entry[0] for entry in kinds])
+    if not whole.all():
+        return _with_soft_core(parts, potential, indices, soft, whole, inner)._replace(notes=notes)
     return Interactions(
         {"lennard_jones": parts.pair_forces(potential, parts.sites(indices))},
         {},
-        tail=tail(potential, inner) if forces.tail_correction else None,
-        notes=_short_cutoff_notes(potential, gather_per_molecule(names, index)),
+        tail=None if inner is None else tail(potential, inner),
+        notes=notes,
     )
+
+
+def _is_soft(coupling: Any, molecule: Any) -> bool:
+    """Whether [coupling] gives a molecule a soft core."""
+    if coupling is None or molecule.name != coupling.species:
+        return False
+    return coupling.lennard_jones < 1
+
+
+def _with_soft_core(
+    parts: SystemParts,
+    potential: LennardJones,
+    indices: list[np.ndarray],
+    soft: list[bool],
+    whole: np.ndarray,
+    inner: InnerPairs | None,
+) -> Interactions:
+    """Lennard-Jones forces between the sites without a soft core, and those of all others.
+
+    potential, indices : of all sites, by species
+    soft : whether each species has a soft core; whole : whether each kind has none, these first
+    inner : the pairs inside molecules, None without tail corrections
+    """
+    forces, sites = parts.scene.forces, parts.sites(indices)
+    is_whole = ~np.array(soft)[parts.model.species]
+    kinds = int(whole.sum())
+    softened = soft_core(
+        potential.c12,
+        potential.c6,
+        potential.kind,
+        ~whole,
+        parts.scene.coupling.lennard_jones,
+        potential.truncation,
+        forces.truncation,
+    )
+    # one group of all molecules without a soft core, which have no pairs here
+    terms = {"soft_core": PairForces(softened, sites, exclusion_groups(sites, is_whole))}
+    tails = [] if inner is None else [tail_of_soft_core(softened, inner)]
+    if kinds:
+        rest = potential._replace(
+            kind=potential.kind[whole[potential.kind]],
+            c12=potential.c12[:kinds, :kinds],
+            c6=potential.c6[:kinds, :kinds],
+        )
+        of_rest = [c[: 0 if one else None] for c, one in zip(indices, soft, strict=True)]
+        terms["lennard_jones"] = parts.pair_forces(rest, parts.sites(of_rest))
+        if inner is not None:
+            inside = InnerPairs(*(column[whole[inner.one]] for column in inner))
+            tails.append(tail(rest, inside))
+    return Interactions(terms, {}, tail=sum_of_tails([one for one in tails if one is not None]))
 
 
 def _sites_of_pairs(parts: SystemParts) -> list[np.ndarray]:

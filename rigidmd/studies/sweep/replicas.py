@@ -1,13 +1,13 @@
 """Analyses of all runs of a sweep: of each run, and of replicas together with errors from their
 scatter."""
 
-import csv
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_frames
+from rigidmd.analysis.free_energy import NAME as FREE_ENERGY
 from rigidmd.analysis.mean_force import NAME as MEAN_FORCE
 from rigidmd.analysis.registry import check_options, selected
 from rigidmd.analysis.result import AnalysisResult
@@ -17,6 +17,7 @@ from rigidmd.core.files import writing
 from rigidmd.errors import OutputError, RigidMDError
 from rigidmd.io.folder import add_to_folder
 from rigidmd.run.record import read_record
+from rigidmd.studies.sweep.coupling import is_of_coupling, write_free_energy
 from rigidmd.studies.sweep.figure import write_analyses_figure
 from rigidmd.studies.sweep.folder import (
     Manifest,
@@ -29,7 +30,11 @@ from rigidmd.studies.sweep.table import SweepRow, Table, measured_values, report
 from rigidmd.studies.sweep.windows import is_of_windows, write_mean_force
 
 ANALYSES = "analysis.csv"
-WINDOWS = "all windows"  # title of the combination of all windows of a restrained distance
+#: Analysis of all points together -> title, whether a sweep has it by default, and what makes it.
+OF_SWEEPS = {
+    MEAN_FORCE: ("all windows", is_of_windows, write_mean_force),
+    FREE_ENERGY: ("all points", is_of_coupling, write_free_energy),
+}
 
 Progress = Callable[[float, str], object]
 Analyse = Callable[..., AnalysisOutput]
@@ -55,7 +60,7 @@ def analyse_sweep(
     viscosity: float | None,
     progress: Progress,
     figures: str = FIGURES[0],
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
 ) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 
@@ -70,16 +75,23 @@ def analyse_sweep(
             f"{folder}: no point of this sweep has finished yet. `rigidmd sweep` continues it"
         )
     combinations = []
-    if names != [MEAN_FORCE]:
-        others = [name for name in names if name != MEAN_FORCE]
+    others = [name for name in names if name not in OF_SWEEPS]
+    if others or not names:
         check_options(selected(others), options or {})
         analyse = partial(
             analyse_frames, names=others, viscosity=viscosity, figures=figures, options=options
         )
         combinations = _analyse_combinations(manifest, start, analyse, progress)
-    if MEAN_FORCE in names or (not names and is_of_windows(manifest)):
-        result, files = write_mean_force(manifest, figures)
-        combinations.append(Combination(WINDOWS, len(finished), [result], {}, files))
+    for name, (title, is_default, write) in OF_SWEEPS.items():
+        if name not in names and (names or not is_default(manifest)):
+            continue
+        try:
+            result, files = write(manifest, figures)
+            combinations.append(Combination(title, len(finished), [result], {}, files))
+        except OutputError as error:
+            if name in names:
+                raise
+            combinations.append(Combination(title, len(finished), [], {name: str(error)}, []))
     if not any(combination.results for combination in combinations):
         reasons = [reason for each in combinations for reason in each.failed.values()]
         raise OutputError(
@@ -114,7 +126,7 @@ def _analyse_combinations(
     table.keys[:] = table.rows[0].values
     if table.columns:
         add_to_folder(manifest.folder, [ANALYSES])
-        report_of(table.lines()).write(manifest.folder / ANALYSES, csv.QUOTE_NONNUMERIC)
+        report_of(table.lines()).write(manifest.folder / ANALYSES, quote_text=True)
     if table.keys and len(table) > 1:
         write_analyses_figure(table, manifest.name)
     return combinations

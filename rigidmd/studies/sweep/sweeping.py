@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from rigidmd.assemble.user_code.trust import trust as trust_file
 from rigidmd.compile.machine import MOST_THREADS
@@ -124,7 +123,7 @@ def jobs_and_threads(count: int, jobs: int | None, threads: int | None) -> tuple
 
 def sweep(
     scene: str | Path,
-    sets: Mapping[str, Any],
+    sets: Mapping[str, object],
     folder: str | Path | None = None,
     *,
     jobs: int | None = None,

@@ -1,17 +1,21 @@
 """The windows of a sweep over a restrained distance, and their potential of mean force."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from rigidmd.analysis.files import write_results
 from rigidmd.analysis.mean_force import Window, potential_of_mean_force
 from rigidmd.analysis.result import AnalysisResult
 from rigidmd.analysis.rigid_frames import production_samples
+from rigidmd.core.toml import Json
 from rigidmd.engines.samples import distance_column
 from rigidmd.errors import OutputError
-from rigidmd.run.record import read_record
+from rigidmd.run.record import Record, read_record
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.studies.sweep.folder import SEED, Manifest, read_manifest
 from rigidmd.studies.sweep.table import Table
@@ -50,7 +54,7 @@ def write_mean_force(manifest: Manifest, figures: str) -> tuple[AnalysisResult, 
     return result, write_results(manifest.folder, used, [result], {}, figures)
 
 
-def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, dict[str, Any]]:
+def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, Json]:
     """The potential of mean force, and the samples used, as analysis.json has them."""
     folder, points = manifest.folder, manifest.points_in("finished")
     if not points:
@@ -73,21 +77,43 @@ def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, dict[str, Any]]:
     )
     if len({*temperatures}) > 1:
         raise OutputError(f"{folder}: the windows have different temperatures")
-    used = uses[-1] | {
+    thermal_energy = BOLTZMANN * temperatures[0] / KJ_PER_MOL
+    return potential_of_mean_force(windows, thermal_energy), used_together(uses)
+
+
+def production_of(folder: Path) -> tuple[Record, Stage, np.ndarray]:
+    """A run of molecules, its last stage and which samples are of production. Raises
+    OutputError."""
+    record = read_record(folder)
+    if not isinstance(record.scene, MolecularScene):
+        raise OutputError(f"{folder} is a run of a single body, which has no molecules")
+    return record, *production_samples(record)
+
+
+def used_samples(record: Record, stage: Stage, production: np.ndarray) -> Json:
+    """The samples used, as analysis.json has them."""
+    time = record.time[production]
+    return {
+        "stage": stage.label,
+        "from_ps": float(time[0]),
+        "to_ps": float(time[-1]),
+        "frames": len(time),
+        "notes": [],
+    }
+
+
+def used_together(uses: Sequence[Json]) -> Json:
+    """The samples used of several runs."""
+    return uses[-1] | {
         "from_ps": min(use["from_ps"] for use in uses),
         "to_ps": max(use["to_ps"] for use in uses),
         "frames": sum(use["frames"] for use in uses),
     }
-    thermal_energy = BOLTZMANN * temperatures[0] / KJ_PER_MOL
-    return potential_of_mean_force(windows, thermal_energy), used
 
 
-def _window(folder: Path, k: int) -> tuple[Window, float, dict[str, Any]]:
+def _window(folder: Path, k: int) -> tuple[Window, float, Json]:
     """The window of a run, its temperature (K), and the samples used."""
-    record = read_record(folder)
-    if not isinstance(record.scene, MolecularScene):
-        raise OutputError(f"{folder} is a run of a single body, which has no distances")
-    stage, production = production_samples(record)
+    record, stage, production = production_of(folder)
     name, column = distance_column(k)
     if name not in record.columns:
         problem = f"fields.restraints.{k} has no `between`"
@@ -96,15 +122,7 @@ def _window(folder: Path, k: int) -> tuple[Window, float, dict[str, Any]]:
         raise OutputError(
             f"{folder}: the windows need a last stage at constant temperature and volume (nvt)"
         )
-    restraint = record.scene.fields.restraints[k]
+    restraint = record.system.scene.fields.restraints[k]
     samples = record.columns[name][production]
     window = Window(not_none(restraint.distance_A), restraint.stiffness[0], samples)
-    time = record.time[production]
-    used = {
-        "stage": stage.label,
-        "from_ps": float(time[0]),
-        "to_ps": float(time[-1]),
-        "frames": len(time),
-        "notes": [],
-    }
-    return window, float(stage.temperatures[1]), used
+    return window, float(stage.temperatures[1]), used_samples(record, stage, production)
