@@ -118,7 +118,7 @@ def second_virial(
         Requested standard error of each coefficient, cm³/mol; default: 0.1 % of the larger of |B2|
         and |T dB2/dT|
     forces
-        Pair potentials made by `rigidmd.pair_potential`
+        Potentials made by `rigidmd.pair_potential` and `rigidmd.body_pair_potential`
     settings
         Keys of a scene with their values, such as {"forces.mixing": "geometric"}
     seed
