@@ -163,8 +163,8 @@ def _not_computed(r: Any, a: Any, b: Any) -> Any:
 
 
 def potentials_of_stored_run(scene: MolecularScene) -> dict[str, BodyPairPotential]:
-    """The potentials of [[forces.bodies]] with bodies, axes and shapes, without energies of texts and
-    tables, and without modules. Raises SceneError."""
+    """The potentials of [[forces.bodies]] with axes and shapes of bodies, without energies of texts
+    and tables, and without modules. Raises SceneError."""
     potentials = {}
     for where, entry in scene.forces.added.items():
         if not isinstance(entry, BodyForce) or entry.module is not None:
