@@ -536,7 +536,7 @@ def test_energy_is_conserved_with_the_order_of_the_integrator():
 
 #: Eight rods without a box or a cutoff, whose energy has all derivatives.
 CLUSTER = {
-    "box": {"lengths_A": 60.0, "periodic": False},
+    "box": {"lengths_A": 24.0, "periodic": False},
     "molecules": [body("rod", 8)],
     "forces": {"bodies": [{"potential": "gay_berne", "parameters": {"rod": ROD}}]},
     "start": {"temperature_K": 60.0},

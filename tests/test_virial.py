@@ -243,6 +243,11 @@ def segments(r, u, v, half=0.5):
     return least
 
 
+def repulsion(n):
+    """(1/d)^n, kJ/mol."""
+    return lambda r, u, v: segments(r, u, v) ** (-n / 2)
+
+
 def test_steep_spherocylinders_tend_to_hard_ones(tmp_path):
     """A repulsion (D/d)^n of the distance of segments with L = D = 1, at kT = 1: closed forms, and
     the limit of hard spherocylinders, 6.02138591938044 (FEASST)."""
@@ -254,9 +259,7 @@ def test_steep_spherocylinders_tend_to_hard_ones(tmp_path):
     temperature = KJ_PER_MOL / BOLTZMANN
     powers, found, errors = (20, 40, 80), [], []
     for n in powers:
-        potential = rigidmd.body_pair_potential(
-            lambda r, u, v, n=n: segments(r, u, v) ** (-n / 2), axis="z"
-        )
+        potential = rigidmd.body_pair_potential(repulsion(n), axis="z")
         result = second_virial(
             str(tmp_path / "rod.toml"),
             temperatures=[temperature],

@@ -524,7 +524,8 @@ def _contents(
 
 
 def _formula(text: str) -> dict[str, float]:
-    """Numbers of atoms in a formula such as C6 H6. Empty if it is unreadable."""
+    """Numbers of atoms in a formula such as C6 H6. The result is empty if the formula is
+    unreadable."""
     words = [re.fullmatch(r"([A-Z][a-z]?)(\d*\.?\d*)", word) for word in text.split()]
     if not all(words):
         return {}

@@ -34,6 +34,7 @@ from rigidmd.units import ENERGY_UNITS
 if TYPE_CHECKING:
     import ase
     from ase import Atoms as AseAtoms
+    from ase.io.trajectory import TrajectoryWriter
 
 EV = ENERGY_UNITS["eV"]
 
@@ -425,7 +426,7 @@ class TrajFile(FrameFile):
             np.array([frame.time, float(frame.step)]),
         ]
 
-    def _open(self, path: Path, mode: str) -> Any:
+    def _open(self, path: Path, mode: str) -> "TrajectoryWriter":
         from ase.io.trajectory import TrajectoryWriter  # slow to import
 
         return TrajectoryWriter(path, mode)

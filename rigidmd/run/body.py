@@ -97,7 +97,7 @@ def energies_of(system: BodySystem, state: State) -> dict[str, float]:
 
 
 class BodyWatch(Observer):
-    """Checks the state against the limits of the scene, independent of the interval of samples.
+    """Checks the state against the limits of the scene, independent of the sample interval.
 
     exchanged : the largest energy exchanged so far (J), to which errors of the energy are relative
     """
@@ -312,7 +312,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         return self._segments[k]
 
     def _equal_step_segments(self) -> list[Segment]:
-        """Segments between the breaks of functions of time, in equal steps no longer than the
+        """Segments between the breaks in functions of time, in equal steps no longer than the
         timestep of the scene."""
         run = self.scene.run
         segments, steps = [], 0
@@ -394,7 +394,9 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             f" {run.integrator.replace('_', ' ')}"
         )
 
-    def start_energy(self) -> dict:
+    def start_energy(
+        self, size: float = 1.0, unit: str = "J", measure_accuracy: bool = False
+    ) -> Json:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the
         body's."""
         self.reset()

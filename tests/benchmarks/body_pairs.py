@@ -1,4 +1,4 @@
-"""Gay-Berne rods at constant energy: steps/s beside LAMMPS from the same state, in turns, and what
+"""Gay-Berne rods at constant energy: steps/s next to LAMMPS from the same state, in turns, and what
 derived forces cost compared with forces by hand.
 
     python tests/benchmarks/body_pairs.py [--rounds 7] [--steps 200] [--threads 2]
