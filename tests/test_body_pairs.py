@@ -18,6 +18,7 @@ from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
 from rigidmd.compile import kernel
 from rigidmd.core.statistics import slope
+from rigidmd.engines.body_pairs import bodies_of_potentials
 from rigidmd.errors import SceneError
 from rigidmd.figures.space import View, camera
 from rigidmd.figures.style import new_figure
@@ -614,6 +615,11 @@ def test_a_text_has_the_same_energy_as_its_function():
             {"potential": "gay_berne", "energy": "1/r"},
             "give one of potential, energy, table and module",
         ),
+        (
+            {"potential": "gay_berne", "parameters": {"rod": ROD | {"width_A": -4.0}}},
+            "width_A of rod is -4, must be above 0",
+        ),
+        (GAY_BERNE | {"options": {"mu": 0.0}}, "mu of options is 0, must be above 0"),
         ({"energy": "1/r +"}, "is not a formula"),
         ({"energy": "k/r"}, "no species has the parameter k"),
         (GAY_BERNE | {"cutoff_A": 30.0}, "longer than half an edge of the box"),
@@ -628,6 +634,24 @@ def test_a_text_has_the_same_energy_as_its_function():
 def test_what_is_wrong_with_a_potential_is_told(tables, message, tmp_path):
     with pytest.raises(SceneError, match=message):
         build(scene(tables))
+
+
+def test_pairs_at_a_cutoff_where_the_energy_jumps_are_no_wrong_force():
+    """Two rods at a distance of exactly the cutoff; a wrong force is found there too."""
+    places = {"box": {"lengths_A": 48.0}, "molecules": [body("rod", 64)]}
+    tables = GAY_BERNE | {"parameters": {"rod": ROD}, "references": {}}
+    right = simulation(tables | {"cutoff_A": 12.0, "truncation": "plain"}, **places)
+    right._start()
+    distances = np.linalg.norm(right.state.position[0] - right.state.position[1:], axis=1)
+    assert np.abs(distances - 12.0).min() < 1e-9
+
+    def wrong(r, u, v):
+        s = np.sqrt(r @ r)
+        return 100 / s**6, 100 * r / s**8, 0 * u, 0 * v
+
+    potential = rigidmd.body_pair_potential(wrong, axis="z", cutoff_A=12.0, truncation="plain")
+    with pytest.raises(SceneError, match="is not the derivative of the energy"):
+        Simulation(scene(None, **places), forces=[potential]).run()
 
 
 def test_bodies_that_do_not_rotate_have_no_such_potential():
@@ -692,6 +716,29 @@ def test_bodies_are_drawn_as_ellipsoids_where_they_are():
     assert (row / image.shape[0] - 0.5) * 20 == pytest.approx(
         np.hypot(6 * np.cos(0.7), 2 * np.sin(0.7)), abs=0.05
     )
+
+
+def test_potentials_of_python_are_drawn_like_those_of_scenes():
+    """Also those of a stored run, whose energies are not computed."""
+    potential = rigidmd.body_pair_potential(
+        GayBerne(),
+        GAY_BERNE["parameters"],
+        axis="z",
+        references=GAY_BERNE["references"],
+        cutoff_A=15.0,
+    )
+    expected = solids_of(build(scene(GAY_BERNE)))
+    systems = [
+        build(scene(None).with_user_code([potential])),
+        build(scene(GAY_BERNE), user_code=False),
+    ]
+    for solids in map(solids_of, systems):
+        assert expected is not None and solids is not None
+        for one, other in zip(solids, expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+    text = {"energy": "exp(-r)*a_b**2", "name": "aligning", "axis": "x"}
+    (bodies, _) = bodies_of_potentials(build(scene(text), user_code=False))
+    assert bodies.potential.axis == "x" and bodies.species.name == "rod"
 
 
 # --- tables ---------------------------------------------------------------------------------------

@@ -351,7 +351,7 @@ def _rigid_frames(
             f" {last:g} ps"
         )
     elif start < first:
-        notes.append(f"frames before {first:g} ps are of an earlier stage")
+        notes.append(f"frames before {first:g} ps belong to an earlier stage")
     if not stage.keeps_momentum:
         notes.append(
             f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and"

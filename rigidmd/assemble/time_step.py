@@ -210,7 +210,7 @@ def step_warnings(scene: MolecularScene) -> list[str]:
                 f" {forces.truncation!r}"
             )
             advice = "Use truncation = 'smooth_switch'"
-            warnings.append(f"stages.{k}: {stage.integrator} is of order {order}, {lost}. {advice}")
+            warnings.append(f"stages.{k}: {stage.integrator} has order {order}, {lost}. {advice}")
     return [*warnings, *_sentences_on_steps(scene, _step_warning)]
 
 

@@ -44,7 +44,7 @@ from rigidmd.commands.arguments import (
         type=int,
         default=3,
         metavar="N",
-        help="number of timings of each run (default: 3). With 1 their spread is not known",
+        help="number of timings of each run (default: 3). One timing shows no spread",
     ),
     flag(
         "--averages",

@@ -131,7 +131,7 @@ def read_geometry(path: Path) -> Atoms:
 
     if (form := format_of(path)) is not None and form.is_trajectory:
         raise structure_error(
-            path, "is a trajectory: name a structure file, or write a frame of it as one"
+            path, "is a trajectory: name a structure file, or write one of its frames as a file"
         )
     atoms = read_atoms(path)
     elements = [

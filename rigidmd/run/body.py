@@ -160,7 +160,7 @@ class BodyWatch(Observer):
         if error <= limits.energy * scale:
             return None
         return FailedCheck(
-            f"the energy less the work done changed by {error:.3g} J,"
+            f"the energy minus the work done changed by {error:.3g} J,"
             f" {error / scale if scale else inf:.3g} of all energy exchanged (watch.energy ="
             f" {limits.energy:g})"
         )

@@ -108,6 +108,6 @@ def _check_same_orientation(system: System, state: State, first: int, other: int
     if distance.min(axis=1).max() > SAME_ROTATION * max(molecule.radius, system.smallest_diameter):
         raise SimulationError(
             f"molecules {first + 1} and {other + 1} are at equal positions in their unit cells and"
-            " have different orientations: the crystal has not the period of its unit cell, so it"
+            " have different orientations: the crystal lacks the period of its unit cell, so it"
             " has no modes at its Gamma point"
         )
