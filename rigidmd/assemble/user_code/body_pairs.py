@@ -157,7 +157,7 @@ def potential_of_scene(
     )
 
 
-def _not_computed(r: Any, a: Any, b: Any) -> Any:
+def _not_computed(r: object, a: object, b: object) -> float:
     """The energy of a text or a table in a stored run."""
     raise NotImplementedError
 
