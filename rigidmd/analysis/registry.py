@@ -50,8 +50,8 @@ KNOWN: dict[str, Analysis] = {}
 def built_in(
     about: str, position: float = inf, on_request: bool = False
 ) -> Callable[[Function], Function]:
-    """Register a built-in analysis under the name of its function of `Runs`, which takes the frames
-    of one run too."""
+    """Register a built-in analysis under its function's name in `Runs`, which takes the frames of
+    one run too."""
 
     def add(function: Function) -> Function:
         @wraps(function)

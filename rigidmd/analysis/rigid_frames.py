@@ -318,7 +318,7 @@ def production_samples(record: Record) -> tuple[Stage, np.ndarray]:
 
 def earlier_production(record: Record) -> Iterator[tuple[Stage, np.ndarray]]:
     """The stages of motion before the last one whose set points do not change, and which samples
-    are of the equilibrated part of each. Raises OutputError."""
+    belong to their equilibrated parts. Raises OutputError."""
     columns, last = record.columns, _last_stage(record.system, record.columns)[0]
     for k, stage in enumerate(record.system.scene.stages):
         if stage is last:
@@ -351,7 +351,7 @@ def _rigid_frames(
             f" {last:g} ps"
         )
     elif start < first:
-        notes.append(f"frames before {first:g} ps are of an earlier stage")
+        notes.append(f"frames before {first:g} ps belong to an earlier stage")
     if not stage.keeps_momentum:
         notes.append(
             f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and"

@@ -21,8 +21,7 @@ Measured = tuple[np.ndarray, np.ndarray]
 class Runs:
     """The frames of independent runs of one system. At least one.
 
-    Averages are over the frames of all runs, and limits of length apply to the sum of their
-    lengths.
+    Averages are over the frames of all runs, and minimum lengths apply to their total length.
     """
 
     members: tuple[RigidFrames, ...]

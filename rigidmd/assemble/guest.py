@@ -152,7 +152,7 @@ class Guest:
         position: np.ndarray,
         rotation: np.ndarray,
     ) -> None:
-        """Add the energies of a term of pairs to those of trials."""
+        """Add the energies of a pair term to the trial energies."""
         offset, owner = term.sites.offsets(), term.sites.molecule
         is_guest = owner == len(self._host)
         fixed = self._without.positions_of(host, owner[~is_guest], offset[~is_guest])

@@ -215,7 +215,7 @@ def _start_lattice(
 
 
 def _lattice_shape(edges: np.ndarray, n: int) -> np.ndarray:
-    """Numbers of points (3,) along edges (3,) of a nearly cubic lattice of at least n points.
+    """Numbers of points (3,) along edges (3,), for a nearly cubic lattice with at least n points.
 
     An edge shorter than half the spacing has one point, and the other edges set the spacing.
     """

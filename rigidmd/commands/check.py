@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene
+from rigidmd.commands.arguments import SCENE, Options, add_engine, command, flag, read_scene
 from rigidmd.commands.streams import warn
 from rigidmd.errors import SceneError
 
@@ -17,18 +17,13 @@ if TYPE_CHECKING:
     "rigidmd check water_nitrogen.toml",
     *SCENE,
     add_engine,
-    argument(
+    flag(
         "--program",
-        action="store_true",
         help="also print the rows of a step: what is done, in which order, on how many blocks",
     ),
-    argument(
+    flag(
         "--profile",
-        action="store_true",
-        help=(
-            "also measure how much of the time of a step each row of the forces takes, from the"
-            " start"
-        ),
+        help="also measure which fraction of a step each row of the forces takes, from the start",
     ),
 )
 def _check(options: Options) -> int:

@@ -2,7 +2,7 @@
 
 import json
 
-from rigidmd.commands.arguments import SCENE, Options, argument, command, read_scene
+from rigidmd.commands.arguments import SCENE, Options, argument, command, flag, read_scene
 from rigidmd.core.toml import Json
 
 
@@ -16,12 +16,8 @@ from rigidmd.core.toml import Json
         choices=["kJ/mol", "kcal/mol", "eV", "K"],
         help="unit of energy (kJ/mol; J for a body)",
     ),
-    argument("--json", action="store_true", help="print JSON"),
-    argument(
-        "--accuracy",
-        action="store_true",
-        help="also measure the error of the Coulomb forces (Ewald sums and PME)",
-    ),
+    flag("--json", help="print JSON"),
+    flag("--accuracy", help="also measure the error of the Coulomb forces (Ewald sums and PME)"),
 )
 def _energy(options: Options) -> int:
     from rigidmd.errors import SceneError

@@ -113,8 +113,8 @@ class Scheme(_SchemeFields):
         )
 
     def with_piston(self, piston: tuple) -> "Scheme":
-        """This scheme, a composition of Verlet steps, with a volume that has inertia: kicks of the
-        volume around the kicks of each step, changes of it around the drift. See the theory chapter
+        """This scheme, a composition of Verlet steps, with a volume that has inertia: volume kicks
+        around the kicks of each step, and volume changes around the drift. See the theory chapter
         `sampling`."""
         steps, flows = self.drifts, []
         for before, after in pairwise((0.0, *steps, 0.0)):

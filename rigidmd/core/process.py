@@ -59,7 +59,7 @@ def without_local_settings() -> Iterator[None]:
 
 
 def python_process(*arguments: str) -> Json:
-    """Arguments of `subprocess.Popen` for a process of Python with the search path of this one.
+    """Arguments of `subprocess.Popen` for a Python process with the search path of this process.
 
     The process does not import from the working directory (`-P`), where a file of others may be
     called `json.py`. It finds this package in any case.
@@ -91,7 +91,7 @@ def free_memory() -> float:
 
 
 def memory_shortage(needed: float, what: str) -> str:
-    """Why `what` cannot have this many bytes of memory. Empty if it can."""
+    """Why `what` cannot have this many bytes of memory, or an empty text if it can."""
     free = free_memory()
     if needed <= (1 - RESERVED) * free:
         return ""

@@ -111,9 +111,9 @@ def impossible_values(data: object) -> list[tuple[list, str]]:
     return errors
 
 
-def shorten_text(text: str, most: int = 80) -> str:
-    """A text, without its middle if it is longer than `most` characters."""
-    return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"
+def shorten_text(text: str) -> str:
+    """A text, without its middle if it is longer than 80 characters."""
+    return text if len(text) <= 80 else f"{text[:40]}...{text[-20:]}"
 
 
 def shorten_repr(value: object) -> str:

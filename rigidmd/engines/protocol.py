@@ -126,7 +126,7 @@ class Engine(Protocol):
         step."""
 
     def change(self, model: NamedTuple, terms: dict[str, NamedTuple]) -> None:
-        """Continue with a model and terms of the same types, as at a kink of prescribed functions
+        """Continue with a model and terms of the same types, as at a kink in prescribed functions
         of time."""
         raise TypeError(f"{self.version} cannot change its forces")
 

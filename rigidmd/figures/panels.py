@@ -61,7 +61,7 @@ class Panel(NamedTuple):
         return max(1, int(width / (0.45 + LETTER * longest)))
 
     def head(self, width: float) -> tuple[list[str], int]:
-        """Lines of the title above an axis of this width, and the number of rows of the legend."""
+        """Lines of the title above an axis with this width, and the number of legend rows."""
         labels = sum(bool(label) for label, _ in self.curves)
         rows = -(-labels // self.columns(width)) if labels > 1 else 0
         return wrap(self.title, int(width / LETTER)), rows

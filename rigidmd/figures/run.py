@@ -54,7 +54,7 @@ def energy_figure(system: "System", samples: SampleTable, summary: Json) -> "Pic
             (
                 times,
                 Panel(
-                    "energies less their means in the last stage (kJ/mol per molecule)", energies
+                    "energies minus their means in the last stage (kJ/mol per molecule)", energies
                 ),
             )
         ],

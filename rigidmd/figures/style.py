@@ -153,14 +153,14 @@ def thin_series(
 def largest_of_parts(
     time: np.ndarray, values: np.ndarray, bins: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A long series of errors reduced to the largest value of each of its parts."""
+    """A long series of errors reduced to the largest value in each part."""
     size = -(-len(time) // bins)
     return time[::size], np.fmax.reduceat(values, np.arange(0, len(time), size))
 
 
 def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | None:
-    """Limits of the axis of a curve (n,): the range of the second halves of the stages, and as much
-    above and below, as the starts of stages would flatten the rest. None if the range is 0."""
+    """Limits of the axis of a curve (n,): the range in the second halves of the stages, and as much
+    above and below, because the starts of stages would flatten the rest. None if the range is 0."""
     late = np.concatenate(
         [part[len(part) // 2 :] for part in (values[stage == k] for k in np.unique(stage))]
     )

@@ -95,7 +95,7 @@ def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
-    """Edges of the convex hull of points in space, in a plane or on a line, the outline of a solid.
+    """Convex-hull edges for points in space, in a plane or on a line: the outline of a solid.
     Points inside, and those between the corners of a side, have none."""
     if len(points) < 2:
         return np.zeros((0, 2), int)

@@ -311,7 +311,7 @@ def _check_order(path: Path, sites: AtomSites) -> None:
         "in which every site is occupied or left out (for ices, GenIce makes proton-disordered"
         " ones)"
     )
-    consequence = "so that molecules are unknown. Give one arrangement of it"
+    consequence = "so that molecules are unknown. Choose one arrangement of it"
     raise structure_error(path, f"{disorder}: the crystal is disordered, {consequence}, {hint}")
 
 
@@ -389,7 +389,7 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
     is_listed = used.what == LISTED
     if contradicting and not is_listed:
         what = " and ".join([used.what, *(other.what for other in contradicting)])
-        advice = f"correct one of them, or give the operations ({OPERATIONS[0]})"
+        advice = f"correct one of them, or list the operations ({OPERATIONS[0]})"
         raise structure_error(path, f"{what} contradict each other: {advice}")
     operations = settings[0].operations
     notes = [_described(settings, used)]
@@ -524,7 +524,8 @@ def _contents(
 
 
 def _formula(text: str) -> dict[str, float]:
-    """Numbers of atoms in a formula such as C6 H6. Empty if it is unreadable."""
+    """Numbers of atoms in a formula such as C6 H6. The result is empty if the formula is
+    unreadable."""
     words = [re.fullmatch(r"([A-Z][a-z]?)(\d*\.?\d*)", word) for word in text.split()]
     if not all(words):
         return {}

@@ -1,5 +1,5 @@
-"""Base of the trajectory files of molecules that a library writes with a table of frames inside the
-file (GSD, ASE)."""
+"""Base for trajectory files of molecules that a library writes with a frame table inside the file
+(GSD, ASE)."""
 
 import contextlib
 import zlib

@@ -55,7 +55,7 @@ class Particles(NamedTuple):
 
     @property
     def site_masses(self) -> np.ndarray | None:
-        """Masses of the sites (s,), if those of each body add up to the mass of its central
+        """Masses of the sites (s,), if the masses in each body add up to the mass of its central
         particle: HOOMD does not use masses of constituents, which may have any value."""
         sites, body = self.sites, self.owner[self.sites]
         total = np.bincount(body, self.mass[sites], len(self.owner))

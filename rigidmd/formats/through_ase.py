@@ -145,7 +145,7 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
             " ones)"
         )
         raise structure_error(
-            path, f"{disorder}, so that molecules are unknown. Give one arrangement of it, {hint}"
+            path, f"{disorder}, so that molecules are unknown. Choose one arrangement of it, {hint}"
         )
     velocity = atoms.get_velocities() * ASE_VELOCITY if atoms.has("momenta") else None
     if velocity is not None and not np.isfinite(velocity).all():

@@ -1,9 +1,9 @@
 """Frames in the formats of MDAnalysis: the file of one frame by its writers, and reading in another
 process.
 
-Its binary trajectories have no names of atoms: XTC and TRR of GROMACS, DCD of CHARMM and NAMD,
-NetCDF of AMBER. XTC has positions to 0.001 nm, TRR and NetCDF velocities too. DCD stores one time
-between all frames.
+Its binary trajectories have no names of atoms: XTC and TRR (GROMACS), DCD (CHARMM and NAMD), NetCDF
+(AMBER). XTC has positions to 0.001 nm, TRR and NetCDF velocities too. DCD stores one time between
+all frames.
 """
 
 import contextlib

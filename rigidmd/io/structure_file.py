@@ -38,7 +38,7 @@ def read_atoms(
     topology: Path | None = None,
     content: bytes | None = None,
 ) -> Atoms:
-    """The atoms of a file, or of one of several structures in it. Raises StructureError.
+    """The atoms in a file, or in one of its structures. Raises StructureError.
 
     frame: 1 for the first, -1 for the last. None for the only structure of a file, or the last of a
     trajectory. atom_types: names of types, for formats with types. topology: a file with the names
@@ -84,8 +84,8 @@ def read_atoms(
 
 
 def _without_placeholder(atoms: Atoms) -> Atoms:
-    """The atoms without a cell that stands for none: a cell of no volume, or the cube of 1 Å of
-    PDB."""
+    """The atoms without a cell that stands for none: a cell without volume, or the cube of 1 Å in
+    PDB files."""
     if atoms.cell is None:
         return atoms
     longest = np.linalg.norm(atoms.cell, axis=1).max()
@@ -131,7 +131,7 @@ def read_geometry(path: Path) -> Atoms:
 
     if (form := format_of(path)) is not None and form.is_trajectory:
         raise structure_error(
-            path, "is a trajectory: name a structure file, or write a frame of it as one"
+            path, "is a trajectory: name a structure file, or write one of its frames as a file"
         )
     atoms = read_atoms(path)
     elements = [

@@ -117,7 +117,7 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
 
 
 def read_times(path: Path, sites: int) -> np.ndarray:
-    """Times (f,) of the frames of a trajectory, ps, without the rounding of files. For errors see
+    """Times (f,) of the trajectory frames, ps, without the rounding of files. For errors see
     `read_frames`."""
     return without_rounding(np.array(_read(_times, path, sites)))
 

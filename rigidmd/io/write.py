@@ -108,7 +108,6 @@ class Column(NamedTuple, Generic[Row]):
 def with_error(
     header: str,
     measured: Callable[[Row], tuple[Cell, Cell] | None],
-    error_header: str = "±",
 ) -> list[Column[Row]]:
     """Columns of a value and its error. measured(row) : both, or None"""
 
@@ -117,7 +116,7 @@ def with_error(
 
     return [
         Column(header, lambda row: pair(row)[0]),
-        Column(error_header, lambda row: pair(row)[1]),
+        Column("±", lambda row: pair(row)[1]),
     ]
 
 

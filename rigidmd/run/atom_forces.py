@@ -2,10 +2,10 @@
 molecule.
 
 `gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's
-force and torque, minus the gradient of the energy as a function of atoms to which rigid molecules
-are fitted. The guide `ase` has the formula. `site_forces`: each atom has the forces on its site.
-Forces on massless sites are distributed over the atoms. Forces inside molecules are included.
-Constraints have to balance them.
+force and torque, minus the energy gradient for atoms to which rigid molecules are fitted. The guide
+`ase` has the formula. `site_forces`: each atom has the forces on its site. Forces on massless sites
+are distributed over the atoms. Forces inside molecules are included. Constraints have to balance
+them.
 """
 
 import contextlib

@@ -97,7 +97,7 @@ def energies_of(system: BodySystem, state: State) -> dict[str, float]:
 
 
 class BodyWatch(Observer):
-    """Checks the state against the limits of the scene, independent of the interval of samples.
+    """Checks the state against the limits of the scene, independent of the sample interval.
 
     exchanged : the largest energy exchanged so far (J), to which errors of the energy are relative
     """
@@ -160,7 +160,7 @@ class BodyWatch(Observer):
         if error <= limits.energy * scale:
             return None
         return FailedCheck(
-            f"the energy less the work done changed by {error:.3g} J,"
+            f"the energy minus the work done changed by {error:.3g} J,"
             f" {error / scale if scale else inf:.3g} of all energy exchanged (watch.energy ="
             f" {limits.energy:g})"
         )
@@ -312,7 +312,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         return self._segments[k]
 
     def _equal_step_segments(self) -> list[Segment]:
-        """Segments between the breaks of functions of time, in equal steps no longer than the
+        """Segments between the breaks in functions of time, in equal steps no longer than the
         timestep of the scene."""
         run = self.scene.run
         segments, steps = [], 0

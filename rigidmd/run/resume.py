@@ -89,7 +89,7 @@ def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: st
 
 
 def scene_digest(scene: Scene) -> str:
-    """SHA-256 of all keys of a resolved scene that may change the bits of its run."""
+    """SHA-256 of all keys in a resolved scene that may change the bits of its run."""
     keys = keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *NOT_COMPARED))
     return hashlib.sha256(json.dumps(keys, sort_keys=True).encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""The simulation of a scene, of molecules or of a single body. Several of them at once in one
+"""The simulation of a scene, with molecules or a single body. Several of them at once in one
 process."""
 
 import atexit

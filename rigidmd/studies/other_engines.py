@@ -61,7 +61,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
     engine = EngineChoice.model_validate({"name": to}) if program.engine else EngineChoice()
     system = build(scene.model_copy(update={"engine": engine}))
     later = [
-        f"stages.{k}: a minimisation after other stages stays with rigidmd"
+        f"stages.{k}: export does not support a minimisation after other stages"
         for k, stage in enumerate(system.scene.stages)
         if stage.is_minimisation
         and any(not before.is_minimisation for before in system.scene.stages[:k])
@@ -198,7 +198,7 @@ def _short_run(system: System, state: State, other: ExternalEngine) -> list[Comp
 
 
 def _sites_after(system: System, engine: Engine, state: State, steps: int) -> np.ndarray:
-    """Positions of sites (s, 3) after the span of the short run, in this number of steps."""
+    """Site positions (s, 3) after the span of the short run, in this number of steps."""
     scheme, dt = SCHEMES["velocity_verlet"], STEPS * STEP * FEMTOSECOND / steps
     moved = engine.begin(state, scheme)
     moved.begin_segment(0.0)

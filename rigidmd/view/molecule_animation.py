@@ -59,8 +59,8 @@ def chemiscope_script() -> str:
 
 
 def frames_of(record: Record, max_frames: int) -> Frames:
-    """Frames of the trajectory of a run of molecules, each molecule whole and inside the box.
-    Raises OutputError if distances within molecules are not as in the molecules of this run."""
+    """Trajectory frames of a run of molecules, each molecule whole and inside the box. Raises
+    OutputError if distances within molecules are not as in the molecules of this run."""
     path, sites = record.trajectory, record.system.sites
     frames = read_frames(path, len(sites.molecule), max_frames)
     pairs = np.flatnonzero(sites.molecule[1:] == sites.molecule[:-1])

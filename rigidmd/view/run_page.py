@@ -57,7 +57,7 @@ ABOUT = {
     "log.csv": "energies, temperatures and pressures over time",
     "motion.csv": "position, attitude, velocities, energies and errors over time",
     "motion.npz": "the same columns as arrays",
-    "final.npz": "the last state, every bit of it",
+    "final.npz": "the last state, exact to every bit",
     "pressure_tensor.csv": "the pressure tensor over time, for a viscosity",
     "analysis.json": "values of `rigidmd analyse` with their errors",
     "checkpoint.npz": "from which `rigidmd resume` continues",

@@ -222,8 +222,8 @@ def _note(sets: list[Trials], guest: Guest, thermal: float) -> str:
 
 
 def _profile(sets: list[Trials], thermal: float, axis: str) -> Curve:
-    """The chemical potential against the distance from the middle of a slab, with errors of blocks
-    of frames; NaN where the molecule overlaps in all trials."""
+    """The chemical potential against the distance from the middle of a slab, with errors from
+    blocks of frames; NaN where the molecule overlaps in all trials."""
     height = np.concatenate([trials.height for trials in sets])
     weight = np.concatenate([trials.weight for trials in sets])
     half = np.abs(height).max()

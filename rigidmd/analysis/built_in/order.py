@@ -30,10 +30,9 @@ def nematic(runs: Runs, axis: Literal["", "x", "y", "z"] = "") -> AnalysisResult
     """S, the largest eigenvalue of Q = <(3 u u - 1)/2>, of the axes u of a species, and the
     director, its eigenvector.
 
-    The mean of S of each frame, whose director may rotate, and S about the director of all frames.
-    S is 1 for parallel axes; that of a frame of N molecules without order is 0.80/sqrt(N), not 0.
-    The middle eigenvalue times -2 has the mean 0 then (Eppenga & Frenkel 1984, Mol. Phys. 52,
-    1303).
+    The mean over frames of S, whose director may rotate, and S about the director of all frames. S
+    is 1 for parallel axes; that of a frame of N molecules without order is 0.80/sqrt(N), not 0. The
+    middle eigenvalue times -2 has the mean 0 then (Eppenga & Frenkel 1984, Mol. Phys. 52, 1303).
 
     Parameters
     ----------

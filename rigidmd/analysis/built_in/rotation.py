@@ -182,9 +182,9 @@ def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) ->
     "spectra and correlations of velocities, angular velocities and angular momenta", position=80
 )
 def spectrum(runs: Runs) -> AnalysisResult:
-    """Densities of states (cm) of translation and of rotation about each body axis, from the power
-    of velocities and angular velocities, and their correlation functions. The integral over wave
-    numbers is the number of degrees of freedom of a molecule. Needs frames with velocities, every
+    """Densities of states (cm) for translation and for rotation about each body axis, from the
+    power of velocities and angular velocities, and their correlation functions. The integral over
+    wave numbers is a molecule's number of degrees of freedom. Needs frames with velocities, every
     few fs. Raises OutputError."""
     if any(run.velocities is None or run.L is None for run in runs.members):
         kinds = " or ".join(written(lambda form: form.velocities))
@@ -402,7 +402,8 @@ def _permittivity_around(runs: Runs) -> float:
 
 
 def _broken_symmetry(runs: Runs) -> str:
-    """What distinguishes a dipole of the system from the opposite one. Empty if nothing does."""
+    """What distinguishes a dipole of the system from the opposite dipole, or an empty text if
+    nothing does."""
     if any(not kind.moves and kind.molecule.has_dipole for kind in runs.kinds):
         return "frozen molecules have dipoles"
     if runs.system.scene.fields.entries:

@@ -1,9 +1,8 @@
 """Response functions from fluctuations: heat capacities, compressibility, thermal expansion and
 thermal pressure coefficient.
 
-Momenta are independent of positions and contribute exactly. Only fluctuations of the potential
-energy, of the volume and of the virial are measured, at the set temperature. See the theory chapter
-`sampling`.
+Momenta are independent of positions and contribute exactly. Only fluctuations in potential energy,
+volume and virial are measured, at the set temperature. See the theory chapter `sampling`.
 """
 
 from collections.abc import Callable
@@ -230,7 +229,8 @@ def _check_conditions(runs: Runs) -> None:
 
 
 def _why_no_pressure(runs: Runs) -> str:
-    """Why the run has no pressure that follows from its energy. Empty if it has one."""
+    """Why the run has no pressure that follows from its energy, or an empty text if it has such a
+    pressure."""
     if not runs.has_box:
         return "the run has no periodic box"
     names = ", ".join(runs.system.position_dependent)

@@ -4,7 +4,7 @@ are cut off."""
 from collections.abc import Callable, Mapping
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -29,7 +29,7 @@ SWITCH_START = 0.9
 
 
 def body_pair_potential(
-    function: Callable[..., Any] | str | Path,
+    function: Callable[..., object] | str | Path,
     parameters: Mapping[str, Parameters] | None = None,
     *,
     species: tuple[str, ...] = (),
@@ -157,14 +157,14 @@ def potential_of_scene(
     )
 
 
-def _not_computed(r: object, a: object, b: object) -> float:
+def _not_computed(r: object, a: object, b: object) -> object:
     """The energy of a text or a table in a stored run."""
     raise NotImplementedError
 
 
 def potentials_of_stored_run(scene: MolecularScene) -> dict[str, BodyPairPotential]:
-    """The potentials of [[forces.bodies]] with axes and shapes of bodies, without energies of texts
-    and tables, and without modules. Raises SceneError."""
+    """The potentials of [[forces.bodies]] with bodies, axes and shapes. Texts and tables have no
+    energies, and modules are left out. Raises SceneError."""
     potentials = {}
     for where, entry in scene.forces.added.items():
         if not isinstance(entry, BodyForce) or entry.module is not None:

@@ -509,8 +509,8 @@ def integration_groups(stage: Stage) -> set[int]:
 
 
 def extra_forces(view: ForceFieldView, k: int) -> list:
-    """The forces of stage k in addition to its integrator: a barostat, and a remover of momentum
-    that makes OpenMM subtract the degrees of freedom of the total momentum."""
+    """The forces of stage k in addition to its integrator: a barostat, and a momentum remover, so
+    that OpenMM subtracts the degrees of freedom of the total momentum."""
     mm, stage, system = library(), view.system.scene.stages[k], view.system
     forces = []
     if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int(

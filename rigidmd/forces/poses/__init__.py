@@ -1,4 +1,4 @@
-"""Energies of pairs of bodies, as functions of their relative position and their orientations.
+"""Pair energies of bodies, as functions of their relative position and their orientations.
 
 `trace` records a user's function, `slopes` derives its slopes and writes its code, and `formulas`
 compiles it. `pairs` has the term, `pair_list` its neighbour list, `trials` energies of trial

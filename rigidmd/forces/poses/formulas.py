@@ -1,5 +1,5 @@
-"""Formulas of pairs of bodies, from functions of NumPy arrays whose slopes are derived, or which
-give force and torques themselves."""
+"""Formulas for pairs of bodies, from NumPy functions whose slopes are derived, or which give force
+and torques themselves."""
 
 import inspect
 import re

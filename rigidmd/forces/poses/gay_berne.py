@@ -25,8 +25,7 @@ SHORTEST = 0.1
 
 
 class GayBerne(NamedTuple):
-    """The energy (kJ/mol) as a function of r, of the axes of both bodies and of their
-    parameters."""
+    """The energy (kJ/mol) as a function of r, the axes of both bodies and their parameters."""
 
     upsilon: float = 1.0  # exponents of the strength
     mu: float = 2.0
@@ -53,7 +52,7 @@ class GayBerne(NamedTuple):
 
 
 def _inverse(across, along_axis, other_across, other_along, cosines):
-    """r G⁻¹ r of a unit vector r, and det G, of G = sum of two matrices with these values across
+    """r G⁻¹ r for a unit vector r, and det G, with G = sum of two matrices with these values across
     and along the axes u and v. cosines : u r, v r, u v"""
     to_u, to_v, between = cosines
     whole = across + other_across

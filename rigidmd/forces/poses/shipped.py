@@ -1,4 +1,4 @@
-"""The shipped potentials of pairs of bodies, and those of a text, for scenes."""
+"""The shipped pair potentials of bodies, and pair potentials from an expression, for scenes."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -105,7 +105,7 @@ MEANS: dict[str, Callable] = {
 
 
 def _value(expression: Any, values: Mapping[str, Any]) -> Any:
-    """The value of a SymPy expression of arithmetic and functions of NumPy."""
+    """The value of a SymPy expression with arithmetic and NumPy functions."""
     if expression.is_Symbol:
         return values[expression.name]
     if expression.is_Number or expression.is_NumberSymbol:

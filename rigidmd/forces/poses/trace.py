@@ -165,7 +165,7 @@ class Traced:
         return self * self
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any):
-        """Functions of NumPy of single numbers and of arrays."""
+        """NumPy functions for single numbers and arrays."""
         if method != "__call__" or options:
             return NotImplemented
         if any(isinstance(value, np.ndarray) for value in inputs):

@@ -147,7 +147,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def clear_sweep(folder: Path, names: Iterable[str]) -> None:
-    """Remove the files of a sweep, and the files of runs in folders of these names. Raises
+    """Remove the files of a sweep, and the files of its runs in folders with these names. Raises
     OutputError."""
     inner_folders = [folder / name for name in names if not (folder / name).is_symlink()]
     for cleared in [*inner_folders, folder]:

@@ -182,10 +182,10 @@ class _Average:
 
 
 def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
-    """Extrapolate all averages of the logs of a sweep, and the values of analyses, to a step of 0.
+    """Extrapolate all log averages in a sweep, and the values of its analyses, to a step of 0.
 
-    Values of analyses are those of replicas together, where they have been analysed together, else
-    of single runs. Raises SceneError if the key is not a swept time step, OutputError.
+    Values of analyses come from replicas together, if they have been analysed together, else from
+    single runs. Raises SceneError if the key is not a swept time step, OutputError.
     """
     limits, missing = [], []
     for average in _averages(manifest, key):

@@ -135,9 +135,9 @@ def _analyse_combinations(
 def _analyse_replicas(
     folders: list[Path], together: Path, start: float | None, analyse: Analyse, progress: Progress
 ) -> tuple[int, AnalysisOutput]:
-    """Analyses of each run of a combination, written into its folder, and of all of them together,
-    written into another folder if there are several. What fails of one run or of one analysis does
-    not end the others. Returns the number of runs too."""
+    """Analyses of each run in a combination, written into the folder of the run, and of all these
+    runs together, written into another folder if there are several. What fails of one run or of one
+    analysis does not end the others. Returns the number of runs too."""
     members: list[RigidFrames] = []
     failed: dict[str, str] = {}
     output = AnalysisOutput({}, [], {}, [])

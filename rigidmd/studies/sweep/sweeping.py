@@ -114,8 +114,8 @@ def open_existing_sweep(folder: Path) -> Iterator[Manifest]:
 
 
 def jobs_and_threads(count: int, jobs: int | None, threads: int | None) -> tuple[int, int]:
-    """Points at a time, and threads of each, so that all cores have work. Given numbers are
-    kept."""
+    """Number of points that run at a time, and threads per point. By default all cores have work.
+    Given numbers are kept."""
     if jobs is None:
         jobs = max(1, min(MOST_THREADS // (threads or 1), count))
     return jobs, threads or max(1, MOST_THREADS // jobs)
@@ -145,7 +145,7 @@ def sweep(
     folder
         default: runs/NAME-sweep. Points that have finished there are not run again
     jobs, threads
-        Points at a time, threads of each. Default: so that all cores have work
+        Number of points that run at a time, and threads per point. Default: all cores have work
     progress
         Whether to show progress, as `Simulation.run` does. Default: in notebooks
 

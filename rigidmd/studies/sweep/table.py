@@ -51,7 +51,7 @@ Measured = tuple[float, float | None]
 
 @dataclass
 class SweepRow:
-    """A combination of values of all keys but the seed, and the results of its runs."""
+    """A combination of values for all keys except the seed, and the results of its runs."""
 
     values: Json
     #: Value of the seed, None if it is not swept -> column -> value and error of that run.
