@@ -30,6 +30,7 @@ from rigidmd.assemble.scenes import (
 from rigidmd.assemble.species import species_of
 from rigidmd.assemble.user_code.force import Force, UserForceError, real_numbers
 from rigidmd.core.state import NOW, State, state_of
+from rigidmd.core.toml import Json
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError, describe_error
@@ -97,14 +98,14 @@ class RigidMD(Calculator):
 
     def __init__(
         self,
-        models: MolecularScene | str | Sequence[str | Mapping[str, Any]],
+        models: MolecularScene | str | Sequence[str | Mapping[str, object]],
         *,
         atom_forces: Form = "gradient",
         bend: float = 0.05,
         tolerance: float = 0.15,
         precision: str | None = None,
-        fields: Mapping[str, Any] | None = None,
-        **forces: Any,
+        fields: Mapping[str, object] | None = None,
+        **forces: object,
     ):
         super().__init__()
         faults = []
@@ -174,7 +175,7 @@ class RigidMD(Calculator):
         self._put(atoms, fitted, fitted.state)
         return float(np.linalg.norm(atoms.positions - before, axis=1).max())
 
-    def minimise(self, atoms: Atoms, **stage_keys: Any) -> dict[str, Any]:
+    def minimise(self, atoms: Atoms, **stage_keys: object) -> Json:
         """Move rigid molecules to a near minimum of the energy, or of the enthalpy with
         pressure_bar.
 
@@ -199,7 +200,7 @@ class RigidMD(Calculator):
         self._put(atoms, fitted, state)
         return minimum_figures(found, len(state.position))
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return self.__dict__ | {"_assembly": None}  # machine code cannot be pickled
 
     def _fit_atoms(self, atoms: Atoms) -> "_FittedAtoms":
@@ -235,12 +236,12 @@ class RigidMD(Calculator):
         self._assembly, self._bent = found, fitted.bent
         return fitted
 
-    def _assemble(self, atoms: Atoms, stage_keys: Mapping[str, Any]) -> "_Assembly":
+    def _assemble(self, atoms: Atoms, stage_keys: Mapping[str, object]) -> "_Assembly":
         """A system of these atoms. Raises SceneError, StructureError."""
         bare = atoms.copy()
         bare.set_constraint()
         bare.arrays.pop("momenta", None)
-        tables: dict[str, Any] = {"structure": {"tolerance": self._tolerance}} | self._settings
+        tables: Json = {"structure": {"tolerance": self._tolerance}} | self._settings
         scene = scene_from_atoms(
             bare, self._models, stages=[{"ensemble": "minimise", **stage_keys}], **tables
         )
@@ -456,7 +457,7 @@ class CalculatorForce(Force):
         arm = position - state.position[sites.molecule]
         return energy, on_sites, -unit * state.volume * stress - on_sites.T @ arm
 
-    def _checked(self, what: str, given: Any, *shapes: tuple[int, ...]) -> np.ndarray:
+    def _checked(self, what: str, given: object, *shapes: tuple[int, ...]) -> np.ndarray:
         """Values of the calculator as an array of real numbers in one of these shapes. Raises
         UserForceError."""
         array, wanted = real_numbers(given), " or ".join(map(str, shapes))
@@ -510,7 +511,7 @@ def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:
     ][index]
 
 
-def _parts_of(scene: MolecularScene) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def _parts_of(scene: MolecularScene) -> tuple[list[Json], Json]:
     """The tables of a scene's species without numbers of molecules, and the other TABLES. Paths are
     absolute."""
     tables = with_absolute_paths(scene.model_dump(exclude_defaults=True), scene.path(""))

@@ -1,4 +1,4 @@
-"""The exceptions of rigidmd. Every rejection raises one of them, with an explanation.
+"""The exceptions of rigidmd. Invalid input and failed runs raise one of these, with an explanation.
 
 The command line prints the message and exits with 2 for bad input and 1 for a failed run. Python
 code gets the exception.

@@ -279,10 +279,10 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F34",
-        "log: the pressures xz and yz exchanged",
+        "log: shear pressures replaced by those along an axis",
         "engines/observables.py",
-        "pressure_xz=xz, pressure_yz=yz,",
-        "pressure_xz=yz, pressure_yz=xz,",
+        "{'xyz'[j]}\": (i, j)",
+        "{'xyz'[j]}\": (j, j)",
         ("test_analyse_runs.py::test_results_in_memory_and_from_the_folder_agree",),
     ),
     Mutation(

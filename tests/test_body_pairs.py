@@ -4,7 +4,7 @@ import shutil
 import subprocess
 import sys
 from functools import partial
-from itertools import product
+from itertools import pairwise, product
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +17,8 @@ import rigidmd
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
 from rigidmd.compile import kernel
+from rigidmd.core.statistics import slope
+from rigidmd.engines.body_pairs import bodies_of_potentials
 from rigidmd.errors import SceneError
 from rigidmd.figures.space import View, camera
 from rigidmd.figures.style import new_figure
@@ -24,11 +26,13 @@ from rigidmd.forces.poses.formulas import formula_of_poses
 from rigidmd.forces.poses.gay_berne import PARAMETERS, GayBerne
 from rigidmd.forces.poses.multipoles import dipole, quadrupole
 from rigidmd.forces.poses.pairs import pair_slopes
-from rigidmd.forces.poses.patch import patch
+from rigidmd.forces.poses.patch import PARAMETERS as PATCH
+from rigidmd.forces.poses.patch import Patch
+from rigidmd.forces.poses.slopes import code_of, slopes_of
 from rigidmd.forces.poses.table import read_body_table
-from rigidmd.forces.poses.trace import Graph, TraceError, code_of, slopes_of
+from rigidmd.forces.poses.trace import Graph, TraceError
 from rigidmd.run.rigid_fit import Bodies
-from rigidmd.units import COULOMB, DEBYE, KJ_PER_MOL
+from rigidmd.units import BOLTZMANN, COULOMB, DEBYE, KJ_PER_MOL
 from rigidmd.view.solids import solids_of
 
 ROD = {"length_A": 12.0, "width_A": 4.0, "epsilon_kJ_mol": 1.0, "side": 1.0, "end": 0.2}
@@ -196,6 +200,64 @@ def test_unlike_ellipsoids_are_those_of_the_general_form(exponents):
         assert energy(-r, v, u, q, p) == pytest.approx(expected, rel=1e-11)
 
 
+def original_gay_berne(r, u, v, width, strength, kappa, wells, mu, nu):
+    """Gay & Berne 1981, equal ellipsoids."""
+    distance = np.linalg.norm(r)
+    a, b, c = u @ r / distance, v @ r / distance, u @ v
+    chi = (kappa**2 - 1) / (kappa**2 + 1)
+    of_wells = (wells ** (1 / mu) - 1) / (wells ** (1 / mu) + 1)
+    shape, depth = (
+        1 - x / 2 * ((a + b) ** 2 / (1 + x * c) + (a - b) ** 2 / (1 - x * c))
+        for x in (chi, of_wells)
+    )
+    rho = (distance - width / np.sqrt(shape) + width) / width
+    epsilon = strength * (1 - (chi * c) ** 2) ** (-nu / 2) * depth**mu
+    return 4 * epsilon * (rho**-12 - rho**-6)
+
+
+@pytest.mark.parametrize("exponents", [(1.0, 2.0), (2.0, 1.0)])
+def test_equal_ellipsoids_have_the_original_form(exponents):
+    nu, mu = exponents
+    rng, energy = np.random.default_rng(4), GayBerne(nu, mu)
+    for kind in (ROD, DISC):
+        for _ in range(5):
+            u, v, direction = (x / np.linalg.norm(x) for x in rng.standard_normal((3, 3)))
+            r = rng.uniform(9, 14) * direction
+            expected = original_gay_berne(
+                r,
+                u,
+                v,
+                kind["width_A"],
+                kind["epsilon_kJ_mol"] * kind["side"],
+                kind["length_A"] / kind["width_A"],
+                kind["side"] / kind["end"],
+                mu,
+                nu,
+            )
+            assert energy(r, u, v, named(kind), named(kind)) == pytest.approx(expected, rel=1e-11)
+
+
+def test_overlapping_ellipsoids_repel():
+    """Where the shifted distance is 0 or negative the form alone would diverge or attract."""
+    u, x = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+    for distance in (1e-3, 1.0, 3.0):
+        assert GayBerne()(distance * u, u, u, named(ROD), named(ROD)) > 1e9
+        assert GayBerne()(distance * x, u, x, named(ROD), named(ROD)) > 1e9
+
+
+def test_torques_and_force_of_a_pair_add_up_to_no_torque():
+    rng, formula = np.random.default_rng(11), formula_of_poses(Patch(), PATCH, "x")
+    evaluate = evaluated(formula)
+    kind = {"sigma_A": 4.0, "epsilon_kJ_mol": 2.0, "width": 0.4}
+    row = np.array(formula.numbers(kind, kind))
+    for _ in range(5):
+        r = 5 * rng.standard_normal(3)
+        a, b = Rotation.random(2, random_state=rng).as_matrix()
+        _, slope, torque, other = map(np.array, evaluate(row, tuple(r), a, b))
+        size = np.abs(torque).max() + np.abs(other).max()
+        assert torque + other - np.cross(r, slope) == pytest.approx(0.0, abs=1e-12 * size)
+
+
 def lammps(*lines: str, folder) -> None:
     program = shutil.which("lmp")
     if program is None:
@@ -311,7 +373,7 @@ def test_dipoles_and_quadrupoles_are_limits_of_charges():
 
 
 def test_patches_attract_where_they_face_each_other():
-    x, energy = np.array([1.0, 0.0, 0.0]), patch()
+    x, energy = np.array([1.0, 0.0, 0.0]), Patch()
     kind = named({"sigma_A": 4.0, "epsilon_kJ_mol": 2.0, "width": 0.2})
     contact = 4.0 * 2 ** (1 / 6) * x
     assert energy(contact, x, -x, kind, kind) == pytest.approx(-2.0, rel=1e-12)
@@ -473,6 +535,44 @@ def test_energy_is_conserved_with_the_order_of_the_integrator():
     assert 3.0 < noise[0] / noise[1] < 5.5
 
 
+#: Eight rods without a box or a cutoff, whose energy has all derivatives.
+CLUSTER = {
+    "box": {"lengths_A": 24.0, "periodic": False},
+    "molecules": [body("rod", 8)],
+    "forces": {"bodies": [{"potential": "gay_berne", "parameters": {"rod": ROD}}]},
+    "start": {"temperature_K": 60.0},
+    "precision": "double",
+    "threads": 1,
+}
+
+
+@pytest.mark.parametrize(
+    ("integrator", "order"), [("velocity_verlet", 2), ("two_stage", 2), ("chin_4a", 4)]
+)
+def test_integrators_have_their_order(integrator, order):
+    """Positions after 2 ps against half the step, and again."""
+    ends = []
+    for step in (20.0, 10.0, 5.0):
+        stage = {"duration_ps": 2.0, "timestep_fs": step, "integrator": integrator}
+        results = Simulation(Scene.from_dict(CLUSTER | {"stages": [stage]}), warn=str).run()
+        ends.append(results.state.position)
+    errors = [np.abs(one - other).max() for one, other in pairwise(ends)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
+
+
+def test_energy_does_not_drift():
+    """The slope of the energy of a hot fluid of rods is within three of its errors, and below
+    0.02 kT/ns for each degree of freedom, as in water."""
+    stage = {"ensemble": "nve", "duration_ps": 20.0, "timestep_fs": 5.0}
+    start, output = {"temperature_K": 600.0}, {"log_interval_ps": 0.1}
+    run = simulation(GAY_BERNE, stages=[stage], start=start, output=output)
+    results = run.run()
+    line = slope(results["time"], results["energy"])
+    thermal = BOLTZMANN / KJ_PER_MOL * results["temperature"].mean() * run.system.freedom.total
+    allowed = 3 * line.error + 2e-5 * thermal
+    assert abs(line.value) < allowed and line.error < 1e-4 * thermal
+
+
 def test_a_text_has_the_same_energy_as_its_function():
     text = "4*eps*((sig/r)**12 - (sig/r)**6)*(1 + k*a_r*b_r + exp(-a_b**2))"
     parameters = {
@@ -515,6 +615,11 @@ def test_a_text_has_the_same_energy_as_its_function():
             {"potential": "gay_berne", "energy": "1/r"},
             "give one of potential, energy, table and module",
         ),
+        (
+            {"potential": "gay_berne", "parameters": {"rod": ROD | {"width_A": -4.0}}},
+            "width_A of rod is -4, must be above 0",
+        ),
+        (GAY_BERNE | {"options": {"mu": 0.0}}, "mu of options is 0, must be above 0"),
         ({"energy": "1/r +"}, "is not a formula"),
         ({"energy": "k/r"}, "no species has the parameter k"),
         (GAY_BERNE | {"cutoff_A": 30.0}, "longer than half an edge of the box"),
@@ -529,6 +634,24 @@ def test_a_text_has_the_same_energy_as_its_function():
 def test_what_is_wrong_with_a_potential_is_told(tables, message, tmp_path):
     with pytest.raises(SceneError, match=message):
         build(scene(tables))
+
+
+def test_pairs_at_a_cutoff_where_the_energy_jumps_are_no_wrong_force():
+    """Two rods at a distance of exactly the cutoff; a wrong force is found there too."""
+    places = {"box": {"lengths_A": 48.0}, "molecules": [body("rod", 64)]}
+    tables = GAY_BERNE | {"parameters": {"rod": ROD}, "references": {}}
+    right = simulation(tables | {"cutoff_A": 12.0, "truncation": "plain"}, **places)
+    right._start()
+    distances = np.linalg.norm(right.state.position[0] - right.state.position[1:], axis=1)
+    assert np.abs(distances - 12.0).min() < 1e-9
+
+    def wrong(r, u, v):
+        s = np.sqrt(r @ r)
+        return 100 / s**6, 100 * r / s**8, 0 * u, 0 * v
+
+    potential = rigidmd.body_pair_potential(wrong, axis="z", cutoff_A=12.0, truncation="plain")
+    with pytest.raises(SceneError, match="is not the derivative of the energy"):
+        Simulation(scene(None, **places), forces=[potential]).run()
 
 
 def test_bodies_that_do_not_rotate_have_no_such_potential():
@@ -593,6 +716,29 @@ def test_bodies_are_drawn_as_ellipsoids_where_they_are():
     assert (row / image.shape[0] - 0.5) * 20 == pytest.approx(
         np.hypot(6 * np.cos(0.7), 2 * np.sin(0.7)), abs=0.05
     )
+
+
+def test_potentials_of_python_are_drawn_like_those_of_scenes():
+    """Also those of a stored run, whose energies are not computed."""
+    potential = rigidmd.body_pair_potential(
+        GayBerne(),
+        GAY_BERNE["parameters"],
+        axis="z",
+        references=GAY_BERNE["references"],
+        cutoff_A=15.0,
+    )
+    expected = solids_of(build(scene(GAY_BERNE)))
+    systems = [
+        build(scene(None).with_user_code([potential])),
+        build(scene(GAY_BERNE), user_code=False),
+    ]
+    for solids in map(solids_of, systems):
+        assert expected is not None and solids is not None
+        for one, other in zip(solids, expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+    text = {"energy": "exp(-r)*a_b**2", "name": "aligning", "axis": "x"}
+    (bodies, _) = bodies_of_potentials(build(scene(text), user_code=False))
+    assert bodies.potential.axis == "x" and bodies.species.name == "rod"
 
 
 # --- tables ---------------------------------------------------------------------------------------

@@ -484,7 +484,7 @@ def test_a_body_whose_energy_goes_wrong(tmp_path, capsys):
     with pytest.raises(SimulationError) as caught:
         simulation.run()
     said = str(caught.value)
-    assert "stopped at step 500 (100 s): the energy less the work done changed by" in said
+    assert "stopped at step 500 (100 s): the energy minus the work done changed by" in said
     assert "Try timestep_s below 0.085, where its spin and swing are stable" in said
     assert "The motion so far" in said
     assert len((tmp_path / "out" / "motion.csv").read_text().splitlines()) > 200

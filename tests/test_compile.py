@@ -4,6 +4,7 @@ cache, and the rules that sources keep."""
 import ast
 import ctypes
 import json
+import operator
 import os
 import platform
 import re
@@ -22,6 +23,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
 from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher, cpu_target
+from numba.core.typing.templates import ConcreteTemplate
 
 from rigidmd.compile import (
     BoundTask,
@@ -35,6 +37,7 @@ from rigidmd.compile import (
     task,
 )
 from rigidmd.compile.cache import CacheIndex, cache_folder, compiling_announced
+from rigidmd.compile.front_end import UNUSED_PASSES
 from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
 from rigidmd.compile.records import (
     array_struct,
@@ -775,6 +778,40 @@ def test_a_kernel_is_compiled_once_for_all_constant_arguments():
 
     assert several(1.0) == 9.0
     assert len(plus.signatures) == 1
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_a_call_is_resolved_once_for_each_list_of_types(monkeypatch):
+    resolved = []
+    apply = ConcreteTemplate.apply
+    monkeypatch.setattr(
+        ConcreteTemplate,
+        "apply",
+        lambda self, args, kws: resolved.append((self.key, *args)) or apply(self, args, kws),
+    )
+    quotients = []
+    for _ in range(2):
+
+        @kernel(from_python=True)
+        def quotient(x, y):
+            return x // y
+
+        quotients.append(quotient(7.0, 2.0))
+    assert quotients == [3.0, 3.0]
+    assert resolved.count((operator.floordiv, types.float64, types.float64)) <= 1
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_an_inner_kernel_is_compiled_without_passes_for_what_no_kernel_has():
+    @kernel
+    def inner(x):
+        return x + x
+
+    inner.compile((types.float64,))
+    (compiled,) = inner.overloads.values()
+    done = set(compiled.metadata["pipeline_times"]["kernels"])
+    assert any(name.endswith("native_lowering") for name in done)
+    assert not any(name.endswith(one.name()) for name in done for one in UNUSED_PASSES)
 
 
 # --- rules that sources keep ----------------------------------------------------------------------

@@ -1,6 +1,7 @@
-"""One idea to a line: tokens per line of code, and the formatter is on everywhere."""
+"""One idea to a line: tokens per line of code, the formatter is on everywhere, and `Any` is rare."""
 
 import io
+import re
 import tokenize
 
 import pytest
@@ -8,6 +9,7 @@ from support import ROOT
 
 MOST_TOKENS = 9.0  # per line of code, in the mean over a package
 MOST_SKIPS = 15  # for tables of numbers
+MOST_ANY = 309  # may only fall
 LAYOUT = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -58,3 +60,9 @@ def test_the_formatter_is_on(folder):
     skips = [text.count("# fmt" + ": ") for text in texts]
     assert sum(skips) <= MOST_SKIPS
     assert not any("# isort" + ": " in text for text in texts)
+
+
+def test_any_is_rare():
+    paths = [*(ROOT / "rigidmd").rglob("*.py"), *(ROOT / "rigidmd").rglob("*.pyi")]
+    count = sum(len(re.findall(r"\bAny\b", path.read_text(encoding="utf-8"))) for path in paths)
+    assert count <= MOST_ANY, "replace Any by a type, or by a Protocol of what is used"

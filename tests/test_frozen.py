@@ -197,7 +197,9 @@ def test_a_run_among_frozen_molecules_keeps_its_energy(tmp_path):
 
 def test_a_scene_in_which_nothing_would_move_is_refused():
     with pytest.raises(SceneError, match="all are frozen"):
-        build(small_scene({}, 20.0, molecules=[{"model": "argon", "count": 3, "frozen": True}]))
+        Simulation(
+            small_scene({}, 20.0, molecules=[{"model": "argon", "count": 3, "frozen": True}])
+        )
     with pytest.raises(SceneError, match="omit it with frozen molecules"):
         small_scene(
             {},
@@ -325,7 +327,7 @@ def test_all_numbers_of_a_species_are_all_of_it():
     assert (system.model.inverse_mass == 0).tolist() == [True, False]
     molecules[1]["frozen"] = [1, 2, 3]
     with pytest.raises(SceneError, match="all are frozen"):
-        build(small_scene({}, 20.0, molecules=molecules))
+        Simulation(small_scene({}, 20.0, molecules=molecules))
     with pytest.raises(SceneError, match="omit it with frozen molecules"):
         small_scene({}, 20.0, forces={"tail_correction": True}, molecules=molecules[:1])
 

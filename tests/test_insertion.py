@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.signal import lfilter
 from support import history, observe, shaken, small_scene
 
 import rigidmd
@@ -14,6 +15,7 @@ from rigidmd.assemble.build import build
 from rigidmd.assemble.guest import CORE, Guest, model_named
 from rigidmd.commands.cli import main
 from rigidmd.core.state import state_of
+from rigidmd.core.statistics import mean_and_error
 from rigidmd.errors import OutputError
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene.models import load_model
@@ -189,6 +191,19 @@ def test_a_profile_is_of_the_distance_from_the_middle():
     near = (np.abs(z) > 3) & (np.abs(z) < 4.5)
     far = (np.abs(z) > 9) & (np.abs(z) < 10)
     assert mu[near].max() < mu[far].min() < 0.5
+
+
+@pytest.mark.parametrize("spread", [0.3, 1.0])
+def test_errors_of_exponential_averages(spread):
+    """Pulls of ln <w> of series of correlated weights exp(x) with a normal x. The larger of two
+    estimates makes them narrower than 1, see the theory chapter `errors`."""
+    rng, memory, pulls = np.random.default_rng(8), np.exp(-1 / 2), []
+    noise = np.sqrt(1 - memory**2) * rng.standard_normal((300, 300))
+    for series in lfilter([1.0], [1.0, -memory], noise, axis=1)[:, 60:]:
+        weight = np.exp(spread * series - spread**2 / 2)
+        _, error = mean_and_error(weight / weight.mean())
+        pulls.append(np.log(weight.mean()) / error)
+    assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.05
 
 
 def test_what_has_no_meaning_is_refused():

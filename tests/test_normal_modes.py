@@ -437,7 +437,8 @@ def test_modes_at_the_gamma_point_are_those_of_the_unit_cell(tmp_path):
     system, state = cell.system, cell.coordinates.state.copy()
     state.position[3] += 0.2
     with pytest.raises(
-        SimulationError, match="has not the period of its unit cell: of 8 copies of a molecule"
+        SimulationError,
+        match="does not have the period of its unit cell: of 8 copies of a molecule",
     ):
         periodic_basis(system, state, cell.coordinates.index)
     state = cell.coordinates.state.copy()

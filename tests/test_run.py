@@ -637,6 +637,12 @@ def test_means_are_over_the_equilibrated_part():
         (KEPT, np.zeros(100), "all 4.95 ps", 0.0),
         (KEPT, np.linspace(0.0, 1e3, 100), "all 4.95 ps, not yet steady", 0.0),
         (
+            KEPT,
+            8 * np.exp(-np.arange(100) / 8) + 1.4 * abs(np.arange(100) % 28 / 14 - 1),
+            "all 4.95 ps, perhaps not yet steady",
+            0.0,
+        ),
+        (
             KEPT | {"temperature_K": [300.0, 200.0]},
             np.linspace(0.0, 1e3, 100),
             "all 4.95 ps, in which the set point changes",
@@ -693,7 +699,7 @@ def test_constant_energy_after_a_thermostat_explains_its_temperature():
     text = summary_text(results.summary)
     off = two["temperature_K"] - 100.0
     assert (
-        f"{off:+.2g} K from the 100 K before: this stage keeps the energy of one moment. Such"
+        f"{off:+.2g} K from the 100 K before: an NVE stage keeps the energy at its start. Such"
         in text
     )
     assert ("equilibrate longer" in text) == (abs(off) > 3 * two["temperature_scatter_K"])

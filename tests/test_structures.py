@@ -1734,9 +1734,9 @@ def test_heavy_water_starts_like_light(there, wanted, ending, tmp_path):
 
 def test_a_geometry_of_heavy_hydrogen_has_its_mass(tmp_path):
     (tmp_path / "a.xyz").write_text("3\n\nOW 0 0 0\nD 0.8 0.6 0\nM 0 0.1 0\n")
-    names, elements, masses, _ = read_geometry(tmp_path / "a.xyz")
-    assert (names, elements) == (["OW", "D", "M"], ["O", "D", "X"])
-    assert masses == pytest.approx([15.999, 2.0141, 0.0])
+    atoms = read_geometry(tmp_path / "a.xyz")
+    assert (atoms.names, atoms.elements) == (["OW", "D", "M"], ["O", "D", "X"])
+    assert atoms.masses == pytest.approx([15.999, 2.0141, 0.0])
 
 
 # crystals

@@ -110,8 +110,9 @@ def without_code(text):
 
 
 @functools.cache
-def tree_of(path):
-    return ast.parse(path.read_text(encoding="utf-8"))
+def nodes_of(path):
+    """All nodes of a Python file."""
+    return tuple(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
 
 
 def texts_of(path):
@@ -143,14 +144,13 @@ def texts_of(path):
     if path.is_relative_to(ROOT / "tests"):  # strings of tests quote code, input and messages
         yield from docstrings_of(path)
         return
-    tree = tree_of(path)
     inner = {
         id(part)
-        for node in ast.walk(tree)
+        for node in nodes_of(path)
         if isinstance(node, ast.JoinedStr)
         for part in ast.walk(node)
     }
-    for node in ast.walk(tree):
+    for node in nodes_of(path):
         if isinstance(node, ast.JoinedStr):
             text = "".join(v.value if isinstance(v, ast.Constant) else "\0" for v in node.values)
         elif (
@@ -165,7 +165,7 @@ def texts_of(path):
 
 def docstrings_of(path):
     """(line, text) of the docstrings of a Python file."""
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
         if isinstance(node, kinds) and ast.get_docstring(node, clean=False):
             text = node.body[0].value
@@ -217,7 +217,7 @@ ALLOWED_NAMES = {"pair_law"}
 def names_in(path):
     """(line, name) of what a Python file defines: functions, classes, arguments, variables,
     attributes."""
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
             yield node.lineno, node.name
         elif isinstance(node, ast.arg):

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Any
 
 from rigidmd.analysis import registry
 from rigidmd.analysis.registry import Analysis, register, selected
@@ -25,7 +24,7 @@ __all__ = ["analyse", "register", *registry.KNOWN]  # pyright: ignore[reportUnsu
 
 
 def analyse(
-    results: Results, name: str, /, start: float | None = None, **options: Any
+    results: Results, name: str, /, start: float | None = None, **options: object
 ) -> AnalysisResult:
     """The result of an analysis by its name, built-in or added by `register`."""
     (entry,) = selected([name])
@@ -67,9 +66,9 @@ def _function_of_results(entry: Analysis) -> Callable[..., AnalysisResult]:
 
     def function(
         results: Results | Sequence[Results],
-        *arguments: Any,
+        *arguments: object,
         start: float | None = None,
-        **options: Any,
+        **options: object,
     ) -> AnalysisResult:
         _check_results(results, entry.name)
         each = [results] if isinstance(results, Results) else results

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from rigidmd.figures.style import (
 if TYPE_CHECKING:
     from rigidmd.analysis.result import Curve
     from rigidmd.figures.picture import Picture
+    from rigidmd.figures.style import Axes
 
 WIDTH, HEIGHT, MOST_CURVES = 5.2, 3.2, 10  # size of a figure, inches, and most curves in it
 UNDRAWN = re.compile(r"n .+-.+")  # headers of columns that are in the file and not drawn
@@ -57,7 +58,7 @@ def curves_figure(curves: "Sequence[Curve]", title: str) -> "Picture":
     return figure
 
 
-def _draw(axis: Any, curve: "Curve") -> None:
+def _draw(axis: "Axes", curve: "Curve") -> None:
     header, x = curve.axis
     shown = [title for title in curve.columns if not UNDRAWN.fullmatch(title)][:MOST_CURVES]
     is_drawn = x > 0 if curve.log[0] else np.ones(len(x), bool)

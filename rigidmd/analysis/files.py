@@ -1,13 +1,12 @@
 """Analyses of the folder of a run, and their files: analysis.json, a CSV file and a figure for each
 curve."""
 
-import csv
 import traceback
 from collections.abc import Callable, Mapping
 from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
@@ -84,7 +83,7 @@ def write_results(
     for curve in curves:
         columns = curve.table
         lines = (list(map(nine_digits, line)) for line in zip(*columns.values(), strict=True))
-        write_csv(folder / f"{curve.file}.csv", [list(columns), *lines], csv.QUOTE_NONNUMERIC)
+        write_csv(folder / f"{curve.file}.csv", [list(columns), *lines], quote_text=True)
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
     for curve in curves:
         title = f"{folder.absolute().name}: {curve.file.replace('_', ' ')}"
@@ -117,7 +116,7 @@ class _FramesUsed(BaseModel):
     notes: list[str]
 
 
-class _Entry(BaseModel):
+class TableEntry(BaseModel):
     about: str
     values: list[Value]
     notes: list[str]
@@ -130,10 +129,10 @@ class _Entry(BaseModel):
 class _Analyses(BaseModel):
     """analysis.json."""
 
-    analyses: dict[str, _Entry]
+    analyses: dict[str, TableEntry]
 
 
-def read_table(folder: Path) -> dict[str, _Entry]:
+def read_table(folder: Path) -> dict[str, TableEntry]:
     """The entries of analysis.json by analysis, if there are any. Raises OutputError."""
     analyses = read_json(folder / ANALYSIS, _Analyses, ". Remove it, and analyse again")
     return {} if analyses is None else analyses.analyses
@@ -190,7 +189,7 @@ def analyse_folder(
     viscosity: float | None = None,
     progress: Callable[[float, str], object] = lambda fraction, name: None,
     figures: str = FIGURES[0],
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
 ) -> AnalysisOutput:
     """Analyse the run in a folder and write the files into it.
 
@@ -226,7 +225,7 @@ def analyse_frames(
     viscosity: float | None,
     progress: Callable[[float, str], object],
     figures: str,
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
 ) -> AnalysisOutput:
     """Analyse frames, and write the files into a folder if there are results. See
     `analyse_folder`."""
@@ -253,7 +252,7 @@ def run_analyses(
     names: list[str],
     viscosity: float | None = None,
     progress: Callable[[float, str], object] = lambda fraction, name: None,
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
 ) -> tuple[list[AnalysisResult], dict[str, str]]:
     """The results of analyses, and a sentence on each that has failed: analysis -> why. No analysis
     ends the others."""

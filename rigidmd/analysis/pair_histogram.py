@@ -66,8 +66,8 @@ def count_pairs(
     edge: float,
     bins: int,
 ) -> np.ndarray:
-    """Number (bins,) of ordered pairs of sites (k, 3) and (l, 3), Å, of different molecules
-    `owner`, by distance.
+    """Number (bins,) of ordered site pairs, (k, 3) and (l, 3), Å, on different molecules `owner`,
+    by distance.
 
     cell (3, 3), a along x and b in the plane of x and y; edge * bins is at most half its smallest
     height.

@@ -8,9 +8,10 @@ from inspect import signature
 from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigidmd.analysis.result import (
     AnalysisResult,
@@ -28,6 +29,8 @@ from rigidmd.scene.base import format_override
 from rigidmd.scene.validation import did_you_mean
 
 Function = Callable[..., AnalysisResult]
+#: A user-defined analysis: a number for each frame, or such series by their titles.
+UserFunction = Callable[[RigidFrames], ArrayLike | Mapping[str, ArrayLike]]
 
 
 class Analysis(NamedTuple):
@@ -47,12 +50,14 @@ KNOWN: dict[str, Analysis] = {}
 def built_in(
     about: str, position: float = inf, on_request: bool = False
 ) -> Callable[[Function], Function]:
-    """Register a built-in analysis under the name of its function of `Runs`, which takes the frames
-    of one run too."""
+    """Register a built-in analysis under its function's name in `Runs`, which takes the frames of
+    one run too."""
 
     def add(function: Function) -> Function:
         @wraps(function)
-        def analysis(frames: RigidFrames | Runs, *arguments: Any, **options: Any) -> AnalysisResult:
+        def analysis(
+            frames: RigidFrames | Runs, *arguments: object, **options: object
+        ) -> AnalysisResult:
             return function(as_runs(frames), *arguments, **options)
 
         name = function.__name__
@@ -70,7 +75,7 @@ def load_built_in() -> None:
         import_module(f"{folder.__name__}.{module.name}")
 
 
-def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], Any]:
+def register(function: UserFunction) -> UserFunction:
     """Register a user-defined analysis under the name of its function. `rigidmd analyse --only
     NAME` runs it.
 
@@ -143,9 +148,9 @@ def selected(names: list[str]) -> list[Analysis]:
     return [KNOWN[name] for name in names or known if names or not KNOWN[name].on_request]
 
 
-def check_options(entries: list[Analysis], options: Mapping[str, Any]) -> None:
+def check_options(entries: list[Analysis], options: Mapping[str, object]) -> None:
     """Raise OutputError for options that none of the analyses takes, or of another type."""
-    known: dict[str, Any] = {}
+    known: dict[str, object] = {}
     for entry in entries:
         _, *parameters = signature(entry.function).parameters.values()
         known |= {parameter.name: parameter.default for parameter in parameters}
@@ -187,9 +192,7 @@ def run_user_file(path: Path) -> None:
         )
 
 
-def _series_of(
-    function: Callable[[RigidFrames], Any], name: str, frames: RigidFrames
-) -> dict[str, np.ndarray]:
+def _series_of(function: UserFunction, name: str, frames: RigidFrames) -> dict[str, np.ndarray]:
     """What a user-defined analysis returns for the frames of a run: a number for each frame (f,) by
     title. Raises OutputError."""
     try:
@@ -205,7 +208,7 @@ def _series_of(
     }
 
 
-def _checked_series(name: str, title: object, values: Any, count: int) -> np.ndarray:
+def _checked_series(name: str, title: object, values: ArrayLike, count: int) -> np.ndarray:
     """What a user-defined analysis returned, as one number for each frame (f,). Raises
     OutputError."""
     try:

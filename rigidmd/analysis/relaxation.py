@@ -94,8 +94,8 @@ def spectral_bands(runs: list[np.ndarray], interval: float) -> Bands:
 
 
 def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
-    """Integral from 0 to infinity of the correlation function of series (n, d) of mean 0, mean over
-    d and runs. None if the series are too short for a fit.
+    """Correlation function of series (n, d) with mean 0, integrated from 0 to infinity, mean over d
+    and runs. None if the series are too short for a fit.
 
     Models of one to three relaxations and a constant are fitted by their likelihood. Their limits
     are averaged with Akaike's weights, and differences between them are a part of the error.

@@ -11,8 +11,8 @@ HEADERS = ("quantity", "value", "unit", "correlation time (ps)")
 
 
 def results_text(results: Sequence[AnalysisResult], failed: Mapping[str, str]) -> list[str]:
-    """Lines of a table of all values, of the values that a run is too short for, and of the
-    analyses that were not possible.
+    """Lines with a table of all values, the values that a run is too short for, and the analyses
+    that were not possible.
 
     failed : analysis -> a sentence on why
     """

@@ -229,8 +229,8 @@ def _unchanged(values: np.ndarray) -> np.ndarray:
 def with_block_error(
     runs: Runs, measure: Callable[[RigidFrames], np.ndarray], conclude: Array = _unchanged
 ) -> Measured:
-    """An array computed from frames, and its standard error: of one run from blocks of at least two
-    frames, of several from their scatter.
+    """An array computed from frames, and its standard error: for one run from blocks of at least
+    two frames, for several runs from their scatter.
 
     measure : means over some frames; conclude : function of the means over all of them
     """
@@ -249,9 +249,9 @@ def with_group_error(
     measure: Callable[[RigidFrames, Kind], np.ndarray],
     conclude: Array = _unchanged,
 ) -> Measured:
-    """An array computed from the molecules of a species, and its standard error: of one run the
-    larger of two, from blocks of frames and from groups of molecules; of several runs from their
-    scatter. Blocks are too similar in a gas, groups where molecules move together."""
+    """An array computed from the molecules of a species, and its standard error: for one run the
+    larger of two estimates, from blocks of frames and from groups of molecules; of several runs
+    from their scatter. Blocks are too similar in a gas, groups where molecules move together."""
     value, error = with_block_error(runs, lambda part: measure(part, kind), conclude)
     if (count := min(MAX_GROUPS, len(kind.index))) > 1 and not runs.are_several:
         groups = (

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from rigidmd.assemble.build import build
 from rigidmd.core.state import NO_CELL
 from rigidmd.engines.samples import equilibrated_from, moving
 from rigidmd.engines.system import System
@@ -20,9 +21,10 @@ from rigidmd.io.trajectory import Frames, read_frames, without_rounding
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.results import Results
 from rigidmd.run.rigid_fit import Bodies, Kind, RigidFit, kinds_of
+from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.stage import Stage
-from rigidmd.scene.validation import did_you_mean
+from rigidmd.scene.validation import did_you_mean, not_none
 from rigidmd.units import BOLTZMANN
 
 EVEN = 1e-3  # two intervals between frames that differ by less than this fraction are equal
@@ -265,13 +267,33 @@ def frames_of_folder(
         raise OutputError(f"{path}: {error}") from None
 
 
+def frames_of_start(scene: MolecularScene, count: int) -> RigidFrames:
+    """The start of a scene as a number of frames, for molecules that do not move. Raises
+    SceneError."""
+    system = build(scene)
+    state, stage = system.state, system.scene.stages[-1]
+    shape = (count, len(system.model.species))
+    return RigidFrames(
+        system,
+        stage,
+        np.arange(count, dtype=float),
+        np.broadcast_to(state.cell, (count, 3, 3)),
+        np.broadcast_to(state.position, (*shape, 3)),
+        np.broadcast_to(state.rotation, (count, *state.rotation.shape)),
+        None,
+        None,
+        {"temperature": np.full(count, not_none(system.scene.start.temperature_K))},
+    )
+
+
 def frames_of_results(results: Results, start: float | None = None) -> RigidFrames:
     """The frames of a run of molecules in this process. Raises OutputError."""
     system = results.system
     if not isinstance(system, System):
         raise OutputError("this is a run of a single body, and analyses are for molecules")
     if results.files:
-        return frames_of_folder(read_record(results.files[0].parent), start)
+        record = replace(read_record(results.files[0].parent), system=system)
+        return frames_of_folder(record, start)
     frames = results._frames
     if not frames:
         raise OutputError("this run has no frames (output.trajectory = false) to analyse")
@@ -296,7 +318,7 @@ def production_samples(record: Record) -> tuple[Stage, np.ndarray]:
 
 def earlier_production(record: Record) -> Iterator[tuple[Stage, np.ndarray]]:
     """The stages of motion before the last one whose set points do not change, and which samples
-    are of the equilibrated part of each. Raises OutputError."""
+    belong to their equilibrated parts. Raises OutputError."""
     columns, last = record.columns, _last_stage(record.system, record.columns)[0]
     for k, stage in enumerate(record.system.scene.stages):
         if stage is last:
@@ -329,7 +351,7 @@ def _rigid_frames(
             f" {last:g} ps"
         )
     elif start < first:
-        notes.append(f"frames before {first:g} ps are of an earlier stage")
+        notes.append(f"frames before {first:g} ps belong to an earlier stage")
     if not stage.keeps_momentum:
         notes.append(
             f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and"

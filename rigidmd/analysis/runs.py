@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigidmd.analysis.rigid_frames import EVEN, RigidFrames
 from rigidmd.engines.system import System
@@ -21,8 +21,7 @@ Measured = tuple[np.ndarray, np.ndarray]
 class Runs:
     """The frames of independent runs of one system. At least one.
 
-    Averages are over the frames of all runs, and limits of length apply to the sum of their
-    lengths.
+    Averages are over the frames of all runs, and minimum lengths apply to their total length.
     """
 
     members: tuple[RigidFrames, ...]
@@ -97,13 +96,15 @@ class Runs:
         """kB T at the mean temperature, u Å²/ps²."""
         return float(self.mean([run.thermal_energy for run in self.members]))
 
-    def mean(self, values: Sequence[Any]) -> np.ndarray:
+    def mean(self, values: Sequence[ArrayLike]) -> np.ndarray:
         """Mean of a value (...) of each run, weighted by the number of its frames."""
         return np.average(
             np.asarray(values, float), axis=0, weights=[len(run) for run in self.members]
         )
 
-    def estimate(self, values: Sequence[Any], conclude: Callable[[np.ndarray], Any]) -> Measured:
+    def estimate(
+        self, values: Sequence[ArrayLike], conclude: Callable[[np.ndarray], ArrayLike]
+    ) -> Measured:
         """What follows from the mean of a value of each run, and its standard error by omitting
         one run after another (jackknife). Without further conclusions this is the standard error of
         the mean over runs.

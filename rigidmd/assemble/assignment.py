@@ -107,8 +107,8 @@ class Orders:
 
     An order is found from an orientation: two atoms that may be two sites of the template (one, if
     it is linear) and the mean position of all atoms give one, and the atoms are assigned to the
-    sites at the least sum of squares (the linear assignment problem). Orientation and order are
-    refined in turn. All pairs of atoms are tried at which distances agree within the limit.
+    sites with the smallest sum of squares (the linear assignment problem). Orientation and order
+    are refined in turn. All pairs of atoms are tried at which distances agree within the limit.
     Symmetric templates fit in several orders.
 
     molecule, classes (s,) of its sites with mass

@@ -1,5 +1,5 @@
-"""The system of a scene of a single body, and errors of keys that do not apply to the body or have
-no effect on it."""
+"""The system for a single-body scene, and errors for keys that do not apply to the body or have no
+effect on it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import permutations

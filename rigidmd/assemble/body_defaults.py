@@ -1,7 +1,5 @@
 """The defaults of scenes of a single body, see `defaults`."""
 
-from typing import Any
-
 from rigidmd.core.integrators import RK4, SOLVERS
 from rigidmd.formats import BODY_TOPOLOGY, TOPOLOGY
 from rigidmd.scene.body import FORMULATION, SAMPLES, BodyScene
@@ -21,7 +19,7 @@ def body_with_defaults(scene: BodyScene, rotates: bool, radius: float) -> BodySc
     run, watch = scene.run, scene.watch
     solver = run.integrator in SOLVERS
     if solver:
-        numbers: dict[str, Any] = {
+        numbers: dict[str, object] = {
             "formulation": (run.formulation or FORMULATION) if rotates else None
         }
         if run.integrator != RK4:

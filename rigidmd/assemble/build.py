@@ -4,6 +4,7 @@ raised together.
 The integrator of a stage: its scheme with the flows of the thermostat and the barostat.
 """
 
+from dataclasses import replace
 from importlib import import_module
 from math import inf
 from typing import NamedTuple
@@ -144,6 +145,10 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
 
             system = with_user_code(system)
             scene, model = system.scene, system.model
+    elif scene.forces.bodies:
+        from rigidmd.assemble.user_code.body_pairs import potentials_of_stored_run
+
+        system = replace(system, body_pairs=potentials_of_stored_run(scene))
     if names := ", ".join(name.replace("_", " ") for name in system.position_dependent):
         why = f"changes the box, and {names} depend on absolute positions in it: keep the volume"
         faults = [

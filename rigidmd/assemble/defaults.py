@@ -8,7 +8,7 @@ and the grid of PME where another cell of the same lattice replaces a cell with 
 """
 
 from importlib import import_module
-from math import inf
+from math import floor, inf
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -159,7 +159,8 @@ def _with_electrostatics(
 
 
 def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
-    """Why a scene has no tail correction by default. Empty if it has one."""
+    """Why a scene has no tail correction by default, or an empty text if it has a tail
+    correction."""
     forces = scene.forces
     if not forces.lennard_jones:
         return "forces.lennard_jones is false"
@@ -215,11 +216,15 @@ def _cutoff_and_switch(
     for key, value in (("cutoff_A", cutoff), ("ewald_cutoff_A", forces.ewald_cutoff_A or 0.0)):
         if value > half:
             default = "" if getattr(forces, key) else " (the default)"
-            why = (
-                "which violates the minimum-image convention. Use a larger box or a shorter cutoff"
-            )
+            larger = "a larger box"
+            if any(m.cell is not None for m in composition.species):
+                factors = np.ceil(2 * value / np.array(space.edges)).astype(int).tolist()
+                larger = f"{' x '.join(map(str, factors))} times the repeats of the cell"
+            shorter = f"{key} = {floor(100 * half) / 100:g} or less"
+            why = f"which violates the minimum-image convention. Use {larger}, or {shorter}"
             faults.append(f"forces.{key} = {value:g}{default} is longer than {limit}, {why}")
-    extents = {m.name: pdist(m.positions_body).max(initial=0.0) for m in composition.species}
+    bodies = [m for m in composition.species if m.cell is None]  # a framework fills the box
+    extents = {m.name: pdist(m.positions_body).max(initial=0.0) for m in bodies}
     faults += [
         f"a molecule of {m} is {x:.2f} Å long, more than {limit}"
         for m, x in extents.items()

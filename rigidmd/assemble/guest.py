@@ -4,6 +4,7 @@ coefficients and insertion."""
 from dataclasses import replace
 from math import inf
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -28,6 +29,9 @@ from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene.models import Molecule, load_model, read_molecule
 from rigidmd.scene.molecules import missing_user_code
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+
+if TYPE_CHECKING:
+    from rigidmd.forces.poses.pairs import BodyPairs
 
 #: Two molecules overlap where the energy of two of their sites, without charges, is at least the
 #: larger of these: u Å²/ps², and a multiple of kT.
@@ -72,7 +76,10 @@ class Guest:
         core = max(CORE, CORE_IN_KT * self._thermal)
         self._pairs: list[tuple[PairForces, list[PairOfKinds]]] = []
         rest: list[str] = []
+        self._poses = [cast("BodyPairs", self._with.terms[name]) for name in self._with.body_pairs]
         for name, term in self._with.terms.items():
+            if name in self._with.body_pairs:
+                continue
             if isinstance(term, PairForces) and isinstance(term.potential, POTENTIALS):
                 is_guest = term.sites.molecule == len(self._host)
                 sites = np.flatnonzero(is_guest), np.flatnonzero(~is_guest)
@@ -110,6 +117,11 @@ class Guest:
         energy = np.zeros(len(position))
         for term, pairs in self._pairs:
             self._add_pairs(energy, term, pairs, host, position, rotation)
+        if self._poses:
+            from rigidmd.forces.poses.trials import add_trial_energies  # for such systems only
+
+            for term in self._poses:
+                add_trial_energies(term, host, position, rotation, energy)
         constant = self.constant(state.volume)
         if self._engines:
             alone = _total(self._engines[1], host)
@@ -140,7 +152,7 @@ class Guest:
         position: np.ndarray,
         rotation: np.ndarray,
     ) -> None:
-        """Add the energies of a term of pairs to those of trials."""
+        """Add the energies of a pair term to the trial energies."""
         offset, owner = term.sites.offsets(), term.sites.molecule
         is_guest = owner == len(self._host)
         fixed = self._without.positions_of(host, owner[~is_guest], offset[~is_guest])
@@ -177,8 +189,9 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
         rotor if inertia.any() else NoRotor(),
     )
     state = _selected(system.state, host)
+    rotates = len(system.state.rotation) > 0 or bool(inertia.any())  # also of frozen molecules
     for _ in added:
-        state = _with_trial(state, np.zeros(3), np.eye(3), rotates=bool(inertia.any()))
+        state = _with_trial(state, np.zeros(3), np.eye(3), rotates)
     scene = system.scene
     if scene.from_python != scene.user_code.names:
         missing = missing_user_code(scene.from_python, scene.user_code.names)

@@ -2,9 +2,9 @@
 templates."""
 
 from collections import Counter, deque
-from collections.abc import Collection
+from collections.abc import Collection, Hashable
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -396,7 +396,7 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
     group, group_wanted = (
         [key if key in shared else key[1] for key in keys] for keys in (present, template)
     )
-    queues: dict[Any, deque[int]] = {key: deque() for key in group_wanted}
+    queues: dict[Hashable, deque[int]] = {key: deque() for key in group_wanted}
     for index, key in zip(indices, group, strict=True):
         queues[key].append(index)
     order = [queues[key].popleft() for key in group_wanted]

@@ -83,8 +83,8 @@ def check_memory(system: "System") -> None:
 
 
 def _samples(scene: "MolecularScene") -> tuple[float, float]:
-    """Number of lines of the log of a run, and the bytes of these lines and of the times of frames
-    at its end."""
+    """Number of log lines in a run, and the bytes that these lines and the frame times have at its
+    end."""
     output = scene.output
     lines, frames = (  # at the interval and at the ends of stages
         sum(2 + s.duration / (every if s.is_auto else max(every, s.step)) for s in scene.stages)

@@ -6,7 +6,7 @@ numbers that are warned of, `REFUSED` of numbers that no scene can mean.
 
 from collections.abc import Iterable, Iterator
 from math import degrees, inf, pi
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,7 @@ COLDEST_LIQUID = 100.0  # K, of water that starts without a file
 
 
 class Quantity(NamedTuple):
-    """Plausible values of a quantity, and the likely cause of smaller and of larger ones."""
+    """Plausible values of a quantity, and the likely cause if a value is smaller or larger."""
 
     unit: str
     least: float
@@ -110,8 +110,8 @@ def scene_errors(
 
 
 def shortest_contact(species: "list[Molecule]") -> float:
-    """Smallest distance of the minimum of the energy of two like molecules, by their largest sites,
-    Å; inf without."""
+    """Smallest distance at which two like molecules have minimum energy, by their largest sites, Å;
+    inf without."""
     largest = [float(m.sigma.max(where=m.epsilon > 0, initial=0.0)) for m in species]
     return MINIMUM * min((x for x in largest if x > 0), default=inf)
 
@@ -227,7 +227,7 @@ def body_warnings(scene: "BodyScene") -> list[str]:
     else:
         warnings = gravity_warnings("gravity.acceleration_m_s2", scene.gravity.acceleration_m_s2)
     for key in ("euler_angles_deg", "yaw_pitch_roll_deg"):
-        angles: Any = getattr(scene.start, key)
+        angles = getattr(scene.start, key)
         if angles is not None and any(map(in_radians, angles)) and max(map(abs, angles)) <= 2 * pi:
             shown = ", ".join(f"{x:g}" for x in angles)
             inside = ", ".join(f"{degrees(x):.4g}" for x in angles)

@@ -55,7 +55,7 @@ def atoms_of(scene: MolecularScene) -> "ase.Atoms":
 
 def scene_from_atoms(
     atoms: "ase.Atoms",
-    models: str | Sequence[str | Mapping[str, Any]],
+    models: str | Sequence[str | Mapping[str, object]],
     **settings: Unpack[Settings],
 ) -> MolecularScene:
     """The scene of an `ase.Atoms`, whose atoms become molecules like the atoms of a structure file.
@@ -128,7 +128,7 @@ def scene_from_atoms(
     )
 
 
-def atoms_errors(atoms: Any) -> list[str]:
+def atoms_errors(atoms: object) -> list[str]:
     """Messages on an object that is not an `ase.Atoms`, or cannot consist of molecules."""
     import ase
 

@@ -64,7 +64,10 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
         else:
             where = "sites or of parameters" if entry.parameters is not None else "sites"
             sites = sites_of_geometry(scene.path(entry.file), entry.sites or (), table, where)
-        kind = molecule(entry.label, sites)
+        if entry.repeat is None:
+            kind = molecule(entry.label, sites)
+        else:
+            kind = _framework(scene.path(not_none(entry.file)), entry.label, sites, entry.repeat)
     if entry.masses_u is not None:
         kind = with_masses(kind, entry.masses_u)
     changed = {
@@ -72,6 +75,23 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
         "residue_names": entry.residue_names or kind.residue_names,
     }
     return replace(kind, **changed)
+
+
+def _framework(
+    path: Path, name: str, sites: tuple[Site, ...], repeat: tuple[int, int, int]
+) -> Molecule:
+    """One body of the sites in the repeated cell of a crystal. Raises StructureError."""
+    atoms = read_atoms(path)
+    if (cell := atoms.cell) is None:
+        raise StructureError(str(path), ["has no cell to repeat"])
+    steps = np.stack(np.meshgrid(*map(np.arange, repeat), indexing="ij"), -1).reshape(-1, 3) @ cell
+    repeated = tuple(
+        site.model_copy(update={"position_A": tuple(not_none(site.position_A) + step)})
+        for step in steps
+        for site in sites
+    )
+    cell = cell * np.array(repeat)[:, None]
+    return replace(molecule(name, repeated), cell=cell, note="; ".join(atoms.notes))
 
 
 def sites_of_geometry(
@@ -84,7 +104,10 @@ def sites_of_geometry(
     available = list(dict.fromkeys(site.name for site in (*entries_of_scene, *table))) or ["none"]
     listed = ", ".join(available[:MOST_LISTED]) + (", ..." if len(available) > MOST_LISTED else "")
     hint = f"there are {listed}. The atoms of the file may have these names in place of elements"
-    for name, element, mass, position in zip(*read_geometry(path), strict=True):
+    atoms = read_geometry(path)
+    charges = [None] * len(atoms.names) if atoms.charges is None else atoms.charges.tolist()
+    columns = atoms.names, atoms.elements, not_none(atoms.masses), atoms.position, charges
+    for name, element, mass, position, charge in zip(*columns, strict=True):
         match, shared = find_site(entries_of_scene, name, element), find_site(table, name, element)
         if match is None and shared is None:
             faults.append(
@@ -95,11 +118,13 @@ def sites_of_geometry(
         entries = [s for s in (match, shared) if s is not None]
         mass = next((s.mass_u for s in entries if s.mass_u is not None), float(mass))
         element = next((s.element for s in entries if s.element != "X"), element)
+        charge = next((s.charge_e for s in entries if s.charge_e is not None), charge)
         known = {
             "name": name[:5],
             "element": element,
             "mass_u": mass,
             "position_A": tuple(map(float, position)),
+            "charge_e": charge,
         }
         sites.append(match.model_copy(update=known) if match else Site(**known))
     faults += [
@@ -130,8 +155,6 @@ def split_frozen(
             index[selected] = len(species)
             species.append(species[k])
             frozen.append(True)
-    if frozen and all(frozen[k] for k in np.unique(index)):
-        faults.append("molecules: all are frozen. Nothing would move")
     return species, index, np.array(frozen), faults
 
 
@@ -153,7 +176,8 @@ def model_from_geometry(
     name : default: the name of the file. Raises StructureError or MoleculeError, with all errors.
     """
     notes, source = [], [f"geometry of {geometry.name}"]
-    names, elements, *_ = read_geometry(geometry)
+    atoms = read_geometry(geometry)
+    names, elements = atoms.names, atoms.elements
     if parameters is None:
         sites = sites_of_geometry(
             geometry, (), tuple(Site(name=element) for element in dict.fromkeys(elements)), ""
@@ -177,7 +201,6 @@ def model_from_geometry(
     sites = _numbered(sites)
     if long := sorted({atom for atom in names if len(atom) > 5}):
         notes.append(f"names of atoms have five characters at most: {', '.join(long)} are cut")
-    atoms = read_atoms(geometry)
     residues = {residue[1] for residue in atoms.residue if len(residue) > 1}
     residues = [
         x

@@ -17,7 +17,7 @@ from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.fields.walls import range_of_centres
 from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.formats import format_of
-from rigidmd.formats.cells import cell_error, pairs_within
+from rigidmd.formats.cells import cell_error, pairs_within, standard_rotation
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import AXES
@@ -47,6 +47,9 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
 
 def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configuration:
     cell, counts = scene.box.cell, [entry.count or 0 for entry in scene.molecules]
+    framework = next((k for k, m in enumerate(species) if m.cell is not None), None)
+    if framework is not None:
+        return _about_framework(scene, species, framework, counts)
     if cell is None and scene.structure is None:
         mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
         cell = np.eye(3) * np.cbrt(mass / (not_none(scene.box.density_g_cm3) * GRAM_PER_CM3))
@@ -96,6 +99,30 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
         cell=cell if scene.box.periodic else None,
     )
     return with_reduced_cell(configuration, "its", may_rotate=False)
+
+
+def _about_framework(
+    scene: MolecularScene, species: list[Molecule], framework: int, counts: list[int]
+) -> Configuration:
+    """A framework at its position in its cell, and molecules on a lattice, also inside its
+    walls."""
+    counts = [0 if k == framework else count for k, count in enumerate(counts)]
+    body, n, first = species[framework], sum(counts), sum(counts[:framework])
+    cell, rotation = standard_rotation(not_none(body.cell))
+    if fault := cell_error(cell):
+        raise SceneError(scene.source, [f"the cell of {body.name}: {fault}"])
+    rng = np.random.default_rng([scene.seed, LATTICE])
+    lattice = _start_lattice(scene, species, n, np.diag(cell), rng) if n else np.zeros((0, 3))
+    configuration = Configuration(
+        species=np.insert(np.repeat(np.arange(len(species)), counts), first, framework),
+        position=np.insert(lattice, first, rotation @ body.centre, axis=0),
+        rotation=np.insert(random_rotations(rng, n), first, rotation @ body.axes, axis=0),
+        velocity=None,
+        angular_momentum_body=None,
+        cell=cell,
+        notes=(f"of {body.name}: {body.note}",) if body.note else (),
+    )
+    return with_reduced_cell(configuration, "its", may_rotate=True)
 
 
 def output_errors(system: System) -> list[str]:
@@ -188,7 +215,7 @@ def _start_lattice(
 
 
 def _lattice_shape(edges: np.ndarray, n: int) -> np.ndarray:
-    """Numbers of points (3,) along edges (3,) of a nearly cubic lattice of at least n points.
+    """Numbers of points (3,) along edges (3,), for a nearly cubic lattice with at least n points.
 
     An edge shorter than half the spacing has one point, and the other edges set the spacing.
     """

@@ -1,9 +1,9 @@
 """Estimates for time steps without compiled code: the fastest motions in a liquid, steps that are
 too long for them, and the precision of forces that suits the error of a step.
 
-A motion of angular frequency w has the rms amplitude sqrt(kT/m)/w at a temperature T. The
-amplitudes of the fastest motions of molecules in liquids are much alike, so w follows from masses,
-moments of inertia and temperature.
+A motion of angular frequency w has the rms amplitude sqrt(kT/m)/w at a temperature T. The fastest
+molecular motions in liquids have similar amplitudes, so w follows from masses, moments of inertia
+and temperature.
 """
 
 from collections.abc import Callable, Iterator
@@ -102,7 +102,7 @@ def _longest_angle(scheme: Scheme, error: float) -> float:
 
 
 def _bias_per_error(stage: Stage) -> float:
-    """Bias of U per time-step error, kT per degree of freedom, of a stage with a thermostat."""
+    """Bias of U per time-step error, kT per degree of freedom, in a stage with a thermostat."""
     if stage.is_hybrid:
         return 0.0
     return BIAS_IN_MIDDLE if stage.integrator in WITH_THERMOSTAT else BIAS_AT_ENDS
@@ -210,7 +210,7 @@ def step_warnings(scene: MolecularScene) -> list[str]:
                 f" {forces.truncation!r}"
             )
             advice = "Use truncation = 'smooth_switch'"
-            warnings.append(f"stages.{k}: {stage.integrator} is of order {order}, {lost}. {advice}")
+            warnings.append(f"stages.{k}: {stage.integrator} has order {order}, {lost}. {advice}")
     return [*warnings, *_sentences_on_steps(scene, _step_warning)]
 
 

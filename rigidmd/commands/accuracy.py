@@ -7,6 +7,7 @@ from rigidmd.commands.arguments import (
     Options,
     argument,
     command,
+    flag,
     output_folder,
     read_scene,
     write_study,
@@ -33,24 +34,27 @@ from rigidmd.commands.arguments import (
     ),
     argument("--timesteps", metavar="X,Y,...", help="time steps, fs for molecules, s for a body"),
     argument(
-        "--span", type=float, metavar="T", help="length of each run (default: 0.1 ps; a body's run)"
+        "--span",
+        type=float,
+        metavar="T",
+        help="length of each run (default: 0.1 ps, for a body the length of its run)",
     ),
     argument(
         "--repeats",
         type=int,
         default=3,
         metavar="N",
-        help="timings of each run (default: 3), 1 shows no spread",
+        help="number of timings of each run (default: 3). One timing shows no spread",
     ),
-    argument(
+    flag(
         "--averages",
-        action="store_true",
         help=(
-            "molecules only: measure the bias of averages instead, by samples of the last stage"
+            "molecules only: measure the bias of averages instead. The last stage is sampled"
             " under its thermostat (nvt, npt) with every integrator at every step. --integrators"
-            " then accepts names with a thermostat, baoab+langevin (default: the method of the"
-            " stage, baoab+velocity_rescaling, baoab+langevin, velocity_verlet+velocity_rescaling),"
-            " and --timesteps default to fractions of the longest stable one"
+            " then accepts names with a thermostat, such as baoab+langevin (default: the method of"
+            " the stage, baoab+velocity_rescaling, baoab+langevin,"
+            " velocity_verlet+velocity_rescaling), and --timesteps has fractions of the longest"
+            " stable step as its default"
         ),
     ),
     argument(
@@ -62,11 +66,8 @@ from rigidmd.commands.arguments import (
             " of it (default: 20)"
         ),
     ),
-    argument(
-        "-v",
-        "--verbose",
-        action="store_true",
-        help="also print which integrators are equally fast within timing noise",
+    flag(
+        "-v", "--verbose", help="also print which integrators are equally fast within timing noise"
     ),
     *output_folder("runs/NAME-accuracy"),
     writes=True,

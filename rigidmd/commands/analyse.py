@@ -4,8 +4,10 @@ import argparse
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import Options, argument, command, number, time_ps
+from rigidmd.commands.arguments import Options, argument, command, flag, number, repeated, time_ps
 from rigidmd.commands.streams import progress_bar
+
+FRAMES = 100  # equal ones, for insertion without a run
 
 
 class _List(argparse.Action):
@@ -28,14 +30,17 @@ class _List(argparse.Action):
     argument(
         "folder",
         metavar="RUN",
-        help="folder of a run, or of a sweep: means and errors over its runs",
+        help=(
+            "folder of a run, or of a sweep, whose runs are analysed together. For `insertion` also"
+            " a scene, into whose frozen molecules a model is inserted without a run"
+        ),
     ),
     argument(
         "requests",
         nargs="*",
         metavar="NAME",
         help=(
-            "these analyses, like --only; KEY=VALUE sets an option of theirs, such as"
+            "analyses to run, like --only. KEY=VALUE sets one of their options, such as"
             " `insertion model=krypton trials=5000`"
         ),
     ),
@@ -44,7 +49,7 @@ class _List(argparse.Action):
         type=lambda text: [name.strip() for name in text.split(",") if name.strip()],
         default=[],
         metavar="NAMES",
-        help="these analyses, separated by commas (default: all). `--list` names them",
+        help="analyses to run, separated by commas (default: all). `--list` names them",
     ),
     argument(
         "--from",
@@ -52,8 +57,8 @@ class _List(argparse.Action):
         type=time_ps,
         metavar="TIME",
         help=(
-            "use frames from this time of the run on, such as 10ps (default: where it is found to"
-            " be equilibrated)"
+            "use frames from this time of the run onwards, such as 10ps (default: from where the"
+            " run is found to be equilibrated)"
         ),
     ),
     argument(
@@ -61,8 +66,7 @@ class _List(argparse.Action):
         type=number(float, 1e-300, 1e12, "a viscosity above 0"),
         metavar="VALUE",
         help=(
-            "viscosity in mPa s for the correction of D for the size of the box (default: measured"
-            " in the run)"
+            "viscosity in mPa s for the finite-size correction of D (default: measured in the run)"
         ),
     ),
     argument(
@@ -75,26 +79,19 @@ class _List(argparse.Action):
         "--extrapolate",
         metavar="KEY",
         help=(
-            "of a sweep: extrapolate all averages and values to a step of 0 over this time step,"
-            " which the sweep varies, such as stages.1.timestep_fs"
+            "for a sweep: extrapolate all averages and values to a time step of 0. KEY is the"
+            " time step that the sweep varies, such as stages.1.timestep_fs"
         ),
     ),
-    argument(
+    repeated(
         "--trust",
-        action="append",
-        default=[],
-        metavar="FILE.py",
+        "FILE.py",
         help=(
-            "run this Python file first, which may define analyses with"
-            " @rigidmd.analysis.register, may be repeated"
+            "run this Python file first. It may define analyses with @rigidmd.analysis.register."
+            " Can be repeated"
         ),
     ),
-    argument(
-        "-v",
-        "--verbose",
-        action="store_true",
-        help="also print the notes of each analysis, and what its curves are",
-    ),
+    flag("-v", "--verbose", help="also print the notes of each analysis, and what its curves show"),
     argument("--list", action=_List, nargs=0, help="list the analyses"),
     scene="this run",
     writes=True,
@@ -113,6 +110,8 @@ def _analyse(options: Options) -> int:
         run_user_file(Path(path))
     names = [*options.only, *(text for text in options.requests if "=" not in text)]
     more = dict(parse_override(text) for text in options.requests if "=" in text)
+    if options.folder.endswith(".toml"):
+        return _insert(options.folder, names, more, options.verbose)
     with progress_bar() as progress:
         folder, request = Path(options.folder), (names, options.start, options.viscosity)
         if is_sweep(folder):
@@ -155,6 +154,29 @@ def _analyse(options: Options) -> int:
         " report` shows them"
     )
     return FAILED if names and done.failed else 0
+
+
+def _insert(path: str, names: list[str], more: dict[str, object], verbose: bool) -> int:
+    """Print the results of insertion into the frozen molecules of a scene."""
+    from rigidmd.analysis.files import run_analyses
+    from rigidmd.analysis.registry import check_options, selected
+    from rigidmd.analysis.rigid_frames import frames_of_start
+    from rigidmd.analysis.runs import Runs
+    from rigidmd.errors import OutputError
+    from rigidmd.scene import MolecularScene
+
+    if names != ["insertion"]:
+        raise OutputError(
+            f"{path} is a scene, and only insertion needs no run: `rigidmd analyse {path} insertion"
+            " model=NAME`, or `rigidmd run` first"
+        )
+    check_options(selected(names), more)
+    runs = Runs((frames_of_start(MolecularScene.read(path), FRAMES),))
+    results, failed = run_analyses(runs, names, options={"zero_loading": True} | more)
+    for result in results:  # trials at rest have no time
+        result.values = [value._replace(correlation_ps=None) for value in result.values]
+    _print_results(results, failed, verbose)
+    return FAILED if failed else 0
 
 
 def _print_results(results: list, failed: dict[str, str], verbose: bool) -> None:

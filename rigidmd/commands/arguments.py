@@ -1,4 +1,4 @@
-"""The registry of commands, arguments that several of them have, and the reading of scenes."""
+"""The command registry, arguments that several commands have, and the reading of scenes."""
 
 import argparse
 import re
@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from math import inf, nan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rigidmd.commands.streams import progress_bar
 from rigidmd.programs import engine_options, runnable
@@ -15,6 +15,7 @@ from rigidmd.programs import engine_options, runnable
 #: Adds an argument to the parser of a command.
 Argument = Callable[[argparse.ArgumentParser], object]
 Options = argparse.Namespace
+Result = TypeVar("Result")
 
 
 class Command(NamedTuple):
@@ -22,7 +23,7 @@ class Command(NamedTuple):
     about: str
     example: str
     arguments: tuple[Argument, ...]
-    options: dict[str, Any]  # that no argument sets
+    options: dict[str, object]  # that no argument sets
     call: Callable[[Options], int]
 
 
@@ -30,7 +31,7 @@ COMMANDS: dict[str, Command] = {}  # the commands of the imported modules, by na
 
 
 def command(
-    position: int, about: str, example: str, *arguments: Argument, **options: Any
+    position: int, about: str, example: str, *arguments: Argument, **options: object
 ) -> Callable:
     """Register a function as the command of its name, without underscores around it.
 
@@ -54,10 +55,22 @@ def argument(*names: str, **settings: Any) -> Argument:
     return lambda parser: parser.add_argument(*names, **settings)
 
 
-def number(kind: type, lowest: float, highest: float, description: str) -> Callable[[str], Any]:
+def flag(*names: str, help: str) -> Argument:
+    """An option that is on or off."""
+    return argument(*names, action="store_true", help=help)
+
+
+def repeated(name: str, metavar: str, help: str, dest: str | None = None) -> Argument:
+    """An option that may be repeated, whose values make a list."""
+    return argument(name, action="append", default=[], metavar=metavar, help=help, dest=dest)
+
+
+def number(
+    kind: type[int] | type[float], lowest: float, highest: float, description: str
+) -> Callable[[str], float]:
     """A reader for argparse of int or float numbers in a range."""
 
-    def read(text: str) -> Any:
+    def read(text: str) -> float:
         try:
             value = kind(text) if kind is float or text.isdigit() else nan
         except ValueError:
@@ -95,35 +108,31 @@ def output_folder(default: str, earlier: str = "earlier results") -> tuple[Argum
     """-o and --force of a command that writes a folder."""
     return (
         argument("-o", "--output", metavar="DIR", help=f"folder (default: {default})"),
-        argument("--force", action="store_true", help=f"replace {earlier} in that folder"),
+        flag("--force", help=f"replace {earlier} in that folder"),
     )
 
 
 #: For the Python files of forces of a scene.
-TRUST = argument(
+TRUST = repeated(
     "--trust",
-    action="append",
-    default=[],
-    metavar="FILE.py",
+    "FILE.py",
     help=(
-        "let [[forces.custom]] of the scene run this Python file, or a copy of it. It is code and"
-        " can do whatever you can, may be repeated"
+        "let [[forces.custom]] of the scene run this Python file, or a copy of it. It is code"
+        " and can do whatever you can. Can be repeated"
     ),
 )
 #: SCENE, --set and --trust, which `read_scene` reads.
 SCENE = (
     argument("scene", metavar="SCENE", help="scene file (TOML)"),
-    argument(
+    repeated(
         "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="overrides",
+        "KEY=VALUE",
         help=(
             "override a key of the scene by its dotted path (an entry of a list by its number,"
-            " counted from 0, or a stage by its name). KEY= without a value removes the key, may be"
-            " repeated"
+            " counted from 0, or a stage by its name). KEY= without a value removes the key. Can"
+            " be repeated"
         ),
+        dest="overrides",
     ),
     TRUST,
 )
@@ -170,7 +179,7 @@ def run_folder(output: str) -> tuple[Argument, Argument, Argument]:
     return (
         argument("folder", metavar="RUN", help="folder of a run"),
         argument("-o", "--output", metavar="FILE", help=output),
-        argument("--force", action="store_true", help="replace that file"),
+        flag("--force", help="replace that file"),
     )
 
 
@@ -194,10 +203,10 @@ def write_study(
     force: bool,
     files: tuple[str, ...],
     begins: str,
-    measure: Callable[[Callable], Any],
-    describe: Callable[[Any], list[str]],
-    write: Callable[[Path, Any, str], list[Path]],
-) -> Any:
+    measure: Callable[[Callable], Result],
+    describe: Callable[[Result], list[str]],
+    write: Callable[[Path, Result, str], list[Path]],
+) -> Result:
     """Measure something, print it and write its files into a folder, which is locked meanwhile.
     Returns what was found.
 

@@ -1,10 +1,14 @@
 """`rigidmd check`."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
-from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene
+from rigidmd.commands.arguments import SCENE, Options, add_engine, command, flag, read_scene
 from rigidmd.commands.streams import warn
 from rigidmd.errors import SceneError
+
+if TYPE_CHECKING:
+    from rigidmd.engines.system import System
+    from rigidmd.scene import MolecularScene
 
 
 @command(
@@ -13,18 +17,13 @@ from rigidmd.errors import SceneError
     "rigidmd check water_nitrogen.toml",
     *SCENE,
     add_engine,
-    argument(
+    flag(
         "--program",
-        action="store_true",
         help="also print the rows of a step: what is done, in which order, on how many blocks",
     ),
-    argument(
+    flag(
         "--profile",
-        action="store_true",
-        help=(
-            "also measure how much of the time of a step each row of the forces takes, from the"
-            " start"
-        ),
+        help="also measure which fraction of a step each row of the forces takes, from the start",
     ),
 )
 def _check(options: Options) -> int:
@@ -63,7 +62,7 @@ def _check(options: Options) -> int:
     return 0
 
 
-def _print_programs(system: Any) -> None:
+def _print_programs(system: "System") -> None:
     """Print the program of each stage that is not a minimisation."""
     from rigidmd.assemble.build import integrator_of_stage
     from rigidmd.engines.cpu.program import describe_program, program_of
@@ -77,7 +76,7 @@ def _print_programs(system: Any) -> None:
         print(describe_program(program_of(engine, system.state, scheme)))
 
 
-def _print_profile(scene: Any) -> None:
+def _print_profile(scene: "MolecularScene") -> None:
     """Measure and print the rows of the first stage that is not a minimisation."""
     from rigidmd.assemble.build import integrator_of_stage
     from rigidmd.engines.cpu.program import describe_profile, profile_of

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import Options, argument, command
+from rigidmd.commands.arguments import Options, argument, command, flag
 
 
 @command(
@@ -14,7 +14,7 @@ from rigidmd.commands.arguments import Options, argument, command
     "rigidmd compare runs/water runs/water2",
     argument("first", metavar="RUN", help="folder of a run"),
     argument("second", metavar="RUN", help="folder of another run"),
-    argument("--json", action="store_true", help="print JSON"),
+    flag("--json", help="print JSON"),
 )
 def _compare(options: Options) -> int:
     from rigidmd.studies.compare import compare, describe_run_comparison

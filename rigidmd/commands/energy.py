@@ -1,9 +1,9 @@
 """`rigidmd energy`."""
 
 import json
-from typing import Any
 
-from rigidmd.commands.arguments import SCENE, Options, argument, command, read_scene
+from rigidmd.commands.arguments import SCENE, Options, argument, command, flag, read_scene
+from rigidmd.core.toml import Json
 
 
 @command(
@@ -16,12 +16,8 @@ from rigidmd.commands.arguments import SCENE, Options, argument, command, read_s
         choices=["kJ/mol", "kcal/mol", "eV", "K"],
         help="unit of energy (kJ/mol; J for a body)",
     ),
-    argument("--json", action="store_true", help="print JSON"),
-    argument(
-        "--accuracy",
-        action="store_true",
-        help="also measure the error of the Coulomb forces (Ewald sums and PME)",
-    ),
+    flag("--json", help="print JSON"),
+    flag("--accuracy", help="also measure the error of the Coulomb forces (Ewald sums and PME)"),
 )
 def _energy(options: Options) -> int:
     from rigidmd.errors import SceneError
@@ -51,7 +47,7 @@ def _energy(options: Options) -> int:
     return 0
 
 
-def _print_molecules(name: str, energies: dict[str, Any], unit: str) -> None:
+def _print_molecules(name: str, energies: Json, unit: str) -> None:
     steps = energies["overlap_removal_steps"]
     removal = f", after {steps} steps of overlap removal" if steps else ""
     print(f"{name}: energies of the start, {energies['molecules']} molecules{removal}")
@@ -82,7 +78,7 @@ def _print_molecules(name: str, energies: dict[str, Any], unit: str) -> None:
         _print_rows([*rows, ("error of the energy", error["energy_error"], unit)], ">22.4g")
 
 
-def _print_body(name: str, energies: dict[str, Any]) -> None:
+def _print_body(name: str, energies: Json) -> None:
     print(f"{name}: energy of the start")
     _print_rows(
         [(key, energies[key], "J") for key in ("kinetic", "potential", "energy")], ">22.15g"

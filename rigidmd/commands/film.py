@@ -7,6 +7,7 @@ from rigidmd.commands.arguments import (
     argument,
     command,
     file_about_run,
+    flag,
     number,
     run_folder,
 )
@@ -33,7 +34,7 @@ from rigidmd.commands.streams import progress_bar
         metavar="N",
         help="pixels (default: 640, of a .gif 300)",
     ),
-    argument("--plots", action="store_true", help="put plots with a moving cursor next to it"),
+    flag("--plots", help="put plots with a moving cursor next to it"),
     scene="this run",
     writes=True,
 )

@@ -3,7 +3,7 @@
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import Options, argument, command, print_page
+from rigidmd.commands.arguments import Options, argument, command, flag, print_page
 from rigidmd.commands.streams import announce
 
 
@@ -12,10 +12,13 @@ from rigidmd.commands.streams import announce
     "run shipped bodies and write a page with a picture of each, which links to its animation",
     "rigidmd gallery heavy_top_3 intermediate_axis",
     argument(
-        "names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)"
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help="bodies from `rigidmd examples` (default: eleven of them)",
     ),
     argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)"),
-    argument("--force", action="store_true", help="replace an earlier gallery in that folder"),
+    flag("--force", help="replace an earlier gallery in that folder"),
     scene="the gallery",
     writes=True,
 )

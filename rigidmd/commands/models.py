@@ -3,7 +3,7 @@
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import Options, argument, command
+from rigidmd.commands.arguments import Options, argument, command, flag
 from rigidmd.commands.streams import warn
 from rigidmd.errors import MoleculeError
 
@@ -19,7 +19,7 @@ from rigidmd.errors import MoleculeError
         metavar="NAME",
         help="model to show, or the .toml file of a custom model",
     ),
-    argument("--draw", action="store_true", help="draw it to NAME.png"),
+    flag("--draw", help="draw it to NAME.png"),
     argument(
         "--from",
         dest="geometry",
@@ -33,8 +33,8 @@ from rigidmd.errors import MoleculeError
         "--parameters",
         metavar="TABLE",
         help=(
-            "with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom"
-            " or element"
+            "with --from: a .toml file with charges and Lennard-Jones parameters by atom name or"
+            " element"
         ),
     ),
     argument("--name", metavar="NAME", dest="custom_name", help="with --from: name of the model"),
@@ -43,11 +43,11 @@ from rigidmd.errors import MoleculeError
         "--output",
         metavar="FILE",
         help=(
-            "picture file: .png, .svg or .pdf. With --from the file of the model (default: the"
-            " structure's, .toml)"
+            "picture file: .png, .svg or .pdf. With --from: the model file (default: the name of"
+            " the structure file, with .toml)"
         ),
     ),
-    argument("--force", action="store_true", help="replace that file"),
+    flag("--force", help="replace that file"),
 )
 def _models(options: Options) -> int:
     from rigidmd.assemble.plausibility import molecule_warnings

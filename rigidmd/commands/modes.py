@@ -10,6 +10,7 @@ from rigidmd.commands.arguments import (
     Options,
     argument,
     command,
+    flag,
     number,
     output_folder,
     read_scene,
@@ -30,20 +31,22 @@ ROWS = 8
     " zero-point and free energy, the longest stable step",
     "rigidmd modes water_dimer.toml --animate 10 && rigidmd view runs/water_dimer-modes",
     *SCENE,
-    argument("--no-minimise", action="store_true", help="require that the start is a minimum"),
+    flag("--no-minimise", help="require that the start is a minimum"),
     argument(
         "--count",
         type=COUNT,
         metavar="N",
         help=(
-            "only the N lowest and N highest modes, by Lanczos (default: all, or 20 if there are"
-            " more than 6000)"
+            "compute only the N lowest and N highest modes, by Lanczos (default: all, or 20 if"
+            " there are more than 6000)"
         ),
     ),
-    argument(
+    flag(
         "--gamma",
-        action="store_true",
-        help="only the modes at the Gamma point of the unit cell that structure.repeat repeats",
+        help=(
+            "compute only the modes at the Gamma point of the unit cell that structure.repeat"
+            " repeats"
+        ),
     ),
     argument(
         "--animate",

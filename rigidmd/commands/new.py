@@ -3,7 +3,7 @@
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import Options, argument, command
+from rigidmd.commands.arguments import Options, argument, command, flag
 
 
 @command(
@@ -12,7 +12,7 @@ from rigidmd.commands.arguments import Options, argument, command
     "rigidmd new water -o mine.toml",
     argument("name", metavar="NAME", help="which one. `rigidmd examples` lists them"),
     argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)"),
-    argument("--force", action="store_true", help="replace that file"),
+    flag("--force", help="replace that file"),
 )
 def _new(options: Options) -> int:
     from rigidmd.core.shipped import copy_example, find_example, series_of

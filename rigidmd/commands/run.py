@@ -10,6 +10,7 @@ from rigidmd.commands.arguments import (
     add_engine,
     argument,
     command,
+    flag,
     read_scene,
     seconds,
     time_ps,
@@ -33,14 +34,13 @@ DURATION = (
         type=time_ps,
         metavar="TIME",
         help=(
-            "let the last stage end at this time of the run, such as 200ps or 1.5ns. Lengthens a"
-            " finished run"
+            "let the last stage end at this time of the run, such as 200ps or 1.5ns. This"
+            " lengthens a finished run"
         ),
     ),
-    argument(
+    flag(
         "-v",
         "--verbose",
-        action="store_true",
         help="print all that the summary has: every stage, precision, momentum, energy noise",
     ),
 )
@@ -52,13 +52,12 @@ DURATION = (
     "rigidmd run water.toml -o runs/water",
     *SCENE,
     argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)"),
-    argument("--force", action="store_true", help="replace an earlier run in that folder"),
-    argument(
+    flag("--force", help="replace an earlier run in that folder"),
+    flag(
         "--resume",
-        action="store_true",
         help=(
             "continue from the last checkpoint in that folder, with bitwise identical results."
-            " Without one, start"
+            " Without a checkpoint, start the run"
         ),
     ),
     add_engine,

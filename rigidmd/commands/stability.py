@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import Options, argument, command, output_folder, write_study
+from rigidmd.commands.arguments import Options, command, flag, output_folder, repeated, write_study
 
 
 @command(
@@ -11,9 +11,9 @@ from rigidmd.commands.arguments import Options, argument, command, output_folder
     "run the built-in stress tests, each compared with a known answer. Exit code 1 if an"
     " error is undetected",
     "rigidmd stability --quick --case near_linear --case water_steps",
-    argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes"),
-    argument("--case", action="append", metavar="NAME", help="only this case, may be repeated"),
-    argument("-v", "--verbose", action="store_true", help="list the warnings of the runs"),
+    flag("--quick", help="use fewer settings, integrators and steps, which takes minutes"),
+    repeated("--case", "NAME", help="only this case, may be repeated"),
+    flag("-v", "--verbose", help="list the warnings of the runs"),
     *output_folder("runs/stability"),
     scene="stability",
     writes=True,

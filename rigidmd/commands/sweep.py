@@ -13,8 +13,10 @@ from rigidmd.commands.arguments import (
     Options,
     argument,
     command,
+    flag,
     number,
     output_folder,
+    repeated,
     seconds,
 )
 from rigidmd.errors import OutputError, visible
@@ -34,23 +36,21 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
     " stages.2.timestep_fs=1,2,4 --extrapolate stages.2.timestep_fs --replicas 8\n  rigidmd sweep"
     " water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
     argument("scene", metavar="SCENE", help="scene file (TOML)"),
-    argument(
+    repeated(
         "--set",
-        action="append",
-        default=[],
-        metavar="KEY=A,B,...",
-        dest="sets",
+        "KEY=A,B,...",
         help=(
-            "values of a key of the scene (entries of a list are counted from 0). KEY=1..8 for"
-            " whole numbers. KEY=VALUE the same for all. KEY,KEY=A,B for keys that vary together,"
-            " may be repeated: all combinations run"
+            "values of a scene key (entries of a list are counted from 0). KEY=1..8 sets whole"
+            " numbers, KEY=VALUE one value for all runs, and KEY,KEY=A,B keys that vary together."
+            " With several --set, all combinations run"
         ),
+        dest="sets",
     ),
     argument(
         "--replicas",
         type=number(int, 2, 10000, "a number of replicas from 2 on"),
         metavar="N",
-        help="run N seeds, from the scene's seed on: errors from their scatter",
+        help="run N seeds, from the scene's seed onwards. Errors come from their scatter",
     ),
     *output_folder("runs/NAME-sweep", "an earlier sweep"),
     argument(
@@ -71,7 +71,7 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
         metavar="H:MM:SS",
         help=(
             "stop shortly before this time is up, with checkpoints and exit code 75. With --to"
-            " slurm of each job"
+            " slurm it applies to each job"
         ),
     ),
     argument(
@@ -83,22 +83,18 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
         "--to",
         choices=["slurm", "commands"],
         help=(
-            "run nothing, and write a script for an array of jobs, a point each, or print the"
-            " commands that run the points, a line each, for any scheduler"
+            "run nothing. slurm writes a script for an array of jobs, with one point per job."
+            " commands prints one line per point with the command that runs it, for any scheduler"
         ),
     ),
-    argument(
-        "--collect",
-        action="store_true",
-        help="run nothing, and write table and figure of existing results",
-    ),
+    flag("--collect", help="run nothing, and write table and figure of existing results"),
     argument(
         "--extrapolate",
         metavar="KEY",
         help=(
-            "extrapolate all averages to a step of 0, with their errors, over this time step of the"
-            " last stage, which --set varies. `rigidmd analyse` has the same option for what it"
-            " measures"
+            "extrapolate all averages, with their errors, to a time step of 0. KEY is the time"
+            " step of the last stage, which --set varies. `rigidmd analyse` has the same option"
+            " for its values"
         ),
     ),
     TRUST,

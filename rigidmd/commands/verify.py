@@ -4,7 +4,7 @@ import argparse
 import json
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene
+from rigidmd.commands.arguments import SCENE, Options, add_engine, command, flag, read_scene
 from rigidmd.programs import runnable
 
 
@@ -25,7 +25,7 @@ def _engine(parser: argparse.ArgumentParser) -> None:
     "rigidmd verify water_pme.toml --engine lammps --ranks 2",
     *SCENE,
     _engine,
-    argument("--json", action="store_true", help="print JSON"),
+    flag("--json", help="print JSON"),
 )
 def _verify(options: Options) -> int:
     from rigidmd.scene import MolecularScene

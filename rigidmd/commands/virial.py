@@ -5,7 +5,7 @@ from itertools import combinations_with_replacement
 from math import inf
 from pathlib import Path
 
-from rigidmd.commands.arguments import TRUST, Options, argument, command, number
+from rigidmd.commands.arguments import TRUST, Options, argument, command, flag, number, repeated
 from rigidmd.commands.streams import progress_bar
 
 
@@ -30,7 +30,10 @@ def _temperatures(text: str) -> list[float]:
         "models",
         nargs="+",
         metavar="MODEL",
-        help="shipped model, or the .toml file of a custom one; of several all pairs are computed",
+        help=(
+            "shipped model, or the .toml file of a custom model. With several models, all pairs"
+            " are computed"
+        ),
     ),
     argument(
         "--temperatures",
@@ -48,20 +51,18 @@ def _temperatures(text: str) -> list[float]:
             " and |T dB2/dT|)"
         ),
     ),
-    argument(
+    repeated(
         "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="overrides",
+        "KEY=VALUE",
         help=(
             "key of [forces] of a scene, such as forces.mixing=geometric, or forces.custom with"
-            " pair potentials, may be repeated"
+            " pair potentials. Can be repeated"
         ),
+        dest="overrides",
     ),
     TRUST,
     argument("-o", "--output", metavar="FILE", help="also write the table as a .csv file"),
-    argument("--force", action="store_true", help="replace that file"),
+    flag("--force", help="replace that file"),
     scene="virial",
 )
 def _virial(options: Options) -> int:

@@ -13,6 +13,7 @@ Private parts of Numba and llvmlite, each tested by tests/test_compile.py:
   `_optimize_final_module` and makes machine code in `_finalize_final_module`. The variables of a
   module that point to environments have names that begin with `_ZN08NumbaEnv`; Numba sets them in
   machine code.
+- `front_end` removes passes from the pipeline of Numba, and remembers the calls that it resolved.
 - A `CFunc` compiles for given types, accepts another cache, and calls `_compile_uncached` if the
   cache has no code.
 """
@@ -38,8 +39,11 @@ from numba.core.registry import CPUDispatcher
 from numba.extending import overload
 
 from rigidmd.compile.cache import open_cache
+from rigidmd.compile.front_end import pipeline_of_kernels, remember_resolved_calls
 from rigidmd.compile.records import Record
 from rigidmd.compile.sources import register_implementation
+
+remember_resolved_calls()
 
 #: Error that compiling a user's function may raise.
 CompileError = NumbaError
@@ -235,7 +239,7 @@ class LinkedCompiler(Compiler):
             self.state.targetctx.codegen(), self.state.func_id.func_qualname
         )
         self.state.library.enable_object_caching()
-        return super().define_pipelines()
+        return [pipeline_of_kernels(self)]
 
 
 class InnerKernel(KernelDispatcher):

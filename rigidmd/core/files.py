@@ -26,8 +26,8 @@ APPEND_FLAGS = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY"
 
 
 def unreadable_reason(path: Path, largest: float = inf) -> str:
-    """Why a file cannot be read. Empty if it can be. Pipes and devices are rejected, because they
-    may never end.
+    """Why a file cannot be read, or an empty text if it can be read. Pipes and devices are
+    rejected, because they may never end.
 
     largest : greatest size in bytes
     """

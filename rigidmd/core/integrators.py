@@ -4,7 +4,7 @@ exact rotor."""
 
 from itertools import pairwise, takewhile
 from math import inf, log2
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 #: Kinds of flows: forces; free flight and rotation; thermostat; removal of the total momentum;
 #: barostat; change of the volume by the inertia of a piston; start and test of a trajectory of
@@ -113,8 +113,8 @@ class Scheme(_SchemeFields):
         )
 
     def with_piston(self, piston: tuple) -> "Scheme":
-        """This scheme, a composition of Verlet steps, with a volume that has inertia: kicks of the
-        volume around the kicks of each step, changes of it around the drift. See the theory chapter
+        """This scheme, a composition of Verlet steps, with a volume that has inertia: volume kicks
+        around the kicks of each step, and volume changes around the drift. See the theory chapter
         `sampling`."""
         steps, flows = self.drifts, []
         for before, after in pairwise((0.0, *steps, 0.0)):
@@ -202,7 +202,7 @@ class Scheme(_SchemeFields):
         return after_drift + sum(flow.gradient != 0 for flow in self.flows)
 
 
-def composed(name: str, steps: tuple[float, ...], order: int, source: str, **flags: Any) -> Scheme:
+def composed(name: str, steps: tuple[float, ...], order: int, source: str, **flags: int) -> Scheme:
     """Velocity Verlet steps of these lengths in succession; neighbouring kicks are merged."""
     kicks = tuple((a + b) / 2 for a, b in pairwise((0.0, *steps, 0.0)))
     return Scheme(name, _alternating(kicks, steps), order, False, source, **flags)
@@ -215,7 +215,7 @@ def split(
     order: int,
     source: str,
     gradients: tuple[float, ...] | None = None,
-    **flags: Any,
+    **flags: int,
 ) -> Scheme:
     """kick(kicks[0] dt) drift(drifts[0] dt) ... kick(kicks[-1] dt), for an exact rotor.
 

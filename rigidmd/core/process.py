@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Iterator
 from math import inf
 from pathlib import Path
-from typing import Any
 
 from rigidmd.core.toml import Json
 from rigidmd.errors import SettingError
@@ -49,7 +48,7 @@ def without_local_settings() -> Iterator[None]:
     """
     exists = os.path.exists
 
-    def exists_elsewhere(path: Any) -> bool:
+    def exists_elsewhere(path: int | str | bytes | os.PathLike) -> bool:
         return path not in LOCAL_SETTINGS and exists(path)
 
     os.path.exists = exists_elsewhere
@@ -60,7 +59,7 @@ def without_local_settings() -> Iterator[None]:
 
 
 def python_process(*arguments: str) -> Json:
-    """Arguments of `subprocess.Popen` for a process of Python with the search path of this one.
+    """Arguments of `subprocess.Popen` for a Python process with the search path of this process.
 
     The process does not import from the working directory (`-P`), where a file of others may be
     called `json.py`. It finds this package in any case.
@@ -92,7 +91,7 @@ def free_memory() -> float:
 
 
 def memory_shortage(needed: float, what: str) -> str:
-    """Why `what` cannot have this many bytes of memory. Empty if it can."""
+    """Why `what` cannot have this many bytes of memory, or an empty text if it can."""
     free = free_memory()
     if needed <= (1 - RESERVED) * free:
         return ""

@@ -87,7 +87,7 @@ def examples(files: str = "*.toml") -> list[Example]:
 
 
 def find_example(name: str) -> Example:
-    """The example of this name, or the first scene of a numbered series of this name. Raises
+    """The example with this name, or the first scene in a numbered series with this name. Raises
     InputError."""
     known = {
         example.name: example for example in [*examples(), *examples(NOTEBOOKS), *examples(SCRIPTS)]
@@ -107,7 +107,7 @@ def find_example(name: str) -> Example:
 
 
 def series_of(name: str) -> list[str]:
-    """The scenes NAME_1, NAME_2 and so on. Empty if there are none."""
+    """The scenes NAME_1, NAME_2 and so on. The list is empty if there are none."""
     return [
         example.name
         for example in examples()

@@ -3,7 +3,7 @@
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,14 +37,13 @@ def write_state(path: Path, saved: SavedState) -> None:
     optional = {"residue_number": saved.residue_number, "models": saved.models}
     optional = {name: array for name, array in optional.items() if array is not None}
     with atomic_file(path) as temporary:
-        arrays: dict[str, Any] = dict(zip(State._fields, saved.state, strict=True))
         np.savez(
             temporary,
             schema=SCHEMA,
             species_names=np.array(saved.names),
             species=saved.species,
             **optional,
-            **arrays,
+            **saved.state._asdict(),
         )
 
 

@@ -18,13 +18,13 @@ BATCHES, BATCH_FACTOR = 5, 1.5
 #: need f/(f - 2) if f did not depend on the estimate; here a short window and a small estimate
 #: coincide.
 LOST_FREEDOM = 2.5
-#: A starting of a series is cut off if chance explains its difference from the rest with less than
-#: this
-#: two-sided probability. It is small, because the cut was chosen among many, and the quiet part
-#: that it may
-#: leave has too small an error. Degrees of freedom that are subtracted, as the correlation of few
-#: independent samples is underestimated.
+#: The beginning of a series is cut off if chance explains its difference from the rest with less
+#: than this two-sided probability. It is small, because the cut was chosen among many, and the
+#: quiet part that it may leave has too small an error. The second number is subtracted from the
+#: degrees of freedom, as the correlation of few independent samples is underestimated.
 CUT_CHANCE, CUT_FREEDOM = 1e-4, 2.0
+#: Standard errors between the beginning of a series and the rest that a user should know of.
+SUSPECT = 4.0
 
 
 def mean_and_error(values: ArrayLike) -> tuple[float | None, float | None]:
@@ -112,7 +112,20 @@ def steady_from(values: np.ndarray) -> int:
     `least_error_from`, if the mean of the samples before it differs from the mean of the others by
     more than their errors explain, else 0."""
     start = least_error_from(values)
-    return start if start and _begins_elsewhere(values, start) else 0
+    if start:
+        difference, limit = _difference_of_beginning(values, start)
+        return start if difference > limit else 0
+    return 0
+
+
+def may_be_unsteady(values: np.ndarray) -> bool:
+    """Whether the beginning of a series (n,) differs from the rest by more than `SUSPECT` of their
+    errors, and independent samples are too few to exclude chance."""
+    start = least_error_from(values)
+    if start:
+        difference, limit = _difference_of_beginning(values, start)
+        return SUSPECT < difference <= limit
+    return False
 
 
 def least_error_from(values: np.ndarray) -> int:
@@ -127,9 +140,10 @@ def least_error_from(values: np.ndarray) -> int:
     return int(np.argmin(error[: len(values) // 2 + 1]))
 
 
-def _begins_elsewhere(values: np.ndarray, start: int) -> bool:
-    """Whether the mean before an index differs from the mean after it, by a test of Student with
-    the variance and the correlation of the second half of the series."""
+def _difference_of_beginning(values: np.ndarray, start: int) -> tuple[float, float]:
+    """The difference of the mean before an index from the mean after it, in units of its error from
+    the variance and the correlation of the second half of the series, and the limit of a test of
+    Student."""
     from scipy import special  # slow to import
 
     late = values[len(values) // 2 :]
@@ -138,13 +152,14 @@ def _begins_elsewhere(values: np.ndarray, start: int) -> bool:
     variance = late.var(ddof=1) / max(0.25, 1 - 1 / freedom)
     error = sqrt(variance * (min(1.0, samples / start) + samples / (len(values) - start)))
     limit = -float(special.stdtrit(max(freedom - CUT_FREEDOM, 0.5), CUT_CHANCE / 2))
-    return abs(float(values[:start].mean() - values[start:].mean())) > limit * error
+    difference = abs(float(values[:start].mean() - values[start:].mean()))
+    return (difference / error if error else np.inf * difference), limit
 
 
 def _window(centred: np.ndarray) -> tuple[float, int]:
-    """1 + 2 sum C(k) of samples (n,) of mean zero, and the last k of the sum: the initial monotone
-    sequence (Geyer 1992), corrected for the sample mean (Wolff 2004, eq. 49). See the theory
-    chapter `errors`."""
+    """1 + 2 sum C(k) for samples (n,) with mean zero, and the last k of the sum: the initial
+    monotone sequence (Geyer 1992), corrected for the sample mean (Wolff 2004, eq. 49). See the
+    theory chapter `errors`."""
     n = len(centred)
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2
     correlation = np.fft.irfft(power)[:n]
@@ -159,8 +174,8 @@ def _window(centred: np.ndarray) -> tuple[float, int]:
 
 
 def _batch_variance(centred: np.ndarray) -> float:
-    """n times the variance of the mean, from means of batches and the correlation of neighbouring
-    ones."""
+    """n times the variance of the mean, from batch means and the correlation between neighbouring
+    batches."""
     size = len(centred) // BATCHES
     means = centred[len(centred) - size * BATCHES :].reshape(BATCHES, size).mean(axis=1)
     means -= means.mean()
@@ -214,6 +229,7 @@ def slope(time: ArrayLike, value: ArrayLike) -> Slope:
 
 
 def _allan(value: np.ndarray, m: int) -> float:
-    """Allan variance: half the variance of the differences of successive means of m samples."""
+    """Allan variance: half the variance of the difference between successive means over m
+    samples."""
     blocks = len(value) // m
     return float(0.5 * np.diff(value[: blocks * m].reshape(blocks, m).mean(axis=1)).var(ddof=1))

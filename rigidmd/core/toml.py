@@ -78,10 +78,10 @@ def plain_values(data: Any, depth: int = 0) -> Any:
     return data
 
 
-def values_in(data: Any) -> Iterator[tuple[list, Any]]:
+def values_in(data: object) -> Iterator[tuple[list, object]]:
     """All values in nested tables and lists in their order, each with its path of keys, before the
     values in it."""
-    pending: list[tuple[list, Any]] = [([], data)]
+    pending: list[tuple[list, object]] = [([], data)]
     while pending:
         keys, value = pending.pop()
         yield keys, value
@@ -90,7 +90,7 @@ def values_in(data: Any) -> Iterator[tuple[list, Any]]:
             pending += [([*keys, key], part) for key, part in reversed(inner)]
 
 
-def impossible_values(data: Any) -> list[tuple[list, str]]:
+def impossible_values(data: object) -> list[tuple[list, str]]:
     """Values that are not allowed in any table, each with its path of keys and what is wrong with
     it. These are tables deeper than `DEEPEST`, whole numbers of more than 64 bits and texts with
     unprintable characters."""
@@ -111,9 +111,9 @@ def impossible_values(data: Any) -> list[tuple[list, str]]:
     return errors
 
 
-def shorten_text(text: str, most: int = 80) -> str:
-    """A text, without its middle if it is longer than `most` characters."""
-    return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"
+def shorten_text(text: str) -> str:
+    """A text, without its middle if it is longer than 80 characters."""
+    return text if len(text) <= 80 else f"{text[:40]}...{text[-20:]}"
 
 
 def shorten_repr(value: object) -> str:

@@ -96,7 +96,7 @@ class Andersen(NamedTuple):
 
 
 class NoseHoover(NamedTuple):
-    """Two Nose-Hoover chains, one of translation and one of rotation, on two halves of
+    """Two Nose-Hoover chains, one for translation and one for rotation, on two halves of
     `state.extra_variables`. Each half is eta (links,), then d eta/dt (links,). See the theory
     chapter `sampling` (Martyna, Tuckerman, Tobias & Klein 1996)."""
 

@@ -70,9 +70,9 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
 
     The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and
     adds the change of the kinetic energy to `state.energy_ledger[0]`, so that energy less heat is
-    conserved. It acts in the middle of each step of "baoab", the default of nvt and npt. With
-    other integrators half before and half after each step (`halved = False` in the class: all of
-    it after the step).
+    conserved. With "baoab", the default in nvt and npt, it acts in the middle of each step. With
+    other integrators half before and half after each step (`halved = False` in the class: all of it
+    after the step).
 
     `changes_momentum = True` in the class means that it changes the total momentum.
 

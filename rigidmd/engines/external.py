@@ -9,7 +9,7 @@ until a table has it.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError
 from rigidmd.forces.poses.potential import BodyPairPotential
 from rigidmd.programs import Program
+from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import KJ_PER_MOL
 
@@ -39,11 +40,11 @@ class Key(NamedTuple):
     """The values of a key of a scene that an engine can translate."""
 
     name: str  # of a scene, with a dot, or of a stage
-    values: Mapping[Any, Any]  # value -> its translation, or `Missing`
+    values: Mapping[object, object]  # value -> its translation, or `Missing`
     reason: str = ""  # why other values are refused, with advice; default: "ENGINE has ..."
-    matters: Callable[[ForceFieldView], Any] = lambda view: True
+    matters: Callable[[ForceFieldView], object] = lambda view: True
 
-    def refusal(self, title: str, value: Any) -> str | None:
+    def refusal(self, title: str, value: object) -> str | None:
         """The message on a value without a translation."""
         how = self.values.get(value, Missing(self.reason))
         if not isinstance(how, Missing):
@@ -54,11 +55,14 @@ class Key(NamedTuple):
         return f"{self.name} = {value!r}: {how or f'{title} has {known}'}"
 
 
-class Limit(NamedTuple):
+Subject = TypeVar("Subject", ForceFieldView, Stage)
+
+
+class Limit(NamedTuple, Generic[Subject]):
     """A combination of settings that an engine lacks."""
 
     message: str  # with {} for what `applies` returns
-    applies: Callable[[Any], Any]  # whether a `ForceFieldView` or a `Stage` has them
+    applies: Callable[[Subject], object]  # whether the settings have them
 
 
 class Translations(NamedTuple):
@@ -68,14 +72,14 @@ class Translations(NamedTuple):
     title: str
     scene: tuple[Key, ...]
     stage: tuple[Key, ...]
-    limits: tuple[Limit, ...]  # of a `ForceFieldView`
-    stage_limits: tuple[Limit, ...]
+    limits: tuple[Limit[ForceFieldView], ...]
+    stage_limits: tuple[Limit[Stage], ...]
     #: Class of the function of a potential of two bodies -> messages on what is lacking of it
     body_pairs: Mapping[type, Callable[[BodyPairPotential, System], Iterator[str]]] = (
         MappingProxyType({})
     )
 
-    def of(self, name: str) -> Mapping[Any, Any]:
+    def of(self, name: str) -> Mapping[object, Any]:
         """The translations of a key."""
         return next(key.values for key in (*self.scene, *self.stage) if key.name == name)
 
@@ -97,7 +101,7 @@ class Translations(NamedTuple):
                 )
 
 
-def _limits(limits: tuple[Limit, ...], subject: Any) -> Iterator[str]:
+def _limits(limits: tuple[Limit[Subject], ...], subject: Subject) -> Iterator[str]:
     return (limit.message.format(value) for limit in limits if (value := limit.applies(subject)))
 
 
@@ -112,7 +116,7 @@ def checked_view(
     return view
 
 
-def moves(title: str, bodies: str) -> tuple[Key, Limit]:
+def moves(title: str, bodies: str) -> tuple[Key, Limit[Stage]]:
     """What holds for all programs: one step, for `velocity_verlet` and baoab. One friction."""
     by = f"{title} moves {bodies} by velocity_verlet"
     return (
@@ -124,12 +128,12 @@ def moves(title: str, bodies: str) -> tuple[Key, Limit]:
     )
 
 
-def is_langevin(stage: Any) -> bool:
+def is_langevin(stage: Stage) -> bool:
     return stage.thermostat_kind == "langevin"
 
 
 #: With constrained distances or split rotations, the exact flow of a free rotor does not exist.
-SPLIT = {None: "", "split": ""}
+SPLIT: Mapping[object, object] = {None: "", "split": ""}
 
 
 class ExternalEngine(Engine, ABC):

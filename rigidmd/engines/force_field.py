@@ -9,7 +9,7 @@ truncation are decided once. `unknown_terms` lists what no other program can exp
 from collections.abc import Callable, Iterator, Mapping
 from itertools import combinations_with_replacement, pairwise, product
 from math import inf
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from rigidmd.forces.potentials.truncation import (
 from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.validation import not_none
+
+if TYPE_CHECKING:
+    import sympy
 
 #: Classes of the pair potentials and terms that the view describes.
 DESCRIBED = (
@@ -274,13 +277,13 @@ def table(formula: str, first: float, last: float, entries: int) -> str:
     )
 
 
-def _symbolic(formula: str) -> tuple[Any, Any]:
+def _symbolic(formula: str) -> "tuple[sympy.Symbol, sympy.Expr]":
     """The symbol r, and the expression of a formula."""
     import sympy  # slow to import
 
     r = sympy.Symbol("r", positive=True)
     text, *definitions = (part.strip() for part in formula.replace("^", "**").split(";"))
-    names: dict[str, Any] = {"r": r, "max": sympy.Max}
+    names: dict[str, object] = {"r": r, "max": sympy.Max}
     for definition in reversed(definitions):
         name, _, value = definition.partition("=")
         names[name] = sympy.parse_expr(value, names)

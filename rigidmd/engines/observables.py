@@ -18,6 +18,12 @@ from rigidmd.forces.potentials.truncation import Unmodified
 from rigidmd.units import BAR, BOLTZMANN, GRAM_PER_CM3, KJ_PER_MOL
 
 UNIT = np.eye(3)
+#: Columns of the box, and of the pressure tensor with their entries in it.
+EDGES = ("a", "b", "c", "alpha", "beta", "gamma")
+COMPONENTS = {
+    f"pressure_{'xyz'[i]}{'xyz'[j]}": (i, j)
+    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+}
 
 
 class Observation(NamedTuple):
@@ -112,11 +118,10 @@ def observe(
         pressure = (flux + (virial + virial.T) / 2) / volume + (
             system.constant_pressure + tail_pressure
         ) * UNIT
-        a, b, c, alpha, beta, gamma = edges_and_angles(state.cell)
+        edges = edges_and_angles(state.cell)
     else:
-        pressure, (a, b, c, alpha, beta, gamma) = np.full((3, 3), nan), [nan] * 6
+        pressure, edges = np.full((3, 3), nan), [nan] * 6
     tensor_bar = pressure / BAR
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor_bar.tolist()
     # not in pilot runs, whose samples are in no log
     changes = [] if stage is None else _changes_with_lambda(system, state, potential)
     energy, ledger = (potential + kinetic) / energy_unit, state.energy_ledger / energy_unit
@@ -137,20 +142,10 @@ def observe(
         drift=conserved - (conserved if origin is None else origin),
         momentum=hypot(*sums.momentum.tolist()),
         orthogonality_error=sums.orthogonality_error,
-        a=a,
-        b=b,
-        c=c,
-        alpha=alpha,
-        beta=beta,
-        gamma=gamma,
+        **dict(zip(EDGES, edges, strict=True)),
         heat=float(ledger[HEAT]),
         work=float(ledger[WORK]),
-        pressure_xx=xx,
-        pressure_yy=yy,
-        pressure_zz=zz,
-        pressure_xy=xy,
-        pressure_xz=xz,
-        pressure_yz=yz,
+        **{name: float(tensor_bar[at]) for name, at in COMPONENTS.items()},
         conserved=conserved,
         stage=stage or 0,
         force_squares=sums.force / energy_unit,
@@ -177,9 +172,9 @@ def observe(
 
 def _changes_with_lambda(system: System, state: State, potential: float) -> list[float]:
     """Energies at each of coupling.lambdas less the present one, u Å²/ps²."""
-    changes = []
+    coupling, changes = system.scene.coupling, []
     for value, engine in system.engines_at_lambda.items():
-        if value == system.scene.coupling.value:
+        if coupling is not None and value == coupling.value:
             changes.append(0.0)
             continue
         at = system.at_lambda[value]

@@ -7,7 +7,7 @@ program (LAMMPS or OpenMM) compute.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -125,12 +125,12 @@ class Engine(Protocol):
         """Discard what depends on positions, because they were changed from outside since the last
         step."""
 
-    def change(self, model: Any, terms: dict[str, NamedTuple]) -> None:
-        """Continue with a model and terms of the same types, as at a kink of prescribed functions
+    def change(self, model: NamedTuple, terms: dict[str, NamedTuple]) -> None:
+        """Continue with a model and terms of the same types, as at a kink in prescribed functions
         of time."""
         raise TypeError(f"{self.version} cannot change its forces")
 
-    def rotor(self, model: Any) -> "NamedTuple | None":
+    def rotor(self, model: NamedTuple) -> "NamedTuple | None":
         """The rotor by which rigidmd rotates bodies exactly as this engine does, if there is
         one."""
 

@@ -1,4 +1,4 @@
-"""The columns of log.csv (molecules) and motion.csv (a body), and the samples of a run of
+"""The columns of log.csv (molecules) and motion.csv (a body), and the samples in a run of
 molecules.
 
 One table serves files, displays and documentation. For molecules it is the record `Sample`: each
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_type
 
 import numpy as np
 
-from rigidmd.core.statistics import least_error_from, steady_from
+from rigidmd.core.statistics import least_error_from, may_be_unsteady, steady_from
 
 if TYPE_CHECKING:
     from rigidmd.scene.stage import Stage
@@ -414,4 +414,8 @@ def describe_equilibrated(
     drifts = any(
         least_error_from(values) == len(time) // 2 for values in _slow_series(of_stage, stage)
     )
-    return f"{part}, not yet steady" if drifts else part
+    if drifts:
+        return f"{part}, not yet steady"
+    if not start and any(map(may_be_unsteady, _slow_series(of_stage, stage))):
+        return f"{part}, perhaps not yet steady"
+    return part

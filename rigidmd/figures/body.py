@@ -2,7 +2,7 @@
 the invariants."""
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from rigidmd.mechanics.free_rotor import SplitRotor
 from rigidmd.mechanics.translation import InertialFrame
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from rigidmd.figures.picture import Picture
 
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
@@ -67,7 +69,7 @@ class _Figures:
     def title(self, text: str) -> str:
         return f"{self.system.scene.name}: {text}"
 
-    def all(self) -> Iterator[tuple[str, Any]]:
+    def all(self) -> "Iterator[tuple[str, Picture | None]]":
         """The figures by the stems of their files."""
         if "q11" in self.columns:
             yield "axis", self.axis()
@@ -178,7 +180,7 @@ class _Figures:
             axis.set_title(title, **NOTE)
         return figure
 
-    def with_curves(self, family: str, title: str, count: int) -> "tuple[Picture, list[Any]]":
+    def with_curves(self, family: str, title: str, count: int) -> "tuple[Picture, list[Axes]]":
         """A figure with curves against time on the left, and the axes of its pictures."""
         width = SERIES + SIDE * count
         figure = new_figure(width, SIDE, layout=None, title=self.title(title))
@@ -217,7 +219,7 @@ class _Figures:
 
 
 def _draw_plane(
-    axis: Any, title: str, position: np.ndarray, plane: np.ndarray, least: float
+    axis: "Axes", title: str, position: np.ndarray, plane: np.ndarray, least: float
 ) -> None:
     """The path in one plane, with equal scales if possible. Otherwise the title states the
     distortion."""
@@ -230,8 +232,8 @@ def _draw_plane(
     else:
         ratio = _enlargement(max(span) / min(span))
         title += f"; drawn {ratio} too {'wide' if span[1] > span[0] else 'tall'}"
-    shown, style = path_style(flat, half)
-    draw_line(axis, flat[shown], color=COOL, **style)
+    shown, width = path_style(flat, half)
+    draw_line(axis, flat[shown], COOL, width)
     axis.plot(*flat[0], "o", color=WARM, ms=5, zorder=4)
     names = []
     for side in plane:
@@ -239,7 +241,8 @@ def _draw_plane(
         is_axis = side.max() > 1 - 1e-9
         names.append(f"{'xyz'[side.argmax()] if is_axis else f'along ({vector})'} (m)")
     axis.set(xlabel=names[0], ylabel=names[1])
-    axis.axis(np.stack([centre - half, centre + half], axis=1).ravel())
+    (left, low), (right, high) = centre - half, centre + half
+    axis.axis((left, right, low, high))
     axis.set_title(f"{title}; dot: start", **NOTE)
     axis.locator_params(nbins=4)
     for line in (axis.xaxis, axis.yaxis):

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,10 @@ from rigidmd.figures.style import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from rigidmd.engines.system import System
+    from rigidmd.figures.picture import Picture
 
 #: Errors of exactly 0 are drawn at this value.
 FLOOR = 1e-17
@@ -58,7 +61,7 @@ class Panel(NamedTuple):
         return max(1, int(width / (0.45 + LETTER * longest)))
 
     def head(self, width: float) -> tuple[list[str], int]:
-        """Lines of the title above an axis of this width, and the number of rows of the legend."""
+        """Lines of the title above an axis with this width, and the number of legend rows."""
         labels = sum(bool(label) for label, _ in self.curves)
         rows = -(-labels // self.columns(width)) if labels > 1 else 0
         return wrap(self.title, int(width / LETTER)), rows
@@ -90,6 +93,10 @@ class Timeline(NamedTuple):
         shown = self.shown.copy()
         shown[self.shown] = part
         return Timeline(shown, self.time[part], self.stage[part], self.unit)
+
+
+#: Rows of panels, each with its times.
+Rows = Sequence[Sequence[tuple[Timeline, Panel]]]
 
 
 def timeline(system: "System | BodySystem", columns: Mapping[str, np.ndarray]) -> Timeline:
@@ -199,7 +206,7 @@ def angle_range(degrees: np.ndarray) -> str:
     return f"from {low:.{digits}f}° to {high:.{digits}f}°"
 
 
-def draw_panel(axis: Any, times: Timeline, panel: Panel) -> None:
+def draw_panel(axis: "Axes", times: Timeline, panel: Panel) -> None:
     """Draw the curves of a panel, which break where stages begin."""
     stages, ranges = np.unique(times.stage), []
     for color, (label, values) in zip(cycle(COLORS), panel.curves, strict=False):
@@ -236,9 +243,7 @@ def draw_panel(axis: Any, times: Timeline, panel: Panel) -> None:
     open_axis(axis, labelsize=8)
 
 
-def draw_rows(
-    figure: Any, rows: Sequence[Sequence[tuple[Timeline, Panel]]], area: Sequence[float]
-) -> list[Any]:
+def draw_rows(figure: "Picture", rows: Rows, area: Sequence[float]) -> "list[Axes]":
     """Draw rows of panels above one another into an area of a figure, inches: left, bottom, right,
     top. The axes of a column have the same ends. Returns the axes."""
     left, bottom, right, top = area
@@ -270,18 +275,27 @@ def draw_rows(
     return axes
 
 
-def _head(axis: Any, panel: Panel, width: float) -> None:
+def _head(axis: "Axes", panel: Panel, width: float) -> None:
     """Draw the title of a panel, and below it the legend."""
     lines, rows = panel.head(width)
     pad = 72 * LINE * rows + 5
     axis.set_title("\n".join(lines), loc="left", fontsize=9, color=INK, pad=pad)
     if rows:
-        style = {"ncols": panel.columns(width), "fontsize": 8, "labelcolor": INK}
-        style |= {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
-        axis.legend(frameon=False, handlelength=1.4, columnspacing=1.2, labelspacing=0.2, **style)
+        axis.legend(
+            ncols=panel.columns(width),
+            fontsize=8,
+            labelcolor=INK,
+            loc="lower left",
+            bbox_to_anchor=(0, 1),
+            borderaxespad=0.2,
+            frameon=False,
+            handlelength=1.4,
+            columnspacing=1.2,
+            labelspacing=0.2,
+        )
 
 
-def stack(rows: Sequence[Sequence[tuple[Timeline, Panel]]], title: str, height: float = 0.0) -> Any:
+def stack(rows: Rows, title: str, height: float = 0.0) -> "Picture":
     """A figure of rows of panels under a title."""
     height = height or HEIGHT * len(rows) + 0.6
     figure = new_figure(WIDTH, height, layout=None, title=title)
@@ -289,7 +303,7 @@ def stack(rows: Sequence[Sequence[tuple[Timeline, Panel]]], title: str, height: 
     return figure
 
 
-def _label_stages(axis: Any, starts: Sequence[tuple[float, str]], width: float) -> None:
+def _label_stages(axis: "Axes", starts: Sequence[tuple[float, str]], width: float) -> None:
     """Write the names of stages above the curves where they begin, each in the first free row of an
     axis of this width."""
     left, right = axis.get_xlim()
@@ -302,9 +316,17 @@ def _label_stages(axis: Any, starts: Sequence[tuple[float, str]], width: float) 
         if row == MOST_ROWS:
             continue
         ends[row : row + 1] = [begin + length]
-        where = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "va": "top"}
         offset, side = (-4, "right") if before else (4, "left")
-        text = {"fontsize": 8, "color": FAINT, "ha": side}
-        axis.annotate(label, (start, 1), (offset, -2 - 10 * row), **where, **text)
+        axis.annotate(
+            label,
+            (start, 1),
+            (offset, -2 - 10 * row),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            va="top",
+            fontsize=8,
+            color=FAINT,
+            ha=side,
+        )
     low, high = axis.get_ylim()
     axis.set_ylim(low, high + 0.1 * len(ends) * (high - low))

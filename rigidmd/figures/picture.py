@@ -3,7 +3,6 @@ slow to import."""
 
 import io
 from collections.abc import Iterator
-from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.artist import Artist
@@ -42,17 +41,17 @@ class Picture(Figure):
         for text in _texts(self):
             text.set_parse_math(False)
 
-    def data(self, kind: str, dpi: float, hashsalt: str = "rigidmd", **settings: str) -> bytes:
-        """The bytes of a file of this type, which are the same for the same figure. settings : of
-        an .svg"""
+    def data(
+        self, kind: str, dpi: float, hashsalt: str = "rigidmd", fonttype: str = "path"
+    ) -> bytes:
+        """The bytes of a file of this type, which are the same for the same figure. hashsalt,
+        fonttype : of an .svg"""
         stream = io.BytesIO()
-        options: dict[str, Any] = {"dpi": dpi}
-        if kind == "svg":
-            options = {"dpi": SVG_DPI, "metadata": {"Date": None, "Creator": None}}
-        changed: Any = {f"svg.{name}": value for name, value in settings.items()}
+        is_svg = kind == "svg"
+        undated = {"Date": None, "Creator": None} if is_svg else None
         # Matplotlib has one set of settings for all threads
-        with PROCESS_LOCK, rc_context(changed | {"svg.hashsalt": hashsalt}):
-            self.savefig(stream, format=kind, **options)
+        with PROCESS_LOCK, rc_context({"svg.hashsalt": hashsalt, "svg.fonttype": fonttype}):
+            self.savefig(stream, format=kind, dpi=SVG_DPI if is_svg else dpi, metadata=undated)
         return stream.getvalue()
 
     def png(self) -> tuple[bytes, dict[str, float]]:

@@ -1,12 +1,14 @@
 """The figures of a run: energy.png of molecules, and the figures of a single body."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from rigidmd.core.statistics import format_signed
+from rigidmd.core.toml import Json
+from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.samples import Samples, moving
+from rigidmd.engines.samples import SampleTable, moving
 from rigidmd.figures.body import body_figures
 from rigidmd.figures.panels import Panel, Timeline, stack, timeline
 
@@ -22,16 +24,16 @@ MOST_DRIFTS = 4
 
 
 def run_figures(
-    system: "System | BodySystem", samples: Any, summary: dict[str, Any]
+    system: "System | BodySystem", samples: SampleTable, summary: Json
 ) -> "dict[str, Picture]":
     """The figures of a run by the names of their files, if there are enough samples."""
     if isinstance(system, BodySystem):
-        return body_figures(system, samples)
+        return body_figures(system, cast(Motion, samples))
     is_enough = moving(system.scene.stages, samples["stage"]).sum() > 1
     return {"energy": energy_figure(system, samples, summary)} if is_enough else {}
 
 
-def energy_figure(system: "System", samples: Samples, summary: dict) -> "Picture":
+def energy_figure(system: "System", samples: SampleTable, summary: Json) -> "Picture":
     """The drift of the conserved energy in each stage, each on its own scale. Energies and
     temperatures."""
     count = len(system.model.species)
@@ -52,7 +54,7 @@ def energy_figure(system: "System", samples: Samples, summary: dict) -> "Picture
             (
                 times,
                 Panel(
-                    "energies less their means in the last stage (kJ/mol per molecule)", energies
+                    "energies minus their means in the last stage (kJ/mol per molecule)", energies
                 ),
             )
         ],

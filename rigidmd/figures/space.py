@@ -1,11 +1,16 @@
 """Drawing of things in space, for all figures and animations: curves, spheres, faces, arrows."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigidmd.figures.style import FAINT, INK, WARM
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.typing import LineStyleType
 
 UP = np.array([0.0, 0.0, 1.0])
 #: Direction of the light: right, up, towards the eye.
@@ -54,19 +59,35 @@ def thin_path(path: np.ndarray, max_points: int) -> np.ndarray:
     return np.unique([0, *marks.clip(0, len(path) - 1), len(path) - 1])
 
 
-def draw_line(axis: Any, flat: np.ndarray, **style: Any) -> None:
+def draw_line(
+    axis: "Axes",
+    flat: np.ndarray,
+    color: str,
+    lw: float,
+    ls: "LineStyleType" = "-",
+    alpha: float | None = None,
+    zorder: float = 2.0,
+) -> None:
     """Draw a line of any number of points (n, 2), in pieces that join."""
     for first in range(0, max(1, len(flat) - 1), AT_ONCE):
-        axis.plot(*flat[first : first + AT_ONCE + 1].T, snap=False, **style)
+        axis.plot(
+            *flat[first : first + AT_ONCE + 1].T,
+            snap=False,
+            color=color,
+            lw=lw,
+            ls=ls,
+            alpha=alpha,
+            zorder=zorder,
+            rasterized=len(flat) > MOST_POINTS,
+        )
 
 
-def path_style(flat: np.ndarray, half: Any) -> tuple[np.ndarray, dict[str, Any]]:
+def path_style(flat: np.ndarray, half: ArrayLike) -> tuple[np.ndarray, float]:
     """Indices of the points of a path (n, 2) to draw, about one per pixel of a picture of this half
-    width, and the style of its line: longer ones are thinner."""
+    width, and the width of its line: longer ones are thinner."""
     length = np.linalg.norm(np.diff(flat, axis=0) / half, axis=1).sum()
     shown = thin_path(flat / half, int(800 * length) + 2)
-    width = max(0.25, 1.7 / (1 + length / 60))
-    return shown, {"lw": width, "rasterized": len(shown) > MOST_POINTS}
+    return shown, max(0.25, 1.7 / (1 + length / 60))
 
 
 class View:
@@ -80,7 +101,13 @@ class View:
         (2,) Half the width and height of the picture, and its centre.
     """
 
-    def __init__(self, axis: Any, matrix: np.ndarray, half: Any = 1.0, centre: Any = (0.0, 0.0)):
+    def __init__(
+        self,
+        axis: "Axes",
+        matrix: np.ndarray,
+        half: ArrayLike = 1.0,
+        centre: ArrayLike = (0.0, 0.0),
+    ):
         self.axis, self.matrix = axis, matrix
         self.half, self.centre = np.broadcast_to(half, 2), np.asarray(centre)
         axis.clear()
@@ -101,7 +128,10 @@ class View:
         points: np.ndarray,
         alphas: tuple[float, float],
         depth: np.ndarray | None = None,
-        **style: Any,
+        *,
+        color: str,
+        lw: float,
+        ls: "LineStyleType" = "-",
     ) -> None:
         """Draw a line that is strong on the side of the eye (depth >= 0) and faint on the other."""
         flat = self.flat(points)
@@ -111,14 +141,14 @@ class View:
         joined[1:] |= front[:-1]
         for part, alpha, order in ((joined, alphas[0], 3), (~front, alphas[1], 1.5)):
             line = np.where(part[:, None], flat, np.nan)
-            draw_line(self.axis, line, alpha=alpha, zorder=order, **style)
+            draw_line(self.axis, line, color, lw, ls, alpha, order)
 
     def path(self, points: np.ndarray, color: str, depth: np.ndarray | None = None) -> None:
         """Draw the path of a motion, with a dot at its start."""
         depth = self.depth(points) if depth is None else depth
         flat = self.flat(points)
-        shown, style = path_style(flat, self.half.max())
-        self.curve(points[shown], (0.95, 0.25), depth[shown], color=color, **style)
+        shown, width = path_style(flat, self.half.max())
+        self.curve(points[shown], (0.95, 0.25), depth[shown], color=color, lw=width)
         self.axis.plot(*flat[0], "o", color=WARM, ms=5, zorder=4)
 
     def spheres(
@@ -134,11 +164,18 @@ class View:
         tint = colors + np.where(white > 0, 1 - colors, colors) * white
         widths = (2 * size[:, 0] * radius).ravel()
         middles = flat + (lift * LIGHT[:2] / 0.82) * radius[..., None]
-        style = {"facecolors": tint.reshape(-1, 3).clip(0, 1), "edgecolors": "none"}
-        style |= {"offsets": middles.reshape(-1, 2), "offset_transform": self.axis.transData}
-        self.axis.add_collection(
-            EllipseCollection(widths, widths, 0, units="xy", zorder=zorder, **style)
+        discs = EllipseCollection(
+            widths,
+            widths,
+            0,
+            units="xy",
+            zorder=zorder,
+            facecolors=tint.reshape(-1, 3).clip(0, 1),
+            edgecolors="none",
+            offsets=middles.reshape(-1, 2),
+            offset_transform=self.axis.transData,
         )
+        self.axis.add_collection(discs)
 
     def faces(self, corners: Sequence[np.ndarray], colors: np.ndarray) -> None:
         """Draw the lit faces of a solid, each (k, 3) counterclockwise from outside. colors :
@@ -154,8 +191,10 @@ class View:
                 shown.append((seen[:, 2].mean(), seen[:, :2], lit * color))
         shown.sort(key=lambda entry: entry[0])
         tints = [color for *_, color in shown]
-        style = {"facecolors": tints, "edgecolors": tints, "lw": 0.5, "zorder": 2}
-        self.axis.add_collection(PolyCollection([flat for _, flat, _ in shown], **style))
+        flat = [corners for _, corners, _ in shown]
+        self.axis.add_collection(
+            PolyCollection(flat, facecolors=tints, edgecolors=tints, lw=0.5, zorder=2)
+        )
 
     def ellipsoids(self, solids: Sequence[tuple[np.ndarray, str]]) -> None:
         """Draw ellipsoids (semi-axes, colour) about the origin, which may intersect, in pale
@@ -251,11 +290,20 @@ class View:
             return None
         head = f"-|>,head_width={0.12 * lw:g},head_length={0.25 * lw:g}"
         arrow = {"arrowstyle": head, "color": color, "lw": lw, "shrinkA": 0, "shrinkB": 0}
-        self.axis.annotate("", tip, xytext=tail, arrowprops=arrow, zorder=zorder)
+        self.axis.annotate("", (*tip,), xytext=(*tail,), arrowprops=arrow, zorder=zorder)
         along = (tip - tail) / size
         label = tip + unit * (0.055 * along + side * np.array([-along[1], along[0]]))
-        style = {"ha": "center", "va": "center", "style": "italic", "zorder": zorder}
-        self.axis.text(*label, name, color=color, fontsize=fontsize, **style)
+        self.axis.text(
+            label[0],
+            label[1],
+            name,
+            color=color,
+            fontsize=fontsize,
+            ha="center",
+            va="center",
+            style="italic",
+            zorder=zorder,
+        )
         return label
 
     def triad(self, names: Sequence[str], down: np.ndarray | None = None) -> None:
@@ -273,8 +321,17 @@ class View:
         """Draw a bar of this length with its label in the lower right corner."""
         x, y = self.centre + 0.95 * self.half * [1, -1]
         self.axis.plot([x - length, x], [y, y], color=INK, lw=2, solid_capstyle="butt", zorder=4)
-        where = {"textcoords": "offset points", "ha": "right", "va": "bottom"}
-        self.axis.annotate(label, (x, y), (0, 3), color=INK, fontsize=10, zorder=4, **where)
+        self.axis.annotate(
+            label,
+            (x, y),
+            (0, 3),
+            textcoords="offset points",
+            ha="right",
+            va="bottom",
+            color=INK,
+            fontsize=10,
+            zorder=4,
+        )
 
     def box(self, corners: np.ndarray) -> None:
         """Draw the edges of a box of eight corners (8, 3) in binary order. Those at the furthest

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from rigidmd.core.files import atomic_file
 from rigidmd.errors import RigidMDError, RigidMDWarning
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+
     from rigidmd.figures.picture import Picture
 
 #: Colours of curves. Any two differ by at least 25 in the Lab space, also for viewers who lack the
@@ -44,13 +47,14 @@ MARKERS = "os^Dv*PX<>"
 DASHES = ((), (5, 1.5), (1.5, 1.2), (6, 1.5, 1.5, 1.5))
 
 
-def curve_style(k: int) -> dict:
-    """Style of the k-th of many curves: the colours of the palette, then other dashes and
-    markers."""
+def curve_style(k: int, connected: bool = True) -> dict:
+    """Style of the k-th of many curves: the colours of the palette, then other dashes and markers.
+    Without lines if the points are not connected."""
     rounds, color = divmod(k, len(COLORS))
     dashes = DASHES[rounds % len(DASHES)]
     marker = MARKERS[(color + 3 * rounds) % len(MARKERS)]
-    return {"color": COLORS[color], "ls": (0, dashes) if dashes else "-", "marker": marker}
+    line = (0, dashes) if dashes else "-"
+    return {"color": COLORS[color], "ls": line if connected else "none", "marker": marker}
 
 
 def head(figure: "Picture", title: str) -> None:
@@ -71,7 +75,7 @@ def drawing(path: Path) -> Iterator[None]:
         warnings.warn(f"{path} cannot be drawn: {reason}", RigidMDWarning, stacklevel=2)
 
 
-def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
+def write_figure(path: Path, draw: "Callable[[], Picture]", title: str = "") -> None:
     """Draw a figure and write it under a title; see `drawing`. Raises OutputError."""
     with drawing(path):
         figure = draw()
@@ -92,12 +96,16 @@ def save_files(figure: "Picture", stem: Path, suffixes: Sequence[str]) -> list[P
 
 
 def new_figure(
-    width: float, height: float, layout: Any = "constrained", title: str = "", **options
+    width: float,
+    height: float,
+    layout: Literal["constrained"] | None = "constrained",
+    title: str = "",
+    dpi: float | None = None,
 ) -> "Picture":
     """An empty figure of this size, inches, under a title."""
     from rigidmd.figures.picture import Picture  # Matplotlib is slow to import
 
-    figure = Picture(figsize=(width, height), layout=layout, **options)
+    figure = Picture(figsize=(width, height), layout=layout, dpi=dpi)
     if title:
         head(figure, title)
     return figure
@@ -105,7 +113,7 @@ def new_figure(
 
 def panel_grid(
     count: int, across: int, width: float, height: float, margin: float
-) -> "tuple[Picture, list[Any]]":
+) -> "tuple[Picture, list[Axes]]":
     """A figure of panels in rows of at most `across`, and the axes of the panels. Inches: of a
     panel, and below all."""
     across = min(across, max(1, count))
@@ -117,11 +125,13 @@ def panel_grid(
     return figure, axes[:count]
 
 
-def open_axis(axis, **ticks) -> None:
-    """Draw an axis without its frame on top and right, with these settings of ticks, in ink."""
+def open_axis(
+    axis: "Axes", labelsize: float | str = "medium", which: Literal["major", "both"] = "major"
+) -> None:
+    """Draw an axis without its frame on top and right, with labels of this size, in ink."""
     axis.spines[["top", "right"]].set_visible(False)
     axis.spines[:].set_color(INK)
-    axis.tick_params(colors=INK, **ticks)
+    axis.tick_params(colors=INK, labelsize=labelsize, which=which)
 
 
 def thin_series(
@@ -143,14 +153,14 @@ def thin_series(
 def largest_of_parts(
     time: np.ndarray, values: np.ndarray, bins: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A long series of errors reduced to the largest value of each of its parts."""
+    """A long series of errors reduced to the largest value in each part."""
     size = -(-len(time) // bins)
     return time[::size], np.fmax.reduceat(values, np.arange(0, len(time), size))
 
 
 def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | None:
-    """Limits of the axis of a curve (n,): the range of the second halves of the stages, and as much
-    above and below, as the starts of stages would flatten the rest. None if the range is 0."""
+    """Limits of the axis of a curve (n,): the range in the second halves of the stages, and as much
+    above and below, because the starts of stages would flatten the rest. None if the range is 0."""
     late = np.concatenate(
         [part[len(part) // 2 :] for part in (values[stage == k] for k in np.unique(stage))]
     )
@@ -161,7 +171,7 @@ def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | 
     return low - 0.05 * (high - low), high + 0.05 * (high - low)
 
 
-def label_minor_ticks(line) -> None:
+def label_minor_ticks(line: "Axis") -> None:
     """Label a logarithmic axis (`axis.xaxis` or `.yaxis`) between powers of ten if it has fewer
     than two of them."""
     from matplotlib.ticker import LogFormatterSciNotation

@@ -1,9 +1,9 @@
 """What force terms are made of: the parts of a system, and the interactions that are made from
 them.
 
-A factory of this package makes the terms of one key of a scene: `interactions` of a pair potential
-or of a method of electrostatics, `term` of a field. The scene and its molecules are values of
-`scene`, a package above this one, so that their types are given in words.
+A factory in this package makes the terms for one scene key: `interactions` of a pair potential or
+of a method of electrostatics, `term` of a field. The scene and its molecules are values of `scene`,
+a package above this one, so that their types are given in words.
 """
 
 from collections.abc import Callable, Iterator

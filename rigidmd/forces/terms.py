@@ -110,7 +110,8 @@ class Term:
 
 
 def trait(term: Any, name: str) -> Any:
-    """An attribute of a term, of its workspace or of a class of these, else that of `Term`."""
+    """An attribute of a term, its workspace or the class of either, else the attribute of
+    `Term`."""
     if hasattr(term, name):
         return getattr(term, name)
     default = getattr(Term, name)

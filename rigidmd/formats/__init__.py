@@ -11,7 +11,7 @@ from importlib import import_module
 from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -23,6 +23,17 @@ from rigidmd.formats.atoms import Atoms, Frame
 #: `of_sites(function)` and `centres(state, wrapped)`.
 System = Any
 Encode = Callable[[Frame, int], bytes]
+
+
+class FrameReader(Protocol):
+    """Reads the frames of a file. Methods raise only OSError and ValueError."""
+
+    count: int
+
+    @property
+    def sites(self) -> int: ...
+    def frame(self, k: int, /) -> Frame: ...
+    def close(self) -> None: ...
 
 
 class Topology(NamedTuple):
@@ -68,9 +79,7 @@ class Format(NamedTuple):
     encoder: Callable[[Any, float, bool], Encode] | None = None
     counter: tuple[int, str] = (0, "")
     writer: Callable[..., Any] | None = None
-    # A `reader` has `count` frames of `sites` sites, `frame(k)` and `close()`, and raises only
-    # OSError and ValueError.
-    reader: Callable[[Path], Any] | None = None  # default: the reader of MDAnalysis
+    reader: Callable[[Path], FrameReader] | None = None  # default: the reader of MDAnalysis
     mdanalysis: str = ""  # its name in MDAnalysis, if that is not its extension
     check: Callable[[str, int, int], dict[str, np.ndarray]] | None = (
         None  # reads all frames, in another process

@@ -49,6 +49,7 @@ class Atoms(NamedTuple):
     cell: np.ndarray | None = None  # (3, 3), rows a, b, c, Å
     masses: np.ndarray | None = None  # (n,) u, if the file has masses
     notes: Sequence[str] = ()
+    charges: np.ndarray | None = None  # (n,) e, if the file has charges of all atoms
 
 
 def structure_error(path: Path, message: str) -> StructureError:
@@ -135,7 +136,7 @@ class Frame(NamedTuple):
     step: int = 0
 
     @property
-    def sites(self) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+    def sites(self) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
         return self.positions, self.velocities, self.cell
 
 

@@ -5,8 +5,9 @@ A system is an `engines.system.System` or an `engines.body_system.BodySystem`, a
 `scene.models.Molecule`.
 """
 
+from collections.abc import Sequence
 from itertools import combinations, pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,6 +16,17 @@ from rigidmd.mechanics.inertia import SOLIDS
 #: Distance from a flat side of a hull, relative to its size, of points on it. Thickness relative to
 #: the size below which points lie in a plane or on a line.
 FLAT, THIN = 1e-6, 1e-9
+
+
+class Shape(Protocol):
+    """The sites of a molecule (s,) that bonds depend on."""
+
+    @property
+    def positions_body(self) -> np.ndarray: ...
+    @property
+    def masses(self) -> np.ndarray: ...
+    @property
+    def elements(self) -> Sequence[str]: ...
 
 
 def connections(system: Any, massless: bool = False) -> np.ndarray:
@@ -83,7 +95,7 @@ def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
-    """Edges of the convex hull of points in space, in a plane or on a line, the outline of a solid.
+    """Convex-hull edges for points in space, in a plane or on a line: the outline of a solid.
     Points inside, and those between the corners of a side, have none."""
     if len(points) < 2:
         return np.zeros((0, 2), int)
@@ -132,7 +144,7 @@ COVALENT = {"H": 0.31, "C": 0.76, "N": 0.71, "O": 0.66, "F": 0.57, "S": 1.05, "C
 SLACK = 1.25
 
 
-def bonds(m: Any) -> list[tuple[int, int]]:
+def bonds(m: Shape) -> list[tuple[int, int]]:
     """Bonds, heavier site first: atoms within bonding distance, shortest links, massless sites to
     nearest atoms."""
     from scipy.spatial.distance import cdist
@@ -140,7 +152,7 @@ def bonds(m: Any) -> list[tuple[int, int]]:
     x = m.positions_body
     atoms = np.flatnonzero(m.masses > 0)
     massless = np.flatnonzero(m.masses == 0)
-    radius = SLACK * np.array([COVALENT.get(m.elements[i], 0.0) for i in atoms])
+    radius = SLACK * np.array([COVALENT.get(m.elements[i], 0.0) for i in atoms.tolist()])
     bonded = cdist(x[atoms], x[atoms]) <= radius[:, None] + radius
     bonded[tuple(shortest_links(x[atoms]).T)] = True
     pairs = atoms[np.argwhere(np.triu(bonded | bonded.T, 1))].tolist()
@@ -149,5 +161,5 @@ def bonds(m: Any) -> list[tuple[int, int]]:
     return [*links, *zip(nearest.tolist(), massless.tolist(), strict=True)]
 
 
-def distance(m: Any, i: int, j: int) -> float:
+def distance(m: Shape, i: int, j: int) -> float:
     return float(np.linalg.norm(m.positions_body[i] - m.positions_body[j]))

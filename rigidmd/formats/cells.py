@@ -28,7 +28,7 @@ THINNEST, LONGEST = 0.5, 1e9
 
 
 def cell_error(cell: np.ndarray) -> str:
-    """Why a cell (3, 3) of finite numbers cannot hold molecules. Empty if it can."""
+    """Why a cell (3, 3) of finite numbers cannot hold molecules, or an empty text if it can."""
     if np.abs(cell).max() > LONGEST:
         return f"it must not be longer than {LONGEST:g} Å"
     edges = np.linalg.norm(cell, axis=1)

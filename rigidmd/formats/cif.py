@@ -185,6 +185,7 @@ def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
         contents.fractional @ cell,
         cell=cell,
         notes=notes,
+        charges=None if (charges := sites.charges()) is None else charges[owner],
     )
 
 
@@ -211,6 +212,11 @@ class AtomSites:
         """The values of the tag _atom_site_{part}. None where it has none."""
         values = self._block.column(f"_atom_site_{part}")
         return [values[row] for row in self._rows] if values else [None] * len(self)
+
+    def charges(self) -> np.ndarray | None:
+        """Charges (n,) in e. None if an atom has none."""
+        charges = np.array([number_of(text)[0] for text in self.column("charge")])
+        return None if np.isnan(charges).any() else charges
 
     def names(self) -> tuple[list[str], list[str]]:
         """Names and elements. A type that is not an element, such as OW or M, is the name."""
@@ -305,7 +311,7 @@ def _check_order(path: Path, sites: AtomSites) -> None:
         "in which every site is occupied or left out (for ices, GenIce makes proton-disordered"
         " ones)"
     )
-    consequence = "so that molecules are unknown. Give one arrangement of it"
+    consequence = "so that molecules are unknown. Choose one arrangement of it"
     raise structure_error(path, f"{disorder}: the crystal is disordered, {consequence}, {hint}")
 
 
@@ -383,7 +389,7 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
     is_listed = used.what == LISTED
     if contradicting and not is_listed:
         what = " and ".join([used.what, *(other.what for other in contradicting)])
-        advice = f"correct one of them, or give the operations ({OPERATIONS[0]})"
+        advice = f"correct one of them, or list the operations ({OPERATIONS[0]})"
         raise structure_error(path, f"{what} contradict each other: {advice}")
     operations = settings[0].operations
     notes = [_described(settings, used)]
@@ -518,7 +524,8 @@ def _contents(
 
 
 def _formula(text: str) -> dict[str, float]:
-    """Numbers of atoms in a formula such as C6 H6. Empty if it is unreadable."""
+    """Numbers of atoms in a formula such as C6 H6. The result is empty if the formula is
+    unreadable."""
     words = [re.fullmatch(r"([A-Z][a-z]?)(\d*\.?\d*)", word) for word in text.split()]
     if not all(words):
         return {}

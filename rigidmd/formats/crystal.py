@@ -200,7 +200,7 @@ def _short(key: str) -> str:
 
 
 def name_of(operations: np.ndarray) -> str:
-    """The space group of operations (g, 3, 4). Empty if it is in no table."""
+    """The space group of operations (g, 3, 4), or an empty text if it is in no table."""
     same = settings_where(lambda entry: np.array_equal(entry.setting.operations, operations))
     return same[0].name if same else ""
 

@@ -1,11 +1,11 @@
-"""Base of the trajectory files of molecules that a library writes with a table of frames inside the
-file (GSD, ASE)."""
+"""Base for trajectory files of molecules that a library writes with a frame table inside the file
+(GSD, ASE)."""
 
 import contextlib
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -24,7 +24,15 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-class FrameFile:
+class Closable(Protocol):
+    def close(self) -> object: ...
+
+
+FileT = TypeVar("FileT", bound=Closable)
+FrameT = TypeVar("FrameT")
+
+
+class FrameFile(Generic[FileT, FrameT]):
     """Writes frames to a file, each to the disk at once. For the arguments see
     `io.trajectory_file.TrajectoryFile`.
 
@@ -35,12 +43,13 @@ class FrameFile:
     """
 
     # A format implements these methods.
-    _open: Callable[[Path, str], Any]  # the file of the library, to write "w" or to append "a"
-    _frame: Callable[[State, float, int], Any]  # the frame of a state, as `_append` takes it
-    _append: Callable[[Any, Any], None]  # (file, frame)
-    _arrays: Callable[[Any], Iterable[np.ndarray]]  # of a frame, for the checksum
+    _open: Callable[[Path, str], FileT]  # the file of the library, to write "w" or to append "a"
+    _frame: Callable[[State, float, int], FrameT]  # the frame of a state, as `_append` takes it
+    _append: Callable[[FileT, FrameT], None]  # (file, frame)
+    _arrays: Callable[[FrameT], Iterable[np.ndarray]]  # of a frame, for the checksum
     #: The first of the file; raises as `_kept_frames` catches
-    _stored_frames: Callable[[int], Iterator[Any]]
+    _stored_frames: Callable[[int], Iterator[FrameT]]
+    _file: Any = None  # of the library
 
     def __init__(
         self,
@@ -53,7 +62,6 @@ class FrameFile:
         self._path, self._system = path, system
         self._velocities, self._wrapped = velocities, wrapped
         self._sum, self._frames, self._kept = 0, 0, kept
-        self._file: Any = None
         self._opened: tuple[int, int] | None = None  # device and number of the file that is open
         if kept is None:
             self._open_new()
@@ -107,7 +115,7 @@ class FrameFile:
             self._file = self._open(self._path, "w")
             self._opened = _identity(self._path)
 
-    def _kept_frames(self) -> Iterator[Any]:
+    def _kept_frames(self) -> Iterator[FrameT]:
         """The frames up to the checkpoint. Raises OutputError if they have changed."""
         kept_sum, count = self._kept or (0, 0)
         self._sum = self._frames = 0
@@ -127,7 +135,7 @@ class FrameFile:
                 " written"
             )
 
-    def _count(self, frame: Any) -> None:
+    def _count(self, frame: FrameT) -> None:
         self._frames += 1
         for array in self._arrays(frame):
             self._sum = zlib.crc32(np.ascontiguousarray(array).tobytes(), self._sum)

@@ -13,9 +13,10 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from math import nan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigidmd.core.state import State
 from rigidmd.formats import Format, System, register
@@ -25,6 +26,9 @@ from rigidmd.formats.cells import make_whole
 from rigidmd.formats.frame_file import FrameFile
 from rigidmd.formats.through_mdanalysis import index_of
 from rigidmd.mechanics.rotation import from_quaternion, to_quaternion
+
+if TYPE_CHECKING:
+    from gsd.hoomd import HOOMDTrajectory
 
 #: Distance, Å, between particles at one position.
 COINCIDENT = 1e-3
@@ -51,7 +55,7 @@ class Particles(NamedTuple):
 
     @property
     def site_masses(self) -> np.ndarray | None:
-        """Masses of the sites (s,), if those of each body add up to the mass of its central
+        """Masses of the sites (s,), if the masses in each body add up to the mass of its central
         particle: HOOMD does not use masses of constituents, which may have any value."""
         sites, body = self.sites, self.owner[self.sites]
         total = np.bincount(body, self.mass[sites], len(self.owner))
@@ -187,7 +191,7 @@ class GsdReader:
         return None
 
     def _of_particles(
-        self, frame: int, n: int, name: str, width: tuple[int, ...], default: Any
+        self, frame: int, n: int, name: str, width: tuple[int, ...], default: ArrayLike
     ) -> np.ndarray:
         """A property of all particles (n, *width)."""
         values = self._chunk(frame, f"particles/{name}")
@@ -260,7 +264,7 @@ def _refusals() -> Iterator[None]:
 DOT = 0.1
 
 
-class GsdFile(FrameFile):
+class GsdFile(FrameFile["HOOMDTrajectory", Any]):
     def __init__(
         self,
         path: Path,
@@ -293,7 +297,7 @@ class GsdFile(FrameFile):
         charge = np.zeros(len(label))
         charge[particle] = charges(system)
         central = set(label[:n][~single])
-        self._constant: dict[str, Any] = {
+        self._constant = {
             "types": types,
             "typeid": np.array([types.index(name) for name in label]),
             "type_shapes": [
@@ -307,12 +311,12 @@ class GsdFile(FrameFile):
         self._bonds = particle[connections(system)]
         super().__init__(path, system, velocities, wrapped, kept)
 
-    def _open(self, path: Path, mode: str) -> Any:
+    def _open(self, path: Path, mode: str) -> "HOOMDTrajectory":
         import gsd.hoomd  # slow to import
 
         return gsd.hoomd.open(str(path), "r+" if mode == "a" else mode)  # pyright: ignore[reportArgumentType]
 
-    def _append(self, file: Any, frame: Any) -> None:
+    def _append(self, file: "HOOMDTrajectory", frame: Any) -> None:
         file.append(frame)
         # after every frame, so that offsets of chunks do not depend on the time of a flush
         file.file.flush()

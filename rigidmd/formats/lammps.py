@@ -247,7 +247,8 @@ def _box(path: Path, head: list[Row]) -> np.ndarray | None:
 
 
 def _residues(numbers_of: Iterable[str]) -> list[tuple]:
-    """Residues from molecule numbers. Empty if all are 0, which stands for no molecules."""
+    """Residues from molecule numbers. The result is empty if all numbers are 0, which stands for no
+    molecules."""
     numbers_read = [parse_whole_number(number) for number in numbers_of]
     return [(number, "") for number in numbers_read] if any(numbers_read) else []
 
@@ -374,8 +375,8 @@ def _dump_names(
     masses: np.ndarray | None,
     atom_types: dict[str, str] | None,
 ) -> tuple[list[str], list[str]]:
-    """Names and elements of the atoms of a dump, from its columns of types, labels and elements,
-    named in a line."""
+    """Names and elements of the atoms in a dump, from its type, label and element columns, named in
+    a line."""
     named = columns.get("element", [])
     labelled = next((columns[name] for name in LABELS if name in columns), named)
     types = columns.get("type", labelled)

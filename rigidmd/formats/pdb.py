@@ -114,8 +114,8 @@ def _pdb_model(
 
 
 def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[float]]:
-    """A line of an atom with names in the columns of the format, the end of the coordinates in the
-    given line, and the coordinates. Numbers wider than their columns shift the rest."""
+    """An atom line with names in the columns of the format, the end of the coordinates in the given
+    line, and the coordinates. Numbers wider than their columns shift the rest."""
     fields = [line[a : a + 8] for a in (30, 38, 46)]
     if all(map(IN_COLUMNS.fullmatch, fields)):
         return line, 54, [float(field) for field in fields]

@@ -34,6 +34,7 @@ from rigidmd.units import ENERGY_UNITS
 if TYPE_CHECKING:
     import ase
     from ase import Atoms as AseAtoms
+    from ase.io.trajectory import TrajectoryWriter
 
 EV = ENERGY_UNITS["eV"]
 
@@ -144,7 +145,7 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
             " ones)"
         )
         raise structure_error(
-            path, f"{disorder}, so that molecules are unknown. Give one arrangement of it, {hint}"
+            path, f"{disorder}, so that molecules are unknown. Choose one arrangement of it, {hint}"
         )
     velocity = atoms.get_velocities() * ASE_VELOCITY if atoms.has("momenta") else None
     if velocity is not None and not np.isfinite(velocity).all():
@@ -425,7 +426,7 @@ class TrajFile(FrameFile):
             np.array([frame.time, float(frame.step)]),
         ]
 
-    def _open(self, path: Path, mode: str) -> Any:
+    def _open(self, path: Path, mode: str) -> "TrajectoryWriter":
         from ase.io.trajectory import TrajectoryWriter  # slow to import
 
         return TrajectoryWriter(path, mode)

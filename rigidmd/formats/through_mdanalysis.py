@@ -1,9 +1,9 @@
 """Frames in the formats of MDAnalysis: the file of one frame by its writers, and reading in another
 process.
 
-Its binary trajectories have no names of atoms: XTC and TRR of GROMACS, DCD of CHARMM and NAMD,
-NetCDF of AMBER. XTC has positions to 0.001 nm, TRR and NetCDF velocities too. DCD stores one time
-between all frames.
+Its binary trajectories have no names of atoms: XTC and TRR (GROMACS), DCD (CHARMM and NAMD), NetCDF
+(AMBER). XTC has positions to 0.001 nm, TRR and NetCDF velocities too. DCD stores one time between
+all frames.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from functools import partial
 from importlib import import_module
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,13 +28,17 @@ from rigidmd.core.state import edges_and_angles
 from rigidmd.formats import Encode, Format, System, register
 from rigidmd.formats.atoms import Frame, structure_error
 
+if TYPE_CHECKING:
+    import MDAnalysis as mda
+    from MDAnalysis.coordinates.timestep import Timestep
+
 
 def dimensions(cell: np.ndarray | None) -> list[float] | None:
     """A cell (3, 3) in MDAnalysis' form. None without a box."""
     return None if cell is None or cell[0, 0] == inf else edges_and_angles(cell)
 
 
-def universe_of(system: System, velocities: bool = False) -> Any:
+def universe_of(system: System, velocities: bool = False) -> "mda.Universe":
     """An MDAnalysis Universe of all sites, one residue per molecule, without bonds."""
     import MDAnalysis as mda
 
@@ -59,7 +63,7 @@ def universe_of(system: System, velocities: bool = False) -> Any:
     return u
 
 
-def set_frame(timestep: Any, frame: Frame) -> None:
+def set_frame(timestep: "Timestep", frame: Frame) -> None:
     timestep.positions = frame.positions
     if frame.velocities is not None:
         timestep.velocities = frame.velocities
@@ -72,7 +76,7 @@ class FrameFiles:
     of its writer."""
 
     def __init__(
-        self, system: System, velocities: bool, name: str, options: dict[str, Any] | None = None
+        self, system: System, velocities: bool, name: str, options: dict[str, object] | None = None
     ):
         self._universe = universe_of(system, velocities)
         self._name = name
@@ -80,7 +84,7 @@ class FrameFiles:
         self.sites: int = len(system.sites.name)
 
     def content(
-        self, frame: Frame, write: Callable[[Any, Any], object] | None = None, **options: Any
+        self, frame: Frame, write: Callable[[Any, Any], object] | None = None, **options: object
     ) -> bytes:
         """`write(writer, atoms)` is called in place of `writer.write(atoms)`."""
         import MDAnalysis as mda

@@ -58,7 +58,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def _contents(archive: zipfile.ZipFile) -> str:
-    """Names, lengths and checksums of the members of an archive, except of this list."""
+    """Names, lengths and checksums of all archive members except this list."""
     return "\n".join(
         f"{m.filename} {m.file_size} {m.CRC:08x}"
         for m in archive.infolist()

@@ -5,11 +5,14 @@ import io
 import sys
 import threading
 import time as clock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
 from rigidmd.core.toml import Json
+
+if TYPE_CHECKING:
+    from IPython.display import DisplayHandle
 
 #: Seconds between two lines.
 PAUSE = 30.0
@@ -29,7 +32,7 @@ class DisplayArea:
     """A part of the output of a notebook cell, whose content can be replaced."""
 
     def __init__(self):
-        self._handle: Any = None
+        self._handle: DisplayHandle | None = None
 
     def show(self, bundle: Json, metadata: Json | None = None) -> None:
         if self._handle is None:
@@ -116,9 +119,9 @@ Bar.set_lock(threading.RLock())  # tqdm's is for several processes too, and slow
 class _NotebookBar(Bar):
     """A bar of HTML, which any notebook shows without widgets and saves in its file."""
 
-    def __init__(self, spot: DisplayArea, **options: Any):
+    def __init__(self, spot: DisplayArea, total: float, unit: str):
         self._spot, self._ended = spot, False
-        super().__init__(file=io.StringIO(), leave=True, **options)
+        super().__init__(file=io.StringIO(), leave=True, total=total, unit=unit)
 
     def close(self) -> None:
         self._ended = True
@@ -146,8 +149,8 @@ class _NotebookBar(Bar):
 class _Lines(Bar):
     """Progress as lines on standard error: time done, rate and time left."""
 
-    def __init__(self, **options: Any):
-        super().__init__(file=io.StringIO(), mininterval=PAUSE, delay=PAUSE, **options)
+    def __init__(self, total: float, unit: str):
+        super().__init__(file=io.StringIO(), mininterval=PAUSE, delay=PAUSE, total=total, unit=unit)
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
         """Print a line, except for the empty message at the end."""

@@ -14,7 +14,7 @@ from functools import lru_cache
 from math import inf
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, NamedTuple, TextIO, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -172,7 +172,7 @@ def read_motion(path: Path) -> Columns | None:
     )
 
 
-def _lines(file: Any) -> Iterator[str]:
+def _lines(file: TextIO) -> Iterator[str]:
     """The complete lines of a file. Raises csv.Error for a line that is too long."""
     while line := file.readline(LONGEST_LINE):
         if line.endswith("\n"):

@@ -5,7 +5,6 @@ import json
 import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 import tomli_w
 
@@ -76,7 +75,7 @@ def _lines(table: Json) -> str:
     return "\n".join(f"{key} = {_value(value)}" for key, value in table.items())
 
 
-def _value(value: Any) -> str:
+def _value(value: object) -> str:
     """A text, a number, a list or a table in one line, which TOML writes as JSON except for
     tables."""
     if isinstance(value, dict):

@@ -38,7 +38,7 @@ def read_atoms(
     topology: Path | None = None,
     content: bytes | None = None,
 ) -> Atoms:
-    """The atoms of a file, or of one of several structures in it. Raises StructureError.
+    """The atoms in a file, or in one of its structures. Raises StructureError.
 
     frame: 1 for the first, -1 for the last. None for the only structure of a file, or the last of a
     trajectory. atom_types: names of types, for formats with types. topology: a file with the names
@@ -84,8 +84,8 @@ def read_atoms(
 
 
 def _without_placeholder(atoms: Atoms) -> Atoms:
-    """The atoms without a cell that stands for none: a cell of no volume, or the cube of 1 Å of
-    PDB."""
+    """The atoms without a cell that stands for none: a cell without volume, or the cube of 1 Å in
+    PDB files."""
     if atoms.cell is None:
         return atoms
     longest = np.linalg.norm(atoms.cell, axis=1).max()
@@ -125,14 +125,13 @@ def _no_types() -> str:
     return f"structure.atom_types is for formats whose atoms have types: {', '.join(names)}"
 
 
-def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndarray]:
-    """Names, elements, masses (s,) and positions (s, 3) of the atoms of a file with one
-    molecule."""
+def read_geometry(path: Path) -> Atoms:
+    """The atoms of a file with one molecule, with elements and masses of all."""
     from ase.data import atomic_masses, atomic_numbers
 
     if (form := format_of(path)) is not None and form.is_trajectory:
         raise structure_error(
-            path, "is a trajectory: name a structure file, or write a frame of it as one"
+            path, "is a trajectory: name a structure file, or write one of its frames as a file"
         )
     atoms = read_atoms(path)
     elements = [
@@ -144,7 +143,7 @@ def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndar
         masses = np.array(
             [known[e] if e in known else atomic_masses[atomic_numbers[e]] for e in elements]
         )
-    return atoms.names, elements, masses, atoms.position
+    return atoms._replace(elements=elements, masses=masses)
 
 
 def _choose(

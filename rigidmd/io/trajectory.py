@@ -14,6 +14,7 @@ import numpy as np
 from MDAnalysis.coordinates.base import ProtoReader, ReaderBase
 from MDAnalysis.coordinates.core import get_reader_for
 from MDAnalysis.coordinates.memory import MemoryReader
+from MDAnalysis.coordinates.timestep import Timestep
 from MDAnalysis.coordinates.XDR import XDRBaseReader
 from MDAnalysis.lib.distances import minimize_vectors, self_capped_distance
 
@@ -116,7 +117,7 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
 
 
 def read_times(path: Path, sites: int) -> np.ndarray:
-    """Times (f,) of the frames of a trajectory, ps, without the rounding of files. For errors see
+    """Times (f,) of the trajectory frames, ps, without the rounding of files. For errors see
     `read_frames`."""
     return without_rounding(np.array(_read(_times, path, sites)))
 
@@ -137,7 +138,7 @@ def _as_decimal(time: float) -> float:
     return float(str(single)) if single == time else float(time)
 
 
-def _read(function: Callable[..., T], path: Path, sites: int, *arguments: Any) -> T:
+def _read(function: Callable[..., T], path: Path, sites: int, *arguments: object) -> T:
     """What a function reads from a trajectory. Raises OutputError for the errors of all readers."""
     if (form := BY_EXTENSION[path.suffix]).check is not None:
         try:
@@ -201,7 +202,7 @@ def _opened(path: Path, sites: int) -> Any:
     return reader
 
 
-def _whole_frames(reader: Any, path: Path, selected: range) -> Iterator[Any]:
+def _whole_frames(reader: Any, path: Path, selected: range) -> Iterator[Timestep]:
     """The selected frames of a reader, without an incomplete last one. Raises OutputError for any
     other."""
     for k in selected:
@@ -341,7 +342,7 @@ def reader_of(extension: str) -> Any:
     return _subclass(_WithoutOffsetsFile, reader) if issubclass(reader, XDRBaseReader) else reader
 
 
-def timed(reader: Any) -> Any:
+def timed(reader: type[ProtoReader]) -> Any:
     """A subclass of a reader with the times of the run."""
     return _subclass(_WithTimes, reader)
 

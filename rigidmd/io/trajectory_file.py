@@ -4,7 +4,7 @@ import struct
 from collections.abc import Sequence
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -92,7 +92,7 @@ class TrajectoryFile(AppendedFile):
     ):
         self._system, self._velocities, self._wrapped = system, velocities, wrapped
         form = BY_EXTENSION[path.suffix]
-        self._encode: Any = not_none(form.encoder)(system, interval, velocities)
+        self._encode = not_none(form.encoder)(system, interval, velocities)
         self._counter, self._count = form.counter[0], struct.Struct(form.counter[1])
         *before, self._frames = kept or (0, 0, 0)
         first = self._count.pack(1) if self._count.size else b""

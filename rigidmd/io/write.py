@@ -6,7 +6,7 @@ import io
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -37,15 +37,24 @@ def check_target(
         )
 
 
-def write_json(path: Path, data: object, **options: Any) -> None:
-    """Write data, with the options of `json.dumps`. Raises OutputError, as all writers here do."""
-    write_text(path, json.dumps(data, **options) + "\n")
-
-
-def write_csv(
-    path: Path, rows: Iterable[Sequence[object]], quoting: Any = csv.QUOTE_MINIMAL
+def write_json(
+    path: Path,
+    data: object,
+    indent: int | None = None,
+    *,
+    ensure_ascii: bool = True,
+    allow_nan: bool = True,
 ) -> None:
-    stream = io.StringIO(newline="")
+    """Write data as `json.dumps` does. Raises OutputError, as all writers here do."""
+    text = json.dumps(data, indent=indent, ensure_ascii=ensure_ascii, allow_nan=allow_nan)
+    write_text(path, f"{text}\n")
+
+
+def write_csv(path: Path, rows: Iterable[Sequence[object]], quote_text: bool = False) -> None:
+    """Write rows as CSV, with texts in quotation marks where needed, or always."""
+    stream, quoting = io.StringIO(newline=""), csv.QUOTE_MINIMAL
+    if quote_text:
+        quoting = csv.QUOTE_NONNUMERIC
     csv.writer(stream, quoting=quoting, lineterminator="\n").writerows(rows)
     write_text(path, stream.getvalue())
 
@@ -78,38 +87,44 @@ def columns_text(lines: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> 
     return "\n".join("  ".join(line).rstrip() for line in padded)
 
 
-def format_cell(value: Any) -> str:
+#: A number, text, or nothing.
+Cell = float | str | None
+Row = TypeVar("Row")
+
+
+def format_cell(value: Cell) -> str:
     """A value with three digits. "-" for None."""
     if value is None or isinstance(value, str):
         return "-" if value is None else value
     return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e5 else f"{value:.1e}"
 
 
-class Column(NamedTuple):
+class Column(NamedTuple, Generic[Row]):
     header: str  # with the unit
-    value: Callable[[Any], Any]  # of a row: a number, text, or None
+    value: Callable[[Row], Cell]
     short: str = ""  # header for a terminal, if it is another one
 
 
 def with_error(
-    header: str, measured: Callable[[Any], Sequence[Any] | None], error_header: str = "±"
-) -> list[Column]:
+    header: str,
+    measured: Callable[[Row], tuple[Cell, Cell] | None],
+) -> list[Column[Row]]:
     """Columns of a value and its error. measured(row) : both, or None"""
 
-    def pair(row):
+    def pair(row: Row) -> tuple[Cell, Cell]:
         return measured(row) or (None, None)
 
     return [
         Column(header, lambda row: pair(row)[0]),
-        Column(error_header, lambda row: pair(row)[1]),
+        Column("±", lambda row: pair(row)[1]),
     ]
 
 
-class Table(NamedTuple):
-    columns: list[Column]
-    rows: Sequence[Any]
+class Table(NamedTuple, Generic[Row]):
+    columns: list[Column[Row]]
+    rows: Sequence[Row]
 
-    def values(self, row: Any) -> list[Any]:
+    def values(self, row: Row) -> list[Cell]:
         return [column.value(row) for column in self.columns]
 
     def shown(self) -> tuple[list[str], list[list[str]]]:
@@ -130,10 +145,10 @@ class Table(NamedTuple):
         aligned_left = [shown_columns.index(k) for k in left if k in shown_columns]
         return columns_text(lines, aligned_left)
 
-    def write(self, path: Path, quoting: Any = csv.QUOTE_MINIMAL) -> None:
-        """Write the table as CSV. Raises OutputError."""
+    def write(self, path: Path, quote_text: bool = False) -> None:
+        """Write the table as CSV, see `write_csv`. Raises OutputError."""
         write_csv(
             path,
             [[column.header for column in self.columns], *map(self.values, self.rows)],
-            quoting,
+            quote_text,
         )

@@ -131,8 +131,8 @@ def rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h):
 
 @kernel
 def rotate_by_series(rotation, angular_momentum_body, m, inverse, h):
-    """Free motion of an asymmetric body by the Taylor series of omega and of the quaternion of the
-    rotation."""
+    """Free motion of an asymmetric body, by the Taylor series for omega and for the rotation
+    quaternion."""
     L = angular_momentum_body[m]
     fastest = abs(L[0] * inverse[0]) + abs(L[1] * inverse[1]) + abs(L[2] * inverse[2])
     if not 0.0 < fastest * abs(h) < inf:

@@ -46,9 +46,9 @@ def shifted_inertia(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.n
 
 
 def inertia_error(tensor: np.ndarray, scale: float = 0.0) -> str:
-    """Why no mass distribution has this inertia tensor (3, 3). Empty if one exists. The tolerance
-    for rounding is 1e-12 of the largest moment, or of `scale` if the tensor is a difference of
-    larger ones."""
+    """Why no mass distribution has this inertia tensor (3, 3), or an empty text if such a
+    distribution exists. The tolerance for rounding is 1e-12 of the largest moment, or of `scale` if
+    the tensor is a difference of larger ones."""
     low, middle, high = np.linalg.eigvalsh(tensor)
     slack = 1e-12 * max(abs(low), abs(high), scale)
     if low < -slack:

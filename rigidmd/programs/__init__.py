@@ -15,7 +15,7 @@ class Option(NamedTuple):
     """A key of [engine] that one engine has."""
 
     values: type[int] | tuple[str, ...]  # the values allowed; int: whole numbers above 0
-    default: Any
+    default: object
     description: str
 
 
@@ -32,7 +32,7 @@ class Program(NamedTuple):
     #: A message on options that contradict each other
     option_errors: Callable[..., str] = lambda **options: ""
     # the options with which `rigidmd verify` compares, unless others are given
-    precise: Mapping[str, Any] = {}
+    precise: Mapping[str, object] = {}
     thermostat: str | None = None  # its default thermostat in place of rigidmd's
     barostat: str | None = None  # likewise of npt; None if its barostat has no name in a scene
     writer: str = (

@@ -2,10 +2,10 @@
 molecule.
 
 `gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's
-force and torque, minus the gradient of the energy as a function of atoms to which rigid molecules
-are fitted. The guide `ase` has the formula. `site_forces`: each atom has the forces on its site.
-Forces on massless sites are distributed over the atoms. Forces inside molecules are included.
-Constraints have to balance them.
+force and torque, minus the energy gradient for atoms to which rigid molecules are fitted. The guide
+`ase` has the formula. `site_forces`: each atom has the forces on its site. Forces on massless sites
+are distributed over the atoms. Forces inside molecules are included. Constraints have to balance
+them.
 """
 
 import contextlib
@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.distance import cdist
 
 from rigidmd.core.process import ignore_warnings
@@ -117,7 +118,11 @@ def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
     return [int(selection) % count]
 
 
-def _sites_of_frames(results: "Results") -> Callable[[int], tuple[Any, Any, Any]]:
+#: Positions, velocities and cell.
+SitesOfFrame = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
+
+
+def _sites_of_frames(results: "Results") -> Callable[[int], SitesOfFrame]:
     """A function of k that gives positions, velocities and cell of frame k, from the files if there
     are any."""
     from rigidmd.io.trajectory import read_exactly  # MDAnalysis is slow to import
@@ -132,7 +137,7 @@ def _sites_of_frames(results: "Results") -> Callable[[int], tuple[Any, Any, Any]
     with ignore_warnings():  # frames that are not evenly spaced: each has its time
         trajectory = cast(Any, results.universe().trajectory)
 
-    def sites(k: int) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    def sites(k: int) -> SitesOfFrame:
         frame = trajectory[k]
         cell = None if frame.dimensions is None else frame.triclinic_dimensions
         return frame.positions, frame.velocities if frame.has_velocities else None, cell
@@ -140,8 +145,8 @@ def _sites_of_frames(results: "Results") -> Callable[[int], tuple[Any, Any, Any]
     return sites
 
 
-def _same(time: Any, other: float) -> Any:
-    return np.abs(time - other) <= SAME_TIME * max(abs(other), 1.0)
+def _same(time: ArrayLike, other: float) -> np.ndarray:
+    return np.abs(np.subtract(time, other)) <= SAME_TIME * max(abs(other), 1.0)
 
 
 def ase_results(

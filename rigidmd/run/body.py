@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, inf
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -48,7 +48,7 @@ EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 1_000_000, 512
 class Sampler(Observer):
     """Keeps snapshots, of which columns are made at the end."""
 
-    remembers: ClassVar[dict[str, Any]] = {"stacked": Arrays}
+    remembers: ClassVar[dict[str, object]] = {"stacked": Arrays}
     ends = True
 
     def __init__(self, interval: float):
@@ -97,12 +97,12 @@ def energies_of(system: BodySystem, state: State) -> dict[str, float]:
 
 
 class BodyWatch(Observer):
-    """Checks the state against the limits of the scene, independent of the interval of samples.
+    """Checks the state against the limits of the scene, independent of the sample interval.
 
     exchanged : the largest energy exchanged so far (J), to which errors of the energy are relative
     """
 
-    remembers: ClassVar[dict[str, Any]] = {"exchanged": NotNegative}
+    remembers: ClassVar[dict[str, object]] = {"exchanged": NotNegative}
     ends = True
 
     def __init__(self, run: "Simulation"):
@@ -160,7 +160,7 @@ class BodyWatch(Observer):
         if error <= limits.energy * scale:
             return None
         return FailedCheck(
-            f"the energy less the work done changed by {error:.3g} J,"
+            f"the energy minus the work done changed by {error:.3g} J,"
             f" {error / scale if scale else inf:.3g} of all energy exchanged (watch.energy ="
             f" {limits.energy:g})"
         )
@@ -312,7 +312,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         return self._segments[k]
 
     def _equal_step_segments(self) -> list[Segment]:
-        """Segments between the breaks of functions of time, in equal steps no longer than the
+        """Segments between the breaks in functions of time, in equal steps no longer than the
         timestep of the scene."""
         run = self.scene.run
         segments, steps = [], 0
@@ -394,7 +394,9 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             f" {run.integrator.replace('_', ' ')}"
         )
 
-    def start_energy(self) -> dict:
+    def start_energy(
+        self, size: float = 1.0, unit: str = "J", measure_accuracy: bool = False
+    ) -> Json:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the
         body's."""
         self.reset()

@@ -189,7 +189,7 @@ def _periods(
     time: np.ndarray, values: np.ndarray, level: float, other: np.ndarray, both_ways: bool = False
 ) -> tuple[float | None, float | None]:
     """The mean time between passages of samples (t,) through a level, and the mean rate of another
-    series (t,) from the first to the last of them. None if there are less than two, or a period has
+    series (t,) from the first to the last passage. None if there are less than two, or a period has
     too few samples.
 
     both_ways : passages upwards and downwards, not upwards alone

@@ -64,7 +64,7 @@ def summarise_body(
 
 
 def motion_figures(columns: Mapping[str, np.ndarray], invariants: Iterable[str]) -> dict:
-    """The part of the summary of a body that follows from the columns of its motion."""
+    """The part of a body's summary that follows from the columns of its motion."""
     theta, orthogonality = columns.get("theta"), columns.get("orthogonality_error")
     return {
         "energy_start_J": float(columns["energy"][0]),

@@ -39,7 +39,7 @@ def check_interval(system: System) -> int:
 
 
 class StepCheck:
-    """Checks of the next step of a run of molecules, relative to the momenta of the last good
+    """Checks of the next step in a run of molecules, relative to the momenta at the last good
     sample."""
 
     def __init__(self, system: System, limits: Watch):

@@ -1,4 +1,5 @@
-"""The error of a failed check, and limits that the checks of molecules and of bodies share."""
+"""The error that a failed check raises, and limits that are common to the checks of molecules and
+bodies."""
 
 from math import sqrt
 

@@ -204,7 +204,9 @@ class RunLoop:
             self._resume_observers(checkpoint)
             if changed is not None:
                 simulation._note(changed)
-            simulation._announce(f"continuing from step {part.state.step[NOW]}")
+            simulation._announce(
+                f"continuing from step {part.state.step[NOW]}, the last checkpoint"
+            )
         if self._folder is not None and stays:
             run_folder.add_to_folder(self._folder, names)
             with writing(self._folder):

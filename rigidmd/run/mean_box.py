@@ -14,9 +14,9 @@ def scale_to_mean_box(system: System, state: State, samples: Samples, k: int) ->
     """Scale a state before stage k, in place, if this stage continues in the mean box of the stage
     before.
 
-    The box has the ratios of the mean edges and the mean angles of the equilibrated part of that
-    stage, and its mean volume. Centres of mass are scaled with it. Molecules do not rotate, and
-    momenta do not change. The change of the energy is added to the energy ledger as work.
+    The new box has the mean volume, the mean angles and the ratios of the mean edges in the
+    equilibrated part of that stage. Centres of mass are scaled with it. Molecules do not rotate,
+    and momenta do not change. The change of the energy is added to the energy ledger as work.
     """
     if not k or not system.scene.stages[k].volume:
         return

@@ -1,4 +1,4 @@
-"""Removal of overlaps, and minimisation of energy or enthalpy in the rigid degrees of freedom by
+"""Overlap removal, and minimisation of energy or enthalpy in the rigid degrees of freedom by
 L-BFGS.
 
 Both move a state to one near it: the first until molecules on a lattice are not too close, the

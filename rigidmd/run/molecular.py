@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from math import isfinite, nan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -18,7 +18,7 @@ from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, REMOVED, State, state_of
 from rigidmd.core.toml import Json
-from rigidmd.dynamics.model import remove_momentum
+from rigidmd.dynamics.model import mobile, remove_momentum
 from rigidmd.dynamics.observables import largest_values
 from rigidmd.engines.observables import Observation, describe_quantities, observe
 from rigidmd.engines.protocol import Engine
@@ -85,13 +85,17 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     summary_text, short_summary = staticmethod(summary_text), staticmethod(short_summary)
 
     def __init__(
-        self, simulation: "Simulation", scene: MolecularScene, forces: Any, thermostat: Any
+        self, simulation: "Simulation", scene: MolecularScene, forces: object, thermostat: object
     ):
         super().__init__(simulation)
         user_forces = (
             forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
         )
         self._start = build(scene.with_user_code(() if forces is None else user_forces, thermostat))
+        if len(self._start.model.species) and not mobile(self._start.model).any():
+            why = "molecules: all are frozen. Nothing would move. Insertion needs no run:"
+            how = f"`rigidmd analyse {scene.source} insertion model=NAME`"
+            raise SceneError(scene.source, [f"{why} {how}"])
         self.reset()
 
     @property

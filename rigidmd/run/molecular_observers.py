@@ -2,7 +2,7 @@
 state."""
 
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -83,7 +83,7 @@ class Sampler(Observer):
     """Keeps samples, checks each against the limits of the scene, and keeps the last state that
     passed."""
 
-    remembers: dict[str, Any] = {"table": np.ndarray}  # noqa: RUF012
+    remembers: dict[str, object] = {"table": np.ndarray}  # noqa: RUF012
     ends = reads_energies = True
     _names = (LAST_GOOD,)
 

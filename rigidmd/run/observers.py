@@ -91,7 +91,7 @@ class Observer:
         checked
     """
 
-    remembers: ClassVar[dict[str, Any]] = {}
+    remembers: ClassVar[dict[str, object]] = {}
     interval: float | None = None  # ps, or s for a single body
     steps: int | None = None
     ends = False
@@ -188,7 +188,9 @@ class Every(Observer):
 class GrowingFile(Observer):
     """An observer whose file grows during the run. None without a folder."""
 
-    remembers: ClassVar[dict[str, Any]] = {"kept": list[Annotated[int, Field(ge=0, strict=True)]]}
+    remembers: ClassVar[dict[str, object]] = {
+        "kept": list[Annotated[int, Field(ge=0, strict=True)]]
+    }
     kept: list[int] | None = (
         None  # sizes and checksum of the file of the run that is resumed, which `begin` opens
     )
@@ -261,7 +263,7 @@ class Figures(Observer):
 class Frames(GrowingFile):
     """Topology and trajectory. Without a folder, frames in memory."""
 
-    remembers: ClassVar[dict[str, Any]] = GrowingFile.remembers | {"times": np.ndarray}
+    remembers: ClassVar[dict[str, object]] = GrowingFile.remembers | {"times": np.ndarray}
     once = True
 
     def __init__(

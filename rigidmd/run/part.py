@@ -2,8 +2,9 @@
 it."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Container
 from math import isclose
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
@@ -19,7 +20,8 @@ from rigidmd.run.schedule import Segment
 
 if TYPE_CHECKING:
     from rigidmd.engines.body_motion import Motion
-    from rigidmd.engines.body_system import BodySystem
+    from rigidmd.engines.body_system import BodySystem, Pose
+    from rigidmd.engines.observables import Observation
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
     from rigidmd.run.simulation import Simulation
@@ -91,11 +93,11 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
     # observation
 
     @abstractmethod
-    def observe(self, moment: Moment) -> Any:
+    def observe(self, moment: Moment) -> "Observation | Pose":
         """The observation that `Moment.observation` keeps."""
 
     @abstractmethod
-    def observe_now(self) -> Any:
+    def observe_now(self) -> "Observation | Pose":
         """The observation of the current state."""
 
     @abstractmethod
@@ -126,12 +128,12 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
 
     @staticmethod
     @abstractmethod
-    def summary_text(summary: Json, known: Any) -> str:
+    def summary_text(summary: Json, known: Container[str]) -> str:
         """The summary as text, without the notes in `known`."""
 
     @staticmethod
     @abstractmethod
-    def short_summary(summary: Json, known: Any) -> str:
+    def short_summary(summary: Json, known: Container[str]) -> str:
         """The main results as text, without the notes in `known`."""
 
     @abstractmethod
@@ -139,7 +141,9 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         """An error in full: what was seen, the likely cause, what to try."""
 
     @abstractmethod
-    def start_energy(self, *arguments: Any, **options: Any) -> Json:
+    def start_energy(
+        self, size: float = 1.0, unit: str = "J", measure_accuracy: bool = False
+    ) -> Json:
         """Energies and forces at the start."""
 
     def take_threads(self, count: int) -> None:

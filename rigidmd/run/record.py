@@ -114,7 +114,7 @@ def read_record(folder: Path) -> Record:
 
 
 def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
-    """Columns of log.csv by the names of `results[...]`, with the index of the stage."""
+    """Columns of log.csv by their names in `results[...]`, with the index of the stage."""
     read = read_columns(folder / LOG)
     if read is None:
         raise OutputError(f"{folder / LOG} cannot be read: there is no such file")

@@ -104,7 +104,7 @@ def _rate(rate: dict, pattern: str) -> str:
 
 
 def body_rows(summary: dict) -> list[tuple[str, str]]:
-    """Names and values of the summary of a run of a single body."""
+    """Names and values in the summary of a single-body run."""
     rows = [
         (
             "energy",
@@ -196,7 +196,7 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         if (scatter := stage.get("temperature_scatter_K")) is not None:
             off = stage["temperature_K"] - stage["temperature_before_K"]
             before = stage["temperature_before_K"]
-            moment = "this stage keeps the energy of one moment. Such temperatures scatter by"
+            moment = "an NVE stage keeps the energy at its start. Such temperatures scatter by"
             hint = "" if abs(off) < 3 * scatter else ", less than this: equilibrate longer"
             rows.append(
                 ("", f"{off:+.2g} K from the {before:g} K before: {moment} {scatter:.2g} K{hint}")

@@ -89,7 +89,7 @@ def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: st
 
 
 def scene_digest(scene: Scene) -> str:
-    """SHA-256 of all keys of a resolved scene that may change the bits of its run."""
+    """SHA-256 of all keys in a resolved scene that may change the bits of its run."""
     keys = keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *NOT_COMPARED))
     return hashlib.sha256(json.dumps(keys, sort_keys=True).encode()).hexdigest()
 
@@ -125,7 +125,7 @@ def keys_of(scene: Mapping[str, object], excluded: Iterable[str]) -> Json:
 
 def differences(
     first: Mapping[str, object], second: Mapping[str, object], left_out: object = "left out"
-) -> dict[str, tuple]:
+) -> dict[str, tuple[object, object]]:
     """Key -> both values, where two dictionaries differ."""
     pairs = {
         key: (first.get(key, left_out), second.get(key, left_out)) for key in {**first, **second}
@@ -133,7 +133,9 @@ def differences(
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
-def describe_differences(values: Mapping[str, tuple[Any, Any]], files: Iterable[str]) -> list[str]:
+def describe_differences(
+    values: Mapping[str, tuple[object, object]], files: Iterable[str]
+) -> list[str]:
     """Phrases: keys with their values now and before, and keys of files that have changed."""
     changes = []
     for key, (now, before) in values.items():
@@ -141,7 +143,7 @@ def describe_differences(values: Mapping[str, tuple[Any, Any]], files: Iterable[
     return changes + [f"the file of {key} has changed" for key in files]
 
 
-def _flat(data: Any, name: str = "") -> Json:
+def _flat(data: object, name: str = "") -> Json:
     """Dotted key -> value of nested tables, without None."""
     if isinstance(data, list) and any(isinstance(value, Mapping) for value in data):
         data = dict(enumerate(data))
@@ -227,7 +229,7 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True
     return state
 
 
-def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
+def stored(owner: object, types: Mapping[str, object]) -> Checkpoint:
     """Attributes of an object for a checkpoint, by their names and types: arrays as arrays, all
     others as JSON."""
     arrays, plain_types = {}, {}
@@ -245,13 +247,11 @@ def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
 
 
 def restored(
-    kept: Checkpoint, types: Mapping[str, Any], rows: Mapping[str, Scheme] | None = None
+    kept: Checkpoint, types: Mapping[str, object], rows: Mapping[str, Scheme] | None = None
 ) -> Json:
     """The attributes of `stored`, validated. rows : see `Scene.rows`. Raises ValueError or
     KeyError."""
-    arrays: dict[str, Any] = {
-        name: kept.arrays[name] for name, kind in types.items() if kind is np.ndarray
-    }
+    arrays: Json = {name: kept.arrays[name] for name, kind in types.items() if kind is np.ndarray}
     for name in (name for name, kind in types.items() if kind == Arrays):
         start = f"{name}/"
         arrays[name] = {
@@ -269,7 +269,7 @@ def restored(
 
 
 @cache
-def _model_of(types: tuple[tuple[str, Any], ...]) -> type[BaseModel]:
+def _model_of(types: tuple[tuple[str, object], ...]) -> type[BaseModel]:
     config = ConfigDict(
         extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants", protected_namespaces=()
     )

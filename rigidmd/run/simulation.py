@@ -1,4 +1,4 @@
-"""The simulation of a scene, of molecules or of a single body. Several of them at once in one
+"""The simulation of a scene, with molecules or a single body. Several of them at once in one
 process."""
 
 import atexit
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     class Options(TypedDict, total=False):
         """The keyword arguments of `Simulation`, which are described there."""
 
-        observers: Any
+        observers: object
         say: Callable[[str], object] | None
         warn: Callable[[str], object]
         resume: bool
@@ -183,7 +183,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         folder: str | Path | None = None,
         force: bool = False,
         *,
-        observers: Any = (),
+        observers: object = (),
         say: Callable[[str], object] | None = None,
         warn: Callable[[str], object] = _as_warning,
         resume: bool = False,
@@ -230,7 +230,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
                 raise SceneError(
                     scene.source, ["applied: for a single body. Molecules take forces=[...]"]
                 )
-            self._part = MolecularRun(self, cast(Any, scene), forces, thermostat)
+            self._part = MolecularRun(self, cast("MolecularScene", scene), forces, thermostat)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._summary_line}>"
@@ -401,10 +401,12 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """Set the number of threads. Results do not depend on it. A single body always has one."""
         self._before_run().take_threads(count)
 
-    def _start_energy(self, *unit: Any, **options: Any) -> Json:
+    def _start_energy(
+        self, size: float = 1.0, unit: str = "J", measure_accuracy: bool = False
+    ) -> Json:
         """Energies and forces at the start. For the arguments see `MolecularRun.start_energy`, a
         body has none."""
-        return self._before_run().start_energy(*unit, **options)
+        return self._before_run().start_energy(size, unit, measure_accuracy)
 
     # The run.
 

@@ -41,9 +41,9 @@ def stiffest_mode(
 ) -> StiffestMode | None:
     """The fastest small motion of all molecules together. None if no restoring force acts.
 
-    The largest eigenvalue of the mass-weighted matrix of force differences, in the Krylov space of
-    one random vector (Arnoldi). The state is unchanged. Each of `DIRECTIONS` directions takes one
-    force evaluation. In large systems only a slab of `MOST_DISPLACED` molecules moves.
+    The largest eigenvalue of the mass-weighted force differences, in the Krylov space of one random
+    vector (Arnoldi). The state is unchanged. Each of `DIRECTIONS` directions takes one force
+    evaluation. In large systems only a slab of `MOST_DISPLACED` molecules moves.
 
     engine : of this system. A new one if not given
     """

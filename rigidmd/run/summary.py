@@ -317,8 +317,8 @@ def drift_of_thermostats(system: System, of_stage: Samples, k: int) -> tuple[flo
     """The drift of the conserved energy that heat between the thermostats of translation and
     rotation causes, and its standard error, kJ/mol/ps.
 
-    In the middle of a drift the shadow Hamiltonian has 1 - x/12 of the kinetic energy, with the
-    mean x of (w dt)² of these motions, so that equal heats at both thermostats are not equal in it.
+    In the middle of a drift the shadow Hamiltonian has 1 - x/12 of the kinetic energy, where x is
+    the mean (w dt)² of these motions, so that equal heats at both thermostats are not equal in it.
     See "Temperatures" in the theory chapter `errors`.
     """
     stage, freedom = system.scene.stages[k], system.freedom_in(k)

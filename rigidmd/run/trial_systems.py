@@ -98,7 +98,7 @@ def molecular_trial_system(
 
 
 def _change(before: np.ndarray, after: np.ndarray) -> float:
-    """Change of the sum over molecules of vectors (n, 3), relative to the sum of their lengths."""
+    """Change of a vector sum over molecules (n, 3), relative to the sum of the lengths."""
     return float(
         np.linalg.norm((after - before).sum(axis=0)) / (np.linalg.norm(before, axis=1).sum() or 1.0)
     )

@@ -120,8 +120,8 @@ class Trial:
 
     @property
     def conservation_error(self) -> float:
-        """The error of the energy, or a larger relative one of QᵀQ or of another conserved
-        quantity."""
+        """The energy error, or the relative error of QᵀQ or another conserved quantity if it is
+        larger."""
         others = [self.orthogonality_error, *self.conserved_errors.values()]
         return max(self.energy_rms, *(error for error in others if not np.isnan(error)), 0.0)
 

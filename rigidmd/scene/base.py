@@ -81,7 +81,7 @@ class Scene(Section, Displayed):
     """Name of the run. Default: the name of the file"""
 
     integrators: tuple[IntegratorRow, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Integrators of users, for stages, [run] of a body and `rigidmd accuracy`"""
+    """User-defined integrators, for stages, [run] of a single body and `rigidmd accuracy`"""
 
     SIZES: ClassVar[tuple[float, float]] = (1e-100, 1e100)
     """Smallest and largest absolute value of numbers other than 0, so that squares and products
@@ -221,7 +221,7 @@ class Scene(Section, Displayed):
         text: str = "",
         embedded_files: dict[str, bytes] | None = None,
     ) -> "MolecularScene | BodyScene":
-        """The scene in a nested dictionary like the one of a TOML file.
+        """The scene as a nested dictionary, as a TOML file gives it.
 
         Numbers and arrays of NumPy and paths are accepted as numbers, lists and texts. The
         dictionary is not changed.
@@ -359,7 +359,7 @@ def _working_directory() -> Path:
         return Path()
 
 
-def with_absolute_paths(data: Mapping[str, Any], folder: PathName = "") -> Json:
+def with_absolute_paths(data: Mapping[str, object], folder: PathName = "") -> Json:
     """A copy of the tables of a scene in which every path, relative to a folder, is absolute.
 
     folder : default: the working directory
@@ -523,7 +523,7 @@ def override(data: dict, key: str, value: object) -> tuple[str, list[str]]:
     return ".".join(map(str, indices)), []
 
 
-def parse_override(text: str) -> tuple[str, Any]:
+def parse_override(text: str) -> tuple[str, object]:
     """KEY=VALUE of the command line. The value is read as TOML, else as text. None if empty. Raises
     SceneError."""
     key, equals, value = text.partition("=")
@@ -544,7 +544,7 @@ def format_override(key: str, value: object) -> str:
     return f"{key}={_format_toml(value)}"
 
 
-def _format_toml(value: Any) -> str:
+def _format_toml(value: object) -> str:
     """A value in one line of TOML. Empty for None."""
     match value:
         case None:

@@ -4,7 +4,7 @@ throughout.
 The equations contain no physical constants, so any other consistent units work as well.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, Strict, field_validator
@@ -110,7 +110,7 @@ class Solid(Section):
     """Semi-axes of an ellipsoid"""
 
     @property
-    def dimensions(self) -> dict[str, Any]:
+    def dimensions(self) -> dict[str, float]:
         """The dimensions given."""
         return {
             key: value
@@ -136,11 +136,11 @@ class SolidPart(Solid):
     density_kg_m3: Positive | None = None
     """Density of this solid, instead of its mass"""
     position_m: Vector = (0.0, 0.0, 0.0)
-    """Position of its centre of mass, along the body axes, from any origin. From the pivot if the
-    body is pinned"""
+    """Position of its centre of mass, along the body axes, from any origin. If the body is pinned,
+    from the pivot"""
     axis: Vector | None = None
-    """Direction of its axis 3, along the body axes, of any length; of a cone from its tip to its
-    base. Default: axis 3 of the body"""
+    """Direction of its axis 3, along the body axes, with any length. For a cone it points from the
+    tip to the base. Default: axis 3 of the body"""
     euler_angles_deg: Vector | None = None
     """Its orientation in the body axes: phi, theta, psi (3-1-3), x_body = Rz(phi) Rx(theta) Rz(psi)
     x_solid"""
@@ -193,14 +193,14 @@ class PointMass(Section):
     mass_kg: Positive
     """Mass"""
     position_m: Vector
-    """Position along the body axes, from any origin. From the pivot if the body is pinned"""
+    """Position along the body axes, from any origin. If the body is pinned, from the pivot"""
 
 
 class BodyTable(Section):
     """The body: mass, inertia and pivot. Without inertia it is a point."""
 
     mass_kg: Positive | None = None
-    """Mass. With solids or points the sum of their masses"""
+    """Mass. With solids or points it is the sum of their masses"""
     solid: Solid | None = None
     """Inertia of a homogeneous solid"""
     solids: tuple[SolidPart, ...] | None = Field(default=None, min_length=1, max_length=MOST_TABLES)
@@ -210,11 +210,11 @@ class BodyTable(Section):
     inertia_kg_m2: NonNegativeVector | None = None
     """Principal moments, along the body's axes"""
     inertia_tensor_kg_m2: Matrix | None = None
-    """Inertia tensor along the body's axes. Off-diagonal entries with the sign of the tensor"""
+    """Inertia tensor along the body's axes. Off-diagonal entries have the sign of the tensor"""
     inertia_about: Literal["centre_of_mass", "pivot"] = "centre_of_mass"
     """Reference point of the given inertia"""
     pinned: Flag = False
-    """One point of the body is fixed"""
+    """Whether one point of the body is fixed"""
     centre_of_mass_m: Vector | None = None
     """Centre of mass of a pinned body, from the pivot, along the body axes"""
 
@@ -283,7 +283,7 @@ class BodyStart(Section):
     yaw_pitch_roll_deg: Vector | None = None
     """yaw, pitch, roll (3-2-1): Q = Rz(yaw) Ry(pitch) Rx(roll)"""
     quaternion_wxyz: Quaternion | None = None
-    """Quaternion of any length except zero"""
+    """Quaternion with any length except zero"""
     rotation: Matrix | None = None
     """Rows of Q, body to lab: x_lab = Q x_body"""
     attitude_matrix: Matrix | None = None
@@ -370,8 +370,8 @@ class Run(MovedByScheme):
     duration_s: Positive
     """Duration"""
     timestep_s: Positive
-    """Time step. With dop853 and radau, whose steps are adaptive, the interval between
-    observations. With auto the longest step"""
+    """Time step. With dop853 and radau, whose steps are adaptive, it is the interval between
+    observations. With auto it is the longest step"""
     integrator: Annotated[str, NameIn((*SCHEMES, AUTO, *SOLVERS), in_scene=True)] = (
         "velocity_verlet"
     )
@@ -381,7 +381,7 @@ class Run(MovedByScheme):
     """With auto: rms error of the energy over the run, as a fraction of the largest kinetic
     energy"""
     trajectory_error: TrajectoryError | None = None
-    """With auto: largest error of Q at the end. For a point the error of X in m"""
+    """With auto: largest error of Q at the end. For a point it is the error of X in m"""
     rotor: Rotor | None = None
     """Free rotation by the split or the exact flow. Default: the flow that the integrator needs"""
     formulation: Literal[tuple(FORMULATIONS)] | None = None  # type: ignore[valid-type]
@@ -394,7 +394,7 @@ class Run(MovedByScheme):
 
     @field_validator("integrator", mode="before")
     @classmethod
-    def _moves_bodies(cls, name: Any):
+    def _moves_bodies(cls, name: object):
         if name in WITH_THERMOSTAT:
             known = ", ".join((*SCHEMES, AUTO, *SOLVERS))
             raise ValueError(
@@ -441,20 +441,20 @@ class BodyOutput(Section):
     trajectory: Annotated[
         str | Literal[False], file_name(lambda form: form.encoder and not form.even)
     ] = TRAJECTORY
-    """Trajectory of points of the body for viewers. The extension sets the format, false for
-    none"""
+    """Trajectory of points of the body for viewers, or false for none. The extension sets the
+    format"""
     topology: Annotated[str | None, file_name(lambda form: form.topology)] = None
-    """Topology file that viewers need for the trajectory (.gro, or .pdb, in which bonds are the
-    edges of the body). Default: topology.pdb, or topology.gro for a body that starts more than 900
-    Å of the trajectory away"""
+    """Topology file that viewers need for the trajectory: .gro, or .pdb, whose bonds are the edges
+    of the body. Default: topology.pdb, or topology.gro for a body that starts more than 900 Å away
+    in the trajectory"""
     trajectory_A_per_m: Positive | None = None
-    """Ångström in the trajectory per metre. Default: the body has a radius of 10 Å. A second
+    """Scale of the trajectory, in Å per metre. Default: the body gets a radius of 10 Å. A second
     becomes a ps"""
     figures: Flag = True
     """Draw the motion"""
     checkpoint_minutes: Annotated[float, Strict(), Field(gt=0, le=1e9)] | Literal[False] = 5.0
-    """Wall time between checkpoints, from which `rigidmd resume` continues a run, false for none.
-    Runs with radau have none"""
+    """Wall time between checkpoints, or false for none. `rigidmd resume` continues a run from a
+    checkpoint. Runs with radau have no checkpoints"""
     axis: Vector | None = None
     """Body axis whose path is drawn. Default: towards the centre of mass, else the axis of
     symmetry, else axis 3"""
@@ -476,7 +476,7 @@ class BodyWatch(Section):
     """Limits beyond which a run of a single body stops, false switches a check off."""
 
     energy: LimitOfEnergy = 1.0
-    """Largest change of the energy less the work done, in units of the largest energy exchanged so
+    """Largest change of the energy minus the work done, in units of the largest energy exchanged so
     far: the kinetic energy at the start and changes of potential energy and work"""
     orthogonality: LimitOfRounding | None = None
     """Largest entry of abs(QᵀQ - 1). Default: 1e-9, or 0.1 with rk4, dop853 and radau, which do not

@@ -29,11 +29,11 @@ class Timed(Section):
     table."""
 
     times_s: Times | None = None
-    """Increasing times. Each quantity is then a list of as many values"""
+    """Increasing times. Each quantity is then a list with one value for each time"""
     from_s: NonNegative | None = None
-    """Begin of the window of time. Default: 0"""
+    """Start of the time window. Default: 0"""
     to_s: NonNegative | None = None
-    """End of the window of time. Default: none"""
+    """End of the time window. Default: none"""
 
     @field_validator("times_s")
     @classmethod
@@ -113,25 +113,26 @@ class Fluid(Section):
     quadratic_rotational_resistance_N_m_s2: NonNegativeVector = (0.0, 0.0, 0.0)
     """Torque per angular velocity squared"""
     density_kg_m3: Positive | None = None
-    """Density of the fluid, from which displaced and added mass of a sphere or ellipsoid follow"""
+    """Density of the fluid. The displaced mass and the added mass of a sphere or ellipsoid follow
+    from it"""
     displaced_mass_kg: NonNegative | None = None
-    """Mass of the fluid displaced: buoyancy is its weight"""
+    """Mass of the displaced fluid. Buoyancy is its weight"""
     centre_of_buoyancy_m: Vector | None = None
     """Point where buoyancy acts, along the body axes, from the centre of mass, or from the pivot of
     a pinned body. Default: the centre of mass"""
     added_mass_kg: NonNegativeVector | None = None
-    """Mass of fluid carried along each axis"""
+    """Mass of the fluid that the body carries along each axis"""
     added_inertia_kg_m2: NonNegativeVector | None = None
-    """Inertia of fluid carried about each axis"""
+    """Inertia of the fluid that the body carries about each axis"""
 
 
 class Frame(Timed):
     """A frame with rotating axes or an accelerated origin. The motion is relative to it."""
 
     angular_velocity_rad_s: Vector | tuple[Vector, ...] | None = None
-    """Angular velocity of the frame, along its own axes"""
+    """Angular velocity of the frame, along the axes of the frame"""
     angular_acceleration_rad_s2: Vector | None = None
-    """Angular acceleration of the frame, along its own axes, constant from the start"""
+    """Angular acceleration of the frame, along the axes of the frame, constant from the start"""
     origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
     """Acceleration of the frame's origin, along the frame's axes. The body has the opposite
     acceleration"""
@@ -161,7 +162,7 @@ class Wheel(Timed):
     about this axis."""
 
     axis: Vector
-    """Direction of the axis, along the body axes, of any length"""
+    """Direction of the axis, along the body axes, with any length"""
     momentum_kg_m2_s: Number = 0.0
     """Initial angular momentum along the axis, relative to the lab"""
     motor_torque_N_m: Number | tuple[Number, ...] | None = None

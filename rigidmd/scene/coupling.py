@@ -1,17 +1,18 @@
 """The table [coupling]: a species whose interactions are scaled, for free energies."""
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field, Strict, create_model
 
 from rigidmd.scene.validation import MOST_TABLES, Section, ShortName
 
 Fraction = Annotated[float, Strict(), Field(ge=0, le=1)]
-#: `lambda` is a word of Python, which no class body can have as a name.
-_FIELDS: dict[str, Any] = {
-    "lambda": (Fraction, Field(1.0, description="0: the species is absent, 1: it is complete"))
-}
-_WithLambda: Any = create_model("_WithLambda", __base__=Section, **_FIELDS)
+if TYPE_CHECKING:
+    _WithLambda = Section
+else:  # `lambda` is a word of Python, which no class body can have as a name
+    _about = "0: the species is absent, 1: it is complete"
+    _lambda = {"lambda": (Fraction, Field(1.0, description=_about))}
+    _WithLambda = create_model("_WithLambda", __base__=Section, **_lambda)
 
 
 class Coupling(_WithLambda):

@@ -77,7 +77,8 @@ def _describe_trajectories(values: Values) -> str:
     return f"trajectories of {steps:g} step{'s' if steps > 1 else ''}{drawn}"
 
 
-def _interval(stage: Any) -> float:
+def default_interval(stage: Any) -> float:
+    """Time between two moves of the box, ps."""
     return (stage.barostat_time_ps or BAROSTAT_TIME) / MOVES_PER_TIME
 
 
@@ -130,7 +131,7 @@ BAROSTATS = {
     "cell_rescaling": Coupling(
         "stochastic cell rescaling, made exact by a Metropolis test",
         "Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107",
-        {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": _interval},
+        {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": default_interval},
         ("npt",),
         relaxes_in_moves=True,
         reads_momenta=True,
@@ -138,7 +139,7 @@ BAROSTATS = {
     "monte_carlo": Coupling(
         "random changes of the volume",
         "Åqvist et al. 2004, Chem. Phys. Lett. 384, 288",
-        {"barostat_interval_ps": _interval},
+        {"barostat_interval_ps": default_interval},
         ("npt",),
         shapes=("isotropic",),
     ),
@@ -168,28 +169,28 @@ class ThermostatKeys(Section):
     """Time constant of velocity_rescaling (default: 0.05 ps), period of nose_hoover (0.5 ps), or
     mean time between two collisions of a molecule with andersen (1 ps)"""
     friction_translation_per_ps: Positive | None = None
-    """Friction of langevin on translation. Default: 1"""
+    """Friction that langevin applies to translation. Default: 1"""
     friction_rotation_per_ps: Positive | None = None
-    """Friction of langevin on rotation. Default: friction_translation_per_ps"""
+    """Friction that langevin applies to rotation. Default: friction_translation_per_ps"""
     nose_hoover_links: Annotated[int, Strict(), Field(ge=1, le=100)] = 3
     """Links of each Nose-Hoover chain"""
     trajectory_steps: Annotated[int, Strict(), Field(ge=1, le=100_000)] | None = None
-    """Steps of a trajectory of hybrid_monte_carlo, after which it is accepted or rejected. Default:
-    those of 0.1 ps"""
+    """Number of steps of a hybrid_monte_carlo trajectory, which is then accepted or rejected.
+    Default: the number of steps in 0.1 ps"""
     momentum_refreshment: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Fraction of the variance of each momentum that hybrid_monte_carlo draws again before a
-    trajectory, 1: all of it"""
+    trajectory. 1: all of it"""
 
 
 class BarostatKeys(Section):
     """The keys of barostats in a stage."""
 
     pressure_bar: Number | tuple[Number, Number] | tuple[Number, Number, Number] | Six | None = None
-    """Pressure of the barostat, or of the minimisation of the enthalpy. Two for a linear change
-    over the stage, [1, 1000]. Three for one along each axis. Six for the tensor xx, yy, zz, xy, xz,
-    yz"""
+    """Pressure of the barostat, or of the minimisation of the enthalpy. Use two values for a linear
+    change over the stage, [1, 1000], three values for the pressures along the axes, or six values
+    for the tensor xx, yy, zz, xy, xz, yz"""
     pressure_coupling: Shapes = "isotropic"
-    """How the box changes: isotropic keeps its shape. semi_isotropic: x and y together, z
+    """How the box changes. isotropic: it keeps its shape. semi_isotropic: x and y together, z
     separately. anisotropic: three edges. flexible: edges and angles. normal: z alone, at constant
     area. lateral: x and y together, z is kept"""
     barostat: Annotated[str, NameIn(BAROSTATS)] | None = Field(
@@ -200,8 +201,9 @@ class BarostatKeys(Section):
         + ". Default: the first one of the ensemble",
     )
     barostat_time_ps: Positive | None = None
-    """Time constant of cell_rescaling, period of the piston of nph. Default: 1 ps"""
+    """Time constant of cell_rescaling, or period of the piston of nph. Default: 1 ps"""
     barostat_interval_ps: Positive | None = None
-    """Time between two moves of the box in npt. Default: 0.05 of barostat_time_ps"""
+    """Time between two box moves in npt. Default: 0.05 of barostat_time_ps"""
     compressibility_per_bar: Positive | None = None
-    """Compressibility. It sets the speed of the box, not the ensemble. Default: 4.5e-5, of water"""
+    """Compressibility. It sets how fast the box changes, but not the ensemble. Default: 4.5e-5, the
+    value for water"""

@@ -36,12 +36,13 @@ class Walls(Section):
     """Two flat walls that confine molecules."""
 
     axis: Literal["x", "y", "z"]
-    """Axis of the lab to which the walls are perpendicular"""
+    """Lab axis to which the walls are perpendicular"""
     kind: Literal["lj93", "harmonic"]
     """lj93: (2/15) (sigma/d)^9 - (sigma/d)^3, times epsilon, at a distance d. harmonic: stiffness/2
     d² at a depth d behind the wall, 0 in front of it"""
     positions_A: tuple[Edge, Edge]
-    """Positions along the axis, the lower one first. Without a box -inf or inf for no wall"""
+    """Positions along the axis, the lower position first. Without a box, use -inf or inf for a
+    side without a wall"""
     acts_on: Literal["sites", "centres"] = "sites"
     """sites: sites with Lennard-Jones parameters. centres: centres of mass"""
     sigma_A: Positive | None = None
@@ -84,20 +85,21 @@ class Restraint(Section):
     with `between`, a spring on the distance of two molecules or groups."""
 
     species: str | None = None
-    """Species that is restrained. Required if there are several"""
+    """The restrained species. Required if there are several species"""
     molecules: Numbers | None = None
     """Numbers of the restrained molecules, [1, 2, 5] or "1-10, 15", as for `frozen`. Default:
     all"""
     between: tuple[Group, Group] | None = None
-    """Two molecules, or groups of them, whose distance is restrained: [1, 2], [[1, 2], "3-5"]. The
-    numbers count all molecules of the scene from 1 on. The distance is between the centres of mass,
-    to the nearest periodic image"""
+    """Two molecules, or two groups of molecules, whose distance is restrained: [1, 2], [[1, 2],
+    "3-5"]. The numbers count all molecules of the scene from 1 onwards. The distance is between the
+    centres of mass, to the nearest periodic image"""
     distance_A: Positive | None = None
     """With between: the distance at which the spring has no energy"""
     stiffness_kJ_mol_A2: NonNegative | tuple[NonNegative, NonNegative, NonNegative]
-    """Stiffness. Three numbers for x, y, z. With between one number"""
+    """Stiffness. Use three numbers for x, y, z. With between, use one number"""
     position_A: Vector | None = None
-    """Position to which all are restrained. Default: the position of each at the start"""
+    """Position to which all these molecules are restrained. Default: the initial position of each
+    molecule"""
 
     @field_validator("stiffness_kJ_mol_A2")
     @classmethod
@@ -132,7 +134,8 @@ class Restraint(Section):
 
     @property
     def spans(self) -> list[tuple[int, int]]:
-        """Ranges (first, last) of the numbers of molecules. Empty if all are restrained."""
+        """Ranges (first, last) of molecule numbers. The list is empty if all molecules are
+        restrained."""
         return [] if self.molecules is None else spans(self.molecules)
 
     @property
@@ -146,7 +149,7 @@ class Fields(Section):
     """External fields that act on molecules."""
 
     electric_V_per_nm: Vector | None = None
-    """Uniform electric field, which acts on all charges, whatever `electrostatics` is"""
+    """Uniform electric field. It acts on all charges, whatever the value of `electrostatics`"""
     electric_frequency_per_ps: Positive | None = None
     """Frequency f of a field that oscillates as cos(2 pi f t + phase), with t from the start of the
     run. Default: a constant field"""

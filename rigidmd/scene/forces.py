@@ -67,7 +67,7 @@ POTENTIALS = {"lennard_jones": ("Lennard-Jones", "lennard_jones is false")}
 
 
 class UnlikePair(Section):
-    """Lennard-Jones parameters of two kinds of sites, in place of the mixing rule."""
+    """Lennard-Jones parameters for two kinds of sites, which replace the mixing rule."""
 
     sites: tuple[str, str]
     """The two kinds: a site name or else an element. `SPECIES.NAME` for sites of one species"""
@@ -95,36 +95,37 @@ class CustomForce(Section):
     file."""
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)]
-    """Name in the log. With `module` also the name of the object in it"""
+    """Name in the log. With `module` it is also the name of the object in this file"""
     module: Line | None = None
     """Python file in the folder of the scene. Its code runs only with --trust FILE"""
     energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
     """Without a module: energy of a pair of sites (kJ/mol) as a function of their distance r (Å)
-    and named parameters, such as A*exp(-B*r) - C/r**6. With exp, log, sqrt, sin, cos"""
+    and named parameters, such as A*exp(-B*r) - C/r**6. The functions exp, log, sqrt, sin and cos
+    can be used"""
     table: Line | None = None
     """Instead of an energy: a file in the folder of the scene with the columns r_A, energy_kJ_mol
-    and perhaps force_kJ_mol_A (-dE/dr), in lines of ascending r up to the cutoff. All keys of an
-    energy are also those of a table. Its one parameter is scale, a factor of the energy. Default:
-    1"""
+    and optionally force_kJ_mol_A (-dE/dr), in lines of ascending r up to the cutoff. All keys of an
+    energy can also be used with a table. Its only parameter is scale, a factor of the energy.
+    Default: 1"""
     parameters: dict[str, Any] = Field(default={}, max_length=MOST_TABLES)
-    """With a module: arguments with which its object is called. With an energy: numbers, the same
-    for all sites, or a table of numbers for each kind of sites, by site, SPECIES.SITE or element.
-    Default: `parameters` in the models' files"""
+    """With a module: arguments with which its object is called. With an energy: numbers, which
+    apply to all sites, or a table of numbers for each kind of site, by site, SPECIES.SITE or
+    element. Default: `parameters` in the models' files"""
     sites: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
-    """With an energy: the sites that it acts on. Default: all with parameters"""
+    """With an energy: the sites that it acts on. Default: all sites with parameters"""
     pairs: tuple[PairParameters, ...] = Field(default=(), max_length=MOST_TABLES)
-    """With an energy: parameters of particular pairs, in place of mixed parameters"""
+    """With an energy: parameters of particular pairs, which replace mixed parameters"""
     mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(
         default={}, max_length=MOST_TABLES
     )
     """With an energy: the mean of each parameter for unlike sites. Default: arithmetic for names
-    that begin with sig, else geometric"""
+    that start with sig, else geometric"""
     truncation: Truncation | None = None
     """With an energy: its cutoff scheme. Default: forces.truncation"""
     cutoff_A: Cutoff | None = None
     """With an energy: its cutoff. Default: forces.cutoff_A"""
     switch_start_A: Positive | None = None
-    """With an energy: where a switch begins. Default: forces.switch_start_A"""
+    """With an energy: distance at which a switch starts. Default: forces.switch_start_A"""
 
     @property
     def label(self) -> str:
@@ -163,47 +164,48 @@ class BodyForce(Section):
     orientations."""
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)] | None = None
-    """Name in the log. Default: the name of the potential. With `module` also the name of the
-    object in it"""
+    """Name in the log. Default: the name of the potential. With `module` it is also the name of the
+    object in this file"""
     potential: Literal["gay_berne", "dipole", "quadrupole", "patch"] | None = None
-    """gay_berne: ellipsoids, dipole and quadrupole: at a point, patch: spheres with an attractive
+    """gay_berne: ellipsoids. dipole and quadrupole: at a point. patch: spheres with an attractive
     patch"""
     energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
-    """Instead of a potential: the energy (kJ/mol) as a function of the distance r (Å), of the
-    cosines a_r and b_r of the angles of the axes of the first and the second body with the vector
-    from the first to the second, of the cosine a_b of the angle between the axes, and of named
-    parameters"""
+    """Instead of a potential: the energy (kJ/mol) as a function of the distance r (Å), the cosines
+    a_r and b_r, the cosine a_b and named parameters. a_r and b_r belong to the angles between the
+    axes of the first and the second body and the vector from the first to the second body. a_b
+    belongs to the angle between the two axes"""
     table: Line | None = None
-    """Instead of a potential: .npz file in the folder of the scene with the energies of pairs of
-    linear bodies"""
+    """Instead of a potential: .npz file in the folder of the scene with the pair energies of linear
+    bodies"""
     species: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
-    """With a table: species on which it acts; default: all"""
+    """With a table: the species that it acts on. Default: all"""
     module: Line | None = None
     """Instead of a potential: Python file in the folder of the scene with a
     `rigidmd.body_pair_potential`. Its code runs only with --trust FILE"""
     parameters: dict[str, dict[str, Number]] = Field(default={}, max_length=MOST_TABLES)
-    """Species -> parameters by name. It acts on these species"""
+    """Species -> parameters by name. The potential acts on these species"""
     pairs: tuple[SpeciesPair, ...] = Field(default=(), max_length=MOST_TABLES)
     """Parameters of particular pairs of species"""
     mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(
         default={}, max_length=MOST_TABLES
     )
     """With an energy: the mean of each parameter for unlike species. Default: arithmetic for names
-    that begin with sig, else geometric"""
+    that start with sig, else geometric"""
     options: dict[str, Number] = Field(default={}, max_length=MOST_TABLES)
-    """gay_berne: upsilon (default: 1), mu (2), gamma (1). dipole: reaction_field_A, the radius of a
-    conductor's reaction field (default: none)"""
+    """gay_berne: upsilon (default: 1), mu (2), gamma (1). dipole: reaction_field_A, the radius of
+    the reaction field of a conductor (default: none)"""
     axis: Literal["x", "y", "z"] = "z"
     """Axis of the bodies, in the coordinates of the models' files"""
     references: dict[str, tuple[Number, Number, Number]] = Field(default={}, max_length=MOST_TABLES)
-    """Species -> the point of the body between which distances count, in the coordinates of the
-    model's file, Å. Default: the centre of mass"""
+    """Species -> the reference point of the body for distances, in the coordinates of the model's
+    file, Å. Default: the centre of mass"""
     truncation: Literal["switch", "plain"] = "switch"
-    """switch: from switch_start_A the energy is switched to 0 at the cutoff. plain: it jumps"""
+    """switch: from switch_start_A onwards the energy is switched to 0 at the cutoff. plain: the
+    energy jumps at the cutoff"""
     cutoff_A: Cutoff | None = None
-    """Cutoff between the points. Default: forces.cutoff_A"""
+    """Cutoff of the distance between the reference points. Default: forces.cutoff_A"""
     switch_start_A: Positive | None = None
-    """Where the switch begins. Default: 0.9 of the cutoff"""
+    """Distance at which the switch starts. Default: 0.9 of the cutoff"""
 
     def _errors(self):
         sources = [self.potential, self.energy, self.table, self.module]
@@ -235,90 +237,91 @@ class Forces(Section):
     cutoff_A: Cutoff | None = None
     """Cutoff between sites. Default: 9 Å in a periodic box, none without a box"""
     truncation: Truncation = "shift"
-    """Cutoff scheme of Lennard-Jones forces. smooth_switch suits integrators of order 4 and more,
-    which forces that jump at the cutoff bring down. Charges follow reaction_field_truncation and
-    ewald_truncation"""
+    """Cutoff scheme of Lennard-Jones forces. Use smooth_switch with integrators of order 4 and
+    more, which lose their order if forces jump at the cutoff. Charges follow
+    reaction_field_truncation and ewald_truncation"""
     switch_start_A: Positive | None = None
-    """Where force_switch and switch begin. Default: 1 Å before the cutoff, or at 0.9 of it if that
-    is larger. Where smooth_switch begins. Default: at 0.6 of the cutoff"""
+    """Distance at which a switch starts. Default for force_switch and switch: 1 Å before the
+    cutoff, or 0.9 of it if that is larger. Default for smooth_switch: 0.6 of the cutoff"""
     lennard_jones: Flag = True
-    """Whether Lennard-Jones sites interact, false where `custom` replaces Lennard-Jones forces"""
+    """Whether Lennard-Jones sites interact. Use false if `custom` replaces Lennard-Jones forces"""
     mixing: Mixing = "lorentz-berthelot"
     """Mixing rule of Lennard-Jones parameters between unlike sites"""
     pairs: tuple[UnlikePair, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Lennard-Jones parameters of particular pairs, in place of the mixing rule"""
+    """Lennard-Jones parameters of particular pairs, which replace the mixing rule"""
     custom: tuple[CustomForce, ...] = Field(default=(), max_length=MOST_TABLES)
     """Custom forces"""
     bodies: tuple[BodyForce, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Potentials of two bodies"""
+    """Pair potentials between bodies"""
     tail_correction: Flag | None = None
-    """Add the energy and pressure of Lennard-Jones beyond the cutoff. `pressure` includes it,
-    `virial` does not. Default: true in a periodic box that the molecules fill evenly, false with
-    walls, frozen molecules, custom forces or empty space"""
+    """Add the Lennard-Jones energy and pressure beyond the cutoff. `pressure` includes the
+    correction, `virial` does not. Default: true in a periodic box that the molecules fill evenly,
+    false with walls, frozen molecules, custom forces or empty space"""
     dispersion: Literal["cutoff", "ewald", "pme"] = "cutoff"
     """Attraction -C6/r⁶ of Lennard-Jones sites: within the cutoff, or also of all periodic images
     beyond it, by a sum over k-vectors (ewald) or on a grid (pme), with the geometric mixing rule
     for C6 there"""
     dispersion_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
-    """With a sum of dispersion: rms error of its force on a site, relative to the largest 24
-    epsilon/sigma of a site, the attraction at sigma. Sets the keys below. Default: 5e-5"""
+    """With dispersion = ewald or pme: rms force error on a site, relative to the largest 24
+    epsilon/sigma of a site, the attraction at sigma. It determines the keys below. Default: 5e-5"""
     dispersion_beta_per_A: Positive | None = None
-    """With a sum of dispersion: splitting parameter"""
+    """With dispersion = ewald or pme: splitting parameter"""
     dispersion_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
     """With dispersion = pme: order of the B-splines"""
     dispersion_grid: tuple[GridSize, GridSize, GridSize] | None = None
     """With dispersion = pme: grid points, as for pme_grid"""
     electrostatics: Literal[tuple(ELECTROSTATICS)] | None = None  # type: ignore[valid-type]
-    """Coulomb forces: ewald and pme act on all periodic images, reaction_field and
-    damped_shifted_force within the cutoff, coulomb on all pairs without a periodic box, none
-    ignores charges. Default: pme in a periodic box, coulomb in an open one"""
+    """Coulomb forces. ewald and pme act on all periodic images, reaction_field and
+    damped_shifted_force act within the cutoff, and coulomb acts on all pairs without a periodic
+    box. none ignores charges. Default: pme in a periodic box, coulomb in an open box"""
     reaction_field_permittivity: Permittivity = inf
-    """Permittivity of the continuum beyond the cutoff; inf for a conductor"""
+    """Permittivity of the continuum beyond the cutoff. inf is a conductor"""
     reaction_field_truncation: Truncation | None = None
-    """Cutoff scheme of charges with a reaction field. A conductor's field leaves no force at the
-    cutoff, so that a shifted energy suffices. switch and smooth_switch multiply the shifted energy.
-    They make the random walk of the energy smaller and steps slower. Default: plain or
-    smooth_switch if `truncation` is, else shift"""
+    """Cutoff scheme of charges with a reaction field. With a conductor the force at the cutoff is
+    0, so that a shifted energy suffices. switch and smooth_switch multiply the shifted energy. They
+    make the random walk of the energy smaller and steps slower. Default: plain or smooth_switch if
+    `truncation` is, else shift"""
     damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
     """Damping of damped_shifted_force, 0 for none"""
     ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
-    """With ewald and pme: rms error of the force on a site, relative to the force between two
-    charges e at 1 Å. Sets the keys below. Default: 5e-5, somewhat better than the defaults of
-    GROMACS and OpenMM"""
+    """With ewald and pme: rms force error on a site, relative to the force between two charges e at
+    1 Å. It determines the keys below. Default: 5e-5, somewhat better than the defaults of GROMACS
+    and OpenMM"""
     ewald_cutoff_A: Cutoff | None = None
-    """With ewald and pme: cutoff of the real-space part. Default: with pme the one that makes a
-    step fastest, by a model of its cost, else cutoff_A"""
+    """With ewald and pme: cutoff of the real-space part. Default: with pme the cutoff for which a
+    cost model predicts the fastest step, else cutoff_A"""
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
     ewald_k_max: KIndex | tuple[KIndex, KIndex, KIndex] | None = None
-    """With ewald: largest |n| of k = 2 pi n/L, one for all axes or one each, for the cell of box or
-    file"""
+    """With ewald: largest |n| of k = 2 pi n/L, one number for all axes or one for each axis, for
+    the cell of the box or file"""
     ewald_k2_max: Count | None = None
     """With ewald: also largest n_x² + n_y² + n_z²"""
     ewald_k_radius_per_A: Positive | None = None
     """With ewald: largest length of k"""
     ewald_truncation: Literal["plain", "shift"] | None = None
     """With ewald and pme: whether the real-space energy erfc(alpha r)/r is shifted to 0 at the
-    cutoff, forces are the same. Default: plain if `truncation` is plain, else shift. With shift,
-    coulomb_self also includes
-    -erfc(alpha R)/(2 R) times the square of each molecule's charge with the cutoff R, which is 0
-    for neutral ones"""
+    cutoff. Forces do not change. Default: plain if `truncation` is plain, else shift. With shift,
+    coulomb_self also includes -erfc(alpha R)/(2 R) times the square of each molecule's charge, with
+    the cutoff R. This is 0 for neutral molecules"""
     ewald_surface_permittivity: Permittivity = inf
-    """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
+    """Permittivity of the medium around all periodic images. inf, a conductor, adds no surface
+    term"""
     ewald_slab: Literal["x", "y", "z"] | None = None
-    """With ewald and pme: the normal of a slab between empty parts of the box. Images along it then
-    do not act"""
+    """With ewald and pme: the normal of a slab between empty parts of the box. Images along this
+    axis then do not act"""
     pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
-    """With pme: order of the B-splines, 4 is cubic"""
+    """With pme: order of the B-splines. 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
-    """With pme: grid points along each edge of the cell of box or file. Three equal numbers if its
-    tilt is more than half an edge, because an equivalent cell then replaces it"""
+    """With pme: number of grid points along each edge of the cell of the box or file. Use three
+    equal numbers if its tilt is more than half an edge, because an equivalent cell then replaces
+    it"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.9
-    """Extra radius of the neighbour list. Affects only the speed"""
+    """Extra radius of the neighbour list. It affects only the speed"""
 
     @property
     def added(self) -> dict[str, CustomForce | BodyForce]:
-        """The tables of custom forces and of potentials of two bodies, by their keys."""
+        """The tables of custom forces and pair potentials of bodies, by their keys."""
         tables = {"custom": self.custom, "bodies": self.bodies}
         return {
             f"forces.{key}.{k}": entry

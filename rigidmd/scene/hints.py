@@ -21,6 +21,7 @@ TABLES = {
 }
 MOST_LISTED = 8  # known keys in a message
 BOHR = 0.529177210903  # Å
+CELSIUS, ICE_POINT = ("C", "degC", "celsius"), 273.15
 #: By the unit of a key, the sizes of other units in it.
 OTHER_UNITS = {
     "ps": {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "µs": 1e6, "s": 1e12},
@@ -51,7 +52,7 @@ UNIT = re.compile(
 )
 
 
-def hint_on_key(name: str, keys: list, value: Any, model: type[BaseModel]) -> str:
+def hint_on_key(name: str, keys: list, value: object, model: type[BaseModel]) -> str:
     """What a scene has instead of an unknown key.
 
     Parameters
@@ -86,9 +87,11 @@ def _other_unit(name: str, value: Any, known: list[str]) -> str:
         if not (match := KEY_WITH_UNIT.fullmatch(key)):
             continue
         stem = key.removesuffix(match[1])
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if match[1] == "K" and name in [stem + unit for unit in CELSIUS]:
+            return f"; write {key} = {value + ICE_POINT:.12g}" if is_number else f"; write {key}"
         size = OTHER_UNITS[match[1]].get(name.removeprefix(stem)) if name.startswith(stem) else None
         if size is not None:
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
             return f"; write {key} = {value * size:.12g}" if is_number else f"; write {key}"
     return ""
 
@@ -122,10 +125,11 @@ def _listed(name: str, known: list[str]) -> str:
     """The known keys, or the most similar of them."""
     if not known:
         return ""
-    if len(known) <= MOST_LISTED:
+    if len(known) <= MOST_LISTED + 1:
         return f"; there are {', '.join(known)}"
     nearest = sorted(known, key=lambda key: -_similarity(name, key))[:MOST_LISTED]
-    return f"; there are {', '.join(nearest)} and {len(known) - MOST_LISTED} others"
+    listed = ", ".join(key for key in known if key in nearest)
+    return f"; there are {listed} and {len(known) - MOST_LISTED} others"
 
 
 def _similarity(name: str, key: str) -> float:
@@ -165,7 +169,7 @@ def known_keys(model: type[BaseModel], keys: list) -> list[str]:
     return list(model.model_fields)
 
 
-def models_in(annotation: Any) -> list[type[BaseModel]]:
+def models_in(annotation: object) -> list[type[BaseModel]]:
     """The models in the type of a key."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]

@@ -35,11 +35,11 @@ class IntegratorRow(Section):
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$", max_length=60)]
     """Name for stages, [run] of a body and --integrators"""
     steps: Coefficients | None = None
-    """Lengths of successive velocity Verlet steps, as fractions of the time step. Such a row works
-    with any rotor"""
+    """Lengths of successive velocity Verlet steps, as fractions of the time step. Such a scheme
+    works with any rotor"""
     kicks: Coefficients | None = None
-    """Instead of steps: fractions of the kicks, of which the first and the last may be 0. Needs the
-    exact rotor"""
+    """Instead of steps: fractions of the kicks, of which the first and the last may be 0. The
+    scheme needs the exact rotor"""
     drifts: Coefficients | None = None
     """Fractions of the drifts between the kicks, one fewer than kicks"""
     gradients: Coefficients | None = None
@@ -48,7 +48,7 @@ class IntegratorRow(Section):
     order: Annotated[int, Strict(), Field(ge=2, le=20)]
     """Order of convergence. It is compared with the order for an anharmonic oscillator"""
     source: Line = ""
-    """Where the coefficients are from"""
+    """Source of the coefficients"""
 
     def _errors(self):
         if exact_names(self.name, Literal[RESERVED]) in RESERVED:

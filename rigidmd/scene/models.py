@@ -175,6 +175,7 @@ class Molecule:
     note: str = ""
     mixing: Mixing | None = None
     parameters: tuple[dict[str, float], ...] = ()  # of each site, for custom pair potentials
+    cell: np.ndarray | None = None  # (3, 3) Å, of a framework, in the coordinates of its file
 
     def __repr__(self) -> str:
         return f"<Molecule {self.name}: {self.description}>"
@@ -238,7 +239,7 @@ class Molecule:
         charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
         count = len(self.masses)
         dipole = ""
-        if self.charges.any() and self.radius > 0:
+        if self.charges.any() and self.radius > 0 and self.cell is None:
             dipole = f", dipole {self.dipole_debye:.3f} D" if self.has_dipole else ", no dipole"
         return (
             f"{shape}, {count} site{'' if count == 1 else 's'}, {self.mass:.4f} u, {charge}{dipole}"

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
+from typing import Annotated, ClassVar, Literal, NamedTuple, TypedDict
 
 from pydantic import Field, PrivateAttr, Strict
 
@@ -13,6 +13,7 @@ from rigidmd.errors import SceneError, option
 from rigidmd.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
 from rigidmd.scene.coupling import Coupling
+from rigidmd.scene.couplings import default_interval
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
@@ -74,10 +75,10 @@ class RunSettings(Section):
     """Settings for all stages."""
 
     remove_momentum_interval_ps: Interval | Literal[False] | None = None
-    """Time between removals of the total momentum, false for never. Default: 1 ps with pme, whose
-    forces do not add up to zero exactly, and with a thermostat that scales all velocities, which
-    can make rounding errors of the momentum grow, else never. The energy removed counts as heat, as
-    with a thermostat"""
+    """Time between removals of the total momentum, or false for never. Default: 1 ps with pme,
+    because its forces do not add up to exactly zero, and with a thermostat that scales all
+    velocities, because rounding errors of the momentum can then grow. Otherwise never. The removed
+    energy counts as heat, as with a thermostat"""
 
 
 class Output(Section):
@@ -88,18 +89,19 @@ class Output(Section):
     pressure_tensor: Flag = False
     """Write the six components of the pressure into log.csv"""
     pressure_tensor_interval_ps: Interval | Literal[False] = False
-    """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water, false for
-    none. Each line needs an evaluation of forces with the virial"""
+    """Time between lines of pressure_tensor.csv, which a viscosity needs. For example, 0.01 ps for
+    water, or false for none. Each line needs a force evaluation with the virial"""
     trajectory: Annotated[
         str | Literal[False], file_name(lambda form: form.encoder or form.writer)
     ] = TRAJECTORY
-    """Trajectory file. The extension sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb).
-    .gsd stores rotations and angular momenta, .traj is ASE's and has double precision, false for
-    none"""
+    """Trajectory file, or false for none. The extension sets the format (.xtc .trr .gsd .traj .dcd
+    .nc .xyz .pdb). .gsd stores rotations and angular momenta. .traj is ASE's format and has double
+    precision"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
     topology: Annotated[str, file_name(lambda form: form.topology)] = TOPOLOGY
-    """File with names and first positions that viewers need for the trajectory (.gro or .pdb)"""
+    """Topology file (.gro or .pdb) with the names and first positions that viewers need for the
+    trajectory"""
     positions: Literal["wrapped", "unwrapped"] = "unwrapped"
     """unwrapped: continuous paths, for displacements. wrapped: centres of mass inside the box.
     Molecules are whole in both cases"""
@@ -108,7 +110,8 @@ class Output(Section):
     figures: Flag = True
     """Draw energy.png"""
     checkpoint_minutes: Minutes = 5.0
-    """Wall time between checkpoints, from which `rigidmd resume` continues a run, false for none"""
+    """Wall time between checkpoints, or false for none. `rigidmd resume` continues a run from a
+    checkpoint"""
 
     def _errors(self):
         if self.velocities and not self.can_store_velocities:
@@ -130,17 +133,17 @@ class Watch(Section):
     off."""
 
     move: Limit = 0.25
-    """Largest displacement of a molecule between two evaluations of its forces, in units of the
-    smallest site diameter"""
+    """Largest displacement of a molecule between two force evaluations, in units of the smallest
+    site diameter"""
     turn_rad: Limit = 2.0
-    """Largest rotation of a molecule between two evaluations of its forces"""
+    """Largest rotation of a molecule between two force evaluations"""
     kick: Limit = 20.0
     """Largest change of a momentum by one kick, in units of the thermal momentum"""
     energy: LimitOfEnergy = 0.5
-    """Largest change of the conserved energy, in units of the kinetic energy: in an nve stage, and
-    within each thermostat_time_ps of an nvt stage"""
+    """Largest change of the conserved energy, in units of the kinetic energy. It is checked over an
+    nve stage, and over each thermostat_time_ps of an nvt stage"""
     volume: LimitOfVolume = 8.0
-    """Largest volume of the box under a barostat, in units of the volume at the start"""
+    """Largest volume of the box under a barostat, in units of the initial volume"""
     orthogonality: LimitOfRounding = 1e-9
     """Largest entry of abs(QᵀQ - 1)"""
     stable_step: Flag = True
@@ -178,8 +181,8 @@ class MolecularScene(Scene):
     """Seed of all random numbers"""
     precision: Literal["auto", "double", "mixed"] = "auto"
     """Arithmetic of the forces between sites. mixed: pairs in single precision, sums and motion in
-    double. auto: mixed where the time-step error hides the error of single precision, else
-    double. Minimisations with tight limits, or with a pressure, are in double"""
+    double precision. auto: mixed if the time-step error hides the error of single precision, else
+    double. Minimisations with tight limits, or with a pressure, use double precision"""
     threads: Count | None = None
     """Number of threads. Default: all cores. Results do not depend on it"""
     engine: EngineChoice = EngineChoice.model_construct()
@@ -206,7 +209,7 @@ class MolecularScene(Scene):
         return self._user_code
 
     def with_user_code(
-        self, forces: Sequence[Any] = (), thermostat: object = None
+        self, forces: Sequence[object] = (), thermostat: object = None
     ) -> "MolecularScene":
         """The same scene with forces and a thermostat from Python, see `Simulation`.
 
@@ -318,13 +321,29 @@ class MolecularScene(Scene):
         return topology
 
     def _errors(self):
-        if self.structure is None:
-            missing = [k for k, species in enumerate(self.molecules) if species.count is None]
+        frameworks = [species for species in self.molecules if species.repeat is not None]
+        if frameworks and (
+            len(frameworks) > 1
+            or self.structure is not None
+            or not self.box.periodic
+            or self.box.lengths_A is not None
+            or self.box.density_g_cm3 is not None
+        ):
+            yield (
+                "molecules.repeat: the cell of one framework is the box: omit [structure], other"
+                " frameworks, box.lengths_A, box.density_g_cm3 and periodic = false"
+            )
+        elif self.structure is None:
+            missing = [
+                k
+                for k, species in enumerate(self.molecules)
+                if species.count is None and species.repeat is None
+            ]
             yield from [
                 f"molecules.{k}.count is missing (required without a structure file)"
                 for k in missing
             ]
-            if self.box.lengths_A is None and self.box.density_g_cm3 is None:
+            if self.box.lengths_A is None and self.box.density_g_cm3 is None and not frameworks:
                 yield "box needs lengths_A or density_g_cm3, or there must be a structure file"
         elif self.box.density_g_cm3 is not None:
             yield "box.density_g_cm3 and a structure file contradict each other: omit one"
@@ -457,10 +476,9 @@ class MolecularScene(Scene):
             stage = self.stages[k]
             if stage.is_minimisation or stage.is_auto:
                 continue
-            of_stage = [
-                (f"stages.{k}.{key}", getattr(stage, key))
-                for key in ("duration_ps", "barostat_interval_ps")
-            ]
+            of_stage = [(f"stages.{k}.duration_ps", stage.duration_ps)]
+            if stage.barostat_interval_ps != default_interval(stage):
+                of_stage.append((f"stages.{k}.barostat_interval_ps", stage.barostat_interval_ps))
             if stage.keeps_momentum:  # elsewhere nothing is removed
                 of_stage.insert(
                     0, ("run.remove_momentum_interval_ps", self.run.remove_momentum_interval_ps)

@@ -59,8 +59,8 @@ class Molecules(Section):
     model: str | None = None
     """A shipped model. `rigidmd models` lists them"""
     file: Line | None = None
-    """A .toml file with a molecule, like those models, or a geometry in a format of ASE, with
-    `sites` for its atoms"""
+    """A .toml file with a molecule, like the shipped models, or a geometry in a format that ASE
+    reads, with `sites` for its atoms"""
     name: ShortName | None = None
     """Name of the species. Default: the name of the model or file"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
@@ -75,10 +75,14 @@ class Molecules(Section):
     """Residue names of this species in structure files"""
     count: Count | None = None
     """Number of molecules. Required without a structure file"""
+    repeat: tuple[Count, Count, Count] | None = None
+    """Repetitions of the cell of a crystal `file` along a, b, c. Its atoms are one frozen body, a
+    framework, and its repeated cell is the box"""
     frozen: Flag | Numbers = False
-    """Molecules that do not move. They act on all others but not on each other. True for all, or
-    numbers of some, [1, 2, 5] or "1-10, 15": residue numbers of the structure file, or, without a
-    file or if its residues are not the molecules, 1, 2, ... within this species"""
+    """Molecules that do not move. They act on all other molecules but not on each other. Use true
+    for all molecules of the species, or the numbers of some of them, [1, 2, 5] or "1-10, 15". These
+    are residue numbers of the structure file. Without a file, or if its residues are not the
+    molecules, they are 1, 2, ... within this species"""
 
     @field_validator("model")
     @classmethod
@@ -108,6 +112,10 @@ class Molecules(Section):
                 file and not (is_complete or sites or table)
             ),
             "a custom molecule needs a name": sites and not file and self.name is None,
+            "repeat needs the file of a crystal": self.repeat and (is_complete or not file),
+            "repeat makes a framework, which does not move: set frozen = true, and count = 1": (
+                self.repeat and not (self.frozen is True and self.count in (None, 1))
+            ),
         }
         return [fault for fault, is_there in faults.items() if is_there][:1]
 
@@ -124,16 +132,18 @@ class Structure(Section):
     """Positions at the start from a file."""
 
     file: Line
-    """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), a trajectory (.xtc .trr
-    .gsd .traj .dcd .nc), or `final.npz` of an earlier run. In the folder of the scene or below"""
+    """Structure file that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), a trajectory
+    (.xtc .trr .gsd .traj .dcd .nc), or `final.npz` of an earlier run. It must be in the folder of
+    the scene or below"""
     topology: Line | None = None
-    """Structure file with the names of the atoms, in the same order, for trajectories without names
-    (all but .gsd). Default: topology.gro or topology.pdb in the folder of the trajectory"""
+    """Structure file with the names of the atoms, in the same order. It is needed for trajectories
+    without names (all formats but .gsd). Default: topology.gro or topology.pdb in the folder of the
+    trajectory"""
     frame: Annotated[int, Strict()] | None = None
-    """Number of the structure in a file with several: 1 is the first, -1 the last. Required for
-    such files, except trajectories. Default for trajectories: the last"""
+    """Number of the structure in a file with several structures: 1 is the first, -1 the last.
+    Required for such files, except for trajectories, whose default is the last frame"""
     repeat: tuple[Count, Count, Count] = (1, 1, 1)
-    """Repetitions of the file's cell along a, b, c, to make a crystal of its unit cell"""
+    """Repetitions of the file's cell along a, b, c. Use it to make a crystal from its unit cell"""
     velocities: Flag = False
     """Use the velocities in the file instead of drawing them"""
     tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
@@ -164,17 +174,18 @@ class Box(Section):
     """The periodic box."""
 
     lengths_A: Positive | tuple[Positive, Positive, Positive] | None = None
-    """Lengths of the edges. One number for a cube"""
+    """Edge lengths. One number for a cube"""
     angles_deg: tuple[Angle, Angle, Angle] | None = None
     """Angles between b and c, c and a, a and b. Default: right angles"""
     density_g_cm3: Positive | None = None
     """Mass density, which sets the edge of a cube"""
     vacuum_A: Positive | None = None
-    """Empty length that is added to an edge, half on each side of the molecules: a slab"""
+    """Empty length that is added to an edge, half of it on each side of the molecules. The
+    molecules then form a slab"""
     vacuum_axis: Literal["x", "y", "z"] = "z"
     """The edge a, b or c to which vacuum_A is added"""
     periodic: Flag = True
-    """Periodic boundary conditions, false: molecules in vacuum without a box"""
+    """Periodic boundary conditions. false: molecules in vacuum without a box"""
 
     def _errors(self):
         if self.lengths_A is not None and self.density_g_cm3 is not None:

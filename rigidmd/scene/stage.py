@@ -89,10 +89,10 @@ class Timing(Section):
     name: ShortName | None = None
     """Name of the stage. Default: the name of the ensemble"""
     ensemble: Ensemble = "nve"
-    """Constant: nve energy and volume; nvt temperature and volume; npt temperature and pressure;
-    nph enthalpy and pressure. minimise: no time passes. Molecules move and rotate to a minimum of
-    the potential energy, or, if pressure_bar is given, molecules and cell to a minimum of the
-    enthalpy"""
+    """What is constant. nve: energy and volume. nvt: temperature and volume. npt: temperature and
+    pressure. nph: enthalpy and pressure. minimise: no time passes. Molecules move and rotate to a
+    minimum of the potential energy. If pressure_bar is set, molecules and cell relax to a minimum
+    of the enthalpy"""
     duration_ps: Positive | None = Field(default=None, validate_default=True)
     """Duration. Required except with minimise"""
     timestep_fs: Positive | None = None
@@ -101,10 +101,11 @@ class Timing(Section):
     0.002 kT per degree of freedom, 4 fs for water at 300 K. At constant energy it is half as long.
     `rigidmd check` prints it"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
-    """Temperature of the thermostat. Two for a linear change over the stage, [300, 240]"""
+    """Temperature of the thermostat. Use two values for a linear change over the stage, [300,
+    240]"""
     volume: Literal["mean"] | None = None
-    """With nve and nvt, mean: the box is scaled at the start to the mean, over its equilibrated
-    part, of the npt or nph stage just before. Default: the box as it is at the end of that stage"""
+    """mean: at the start of an nve or nvt stage the box is scaled to its mean over the equilibrated
+    part of the npt or nph stage just before. Default: the box at the end of that stage"""
 
 
 class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
@@ -118,11 +119,11 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     with nvt and npt, whose averages have almost no time-step error, except with
     hybrid_monte_carlo, which corrects it, else velocity_verlet"""
     energy_error_kT: Positive | None = None
-    """With auto: rms error of the energy over the whole stage, as pilot runs predict it, in kT per
-    degree of freedom"""
+    """With auto: rms error of the energy over the whole stage, in kT per degree of freedom, as
+    predicted by pilot runs"""
     trajectory_error: TrajectoryError | None = None
-    """With auto: largest error of Q (for points of X in Å) at the end of the pilot run of ten
-    radians of libration"""
+    """With auto: largest error of Q at the end of the pilot run of ten radians of libration. For
+    points it is the error of X in Å"""
     bias_kT: Positive | None = None
     """With auto in nvt: estimated bias of the average potential energy, in kT per degree of
     freedom"""
@@ -135,12 +136,12 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     kT at 300 K"""
     torque_limit_kJ_mol: Positive = 0.1
     """With minimise: largest torque on a molecule about a principal axis at convergence. For a
-    molecule with a radius of 1 Å as strict as the default limit of forces"""
+    molecule with a radius of 1 Å it is as strict as the default force limit"""
     pressure_limit_bar: Positive = 1.0
-    """With minimise and pressure_bar: largest deviation of the pressure at convergence. At the
-    compressibility of water 1 bar changes the volume by 5e-5"""
+    """With minimise and pressure_bar: largest deviation of the pressure at convergence. With the
+    compressibility of water, 1 bar changes the volume by 5e-5"""
     most_iterations: Count = 5000
-    """With minimise: largest number of iterations, after which it stops with a warning"""
+    """With minimise: maximum number of iterations. The minimisation then stops with a warning"""
 
     @model_validator(mode="before")
     @classmethod
@@ -155,7 +156,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @field_validator("thermostat", "barostat", mode="before")
     @classmethod
-    def _is_available(cls, name: Any, field: ValidationInfo):
+    def _is_available(cls, name: object, field: ValidationInfo):
         plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
         if plain in REFUSED:
             known = THERMOSTATS if field.field_name == "thermostat" else BAROSTATS
@@ -164,7 +165,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @field_validator("integrator", mode="before")
     @classmethod
-    def _moves_molecules(cls, name: Any, info: ValidationInfo):
+    def _moves_molecules(cls, name: object, info: ValidationInfo):
         plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
         if plain in OTHER_INTEGRATORS and name not in (info.context or ()):
             known = ", ".join((*SCHEMES, *WITH_THERMOSTAT, AUTO))
@@ -389,7 +390,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def with_defaults(self) -> "Stage":
         """This stage with the defaults of all keys that it uses."""
-        defaults: dict[str, Any] = {}
+        defaults: dict[str, object] = {}
         if self.has_thermostat:
             defaults |= {"thermostat": self.thermostat_kind} | self.thermostat_values
         if self.has_barostat:

@@ -140,7 +140,7 @@ def validation_messages(
     ]
 
 
-def numbers_out_of_range(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
+def numbers_out_of_range(data: object, least: float, largest: float) -> list[tuple[list, str]]:
     """Path of keys and message of numbers in nested tables whose absolute value is outside these
     limits."""
     bounds = f"{least:g} and {largest:g}".replace("e+", "e")
@@ -301,11 +301,11 @@ def _british_keys(data: dict, known: Container[str]) -> dict:
 
 
 @cache
-def _annotations(model: type[BaseModel]) -> dict[str, Any]:
+def _annotations(model: type[BaseModel]) -> dict[str, object]:
     return {key: field.rebuild_annotation() for key, field in model.model_fields.items()}
 
 
-def _choices(annotation: Any) -> list[str]:
+def _choices(annotation: object) -> list[str]:
     """The values that a type allows, if it is a choice of names."""
     if isinstance(annotation, str):
         return [annotation]

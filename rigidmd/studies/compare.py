@@ -11,7 +11,7 @@ import numpy as np
 from rigidmd.core.files import unreadable_reason
 from rigidmd.core.state import State
 from rigidmd.core.state_file import read_state
-from rigidmd.core.toml import read_toml
+from rigidmd.core.toml import Json, read_toml
 from rigidmd.errors import OutputError, RigidMDError, SceneError
 from rigidmd.io.folder import FINAL, LOG, MOTION, SCENE, SUMMARY, check_is_run
 from rigidmd.io.run_files import Columns, Summary, read_columns, read_json, read_motion
@@ -74,7 +74,7 @@ class RunComparison:
         )
         return same_samples and not self.state and all(self.files.values()) and not self.missing
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         return asdict(self) | {"same": self.same}
 
 
@@ -96,8 +96,10 @@ def compare(first: Path, second: Path) -> RunComparison:
                 content, why = read(path), f"{path} does not exist"
             except RigidMDError as error:
                 content, why = None, str(error)
-            contents += [] if content is None else [content]
-            found.missing += [why] if content is None else []
+            if content is None:
+                found.missing.append(why)
+            else:
+                contents.append(content)
         return contents if len(contents) == 2 else []
 
     if scenes := both(SCENE, lambda path: read_toml(path, SceneError)[0]):

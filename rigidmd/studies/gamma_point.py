@@ -36,7 +36,7 @@ def periodic_basis(system: System, state: State, index: np.ndarray) -> np.ndarra
 
     index : (d,) of the coordinates among shifts (3 n) and rotations (3 n), as in
         `normal_modes.Coordinates`
-    Raises SceneError without a repeated cell, SimulationError if the crystal has not the period of
+    Raises SceneError without a repeated cell, SimulationError if the crystal lacks the period of
     the unit cell.
     """
     n, rotates = len(state.position), len(state.rotation) > 0
@@ -67,8 +67,8 @@ def periodic_basis(system: System, state: State, index: np.ndarray) -> np.ndarra
 
 
 def _translated_copies(system: System, state: State) -> list[np.ndarray]:
-    """Indices of the molecules that are copies of each other by translations of the unit cell.
-    Raises SceneError, SimulationError."""
+    """Indices of the molecules that are copies of each other by unit-cell translations. Raises
+    SceneError, SimulationError."""
     repeat = np.array(cells_of(system))
     in_cells = state.position @ np.linalg.inv(state.cell) * repeat
     unit_cell = state.cell / repeat[:, None]
@@ -84,9 +84,9 @@ def _translated_copies(system: System, state: State) -> list[np.ndarray]:
     if any(len(group) != prod(repeat) for group in groups):
         sizes = ", ".join(map(str, sorted({len(group) for group in groups})))
         raise SimulationError(
-            f"at its minimum the crystal has not the period of its unit cell: of {prod(repeat)}"
-            f" copies of a molecule {sizes} are at equal positions. Its modes at the Gamma point"
-            " are those of a larger cell"
+            "at its minimum the crystal does not have the period of its unit cell: of"
+            f" {prod(repeat)} copies of a molecule {sizes} are at equal positions. Its modes at the"
+            " Gamma point belong to a larger cell"
         )
     for group in groups if len(state.rotation) else []:
         for j in group[1:]:
@@ -108,6 +108,6 @@ def _check_same_orientation(system: System, state: State, first: int, other: int
     if distance.min(axis=1).max() > SAME_ROTATION * max(molecule.radius, system.smallest_diameter):
         raise SimulationError(
             f"molecules {first + 1} and {other + 1} are at equal positions in their unit cells and"
-            " have different orientations: the crystal has not the period of its unit cell, so it"
+            " have different orientations: the crystal lacks the period of its unit cell, so it"
             " has no modes at its Gamma point"
         )

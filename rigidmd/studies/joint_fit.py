@@ -66,7 +66,7 @@ def slope_name(quantity: str) -> str:
 
 
 def size_name(quantity: str) -> str:
-    """The sum of the sizes of the parts of a slope, which may cancel."""
+    """The summed sizes of the parts of a slope, which may cancel."""
     return f"size of the slope of {quantity}"
 
 
@@ -294,7 +294,7 @@ def _with_errors(
 
 
 def _correlation(runs: Mapping[float, Sequence[RunResults]], names: list[str]) -> np.ndarray:
-    """Correlations of the errors of results, over the blocks of all runs."""
+    """Error correlations between results, over the blocks of all runs."""
     total = np.zeros((len(names), len(names)))
     for of in (of for found in runs.values() for of in found):
         columns = [list(of.values).index(name) for name in names]

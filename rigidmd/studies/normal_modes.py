@@ -141,7 +141,7 @@ class NormalModes:
     error: np.ndarray
     # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
     vector: np.ndarray
-    # (k,) fraction of the kinetic energy that is of translation, not of libration
+    # (k,) translational fraction of the kinetic energy. The rest is librational
     translation: np.ndarray
     weight: np.ndarray  # (k, n) fraction of the kinetic energy in each molecule
     # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges
@@ -150,9 +150,9 @@ class NormalModes:
     cells: int = 0  # number of unit cells, if these are modes at the Gamma point
 
     def free_energy(self, temperature: float, quantum: bool = True) -> float:
-        """Helmholtz energy (kJ/mol) of the vibrations of the rigid molecules, from the energy of
-        the minimum on, at a temperature (K). At 0 the zero-point energy. Raises ValueError if there
-        are only some of the modes."""
+        """Helmholtz energy (kJ/mol) of the rigid-molecule vibrations at a temperature (K), relative
+        to the energy of the minimum. At 0 the zero-point energy. Raises ValueError if there are
+        only some of the modes."""
         if len(self.rate) < len(self.coordinates.index):
             raise ValueError("a sum over all modes needs all of them: leave out count and gamma")
         quanta, thermal = HBAR * self.rate[self.rate > 0], BOLTZMANN * temperature
@@ -318,8 +318,8 @@ def _numbers(c: Coordinates, count: int | None, gamma: bool) -> np.ndarray:
 
 
 def _last_temperature(scene: MolecularScene) -> float:
-    """The temperature at the end of the last stage that sets one, K. Without one the one of the
-    start, or 0."""
+    """The temperature at the end of the last stage that sets a temperature, K. Without such a
+    stage, the temperature of the start, or 0."""
     temperature = scene.start.temperature_K or 0.0
     for stage in scene.stages:
         temperature = stage.temperatures[1] or temperature

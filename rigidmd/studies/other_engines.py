@@ -6,7 +6,7 @@ import tempfile
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from rigidmd.assemble.build import build
 from rigidmd.core.files import writing
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW, State
+from rigidmd.core.toml import Json
 from rigidmd.engines.external import (
     ERRORS,
     Comparison,
@@ -60,7 +61,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
     engine = EngineChoice.model_validate({"name": to}) if program.engine else EngineChoice()
     system = build(scene.model_copy(update={"engine": engine}))
     later = [
-        f"stages.{k}: a minimisation after other stages stays with rigidmd"
+        f"stages.{k}: export does not support a minimisation after other stages"
         for k, stage in enumerate(system.scene.stages)
         if stage.is_minimisation
         and any(not before.is_minimisation for before in system.scene.stages[:k])
@@ -135,7 +136,7 @@ class Verification(NamedTuple):
         ]
         return "\n".join(parts)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         lines = {
             part: [line._asdict() for line in getattr(self, part)] for part in ("start", "run")
         }
@@ -197,7 +198,7 @@ def _short_run(system: System, state: State, other: ExternalEngine) -> list[Comp
 
 
 def _sites_after(system: System, engine: Engine, state: State, steps: int) -> np.ndarray:
-    """Positions of sites (s, 3) after the span of the short run, in this number of steps."""
+    """Site positions (s, 3) after the span of the short run, in this number of steps."""
     scheme, dt = SCHEMES["velocity_verlet"], STEPS * STEP * FEMTOSECOND / steps
     moved = engine.begin(state, scheme)
     moved.begin_segment(0.0)

@@ -1,5 +1,4 @@
-"""Reading of the folder of a run or of a sweep as results. Nothing is written, locked or
-computed."""
+"""Reads the folder of a run or a sweep as results. Nothing is written, locked or computed."""
 
 from collections.abc import Sequence
 from functools import cached_property

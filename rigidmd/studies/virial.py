@@ -118,7 +118,7 @@ def second_virial(
         Requested standard error of each coefficient, cm³/mol; default: 0.1 % of the larger of |B2|
         and |T dB2/dT|
     forces
-        Pair potentials made by `rigidmd.pair_potential`
+        Potentials made by `rigidmd.pair_potential` and `rigidmd.body_pair_potential`
     settings
         Keys of a scene with their values, such as {"forces.mixing": "geometric"}
     seed
@@ -265,8 +265,8 @@ def _points(seed: int) -> qmc.Sobol:
 
 
 def _adapted_edges(energy: Energy, thermal: np.ndarray, seed: int) -> np.ndarray:
-    """Edges (6, bins + 1) of intervals of the variables with equal numbers of samples, narrow where
-    the integrand is large (Lepage 1978, J. Comput. Phys. 27, 192)."""
+    """Edges (6, bins + 1) of variable intervals with equal numbers of samples, narrow where the
+    integrand is large (Lepage 1978, J. Comput. Phys. 27, 192)."""
     even = np.linspace(0, 1, BINS + 1)
     edges, points = np.tile(even, (6, 1)), _points(seed)
     for _ in range(ADAPTATIONS):

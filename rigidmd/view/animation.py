@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from itertools import chain
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +19,14 @@ from rigidmd.figures.panels import draw_rows, panels, timeline
 from rigidmd.figures.style import COLORS, INK, WARM, new_figure
 from rigidmd.run.record import Record, read_record
 from rigidmd.scene.validation import not_none
+from rigidmd.view.body_animation import BodyAnimation
+from rigidmd.view.molecule_animation import MoleculeAnimation
 from rigidmd.view.run_page import animation_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from rigidmd.figures.picture import Picture
 
 EXTENSIONS = (".mp4", ".gif")
 #: Frames per second, length in seconds, and height in pixels of an animation; inches of its
@@ -90,7 +97,7 @@ def write_film(
     return path, [*notes, f"{seconds:g} s of animation: {rate}"]
 
 
-def _pixels(figure: Any) -> np.ndarray:
+def _pixels(figure: "Picture") -> np.ndarray:
     """Red, green and blue of a figure, (h, w, 3)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -101,7 +108,7 @@ def _pixels(figure: Any) -> np.ndarray:
 
 def _frames(
     record: Record,
-    animation: Any,
+    animation: BodyAnimation | MoleculeAnimation,
     times: np.ndarray,
     pixels: int,
     with_plots: bool,
@@ -121,14 +128,14 @@ def _frames(
         clock.set_text(f"{time:.{digits}f} {record.time_unit}")
         beside = plots.copy()
         for axis in cursors:
-            x, _ = axis.transData.transform((time, 0)).astype(int)
-            low, high = pixels - axis.bbox.intervaly.astype(int)
+            x = int(axis.transData.transform((time, 0))[0])
+            low, high = (pixels - int(end) for end in axis.bbox.intervaly)
             beside[high:low, x : x + 2] = CURSOR
         yield np.hstack([_pixels(figure), beside])
         progress((k + 1) / len(times))
 
 
-def _plots(record: Record, dpi: float) -> tuple[np.ndarray, list[Any]]:
+def _plots(record: Record, dpi: float) -> "tuple[np.ndarray, list[Axes]]":
     """A picture of the first plots of a run, and their axes."""
     width = 2 * round(0.375 * INCHES * dpi) / dpi  # an even number of pixels
     figure = new_figure(width, INCHES, layout=None, dpi=dpi)
@@ -154,8 +161,14 @@ def _write_gif(path: Path, frames: Iterator[np.ndarray], most: float) -> None:
     ]
     for step in GIF_STEPS:
         first, *others = quantized[::step]
-        options = {"duration": round(1000 * step / RATE[".gif"]), "loop": 0, "optimize": True}
-        first.save(path, save_all=True, append_images=others, **options)
+        first.save(
+            path,
+            save_all=True,
+            append_images=others,
+            duration=round(1000 * step / RATE[".gif"]),
+            loop=0,
+            optimize=True,
+        )
         if path.stat().st_size < most:
             break
 

@@ -2,7 +2,7 @@
 drawing by Matplotlib."""
 
 import html
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run.record import Record
 from rigidmd.view.mesh import mesh_of
 from rigidmd.view.page import PagePart, read_asset
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Most samples of an animation, most points of the drawn path.
 MOST_SAMPLES, MOST_POINTS = 20_000, 3000
@@ -124,7 +127,7 @@ class BodyAnimation:
         level = np.array([np.cos(self.azimuth), np.sin(self.azimuth), 0.0])
         self._view = camera(np.cos(LIFT) * level + np.sin(LIFT) * UP)
 
-    def draw(self, axes: Any, time: float) -> None:
+    def draw(self, axes: "Axes", time: float) -> None:
         """Draw a time into axes, which are cleared."""
         from matplotlib.patches import Circle
 
@@ -139,8 +142,8 @@ class BodyAnimation:
             view.curve(self.path, (0.25, 0.08), color=COOL, lw=0.9)
             view.curve(np.vstack([past, tip]), (0.95, 0.3), color=COOL, lw=1.7)
             front = view.depth(tip) >= 0
-            style = {"ms": 6, "alpha": 1.0 if front else 0.4, "zorder": 5 if front else 1}
-            axes.plot(*view.flat(tip), "o", color=WARM, **style)
+            alpha, order = (1.0, 5) if front else (0.4, 1)
+            axes.plot(*view.flat(tip), "o", color=WARM, ms=6, alpha=alpha, zorder=order)
         else:
             for line, alpha, width in ((self.path, 0.3, 0.9), (np.vstack([past, origin]), 1, 1.7)):
                 axes.plot(*view.flat(line).T, color=COOL, lw=width, alpha=alpha, zorder=1)

@@ -4,7 +4,7 @@ Matplotlib."""
 import html
 from importlib.resources import files
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,6 +21,9 @@ from rigidmd.scene.validation import not_none
 from rigidmd.view.molecule_figure import color_of
 from rigidmd.view.page import PagePart, read_asset
 from rigidmd.view.solids import DEFAULT_RADIUS, SPHERE_SCALE, solids_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Most coordinates in a page, of 2 bytes each: with base64 about 21 MB, plus 3 MB of chemiscope.
 MOST_COORDINATES = 8_000_000
@@ -56,8 +59,8 @@ def chemiscope_script() -> str:
 
 
 def frames_of(record: Record, max_frames: int) -> Frames:
-    """Frames of the trajectory of a run of molecules, each molecule whole and inside the box.
-    Raises OutputError if distances within molecules are not as in the molecules of this run."""
+    """Trajectory frames of a run of molecules, each molecule whole and inside the box. Raises
+    OutputError if distances within molecules are not as in the molecules of this run."""
     path, sites = record.trajectory, record.system.sites
     frames = read_frames(path, len(sites.molecule), max_frames)
     pairs = np.flatnonzero(sites.molecule[1:] == sites.molecule[:-1])
@@ -132,7 +135,7 @@ class MoleculeAnimation:
     def film_notes(self, interval: float, seconds: float) -> list[str]:
         return []
 
-    def draw(self, axes: Any, time: float) -> None:
+    def draw(self, axes: "Axes", time: float) -> None:
         """Draw the last frame up to a time into axes, which are cleared."""
         rounding = 1e-9 * (self.time[-1] - self.time[0])
         k = max(0, int(np.searchsorted(self.time, time + rounding, "right")) - 1)

@@ -182,8 +182,7 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
             color = color_of(m.elements[i])
             view.spheres(m.positions_body[i : i + 1], radius[i : i + 1], color[None], order)
         else:
-            style = {"marker": "D", "ms": 6, "mfc": "white", "mec": COOL, "mew": 1.5}
-            view.axis.plot(*flat[i], **style, zorder=6.5)
+            view.axis.plot(*flat[i], "D", ms=6, mfc="white", mec=COOL, mew=1.5, zorder=6.5)
     _labels(view, m, radius, taken)
     length = 1.0 if half > 1.6 else 0.5
     view.scale(length, f"{length:g} Å")
@@ -220,8 +219,7 @@ def _bonds(view: View, m: Molecule, radius: np.ndarray) -> list[np.ndarray]:
         along = 0.9 * (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
         flat = view.flat(ends + np.outer([radius[i], -radius[j]], along))
         for color, width in (("#8f949b", 7.0), ("#c9cdd2", 4.0)):
-            style = {"color": color, "lw": width, "solid_capstyle": "butt"}
-            view.axis.plot(*flat.T, **style, zorder=order)
+            view.axis.plot(*flat.T, color=color, lw=width, solid_capstyle="butt", zorder=order)
         taken += [*np.linspace(flat[0], flat[1], 12)]
     return taken
 
@@ -234,8 +232,7 @@ def _axes(view: View, m: Molecule) -> list[np.ndarray]:
     for k, tip in enumerate(0.9 * view.half.max() * np.eye(3)[:count]):
         name = view.arrow(np.zeros(3), tip, INK, str(k + 1), lw=0.9, fontsize=FONT, zorder=3)
         if name is None:
-            ring = {"ms": 9, "mfc": "none", "mec": INK, "zorder": 7}
-            view.axis.plot(0, 0, "o", **ring)
+            view.axis.plot(0, 0, "o", ms=9, mfc="none", mec=INK, zorder=7)
             view.axis.plot(0, 0, ".", ms=4, color=INK, zorder=7)
         else:
             taken += [*np.linspace(np.zeros(2), name, 30)]
@@ -264,5 +261,14 @@ def _labels(view: View, m: Molecule, radius: np.ndarray, taken: list[np.ndarray]
         if gap[best] > GAPS[0]:
             line = [centres[i], np.clip(centres[i], low[best], high[best])]
             view.axis.plot(*np.array(line).T, color=FAINT, lw=0.7, zorder=6.4)
-        style = {"ha": "center", "va": "center", "parse_math": False, "zorder": 9}
-        view.axis.text(*middle[best], text, color=INK, fontsize=FONT, **style)
+        view.axis.text(
+            middle[best, 0],
+            middle[best, 1],
+            text,
+            color=INK,
+            fontsize=FONT,
+            ha="center",
+            va="center",
+            parse_math=False,
+            zorder=9,
+        )

@@ -128,7 +128,7 @@ def _columns(results: Results) -> str:
     return f"<details><summary>{title}</summary>{listed}</details>"
 
 
-#: Most coordinates in a notebook.
+#: Maximum number of coordinates in a notebook.
 MOST_COORDINATES = 1_500_000
 #: Height of a frame, pixels.
 HEIGHT = 720

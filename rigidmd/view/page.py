@@ -5,10 +5,14 @@ import html
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rigidmd.core.files import write_text
+from rigidmd.core.toml import Json
 from rigidmd.figures.style import DARK_PALETTE, FAINT, PALETTE, curve_style, drawing
+
+if TYPE_CHECKING:
+    from rigidmd.figures.picture import Picture
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
@@ -32,7 +36,7 @@ class PagePart(NamedTuple):
     picture: str  # HTML
     legend: str  # HTML
     usage: str  # how to use it
-    data: dict[str, Any]  # for the scripts: JSON values and arrays
+    data: Json  # for the scripts: JSON values and arrays
     scripts: list[str]
 
 
@@ -128,7 +132,7 @@ def code(text: str) -> str:
     return f"<pre>{html.escape(text)}</pre>"
 
 
-def figure(drawn, salt: str, about: str) -> str:
+def figure(drawn: "Picture", salt: str, about: str) -> str:
     """A figure of Matplotlib as part of a page, whose colours it takes. salt: another one for each
     figure of a page."""
     for part in (drawn, *drawn.axes):
@@ -141,7 +145,7 @@ def figure(drawn, salt: str, about: str) -> str:
     return svg
 
 
-def wide(drawn, salt: str, about: str) -> str:
+def wide(drawn: "Picture", salt: str, about: str) -> str:
     """A figure of several panels, which scrolls on a narrow screen."""
     width = 120 * drawn.get_figwidth()  # pixels
     style = f"max-width:{width:.0f}px;min-width:{min(620.0, 0.7 * width):.0f}px"

@@ -2,12 +2,13 @@
 live ones."""
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
+from rigidmd.core.toml import Json
 from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import BODY_COLUMNS, MATRIX, Column, Samples
@@ -47,7 +48,7 @@ def plots_part(record: Record) -> str:
 def record_of(
     system: System | BodySystem,
     samples: Samples | Motion,
-    summary: dict[str, Any] | None,
+    summary: Json | None,
     names: Sequence[str] | None = None,
 ) -> Record:
     """A run in memory as a record, with all its columns or with the named ones and the time."""
@@ -83,7 +84,9 @@ def plot(results: Results, *columns: str, log: bool = False) -> Picture:
     return columns_figure(record, columns, results.samples.described, log)
 
 
-def check_names(names: Sequence[str], described: dict[str, Column], figures: Any = ()) -> None:
+def check_names(
+    names: Sequence[str], described: dict[str, Column], figures: Iterable[str] = ()
+) -> None:
     """Raise KeyError, with a suggestion, for a name that is not a column of numbers."""
     known = [name for name, column in described.items() if column.unit and name != MATRIX]
     for name in (name for name in names if name not in known):

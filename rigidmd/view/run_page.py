@@ -10,7 +10,6 @@ import json
 import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from rigidmd.analysis.files import read_results
 from rigidmd.assemble.describe import describe
 from rigidmd.core.shipped import Example, examples
 from rigidmd.core.statistics import format_with_error
+from rigidmd.core.toml import Json
 from rigidmd.engines.samples import BODY
 from rigidmd.errors import InputError
 from rigidmd.figures.style import new_figure
@@ -57,7 +57,7 @@ ABOUT = {
     "log.csv": "energies, temperatures and pressures over time",
     "motion.csv": "position, attitude, velocities, energies and errors over time",
     "motion.npz": "the same columns as arrays",
-    "final.npz": "the last state, every bit of it",
+    "final.npz": "the last state, exact to every bit",
     "pressure_tensor.csv": "the pressure tensor over time, for a viscosity",
     "analysis.json": "values of `rigidmd analyse` with their errors",
     "checkpoint.npz": "from which `rigidmd resume` continues",
@@ -155,8 +155,8 @@ def _margins(record: Record) -> str:
     """Time steps compared with the longest stable ones."""
     summary, rows = record.summary or {}, []
     unit = "s" if record.is_body else "fs"
-    whole: list[dict[str, Any]] = [{"name": record.scene.name} | summary]
-    stages = whole if record.is_body else summary.get("stages", ())
+    whole: Json = {"name": record.scene.name} | summary
+    stages = [whole] if record.is_body else summary.get("stages", ())
     for stage in stages:
         step, stable = stage.get(f"timestep_{unit}"), stage.get(f"stable_timestep_{unit}")
         if step and stable:

@@ -4,7 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.engines.body_pairs import bodies_of_potentials
 from rigidmd.engines.system import System
+from rigidmd.forces.poses.gay_berne import GayBerne
+from rigidmd.forces.poses.patch import Patch
 from rigidmd.formats.bonds import COVALENT
 from rigidmd.run.rigid_fit import Bodies
 from rigidmd.view.molecule_figure import color_of
@@ -40,34 +43,33 @@ class Solids(NamedTuple):
 
 
 def solids_of(system: System) -> Solids | None:
-    """The solids of a system, and its other sites with mass as spheres; None if no potential of the
-    scene has a shape."""
+    """The solids of a system, and its other sites with mass as spheres; None if no potential has a
+    shape."""
     rows: list[tuple] = []
-    drawn: set[int] = set()
-    for entry in system.scene.forces.bodies:
-        for index, species in enumerate(system.species):
-            values = entry.parameters.get(species.name)
-            if entry.potential not in ("gay_berne", "patch") or not values or index in drawn:
-                continue
-            drawn.add(index)
-            reference = np.array(entry.references.get(species.name, species.centre))
-            offset = (reference - species.centre) @ species.axes
-            k = "xyz".index(entry.axis)
-            frame = species.axes.T[:, [k - 2, k - 1, k]]
-            for m in np.flatnonzero(system.model.species == index).tolist():
-                if entry.potential == "patch":
-                    radius = values["sigma_A"] / 2
-                    rows.append((m, offset, frame, [radius] * 3, BALL))
-                    moved = offset + PATCH_OFFSET * radius * frame[:, 2]
-                    rows.append((m, moved, frame, [PATCH_RADIUS * radius] * 3, PATCH))
-                else:
-                    wide, long = values["width_A"] / 2, values["length_A"] / 2
-                    rows.append((m, offset, frame, [wide, wide, long], np.full(3, np.nan)))
+    drawn: set[str] = set()
+    for bodies in bodies_of_potentials(system):
+        name, potential = bodies.species.name, bodies.potential
+        if name in drawn or type(potential.function) not in (GayBerne, Patch):
+            continue
+        drawn.add(name)
+        values, offset = potential.parameters[name], bodies.reference
+        k = "xyz".index(potential.axis or "z")
+        frame = bodies.frame[:, [k - 2, k - 1, k]]
+        for m in bodies.molecule.tolist():
+            if isinstance(potential.function, Patch):
+                radius = values["sigma_A"] / 2
+                rows.append((m, offset, frame, [radius] * 3, BALL))
+                moved = offset + PATCH_OFFSET * radius * frame[:, 2]
+                rows.append((m, moved, frame, [PATCH_RADIUS * radius] * 3, PATCH))
+            else:
+                wide, long = values["width_A"] / 2, values["length_A"] / 2
+                rows.append((m, offset, frame, [wide, wide, long], np.full(3, np.nan)))
     if not rows:
         return None
     sites = system.sites
     for s in np.flatnonzero(sites.mass > 0).tolist():
-        if system.model.species[sites.molecule[s]] not in drawn:
+        species = system.species[system.model.species[sites.molecule[s]]]
+        if species.name not in drawn:
             element = str(sites.element[s])
             radius = SPHERE_SCALE * COVALENT.get(element, 0.0) or DEFAULT_RADIUS
             place = (sites.molecule[s], sites.offset_body[s], np.eye(3))

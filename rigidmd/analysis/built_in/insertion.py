@@ -66,6 +66,7 @@ def insertion(
     zero_loading: bool = False,
     axis: str = "",
     seed: int = 1,
+    temperature: float | None = None,
 ) -> AnalysisResult:
     """Excess chemical potential of a model by trial insertions into the frames of a run, and its
     fugacity or Henry constant; in frozen molecules also the heat of adsorption at zero loading.
@@ -77,6 +78,7 @@ def insertion(
     zero_loading : only the frozen molecules act on the trial molecule
     axis : x, y or z for the profile along the normal of a slab
     seed : of the trials
+    temperature : K, with zero_loading; default: the temperature of the run
 
     Raises OutputError.
     """
@@ -91,7 +93,13 @@ def insertion(
     if zero_loading and not frozen.any():
         raise OutputError("zero loading needs frozen molecules, and the run has none")
     host = frozen if zero_loading else np.ones(len(frozen), bool)
-    thermal = float(runs.mean([thermal_energy_of(run) for run in runs.members]))
+    if temperature is not None and not (zero_loading and temperature > 0):
+        raise OutputError("insertion at another temperature, above 0 K, needs zero_loading=true")
+    if not (model or runs.moving):
+        raise OutputError("insertion needs a molecule, such as model=methane_trappe")
+    thermal = BOLTZMANN * (temperature or 0) or float(
+        runs.mean([thermal_energy_of(run) for run in runs.members])
+    )
     try:
         molecule = model_named(model or runs.moving[0].name, runs.system.species)
         guest = Guest(runs.system, molecule, thermal / BOLTZMANN, host)
@@ -214,8 +222,8 @@ def _note(sets: list[Trials], guest: Guest, thermal: float) -> str:
 
 
 def _profile(sets: list[Trials], thermal: float, axis: str) -> Curve:
-    """The chemical potential against the distance from the middle of a slab, with errors of blocks
-    of frames; NaN where the molecule overlaps in all trials."""
+    """The chemical potential against the distance from the middle of a slab, with errors from
+    blocks of frames; NaN where the molecule overlaps in all trials."""
     height = np.concatenate([trials.height for trials in sets])
     weight = np.concatenate([trials.weight for trials in sets])
     half = np.abs(height).max()

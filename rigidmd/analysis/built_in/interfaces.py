@@ -147,8 +147,7 @@ def _changes_of_fit(z: np.ndarray, densities: np.ndarray, parameters: np.ndarray
 
 @built_in("interfaces of a slab: coexisting densities, width, orientation", position=32)
 def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
-    """Densities of liquid and vapour, thickness of the slab and width of its interfaces, from a fit
-    of
+    """Liquid and vapour densities, slab thickness and interface width, from a fit of
 
     rho(z) = (rho_l + rho_v)/2 - (rho_l - rho_v)/2 tanh((z - z0)/d)
 

@@ -15,6 +15,7 @@ from rigidmd.analysis.result import (
 )
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs
+from rigidmd.engines.body_pairs import bodies_of_potentials
 from rigidmd.errors import OutputError
 from rigidmd.run.rigid_fit import Kind
 
@@ -29,16 +30,15 @@ def nematic(runs: Runs, axis: Literal["", "x", "y", "z"] = "") -> AnalysisResult
     """S, the largest eigenvalue of Q = <(3 u u - 1)/2>, of the axes u of a species, and the
     director, its eigenvector.
 
-    The mean of S of each frame, whose director may rotate, and S about the director of all frames.
-    S is 1 for parallel axes; that of a frame of N molecules without order is 0.80/sqrt(N), not 0.
-    The middle eigenvalue times -2 has the mean 0 then (Eppenga & Frenkel 1984, Mol. Phys. 52,
-    1303).
+    The mean over frames of S, whose director may rotate, and S about the director of all frames. S
+    is 1 for parallel axes; that of a frame of N molecules without order is 0.80/sqrt(N), not 0. The
+    middle eigenvalue times -2 has the mean 0 then (Eppenga & Frenkel 1984, Mol. Phys. 52, 1303).
 
     Parameters
     ----------
     axis
         In the coordinates of the models' files; default: the axis of linear molecules, and of
-        the potentials of two bodies of the scene
+        the potentials of two bodies
 
     Raises
     ------
@@ -88,16 +88,16 @@ def nematic(runs: Runs, axis: Literal["", "x", "y", "z"] = "") -> AnalysisResult
 def _axis_body(runs: Runs, kind: Kind, axis: str) -> np.ndarray | None:
     """The axis of a species in its body frame; None without one."""
     molecule = kind.molecule
-    of_scene = [
-        entry.axis
-        for entry in runs.system.scene.forces.bodies
-        if entry.module is None and molecule.name in entry.parameters
+    of_potentials = [
+        bodies.potential.axis
+        for bodies in bodies_of_potentials(runs.system)
+        if bodies.species.name == molecule.name and bodies.potential.axis
     ]
     if axis not in ("", *"xyz"):
         raise OutputError(f"axis is {axis!r}, must be x, y or z")
     if molecule.kind == "linear":
         return np.eye(3)[0]
-    if not molecule.inertia.any() or not (named := [axis] if axis else of_scene):
+    if not molecule.inertia.any() or not (named := [axis] if axis else of_potentials):
         return None
     return molecule.axes["xyz".index(named[0])]
 

@@ -27,6 +27,7 @@ from rigidmd.errors import OutputError
 from rigidmd.formats import written
 from rigidmd.mechanics.inertia import rotational_freedom
 from rigidmd.run.rigid_fit import Kind
+from rigidmd.scene.validation import not_none
 from rigidmd.units import COULOMB, DEBYE
 
 #: correlation at which the integral of a correlation function is continued by an exponential
@@ -181,9 +182,9 @@ def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) ->
     "spectra and correlations of velocities, angular velocities and angular momenta", position=80
 )
 def spectrum(runs: Runs) -> AnalysisResult:
-    """Densities of states (cm) of translation and of rotation about each body axis, from the power
-    of velocities and angular velocities, and their correlation functions. The integral over wave
-    numbers is the number of degrees of freedom of a molecule. Needs frames with velocities, every
+    """Densities of states (cm) for translation and for rotation about each body axis, from the
+    power of velocities and angular velocities, and their correlation functions. The integral over
+    wave numbers is a molecule's number of degrees of freedom. Needs frames with velocities, every
     few fs. Raises OutputError."""
     if any(run.velocities is None or run.L is None for run in runs.members):
         kinds = " or ".join(written(lambda form: form.velocities))
@@ -247,12 +248,15 @@ def spectrum(runs: Runs) -> AnalysisResult:
     return result
 
 
-def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[RigidFrames, Kind], Any]]]:
+def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[RigidFrames, Kind], np.ndarray]]]:
     """The velocities of a species by name: mass or moment of inertia, and a function that returns
     their series."""
     name, moments = kind.name, kind.molecule.inertia.tolist()
-    rates: dict[str, Any] = {
-        f"V {name}": (kind.molecule.mass, lambda part, group: part.velocities[:, group.index])
+    rates: dict[str, tuple[float, Callable[[RigidFrames, Kind], np.ndarray]]] = {
+        f"V {name}": (
+            kind.molecule.mass,
+            lambda part, group: not_none(part.velocities)[:, group.index],
+        )
     }
     if kind.molecule.degrees_of_freedom <= 3:
         return rates
@@ -398,7 +402,8 @@ def _permittivity_around(runs: Runs) -> float:
 
 
 def _broken_symmetry(runs: Runs) -> str:
-    """What distinguishes a dipole of the system from the opposite one. Empty if nothing does."""
+    """What distinguishes a dipole of the system from the opposite dipole, or an empty text if
+    nothing does."""
     if any(not kind.moves and kind.molecule.has_dipole for kind in runs.kinds):
         return "frozen molecules have dipoles"
     if runs.system.scene.fields.entries:

@@ -27,8 +27,7 @@ from rigidmd.run.rigid_fit import Kind
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
 
-#: Molecules in all frames together for g(r) and hydrogen bonds, and for S(k); more frames add
-#: little.
+#: Enough molecules x frames for g(r) and hydrogen bonds, and for S(k). Further frames add little.
 ENOUGH_MOLECULES, ENOUGH_MOLECULES_K = 200_000, 100_000
 FEWEST, MOST = 20, 500  # frames
 #: Å: largest distance and width of bins of g(r), unless others are given.
@@ -89,7 +88,8 @@ def rdf(
             result.notes.append(f"g(r) of {a} and {b}: no two different molecules have these sites")
             continue
         g = [_g_of_frames(run, a, b, pair_count, width, shells) for run in thinned.members]
-        # of the others that each a has, so that two molecules have one neighbour each
+        # density of b around each a, without its own molecule: two molecules have one neighbour
+        # each
         density = pair_count / len(thinned.first.sites(a, slice(0, 1))[1]) / thinned.volume
         title = f"g {a}-{b}"
         mean, error = _mean_of_frames(thinned, g)
@@ -129,8 +129,8 @@ def _thinned(runs: Runs, enough: int) -> tuple[Runs, list[str]]:
 
 
 def _mean_of_frames(runs: Runs, values: list[np.ndarray]) -> Measured | tuple[np.ndarray, None]:
-    """Mean of arrays (f, p) of the frames of each run, and its error: of one run from blocks, of
-    several from their scatter. None with few frames."""
+    """Mean over the frames of each run, whose arrays are (f, p), and its error: of one run from
+    blocks, of several from their scatter. None with few frames."""
     means = [of_run.mean(axis=0) for of_run in values]
     if runs.are_several:
         return runs.estimate(means, lambda mean: mean)
@@ -240,9 +240,9 @@ def _shift_of_vertex(low: float, middle: float, high: float) -> float:
 def _errors_over_blocks(
     frames: np.ndarray, conclude: Callable[[np.ndarray], np.ndarray], samples: float
 ) -> Measured:
-    """Two estimates of the standard errors of what follows from the mean of frames (f, ...): the
-    scatter of blocks of frames, whose means are noisy, and that of omitting one block after
-    another, which sees few of the jumps.
+    """Two estimates of standard errors, for quantities that follow from a mean over frames (f,
+    ...): the scatter between blocks of frames, whose means are noisy, and the scatter when one
+    block after another is omitted, which includes few jumps.
 
     samples : frames for each independent one
     """

@@ -1,14 +1,13 @@
 """Response functions from fluctuations: heat capacities, compressibility, thermal expansion and
 thermal pressure coefficient.
 
-Momenta are independent of positions and contribute exactly. Only fluctuations of the potential
-energy, of the volume and of the virial are measured, at the set temperature. See the theory chapter
-`sampling`.
+Momenta are independent of positions and contribute exactly. Only fluctuations in potential energy,
+volume and virial are measured, at the set temperature. See the theory chapter `sampling`.
 """
 
 from collections.abc import Callable
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,6 +63,10 @@ class Matter(NamedTuple):
         return self.thermal_energy / BOLTZMANN
 
 
+#: One value, or an array of them.
+Numbers = float | np.ndarray
+
+
 class Fluctuations(NamedTuple):
     """Covariances of an energy x, in kT, with y.
 
@@ -71,13 +74,13 @@ class Fluctuations(NamedTuple):
     pressure: the potential energy with p V, and the volume, Å³.
     """
 
-    y: Any  # mean
-    xx: Any
-    xy: Any
-    yy: Any
+    y: Numbers  # mean
+    xx: Numbers
+    xy: Numbers
+    yy: Numbers
 
 
-def at_constant_volume(matter: Matter, of: Fluctuations) -> dict[str, Any]:
+def at_constant_volume(matter: Matter, of: Fluctuations) -> dict[str, Numbers]:
     """Responses in the canonical ensemble (Allen & Tildesley 2017, section 2.5)."""
     return {
         "c_v": (matter.momenta + BOLTZMANN * of.xx) / matter.count,
@@ -85,14 +88,14 @@ def at_constant_volume(matter: Matter, of: Fluctuations) -> dict[str, Any]:
     }
 
 
-def at_constant_energy(matter: Matter, of: Fluctuations) -> dict[str, Any]:
+def at_constant_energy(matter: Matter, of: Fluctuations) -> dict[str, Numbers]:
     """The same from the fluctuations at constant energy, which are smaller by one factor (Lebowitz,
     Percus & Verlet 1967)."""
     factor = 1 / (1 - BOLTZMANN * of.xx / matter.counted)
     return at_constant_volume(matter, of._replace(xx=factor * of.xx, xy=factor * of.xy))
 
 
-def at_constant_pressure(matter: Matter, of: Fluctuations) -> dict[str, Any]:
+def at_constant_pressure(matter: Matter, of: Fluctuations) -> dict[str, Numbers]:
     """Responses at constant temperature and pressure (Lagache et al. 2001)."""
     at_same_volume = of.xx - of.xy**2 / of.yy
     return {
@@ -105,7 +108,7 @@ def at_constant_pressure(matter: Matter, of: Fluctuations) -> dict[str, Any]:
 
 
 #: Ensemble -> its formulas. The piston of nph keeps the enthalpy, and is not among them.
-RESPONSES: dict[str, Callable[[Matter, Fluctuations], dict[str, Any]]] = {
+RESPONSES: dict[str, Callable[[Matter, Fluctuations], dict[str, Numbers]]] = {
     "nvt": at_constant_volume,
     "nve": at_constant_energy,
     "npt": at_constant_pressure,
@@ -142,7 +145,7 @@ class Samples:
         if _why_no_pressure(runs):
             self.names.remove("gamma_V")
 
-    def responses(self, moments: np.ndarray, fraction: Any = 1.0) -> np.ndarray:
+    def responses(self, moments: np.ndarray, fraction: Numbers = 1.0) -> np.ndarray:
         """The responses (r, ...) in their units.
 
         moments : means (5, ...) over a fraction of the samples
@@ -226,7 +229,8 @@ def _check_conditions(runs: Runs) -> None:
 
 
 def _why_no_pressure(runs: Runs) -> str:
-    """Why the run has no pressure that follows from its energy. Empty if it has one."""
+    """Why the run has no pressure that follows from its energy, or an empty text if it has such a
+    pressure."""
     if not runs.has_box:
         return "the run has no periodic box"
     names = ", ".join(runs.system.position_dependent)

@@ -99,7 +99,7 @@ def msd(runs: Runs) -> AnalysisResult:
 
 @built_in("diffusion coefficient, with the correction for the size of the box", position=60)
 def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResult:
-    """D of each species (1e-9 m²/s) from the slope of its mean squared displacement, and D of an
+    """D for each species (1e-9 m²/s) from the slope of its mean squared displacement, and D in an
     infinite box.
 
     Parameters
@@ -217,8 +217,8 @@ COMPONENTS = 5
 
 @built_in("viscosity from the pressure tensor, by Green and Kubo", position=100)
 def viscosity(runs: Runs) -> AnalysisResult:
-    """Shear viscosity (mPa s): V/kT times the integral of the correlation of five independent
-    components of the pressure tensor (output.pressure_tensor_interval_ps).
+    """Shear viscosity (mPa s): V/kT times the time integral over the autocorrelation of five
+    independent pressure components (output.pressure_tensor_interval_ps).
 
     The integral is half the spectral density at frequency 0, from a fit of relaxations to the
     periodogram (`rigidmd.analysis.relaxation`). It has no time at which it would be cut off. The

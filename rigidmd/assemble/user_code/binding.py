@@ -51,7 +51,7 @@ RESERVED = {
 }
 
 
-def custom_forces(scene: MolecularScene) -> list[Any]:
+def custom_forces(scene: MolecularScene) -> list[object]:
     """The objects of [[forces.custom]] and [[forces.bodies]]. Raises SceneError with all errors."""
     forces, faults = [], []
     for where, entry in scene.forces.added.items():
@@ -180,7 +180,7 @@ def with_user_code(system: System) -> System:
     )
 
 
-def is_thermostat(thermostat: Any) -> bool:
+def is_thermostat(thermostat: object) -> bool:
     """Whether an object is a compiled thermostat of the user, or makes one for each stage."""
     return type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")
 

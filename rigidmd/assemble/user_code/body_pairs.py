@@ -4,15 +4,18 @@ are cut off."""
 from collections.abc import Callable, Mapping
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from rigidmd.assemble.user_code.cutoffs import PairPotentialError, check_cutoff
 from rigidmd.assemble.user_code.force import BoundTerm
 from rigidmd.core.plain_text import did_you_mean
+from rigidmd.engines.body_pairs import reference_of
 from rigidmd.engines.system import System
+from rigidmd.errors import SceneError
 from rigidmd.forces.poses.potential import BodyPairPotential, Parameters, Vector
+from rigidmd.scene import MolecularScene
 from rigidmd.scene.forces import BodyForce
 from rigidmd.scene.validation import not_none
 
@@ -26,7 +29,7 @@ SWITCH_START = 0.9
 
 
 def body_pair_potential(
-    function: Callable[..., Any] | str | Path,
+    function: Callable[..., object] | str | Path,
     parameters: Mapping[str, Parameters] | None = None,
     *,
     species: tuple[str, ...] = (),
@@ -122,15 +125,20 @@ def body_pair_potential(
     )
 
 
-def potential_of_scene(entry: BodyForce, path: Callable[[str], Path]) -> BodyPairPotential:
+def potential_of_scene(
+    entry: BodyForce, path: Callable[[str], Path] | None = None
+) -> BodyPairPotential:
     """The potential of one of [[forces.bodies]] without a module. Raises ValueError.
 
-    path : of the file of a table
+    path : of the file of a table; None for a stored run, of which no energy is computed
     """
     from rigidmd.forces.poses.shipped import function_of_text, shipped_function
 
+    pairs = {pair.species: pair.parameters for pair in entry.pairs}
     if entry.potential is not None:
-        function = shipped_function(entry.potential, entry.options, entry.parameters)
+        function = shipped_function(entry.potential, entry.options, entry.parameters, pairs)
+    elif path is None:
+        function = _not_computed
     elif entry.table is not None:
         function = path(entry.table)
     else:
@@ -139,7 +147,7 @@ def potential_of_scene(entry: BodyForce, path: Callable[[str], Path]) -> BodyPai
         function,
         entry.parameters,
         species=entry.species,
-        pairs={pair.species: pair.parameters for pair in entry.pairs},
+        pairs=pairs,
         axis=entry.axis,
         references=entry.references,
         truncation=entry.truncation,
@@ -147,6 +155,25 @@ def potential_of_scene(entry: BodyForce, path: Callable[[str], Path]) -> BodyPai
         switch_start_A=entry.switch_start_A,
         name=entry.label,
     )
+
+
+def _not_computed(r: object, a: object, b: object) -> object:
+    """The energy of a text or a table in a stored run."""
+    raise NotImplementedError
+
+
+def potentials_of_stored_run(scene: MolecularScene) -> dict[str, BodyPairPotential]:
+    """The potentials of [[forces.bodies]] with bodies, axes and shapes. Texts and tables have no
+    energies, and modules are left out. Raises SceneError."""
+    potentials = {}
+    for where, entry in scene.forces.added.items():
+        if not isinstance(entry, BodyForce) or entry.module is not None:
+            continue
+        try:
+            potentials[where] = potential_of_scene(entry)
+        except ValueError as error:
+            raise SceneError(scene.source, [f"{where}: {error}"]) from None
+    return potentials
 
 
 def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
@@ -161,8 +188,7 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
 
     species = [m.name for m in system.species]
     faults = _unknown_species(potential, list(dict.fromkeys(species)))
-    acts_on = potential.species or tuple(potential.parameters) or tuple(dict.fromkeys(species))
-    kinds = [name for name in dict.fromkeys(species) if name in acts_on]
+    kinds = [name for name in dict.fromkeys(species) if potential.acts_on(name)]
     if not len(system.state.rotation):
         faults.append("no body of the scene rotates: rigidmd.pair_potential is for points")
     if faults:
@@ -183,11 +209,7 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
     body = np.arange(len(kind))
     frozen = (system.model.inverse_mass == 0)[system.model.species]
     models = {m.name: m for m in system.species}
-    references = [
-        (np.array(potential.references.get(name, models[name].centre)) - models[name].centre)
-        @ models[name].axes
-        for name in kinds
-    ]
+    references = [reference_of(potential, models[name]) for name in kinds]
     term = BodyPairs(
         formula=formula.kind(),
         kind=kind,

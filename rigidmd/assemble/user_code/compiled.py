@@ -25,8 +25,8 @@ LEDGER_ERROR = 1e-9
 
 
 def check_compiled_code(system: System, state: State) -> list[str]:
-    """Call each compiled force and thermostat of the user once, with checks of indices, on copies
-    of the state. Returns notes. Raises SceneError with all errors."""
+    """Call each user-defined compiled force and thermostat once, with index checks, on copies of
+    the state. Returns notes. Raises SceneError with all errors."""
     faults, notes = [], []
     for name, term in system.terms.items():
         if function := FORCES.get(type(term)):

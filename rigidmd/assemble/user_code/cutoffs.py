@@ -49,8 +49,8 @@ class ValuesAtCutoff(NamedTuple):
         return cls(cutoff, energy, force, max([x for x in beyond if isfinite(x)], default=0.0))
 
     def lost(self, truncation: TruncationName) -> float:
-        """What the truncation changes: the jump of the energy, its change beyond the cutoff, and
-        the work of the force over a tenth of the cutoff, whichever is largest."""
+        """What the truncation changes: the energy jump, the energy change beyond the cutoff, and
+        the work over a tenth of the cutoff, whichever is largest."""
         jump = abs(self.energy) if truncation == "plain" else 0.0
         return max(jump, self.change, 0.1 * self.cutoff * abs(self.force))
 

@@ -184,7 +184,7 @@ class BoundForce:
             torque = np.einsum("nji,nj->ni", state.rotation, lab)
         return energy, total, torque, virial
 
-    def _parts(self, returned: Any, largest: int) -> list:
+    def _parts(self, returned: object, largest: int) -> list:
         """Energy and three further values, None for omitted ones."""
         if not isinstance(returned, tuple) or not 2 <= len(returned) <= largest:
             if isinstance(returned, tuple):
@@ -204,7 +204,7 @@ class BoundForce:
     def _fill(
         self,
         target: np.ndarray,
-        returned: Any,
+        returned: object,
         what: str,
         molecule: np.ndarray | None = None,
         unit: float = KJ_PER_MOL,
@@ -230,7 +230,7 @@ class BoundForce:
     def _error(self, what: str, kind: type[UserForceError] = UserForceError) -> UserForceError:
         return kind(f"the force {self.name} returned {what}")
 
-    def _called(self, what: str, *arguments: Any) -> Any:
+    def _called(self, what: str, *arguments: object) -> object:
         try:
             return getattr(self.force, what)(*arguments)
         except UserForceError:

@@ -68,11 +68,11 @@ class PairPotential:
 
 def pair_potential(
     energy: "str | Callable | None" = None,
-    parameters: Mapping[str, Any] | None = None,
+    parameters: Mapping[str, object] | None = None,
     *,
     table: "tuple[Sequence[float], ...] | str | Path | None" = None,
     sites: Sequence[str] = (),
-    pairs: Mapping[tuple[str, str], Any] | None = None,
+    pairs: Mapping[tuple[str, str], object] | None = None,
     mixing: Mapping[str, Rule] | None = None,
     truncation: TruncationName | None = None,
     cutoff_A: float | None = None,
@@ -175,8 +175,8 @@ def _check_names(name: Any, truncation: Any, mixing: Any, pairs: Any) -> None:
             raise ValueError(f"pairs: {key!r} is not a pair of names of sites")
 
 
-def _columns(table: Any) -> Columns:
-    """The table of a file, or of lists of numbers. Raises ValueError."""
+def _columns(table: object) -> Columns:
+    """The table from a file, or from lists of numbers. Raises ValueError."""
     if isinstance(table, str | Path):
         return read_columns(Path(table))
     if not (isinstance(table, tuple | list) and len(table) in (2, 3)):
@@ -187,7 +187,7 @@ def _columns(table: Any) -> Columns:
 
 
 def _constants_and_tables(
-    parameters: Any,
+    parameters: object,
 ) -> tuple[dict[str, float], dict[str, dict[str, float]] | None]:
     """Parameters of all sites, and parameters by site. None without either. Raises ValueError."""
     if parameters is None:
@@ -204,7 +204,7 @@ def _constants_and_tables(
     return _numbers("parameters", parameters), {}
 
 
-def _mapping(where: str, table: Any) -> Mapping[str, Any]:
+def _mapping(where: str, table: Any) -> Mapping[str, object]:
     """A dictionary, or the fields of a NamedTuple. Raises ValueError."""
     table = table._asdict() if hasattr(table, "_asdict") else table
     if not isinstance(table, Mapping):

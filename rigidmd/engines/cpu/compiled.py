@@ -82,7 +82,7 @@ class CompiledEngine(Engine):
 
     def __init__(
         self,
-        model: Any,
+        model: NamedTuple,
         terms: dict[str, NamedTuple],
         setup: Setup,
         python_forces: dict[str, Callable] | None,
@@ -109,7 +109,7 @@ class CompiledEngine(Engine):
         """Name of a term -> its present workspace. Empty before the first use."""
         return dict(zip(self.names, self._workspaces or (), strict=False))
 
-    def change(self, model: Any, terms: dict[str, NamedTuple]) -> None:
+    def change(self, model: NamedTuple, terms: dict[str, NamedTuple]) -> None:
         self.model, self.terms = model, terms
         self._workspaces = None
         self.forget()

@@ -119,7 +119,7 @@ def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Pr
 
 
 def describe_profile(profile: Profile) -> str:
-    """A table of the rows of a profile, with their fractions of a step."""
+    """A table with the rows of a profile and their fractions of a step."""
     width = max(len(text) for text, _ in profile.rows)
     lines = [
         f"  {text:<{width}} {1e6 * spent:>9.1f} {spent / profile.step:>6.1%}"

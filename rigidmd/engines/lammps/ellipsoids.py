@@ -2,16 +2,16 @@
 without mass, which is fixed in it as its sites are."""
 
 from collections.abc import Iterator
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rigidmd.core.state import State
+from rigidmd.engines.body_pairs import bodies_of_potentials
 from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.rigid_bodies import Points
 from rigidmd.engines.system import System
-from rigidmd.forces.poses.pairs import BodyPairs
 from rigidmd.forces.poses.potential import BodyPairPotential
 
 
@@ -48,26 +48,20 @@ def limits(potential: BodyPairPotential, system: System) -> Iterator[str]:
 def ellipsoids(view: ForceFieldView) -> list[Ellipsoids]:
     """All ellipsoids of a system."""
     kinds = []
-    for name, potential in view.system.body_pairs.items():
-        term = cast(BodyPairs, view.system.terms[name])
-        for k in range(len(term.reference)):
-            molecule = np.flatnonzero(term.kind == k)
-            if not len(molecule):
-                continue
-            species = view.system.species[view.system.model.species[molecule[0]]].name
-            values = potential.parameters[species]
-            along = np.arange(3) == "xyz".index(str(potential.axis))
-            kinds.append(
-                Ellipsoids(
-                    name,
-                    species,
-                    molecule,
-                    term.reference[k],
-                    term.frame[k],
-                    np.where(along, values["length_A"], values["width_A"]),
-                    np.where(along, values["end"], values["side"]),
-                )
+    for bodies in bodies_of_potentials(view.system):
+        values = bodies.potential.parameters[bodies.species.name]
+        along = np.arange(3) == "xyz".index(str(bodies.potential.axis))
+        kinds.append(
+            Ellipsoids(
+                bodies.name,
+                bodies.species.name,
+                bodies.molecule,
+                bodies.reference,
+                bodies.frame,
+                np.where(along, values["length_A"], values["width_A"]),
+                np.where(along, values["end"], values["side"]),
             )
+        )
     return kinds
 
 

@@ -6,7 +6,7 @@ from itertools import combinations_with_replacement
 from math import inf, pi, sqrt
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, SupportsFloat, cast
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from rigidmd.forces.poses.pairs import BodyPairs
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import TRUNCATIONS, Unmodified
 from rigidmd.scene.stage import Stage
+from rigidmd.scene.validation import not_none
 from rigidmd.units import BAR, COULOMB, ENERGY_UNITS, KJ_PER_MOL
 
 KCAL = ENERGY_UNITS["kcal/mol"]
@@ -206,7 +207,7 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _num(number: Any) -> str:
+def _num(number: SupportsFloat) -> str:
     """The shortest decimal form of a number that is read back exactly."""
     return repr(float(number))
 
@@ -244,7 +245,7 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
         accuracy = float(system.force_error or 0.0) / COULOMB
         lines += [
             f"kspace_style {style} {accuracy:.3g}",
-            f"kspace_modify gewald {_num(forces.ewald_alpha_per_A)}",
+            f"kspace_modify gewald {_num(not_none(forces.ewald_alpha_per_A))}",
         ]
     lines += [
         f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}",

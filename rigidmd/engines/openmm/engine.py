@@ -5,7 +5,7 @@ The other evaluates it term by term, so that observations leave no trace in the 
 no virial: the molecular virial follows from energies at scaled centres of mass.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.programs.openmm import FIXED_PRECISIONS, PLATFORMS, precision_of
 from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL
 
+if TYPE_CHECKING:
+    import openmm
+
 ANGSTROM = 1 / NM  # Å per nm
 #: kJ/mol/nm in u Å/ps².
 FORCE = KJ_PER_MOL * NM
@@ -46,7 +49,7 @@ STRAIN = {True: 2e-5, False: 5e-4}
 ERRORS = {"double": (0.0, 1e-4), "mixed": (2e-5, 1e-3), "single": (2e-5, 1e-3)}
 
 
-def _platforms() -> dict[str, Any]:
+def _platforms() -> "dict[str, openmm.Platform]":
     """Name -> platform of OpenMM on this machine."""
     kinds = library().Platform
     return {p.getName(): p for p in map(kinds.getPlatform, range(kinds.getNumPlatforms()))}

@@ -8,7 +8,8 @@ kJ/mol.
 
 import re
 from math import inf, pi, sqrt
-from typing import TYPE_CHECKING, Any, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import erfc
@@ -32,6 +33,9 @@ from rigidmd.units import COULOMB, KJ_PER_MOL
 
 if TYPE_CHECKING:
     import openmm
+
+    Pairs = openmm.NonbondedForce | openmm.CustomNonbondedForce
+    PairsT = TypeVar("PairsT", openmm.NonbondedForce, openmm.CustomNonbondedForce)
 
 #: nm per Å.
 NM = 0.1
@@ -162,7 +166,7 @@ class Group:
     LENNARD_JONES, COULOMB_PAIRS, RECIPROCAL, STEP_LENNARD_JONES, STEP_COULOMB, TAIL = range(6)
 
 
-def library() -> Any:
+def library() -> ModuleType:
     """The module openmm. Raises EngineError if it is not installed."""
     try:
         import openmm
@@ -275,7 +279,9 @@ def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openm
     return made
 
 
-def _openmm_virtual_site(points: list[int], weight: list[float], cross: float) -> Any:
+def _openmm_virtual_site(
+    points: list[int], weight: list[float], cross: float
+) -> "openmm.VirtualSite":
     """The virtual site at the sum of weight times point."""
     mm = library()
     if len(points) == 2:
@@ -349,7 +355,7 @@ def _nonbonded(
     cutoff: float,
     charge: np.ndarray,
     lennard_jones: tuple[np.ndarray, np.ndarray] | None,
-) -> Any:
+) -> "openmm.NonbondedForce":
     """A NonbondedForce between charges (s,) of sites, and with sigma and epsilon of kinds."""
     view, rows = particles.view, np.zeros((len(particles.mass), 3))
     force = _within(library().NonbondedForce(), view, cutoff)
@@ -368,7 +374,7 @@ def _nonbonded(
     return force
 
 
-def _within(force: Any, view: ForceFieldView, cutoff: float) -> Any:
+def _within(force: "PairsT", view: ForceFieldView, cutoff: float) -> "PairsT":
     """The same force, within a cutoff (Å) unless it is infinite."""
     if cutoff < inf:
         force.setNonbondedMethod(
@@ -378,7 +384,9 @@ def _within(force: Any, view: ForceFieldView, cutoff: float) -> Any:
     return force
 
 
-def _custom(particles: Layout, cutoff: float, formula: str, name: str, of_sites: np.ndarray) -> Any:
+def _custom(
+    particles: Layout, cutoff: float, formula: str, name: str, of_sites: np.ndarray
+) -> "openmm.CustomNonbondedForce":
     """A CustomNonbondedForce with a formula of r in Å, and named values (s,) of sites."""
     text = re.sub(r"\br\b", "R", formula)
     force = library().CustomNonbondedForce(f"{text}; R={1 / NM!r}*r" if text != formula else text)
@@ -390,7 +398,7 @@ def _custom(particles: Layout, cutoff: float, formula: str, name: str, of_sites:
     return _within(force, particles.view, cutoff)
 
 
-def _custom_lennard_jones(particles: Layout, step: bool = False) -> Any:
+def _custom_lennard_jones(particles: Layout, step: bool = False) -> "Pairs":
     """The Lennard-Jones potential as a formula, or its step at the cutoff. Linear in c12 and c6,
     from tables of kinds. Kind 0 is for mass points without a site."""
     view = particles.view
@@ -416,7 +424,7 @@ def _custom_lennard_jones(particles: Layout, step: bool = False) -> Any:
     return force
 
 
-def _custom_coulomb(particles: Layout, formula: str) -> Any:
+def _custom_coulomb(particles: Layout, formula: str) -> "Pairs":
     """q q times a formula of unit strength. Charges are in units in which q q/r is in kJ/mol."""
     main, *definitions = formula.split(";", 1)
     charge = particles.view.charge * np.sqrt(COULOMB / KJ_PER_MOL)
@@ -435,7 +443,7 @@ NEVER = 2**31 - 1
 TOLERANCES = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 
 
-def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> Any:
+def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> "openmm.Integrator":
     """The integrator of stage k. A minimisation gets velocity Verlet."""
     mm, stage = library(), view.system.scene.stages[k]
     dt = stage.step
@@ -455,7 +463,7 @@ def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> An
     return made
 
 
-def _velocity_verlet(dt: float) -> Any:
+def _velocity_verlet(dt: float) -> "openmm.CustomIntegrator":
     """Velocity Verlet with constrained distances, to be stepped by `step`.
 
     Leapfrog steps with half a kick at either end give the same positions and velocities (RATTLE;
@@ -501,8 +509,8 @@ def integration_groups(stage: Stage) -> set[int]:
 
 
 def extra_forces(view: ForceFieldView, k: int) -> list:
-    """The forces of stage k in addition to its integrator: a barostat, and a remover of momentum
-    that makes OpenMM subtract the degrees of freedom of the total momentum."""
+    """The forces of stage k in addition to its integrator: a barostat, and a momentum remover, so
+    that OpenMM subtracts the degrees of freedom of the total momentum."""
     mm, stage, system = library(), view.system.scene.stages[k], view.system
     forces = []
     if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int(

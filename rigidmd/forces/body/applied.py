@@ -21,8 +21,8 @@ class SteadyForce(NamedTuple):
 
 
 class TimeDependentForce(NamedTuple):
-    """A force at a point of the body and a torque, functions of time, along the axes of the lab or
-    of the body."""
+    """A force at a point of the body and a torque, as functions of time, along lab axes or body
+    axes."""
 
     force: TimeFunction
     torque: TimeFunction

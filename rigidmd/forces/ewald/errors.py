@@ -50,7 +50,7 @@ class Charges(NamedTuple):
         return square
 
     def transform(self, alpha: float, square: np.ndarray) -> np.ndarray:
-        """Fourier transform of the smooth part of the potential of a unit charge at k² > 0."""
+        """Fourier transform of a unit charge's smooth potential at k² > 0."""
         return 4 * pi / square * np.exp(-square / (4 * alpha**2))
 
     def force_spectrum(self, alpha: float, k: np.ndarray) -> np.ndarray:

@@ -4,10 +4,10 @@ transforms.
     charges -> grid -> Fourier transform, times the influence function -> potential on the grid ->
     forces
 
-See the theory chapter `interactions`. The work is divided into blocks of planes, of rows of Fourier
-components, and of sites. Sites are sorted by plane, and each plane is written by one block. The
-number of blocks does not depend on the number of threads, so the result is the same bit for bit.
-This module needs rocket-fft. Only scenes with PME import it.
+See the theory chapter `interactions`. The work is divided into blocks: planes, rows of Fourier
+components, and sites. Sites are sorted by plane, and each plane is written by one block. The number
+of blocks does not depend on the number of threads, so the result is the same bit for bit. This
+module needs rocket-fft. Only scenes with PME import it.
 """
 
 from fractions import Fraction
@@ -68,8 +68,8 @@ def _b_spline_coefficient(order: int, j: int, x: Fraction) -> Fraction:
 
 
 class Spline(NamedTuple):
-    """Splines of one order, with weights as vectors of four numbers up to order 4, of eight up to
-    order 8."""
+    """Splines of one order, with weights as vectors: four numbers up to order 4, eight up to order
+    8."""
 
     nodes: tuple[int, ...]  # 0 ... order - 1; its length is a constant at compile time
     value: np.ndarray  # (width order,) coefficients of the weights, see `weights`

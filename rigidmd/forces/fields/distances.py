@@ -1,5 +1,5 @@
-"""A harmonic restraint of the distance between two molecules, or between the centres of mass of two
-groups of them."""
+"""A harmonic restraint on the distance between two molecules, or between the centres of mass of two
+groups."""
 
 from math import sqrt
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Harmonic restraints of the centres of mass of some molecules to reference positions in the
+"""Harmonic restraints that hold the centres of mass of some molecules at reference positions in the
 lab."""
 
 from typing import Any, NamedTuple

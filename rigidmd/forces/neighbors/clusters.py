@@ -136,9 +136,9 @@ def wrap_sites(arguments, block):
 
 @task(count_references=False)
 def bin_sites(arguments, block):
-    """Write the bins of the sites of a block of molecules, and heights within bins, into `slot` and
-    `moved`. Bins form columns along z, as wide as a cluster. They run up one column and down the
-    next, so that a cluster that starts in one column and ends in the next is compact too."""
+    """Write the bins for the sites of a block of molecules, and heights within bins, into `slot`
+    and `moved`. Bins form columns along z, as wide as a cluster. They run up one column and down
+    the next, so that a cluster that starts in one column and ends in the next is compact too."""
     pairs, sites, _ = load_arguments(arguments)
     clusters = pairs.clusters
     low, extent, (nx, ny, nz) = _bins(clusters)
@@ -322,7 +322,7 @@ def restore_half_squares(clusters):
 
 @task(count_references=False)
 def set_local(arguments, block):
-    """Set `local` of the sites of a block of molecules to the current positions. Padding stays at
+    """Set `local` for the sites in a block of molecules to the current positions. Padding stays at
     its reference."""
     pairs, sites, state = load_arguments(arguments)
     clusters, cell = pairs.clusters, pairs.cell

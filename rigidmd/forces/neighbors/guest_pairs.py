@@ -93,7 +93,7 @@ def _core_of(potential: NamedTuple, energy: float) -> float:
 
 @chosen_by_type(inline=True)
 def unit_energy(potential, r2):
-    """Energy of a pair with the numbers of the potential, or of two unit charges."""
+    """Energy of a pair with the numbers of the potential, or with two unit charges."""
     if is_a(potential, ReactionField):
         return lambda potential, r2: radial(potential, r2)[0]
     if is_a(potential, ScreenedCoulomb):
@@ -125,7 +125,7 @@ def _energies(potential, distance):
 
 @kernel(from_python=True)
 def add_guest_energies(potential, core, guest, host, guest_strength, host_strength, cell, energy):
-    """Add the energies of trial molecules with the nearest images of the sites of a system.
+    """Add the energies between trial molecules and the nearest images of a system's sites.
 
     guest (m, g, 3), host (h, 3) : sites, Å; strengths (g,) and (h,)
     cell (3, 3) : as in `State`; images within half its shortest diagonal element are the nearest

@@ -404,7 +404,7 @@ def update_origin_vectors(arguments, block):
 
 @kernel(inline=True)
 def _origin_vector(pairs, c, other, image, k):
-    """Component k of the vector from the image of another cluster's origin to the origin of cluster
-    c, Å."""
+    """Component k of the vector to the origin of cluster c from the image of another cluster's
+    origin, Å."""
     clusters = pairs.clusters
     return clusters.origin[4 * c + k] - pairs.shift[4 * image + k] - clusters.origin[4 * other + k]

@@ -130,7 +130,7 @@ class InSlots(NamedTuple):
 
 @kernel(inline=True)
 def index_of_x(slot, width):
-    """Index of the x of a slot in an array of x, y, z in slots. `width` is a power of two."""
+    """Index of a slot's x in an array of x, y, z in slots. `width` is a power of two."""
     return 3 * slot - 2 * (slot & (width - 1))
 
 

@@ -91,8 +91,7 @@ def fractions(space: Space, position: np.ndarray) -> np.ndarray:
 
 
 def longest_gaps(space: Space, position: np.ndarray) -> np.ndarray:
-    """The longest part (3,) of each edge of a periodic box without any of the positions (n, 3),
-    Å."""
+    """The longest part (3,) of each periodic box edge that has none of the positions (n, 3), Å."""
     fraction = np.sort(fractions(space, position) % 1.0, axis=0)
     return np.diff(fraction, axis=0, append=fraction[:1] + 1.0).max(axis=0) * space.edges
 

@@ -16,8 +16,8 @@ from rigidmd.compile.simd import lane_count, lanes_of, load, lowest_bit, mask_bi
 
 
 class BoxTree(NamedTuple):
-    """Boxes of clusters (level 0), of groups of such boxes, called families (level 1), and so on up
-    to one family."""
+    """Boxes around clusters (level 0), around groups of such boxes, called families (level 1), and
+    so on up to one family."""
 
     low: np.ndarray  # (3, nodes) the levels one after the other, each padded with empty boxes
     high: np.ndarray  # (3, nodes)

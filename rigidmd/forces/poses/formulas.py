@@ -1,5 +1,5 @@
-"""Formulas of pairs of bodies, from functions of NumPy arrays whose slopes are derived, or which
-give force and torques themselves."""
+"""Formulas for pairs of bodies, from NumPy functions whose slopes are derived, or which give force
+and torques themselves."""
 
 import inspect
 import re
@@ -10,8 +10,9 @@ import numpy as np
 
 from rigidmd.core.user_modules import module_of
 from rigidmd.errors import describe_error
+from rigidmd.forces.poses.slopes import Hoisted, code_of, slopes_of
 from rigidmd.forces.poses.table import BodyTable, TableFormula
-from rigidmd.forces.poses.trace import Graph, Hoisted, Traced, TraceError, code_of, slopes_of
+from rigidmd.forces.poses.trace import Graph, Traced, TraceError
 from rigidmd.units import KJ_PER_MOL
 
 AXES = "xyz"

@@ -19,9 +19,13 @@ import numpy as np
 PARAMETERS = ("length_A", "width_A", "epsilon_kJ_mol", "side", "end")
 
 
+#: The shifted distance, in widths, below which the energy is constant: it would diverge, and nearer
+#: ellipsoids would attract each other.
+SHORTEST = 0.1
+
+
 class GayBerne(NamedTuple):
-    """The energy (kJ/mol) as a function of r, of the axes of both bodies and of their
-    parameters."""
+    """The energy (kJ/mol) as a function of r, the axes of both bodies and their parameters."""
 
     upsilon: float = 1.0  # exponents of the strength
     mu: float = 2.0
@@ -41,13 +45,14 @@ class GayBerne(NamedTuple):
         side, end = ([x**power for x in both] for both in ((p.side, q.side), (p.end, q.end)))
         depth, _ = _inverse(side[0], end[0], side[1], end[1], along)
         width = (p.width_A + q.width_A) / 2
-        ratio = width / (distance - contact + self.gamma * width)
+        shifted = distance - contact + self.gamma * width
+        ratio = width / np.maximum(shifted, SHORTEST * width)
         epsilon = np.sqrt(p.epsilon_kJ_mol * q.epsilon_kJ_mol)
         return 4 * epsilon * strength * (2 * depth) ** self.mu * (ratio**12 - ratio**6)
 
 
 def _inverse(across, along_axis, other_across, other_along, cosines):
-    """r G⁻¹ r of a unit vector r, and det G, of G = sum of two matrices with these values across
+    """r G⁻¹ r for a unit vector r, and det G, with G = sum of two matrices with these values across
     and along the axes u and v. cosines : u r, v r, u v"""
     to_u, to_v, between = cosines
     whole = across + other_across

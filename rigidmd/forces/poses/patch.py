@@ -5,22 +5,20 @@ and d of the angles between the axes and the vector from the first to the second
 attract each other if they face each other, and the spheres repel otherwise.
 """
 
-from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 PARAMETERS = ("sigma_A", "epsilon_kJ_mol", "width")
 
 
-def patch() -> Callable:
+class Patch(NamedTuple):
     """The energy (kJ/mol) of two spheres with patches along an axis."""
 
-    def energy(r, u, v, p, q):
+    def __call__(self, r, u, v, p, q):
         square = r @ r
         distance = np.sqrt(square)
         sigma, width = (p.sigma_A + q.sigma_A) / 2, (p.width + q.width) / 2
         facing = np.exp(((u @ r - v @ r) / distance - 2) / width)
         six = (sigma * sigma / square) ** 3
         return 4 * np.sqrt(p.epsilon_kJ_mol * q.epsilon_kJ_mol) * (six * six - facing * six)
-
-    return energy

@@ -24,6 +24,11 @@ class BodyPairPotential:
     switch_start_A: float | None
     name: str
 
+    def acts_on(self, species: str) -> bool:
+        """Whether a species takes part."""
+        named = self.species or self.parameters
+        return not named or species in named
+
     def parameters_of(self, one: str, other: str) -> tuple[Parameters, Parameters]:
         """The parameters of two species in a pair of them."""
         pairs = self.pairs

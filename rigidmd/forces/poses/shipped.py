@@ -1,4 +1,4 @@
-"""The shipped potentials of pairs of bodies, and those of a text, for scenes."""
+"""The shipped pair potentials of bodies, and pair potentials from an expression, for scenes."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -16,20 +16,31 @@ class Shipped(NamedTuple):
     make: Callable[..., Callable]  # the function of two poses, from its options
     parameters: tuple[str, ...]  # of a species
     options: tuple[str, ...] = ()
+    signed: tuple[str, ...] = ()  # which of both may be negative or 0
 
 
 SHIPPED = {
-    "gay_berne": Shipped(GayBerne, gay_berne.PARAMETERS, GayBerne._fields),
-    "dipole": Shipped(multipoles.dipole, multipoles.DIPOLE, ("reaction_field_A",)),
-    "quadrupole": Shipped(multipoles.quadrupole, multipoles.QUADRUPOLE),
-    "patch": Shipped(patch.patch, patch.PARAMETERS),
+    "gay_berne": Shipped(GayBerne, gay_berne.PARAMETERS, GayBerne._fields, ("upsilon",)),
+    "dipole": Shipped(
+        multipoles.dipole, multipoles.DIPOLE, ("reaction_field_A",), multipoles.DIPOLE
+    ),
+    "quadrupole": Shipped(
+        multipoles.quadrupole, multipoles.QUADRUPOLE, signed=multipoles.QUADRUPOLE
+    ),
+    "patch": Shipped(patch.Patch, patch.PARAMETERS),
 }
 
 
 def shipped_function(
-    name: str, options: Mapping[str, float], parameters: Mapping[str, Mapping[str, float]]
+    name: str,
+    options: Mapping[str, float],
+    parameters: Mapping[str, Mapping[str, float]],
+    pairs: Mapping[tuple[str, str], Mapping[str, float]],
 ) -> Callable:
-    """The function of a shipped potential. Raises ValueError for wrong options and parameters."""
+    """The function of a shipped potential. Raises ValueError for wrong options and parameters.
+
+    pairs : parameters of pairs of species
+    """
     kind = SHIPPED[name]
     for key in options:
         if key not in kind.options:
@@ -40,10 +51,16 @@ def shipped_function(
         raise ValueError(
             f"parameters is missing: {name} needs {', '.join(kind.parameters)} of each species"
         )
-    for species, values in parameters.items():
+    of_pairs = {", ".join(pair): values for pair, values in pairs.items()}
+    for species, values in (*parameters.items(), *of_pairs.items()):
         if wrong := [key for key in values if key not in kind.parameters]:
             hint = did_you_mean(wrong[0], kind.parameters) or ""
             raise ValueError(f"parameters of {species}: {name} has no {wrong[0]}{hint}")
+    for what, values in {"options": options, **parameters, **of_pairs}.items():
+        for key, value in values.items():
+            if key not in kind.signed and not value > 0 and (key != "epsilon_kJ_mol" or value):
+                raise ValueError(f"{key} of {what} is {value:g}, must be above 0")
+    for species, values in parameters.items():
         if missing := [key for key in kind.parameters if key not in values]:
             raise ValueError(f"parameters of {species}: {', '.join(missing)} is missing")
     return kind.make(**options)
@@ -88,7 +105,7 @@ MEANS: dict[str, Callable] = {
 
 
 def _value(expression: Any, values: Mapping[str, Any]) -> Any:
-    """The value of a SymPy expression of arithmetic and functions of NumPy."""
+    """The value of a SymPy expression with arithmetic and NumPy functions."""
     if expression.is_Symbol:
         return values[expression.name]
     if expression.is_Number or expression.is_NumberSymbol:

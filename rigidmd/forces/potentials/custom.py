@@ -161,7 +161,7 @@ def tail_of_pair(
     truncation: Truncation,
     inner: InnerPairs | None = None,
 ) -> Tail:
-    """The tail correction of one pair of sites, with the constant of the `inner` pairs, which are
+    """The tail correction for one pair of sites, with the constant of the `inner` pairs, which are
     all of these kinds. See `lennard_jones.tail`. Raises ArithmeticError if the energy falls too
     slowly."""
     from scipy.integrate import quad  # slow to import

@@ -216,15 +216,17 @@ def interactions(parts: SystemParts) -> Interactions:
         for m, c in zip(species, indices, strict=True)
     ]
     positions = [m.positions_body[i] for m, i in zip(species, indices, strict=True)]
-    inner = inner_pairs(of_species, positions, parts.counts)
     notes = _short_cutoff_notes(potential, gather_per_molecule(names, index))
+    inner = None
+    if forces.tail_correction:
+        inner = inner_pairs(of_species, positions, parts.counts)
     whole = np.array([not entry[0] for entry in kinds])
     if not whole.all():
         return _with_soft_core(parts, potential, indices, soft, whole, inner)._replace(notes=notes)
     return Interactions(
         {"lennard_jones": parts.pair_forces(potential, parts.sites(indices))},
         {},
-        tail=tail(potential, inner) if forces.tail_correction else None,
+        tail=None if inner is None else tail(potential, inner),
         notes=notes,
     )
 
@@ -242,13 +244,13 @@ def _with_soft_core(
     indices: list[np.ndarray],
     soft: list[bool],
     whole: np.ndarray,
-    inner: InnerPairs,
+    inner: InnerPairs | None,
 ) -> Interactions:
     """Lennard-Jones forces between the sites without a soft core, and those of all others.
 
     potential, indices : of all sites, by species
     soft : whether each species has a soft core; whole : whether each kind has none, these first
-    inner : the pairs inside molecules
+    inner : the pairs inside molecules, None without tail corrections
     """
     forces, sites = parts.scene.forces, parts.sites(indices)
     is_whole = ~np.array(soft)[parts.model.species]
@@ -264,7 +266,7 @@ def _with_soft_core(
     )
     # one group of all molecules without a soft core, which have no pairs here
     terms = {"soft_core": PairForces(softened, sites, exclusion_groups(sites, is_whole))}
-    tails = [tail_of_soft_core(softened, inner)]
+    tails = [] if inner is None else [tail_of_soft_core(softened, inner)]
     if kinds:
         rest = potential._replace(
             kind=potential.kind[whole[potential.kind]],
@@ -273,10 +275,10 @@ def _with_soft_core(
         )
         of_rest = [c[: 0 if one else None] for c, one in zip(indices, soft, strict=True)]
         terms["lennard_jones"] = parts.pair_forces(rest, parts.sites(of_rest))
-        inside = InnerPairs(*(column[whole[inner.one]] for column in inner))
-        tails.append(tail(rest, inside))
-    found = [one for one in tails if one is not None and forces.tail_correction]
-    return Interactions(terms, {}, tail=sum_of_tails(found))
+        if inner is not None:
+            inside = InnerPairs(*(column[whole[inner.one]] for column in inner))
+            tails.append(tail(rest, inside))
+    return Interactions(terms, {}, tail=sum_of_tails([one for one in tails if one is not None]))
 
 
 def _sites_of_pairs(parts: SystemParts) -> list[np.ndarray]:

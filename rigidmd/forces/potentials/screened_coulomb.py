@@ -146,7 +146,7 @@ def force_table(alpha: float, cutoff: float) -> tuple[np.float32, np.ndarray, fl
 
 
 def _cut(series: np.ndarray, error: float, kind: np.dtype, terms: int) -> np.ndarray:
-    """Coefficients of powers of t for a Chebyshev series, truncated at an error to a number of
+    """Coefficients in powers of t for a Chebyshev series, truncated at an error to a number of
     terms, or STEP more."""
     left = np.cumsum(np.abs(series[::-1]))[::-1]
     needed = int(np.sum(left > max(error, FIT_ERROR[kind] * left[0])))

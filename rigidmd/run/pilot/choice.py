@@ -26,8 +26,8 @@ from rigidmd.scene.validation import not_none
 CANDIDATES = sorted(
     (name for name, scheme in SCHEMES.items() if scheme.auto), key=lambda name: SCHEMES[name].auto
 )
-#: Most trials of each, how much its longest step is shortened at most, and the least gain for
-#: another trial.
+#: Maximum number of trials of each candidate, maximum factor by which its longest step is
+#: shortened, and minimum gain for another trial.
 MAX_TRIALS, MAX_SHORTENING, MIN_GAIN = 16, 4096, 1.1
 #: Maximum number of halvings of the reference's step.
 HALVINGS = 12

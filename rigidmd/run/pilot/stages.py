@@ -36,8 +36,8 @@ def choose_for_stage(system: System, state: State, k: int) -> tuple[Stage, str]:
 
 
 def natural_time(system: System, state: State) -> float | None:
-    """Time (ps) of one radian of the faster of vibration and libration. None at rest. Its inverse
-    squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion. Likewise for
+    """Time (ps) for one radian of the faster motion, vibration or libration. None at rest. Its
+    inverse squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion. Likewise for
     torques."""
     sums = sums_of_state(system.model, state, system.engine().evaluate(state)[0])
     pairs = (sums.force, sums.translation), (sums.torque, sums.rotation)

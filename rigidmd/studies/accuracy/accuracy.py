@@ -410,17 +410,17 @@ def accuracy_figure(measured: IntegratorAccuracy):
                 times, errors, xerr=[low, high], fmt="none", ecolor=style["color"], elinewidth=0.7
             )
         front = [t for t in measured.front(error) if getattr(t, error) > 0]
-        ring = {
-            "ms": 9,
-            "mfc": "none",
-            "mec": INK,
-            "mew": 0.8,
-            "label": "best, with its step",
-        }
-        axis.loglog(
-            [t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring
-        )
         points = [(t.time / s.span, getattr(t, error), t.timestep) for t in front]
+        axis.loglog(
+            [time for time, *_ in points],
+            [error for _, error, _ in points],
+            "o",
+            ms=9,
+            mfc="none",
+            mec=INK,
+            mew=0.8,
+            label="best, with its step",
+        )
         _label_steps(axis, points, s.time_unit)
         axis.set_title(title, loc="left", fontsize=9, color=INK)
         open_axis(axis, which="both")

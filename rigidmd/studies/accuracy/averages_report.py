@@ -7,8 +7,8 @@ from pathlib import Path
 
 from rigidmd.core.statistics import format_signed
 from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, panel_grid, write_figure
-from rigidmd.io.write import Column, Table, with_error, write_json
-from rigidmd.studies.accuracy.averages import BIAS_LIMIT, AveragedQuantity, Averages
+from rigidmd.io.write import Cell, Column, Table, with_error, write_json
+from rigidmd.studies.accuracy.averages import BIAS_LIMIT, AveragedQuantity, AverageRun, Averages
 from rigidmd.view.page import chips, code, items, plain, section, table, wide, write_page
 
 FILES = ("accuracy.csv", "accuracy.json", "averages.png", "averages.html")
@@ -16,7 +16,7 @@ FILES = ("accuracy.csv", "accuracy.json", "averages.png", "averages.html")
 
 def full_table(averages: Averages) -> Table:
     """Means and biases of all runs, with their errors."""
-    columns = [
+    columns: list[Column[AverageRun]] = [
         Column("integrator", lambda run: run.integrator),
         Column("thermostat", lambda run: run.thermostat),
         Column("step (fs)", lambda run: run.timestep),
@@ -24,12 +24,15 @@ def full_table(averages: Averages) -> Table:
         Column("seconds per ns", lambda run: run.seconds_per_ns),
     ]
     for q in averages.quantities:
-        columns += with_error(
-            f"{q.name} ({q.unit})", lambda run, q=q: (point := averages.point(run, q)) and point[2:]
-        )
-        columns += with_error(
-            f"bias of {q.name} ({q.unit_of_bias})", lambda run, q=q: averages.bias(run, q)
-        )
+
+        def measured(run: AverageRun, q=q) -> tuple[Cell, Cell] | None:
+            return (point := averages.point(run, q)) and point[2:]
+
+        def bias(run: AverageRun, q=q) -> tuple[Cell, Cell] | None:
+            return averages.bias(run, q)
+
+        columns += with_error(f"{q.name} ({q.unit})", measured)
+        columns += with_error(f"bias of {q.name} ({q.unit_of_bias})", bias)
     return Table([*columns, Column("failure", lambda run: run.failure)], averages.runs)
 
 

@@ -144,7 +144,7 @@ def describe_growth(errors: np.ndarray) -> str:
 
 @builder
 def fast_top(trial: Trial, x: float) -> Trials:
-    """The centre of mass at 0.5 s of the benchmark of Bruls & Cardona, m."""
+    """The centre of mass at 0.5 s in the benchmark of Bruls & Cardona, m."""
     known = [-0.7024682970565856, -0.02116518470192333, -0.7114002576517344]
 
     def error(results: Results) -> float:

@@ -176,7 +176,7 @@ def far_away(trial: Trial, shift: float) -> Trials:
     if shift == 0:
         away.position[:] -= state.position[0]
 
-    def compare(*_: Any) -> Outcome:
+    def compare(*_: object) -> Outcome:
         energy, force = energy_and_force(system, state)
         its_energy, its_force = energy_and_force(system, away)
         force_error = np.abs(its_force - force).max() / np.abs(force).max()
@@ -221,7 +221,7 @@ def spoiled_scenes(trial: Trial, x: float) -> Trials:
         yield trial._replace(setting=f"{trial.setting}, {name} = {value}", scene=scene)
 
 
-def spoiled(data: Any) -> Iterator[tuple[list[Any], float, Any]]:
+def spoiled(data: Any) -> Iterator[tuple[list[str | int], float, Any]]:
     """Nested tables and lists with one number replaced by NaN or an infinity: its path, the value,
     the tables."""
     if isinstance(data, dict | list):

@@ -3,10 +3,9 @@
 import html
 import platform
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from math import inf, isfinite, isnan
 from pathlib import Path
-from typing import Any
 
 from rigidmd.io.write import columns_text, format_cell, write_csv
 from rigidmd.studies.stability.cases import (
@@ -94,8 +93,8 @@ def verdict_counts(results: Results) -> dict[str, int]:
     return {verdict: counts[verdict] for verdict in VERDICTS if counts[verdict]}
 
 
-def grouped(results: Results, key: Callable[[TrialResult], Any]) -> list[Results]:
-    groups: dict[Any, Results] = {}
+def grouped(results: Results, key: Callable[[TrialResult], Hashable]) -> list[Results]:
+    groups: dict[Hashable, Results] = {}
     for result in results:
         groups.setdefault(key(result), []).append(result)
     return list(groups.values())
@@ -150,7 +149,7 @@ def write_stability(folder: Path, results: Results, command: str) -> list[Path]:
     return [folder / name for name in FILES]
 
 
-def _csv_row(result: TrialResult) -> list[Any]:
+def _csv_row(result: TrialResult) -> list[object]:
     case, trial, outcome, limit = result.case, result.trial, result.outcome, result.limit
     row = [case.name, case.group, "run" if limit is None else "longest step", trial.setting]
     row += [result.integrator, trial.step if limit is None else limit.longest, case.step_unit]

@@ -1,13 +1,13 @@
 """The points of a sweep over coupling.lambda, and their free energy."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rigidmd.analysis.files import write_results
 from rigidmd.analysis.free_energy import NAME, OF_ALL, SampledLambda, free_energy_of
 from rigidmd.analysis.result import AnalysisResult
+from rigidmd.core.toml import Json
 from rigidmd.engines.samples import lambda_column
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
@@ -51,7 +51,7 @@ def write_free_energy(manifest: Manifest, figures: str) -> tuple[AnalysisResult,
     return result, write_results(manifest.folder, used, [result], {}, figures)
 
 
-def _free_energy(manifest: Manifest) -> tuple[AnalysisResult, dict[str, Any]]:
+def _free_energy(manifest: Manifest) -> tuple[AnalysisResult, Json]:
     folder, points = manifest.folder, manifest.points_in("finished")
     if manifest.keys.keys() - {SEED} != {KEY}:
         raise OutputError(f"{folder}: {NAME} needs a sweep over {KEY} alone, and over {SEED}")

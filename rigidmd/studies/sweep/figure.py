@@ -1,9 +1,8 @@
 """Figures of sweeps: means with errors against a key, a panel for each quantity."""
 
-import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,6 +29,11 @@ from rigidmd.studies.sweep.table import (
     table_of,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from rigidmd.figures.picture import Picture
+
 #: Relative error of the density from which on the volume is taken to change: the density is drawn,
 #: not the pressure.
 CHANGES = 1e-9
@@ -48,7 +52,7 @@ def collect(manifest: Manifest) -> tuple[Table, list[Path]]:
     table = table_of(manifest)
     if not table.runs:
         return table, []
-    report_of(table.lines()).write(table.folder / TABLE, csv.QUOTE_NONNUMERIC)
+    report_of(table.lines()).write(table.folder / TABLE, quote_text=True)
     write_sweep_figure(table, manifest.name)
     files = [table.folder / TABLE, table.folder / FIGURE]
     return table, [path for path in files if path.is_file()]
@@ -99,7 +103,7 @@ def _drawn_columns(table: Table) -> list[str]:
     return [column for column in columns if column not in omitted][:MOST_PANELS]
 
 
-def _panels(titles: Sequence[str]):
+def _panels(titles: Sequence[str]) -> "tuple[Picture, list[Axes]]":
     """A figure, and its panels with these titles."""
     figure, axes = panel_grid(len(titles), 2 if len(titles) <= MOST_PANELS else 3, 4.4, 3.0, 0.4)
     for axis, title in zip(axes, titles, strict=True):
@@ -108,19 +112,26 @@ def _panels(titles: Sequence[str]):
     return figure, axes
 
 
-def _add_legend(figure: Any, axis: Any) -> None:
+def _add_legend(figure: "Picture", axis: "Axes") -> None:
     """Name the curves of one panel, which all have, if there are several and not too many."""
     handles, labels = axis.get_legend_handles_labels()
     if 1 < len(labels) <= MOST_NAMED:
-        style = {"ncols": 4, "frameon": False, "fontsize": 8, "labelcolor": INK}
-        figure.legend(handles, labels, loc="outside lower center", **style)
+        figure.legend(
+            handles,
+            labels,
+            loc="outside lower center",
+            ncols=4,
+            frameon=False,
+            fontsize=8,
+            labelcolor=INK,
+        )
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return type(value) in (int, float)
 
 
-def draw_table(table: Table, columns: list[str], connected: bool = True):
+def draw_table(table: Table, columns: list[str], connected: bool = True) -> "Picture":
     """A panel for each column against the first key with numbers, else the first key. Without keys
     against the seed."""
     rows = [row for row in table.rows if row.runs]
@@ -143,7 +154,7 @@ def draw_table(table: Table, columns: list[str], connected: bool = True):
         curves.setdefault(label, []).append(row)
     values = [row.values[key] for row in rows]
     for axis, column in zip(axes, columns, strict=True):
-        _draw(axis, curves, key, column, {} if connected else {"ls": "none"})
+        _draw(axis, curves, key, column, connected)
         axis.set_xlabel(axis_label(key, table.together.get(key, ())), fontsize=9, color=INK)
         if numbers and all(float(value).is_integer() for value in values):
             axis.locator_params(axis="x", integer=True)
@@ -153,7 +164,7 @@ def draw_table(table: Table, columns: list[str], connected: bool = True):
     return figure
 
 
-def _draw_band(axis: Any, mean: float, error: float | None) -> None:
+def _draw_band(axis: "Axes", mean: float, error: float | None) -> None:
     """Draw the mean over all runs, and its error."""
     error = error or 0.0
     axis.axhline(mean, color=FAINT, lw=0.9, zorder=0)
@@ -161,7 +172,7 @@ def _draw_band(axis: Any, mean: float, error: float | None) -> None:
 
 
 def _draw(
-    axis: Any, curves: dict[str, list[SweepRow]], key: str, column: str, line: dict[str, Any]
+    axis: "Axes", curves: dict[str, list[SweepRow]], key: str, column: str, connected: bool
 ) -> None:
     """Draw a column against a key, a curve for each label."""
     from matplotlib.transforms import ScaledTranslation  # slow to import
@@ -174,8 +185,17 @@ def _draw(
         means, errors = np.array([row[column] for row in rows], float).T
         shift = SPREAD * (k - (len(curves) - 1) / 2)
         offset = ScaledTranslation(shift, 0, axis.figure.dpi_scale_trans)
-        style = curve_style(k) | {"lw": 0.9, "ms": 3.5, "capsize": 2.5, "elinewidth": 0.9}
-        curve = axis.errorbar(x, means, np.nan_to_num(errors), label=label, **style | line)
+        curve = axis.errorbar(
+            x,
+            means,
+            np.nan_to_num(errors),
+            label=label,
+            lw=0.9,
+            ms=3.5,
+            capsize=2.5,
+            elinewidth=0.9,
+            **curve_style(k, connected),
+        )
         if np.isfinite(errors).any():
             for artist in curve.get_children():
                 artist.set_transform(artist.get_transform() + offset)

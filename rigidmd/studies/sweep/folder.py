@@ -9,11 +9,12 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import ConfigDict
 
 from rigidmd.core.files import writing
+from rigidmd.core.toml import Json
 from rigidmd.errors import OutputError, option
 from rigidmd.io.folder import (
     LOCK,
@@ -40,7 +41,7 @@ class SweepPoint:
     __pydantic_config__ = STRICT
 
     folder: str  # its name
-    values: dict[str, Any]  # swept key -> value
+    values: Json  # swept key -> value
     scene_sha256: str  # digest of its scene, as it was read, and of the files that it reads
     state: State = "waiting"
     ran_sha256: str | None = None  # scene_sha256 of the summary of its run, once it has ended
@@ -72,14 +73,14 @@ class Manifest:
     name: str
     scene: str  # its file
     keys: dict[str, list[str]]  # swept key -> the keys that are set together with it, itself first
-    fixed: dict[str, Any]  # key -> value for all points
-    common: dict[str, Any]  # dotted key -> value of the scene, without the swept keys
+    fixed: Json  # key -> value for all points
+    common: Json  # dotted key -> value of the scene, without the swept keys
     inputs: dict[str, str]  # dotted key -> SHA-256 of the files that all points read
     points: list[SweepPoint] = field(default_factory=list)
     has_checkpoints: bool = True
     folder: Path = field(default=Path(), init=False)  # is not in the file
 
-    def overrides(self, values: Mapping[str, Any]) -> dict[str, Any]:
+    def overrides(self, values: Json) -> Json:
         """Dotted key -> value, for `Scene.read`, at these values of the swept keys."""
         swept = {key: value for first, value in values.items() for key in self.keys[first]}
         return self.fixed | swept
@@ -91,10 +92,10 @@ class Manifest:
     def unfinished(self) -> list[SweepPoint]:
         return [point for point in self.points if point.state != "finished"]
 
-    def combinations(self) -> list[tuple[dict[str, Any], list[SweepPoint]]]:
+    def combinations(self) -> list[tuple[Json, list[SweepPoint]]]:
         """The values of all keys but `seed`, each with its points: its replicas, if the seed is
         swept."""
-        groups: dict[str, tuple[dict[str, Any], list[SweepPoint]]] = {}
+        groups: dict[str, tuple[Json, list[SweepPoint]]] = {}
         for point in self.points:
             values = without_seed(point.values)
             groups.setdefault(json.dumps(values), (values, []))[1].append(point)
@@ -111,7 +112,7 @@ class Manifest:
         write_json(self.folder / MANIFEST, content, indent=1)
 
 
-def without_seed(values: Mapping[str, Any]) -> dict[str, Any]:
+def without_seed(values: Json) -> Json:
     return {key: value for key, value in values.items() if key != SEED}
 
 
@@ -146,7 +147,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def clear_sweep(folder: Path, names: Iterable[str]) -> None:
-    """Remove the files of a sweep, and the files of runs in folders of these names. Raises
+    """Remove the files of a sweep, and the files of its runs in folders with these names. Raises
     OutputError."""
     inner_folders = [folder / name for name in names if not (folder / name).is_symlink()]
     for cleared in [*inner_folders, folder]:
@@ -207,7 +208,7 @@ def readable_key(key: str) -> str:
     return label + (f" ({UNITS[end]})" if end else "")
 
 
-def value_name(value: Any) -> str:
+def value_name(value: object) -> str:
     """A value in the name of a folder: letters, digits and . + - only. Equal values have equal
     names."""
     match value:
@@ -229,12 +230,12 @@ def _short_digest(text: str, length: int) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:length]
 
 
-def point_name(values: Mapping[str, Any], short: Mapping[str, str]) -> str:
+def point_name(values: Mapping[str, object], short: Mapping[str, str]) -> str:
     """The name of a point's folder: temperature_K=280_seed=1."""
     name = "_".join(f"{short[key]}={value_name(value)}" for key, value in values.items())
     return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{_short_digest(name, 8)}"
 
 
-def describe_values(values: Mapping[str, Any], short: Mapping[str, str]) -> str:
+def describe_values(values: Mapping[str, object], short: Mapping[str, str]) -> str:
     """Values for messages: temperature_K = 280, seed = 1."""
     return ", ".join(f"{short[key]} = {value_name(value)}" for key, value in values.items())

@@ -1,21 +1,21 @@
 """Averages of a sweep over a time step, extrapolated to zero time step: extrapolation.csv, .png and
 .html."""
 
-import csv
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rigidmd.analysis.files import read_table
 from rigidmd.core.statistics import format_signed
+from rigidmd.core.toml import Json
 from rigidmd.engines.samples import COLUMNS
 from rigidmd.errors import RigidMDError, SceneError
 from rigidmd.figures.style import curve_style, write_figure
 from rigidmd.io.folder import SCENE, add_to_folder
-from rigidmd.io.write import Table, nine_digits
+from rigidmd.io.write import Cell, Table, nine_digits
 from rigidmd.run.record import read_record
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, Together, extrapolate, means_of_runs
@@ -35,6 +35,9 @@ from rigidmd.studies.sweep.table import (
 from rigidmd.studies.sweep.table import Table as SweepTable
 from rigidmd.view.page import code, items, plain, section, table, wide, write_page
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 OPTION = "--extrapolate"
 FILES = ("extrapolation.csv", "extrapolation.png", "extrapolation.html")
 MOST_PANELS = 12
@@ -48,7 +51,7 @@ class Limit(NamedTuple):
     """A quantity at zero time step, for a combination of values of the keys other than the step and
     the seed."""
 
-    values: dict[str, Any]
+    values: Json
     method: str  # integrator
     quantity: str  # with its unit
     points: list[MeanAtStep]
@@ -113,7 +116,7 @@ class Limits(NamedTuple):
             lines.append(line)
         return report_of(lines)
 
-    def lines(self) -> list[dict[str, Any]]:
+    def lines(self) -> list[dict[str, Cell]]:
         """The lines of extrapolation.csv."""
         lines = []
         for limit in self.limits:
@@ -164,7 +167,7 @@ def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
 class _Average:
     """An average of the combinations that differ in the step alone."""
 
-    values: dict[str, Any]  # of the other keys
+    values: Json  # of the other keys
     quantity: str
     integrator: str
     order: int
@@ -179,10 +182,10 @@ class _Average:
 
 
 def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
-    """Extrapolate all averages of the logs of a sweep, and the values of analyses, to a step of 0.
+    """Extrapolate all log averages in a sweep, and the values of its analyses, to a step of 0.
 
-    Values of analyses are those of replicas together, where they have been analysed together, else
-    of single runs. Raises SceneError if the key is not a swept time step, OutputError.
+    Values of analyses come from replicas together, if they have been analysed together, else from
+    single runs. Raises SceneError if the key is not a swept time step, OutputError.
     """
     limits, missing = [], []
     for average in _averages(manifest, key):
@@ -206,7 +209,7 @@ def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
 class _Combination:
     """Results of the runs that differ in the step and the seed alone, by the step (fs)."""
 
-    values: dict[str, Any]
+    values: Json
     integrator: str = ""
     runs: dict[float, list[RunResults]] = field(default_factory=dict)
 
@@ -289,7 +292,7 @@ def write_limits(folder: Path, limits: Limits, command: str) -> list[str]:
     if not limits.limits:
         return []
     add_to_folder(folder, FILES)
-    report_of(limits.lines()).write(folder / FILES[0], csv.QUOTE_NONNUMERIC)
+    report_of(limits.lines()).write(folder / FILES[0], quote_text=True)
     write_figure(folder / FILES[1], lambda: _figure(limits), f"{limits.name}: {limits.title}")
     title = f"{limits.name}: averages at a step of 0"
     write_page(folder / FILES[2], title, _parts(limits, command))
@@ -329,13 +332,22 @@ def _figure(limits: Limits):
     for limit in independent:
         if limit.quantity in shown:
             axis = figure.axes[shown.index(limit.quantity)]
-            _draw_limit(axis, limit.fit, curve_style(labels.index(limit.label)))
+            _draw_limit(axis, limit.fit, labels.index(limit.label))
     return figure
 
 
-def _draw_limit(axis: Any, fit: BiasFit, style: dict[str, Any]) -> None:
-    bars = {"ls": "none", "ms": 4, "capsize": 2.5, "mfc": "none", "clip_on": False}
-    axis.errorbar([0], [fit.limit], [fit.limit_error], **style | bars)
+def _draw_limit(axis: "Axes", fit: BiasFit, k: int) -> None:
+    style = curve_style(k, connected=False)
+    axis.errorbar(
+        [0],
+        [fit.limit],
+        [fit.limit_error],
+        ms=4,
+        capsize=2.5,
+        mfc="none",
+        clip_on=False,
+        **style,
+    )
     step = np.linspace(0, fit.longest, 60)
     slope = fit.slopes[""][0] if fit.slopes else 0.0
     axis.plot(step, fit.limit + slope * step**fit.order, color=style["color"], lw=0.9)

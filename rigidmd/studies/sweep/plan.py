@@ -15,11 +15,12 @@ from functools import cache
 from itertools import product
 from math import inf, prod
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rigidmd.assemble.scenes import resolve
 from rigidmd.assemble.user_code.trust import check_trusted, unused_files
 from rigidmd.core.toml import (
+    Json,
     TOMLDecodeError,
     parse_toml,
     parse_whole_number,
@@ -64,7 +65,7 @@ class Axis(NamedTuple):
     value."""
 
     keys: tuple[str, ...]
-    values: tuple[Any, ...]
+    values: tuple[object, ...]
     swept: bool = True
 
 
@@ -90,12 +91,12 @@ def parse_axis(text: str) -> Axis:
     return Axis(keys, tuple(values), swept=not is_single)
 
 
-def _words_and_ranges(listed: str, text: str) -> list[Any]:
+def _words_and_ranges(listed: str, text: str) -> list[object]:
     """The values of a list that is not TOML. Raises SceneError."""
     if re.search(r"[\[\]{}\"']", listed):
         advice = "put texts that contain them into quotation marks"
         raise _error(text, f": brackets or quotation marks do not match; {advice}")
-    values: list[Any] = []
+    values: list[object] = []
     for piece in map(str.strip, listed.split(",")):
         if not piece:
             raise _error(text, EMPTY)
@@ -132,7 +133,7 @@ def _parse_range(piece: str, text: str) -> range | None:
     return range(first, last + 1)
 
 
-def axes_of(sets: Mapping[str, Any]) -> list[Axis]:
+def axes_of(sets: Mapping[str, object]) -> list[Axis]:
     """Axes from Python: key -> a list, tuple, array or range of values, or one value for all
     points.
 
@@ -149,7 +150,9 @@ def axes_of(sets: Mapping[str, Any]) -> list[Axis]:
     return axes
 
 
-def with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, Any]) -> list[Axis]:
+def with_seeds(
+    scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, object]
+) -> list[Axis]:
     """The axes with an axis of the seeds of replicas."""
     if "body" in data:
         raise SceneError(
@@ -168,7 +171,7 @@ def with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, 
     return [*others, Axis((SEED,), tuple(range(seed, seed + replicas)))]
 
 
-def settings(axes: Sequence[Axis]) -> list[dict[str, Any]]:
+def settings(axes: Sequence[Axis]) -> list[Json]:
     """The values of the swept keys at each point, the last axis fastest. Only the first of keys
     that vary together."""
     swept = {axis.keys[0]: axis.values for axis in axes if axis.swept}

@@ -1,8 +1,8 @@
 """The running of points. A point is a process of `rigidmd run --resume` in its folder.
 
-The threads of an executor wait for these processes, in this process or in the workers of a cluster
-of dask.distributed with a common file system. Messages of points are in files, which this module
-reads. Another file requests that points stop.
+The threads of an executor wait for these processes, in this process or in the workers of a
+dask.distributed cluster with a common file system. Messages of points are in files, which this
+module reads. Another file requests that points stop.
 """
 
 import re
@@ -163,7 +163,7 @@ def format_walltime(span: float) -> str:
 
 @contextmanager
 def cluster(address: str) -> Iterator[Executor]:
-    """The executor of the cluster of dask.distributed with this address of its scheduler. Raises
+    """The executor of the dask.distributed cluster whose scheduler has this address. Raises
     SettingError without the library, or if nothing answers."""
     try:
         from distributed import Client

@@ -1,11 +1,10 @@
 """Analyses of all runs of a sweep: of each run, and of replicas together with errors from their
 scatter."""
 
-import csv
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_frames
 from rigidmd.analysis.free_energy import NAME as FREE_ENERGY
@@ -61,7 +60,7 @@ def analyse_sweep(
     viscosity: float | None,
     progress: Progress,
     figures: str = FIGURES[0],
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
 ) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 
@@ -127,7 +126,7 @@ def _analyse_combinations(
     table.keys[:] = table.rows[0].values
     if table.columns:
         add_to_folder(manifest.folder, [ANALYSES])
-        report_of(table.lines()).write(manifest.folder / ANALYSES, csv.QUOTE_NONNUMERIC)
+        report_of(table.lines()).write(manifest.folder / ANALYSES, quote_text=True)
     if table.keys and len(table) > 1:
         write_analyses_figure(table, manifest.name)
     return combinations
@@ -136,9 +135,9 @@ def _analyse_combinations(
 def _analyse_replicas(
     folders: list[Path], together: Path, start: float | None, analyse: Analyse, progress: Progress
 ) -> tuple[int, AnalysisOutput]:
-    """Analyses of each run of a combination, written into its folder, and of all of them together,
-    written into another folder if there are several. What fails of one run or of one analysis does
-    not end the others. Returns the number of runs too."""
+    """Analyses of each run in a combination, written into the folder of the run, and of all these
+    runs together, written into another folder if there are several. What fails of one run or of one
+    analysis does not end the others. Returns the number of runs too."""
     members: list[RigidFrames] = []
     failed: dict[str, str] = {}
     output = AnalysisOutput({}, [], {}, [])

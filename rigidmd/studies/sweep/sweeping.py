@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from rigidmd.assemble.user_code.trust import trust as trust_file
 from rigidmd.compile.machine import MOST_THREADS
@@ -115,8 +114,8 @@ def open_existing_sweep(folder: Path) -> Iterator[Manifest]:
 
 
 def jobs_and_threads(count: int, jobs: int | None, threads: int | None) -> tuple[int, int]:
-    """Points at a time, and threads of each, so that all cores have work. Given numbers are
-    kept."""
+    """Number of points that run at a time, and threads per point. By default all cores have work.
+    Given numbers are kept."""
     if jobs is None:
         jobs = max(1, min(MOST_THREADS // (threads or 1), count))
     return jobs, threads or max(1, MOST_THREADS // jobs)
@@ -124,7 +123,7 @@ def jobs_and_threads(count: int, jobs: int | None, threads: int | None) -> tuple
 
 def sweep(
     scene: str | Path,
-    sets: Mapping[str, Any],
+    sets: Mapping[str, object],
     folder: str | Path | None = None,
     *,
     jobs: int | None = None,
@@ -146,7 +145,7 @@ def sweep(
     folder
         default: runs/NAME-sweep. Points that have finished there are not run again
     jobs, threads
-        Points at a time, threads of each. Default: so that all cores have work
+        Number of points that run at a time, and threads per point. Default: all cores have work
     progress
         Whether to show progress, as `Simulation.run` does. Default: in notebooks
 

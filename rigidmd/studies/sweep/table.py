@@ -6,17 +6,19 @@ from dataclasses import dataclass, field
 from math import isfinite, nan
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.analysis.files import read_table
+from rigidmd.analysis.files import TableEntry, read_table
+from rigidmd.analysis.result import AnalysisResult
 from rigidmd.analysis.rigid_frames import earlier_production, production_samples
 from rigidmd.core.display import Displayed
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
+from rigidmd.core.toml import Json
 from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
 from rigidmd.errors import RigidMDError
-from rigidmd.io.write import Column, nine_digits
+from rigidmd.io.write import Cell, Column, nine_digits
 from rigidmd.io.write import Table as ReportTable
 from rigidmd.run.record import Record, read_record
 from rigidmd.studies.sweep.folder import SEED, Manifest, readable_key, short_keys, value_name
@@ -49,11 +51,11 @@ Measured = tuple[float, float | None]
 
 @dataclass
 class SweepRow:
-    """A combination of values of all keys but the seed, and the results of its runs."""
+    """A combination of values for all keys except the seed, and the results of its runs."""
 
-    values: dict[str, Any]
+    values: Json
     #: Value of the seed, None if it is not swept -> column -> value and error of that run.
-    runs: dict[Any, dict[str, Measured]] = field(default_factory=dict)
+    runs: dict[object, dict[str, Measured]] = field(default_factory=dict)
     together: int = 0  # number of runs whose common results are those of one run here
 
     @property
@@ -126,7 +128,7 @@ class Table(Displayed):
             raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
         return pandas.DataFrame(self.lines())
 
-    def lines(self) -> list[dict[str, Any]]:
+    def lines(self) -> list[dict[str, Cell]]:
         """The lines of sweep.csv: values of keys, number of runs, and each column with its
         error."""
         with_error = {name for name in self.columns if self.has_error(name)}
@@ -164,13 +166,13 @@ class Table(Displayed):
         return [name for name in (*MAIN, *MAIN_OF_BODY) if name in self.columns] + earlier
 
 
-def report_of(lines: Sequence[dict[str, Any]]) -> ReportTable:
+def report_of(lines: Sequence[Mapping[str, Cell]]) -> ReportTable:
     """A table of lines with the same headers."""
     headers = lines[0] if lines else ()
     return ReportTable([Column(header, itemgetter(header)) for header in headers], lines)
 
 
-def key_cells(values: Mapping[str, Any]) -> dict[str, Any]:
+def key_cells(values: Json) -> dict[str, Cell]:
     """The values of the keys of a combination, as cells of a file."""
     return {
         key: value if type(value) in (int, float, str) else value_name(value)
@@ -204,7 +206,7 @@ def table_of(manifest: Manifest, with_analyses: bool = False) -> Table:
     return table
 
 
-def measured_values(results: Iterable[Any]) -> dict[str, Measured]:
+def measured_values(results: Iterable[AnalysisResult | TableEntry]) -> dict[str, Measured]:
     """The values of results of analyses by their headers."""
     return {
         value.header: (value.value, value.error)

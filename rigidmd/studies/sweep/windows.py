@@ -3,7 +3,6 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from rigidmd.analysis.files import write_results
 from rigidmd.analysis.mean_force import Window, potential_of_mean_force
 from rigidmd.analysis.result import AnalysisResult
 from rigidmd.analysis.rigid_frames import production_samples
+from rigidmd.core.toml import Json
 from rigidmd.engines.samples import distance_column
 from rigidmd.errors import OutputError
 from rigidmd.run.record import Record, read_record
@@ -54,7 +54,7 @@ def write_mean_force(manifest: Manifest, figures: str) -> tuple[AnalysisResult, 
     return result, write_results(manifest.folder, used, [result], {}, figures)
 
 
-def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, dict[str, Any]]:
+def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, Json]:
     """The potential of mean force, and the samples used, as analysis.json has them."""
     folder, points = manifest.folder, manifest.points_in("finished")
     if not points:
@@ -90,7 +90,7 @@ def production_of(folder: Path) -> tuple[Record, Stage, np.ndarray]:
     return record, *production_samples(record)
 
 
-def used_samples(record: Record, stage: Stage, production: np.ndarray) -> dict[str, Any]:
+def used_samples(record: Record, stage: Stage, production: np.ndarray) -> Json:
     """The samples used, as analysis.json has them."""
     time = record.time[production]
     return {
@@ -102,7 +102,7 @@ def used_samples(record: Record, stage: Stage, production: np.ndarray) -> dict[s
     }
 
 
-def used_together(uses: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def used_together(uses: Sequence[Json]) -> Json:
     """The samples used of several runs."""
     return uses[-1] | {
         "from_ps": min(use["from_ps"] for use in uses),
@@ -111,7 +111,7 @@ def used_together(uses: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _window(folder: Path, k: int) -> tuple[Window, float, dict[str, Any]]:
+def _window(folder: Path, k: int) -> tuple[Window, float, Json]:
     """The window of a run, its temperature (K), and the samples used."""
     record, stage, production = production_of(folder)
     name, column = distance_column(k)
