@@ -381,7 +381,7 @@ def test_water_in_water_has_the_published_free_energy(tmp_path, monkeypatch, cap
     scene = guide.partition("file hydration.toml -->\n```toml\n")[2].partition("```")[0]
     (tmp_path / "hydration.toml").write_text(scene)
     values = "0,0.1,0.2,0.3,0.5,0.625,0.75,0.875,1"
-    sets = ["--set", f"coupling.lambda={values}"]
+    sets = ["--set", f"coupling.lambda={values}", "--set", "stages.0.duration_ps=600"]
     assert main(["sweep", "hydration.toml", "-o", "sweep", *sets]) == 0
     value = rigidmd.free_energy(tmp_path / "sweep").value("free energy of coupling")
     with capsys.disabled():
