@@ -48,7 +48,14 @@ SECTIONS = {
     "guides": tuple(name for names in GUIDES.values() for name in names),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
-    "evidence": ("benchmarks", "accuracy_cost", "collection", "validation", "robustness"),
+    "evidence": (
+        "benchmarks",
+        "accuracy_cost",
+        "time_step_water",
+        "collection",
+        "validation",
+        "robustness",
+    ),
     "project": ("contributing", "architecture", "changelog"),
 }
 CHAPTERS = {
