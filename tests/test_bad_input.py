@@ -26,6 +26,7 @@ from rigidmd.io.folder import check_folder
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene, parse_override, schema
 from rigidmd.scene.models import Site, load_model, molecule, read_molecule
+from rigidmd.scene.stage import Stage
 
 
 def refused(capsys, tmp_path, text, *arguments, code=2):
@@ -527,6 +528,10 @@ LIQUID = {
         ({"stages": [{"tau_t_ps": 1.0}]}, "this is thermostat_time_ps in [[stages]] (in ps)"),
         ({"stages": [{"tdamp_ps": 1.0}]}, "this is thermostat_time_ps in [[stages]]"),
         ({"stages": [{"duration_ns": 1.5}]}, "duration_ns: unknown key; write duration_ps = 1500"),
+        (
+            {"stages": [{"temperature_C": 25}]},
+            "temperature_C: unknown key; write temperature_K = 298.15",
+        ),
         ({"forces": {"cutoff_nm": 0.9}}, "cutoff_nm: unknown key; write cutoff_A = 9"),
         ({"nonbonded": {}}, "nonbonded: unknown key; did you mean forces?"),
         ({"initial": {}}, "initial: unknown key; did you mean start?"),
@@ -549,6 +554,8 @@ def test_a_long_list_of_keys_has_the_most_similar_ones():
         Scene.from_dict(LIQUID | {"stages": [{"xyzzy": 1.0, "duration_ps": 1.0}]})
     (line,) = (line for line in raised.value.errors if "xyzzy" in line)
     assert re.search(r"there are (\w+, ){7}\w+ and \d+ others$", line)
+    listed = re.findall(r"\w+", line.partition("there are ")[2].partition(" and ")[0])
+    assert listed == [key for key in Stage.model_fields if key in listed]
 
 
 def test_american_spelling_is_accepted():

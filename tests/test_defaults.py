@@ -74,6 +74,7 @@ def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
             "'pme' needs a periodic box; use coulomb, the sum over all pairs",
         ),
         (13.0, {"ewald_cutoff_A": 7.0}, "ewald_cutoff_A = 7 is longer than half the shortest edge"),
+        (13.257, {"cutoff_A": 7.0}, r"Use a larger box, or cutoff_A = 6\.62 or less"),
         (
             13.0,
             {"electrostatics": "pme", "reaction_field_truncation": "switch"},

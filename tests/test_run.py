@@ -344,6 +344,9 @@ def test_intervals_that_are_not_whole_steps_are_noted():
         "stages.2.duration_ps = 0.022 is not a whole number of steps of 4 fs (stages.2): it is 0.024 ps",
         "stages.2.barostat_interval_ps = 0.03 is not a whole number of steps of 4 fs (stages.2): it is 0.032 ps",
     ]
+    del stages[2]["barostat_interval_ps"]  # its default, 0.05 ps, is 12.5 steps
+    notes = small_scene({"argon": 20}, 20.0, **sections).rounded_times()
+    assert not any("barostat" in note for note in notes)
     run = Simulation(scene, warn=str)
     for note in scene.rounded_times():
         assert note in run._introduction()

@@ -1,5 +1,5 @@
-"""Numba's front end without the work that kernels do not need: the other passes and resolved calls
-make up a quarter of the time of compiling."""
+"""Numba's front end without the work that kernels do not need: passes without effect, and the
+resolution of calls that it has resolved. Together they take a fifth of the time of a first run."""
 
 from weakref import WeakKeyDictionary
 
@@ -36,8 +36,9 @@ def pipeline_of_kernels(compiler: CompilerBase) -> PassManager:
 def remember_resolved_calls():
     """Let Numba resolve the call of a function once for each list of types of its arguments.
 
-    Type inference asks again for the same call in every iteration and every function: for the
-    kernels of argon 6,700 times, of which a fifth differ. Calls that fail are not remembered.
+    Type inference asks again for the same call in every iteration and every function: for
+    `rigidmd energy systems/argon.toml` 7,100 times, for 543 different calls. Calls that fail are
+    not remembered.
     """
     resolve = BaseFunction.get_call_type
     signatures: WeakKeyDictionary[BaseFunction, dict] = WeakKeyDictionary()

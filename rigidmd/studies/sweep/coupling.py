@@ -13,9 +13,9 @@ from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.scene.coupling import Coupling
 from rigidmd.scene.validation import not_none
-from rigidmd.studies.sweep.folder import SEED, Manifest, read_manifest
+from rigidmd.studies.sweep.folder import SEED, Manifest
 from rigidmd.studies.sweep.table import Table
-from rigidmd.studies.sweep.windows import production_of, used_samples, used_together
+from rigidmd.studies.sweep.windows import manifest_of, production_of, used_samples, used_together
 from rigidmd.units import AVOGADRO, BOLTZMANN, KJ_PER_MOL
 
 KEY = "coupling.lambda"
@@ -41,8 +41,7 @@ def free_energy(sweep: Table | str | Path) -> AnalysisResult:
     ------
     OutputError
     """
-    folder = sweep.folder if isinstance(sweep, Table) else Path(sweep)
-    return _free_energy(read_manifest(folder))[0]
+    return _free_energy(manifest_of(sweep))[0]
 
 
 def write_free_energy(manifest: Manifest, figures: str) -> tuple[AnalysisResult, list[Path]]:

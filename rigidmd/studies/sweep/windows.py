@@ -44,8 +44,12 @@ def pmf(sweep: Table | str | Path) -> AnalysisResult:
     ------
     OutputError
     """
-    folder = sweep.folder if isinstance(sweep, Table) else Path(sweep)
-    return _mean_force(read_manifest(folder))[0]
+    return _mean_force(manifest_of(sweep))[0]
+
+
+def manifest_of(sweep: Table | str | Path) -> Manifest:
+    """The manifest of a sweep or of its folder. Raises OutputError."""
+    return read_manifest(sweep.folder if isinstance(sweep, Table) else Path(sweep))
 
 
 def write_mean_force(manifest: Manifest, figures: str) -> tuple[AnalysisResult, list[Path]]:
