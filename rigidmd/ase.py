@@ -11,7 +11,7 @@ results = rigidmd.Simulation(scene, forces=[CalculatorForce(calculator)]).run()
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from ase import Atoms
@@ -121,25 +121,27 @@ class RigidMD(Calculator):
         faults += [
             f"unknown keyword {key}{did_you_mean(key, known)}" for key in forces if key not in known
         ]
-        self._user_forces: tuple[Any, ...] = ()
-        if isinstance(models, Scene):
-            if not isinstance(models, MolecularScene):
-                faults.append(f"the scene {models.name} is of a single body, which has no atoms")
-            elif given:
-                faults.append(f"{', '.join(given)}: set by the scene. Change the scene")
-            else:
-                self._user_forces = models.user_code.forces
-                models, given = _parts_of(models)
+        self._user_forces: tuple[object, ...] = ()
+        species: str | Sequence[str | Mapping[str, object]] = []
+        if not isinstance(models, Scene):
+            species = models
+        elif not isinstance(models, MolecularScene):
+            faults.append(f"the scene {models.name} is of a single body, which has no atoms")
+        elif given:
+            faults.append(f"{', '.join(given)}: set by the scene. Change the scene")
+        else:
+            self._user_forces = models.user_code.forces
+            species, given = _parts_of(models)
         if faults:
             raise SceneError("RigidMD", faults)
-        self._models: Any = models_with_absolute_paths(cast(Any, models))
+        self._models = models_with_absolute_paths(species)
         self._settings = with_absolute_paths(given)
         self._form: Form = atom_forces
         self._bend, self._tolerance = bend, tolerance
         self._warned = False
         self._assembly: _Assembly | None = None
         self._bent = 0.0  # of the molecules seen last
-        not_none(self.parameters).update(models=models, atom_forces=atom_forces, **given)
+        not_none(self.parameters).update(models=species, atom_forces=atom_forces, **given)
 
     def calculate(
         self, atoms: Atoms | None = None, properties=("energy",), system_changes=all_changes
@@ -387,7 +389,7 @@ class CalculatorForce(Force):
 
     def __init__(
         self,
-        calculator: Any,
+        calculator: Calculator,
         *,
         name: str | None = None,
         energy_noise_eV: float = 0.0,

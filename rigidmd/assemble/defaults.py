@@ -10,12 +10,13 @@ and the grid of PME where another cell of the same lattice replaces a cell with 
 from importlib import import_module
 from math import floor, inf
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.assemble.plausibility import shortest_contact
 from rigidmd.core.integrators import WITH_THERMOSTAT
+from rigidmd.core.toml import Json
 from rigidmd.forces.neighbors.space import Triclinic, longest_gaps
 from rigidmd.forces.parts import Composition, Grid, Settings
 from rigidmd.forces.potentials.truncation import default_switch_start
@@ -48,7 +49,7 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
         if stage.ensemble == "npt" and stage.barostat is None:
             defaults["barostat"] = program.barostat
         stages.append(stage.model_copy(update=defaults))
-    changed: dict[str, Any] = {"stages": tuple(stages)}
+    changed: dict[str, object] = {"stages": tuple(stages)}
     if scene.run.remove_momentum_interval_ps is None:
         changed["run"] = scene.run.model_copy(update={"remove_momentum_interval_ps": False})
     return scene.model_copy(update=changed), notes
@@ -149,7 +150,7 @@ def _with_electrostatics(
         has_charges = any(m.charges.any() for m in composition.species)
         method = (PERIODIC if composition.space.volume < inf else OPEN) if has_charges else "none"
         faults += [f"forces.{message}" for message in forces.idle_key_errors(method)]
-    numbers: dict[str, Any] = {"electrostatics": method}
+    numbers: Json = {"electrostatics": method}
     if method == "reaction_field" and forces.reaction_field_truncation is None:
         like = forces.truncation in ("plain", "smooth_switch")
         numbers["reaction_field_truncation"] = forces.truncation if like else "shift"
@@ -201,9 +202,7 @@ def electrostatics_module(forces: Forces) -> ModuleType | None:
     return import_module(f"rigidmd.forces.{name}") if name else None
 
 
-def _cutoff_and_switch(
-    forces: Forces, composition: Composition
-) -> tuple[dict[str, Any], list[str]]:
+def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[Json, list[str]]:
     """Cutoff and start of a switch as keys of [forces], and error messages."""
     from scipy.spatial.distance import pdist  # slow to import
 

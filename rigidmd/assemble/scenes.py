@@ -7,13 +7,13 @@ The atoms of such a scene are an embedded structure file, extended XYZ with ever
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
-from rigidmd.core.toml import plain_values
+from rigidmd.core.toml import Json, plain_values
 from rigidmd.errors import RigidMDWarning, SceneError
 from rigidmd.formats import STRUCTURE
 from rigidmd.formats.cells import cell_error
@@ -83,7 +83,7 @@ def scene_from_atoms(
     if faults := atoms_errors(atoms):
         raise SceneError(SOURCE, faults)
     data = with_absolute_paths(settings)
-    filled: dict[str, dict[str, Any]] = {
+    filled: dict[str, Json] = {
         key: data.setdefault(key, {}) for key in ("structure", "start", "box")
     }
     faults = ["molecules is given by the atoms and models"] if "molecules" in data else []
@@ -194,8 +194,8 @@ def _digits(values: np.ndarray) -> list[list[str]]:
 
 
 def models_with_absolute_paths(
-    models: str | Sequence[str | Mapping[str, Any]],
-) -> list[dict[str, Any]]:
+    models: str | Sequence[str | Mapping[str, object]],
+) -> list[Json]:
     """Tables [[molecules]] of models, with absolute paths, so that they do not depend on the
     working directory."""
     entries = []
@@ -203,9 +203,9 @@ def models_with_absolute_paths(
     for entry in models if isinstance(models, list) else [models]:
         if isinstance(entry, dict):
             paths = {
-                key: os.path.abspath(entry[key])
+                key: os.path.abspath(path)
                 for key in SPECIES_FILES
-                if isinstance(entry.get(key), str)
+                if isinstance(path := entry.get(key), str)
             }
             entries.append(entry | paths)
         elif isinstance(entry, str) and entry.endswith(".toml"):

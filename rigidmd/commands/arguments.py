@@ -4,10 +4,10 @@ import argparse
 import re
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from math import inf, nan
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypedDict, TypeVar, Unpack
 
 from rigidmd.commands.streams import progress_bar
 from rigidmd.programs import engine_options, runnable
@@ -15,6 +15,7 @@ from rigidmd.programs import engine_options, runnable
 #: Adds an argument to the parser of a command.
 Argument = Callable[[argparse.ArgumentParser], object]
 Options = argparse.Namespace
+ActionClass = type[argparse.Action]
 Result = TypeVar("Result")
 
 
@@ -49,9 +50,23 @@ def command(
     return register
 
 
-def argument(*names: str, **settings: Any) -> Argument:
-    """An argument of a command, by its names and the settings of
-    `argparse.ArgumentParser.add_argument`."""
+class Settings(TypedDict, total=False):
+    """Those of `argparse.ArgumentParser.add_argument`."""
+
+    help: str
+    metavar: str | None
+    dest: str | None
+    default: object
+    const: object
+    type: Callable[[str], object]
+    choices: Iterable[str]
+    nargs: int | str
+    action: str | ActionClass
+    required: bool
+
+
+def argument(*names: str, **settings: Unpack[Settings]) -> Argument:
+    """An argument of a command."""
     return lambda parser: parser.add_argument(*names, **settings)
 
 

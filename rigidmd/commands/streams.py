@@ -6,7 +6,7 @@ import io
 import os
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any, TextIO
+from typing import TextIO, cast
 
 from rigidmd.errors import OutputError, visible
 
@@ -64,8 +64,8 @@ def checked_streams(lasting: bool) -> Iterator[None]:
 
     lasting : raise neither. The stream goes silent
     """
-    stdout: Any = _Checked(sys.stdout, lasting)
-    stderr: Any = _Checked(sys.stderr, lasting)
+    stdout = cast(TextIO, _Checked(sys.stdout, lasting))
+    stderr = cast(TextIO, _Checked(sys.stderr, lasting))
     with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
         yield
         stdout.flush()
@@ -87,7 +87,7 @@ class _Checked:
         with self._errors_reported():
             self._stream.flush()
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         return getattr(self._stream, name)
 
     @contextlib.contextmanager

@@ -11,17 +11,16 @@ from importlib import import_module
 from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from rigidmd.formats.atoms import Atoms, Frame
+from rigidmd.formats.systems import System
 
-#: The system of a run, of a package above. All have `state`, `sites` with arrays `name`, `element`,
-#: `mass`, `molecule`, `residue_names`, `site_positions(state, wrapped)`, `site_velocities(state)`.
-#: Those of molecules also have `species`, a `scene.models.Molecule` of each kind, `model.species`,
-#: `of_sites(function)` and `centres(state, wrapped)`.
-System = Any
+if TYPE_CHECKING:
+    from rigidmd.formats.frame_file import FrameFile
+
 Encode = Callable[[Frame, int], bytes]
 
 
@@ -76,9 +75,9 @@ class Format(NamedTuple):
     # with the head of the file. `counter` is the position and the `struct` format of the number of
     # frames in the file. `writer` is a class for all other formats of molecules, see
     # `frame_file.FrameFile`.
-    encoder: Callable[[Any, float, bool], Encode] | None = None
+    encoder: Callable[[System, float, bool], Encode] | None = None
     counter: tuple[int, str] = (0, "")
-    writer: Callable[..., Any] | None = None
+    writer: "type[FrameFile] | None" = None
     reader: Callable[[Path], FrameReader] | None = None  # default: the reader of MDAnalysis
     mdanalysis: str = ""  # its name in MDAnalysis, if that is not its extension
     check: Callable[[str, int, int], dict[str, np.ndarray]] | None = (

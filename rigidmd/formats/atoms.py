@@ -4,7 +4,7 @@ of text."""
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -129,7 +129,7 @@ class Frame(NamedTuple):
     memory."""
 
     time: float  # ps
-    positions: Any = None  # (s, 3) sites, Å
+    positions: np.ndarray = np.empty((0, 3))  # (s, 3) sites, Å
     cell: np.ndarray | None = None  # (3, 3) Å; None without a box
     velocities: np.ndarray | None = None  # (s, 3) sites, Å/ps
     rotation: np.ndarray | None = None  # (n, 3, 3) molecules

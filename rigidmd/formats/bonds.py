@@ -1,40 +1,32 @@
 """Bonds for viewers and topology files: those of molecules, and the edges between the points of a
-single body.
+single body."""
 
-A system is an `engines.system.System` or an `engines.body_system.BodySystem`, a molecule a
-`scene.models.Molecule`.
-"""
-
-from collections.abc import Sequence
 from itertools import combinations, pairwise
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidmd.formats.systems import MolecularSystem, Shape, System
 from rigidmd.mechanics.inertia import SOLIDS
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs  # of Python 3.13
 
 #: Distance from a flat side of a hull, relative to its size, of points on it. Thickness relative to
 #: the size below which points lie in a plane or on a line.
 FLAT, THIN = 1e-6, 1e-9
 
 
-class Shape(Protocol):
-    """The sites of a molecule (s,) that bonds depend on."""
-
-    @property
-    def positions_body(self) -> np.ndarray: ...
-    @property
-    def masses(self) -> np.ndarray: ...
-    @property
-    def elements(self) -> Sequence[str]: ...
+def _is_molecular(system: System) -> "TypeIs[MolecularSystem]":
+    return hasattr(system, "species")
 
 
-def connections(system: Any, massless: bool = False) -> np.ndarray:
+def connections(system: System, massless: bool = False) -> np.ndarray:
     """Pairs (b, 2) of sites that are joined: bonds of molecules, or of a body the edges of the hull
     of each solid or the shortest links between points, with links between solids and from a pinned
     body to its pivot. `massless`: whether massless sites are joined to their nearest atoms, so that
     each molecule is connected."""
-    if hasattr(system, "species"):
+    if _is_molecular(system):
         starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
         chosen = [
             [pair for pair in bonds(m) if massless or m.masses[pair[1]] > 0] for m in system.species
@@ -59,9 +51,9 @@ def connections(system: Any, massless: bool = False) -> np.ndarray:
     return pairs.astype(int)
 
 
-def charges(system: Any) -> np.ndarray:
+def charges(system: System) -> np.ndarray:
     """Charges (s,) of all sites, e, 0 for a single body."""
-    if hasattr(system, "species"):
+    if _is_molecular(system):
         return system.of_sites(lambda m: m.charges)
     return np.zeros(len(system.points))
 

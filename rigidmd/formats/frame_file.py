@@ -5,14 +5,14 @@ import contextlib
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from rigidmd.core.files import LostFileError, atomic_file, create_empty_file, unreadable_reason
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
-from rigidmd.formats import System
+from rigidmd.formats.systems import MolecularSystem
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -49,12 +49,13 @@ class FrameFile(Generic[FileT, FrameT]):
     _arrays: Callable[[FrameT], Iterable[np.ndarray]]  # of a frame, for the checksum
     #: The first of the file; raises as `_kept_frames` catches
     _stored_frames: Callable[[int], Iterator[FrameT]]
-    _file: Any = None  # of the library
+    _file: FileT  # of the library
+    _is_open = False
 
     def __init__(
         self,
         path: Path,
-        system: System,
+        system: MolecularSystem,
         velocities: bool,
         wrapped: bool,
         kept: Sequence[int] | None = None,
@@ -78,7 +79,7 @@ class FrameFile(Generic[FileT, FrameT]):
 
     def check(self) -> None:
         """Raise LostFileError if the file was removed or replaced by another program."""
-        if self._file is not None and _identity(self._path) != self._opened:
+        if self._is_open and _identity(self._path) != self._opened:
             how = "replaced by another file" if self._path.exists() else "removed"
             raise LostFileError(f"{self._path} was {how} while the run was writing it")
 
@@ -101,19 +102,21 @@ class FrameFile(Generic[FileT, FrameT]):
             ):
                 for frame in self._kept_frames():
                     self._append(new, frame)
-            self._file = self._open(self._path, "a")
-            self._opened = _identity(self._path)
+            self._open_file("a")
 
     def close(self) -> None:
-        if self._file is not None:
+        if self._is_open:
             with self._writing():
                 self._file.close()
 
     def _open_new(self) -> None:
         with self._writing():
             create_empty_file(self._path)
-            self._file = self._open(self._path, "w")
-            self._opened = _identity(self._path)
+            self._open_file("w")
+
+    def _open_file(self, mode: str) -> None:
+        self._file, self._is_open = self._open(self._path, mode), True
+        self._opened = _identity(self._path)
 
     def _kept_frames(self) -> Iterator[FrameT]:
         """The frames up to the checkpoint. Raises OutputError if they have changed."""

@@ -13,21 +13,23 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidmd.core.state import State
-from rigidmd.formats import Format, System, register
+from rigidmd.formats import Format, register
 from rigidmd.formats.atoms import SAME_MASS, Atoms, Frame, names_of_types, structure_error
 from rigidmd.formats.bonds import charges, connections
 from rigidmd.formats.cells import make_whole
 from rigidmd.formats.frame_file import FrameFile
+from rigidmd.formats.systems import MolecularSystem, Species
 from rigidmd.formats.through_mdanalysis import index_of
 from rigidmd.mechanics.rotation import from_quaternion, to_quaternion
 
 if TYPE_CHECKING:
+    from gsd.hoomd import Frame as HoomdFrame
     from gsd.hoomd import HOOMDTrajectory
 
 #: Distance, Å, between particles at one position.
@@ -100,7 +102,7 @@ class GsdReader:
         import gsd.fl
 
         with _refusals():
-            self._file: Any = gsd.fl.open(name=str(path), mode="r")
+            self._file = gsd.fl.open(name=str(path), mode="r")
         if self._file.schema != "hoomd":
             self._file.close()
             raise ValueError(f"its schema is {self._file.schema[:30]!r}, must be 'hoomd'")
@@ -264,11 +266,11 @@ def _refusals() -> Iterator[None]:
 DOT = 0.1
 
 
-class GsdFile(FrameFile["HOOMDTrajectory", Any]):
+class GsdFile(FrameFile["HOOMDTrajectory", "HoomdFrame"]):
     def __init__(
         self,
         path: Path,
-        system: System,
+        system: MolecularSystem,
         velocities: bool,
         wrapped: bool,
         kept: Sequence[int] | None = None,
@@ -316,21 +318,21 @@ class GsdFile(FrameFile["HOOMDTrajectory", Any]):
 
         return gsd.hoomd.open(str(path), "r+" if mode == "a" else mode)  # pyright: ignore[reportArgumentType]
 
-    def _append(self, file: "HOOMDTrajectory", frame: Any) -> None:
+    def _append(self, file: "HOOMDTrajectory", frame: "HoomdFrame") -> None:
         file.append(frame)
         # after every frame, so that offsets of chunks do not depend on the time of a flush
         file.file.flush()
 
-    def _stored_frames(self, count: int) -> Iterator[Any]:
+    def _stored_frames(self, count: int) -> "Iterator[HoomdFrame]":
         with contextlib.closing(GsdReader(self._path)) as reader:
             particles = len(self._constant["mass"])
             if reader.count < count or not {reader.size(k) for k in range(count)} <= {particles}:
                 raise ValueError(f"{count} frames of {particles} particles are needed")
         with self._open(self._path, "r") as old:
             for k in range(count):
-                yield old[k]
+                yield cast("HoomdFrame", old[k])
 
-    def _frame(self, state: State, time: float, step: int) -> Any:
+    def _frame(self, state: State, time: float, step: int) -> "HoomdFrame":
         import gsd.hoomd
 
         system, sites = self._system, self._constituent
@@ -364,7 +366,7 @@ class GsdFile(FrameFile["HOOMDTrajectory", Any]):
                 properties["angmom"][:n] = momentum_quaternion(
                     orientation, state.angular_momentum_body
                 )
-        frame: Any = gsd.hoomd.Frame()
+        frame: Any = gsd.hoomd.Frame()  # its attributes have no types
         frame.configuration.step = step
         frame.configuration.dimensions = 3
         frame.configuration.box = np.array(box_of(state.cell), np.float32)
@@ -383,20 +385,20 @@ class GsdFile(FrameFile["HOOMDTrajectory", Any]):
             frame.bonds.typeid = np.zeros(len(self._bonds), int)
         return frame
 
-    def _arrays(self, frame: Any) -> list[np.ndarray]:
+    def _arrays(self, frame: "HoomdFrame") -> list[np.ndarray]:
         return [
-            frame.configuration.box,
+            np.asarray(frame.configuration.box),
             frame.log[TIME],
             *(getattr(frame.particles, name) for name in self._changing),
         ]
 
 
-def _labels(system: System) -> np.ndarray:
+def _labels(system: MolecularSystem) -> np.ndarray:
     """Type of each site (s,): its element, or its name without element, with the species if it is
     ambiguous."""
     kinds = defaultdict(set)  # properties of sites by name, and by species and name
 
-    def names_of(m: Any) -> list[str]:
+    def names_of(m: Species) -> list[str]:
         return [name if e == "X" else e for e, name in zip(m.elements, m.site_names, strict=True)]
 
     for m in system.species:
@@ -404,7 +406,7 @@ def _labels(system: System) -> np.ndarray:
             kinds[name].add(tuple(kind))
             kinds[m.name, name].add(tuple(kind))
 
-    def labels(m: Any) -> np.ndarray:
+    def labels(m: Species) -> np.ndarray:
         labels_of_sites = []
         for name, site in zip(names_of(m), m.site_names, strict=True):
             in_species = f"{m.name}.{name if len(kinds[m.name, name]) == 1 else site}"

@@ -12,14 +12,15 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NOW, State
+from rigidmd.core.toml import Json
 from rigidmd.errors import StructureError
-from rigidmd.formats import Format, System, extensions, register
+from rigidmd.formats import Format, extensions, register
 from rigidmd.formats.atoms import (
     HEAVY_HYDROGEN,
     MASSLESS_NAME,
@@ -29,11 +30,13 @@ from rigidmd.formats.atoms import (
     structure_error,
 )
 from rigidmd.formats.frame_file import FrameFile
+from rigidmd.formats.systems import MolecularSystem
 from rigidmd.units import ENERGY_UNITS
 
 if TYPE_CHECKING:
     import ase
     from ase import Atoms as AseAtoms
+    from ase.io import ulm
     from ase.io.trajectory import TrajectoryWriter
 
 EV = ENERGY_UNITS["eV"]
@@ -49,13 +52,16 @@ DL_POLY_NAMES = "dlp4_labels"
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
 
 
-def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list[AseAtoms]":
-    """The structures in a file or text. Raises StructureError."""
+def read_by_ase(
+    path: Path, source: Path | io.StringIO, name: str | None = None
+) -> "list[AseAtoms]":
+    """The structures in a file or text, in the format of a name if it has one. Raises
+    StructureError."""
     import ase.io.formats
 
     try:
         with ignore_warnings():
-            frames = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
+            frames = cast("list[AseAtoms]", ase.io.read(source, index=":", format=name))
     except ase.io.formats.UnknownFileTypeError:
         known = " ".join(extensions(lambda form: form.read or form.reader))
         raise structure_error(path, f"its format is unknown to ASE; there are {known}") from None
@@ -183,7 +189,7 @@ def _residues(atoms) -> list[tuple] | None:
     return [(int(n), str(name)) for n, name in zip(numbers, names, strict=True)]
 
 
-def atoms_of_system(system: System, state: State, wrapped: bool = False) -> "ase.Atoms":
+def atoms_of_system(system: MolecularSystem, state: State, wrapped: bool = False) -> "ase.Atoms":
     """A state of a system as an `ase.Atoms`, see `atoms_of_sites`."""
     return atoms_of_sites(
         system,
@@ -195,7 +201,7 @@ def atoms_of_system(system: System, state: State, wrapped: bool = False) -> "ase
 
 
 def atoms_of_sites(
-    system: System,
+    system: MolecularSystem,
     positions: np.ndarray,
     velocities: np.ndarray | None,
     cell: np.ndarray | None,
@@ -296,7 +302,7 @@ class TrajReader:
         try:
             item = self._file[k]
             cell: np.ndarray = np.array(item.cell, float)
-            info: Any = item.get("info") or {}
+            info = cast(Json, item.get("info") or {})
             if cell.shape != (3, 3):
                 raise ValueError("it is damaged: a cell is not of shape (3, 3)")
             n, m = len(self._atoms), self.sites - len(self._atoms)
@@ -329,7 +335,7 @@ class TrajReader:
         return of_sites
 
     def _array(
-        self, item: Any, name: str, shape: tuple[int, ...], kind: type = np.float64
+        self, item: "ulm.Reader", name: str, shape: tuple[int, ...], kind: type = np.float64
     ) -> np.ndarray:
         """An array of an item with this type and shape (-1: any length)."""
         try:
@@ -354,14 +360,18 @@ class TrajReader:
         return array
 
 
-class TrajFile(FrameFile):
+def _items(file: "TrajectoryWriter") -> "ulm.Writer":
+    return cast("ulm.Writer", file.backend)
+
+
+class TrajFile(FrameFile["TrajectoryWriter", Stored]):
     """Writes ASE's .traj files of molecules, in double precision, for `ase gui` and
     `ase.io.read`."""
 
     def __init__(
         self,
         path: Path,
-        system: System,
+        system: MolecularSystem,
         velocities: bool,
         wrapped: bool,
         kept: Sequence[int] | None = None,
@@ -377,7 +387,7 @@ class TrajFile(FrameFile):
     @property
     def kept(self) -> tuple[int, int]:
         with self._writing():
-            os.fsync(self._file.backend.fd.fileno())
+            os.fsync(_items(self._file).fd.fileno())
         return super().kept
 
     def _frame(self, state: State, time: float, step: int) -> Stored:
@@ -396,7 +406,7 @@ class TrajFile(FrameFile):
             position[self._massive], momenta, massless, of_massless, cell, float(time), int(step)
         )
 
-    def _append(self, file: Any, frame: Stored) -> None:
+    def _append(self, file: "TrajectoryWriter", frame: Stored) -> None:
         atoms = self._template
         atoms.set_positions(frame.positions)
         if frame.cell is not None:
@@ -405,11 +415,10 @@ class TrajFile(FrameFile):
             atoms.set_momenta(frame.momenta)
         atoms.info = {"time_ps": frame.time, "step": frame.step}
         additional = {MASSLESS: frame.massless, MASSLESS_VELOCITY: frame.massless_velocity}
-        if len(file.backend) == 0:
+        items = _items(file)
+        if len(items) == 0:
             additional[ATOMS] = self._massive.astype(np.int64)
-        file.backend.write(
-            **{name: array for name, array in additional.items() if array is not None}
-        )
+        items.write(**{name: array for name, array in additional.items() if array is not None})
         file.write(atoms)
 
     def _stored_frames(self, count: int) -> Iterator[Stored]:

@@ -19,7 +19,7 @@ from functools import partial
 from importlib import import_module
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
@@ -30,7 +30,19 @@ from rigidmd.formats.atoms import Frame, structure_error
 
 if TYPE_CHECKING:
     import MDAnalysis as mda
+    from MDAnalysis.coordinates.base import WriterBase
     from MDAnalysis.coordinates.timestep import Timestep
+
+
+class TrajectoryReader(Protocol):
+    """What is used of the readers of MDAnalysis."""
+
+    n_atoms: int
+    n_frames: int
+    ts: "Timestep"
+
+    def __getitem__(self, k: int, /) -> "Timestep": ...
+    def close(self) -> object: ...
 
 
 def dimensions(cell: np.ndarray | None) -> list[float] | None:
@@ -84,20 +96,22 @@ class FrameFiles:
         self.sites: int = len(system.sites.name)
 
     def content(
-        self, frame: Frame, write: Callable[[Any, Any], object] | None = None, **options: object
+        self,
+        frame: Frame,
+        write: "Callable[[WriterBase, mda.AtomGroup], object] | None" = None,
+        **options: object,
     ) -> bytes:
         """`write(writer, atoms)` is called in place of `writer.write(atoms)`."""
         import MDAnalysis as mda
 
         set_frame(self._universe.trajectory.ts, frame)
+        atoms = cast("mda.AtomGroup", self._universe.atoms)
         with scratch_file() as path, ignore_warnings():
-            writer: Any = mda.Writer(
+            writer = mda.Writer(
                 path, n_atoms=self.sites, format=self._name, **self._options, **options
             )
             with writer:
-                writer.write(self._universe.atoms) if write is None else write(
-                    writer, self._universe.atoms
-                )
+                writer.write(atoms) if write is None else write(writer, atoms)
             return Path(path).read_bytes()
 
 
@@ -272,8 +286,8 @@ def arrays_of_reader(name: str, path: str, frame: int, atoms: int) -> dict[str, 
     """A frame by the reader of MDAnalysis for the format of this name."""
     from MDAnalysis.coordinates.core import get_reader_for
 
-    reader_class: Any = get_reader_for(path, name)
-    with reader_class(path) as reader:
+    reader_class = cast("Callable[[str], TrajectoryReader]", get_reader_for(path, name))
+    with contextlib.closing(reader_class(path)) as reader:
         _check(reader.n_atoms, atoms)
         timestep = reader[index_of(reader.n_frames, frame)]
         arrays = {"position": timestep.positions}

@@ -61,9 +61,7 @@ def read_xyz(
             clean.append(" ".join(words))
         at += 2 + count
     frames, first = [], 0
-    for atoms in (
-        read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), format="extxyz") if clean else []
-    ):
+    for atoms in read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), "extxyz") if clean else []:
         of_frame = labels[first : first + len(atoms)]
         first += len(atoms)
         named = len(of_frame) == len(atoms) and None not in of_frame

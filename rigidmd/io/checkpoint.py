@@ -5,7 +5,7 @@ import json
 import os
 import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,8 +46,8 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     with atomic_file(path) as temporary:
         values = json.dumps(checkpoint.values | {"schema": SCHEMA}).encode()
         with temporary.open("wb") as file:
-            arrays: dict[str, Any] = {JSON: np.frombuffer(values, np.uint8), **checkpoint.arrays}
-            np.savez(file, **arrays)
+            arrays = {JSON: np.frombuffer(values, np.uint8), **checkpoint.arrays}
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
         with zipfile.ZipFile(temporary, "a") as archive:
             archive.writestr(CONTENTS, _contents(archive))
         sync_file(temporary)

@@ -5,7 +5,7 @@ import io
 import sys
 import threading
 import time as clock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TextIO, TypedDict, Unpack
 
 from tqdm import tqdm
 
@@ -72,15 +72,27 @@ def progress_of(
     )
 
 
+class BarOptions(TypedDict, total=False):
+    """Arguments of tqdm."""
+
+    total: float
+    unit: str
+    bar_format: str
+    disable: bool
+    leave: bool
+    file: TextIO
+    mininterval: float
+    delay: float
+
+
 class Bar(tqdm):
     """A bar on a terminal. Its rate is without pauses."""
 
-    def __init__(self, **options: Any):
+    def __init__(self, **options: Unpack[BarOptions]):
         # with miniters no thread of tqdm shows the bar; the output of a thread would have no cell
         # in a notebook
-        super().__init__(
-            **{"leave": False, "mininterval": 0.2, "miniters": 0, "smoothing": 0.0} | options
-        )
+        defaults: BarOptions = {"leave": False, "mininterval": 0.2}
+        super().__init__(**(defaults | options), miniters=0, smoothing=0.0)
         self._time, self.initial = clock.monotonic, 0.0
         self.start_t = self.last_print_t = self._marked = clock.monotonic()
 

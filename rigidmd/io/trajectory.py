@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import MDAnalysis as mda
 import numpy as np
@@ -27,6 +27,7 @@ from rigidmd.formats import BY_EXTENSION
 from rigidmd.formats.atoms import Frame
 from rigidmd.formats.bonds import charges, connections
 from rigidmd.formats.through_mdanalysis import (
+    TrajectoryReader,
     dimensions,
     read_in_process,
     set_frame,
@@ -38,6 +39,7 @@ from rigidmd.scene.validation import not_none
 EVEN = 1e-6
 
 T = TypeVar("T")
+Reader = TypeVar("Reader", bound=ProtoReader)
 
 
 def universe(system: System | BodySystem, state: State, wrapped: bool = True) -> mda.Universe:
@@ -191,9 +193,9 @@ def _times(path: Path, sites: int) -> list[float]:
     return text_times[: len(times)] if text_times else times
 
 
-def _opened(path: Path, sites: int) -> Any:
+def _opened(path: Path, sites: int) -> TrajectoryReader:
     """The reader of a trajectory. Raises OutputError if it has another number of sites."""
-    reader = reader_of(path.suffix)(str(path))
+    reader = cast(TrajectoryReader, reader_of(path.suffix)(str(path)))
     if reader.n_atoms != sites:
         reader.close()
         raise OutputError(
@@ -202,7 +204,7 @@ def _opened(path: Path, sites: int) -> Any:
     return reader
 
 
-def _whole_frames(reader: Any, path: Path, selected: range) -> Iterator[Timestep]:
+def _whole_frames(reader: TrajectoryReader, path: Path, selected: range) -> Iterator[Timestep]:
     """The selected frames of a reader, without an incomplete last one. Raises OutputError for any
     other."""
     for k in selected:
@@ -332,23 +334,24 @@ class _WithoutOffsetsFile:
         super()._read_offsets(store=False)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def reader_of(extension: str) -> Any:
+def reader_of(extension: str) -> type[ReaderBase]:
     """MDAnalysis' class of readers of a format."""
     form = BY_EXTENSION[extension]
     if form.reader:
         reader = SiteReader
     else:
-        reader = get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
+        found = get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
+        reader = cast(type[ReaderBase], found)
     return _subclass(_WithoutOffsetsFile, reader) if issubclass(reader, XDRBaseReader) else reader
 
 
-def timed(reader: type[ProtoReader]) -> Any:
+def timed(reader: type[Reader]) -> type[Reader]:
     """A subclass of a reader with the times of the run."""
     return _subclass(_WithTimes, reader)
 
 
 @functools.cache
-def _subclass(mixin: type, reader: Any) -> Any:
+def _subclass(mixin: type, reader: type[Reader]) -> type[Reader]:
     """A subclass of a reader with a mixin, as a name of this module, so that it can be pickled."""
     name = f"{reader.__name__}{mixin.__name__}"
     globals()[name] = type(reader)(name, (mixin, reader), {"__module__": __name__})

@@ -4,7 +4,7 @@ import struct
 from collections.abc import Sequence
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def open_trajectory(
 ) -> "TrajectoryFile | FrameFile":
     """The trajectory file for the extension of a path. For the arguments see `TrajectoryFile`."""
     if (writer := BY_EXTENSION[path.suffix].writer) is not None:
-        return writer(path, system, velocities, wrapped, kept)
+        return writer(path, cast("System", system), velocities, wrapped, kept)
     return TrajectoryFile(path, system, interval, velocities, wrapped, kept)
 
 

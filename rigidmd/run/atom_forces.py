@@ -10,7 +10,7 @@ them.
 
 import contextlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,8 +26,9 @@ from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.formats import format_of
 from rigidmd.formats.through_ase import EV, atoms_of_sites, atoms_of_system
+from rigidmd.formats.through_mdanalysis import TrajectoryReader
 from rigidmd.mechanics.rotation import hat
-from rigidmd.run.force_errors import forces_inside
+from rigidmd.run.force_errors import HasSiteForces, forces_inside
 from rigidmd.run.rigid_fit import kinds_of
 from rigidmd.scene.models import Molecule
 from rigidmd.units import BAR, KJ_PER_MOL
@@ -103,7 +104,7 @@ def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
     ValueError."""
     from ase.utils import string2index
 
-    selection: Any = frame
+    selection: object = frame
     if isinstance(frame, str):
         with contextlib.suppress(ValueError, TypeError):
             selection = string2index(frame)
@@ -135,7 +136,7 @@ def _sites_of_frames(results: "Results") -> Callable[[int], SitesOfFrame]:
         frames = results._frames if exact is None else read_exactly(exact)
         return lambda k: frames[k].sites
     with ignore_warnings():  # frames that are not evenly spaced: each has its time
-        trajectory = cast(Any, results.universe().trajectory)
+        trajectory = cast(TrajectoryReader, results.universe().trajectory)
 
     def sites(k: int) -> SitesOfFrame:
         frame = trajectory[k]
@@ -235,7 +236,7 @@ def site_forces(
         sites = getattr(workspace, "sites", None)
         if not hasattr(workspace, "site_force") or not isinstance(sites, BodySites | CentralSites):
             continue
-        of_term = np.array(cast(Any, workspace).site_force)
+        of_term = np.array(cast(HasSiteForces, workspace).site_force)
         at = _site_indices(system, sites)
         if name.endswith("reciprocal"):
             term = cast(EwaldSum, system.terms[name])

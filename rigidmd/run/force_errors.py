@@ -4,7 +4,7 @@ between pairs; of user-defined forces, which are compared with their energies.""
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import inf
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
@@ -40,6 +40,13 @@ if TYPE_CHECKING:
 #: Error of the reference sum, relative to the estimated error of the sum under test.
 REFERENCE_ERROR = 1e-3
 MIN_REFERENCE_ERROR = 1e-12  # e²/Å²; float64 has no more digits
+
+
+class HasSiteForces(Protocol):
+    """The workspace of a force between sites."""
+
+    @property
+    def site_force(self) -> np.ndarray: ...  # (s, 3)
 
 
 def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
@@ -126,7 +133,7 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     _, tallies = engine.evaluate(state)
     real, force = cast(PairForces, system.terms["coulomb_real"]), np.zeros((system.site_count, 3))
     for name in ("coulomb_real", "coulomb_reciprocal"):
-        force = force + cast(Any, engine.workspaces[name]).site_force
+        force = force + cast(HasSiteForces, engine.workspaces[name]).site_force
     position = np.empty_like(force)
     compute_site_positions(real.sites, state, position)
     potential = cast(ScreenedCoulomb, real.potential)

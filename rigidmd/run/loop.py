@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +28,6 @@ from rigidmd.io.progress import progress_of
 from rigidmd.io.write import write_json
 from rigidmd.run import resume
 from rigidmd.run.observers import GrowingFile, Moment, Observer
-from rigidmd.run.part import RunPart
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import (
     SEGMENT_SECONDS,
@@ -78,7 +77,7 @@ class RunLoop:
         self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None
     ):
         self._simulation, self._folder = simulation, simulation.folder
-        self._part: RunPart[Any, Any, Any] = simulation._part
+        self._part = simulation._part
         self._force, self._resumes = force, resumes
         self.checkpoints = CheckpointSchedule(
             simulation.folder, simulation.scene.output.checkpoint_minutes, deadline
@@ -174,10 +173,7 @@ class RunLoop:
         scene = resume.plain(simulation.scene)
         if checkpoint is not None:
             with resume.as_checkpoint_errors(self._folder):
-                kind = part.record_type
-                part.record = kind(
-                    **resume.restored(checkpoint.of(RECORD), kind.types(), part.scene.rows)
-                )
+                part.restore_record(checkpoint.of(RECORD))
                 part.restore(checkpoint)
                 part.check_position()
                 changed = resume.describe_changes(checkpoint.values["with"])
@@ -286,7 +282,7 @@ class RunLoop:
         made_by = resume.provenance(
             simulation.scene, part.threads, part.record.inputs, part.engine_version
         )
-        results.summary = made_by | part.summary(results.samples, self._preparing, wall)
+        results.summary = made_by | part.summary_of(results, self._preparing, wall)
         for draws in (False, True):  # results first, pictures after
             noted = len(notes)
             for observer in self._observers.values():

@@ -15,6 +15,7 @@ from rigidmd.io.run_files import TENSOR_FILE, Log, TensorFile, tensor_row
 from rigidmd.run import checks
 from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.scene.stage import Stage
+from rigidmd.scene.validation import not_none
 from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from rigidmd.run.simulation import Simulation
 
 
-class LogFile(GrowingFile):
+class LogFile(GrowingFile[Log]):
     """log.csv: a line for each sample."""
 
     ends = reads_energies = True
@@ -35,14 +36,14 @@ class LogFile(GrowingFile):
         self._file = Log(run.path(LOG), self._tensor, self.kept, run.system.more_columns)
 
     def see(self, moment: Moment) -> None:
-        self._file.write(moment.sample)
+        not_none(self._file).write(moment.sample)
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        self._file.flush()
+        not_none(self._file).flush()
         results.files.append(run.path(LOG))
 
 
-class PressureTensor(GrowingFile):
+class PressureTensor(GrowingFile[TensorFile]):
     """pressure_tensor.csv: the pressure tensor at its own interval. Without a folder in memory."""
 
     once = reads_energies = True

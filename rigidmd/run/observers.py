@@ -10,7 +10,7 @@ is observed. No observer depends on another: data that several need belong to th
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from math import inf
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -20,8 +20,10 @@ from rigidmd.formats.atoms import Frame
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import SCENE
 from rigidmd.run.resume import restored, stored
+from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
+    from rigidmd.engines.observables import Observation
     from rigidmd.engines.samples import Sample
     from rigidmd.run.results import Results
     from rigidmd.run.simulation import Simulation
@@ -57,7 +59,7 @@ class Moment:
         return self._state.copy().read_only
 
     @cached_property
-    def observation(self) -> Any:
+    def observation(self) -> "Observation | Any":
         """Evaluated at its first use, for all observers: an `Observation` of molecules, in the
         units of the log, or the `Pose` of a body, in SI units."""
         return self._run._part.observe(self)
@@ -185,7 +187,20 @@ class Every(Observer):
         self.function(moment)
 
 
-class GrowingFile(Observer):
+class OpenFile(Protocol):
+    """A file that grows during the run."""
+
+    @property
+    def kept(self) -> Sequence[int]: ...  # sizes and checksum
+    def check(self) -> None: ...
+    def cut(self) -> None: ...
+    def close(self) -> None: ...
+
+
+FileT = TypeVar("FileT", bound=OpenFile)
+
+
+class GrowingFile(Observer, Generic[FileT]):
     """An observer whose file grows during the run. None without a folder."""
 
     remembers: ClassVar[dict[str, object]] = {
@@ -194,10 +209,10 @@ class GrowingFile(Observer):
     kept: list[int] | None = (
         None  # sizes and checksum of the file of the run that is resumed, which `begin` opens
     )
-    _file: Any = None
+    _file: FileT | None = None
 
     def memory(self) -> Checkpoint:
-        self.kept = list(self._file.kept)
+        self.kept = list(not_none(self._file).kept)
         return super().memory()
 
     def check_file(self) -> None:
@@ -260,7 +275,11 @@ class Figures(Observer):
             raise failed
 
 
-class Frames(GrowingFile):
+class OpenTrajectory(OpenFile, Protocol):
+    def write(self, state: State, time: float, step: int) -> None: ...
+
+
+class Frames(GrowingFile[OpenTrajectory]):
     """Topology and trajectory. Without a folder, frames in memory."""
 
     remembers: ClassVar[dict[str, object]] = GrowingFile.remembers | {"times": np.ndarray}

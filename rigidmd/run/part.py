@@ -4,7 +4,7 @@ it."""
 from abc import ABC, abstractmethod
 from collections.abc import Container
 from math import isclose
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.errors import SimulationError
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.run.observers import Moment, Observer
-from rigidmd.run.resume import RunRecord
+from rigidmd.run.resume import RunRecord, restored
 from rigidmd.run.schedule import Segment
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rigidmd.engines.observables import Observation
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
+    from rigidmd.run.results import Results
     from rigidmd.run.simulation import Simulation
 
 SystemT = TypeVar("SystemT", "System", "BodySystem")
@@ -126,6 +127,10 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         wall : seconds of the run, with observers and output
         """
 
+    def summary_of(self, results: "Results", preparing: float, wall: float) -> Json:
+        """The summary of the results of this run."""
+        return self.summary(cast(SamplesT, results.samples), preparing, wall)
+
     @staticmethod
     @abstractmethod
     def summary_text(summary: Json, known: Container[str]) -> str:
@@ -154,6 +159,11 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
         record."""
         self.record = self.record_type()
         self.segment = Segment(SCHEMES["velocity_verlet"], 1.0, 0)  # before the first segment
+
+    def restore_record(self, kept: Checkpoint) -> None:
+        """Read the record of a checkpoint. Raises ValueError or KeyError."""
+        values = restored(kept, self.record_type.types(), self.scene.rows)
+        self.record = self.record_type(**values)
 
     def check_position(self) -> None:
         """Compare the position of a checkpoint with the scene and the state. Raises ValueError."""

@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from rigidmd.engines import samples
 from rigidmd.engines.body_motion import Snapshot, motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import BODY, BODY_COLUMNS
+from rigidmd.engines.system import System
 from rigidmd.errors import CheckpointError, OutputError
 from rigidmd.io.checkpoint import latest
 from rigidmd.io.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
@@ -28,8 +29,11 @@ from rigidmd.scene.stage import Stage
 HEADERS = {column.header: name for name, column in samples.IN_LOGS.items() if column.header}
 
 
+SystemT = TypeVar("SystemT", bound=System | BodySystem, covariant=True)
+
+
 @dataclass(frozen=True)
-class Record:
+class Record(Generic[SystemT]):
     """The contents of the folder of a run.
 
     summary : None if the run has not ended
@@ -39,7 +43,7 @@ class Record:
 
     folder: Path
     scene: MolecularScene | BodyScene
-    system: Any  # a `System`, or a `BodySystem` for a body
+    system: SystemT
     summary: Json | None
     columns: dict[str, np.ndarray]
     missing: list[str]
@@ -54,7 +58,7 @@ class Record:
         return self.columns["time"]
 
     @property
-    def log(self) -> samples.Samples:
+    def log(self: "Record[System]") -> samples.Samples:
         """The samples of a run of molecules. NaN in columns that log.csv does not have."""
         names, unknown = self.system.more_columns, np.full(len(self.time), np.nan)
         table = np.column_stack(

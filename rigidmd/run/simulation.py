@@ -14,7 +14,6 @@ from math import inf
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
-    Any,
     Generic,
     NamedTuple,
     TypedDict,
@@ -170,7 +169,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         @overload
         def __init__(
-            self: "Simulation[Any, Any]",
+            self: "Simulation[System | BodySystem, MolecularScene | BodyScene]",
             scene: Scene | str | Path,
             folder: str | Path | None = None,
             force: bool = False,

@@ -7,7 +7,7 @@ import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, overload
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, cast, overload
 
 from pydantic import (
     AfterValidator,
@@ -52,6 +52,8 @@ from rigidmd.scene.validation import (
 if TYPE_CHECKING:
     from rigidmd.scene.body import BodyScene
     from rigidmd.scene.molecules import MolecularScene
+
+    KindOfScene = type[MolecularScene] | type[BodyScene]
 
 LONGEST_NAME = 100
 #: Largest number of characters of the name of a file. File systems allow 255, which temporary files
@@ -240,7 +242,7 @@ class Scene(Section, Displayed):
         """
         folder, data = Path(folder), plain_values(data)
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
-        kind: Any = _kind_of_scene(data) if cls is Scene else cls
+        kind = _kind_of_scene(data) if cls is Scene else cast("KindOfScene", cls)
         if kind is None:
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults, overridden = [], []
@@ -429,7 +431,7 @@ def file_name(wanted: Callable[[Format], object]) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _kind_of_scene(data: dict):
+def _kind_of_scene(data: dict) -> "KindOfScene | None":
     """The class of scenes with these tables. None if no table belongs to either class."""
     from rigidmd.scene.body import BodyScene
 
@@ -483,7 +485,7 @@ def override(data: dict, key: str, value: object) -> tuple[str, list[str]]:
             f"{option('overrides')} {shorten_repr(key)}: is a key of more than {DEEPEST} parts"
         ]
     target: Any = data
-    indices: list[Any] = []
+    indices: list[int | str | None] = []
     for depth, part in enumerate([*parents, last]):
         here = ".".join(key.split(".")[:depth])
         listed, table = isinstance(target, list), isinstance(target, dict)
@@ -510,7 +512,7 @@ def override(data: dict, key: str, value: object) -> tuple[str, list[str]]:
         elif value is None and part not in target:
             hint = did_you_mean(part, target) or f"; there are {', '.join(target)}"
             return key, [f"{setting(key)}: {here or 'the scene'} has no {part} to remove{hint}"]
-        index: Any = number if listed else part
+        index = number if listed else part
         indices.append(index)
         if depth == len(parents) and value is None:
             del target[index]

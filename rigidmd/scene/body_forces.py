@@ -1,10 +1,10 @@
 """Tables of a scene that act on a single body: fields, forces, friction, fluids, frames, wheels. SI
 units."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from math import inf
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -43,7 +43,9 @@ class Timed(Section):
                 raise ValueError(f"must increase: entry {k + 1} is {b:g} after {a:g}")
         return times
 
-    def timing_errors(self, values: dict[str, Any], entry: type) -> Iterator[str]:
+    def timing_errors(
+        self, values: Mapping[str, float | tuple[object, ...] | None], entry: type
+    ) -> Iterator[str]:
         """Messages on quantities that do not match the times. A single value has the type
         `entry`."""
         times = self.times_s
@@ -61,7 +63,7 @@ class Timed(Section):
                 yield f"{key} is a list of values: times_s is missing"
             elif times is not None and value is not None and not many:
                 yield f"{key} is one value: with times_s it must be a list of {len(times)}"
-            elif times is not None and value is not None and len(value) != len(times):
+            elif times is not None and isinstance(value, tuple) and len(value) != len(times):
                 yield f"{key} has {len(value)} values for {len(times)} times"
 
     @property

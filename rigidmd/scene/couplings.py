@@ -4,7 +4,7 @@ Their flows are in `dynamics.thermostats` and `dynamics.barostats`, under the sa
 """
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple, Protocol, get_args
 
 from pydantic import Field, Strict
 
@@ -21,13 +21,26 @@ MOVES_PER_TIME = 20
 COMPRESSIBILITY = 4.5e-5
 
 
+class CoupledStage(Protocol):
+    """The keys of a stage on which defaults of other keys depend."""
+
+    @property
+    def step(self) -> float: ...  # ps
+
+    @property
+    def barostat_time_ps(self) -> float | None: ...
+
+    @property
+    def friction_translation_per_ps(self) -> float | None: ...
+
+
 class Coupling(NamedTuple):
     """What scenes and reports know of a thermostat or barostat."""
 
     summary: str  # for the description of the key `thermostat` or `barostat`
     source: str
     #: Its keys -> their defaults, or functions of the stage
-    keys: dict[str, float | Callable[[Any], float]]
+    keys: dict[str, float | Callable[[CoupledStage], float]]
     ensembles: tuple[str, ...] = ("nvt", "npt")
     #: For a thermostat: whether it acts on each molecule by itself, so that the total momentum is
     #: not conserved and diffusion and spectra change; its time constant (ps) and its description by
@@ -51,7 +64,7 @@ class Coupling(NamedTuple):
     #: For a barostat: whether it reads the momenta at the ends of steps, or only a temperature.
     reads_momenta: bool = False
 
-    def values(self, stage: Any) -> Values:
+    def values(self, stage: CoupledStage) -> Values:
         """The values of its keys in a stage."""
         defaults = {
             key: default(stage) if callable(default) else default
@@ -77,7 +90,7 @@ def _describe_trajectories(values: Values) -> str:
     return f"trajectories of {steps:g} step{'s' if steps > 1 else ''}{drawn}"
 
 
-def default_interval(stage: Any) -> float:
+def default_interval(stage: CoupledStage) -> float:
     """Time between two moves of the box, ps."""
     return (stage.barostat_time_ps or BAROSTAT_TIME) / MOVES_PER_TIME
 

@@ -1,9 +1,10 @@
 """The table [engine] of a scene: rigidmd itself or an external engine, with its options."""
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, create_model
 
+from rigidmd.core.toml import Json
 from rigidmd.programs import Program, engine_options, runnable
 from rigidmd.scene.validation import Count, Section
 
@@ -45,7 +46,7 @@ class _Engine(Section):
         return self.program is not None
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Json:
         """The options of this engine, with defaults."""
         options = self.program.options if self.program else {}
         values = {key: getattr(self, key) for key in options}

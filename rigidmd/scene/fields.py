@@ -1,8 +1,8 @@
 """The table [fields] of a scene of molecules: electric field, gravity, walls, restraints."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from math import inf
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Generic, Literal, NamedTuple, TypeVar
 
 from pydantic import Field, Strict, field_validator
 
@@ -16,12 +16,18 @@ from rigidmd.scene.validation import (
     Positive,
     Section,
     Vector,
+    not_none,
 )
 
 if TYPE_CHECKING:
+    from rigidmd.forces.fields.restraints import Restraints
+    from rigidmd.forces.fields.walls import HarmonicWalls, LennardJonesWalls
     from rigidmd.scene.molecules import MolecularScene
 
 AXES = "xyz"
+
+Table = TypeVar("Table", bound=Section)
+Term = TypeVar("Term")
 
 Edge = Annotated[float, Strict()]
 
@@ -196,27 +202,29 @@ class Fields(Section):
         return None
 
 
-class FieldKind(NamedTuple):
+class FieldKind(NamedTuple, Generic[Table, Term]):
     """A kind of field. Its keys are of `Fields`."""
 
     module: str  # in `forces.fields`, with the function `term`
     key: str  # of `Fields`: a value, a table or a list of tables, each of which is one term
     title: str  # in the list of unused interactions of a scene
     #: Of the table with its keys and of its term, for `rigidmd check`
-    sentence: Callable[[Any, Any], str]
+    sentence: Callable[[Table, Term], str]
 
 
-def _electric_sentence(fields: Fields, term: Any) -> str:
+def _electric_sentence(fields: Fields, term: object) -> str:
+    amplitude = f"{_vector(not_none(fields.electric_V_per_nm))} V/nm"
     if fields.electric_frequency_per_ps is None:
-        return f"{_vector(fields.electric_V_per_nm)} V/nm"
+        return amplitude
     frequency = f"f = {fields.electric_frequency_per_ps:g}/ps. Its work is in the energy ledger"
-    return (
-        f"{_vector(fields.electric_V_per_nm)} V/nm cos(2 pi f t + {fields.electric_phase_deg:g}°),"
-        f" {frequency}"
-    )
+    return f"{amplitude} cos(2 pi f t + {fields.electric_phase_deg:g}°), {frequency}"
 
 
-def _walls_sentence(walls: Walls, term: Any) -> str:
+def _gravity_sentence(fields: Fields, term: object) -> str:
+    return f"{_vector(not_none(fields.gravity_m_s2))} m/s²"
+
+
+def _walls_sentence(walls: Walls, term: "LennardJonesWalls | HarmonicWalls") -> str:
     kind = f"harmonic, {walls.stiffness_kJ_mol_A2 or 0:g} kJ/mol/Å²"
     if walls.kind == "lj93":
         kind = (
@@ -229,7 +237,7 @@ def _walls_sentence(walls: Walls, term: Any) -> str:
     return f"at {' and '.join(positions)}, on {what}: {kind}"
 
 
-def _restraint_sentence(entry: Restraint, term: Any) -> str:
+def _restraint_sentence(entry: Restraint, term: "Restraints") -> str:
     if entry.between is not None:
         one, other = (_numbers(group) for group in entry.groups)
         spring = f"restrained to {entry.distance_A:g} Å, {entry.stiffness[0]:g} kJ/mol/Å²"
@@ -249,7 +257,7 @@ def _numbers(group: list[int]) -> str:
     return f"the centre of {len(group)} molecules ({group[0]}, ...)"
 
 
-def _vector(values: Any) -> str:
+def _vector(values: Iterable[float]) -> str:
     return f"({', '.join(f'{x:g}' for x in values)})"
 
 
@@ -258,12 +266,7 @@ FIELDS = {
     "electric_field": FieldKind(
         "electric", "electric_V_per_nm", "electric field", _electric_sentence
     ),
-    "gravity": FieldKind(
-        "gravity",
-        "gravity_m_s2",
-        "gravity",
-        lambda fields, _: f"{_vector(fields.gravity_m_s2)} m/s²",
-    ),
+    "gravity": FieldKind("gravity", "gravity_m_s2", "gravity", _gravity_sentence),
     "walls": FieldKind("walls", "walls", "walls", _walls_sentence),
     "restraints": FieldKind("restraints", "restraints", "restraints", _restraint_sentence),
 }

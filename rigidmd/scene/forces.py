@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator
 from math import inf
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, Strict
 
-from rigidmd.core.toml import shorten_repr
+from rigidmd.core.toml import Json, shorten_repr
 from rigidmd.scene.models import Mixing
 from rigidmd.scene.validation import (
     MOST_TABLES,
@@ -107,7 +107,7 @@ class CustomForce(Section):
     and optionally force_kJ_mol_A (-dE/dr), in lines of ascending r up to the cutoff. All keys of an
     energy can also be used with a table. Its only parameter is scale, a factor of the energy.
     Default: 1"""
-    parameters: dict[str, Any] = Field(default={}, max_length=MOST_TABLES)
+    parameters: Json = Field(default={}, max_length=MOST_TABLES)
     """With a module: arguments with which its object is called. With an energy: numbers, which
     apply to all sites, or a table of numbers for each kind of site, by site, SPECIES.SITE or
     element. Default: `parameters` in the models' files"""

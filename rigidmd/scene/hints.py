@@ -4,7 +4,6 @@ import difflib
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel
 
@@ -81,18 +80,20 @@ def hint_on_key(name: str, keys: list, value: object, model: type[BaseModel]) ->
     return did_you_mean(name, known) or _listed(name, known)
 
 
-def _other_unit(name: str, value: Any, known: list[str]) -> str:
+def _other_unit(name: str, value: object, known: list[str]) -> str:
     """Advice on a key in another unit, such as duration_ns."""
+    number = value if isinstance(value, int | float) and not isinstance(value, bool) else None
     for key in known:
         if not (match := KEY_WITH_UNIT.fullmatch(key)):
             continue
         stem = key.removesuffix(match[1])
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if match[1] == "K" and name in [stem + unit for unit in CELSIUS]:
-            return f"; write {key} = {value + ICE_POINT:.12g}" if is_number else f"; write {key}"
+            new = "" if number is None else f" = {number + ICE_POINT:.12g}"
+            return f"; write {key}{new}"
         size = OTHER_UNITS[match[1]].get(name.removeprefix(stem)) if name.startswith(stem) else None
         if size is not None:
-            return f"; write {key} = {value * size:.12g}" if is_number else f"; write {key}"
+            new = "" if number is None else f" = {number * size:.12g}"
+            return f"; write {key}{new}"
     return ""
 
 

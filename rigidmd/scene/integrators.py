@@ -2,7 +2,7 @@
 `integrator`."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, PrivateAttr, Strict, ValidationError
 
@@ -177,7 +177,7 @@ class MovedByScheme(Section):
 
     _user_schemes: dict[str, Scheme] = PrivateAttr(default_factory=dict)
 
-    def model_post_init(self, context: Any) -> None:
+    def model_post_init(self, context: dict[str, Scheme] | None) -> None:
         self._user_schemes = context or {}
 
     @property

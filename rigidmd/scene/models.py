@@ -5,7 +5,7 @@ import re
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
@@ -272,11 +272,21 @@ class Molecule:
         return entries
 
 
+class About(TypedDict, total=False):
+    """Fields of a `Molecule` that do not follow from its sites."""
+
+    title: str
+    source: str
+    group: str
+    note: str
+    mixing: Mixing | None
+
+
 def molecule(
-    name: str, sites: tuple[Site, ...], residue_names: tuple[str, ...] = (), **about: Any
+    name: str, sites: tuple[Site, ...], residue_names: tuple[str, ...] = (), **about: Unpack[About]
 ) -> Molecule:
-    """The rigid body of these sites, each of which needs a position and a mass. about: more fields
-    of `Molecule`. Raises MoleculeError."""
+    """The rigid body of these sites, each of which needs a position and a mass. Raises
+    MoleculeError."""
     missing = [
         (s, key) for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
     ]

@@ -2,7 +2,7 @@
 minimisation."""
 
 from math import inf, log, pi
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
@@ -26,6 +26,7 @@ from rigidmd.scene.validation import (
     Section,
     ShortName,
     TrajectoryError,
+    not_none,
 )
 from rigidmd.units import FEMTOSECOND
 
@@ -145,7 +146,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @model_validator(mode="before")
     @classmethod
-    def _middle_thermostat(cls, data: Any):
+    def _middle_thermostat(cls, data: object):
         """Set baoab as the default with a thermostat that acts in the middle of a step."""
         if not isinstance(data, dict) or "integrator" in data:
             return data
@@ -459,7 +460,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def pressures(self) -> tuple[Six, Six]:
         """Pressure at start and end, bar: xx, yy, zz, xy, xz, yz."""
-        pressure = self.pressure_bar
+        pressure = not_none(self.pressure_bar)
         first, last = (
             pressure if isinstance(pressure, tuple) and len(pressure) == 2 else (pressure, pressure)
         )
@@ -498,7 +499,8 @@ def _users(key: str) -> set[str]:
     }
 
 
-def _tensor(pressure: Any) -> Six:
+def _tensor(pressure: float | tuple[float, float, float] | Six) -> Six:
     """One, three or six pressures as a tensor."""
-    values = pressure if isinstance(pressure, tuple) else (pressure,) * 3
-    return (*values, 0.0, 0.0, 0.0) if len(values) == 3 else values
+    if not isinstance(pressure, tuple):
+        return pressure, pressure, pressure, 0.0, 0.0, 0.0
+    return pressure if len(pressure) == 6 else (*pressure, 0.0, 0.0, 0.0)

@@ -8,7 +8,7 @@ from collections.abc import Collection, Container, Iterable
 from functools import cache
 from itertools import pairwise
 from math import isfinite
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar, overload
 
 from pydantic import (
     BaseModel,
@@ -93,9 +93,9 @@ class NameIn:
     def __init__(self, names: Collection[str], in_scene: bool = False):
         self.names, self.in_scene = names, in_scene
 
-    def _check(self, name: Any, info: ValidationInfo) -> str:
+    def _check(self, name: object, info: ValidationInfo) -> str:
         *first, last = known = [*self.names, *(info.context or () if self.in_scene else ())]
-        if name not in known:
+        if not isinstance(name, str) or name not in known:
             raise PydanticKnownError(
                 "literal_error", {"expected": f"{', '.join(map(repr, first))} or {last!r}"}
             )
@@ -269,7 +269,13 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     return f"is {shown}: {detail['msg']}"
 
 
-def exact_names(data: Any, annotation: Any) -> Any:
+@overload
+def exact_names(data: Json, annotation: object) -> Json: ...
+@overload
+def exact_names(data: str | None, annotation: object) -> str | None: ...
+@overload
+def exact_names(data: object, annotation: object) -> object: ...
+def exact_names(data: object, annotation: object) -> object:
     """Data of a type in which keys, and values with a fixed choice, have their exact spelling:
     "NVT" becomes "nvt", and "minimize" becomes "minimise". The case of letters, hyphens,
     underscores and slashes do not matter in values, nor does American spelling."""

@@ -4,7 +4,7 @@ import filecmp
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from rigidmd.run.resume import MADE_WITH, differences, keys_of
 #: Columns by which samples are matched: steps if they have the same times in both files, else
 #: times.
 STEP, TIMES = "Step", ("Time (ps)", "time")
+Content = TypeVar("Content")
 BITS = 53  # bits of the significand of a float64
 
 
@@ -87,7 +88,7 @@ def compare(first: Path, second: Path) -> RunComparison:
     def either(name: str) -> bool:
         return (first / name).exists() or (second / name).exists()
 
-    def both(name: str, read: Callable[[Path], Any]) -> list[Any]:
+    def both(name: str, read: Callable[[Path], Content | None]) -> list[Content]:
         """The content of this file in both folders. Empty, which `missing` explains, if one of them
         cannot be read."""
         contents = []

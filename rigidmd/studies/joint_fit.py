@@ -15,6 +15,7 @@ from rigidmd.core.integrators import DRIFT, KICK
 from rigidmd.core.statistics import inefficiency, mean_and_error
 from rigidmd.dynamics.model import mobile
 from rigidmd.engines.samples import IN_LOGS
+from rigidmd.engines.system import System
 from rigidmd.run.record import Record
 from rigidmd.scene.couplings import BAROSTATS
 from rigidmd.scene.stage import Stage
@@ -96,7 +97,7 @@ def why_not(stage: Stage) -> str:
     return ""
 
 
-def results_of_run(record: Record) -> RunResults | str:
+def results_of_run(record: Record[System]) -> RunResults | str:
     """Results of a run, or why it has none. Raises OutputError."""
     stage, production = production_samples(record)
     if reason := why_not(stage):
@@ -117,7 +118,7 @@ def results_of_run(record: Record) -> RunResults | str:
     return results_of_samples(np.array(samples), at, stage.has_barostat)
 
 
-def _conditions(record: Record, stage: Stage) -> Conditions:
+def _conditions(record: Record[System], stage: Stage) -> Conditions:
     system = record.system
     freedom = system.freedom_in(system.scene.stages.index(stage))
     return Conditions(

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi, prod
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
@@ -246,10 +247,8 @@ def normal_modes(
             simulation.scene.source,
             ["normal modes need a molecular scene, and this is a single body"],
         )
-    state, system = (
-        (simulation.state if simulation is scene else simulation._settle()).copy(),
-        simulation.system,
-    )
+    state = (simulation.state if simulation is scene else simulation._settle()).copy()
+    system = cast(System, simulation.system)
     numbers = _numbers(Coordinates(system, state), count, gamma)
     if required is not None and required not in numbers:
         among = (

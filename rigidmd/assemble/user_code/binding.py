@@ -4,7 +4,7 @@ become messages."""
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from rigidmd.assemble.user_code.cutoffs import check_cutoff
 from rigidmd.assemble.user_code.force import (
     BoundTerm,
     Force,
+    HasTerm,
     UserForceError,
     bind_force,
     changes_momentum,
@@ -66,7 +67,7 @@ def custom_forces(scene: MolecularScene) -> list[object]:
     return forces
 
 
-def _custom(scene: MolecularScene, entry: CustomForce | BodyForce, key: str) -> Any:
+def _custom(scene: MolecularScene, entry: CustomForce | BodyForce, key: str) -> object:
     if entry.module is None and isinstance(entry, BodyForce):
         return potential_of_scene(entry, scene.path)
     if entry.module is None and isinstance(entry, CustomForce):
@@ -185,8 +186,8 @@ def is_thermostat(thermostat: object) -> bool:
     return type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")
 
 
-def bind(force: Any, system: System, name: str) -> BoundTerm:
-    """Any force of the user in a system. Raises PairPotentialError, ValueError, UserForceError,
+def bind(force: object, system: System, name: str) -> BoundTerm:
+    """A force of the user in a system. Raises PairPotentialError, ValueError, UserForceError,
     SceneError."""
     if isinstance(force, PairPotential):
         return bind_pair_potential(force, system)
@@ -197,9 +198,9 @@ def bind(force: Any, system: System, name: str) -> BoundTerm:
     return _bind_term(force, system)
 
 
-def _bind_term(made: Any, system: System) -> BoundTerm:
+def _bind_term(made: object, system: System) -> BoundTerm:
     """A finished term, or an object whose method `term` makes it for a system."""
-    if hasattr(made, "term"):
+    if isinstance(made, HasTerm):
         try:
             made = made.term(system)
         except (ValueError, SceneError):
@@ -217,8 +218,9 @@ def _bind_term(made: Any, system: System) -> BoundTerm:
             f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_potential,"
             f" {compiled}"
         )
+    term = cast(NamedTuple, made)
     numbers = ", ".join(
-        f"{key} = {x:.6g}" for key, x in made._asdict().items() if isinstance(x, int | float)
+        f"{key} = {x:.6g}" for key, x in term._asdict().items() if isinstance(x, int | float)
     )
-    kind = type(made).__qualname__
-    return BoundTerm(made, f"{kind} with {numbers}" if numbers else kind)
+    kind = type(term).__qualname__
+    return BoundTerm(term, f"{kind} with {numbers}" if numbers else kind)

@@ -7,7 +7,7 @@ import re
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,7 +55,7 @@ def check_compiled_code(system: System, state: State) -> list[str]:
     return list(dict.fromkeys(notes))
 
 
-def _thermostats(system: System) -> Iterator[tuple[str, Any, float]]:
+def _thermostats(system: System) -> Iterator[tuple[str, NamedTuple, float]]:
     """The user's thermostat in each stage of motion: its name, the NamedTuple, the time of its flow
     (ps)."""
     if system.thermostat is None:

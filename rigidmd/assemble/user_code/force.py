@@ -3,9 +3,10 @@
 import time as clock
 import traceback
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigidmd.core.state import State
 from rigidmd.engines.system import System
@@ -18,10 +19,11 @@ from rigidmd.units import KJ_PER_MOL
 EVERY = (True, True, True)
 
 
+@runtime_checkable
 class HasTerm(Protocol):
     """An object that makes a compiled term for a system."""
 
-    def term(self, system: System) -> Any:
+    def term(self, system: System) -> NamedTuple:
         """A NamedTuple of a class with `compiled_force`."""
         ...
 
@@ -29,15 +31,15 @@ class HasTerm(Protocol):
 class HasStage(Protocol):
     """An object that makes a compiled thermostat for each stage."""
 
-    def for_stage(self, system: System, k: int) -> Any:
+    def for_stage(self, system: System, k: int) -> NamedTuple:
         """The thermostat of stage k, a NamedTuple of a class with `compiled_thermostat`."""
         ...
 
 
 class BoundTerm(NamedTuple):
-    """Any user-defined force in a system."""
+    """A user-defined force in a system."""
 
-    term: Any  # a NamedTuple
+    term: NamedTuple
     description: str
     function: "BoundForce | None" = None  # of a term that Python computes
     tail: Tail | None = None  # of a pair potential, where the scene has forces.tail_correction
@@ -243,11 +245,11 @@ class BoundForce:
             ) from error
 
 
-def real_numbers(values: Any) -> np.ndarray | None:
+def real_numbers(values: object) -> np.ndarray | None:
     """An array of real numbers. None for anything else, such as complex numbers and masked
     values."""
     try:
-        if np.iscomplexobj(values) or np.ma.is_masked(values):
+        if np.iscomplexobj(cast(ArrayLike, values)) or np.ma.is_masked(values):
             return None
         return np.asarray(values, float)
     except (TypeError, ValueError):
@@ -260,7 +262,7 @@ def _read_only(array: np.ndarray) -> np.ndarray:
     return view
 
 
-def changes_momentum(term: Any) -> np.ndarray:
+def changes_momentum(term: object) -> np.ndarray:
     """Components (3,) of the total momentum that a force may change. Raises ValueError."""
     flags = getattr(term, "changes_momentum", EVERY)
     each = flags if isinstance(flags, tuple | list | np.ndarray) else (flags,)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -157,7 +157,12 @@ def pair_potential(
 pair_law = pair_potential
 
 
-def _check_names(name: Any, truncation: Any, mixing: Any, pairs: Any) -> None:
+def _check_names(
+    name: str,
+    truncation: TruncationName | None,
+    mixing: Mapping[str, Rule] | None,
+    pairs: Mapping[tuple[str, str], object] | None,
+) -> None:
     """Raise ValueError for a name that is not a text, and for a choice that does not exist."""
     if not isinstance(name, str):
         raise ValueError(f"name is {name!r:.60}, must be a text")
@@ -204,27 +209,29 @@ def _constants_and_tables(
     return _numbers("parameters", parameters), {}
 
 
-def _mapping(where: str, table: Any) -> Mapping[str, object]:
+def _mapping(where: str, table: object) -> Mapping[str, object]:
     """A dictionary, or the fields of a NamedTuple. Raises ValueError."""
-    table = table._asdict() if hasattr(table, "_asdict") else table
+    as_dictionary = getattr(table, "_asdict", None)
+    table = table if as_dictionary is None else as_dictionary()
     if not isinstance(table, Mapping):
         raise ValueError(f"{where}: {table!r:.60} is not a table of numbers")
     return table
 
 
-def _numbers(where: str, table: Any) -> dict[str, float]:
+def _numbers(where: str, table: object) -> dict[str, float]:
     """Parameters as a dictionary of finite numbers. Raises ValueError."""
-    table = _mapping(where, table)
-    for key, value in table.items():
+    numbers: dict[str, float] = {}
+    for key, value in _mapping(where, table).items():
         if (
             not isinstance(value, int | float | np.number)
             or isinstance(value, bool)
             or not isfinite(value)
         ):
             raise ValueError(f"{where}: {key} is {value!r}, must be a finite number")
-    if taken := [key for key in table if key in (DISTANCE, "pi")]:
+        numbers[str(key)] = float(value)
+    if taken := [key for key in numbers if key in (DISTANCE, "pi")]:
         raise ValueError(
             f"{where}: {taken[0]} is the {'distance' if taken[0] == DISTANCE else 'number pi'}."
             " Rename it"
         )
-    return {str(key): float(value) for key, value in table.items()}
+    return numbers

@@ -4,10 +4,10 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import nan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, overload
 
 from rigidmd.core.state import State
-from rigidmd.core.toml import parse_toml
+from rigidmd.core.toml import Json, parse_toml
 from rigidmd.run.results import Results
 
 RIGHT, REFUSED, REPORTED, UNDETECTED, CRASH = "right", "refused", "reported", "undetected", "crash"
@@ -16,10 +16,10 @@ RIGHT, REFUSED, REPORTED, UNDETECTED, CRASH = "right", "refused", "reported", "u
 BOUND = 0.1
 LINEAR = re.compile(r"(?:(\S+) \+ )?(?:(\S+) )?x")
 
-Tables = dict[str, Any]
 TABLES = parse_toml(Path(__file__).with_name("cases.toml").read_text(encoding="utf-8"))
-#: Makes the trials of a value of a row from the one that the table describes.
-Builder = Callable[["Trial", Any], Iterator["Trial"]]
+#: Makes the trials of a value of a row from the one that the table describes. Rows whose values
+#: are texts have the builder `run`.
+Builder = Callable[["Trial", float], Iterator["Trial"]]
 BUILDERS: dict[str, Builder] = {}
 
 
@@ -45,9 +45,9 @@ class Trial(NamedTuple):
     """
 
     setting: str = ""
-    scene: Tables = {}  # noqa: RUF012
+    scene: Json = {}  # noqa: RUF012
     build: str = "run"
-    stage: Tables = {}  # keys of a thermostat  # noqa: RUF012
+    stage: Json = {}  # keys of a thermostat  # noqa: RUF012
     integrators: Sequence[str] = ()
     step: float = nan
     steps: int = 1
@@ -77,8 +77,8 @@ class Case(NamedTuple):
     name: str
     group: int  # number of its kind of difficulty, from 1 to 14
     sentence: str
-    rows: list[Tables]
-    common: Tables = {}  # keys of all rows  # noqa: RUF012
+    rows: list[Json]
+    common: Json = {}  # keys of all rows  # noqa: RUF012
     error_title: str = ""  # what its error is
     step_unit: str = "s"
 
@@ -94,17 +94,21 @@ class Case(NamedTuple):
                         yield built._replace(is_bisected=is_bisected)
 
 
-def _layered(common: Tables, row: Tables, quick: bool) -> Tables:
+def _layered(common: Json, row: Json, quick: bool) -> Json:
     """The keys of a row, after the keys of the layers above it."""
     like = (common | row).get("like")
-    keys: Tables = {"scene": {}}
+    keys: Json = {"scene": {}}
     for layer in (TABLES["defaults"], TABLES["shared"].get(like, {}), common, row):
         changes = layer | (layer.get("quick", {}) if quick else {})
         keys |= changes | {"scene": keys["scene"] | changes.get("scene", {})}
     return {name: value for name, value in keys.items() if name not in ("quick", "like")}
 
 
-def insert(data: Any, x: Any) -> Any:
+@overload
+def insert(data: Json, x: float | str) -> Json: ...
+@overload
+def insert(data: object, x: float | str) -> object: ...
+def insert(data: object, x: float | str) -> object:
     """Data of the table with a value of x in linear functions such as "1 + 0.3 x", and with the
     sites of molecules."""
     if isinstance(data, list):
@@ -112,15 +116,15 @@ def insert(data: Any, x: Any) -> Any:
     if isinstance(data, dict):
         inserted = {key: insert(part, x) for key, part in data.items()}
         molecule = inserted.pop("molecule", None)
-        return inserted if molecule is None else insert(_sites(molecule), x) | inserted
+        return insert(_sites(molecule), x) | inserted if isinstance(molecule, str) else inserted
     if data == "x":
         return x
-    if isinstance(data, str) and (match := LINEAR.fullmatch(data)):
+    if isinstance(data, str) and not isinstance(x, str) and (match := LINEAR.fullmatch(data)):
         return float(match[1] or 0) + float(match[2] or 1) * x
     return data
 
 
-def _sites(molecule: str) -> Tables:
+def _sites(molecule: str) -> Json:
     columns = TABLES["site"] | TABLES["molecules"][molecule]
     count = len(columns["position_A"])
     lists = [value if isinstance(value, list) else [value] * count for value in columns.values()]

@@ -5,18 +5,18 @@ import sys
 from collections.abc import Iterator
 from math import hypot, inf, nan, sqrt
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rigidmd.assemble.describe import describe
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
+from rigidmd.core.toml import Json
 from rigidmd.engines.system import System
 from rigidmd.run.results import Results
 from rigidmd.scene import Scene
 from rigidmd.scene.validation import not_none
-from rigidmd.studies.stability.cases import Outcome, Tables, Trial, builder
+from rigidmd.studies.stability.cases import Outcome, Trial, builder
 from rigidmd.studies.stability.runner import Warn, complete_scene, finish, run_scene, system_of
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -27,7 +27,7 @@ STATES: dict[tuple[str, float], State] = {}
 
 
 @builder
-def run(trial: Trial, x: float) -> Trials:
+def run(trial: Trial, x: object) -> Trials:
     """The errors of conserved quantities."""
     yield trial
 
@@ -93,7 +93,7 @@ def water_at(trial: Trial, temperature: float) -> State:
         is_first, is_frozen = temperature == 298.0, temperature == 0.0
         step, steps = (1.0, 500) if is_first else (trial.step, 1000)
         heat = {"temperature_K": temperature, "thermostat_time_ps": 20 * step / 1000}
-        changes: Tables = {"start": {"temperature_K": 298.0}}
+        changes: Json = {"start": {"temperature_K": 298.0}}
         if is_frozen:
             changes |= {"stages": [{"ensemble": "minimise"}]}
         preparation = Trial(
@@ -221,7 +221,7 @@ def spoiled_scenes(trial: Trial, x: float) -> Trials:
         yield trial._replace(setting=f"{trial.setting}, {name} = {value}", scene=scene)
 
 
-def spoiled(data: Any) -> Iterator[tuple[list[str | int], float, Any]]:
+def spoiled(data: object) -> Iterator[tuple[list[str | int], float, object]]:
     """Nested tables and lists with one number replaced by NaN or an infinity: its path, the value,
     the tables."""
     if isinstance(data, dict | list):

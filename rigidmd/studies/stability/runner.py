@@ -13,6 +13,7 @@ import numpy as np
 from rigidmd.assemble.build import build
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.core.state_file import write_state
+from rigidmd.core.toml import Json
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDError, SceneError
 from rigidmd.run import Simulation
@@ -30,7 +31,6 @@ from rigidmd.studies.stability.cases import (
     UNDETECTED,
     Case,
     Outcome,
-    Tables,
     Trial,
 )
 
@@ -167,7 +167,7 @@ def finish(trial: Trial, integrator: str, warn: Warn, step: float) -> Results:
         return simulation.run()
 
 
-def complete_scene(trial: Trial, integrator: str, step: float) -> Tables:
+def complete_scene(trial: Trial, integrator: str, step: float) -> Json:
     """The tables of a scene with those of a run that writes no files, unless it has its own."""
     method = TABLES["methods"][integrator]
     trial = trial._replace(step=step)

@@ -81,7 +81,8 @@ def _free_energy(manifest: Manifest) -> tuple[AnalysisResult, Json]:
         raise OutputError(f"{folder}: the points have different temperatures")
     thermal = BOLTZMANN * temperatures.pop() / KJ_PER_MOL
     sampled = [SampledLambda(k, changes / thermal) for k, changes in runs]
-    result = free_energy_of(lambdas, sampled, thermal, _parts(system.scene.coupling, lambdas))
+    parts = _parts(not_none(system.scene.coupling), lambdas)
+    result = free_energy_of(lambdas, sampled, thermal, parts)
     value = result.values[0]
     result.values[0] = value._replace(note=_standard_state(system, 1e3 * float(np.mean(volumes))))
     return result, used_together(uses)

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from filelock import FileLock, Timeout
 
@@ -171,7 +171,7 @@ def cluster(address: str) -> Iterator[Executor]:
         message = f"{option('scheduler')} needs dask.distributed: pip install distributed"
         raise SettingError(message) from None
     try:
-        client: Any = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+        client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise SettingError(
             f"{option('scheduler')} {address}: no scheduler of dask.distributed answers ({error})."

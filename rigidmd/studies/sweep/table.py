@@ -16,7 +16,9 @@ from rigidmd.analysis.rigid_frames import earlier_production, production_samples
 from rigidmd.core.display import Displayed
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.core.toml import Json
+from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
+from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDError
 from rigidmd.io.write import Cell, Column, nine_digits
 from rigidmd.io.write import Table as ReportTable
@@ -236,7 +238,7 @@ def summarise_run(record: Record) -> dict[str, Measured]:
     return results
 
 
-def _means_of(record: Record, samples: np.ndarray) -> dict[str, Measured]:
+def _means_of(record: Record[System], samples: np.ndarray) -> dict[str, Measured]:
     """Means of the columns of the log over some samples. A constant has no error."""
     means: dict[str, Measured] = {}
     described = record.log.described
@@ -253,7 +255,7 @@ def _means_of(record: Record, samples: np.ndarray) -> dict[str, Measured]:
     return means
 
 
-def _summarise_motion(record: Record) -> dict[str, Measured]:
+def _summarise_motion(record: Record[BodySystem]) -> dict[str, Measured]:
     results: dict[str, Measured] = {}
     for name, values in record.columns.items():
         if name in NOT_OF_BODY or name[:2] in OF_ROTATION or not np.isfinite(values).all():

@@ -12,6 +12,7 @@ from rigidmd.analysis.result import AnalysisResult
 from rigidmd.analysis.rigid_frames import production_samples
 from rigidmd.core.toml import Json
 from rigidmd.engines.samples import distance_column
+from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.run.record import Record, read_record
 from rigidmd.scene import MolecularScene
@@ -85,7 +86,7 @@ def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, Json]:
     return potential_of_mean_force(windows, thermal_energy), used_together(uses)
 
 
-def production_of(folder: Path) -> tuple[Record, Stage, np.ndarray]:
+def production_of(folder: Path) -> tuple[Record[System], Stage, np.ndarray]:
     """A run of molecules, its last stage and which samples are of production. Raises
     OutputError."""
     record = read_record(folder)
