@@ -1,7 +1,7 @@
 """Rates and periods of a single body in closed form: Lagrange's top, and bodies that no torque acts
 on.
 
-Any consistent units. See "Tops in gravity" in the theory chapter `bodies`.
+In consistent units. See "Tops in gravity" in the theory chapter `bodies`.
 """
 
 from typing import NamedTuple

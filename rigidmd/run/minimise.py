@@ -55,7 +55,7 @@ def remove_overlaps(
     enough.
 
     Moves are limited by the smallest diameter. Radii of molecules convert angles to moves. After a
-    move that lowers the energy the next is longer by a fifth. Any other move is undone and halved.
+    move that lowers the energy the next is longer by a fifth. Other moves are undone and halved.
 
     thermal, dt : scale of energies (u Å²/ps²) and time step (ps) of the kicks; stop : called before
     each step. The removal ends if it is true

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, get_type_hints
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
@@ -273,8 +273,8 @@ def _model_of(types: tuple[tuple[str, object], ...]) -> type[BaseModel]:
     config = ConfigDict(
         extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants", protected_namespaces=()
     )
-    fields: Any = {name: (kind, ...) for name, kind in types}
-    return create_model("Stored", __config__=config, **fields)
+    fields = {name: (kind, ...) for name, kind in types}
+    return create_model("Stored", __config__=config, **fields)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
 @dataclass
