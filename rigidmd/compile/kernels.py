@@ -20,8 +20,9 @@ Private parts of Numba and llvmlite, each tested by tests/test_compile.py:
 
 import functools
 import inspect
+import typing
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 from llvmlite import binding
@@ -49,13 +50,28 @@ remember_resolved_calls()
 CompileError = NumbaError
 
 
+Function = TypeVar("Function", bound=Callable)
+
+
+@typing.overload
+def kernel(
+    function: Function,
+    *,
+    inline: bool = False,
+    count_references: bool = True,
+    from_python: bool = False,
+) -> Function: ...
+@typing.overload
+def kernel(
+    *, inline: bool = False, count_references: bool = True, from_python: bool = False
+) -> Callable[[Function], Function]: ...
 def kernel(
     function: Callable | None = None,
     *,
     inline: bool = False,
     count_references: bool = True,
     from_python: bool = False,
-) -> Any:
+) -> Callable:
     """`numba.njit`, cached on disk.
 
     There are no fast-math flags. With them LLVM rounds a force differently if its energy is
@@ -90,7 +106,7 @@ def kernel(
 
 def implements(
     stub: Callable, kinds: type | tuple[type, ...] = (), *, chooses: bool = False, **options: bool
-) -> Any:
+) -> Callable[[Function], Function]:
     """`numba.extending.overload` with the options of `kernel`: an overload does not inherit those
     of its caller.
 
@@ -125,7 +141,7 @@ def implements(
     return register_for_kinds
 
 
-def chosen_by_type(choose: Callable | None = None, **options: bool) -> Any:
+def chosen_by_type(choose: Callable | None = None, **options: bool) -> Callable[..., Any]:
     """A function for compiled code. The decorated function is called with the Numba types of the
     arguments, and returns the implementation for them; options as for `implements`, which can add
     implementations where it returns None."""

@@ -85,7 +85,7 @@ def by_reference(kind: types.Type) -> types.Type:
 T = TypeVar("T")
 
 
-def remember_by_structure(function: Callable[[Any], T]) -> Callable[[Any], T]:
+def remember_by_structure(function: Callable[[object], T]) -> Callable[[object], T]:
     """Call a function of a value, whose result depends on the Numba type alone, once for each
     structure of values.
 
@@ -94,7 +94,7 @@ def remember_by_structure(function: Callable[[Any], T]) -> Callable[[Any], T]:
     results: dict[Hashable, T] = {}
 
     @wraps(function)
-    def remembered(value: Any) -> T:
+    def remembered(value: object) -> T:
         structure = structure_of(value)
         if structure not in results:
             results[structure] = function(value)
@@ -121,7 +121,7 @@ def structure_of(value: Any) -> Hashable:
 
 
 @remember_by_structure
-def referenced_type(value: Any) -> types.Type:
+def referenced_type(value: object) -> types.Type:
     """The type of task arguments whose named tuples are records."""
     return by_reference(numba.typeof(value))
 
@@ -176,7 +176,7 @@ class Layout(NamedTuple):
 
 
 @remember_by_structure
-def _layout(value: Any) -> tuple[types.Type, Layout]:
+def _layout(value: object) -> tuple[types.Type, Layout]:
     """The type of a value with records, and its layout."""
     kind = referenced_type(value)
     records: list[Struct] = []
@@ -227,7 +227,9 @@ class NumbaStruct:
         self._memory = ctypes.create_string_buffer(layout.numbers.pack(*numbers))
         self.address = ctypes.addressof(self._memory)
 
-    def _append(self, value: Any, numbers: list[float], records: Iterator[Struct] | None) -> None:
+    def _append(
+        self, value: object, numbers: list[float], records: Iterator[Struct] | None
+    ) -> None:
         """Append the numbers of a value. Without `records` they contain those of named tuples."""
         if isinstance(value, np.ndarray):
             numbers += (0, 0, value.size, value.itemsize, value.ctypes.data)

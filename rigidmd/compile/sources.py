@@ -19,7 +19,7 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rigidmd.core.files import untrusted_reason, write_text
 from rigidmd.errors import OutputError
@@ -53,7 +53,7 @@ def register_implementation(of: Callable, kinds: tuple[type, ...], function: Cal
     implementations.extend(Implementation(node_of(of), kind, node_of(function)) for kind in nodes)
 
 
-def node_of(value: Any) -> Node:
+def node_of(value: Callable) -> Node:
     """The top-level definition that contains a function or class."""
     return value.__module__, value.__qualname__.partition(".")[0]
 
