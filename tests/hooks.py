@@ -43,118 +43,206 @@ LONGEST = (
 )
 RANKS = {f"test_{name}.py": rank for rank, name in enumerate(LONGEST)}
 
-#: Variants that compile kinds of kernels which no other default test needs, or start many processes:
-#: file -> patterns of names. They have the marker `extended`, and .ci/run runs them too.
-EXTENDED = {
-    "test_accuracy.py": ("the_command_writes_a_table_a_figure_and_a_page",),
-    "test_auto.py": ("a_crude_error_is_kept_crudely*",),
-    "test_bodies.py": (
-        "free_bodies_of_others",
-        "the_sleeping_top_wakes_where_it_should",
-        "the_split_rotor_has_the_best_of_all_orders*",
-    ),
-    "test_body_engine.py": (
-        "a_python_function_can_apply_what_a_scene_does",
-        "stiff_resistance_ends_at_the_terminal_speed",
-        "the_textbook_systems_are_the_same_motion*matrix*",
-        "wheels_drives_and_friction_in_a_turning_accelerated_frame",
-    ),
-    "test_body_pairs.py": (
-        "a_text_has_the_same_energy_as_its_function*",
-        "integrators_have_their_order*",
-    ),
-    "test_dispersion.py": (
-        "forces_are_as_accurate_as_asked_for*",
-        "mixed_precision*",
-        "openmm_has_the_same_energy_and_forces",
-        "the_mesh_is_the_sum*",
-    ),
-    "test_docs.py": tuple(
-        f"what_a_document_says_can_be_done[[]{page}]"
-        for page in (
-            "analysis",
-            "body_pairs",
-            "crystals",
-            "extending",
-            "five_minutes",
-            "mixtures",
-            "molecule",
-            "normal_modes",
-            "npt",
-            "pictures",
-            "slab",
-            "studies",
-            "tables",
-            "top",
-            "water",
-        )
-    ),
-    "test_coupling.py": ("a_sweep_has_a_free_energy",),
-    "test_dynamics.py": (
-        "a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid[[]chin_4a*",
-        "adding_an_integrator_*",
-    ),
-    "test_engine_settings.py": ("adding_an_engine_takes_a_folder_and_a_file",),
-    "test_ewald.py": (
-        "lennard_jones_and_real_space_end_apart*",
-        "total_does_not_depend_on_how_it_is_split*",
-        "total_momentum_is_taken_out_at_steps_that_the_scene_decides",
-        "waves_of_a_cell_that_a_file_describes_otherwise",
-    ),
-    "test_fault_driver.py": ("runs_survive_mixed_faults",),
-    "test_faults.py": ("a_run_that_is_stopped_by_signals_goes_on*",),
-    "test_fields.py": ("adding_a_field_*",),
-    "test_forces.py": (
-        "a_list_with_almost_no_skin_is_built_at_every_step[[]mixed*",
-        "energies_are_those_of_the_oracle[[]smooth_switch*",
-        "energies_are_those_of_the_oracle[[]switch*",
-        "everything_follows_a_cell_that_changes[[]ewald*",
-        "slanted_boxes*",
-        "a_list_with_little_room_grows_and_misses_nothing[[]mixed]",
-        "adding_a_pair_potential_takes_two_files",
-        "energies_are_those_of_the_oracle[[]force_switch*",
-        "energies_are_those_of_the_oracle[[]plain*",
-        "molecules_millions_of_cells_away*",
-    ),
-    "test_fuzz.py": ("all_that_is_changed_is_valid*",),
-    "test_notebook.py": ("the_tutorial_runs", "the_tutorial_shows_what_it_says"),
-    "test_properties.py": ("any_small_scene_of_one_kind_runs_ten_steps_or_is_refused_in_words",),
-    "test_python.py": ("an_editor_knows_the_types",),
-    "test_resume.py": (
-        "a_run_that_is_killed_goes_on[[]2*",
-        "a_run_that_is_stopped_ends_like_one_that_is_not",
-    ),
-    "test_run.py": (
-        "a_look_takes_the_energies_of_the_last_step[[]cell*",
-        "a_look_takes_the_energies_of_the_last_step[[]piston*",
-        *(
-            f"every_system_runs_a_few_steps[[]{name}]"
-            for name in (
-                "dry_ice",
-                "tip4p2005",
-                "water_from_structure",
-                "water_npt",
-                "water_pme",
-                "water_slab",
+#: Tests beyond the default tier: marker -> file -> patterns of names. Extended: variants that compile
+#: kinds of kernels which no other default test needs, or start many processes; .ci/run runs them.
+#: Soak: repeats of statistics, rare variants, and the whole of what other tests check in parts.
+TIERS = {
+    "extended": {
+        "test_accuracy.py": (
+            "only_what_keeps_its_order_is_tried",
+            "the_command_writes_a_table_a_figure_and_a_page",
+        ),
+        "test_architecture.py": ("a_run_of_a_top_loads_what_its_output_needs[default output]",),
+        "test_bodies.py": (
+            "euler_angles_refuse_the_pole_or_come_through_it[rk4]",
+            "the_sleeping_top_wakes_where_it_should",
+            "the_split_rotor_has_the_best_of_all_orders*",
+        ),
+        "test_body_engine.py": (
+            "a_body_in_a_fluid_follows_kirchhoff",
+            "a_frame_that_changes_its_axis_is_left_to_compositions",
+            "a_python_function_can_apply_what_a_scene_does",
+            "a_run_that_cannot_go_on_says_when",
+            "a_table_does_not_cost_the_order_of_the_integrator",
+            "equal_coefficients_resist_alike_in_all_directions",
+            "stiff_resistance_ends_at_the_terminal_speed",
+            "the_same_scene_gives_the_same_bits_however_often_it_is_looked_at",
+            "the_textbook_systems_are_the_same_motion[quaternion-fluid]",
+            "what_has_no_exact_flow_is_not_given_to_schemes_that_count_on_one",
+            "what_is_switched_on_and_off_gives_its_whole_impulse[ra*",
+            "what_is_switched_on_and_off_gives_its_whole_impulse[rk4]",
+            "wheels_drives_and_friction_in_a_turning_accelerated_frame",
+        ),
+        "test_body_pairs.py": (
+            "a_scene_has_a_table_as_a_file_and_compares_its_forces_at_the_start",
+            "a_text_has_the_same_energy_as_its_function*",
+            "integrators_have_their_order*",
+        ),
+        "test_compile.py": (
+            "a_second_process_compiles_the_last_tasks_first",
+            "an_index_that_cannot_be_read_is_not_replaced",
+            "compiling_goes_on_alone_where_the_second_process_ends",
+            "kernels_are_found_after_a_process_with_a_module_that_others_lack",
+            "settings_that_change_code_have_a_cache_of_their_own",
+        ),
+        "test_coupling.py": ("a_sweep_has_a_free_energy",),
+        "test_defaults.py": ("a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid*",),
+        "test_dispersion.py": (
+            "energy_is_conserved*",
+            "forces_are_as_accurate_as_asked_for*",
+            "forces_torques_and_virial_are_slopes_of_the_energy[forces1*",
+            "mixed_precision[co2_trappe]",
+            "openmm_has_the_same_energy_and_forces",
+            "the_mesh_is_the_sum*",
+        ),
+        "test_docs.py": tuple(
+            f"what_a_document_says_can_be_done[{page}]"
+            for page in (
+                "analysis",
+                "body_pairs",
+                "chemical_potential",
+                "crystals",
+                "ensembles",
+                "extending",
+                "five_minutes",
+                "mixtures",
+                "molecule",
+                "normal_modes",
+                "npt",
+                "pictures",
+                "python",
+                "resume",
+                "slab",
+                "studies",
+                "tables",
+                "top",
+                "water",
             )
         ),
-        "the_scene_that_a_run_writes_holds_every_number_it_used[[]pme]",
-    ),
-    "test_simd.py": (
-        "mixed_precision_costs_less_than_a_hundred_thousandth*switch*",
-        "the_narrowest_vectors*",
-        "the_same_bits_for_any_number_of_threads[[]mixed]",
-    ),
-    "test_stability.py": ("quick*",),
-    "test_strangers.py": ("analyses_execute_and_obey_nothing*",),
-    "test_sweep.py": ("energy_at_a_step_of_zero_has_a_joint_fit*",),
-    "test_threads.py": ("simulations_on_all_threads_at_once_have_the_bits_of_each_alone",),
-    "test_trajectory_structures.py": ("a_run_goes_on_from_a_trajectory",),
-    "test_user_code.py": (
-        "a_table_in_a_file_is_the_potential_that_it_lists*",
-        "every_example_of_an_extension_runs_and_is_short*",
-    ),
-    "test_virial.py": ("steep_spherocylinders_tend_to_hard_ones",),
+        "test_dynamics.py": ("adding_an_integrator_from_python",),
+        "test_ensembles.py": ("*",),
+        "test_ewald.py": (
+            "forces_of_a_slab_are_as_accurate_as_asked_for*",
+            "frozen_molecules_do_not_act_on_one_another",
+            "ions_in_a_triclinic_cell[pme]",
+            "lennard_jones_and_real_space_end_apart*",
+            "total_does_not_depend_on_how_it_is_split*",
+            "total_momentum_is_taken_out_at_steps_that_the_scene_decides",
+            "waves_of_a_cell_that_a_file_describes_otherwise",
+        ),
+        "test_faults.py": ("*",),
+        "test_fields.py": ("adding_a_field_*",),
+        "test_figures.py": ("figures_of_a_run_and_of_a_molecule_take_any_name*",),
+        "test_forces.py": (
+            "a_cutoff_within_which_are_too_many_sites_is_refused",
+            "a_list_with_little_room_grows_and_misses_nothing[mixed]",
+            "energies_are_those_of_the_oracle[force_switch*",
+            "energies_are_those_of_the_oracle[plain*",
+            "energies_are_those_of_the_oracle[smooth_switch*",
+            "energies_are_those_of_the_oracle[switch*",
+            "everything_follows_a_cell_that_changes[ewald*",
+            "everything_follows_a_cell_that_changes[pme*",
+            "forces_and_torques_are_the_slope_of_the_energy[force_shift*",
+            "forces_have_the_same_bits_with_their_energies_and_without[a text*",
+            "forces_have_the_same_bits_with_their_energies_and_without[damped*",
+            "forces_have_the_same_bits_with_their_energies_and_without[defaults-mixed]",
+            "forces_have_the_same_bits_with_their_energies_and_without[no box*",
+            "molecules_millions_of_cells_away*",
+            "slanted_boxes*",
+        ),
+        "test_framework.py": (
+            "a_framework_acts_as_its_atoms_do[na_spce-pme]",
+            "a_published_henry_constant",
+        ),
+        "test_fuzz.py": ("*",),
+        "test_insertion.py": ("energies_are_the_differences_of_the_engine*",),
+        "test_known.py": ("gyrocompass_swings",),
+        "test_lammps.py": ("a_run_is_one_like_any_other[1]",),
+        "test_notebook.py": ("a_sweep_shows_its_progress",),
+        "test_properties.py": (
+            "any_small_scene_of_one_kind_runs_ten_steps_or_is_refused_in_words",
+        ),
+        "test_python.py": (
+            "an_editor_knows_the_types",
+            "every_column_of_every_body_is_in_the_table",
+        ),
+        "test_resume.py": (
+            "a_folder_is_all_that_is_needed",
+            "a_forked_child_leaves_the_files_of_the_run_alone",
+            "a_run_that_is_killed_goes_on[2*",
+            "a_run_that_is_stopped_ends_like_one_that_is_not",
+            "every_ensemble_goes_on_to_the_same_bits[hybrid_monte_carlo*",
+            "no_command_writes_through_a_link*",
+            "wrong_numbers_in_a_checkpoint_are_refused[dop853*",
+        ),
+        "test_run.py": (
+            "a_look_takes_the_energies_of_the_last_step[c*",
+            "a_look_takes_the_energies_of_the_last_step[piston*",
+            "a_signal_stops_with_a_summary_and_its_code[15*",
+            *(
+                f"every_system_runs_a_few_steps[{name}]"
+                for name in ("gay_berne", "janus", "lta", "water_nitrogen", "water_slab")
+            ),
+            "the_scene_that_a_run_writes_holds_every_number_it_used[pme]",
+        ),
+        "test_simd.py": (
+            "mixed_precision_costs_less_than_a_hundred_thousandth*switch*",
+            "the_same_bits_for_any_number_of_threads[mixed]",
+        ),
+        "test_sources.py": ("*",),
+        "test_stability.py": ("the_command_writes_its_files_and_does_not_overwrite",),
+        "test_stored_runs.py": ("a_sweep_is_read",),
+        "test_strangers.py": ("nothing_in_the_working_directory_is_executed_or_obeyed*",),
+        "test_sweep.py": (
+            "a_killed_process_loses_its_point_alone_and_a_signal_stops_all",
+            "points_run_on_a_cluster_of_dask",
+            "points_that_fail_are_told_and_repeated",
+        ),
+        "test_threads.py": ("simulations_on_all_threads_at_once_have_the_bits_of_each_alone",),
+        "test_trajectory_structures.py": ("a_run_goes_on_from_a_trajectory",),
+        "test_user_code.py": (
+            "a_table_in_a_file_is_the_potential_that_it_lists*",
+            "any_text_is_read_or_refused_soon",
+        ),
+        "test_view.py": ("a_browser_shows_a_top_that_moves",),
+        "test_virial.py": ("published_values",),
+    },
+    "soak": {
+        "test_auto.py": ("a_crude_error_is_kept_crudely*",),
+        "test_bodies.py": ("free_bodies_of_others",),
+        "test_body_engine.py": ("the_textbook_systems_are_the_same_motion*matrix*",),
+        "test_dispersion.py": ("mixed_precision[argon]",),
+        "test_dynamics.py": (
+            "a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid[chin_4a*",
+            "adding_an_integrator_to_a_scene",
+        ),
+        "test_engine_settings.py": ("adding_an_engine_takes_a_folder_and_a_file",),
+        "test_fault_driver.py": ("runs_survive_mixed_faults",),
+        "test_faults.py": ("a_run_that_is_stopped_by_signals_goes_on*",),
+        "test_forces.py": (
+            "a_list_with_almost_no_skin_is_built_at_every_step[mixed*",
+            "adding_a_pair_potential_takes_two_files",
+        ),
+        "test_fuzz.py": ("all_that_is_changed_is_valid*",),
+        "test_joint_fit.py": ("pulls_of_joint_limits_have_unit_width*",),
+        "test_mean_force.py": ("errors_are_those_of_repeated_samples",),
+        "test_notebook.py": ("the_tutorial_runs", "the_tutorial_shows_what_it_says"),
+        "test_reference.py": ("a_cutoff_that_reaches_hundreds_of_clusters",),
+        "test_run.py": tuple(
+            f"every_system_runs_a_few_steps[{name}]"
+            for name in ("dry_ice", "tip4p2005", "water_from_structure", "water_npt", "water_pme")
+        ),
+        "test_simd.py": ("the_narrowest_vectors*",),
+        "test_stability.py": ("quick*",),
+        "test_strangers.py": ("analyses_execute_and_obey_nothing*",),
+        "test_sweep.py": (
+            "a_second_interrupt_ends_all_points_at_once",
+            "energy_at_a_step_of_zero_has_a_joint_fit*",
+            "points_end_with_their_sweep*",
+        ),
+        "test_user_code.py": ("every_example_of_an_extension_runs_and_is_short*",),
+        "test_virial.py": ("errors_are_honest", "steep_spherocylinders_tend_to_hard_ones"),
+    },
 }
 
 #: Reasons to skip that are properties of a machine, which CI cannot install.
@@ -194,19 +282,26 @@ _skipped: list[str] = []
 
 @pytest.hookimpl(tryfirst=True)  # before tests are selected by their markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files come first; variants are marked; a test of the soak tier has no limit of time."""
+    """Long files come first; tests have the markers of their tiers; a test of the soak tier has no
+    limit of time."""
     items.sort(key=lambda item: RANKS.get(item.path.name, len(RANKS)))
     for item in items:
+        if (tier := tier_of(item.path.name, item.name)) and not item.get_closest_marker("soak"):
+            item.add_marker(tier)
         if item.get_closest_marker("soak"):
             item.add_marker(pytest.mark.timeout(0))
-        elif is_extended(item.path.name, item.name):
-            item.add_marker(pytest.mark.extended)
 
 
-def is_extended(file: str, name: str) -> bool:
-    """Whether a test is a variant of the second tier."""
+def tier_of(file: str, name: str) -> str | None:
+    """The marker of a test by `TIERS`, the later of two; None for the default tier."""
+    return next((tier for tier in reversed(TIERS) if pattern_in(tier, file, name)), None)
+
+
+def pattern_in(tier: str, file: str, name: str) -> str | None:
+    """The first pattern of a tier that names a test."""
     name = name.removeprefix("test_")
-    return any(fnmatchcase(name, pattern) for pattern in EXTENDED.get(file, ()))
+    patterns = TIERS[tier].get(file, ())
+    return next((one for one in patterns if fnmatchcase(name, one.replace("[", "[[]"))), None)
 
 
 def _note(report: pytest.TestReport | pytest.CollectReport) -> None:

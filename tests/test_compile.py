@@ -13,6 +13,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from struct import calcsize
 from typing import NamedTuple
 
 import numba
@@ -40,7 +41,8 @@ from rigidmd.compile.cache import CacheIndex, cache_folder, compiling_announced
 from rigidmd.compile.front_end import UNUSED_PASSES
 from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
 from rigidmd.compile.records import (
-    array_struct,
+    ARRAY_FIELDS,
+    array_format,
     by_reference,
     referenced_type,
     structure_of,
@@ -237,16 +239,17 @@ def _tell(task_arguments, block):
 
 def test_arrays_are_stored_as_assumed():
     kind, context = types.Array(types.float64, 2, "C"), cpu_target.target_context
-    model, assumed = context.data_model_manager[kind], array_struct(2)
-    stored = [
-        (name, context.get_abi_sizeof(context.get_value_type(model.get_member_fe_type(name))))
+    model = context.data_model_manager[kind]
+    sizes = [
+        context.get_abi_sizeof(context.get_value_type(model.get_member_fe_type(name)))
         for name in model._fields
     ]
-    fields = [(name, ctypes.sizeof(c_type)) for name, c_type in assumed._fields_]
     size = context.get_abi_sizeof(context.get_value_type(kind))
-    assert (fields, ctypes.sizeof(assumed)) == (stored, size), (
-        f"Numba {numba.__version__} stores an array as {stored} (name, bytes), {size} bytes in all; rigidmd/compile/"
-        f"records.py assumes {fields}, {ctypes.sizeof(assumed)} bytes in all: change `array_struct` and `c_value` there"
+    stored = list(zip(model._fields, sizes, strict=True))
+    assumed = list(zip(ARRAY_FIELDS, [8, 8, 8, 8, 8, 16, 16], strict=True))
+    assert (stored, size) == (assumed, calcsize(array_format(2))), (
+        f"Numba {numba.__version__} stores an array as {stored} (name, bytes), {size} bytes in all;"
+        f" rigidmd/compile/records.py assumes {assumed}: change `ARRAY_FIELDS` there"
     )
 
 
@@ -274,9 +277,9 @@ def test_values_are_stored_as_in_compiled_code():
     assert found.tolist() == [-3, 1, 0, 5, 0.5, 1, 65000, 8, 2.5, -(2**40), 5, 5]
     assert plane[0, 0] == -1.0
     context, struct = cpu_target.target_context, NumbaStruct(mixed)
-    assert ctypes.sizeof(struct._memory) == context.get_abi_sizeof(
-        context.get_value_type(struct.kind)
-    )
+    for memory, kind in (struct._memory, struct.kind), (*struct._records, struct.kind.content):
+        expected = context.get_abi_sizeof(context.get_value_type(kind))
+        assert ctypes.sizeof(memory) - 1 == expected  # a buffer of text ends with a zero
 
 
 class OtherMixed(NamedTuple):

@@ -187,6 +187,8 @@ class Reader:
             case ["rigidmd", *arguments]:
                 if arguments[0] in ("run", "accuracy", "sweep"):
                     arguments += options
+                if arguments[0] == "film":
+                    arguments += ["--seconds", "0.3"]
                 to = Path(arguments[arguments.index(">") + 1]) if ">" in arguments else None
                 parse(arguments := arguments[: arguments.index(">")] if to else arguments)
                 if runs:

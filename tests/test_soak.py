@@ -5,7 +5,7 @@ import re
 import sys
 
 import soak
-from hooks import EXTENDED, is_extended
+from hooks import TIERS, pattern_in, tier_of
 from support import ROOT
 
 
@@ -46,12 +46,13 @@ def test_a_part_that_fails_fails_the_soak(tmp_path, monkeypatch):
     assert soak.main(["statistics", "faults", *record]) == 1
 
 
-def test_every_variant_of_the_extended_tier_exists():
-    for file, patterns in EXTENDED.items():
+def test_every_pattern_of_a_tier_names_a_test():
+    files = {(tier, file) for tier, patterns in TIERS.items() for file in patterns}
+    for tier, file in files:
         tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
         names = [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
-        for pattern in patterns:
-            function = re.split(r"\[\[\]|\*", pattern)[0]
+        for pattern in TIERS[tier][file]:
+            function = re.split(r"\[|\*", pattern)[0]
             assert any(name.startswith(f"test_{function}") for name in names), (file, pattern)
-            assert is_extended(file, f"test_{pattern.replace('[[]', '[').replace('*', '')}")
-    assert not is_extended("test_run.py", "test_every_system_runs_a_few_steps[water]")
+            assert pattern_in(tier, file, f"test_{pattern.replace('*', '')}"), (file, pattern)
+    assert tier_of("test_run.py", "test_every_system_runs_a_few_steps[water]") is None

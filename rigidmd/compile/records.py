@@ -13,9 +13,10 @@ would run all of it.
 """
 
 import ctypes
-from collections.abc import Callable, Hashable
-from functools import cache, wraps
-from typing import Any, TypeVar
+from collections.abc import Callable, Hashable, Iterator
+from functools import wraps
+from struct import Struct, calcsize
+from typing import Any, NamedTuple, TypeVar
 
 import numba
 import numpy as np
@@ -28,16 +29,13 @@ from numba.extending import models, register_model
 
 from rigidmd.compile.machine import field_address
 
-#: C types of the numbers of compiled code.
-C_TYPES = {
-    types.boolean: ctypes.c_bool,
-    types.float64: ctypes.c_double,
-    types.float32: ctypes.c_float,
-} | {
-    kind: getattr(ctypes, f"c_{kind.name}")
-    for kind in sorted(types.integer_domain, key=str)
-    if kind.bitwidth <= 64
-}
+#: Formats of the module `struct` for the numbers of compiled code, and for addresses and sizes.
+FORMATS = {types.boolean: "?", types.float64: "d", types.float32: "f"}
+FORMATS |= {types.int8: "b", types.int16: "h", types.int32: "i", types.int64: "q"}
+FORMATS |= {types.uint8: "B", types.uint16: "H", types.uint32: "I", types.uint64: "Q"}
+WORD = "n"
+#: Fields of Numba's `ArrayModel`, in its order.
+ARRAY_FIELDS = ("meminfo", "parent", "nitems", "itemsize", "data", "shape", "strides")
 
 
 class Record(types.Type):
@@ -170,6 +168,48 @@ def stored_by_reference(context, builder, kind: types.Type, value):
     return value
 
 
+class Layout(NamedTuple):
+    """How a value lies in memory: its own numbers, and those of each of its records in order."""
+
+    numbers: Struct
+    records: tuple[Struct, ...]
+
+
+@remember_by_structure
+def _layout(value: Any) -> tuple[types.Type, Layout]:
+    """The type of a value with records, and its layout."""
+    kind = referenced_type(value)
+    records: list[Struct] = []
+    numbers = Struct(_format(kind, value, records))
+    return kind, Layout(numbers, tuple(records))
+
+
+def _format(kind: types.Type, value: Any, records: list[Struct]) -> str:
+    """Format of the numbers of a value, as in a struct of LLVM: each is aligned to its own size, a
+    tuple to that of its largest number."""
+    if isinstance(kind, Record):
+        records.append(Struct(_format(kind.content, value, [])))
+        return WORD
+    if isinstance(kind, types.Array):
+        return array_format(kind.ndim)
+    if isinstance(kind, types.BaseTuple):
+        parts = zip(kind.types, value, strict=True)
+        text = "".join(_format(part, one, records) for part, one in parts)
+        alignment = "0" + max(filter(str.isalpha, text), key=calcsize, default="b")
+        return alignment + text + alignment
+    if kind is types.none or hasattr(value, "address_value"):
+        return WORD
+    if kind not in FORMATS:
+        raise TypeError(f"a value of type {kind} cannot be an argument of a task")
+    return FORMATS[kind]
+
+
+def array_format(dimensions: int) -> str:
+    """Format of an array: `ARRAY_FIELDS`, of which the last two have a number for each
+    dimension."""
+    return f"{len(ARRAY_FIELDS) - 2 + 2 * dimensions}{WORD}"
+
+
 class NumbaStruct:
     """Task arguments in memory as compiled code reads them, at `address`, with records for named
     tuples.
@@ -178,63 +218,31 @@ class NumbaStruct:
     anything but numbers, arrays, None, codes, and tuples of these.
     """
 
-    def __init__(self, value: Any):
-        self.value, self.kind = value, referenced_type(value)
-        self._records: list[Any] = []
-        self._memory = self._reference(self.kind, value)
+    def __init__(self, value: object):
+        self.value = value
+        self.kind, layout = _layout(value)
+        self._records: list[ctypes.Array] = []
+        numbers: list[float] = []
+        self._append(value, numbers, iter(layout.records))
+        self._memory = ctypes.create_string_buffer(layout.numbers.pack(*numbers))
         self.address = ctypes.addressof(self._memory)
 
-    def _reference(self, kind: types.Type, value: Any) -> Any:
-        """An object of ctypes for a value with records."""
-        if isinstance(kind, Record):
-            record = c_value(kind.content, value)
+    def _append(self, value: Any, numbers: list[float], records: Iterator[Struct] | None) -> None:
+        """Append the numbers of a value. Without `records` they contain those of named tuples."""
+        if isinstance(value, np.ndarray):
+            numbers += (0, 0, value.size, value.itemsize, value.ctypes.data)
+            numbers += value.shape
+            numbers += value.strides
+        elif isinstance(value, tuple) and hasattr(value, "_fields") and records is not None:
+            content: list[float] = []
+            self._append(value, content, None)
+            record = ctypes.create_string_buffer(next(records).pack(*content))
             self._records.append(record)
-            return ctypes.c_void_p(ctypes.addressof(record))
-        if isinstance(kind, types.BaseTuple):
-            return _tuple_struct(
-                self._reference(part, one) for part, one in zip(kind.types, value, strict=True)
-            )
-        return c_value(kind, value)
-
-
-def c_value(kind: types.Type, value: Any) -> Any:
-    """A value as an object of ctypes with its own memory."""
-    if isinstance(kind, types.Array):
-        struct, numbers = array_struct(kind.ndim), ctypes.c_ssize_t * kind.ndim
-        sizes = value.size, value.itemsize, value.ctypes.data
-        return struct(None, None, *sizes, numbers(*value.shape), numbers(*value.strides))
-    if isinstance(kind, types.BaseTuple):
-        return _tuple_struct(
-            c_value(part, one) for part, one in zip(kind.types, value, strict=True)
-        )
-    if hasattr(value, "address_value"):
-        return ctypes.c_int64(value.address_value)
-    if kind is types.none:
-        return ctypes.c_void_p()
-    if kind not in C_TYPES:
-        raise TypeError(f"a value of type {kind} cannot be an argument of a task")
-    return C_TYPES[kind](value)
-
-
-def _tuple_struct(parts: Any) -> ctypes.Structure:
-    items = tuple(parts)
-    return _struct(tuple((f"item_{k}", type(part)) for k, part in enumerate(items)))(*items)
-
-
-@cache
-def _struct(fields: tuple[tuple[str, Any], ...]) -> type[ctypes.Structure]:
-    """The C struct of named values, each aligned to its own size, like a struct of LLVM."""
-    return type("NumbaTuple", (ctypes.Structure,), {"_fields_": fields})
-
-
-@cache
-def array_struct(dimensions: int) -> type[ctypes.Structure]:
-    """The C struct of an array, with the fields of Numba's `ArrayModel` in the same order."""
-    numbers = ctypes.c_ssize_t * dimensions
-    owners = ("meminfo", ctypes.c_void_p), ("parent", ctypes.c_void_p)
-    content = (
-        ("nitems", ctypes.c_ssize_t),
-        ("itemsize", ctypes.c_ssize_t),
-        ("data", ctypes.c_void_p),
-    )
-    return _struct((*owners, *content, ("shape", numbers), ("strides", numbers)))
+            numbers.append(ctypes.addressof(record))
+        elif isinstance(value, tuple):
+            for one in value:
+                self._append(one, numbers, records)
+        elif value is None:
+            numbers.append(0)
+        else:
+            numbers.append(getattr(value, "address_value", value))

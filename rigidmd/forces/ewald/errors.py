@@ -7,7 +7,7 @@ of 1 Å. For dispersion it is u Å/ps².
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from math import exp, inf, pi, sqrt
 from typing import NamedTuple
 
@@ -39,8 +39,8 @@ class Charges(NamedTuple):
 
     count: int  # charged sites
     square: float  # sum of q², e²
-    # (p, 2) q_i q_j (e²), in both orders, and distance (Å) of pairs of sites inside molecules
-    pairs: np.ndarray
+    # q_i q_j (e²), in both orders, and distance (Å) of pairs of sites inside molecules
+    pairs: tuple[tuple[float, float], ...]
 
     def form(self, k: np.ndarray) -> np.ndarray:
         """Sum over molecules of |sum q exp(i k r)|², averaged over orientations, e²; k (1/Å) of any
@@ -113,7 +113,7 @@ def charges_in(
     sums, order = np.zeros(len(first)), np.argsort(first)
     np.add.at(sums, which, np.concatenate(products))
     rounded = [round(d, FINE) for d in distance[order].tolist()]
-    return kind(count, square, np.array([sums[order], rounded]).T.copy())
+    return kind(count, square, tuple(zip(sums[order].tolist(), rounded, strict=True)))
 
 
 def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
@@ -258,13 +258,15 @@ def pme_grid_for(
 ) -> tuple[tuple[int, int, int], int] | None:
     """The fastest grid and spline order with at most this error. None if none has. order, grid :
     fixed, if given"""
-    return _fastest_grid(charges, alpha, cell, error, order, grid, MAX_PROXY_POINTS)[1]
+    rows = tuple(map(tuple, cell.tolist()))
+    return _fastest_grid(charges, alpha, rows, error, order, grid, MAX_PROXY_POINTS)[1]
 
 
+@lru_cache(maxsize=1024)  # trials and studies build a scene many times
 def _fastest_grid(
     charges: Charges,
     alpha: float,
-    cell: np.ndarray,
+    rows: tuple[tuple[float, ...], ...],
     error: float,
     order: int | None = None,
     grid: tuple[int, int, int] | None = None,
@@ -272,11 +274,13 @@ def _fastest_grid(
 ) -> tuple[float, tuple[tuple[int, int, int], int] | None]:
     """Approximate time (ns) of the reciprocal part on one core with the fastest grid and order, and
     these. Infinite and None without any."""
+    cell = np.array(rows)
     edges = np.linalg.norm(cell, axis=1)
     sensible = SPACINGS[edges.max() / SPACINGS <= MAX_GRID_POINTS]
-    grids = (
-        [tuple(fft_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]
-    )
+    grids = [grid]
+    if grid is None:
+        sizes = (tuple(fft_size(edge / h) for edge in edges) for h in sensible)
+        grids = list(dict.fromkeys(sizes))  # neighbouring spacings often have the same grid
     best, cheapest = None, inf
     for p in ORDERS if order is None else (order,):
         k = bisect_left(
@@ -299,6 +303,7 @@ def fastest_cutoff(
     filled : see `filled_fraction`
     """
     volume, cutoffs = abs(float(np.linalg.det(cell))), np.arange(SHORTEST_CUTOFF, longest, 0.5)
+    rows = tuple(map(tuple, cell.tolist()))
 
     @cache
     def cost(k: int) -> float:
@@ -308,7 +313,7 @@ def fastest_cutoff(
             * min(1.0, 4 / 3 * pi * (cutoffs[k] + LIST_MARGIN) ** 3 / (filled * volume))
         )
         alpha = alpha_for(charges, cutoffs[k], volume, error)
-        return PAIR_NS * pairs + _fastest_grid(charges, alpha, cell, error)[0]
+        return PAIR_NS * pairs + _fastest_grid(charges, alpha, rows, error)[0]
 
     low, high = 0, len(cutoffs) - 1
     while high - low > 2:  # the cost has one minimum, except for the steps between sizes of grids
@@ -339,7 +344,9 @@ class Aliases(NamedTuple):
     second: np.ndarray  # sum of (n + m K)² U²
 
 
+@cache
 def aliases(points: int, order: int) -> Aliases:
+    """The sums for a number of points and a spline order. Callers share the arrays."""
     n = np.arange(points)
     n = np.where(2 * n > points, n - points, n)
     every = n[:, None] + points * np.arange(-ALIASES, ALIASES + 1)
