@@ -228,6 +228,27 @@ def test_a_walk_that_no_step_makes_smaller_is_reported_with_what_helps(known):
     )
 
 
+@pytest.mark.parametrize("longest_stable", [0.0, 2.0])
+def test_a_step_that_diverges_in_its_longer_pilot_is_not_chosen(longest_stable, known, monkeypatch):
+    trial_system, longest, _ = known(2.0)
+    measure = trials.measure_errors
+
+    def diverges_late(system, trial, exact, *observations):
+        measure(system, trial, exact, *observations)
+        is_pilot = system.span > trial_system.span and not observations
+        if is_pilot and trial.timestep > longest_stable:
+            trial.failure = "diverges"
+
+    monkeypatch.setattr(trials, "measure_errors", diverges_late)
+    if longest_stable:
+        assert choose(trial_system, longest, 1e-4, duration=20.0).timestep <= longest_stable
+    else:
+        with pytest.raises(
+            SimulationError, match=r"keeps its error for 0\.1 but diverges within 1"
+        ):
+            choose(trial_system, longest, 1e-4, duration=20.0)
+
+
 @pytest.mark.parametrize("target", [1e-8, pytest.param(1e-3, marks=pytest.mark.soak)])
 def test_the_error_of_a_top_is_what_was_asked_for(target):
     changes = {"run.integrator": "auto", "run.trajectory_error": target, "run.timestep_s": 0.05}

@@ -213,7 +213,7 @@ def choose(
 
 def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[Trial, float, str]:
     """The best trial for a run that is longer than its pilots, its expected error, and a phrase
-    about the pilot run."""
+    about the pilot run. Raises SimulationError if none survives its pilot run."""
     span, target = search.system.span, search.target
     search.energy_walk, search.time = measure_energy_walk(search.system, first.timestep), duration
     search.target = SAFETY * target
@@ -223,12 +223,12 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
     for _ in range(CORRECTIONS):
         if (candidate := search.best()) is None:
             break
-        best = candidate
-        pilot_trial = search.trial(candidate.integrator, candidate.timestep, length)
-        name, step = best.integrator, best.timestep
-        if pilot_trial.diverged:
+        name, step = candidate.integrator, candidate.timestep
+        trial = search.trial(name, step, length)
+        if trial.diverged:
             search.longest[name] = step / 2
             continue
+        best, pilot_trial = candidate, trial
         of_pilot = search.walk_square(name, step, length)
         # the error may not be 0 at the start
         square = max(pilot_trial.energy_rms**2, 2 * float(np.var(pilot_trial.energies)))
@@ -238,6 +238,11 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
         regular = sqrt(max(square - of_pilot, best.energy_rms**2))
         slow = regular / (best.energy_rms or regular or 1.0)
         search.slow_factor[name] = max(1.2 * search.slow_factor.get(name, 1.0), slow)
+    if best.timestep > search.longest[best.integrator]:
+        raise SimulationError(
+            f"{best.integrator} at {best.timestep:.3g} {search.system.time_unit} keeps its error"
+            f" for {span:.3g} but diverges within {length:.3g}: give an integrator and a time step"
+        )
     pilot = pilot_trial.steps * pilot_trial.timestep * search.system.time_size
     pilot_error = f"{pilot_trial.energy_rms:.1e} in a pilot of {pilot:.3g} ps"
     return best, value, f" (expected, from {pilot_error})"
