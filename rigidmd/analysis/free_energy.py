@@ -4,7 +4,7 @@ Phys. 129, 124105)."""
 import logging
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.core.statistics import inefficiency
 from rigidmd.errors import OutputError
 from rigidmd.io.write import columns_text
+
+if TYPE_CHECKING:
+    from pymbar import MBAR
 
 NAME = "free_energy"
 ABOUT, OVER = "free energy of the molecules in [coupling], by MBAR", "coupling.lambda"
@@ -91,7 +94,7 @@ def free_energy_of(
     return AnalysisResult(NAME, ABOUT, values, [curve, matrix], notes)
 
 
-def _mbar(energies: np.ndarray, counts: np.ndarray) -> Any:
+def _mbar(energies: np.ndarray, counts: np.ndarray) -> "MBAR":
     """pymbar's solution for energies (lambdas, n) in kT, of counts (lambdas,) samples each."""
     logging.getLogger("pymbar").setLevel(logging.ERROR)  # it warns of accelerators at its import
     try:

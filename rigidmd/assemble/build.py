@@ -40,8 +40,10 @@ from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene, couplings
 from rigidmd.scene.fields import FIELDS, field_notes
 from rigidmd.scene.forces import ELECTROSTATICS, POTENTIALS
+from rigidmd.scene.models import Molecule
 from rigidmd.scene.molecules import missing_user_code
 from rigidmd.scene.stage import Stage
+from rigidmd.scene.validation import not_none
 from rigidmd.units import BAR, BOLTZMANN
 
 
@@ -98,9 +100,9 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         cell=start.cell,
     )
     whole = SystemParts(scene, species, model, space, state, number, start.basis, resolved.pme_grid)
-    acting = acting_in(whole)
+    acting = acting_in(scene, species, whole)
     others = () if scene.coupling is None else scene.coupling.lambdas
-    at = {x: acting_in(whole._replace(scene=at_lambda(scene, x))) for x in others}
+    at = {x: acting_in(at_lambda(scene, x), species, whole) for x in others}
     species = coupled(scene, species)
     model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
@@ -203,23 +205,23 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     return system
 
 
-def acting_in(whole: SystemParts) -> Interactions:
+def acting_in(scene: MolecularScene, species: list[Molecule], whole: SystemParts) -> Interactions:
     """The interactions and fields of a resolved scene. Raises SceneError.
 
-    whole : its parts, with the whole charges of the species in [coupling]
+    species, whole : its parts, with the whole charges of the species in [coupling]
     """
-    parts = whole._replace(species=coupled(whole.scene, whole.species))
-    acting = interactions(parts)
-    acting.terms.update(field_terms(parts))
+    parts = whole._replace(scene=scene, species=coupled(scene, species))
+    acting = interactions(scene, parts)
+    acting.terms.update(field_terms(scene, parts))
     return acting
 
 
-def interactions(parts: SystemParts) -> Interactions:
+def interactions(scene: MolecularScene, parts: SystemParts) -> Interactions:
     """The interactions of a resolved scene. Raises SceneError."""
-    forces = parts.scene.forces
+    forces = scene.forces
     names = [f"potentials.{key}" for key in POTENTIALS if getattr(forces, key) is not None]
     if any(m.charges.any() for m in parts.species):
-        names.append(ELECTROSTATICS[forces.electrostatics].module)
+        names.append(ELECTROSTATICS[not_none(forces.electrostatics)].module)
     if forces.dispersion != "cutoff":
         names.append("ewald.dispersion")
     contributions = [
@@ -235,11 +237,11 @@ def interactions(parts: SystemParts) -> Interactions:
     )
 
 
-def field_terms(parts: SystemParts) -> dict[str, NamedTuple]:
+def field_terms(scene: MolecularScene, parts: SystemParts) -> dict[str, NamedTuple]:
     """The terms of a scene's fields, by name. Raises SceneError with all errors."""
     faults: list[str] = []
     terms: dict[str, NamedTuple] = {}
-    for name, (kind, entry, where) in parts.scene.fields.entries.items():
+    for name, (kind, entry, where) in scene.fields.entries.items():
         term = import_module(f"rigidmd.forces.fields.{kind.module}").term(
             parts, entry, where, faults
         )
@@ -247,13 +249,13 @@ def field_terms(parts: SystemParts) -> dict[str, NamedTuple]:
             terms[name] = term
     if (
         not faults
-        and parts.scene.run.remove_momentum_interval_ps
+        and scene.run.remove_momentum_interval_ps
         and not conserved_momentum(parts.model, terms).any()
     ):
         why = "fields or frozen molecules change all components of the total momentum. Leave it out"
         faults.append(f"run.remove_momentum_interval_ps: {why}")
     if faults:
-        raise SceneError(parts.scene.source, faults)
+        raise SceneError(scene.source, faults)
     return terms
 
 

@@ -203,12 +203,12 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
     parts = SystemParts(
         scene, species, model, system.space, state, number, SAME_BASIS, _grid_of(system)
     )
-    acting = interactions(parts)
+    acting = interactions(scene, parts)
     k_vectors = getattr(system.terms.get("coulomb_reciprocal"), "k_vectors", None)
     if k_vectors is not None and "coulomb_reciprocal" in acting.terms:
         term = acting.terms["coulomb_reciprocal"]._replace(k_vectors=k_vectors)  # type: ignore[attr-defined]
         acting.terms["coulomb_reciprocal"] = term
-    acting.terms.update(field_terms(parts))
+    acting.terms.update(field_terms(scene, parts))
     made = replace(
         system,
         scene=scene,

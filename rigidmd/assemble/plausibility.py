@@ -4,7 +4,7 @@ Two tables have limits of quantities with the likely causes of numbers outside t
 numbers that are warned of, `REFUSED` of numbers that no scene can mean.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from math import degrees, inf, pi
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,6 +13,7 @@ import numpy as np
 from rigidmd.units import GRAM_PER_CM3, KJ_PER_MOL
 
 if TYPE_CHECKING:
+    from rigidmd.forces import inputs
     from rigidmd.forces.neighbors.space import Space
     from rigidmd.scene import BodyScene, MolecularScene
     from rigidmd.scene.models import Molecule
@@ -109,7 +110,7 @@ def scene_errors(
     return faults
 
 
-def shortest_contact(species: "list[Molecule]") -> float:
+def shortest_contact(species: "Sequence[inputs.Molecule]") -> float:
     """Smallest distance at which two like molecules have minimum energy, by their largest sites, Å;
     inf without."""
     largest = [float(m.sigma.max(where=m.epsilon > 0, initial=0.0)) for m in species]

@@ -58,7 +58,7 @@ def parse_toml(text: str) -> Json:
         raise TOMLDecodeError(f"{why} (at line {line}, column 1)") from None
 
 
-def plain_values(data: Any, depth: int = 0) -> Any:
+def plain_values(data: object, depth: int = 0) -> Any:
     """Tables from Python with the types of a file: str for paths and integer keys, numbers and
     lists for arrays."""
     match data:
@@ -73,9 +73,8 @@ def plain_values(data: Any, depth: int = 0) -> Any:
             return [plain_values(value, depth + 1) for value in data]
         case os.PathLike():
             return os.fspath(data)
-        case _ if hasattr(data, "tolist"):  # NumPy types, without importing NumPy
-            return data.tolist()
-    return data
+    to_list = getattr(data, "tolist", None)  # of NumPy types, without importing NumPy
+    return data if to_list is None else to_list()
 
 
 def values_in(data: object) -> Iterator[tuple[list, object]]:

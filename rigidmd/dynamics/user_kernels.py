@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable
 from functools import cache
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rigidmd.compile import implements
 from rigidmd.compile.kernels import compile_user_function
@@ -11,18 +11,18 @@ from rigidmd.dynamics.thermostats import apply_thermostat
 from rigidmd.forces.terms import add_forces
 
 #: The registered classes, and the function of each.
-FORCES: dict[type, Callable[..., Any]] = {}
-THERMOSTATS: dict[type, Callable[..., Any]] = {}
+FORCES: dict[type, Callable[..., object]] = {}
+THERMOSTATS: dict[type, Callable[..., object]] = {}
 
 
 @cache
-def with_checked_indices(function: Callable[..., Any]) -> Callable[..., Any]:
+def with_checked_indices(function: Callable[..., object]) -> Callable[..., object]:
     """A registered function by itself, compiled such that an index beyond an array raises
     IndexError."""
     return compile_user_function(function, checks_indices=True)
 
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def compiled_force(kind: type) -> Callable[[Function], Function]:
@@ -128,6 +128,6 @@ def _check_arguments(function: Callable, expected: tuple[str, ...]) -> None:
         )
 
 
-def _check_class(kind: Any) -> None:
+def _check_class(kind: object) -> None:
     if not (isinstance(kind, type) and issubclass(kind, tuple) and getattr(kind, "_fields", ())):
         raise TypeError(f"{kind!r} is not a NamedTuple class with fields")

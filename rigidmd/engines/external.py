@@ -9,7 +9,7 @@ until a table has it.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -40,7 +40,7 @@ class Key(NamedTuple):
     """The values of a key of a scene that an engine can translate."""
 
     name: str  # of a scene, with a dot, or of a stage
-    values: Mapping[object, object]  # value -> its translation, or `Missing`
+    values: Mapping[object, str]  # value -> its translation, or `Missing`
     reason: str = ""  # why other values are refused, with advice; default: "ENGINE has ..."
     matters: Callable[[ForceFieldView], object] = lambda view: True
 
@@ -79,7 +79,7 @@ class Translations(NamedTuple):
         MappingProxyType({})
     )
 
-    def of(self, name: str) -> Mapping[object, Any]:
+    def of(self, name: str) -> Mapping[object, str]:
         """The translations of a key."""
         return next(key.values for key in (*self.scene, *self.stage) if key.name == name)
 
@@ -133,7 +133,7 @@ def is_langevin(stage: Stage) -> bool:
 
 
 #: With constrained distances or split rotations, the exact flow of a free rotor does not exist.
-SPLIT: Mapping[object, object] = {None: "", "split": ""}
+SPLIT: Mapping[object, str] = {None: "", "split": ""}
 
 
 class ExternalEngine(Engine, ABC):

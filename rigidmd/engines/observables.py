@@ -2,7 +2,7 @@
 orthogonality of Q."""
 
 from math import hypot, inf, nan
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -45,8 +45,16 @@ class Observation(NamedTuple):
     load: Load  # u Å/ps² and u Å²/ps²
     energy_unit: float  # u Å²/ps²
 
-    def __getattr__(self, column: str) -> Any:
+    def __getattr__(self, column: str) -> float:
         return getattr(self.sample, column)
+
+    @property
+    def stage_name(self) -> str:
+        return self.sample.stage_name
+
+    @property
+    def user_energies(self) -> tuple[float, ...]:
+        return self.sample.user_energies
 
     def __dir__(self) -> list[str]:
         return [*object.__dir__(self), *Sample._fields]

@@ -12,7 +12,7 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from math import nan
 from operator import attrgetter
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
@@ -325,13 +325,15 @@ class Samples(SampleTable):
     def row(self, k: int) -> Sample:
         """Sample k. -1 for the last one."""
         first, width = range(len(self))[k] * len(self._numbers), len(NUMBERS)
-        values: dict[str, Any] = dict(
-            zip(NUMBERS, self._values[first : first + width], strict=True)
-        )
-        values |= {name: int(values[name]) for name in ("step", "stage")}
+        values = dict(zip(NUMBERS, self._values[first : first + width], strict=True))
+        step, stage = int(values.pop("step")), int(values.pop("stage"))
         energies = self._values[first + width : first + len(self._numbers)]
         return Sample(
-            **values, stage_name=self.stages[values["stage"]], user_energies=tuple(energies)
+            **values,
+            step=step,
+            stage=stage,
+            stage_name=self.stages[stage],
+            user_energies=tuple(energies),
         )
 
     def latest(self, time: float, since: int) -> int:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 
@@ -23,6 +23,15 @@ from rigidmd.forces.terms import trait
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
+
+
+@runtime_checkable
+class ThermostatOfStages(Protocol):
+    """A user-defined thermostat that is made for each stage."""
+
+    def for_stage(self, system: "System", k: int) -> NamedTuple:
+        """The thermostat of stage k, of a class with `compiled_thermostat`."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -58,7 +67,8 @@ class System:
     warnings: list[str] = field(default_factory=list)  # of what is allowed and probably not meant
     #: Name of a term that Python computes -> function
     python_forces: dict[str, Callable] = field(default_factory=dict)
-    thermostat: Any = None  # user-defined, in place of the thermostat of every stage
+    #: User-defined, in place of the thermostat of every stage
+    thermostat: "NamedTuple | ThermostatOfStages | None" = None
     #: Name of a user-defined term -> description
     user_terms: dict[str, str] = field(default_factory=dict)
     #: Those that are potentials of pairs of bodies
@@ -103,9 +113,9 @@ class System:
         """Cutoff between sites, Å; inf without one."""
         return self.scene.forces.cutoff_A or inf
 
-    def user_thermostat(self, k: int) -> Any:
+    def user_thermostat(self, k: int) -> "NamedTuple | None":
         """The user-defined thermostat in stage k. None without one."""
-        if hasattr(self.thermostat, "for_stage"):
+        if isinstance(self.thermostat, ThermostatOfStages):
             return self.thermostat.for_stage(self, k)
         return self.thermostat
 

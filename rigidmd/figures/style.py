@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from rigidmd.figures.picture import Picture
 
-#: Colours of curves. Any two differ by at least 25 in the Lab space, also for viewers who lack the
+#: Colours of curves. Each two differ by at least 25 in the Lab space, also for viewers who lack the
 #: pigment of red or of green.
 PALETTE = {
     "cool": "#2b6f9e",

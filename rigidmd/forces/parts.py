@@ -2,31 +2,29 @@
 them.
 
 A factory in this package makes the terms for one scene key: `interactions` of a pair potential or
-of a method of electrostatics, `term` of a field. The scene and its molecules are values of `scene`,
-a package above this one, so that their types are given in words.
+of a method of electrostatics, `term` of a field.
 """
 
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.forces.ewald.errors import FINE, Charges, charges_in, filled_fraction
+from rigidmd.forces.inputs import Grid, KeysAndValues, Masses, Molecule, SceneKeys
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites, exclusion_groups, sites_of
 from rigidmd.forces.neighbors.space import Space
 from rigidmd.units import COULOMB_CHARGE
 
-Grid = tuple[int, int, int]
-
 
 class SystemParts(NamedTuple):
     """The parts of a system on which its terms depend."""
 
-    scene: Any  # `scene.MolecularScene`, with defaults
-    species: list[Any]  # `scene.models.Molecule`
-    model: Any  # `dynamics.model.Model`
+    scene: SceneKeys
+    species: Sequence[Molecule]
+    model: Masses
     space: Space
     state: State  # the start
     number: np.ndarray  # (n,) residue numbers, by which a scene selects molecules
@@ -149,7 +147,7 @@ class Interactions(NamedTuple):
 class Composition(NamedTuple):
     """The properties of a system, in addition to its scene, on which defaults depend."""
 
-    species: list[Any]  # `scene.models.Molecule`
+    species: Sequence[Molecule]
     counts: np.ndarray  # (k,) molecules of each species
     space: Space
     basis: np.ndarray  # see `SystemParts`
@@ -169,7 +167,7 @@ class Composition(NamedTuple):
 class Settings(NamedTuple):
     """Settings of a method of electrostatics that follow from the system."""
 
-    numbers: dict[str, Any]  # keys of [forces]
+    numbers: KeysAndValues
     errors: list[str]
     grid: Grid | None = None  # of PME, along the edges of the box
 
@@ -203,7 +201,7 @@ def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.nda
     return np.concatenate(values)[rows]
 
 
-def sites_named(species: list[Any], name: str) -> list[np.ndarray]:
+def sites_named(species: Sequence[Molecule], name: str) -> list[np.ndarray]:
     """Masks of the sites of each species with this name, or else this element. SPECIES.NAME for one
     species."""
     owner, _, site = name.rpartition(".")

@@ -8,8 +8,9 @@ one file with a NamedTuple and an `@implements(add_forces)`, a new pair potentia
 `@implements(pair_loop.pair)`.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Literal, NamedTuple, overload
 
 import numpy as np
 from numba import literal_unroll
@@ -109,7 +110,26 @@ class Term:
         ]
 
 
-def trait(term: Any, name: str) -> Any:
+@overload
+def trait(
+    term: object, name: Literal["tied_to_places", "acts_on_charges", "time_dependent"]
+) -> bool: ...
+@overload
+def trait(term: object, name: Literal["changes_momentum", "scratch"]) -> np.ndarray | None: ...
+@overload
+def trait(
+    term: object,
+    name: Literal["workspace", "with_scratch", "with_code", "with_capacity", "restore"],
+) -> Callable[..., NamedTuple]: ...
+@overload
+def trait(term: object, name: Literal["renew_list"]) -> Callable[[], None]: ...
+@overload
+def trait(
+    term: object, name: Literal["checkpoint_arrays"]
+) -> Callable[[], dict[str, np.ndarray]]: ...
+@overload
+def trait(term: object, name: Literal["passes"]) -> "Callable[[Evaluation], list[Pass]]": ...
+def trait(term: object, name: str) -> object:
     """An attribute of a term, its workspace or the class of either, else the attribute of
     `Term`."""
     if hasattr(term, name):

@@ -2,7 +2,6 @@
 states. The dielectric constant from the fluctuation of the total dipole."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from scipy import signal
@@ -230,10 +229,15 @@ def spectrum(runs: Runs) -> AnalysisResult:
                 values, total = of(part, group), 0.0
                 for first in range(0, values.shape[1], 256):
                     some = values[:, first : first + 256].reshape(len(values), -1)
-                    no: Any = False  # which the types of SciPy do not know
-                    total = total + signal.welch(
-                        some, 1 / interval, "hann", size, detrend=no, axis=0
-                    )[1].sum(axis=1)
+                    density = signal.welch(
+                        some,
+                        1 / interval,
+                        "hann",
+                        size,
+                        detrend=False,  # type: ignore[arg-type]  # SciPy's types lack it
+                        axis=0,
+                    )[1]
+                    total = total + density.sum(axis=1)
                 return weight * np.asarray(total) * PER_CM / values.shape[1]
 
             power.add(title, *with_group_error(runs, kind, states))

@@ -1,8 +1,6 @@
 """Correlation functions. Mean squared displacement, diffusion and viscosity, each with its
 error."""
 
-from typing import Any
-
 import numpy as np
 from scipy import fft
 
@@ -35,8 +33,8 @@ def correlation(series: np.ndarray, lags: int) -> np.ndarray:
     power = np.zeros(size // 2 + 1)
     chunk = max(1, AT_ONCE // size)
     for first in range(0, flat.shape[1], chunk):
-        transform: Any = fft.rfft(flat[:, first : first + chunk], size, axis=0)
-        real, imaginary = transform.real, transform.imag
+        transform = np.asarray(fft.rfft(flat[:, first : first + chunk], size, axis=0))
+        real, imaginary = np.real(transform), np.imag(transform)
         power += np.einsum("fm,fm->f", real, real) + np.einsum("fm,fm->f", imaginary, imaginary)
     return np.asarray(fft.irfft(power, size))[:lags] / (frames - np.arange(lags)) / flat.shape[1]
 

@@ -64,7 +64,7 @@ def _thermostats(system: System) -> Iterator[tuple[str, NamedTuple, float]]:
         if stage.is_minimisation or stage.is_auto:
             continue
         thermostat = system.user_thermostat(k)
-        if type(thermostat) in THERMOSTATS:
+        if thermostat is not None and type(thermostat) in THERMOSTATS:
             name = f"thermostat {name_of(system.thermostat)}"
             yield name, thermostat, float(stage.step)
 

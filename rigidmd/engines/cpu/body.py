@@ -15,11 +15,9 @@ from rigidmd.engines.cpu.compiled import CompiledEngine, Steps
 from rigidmd.forces.terms import Setup
 
 
-class BodyEngine(CompiledEngine):
+class BodyEngine(CompiledEngine[Body, tuple[FlowArrays, GradientWorkspace | None]]):
     """An engine of a single body, which has no pairs and one thread. For the arguments see
     `CompiledEngine`."""
-
-    model: Body
 
     def __init__(
         self,

@@ -7,7 +7,7 @@ arrays when a kernel returns that one is full, and raises exceptions for status 
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -41,6 +41,10 @@ from rigidmd.forces.terms import (
 )
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
+if TYPE_CHECKING:
+    from rigidmd.dynamics.body_step_loop import Body
+    from rigidmd.dynamics.model import Model
+
 #: Owner of arrays in `Engine.memory` besides the terms.
 LOAD = "load"
 #: When the passes of terms act, by what the engine uses them for.
@@ -66,7 +70,12 @@ class LastAdvance:
     )
 
 
-class CompiledEngine(Engine):
+ModelT = TypeVar("ModelT", "Model", "Body")
+#: What an engine binds to a state and its load.
+Bound = TypeVar("Bound")
+
+
+class CompiledEngine(Engine, Generic[ModelT, Bound]):
     """An engine of compiled code.
 
     model : the constant part of the system
@@ -76,13 +85,13 @@ class CompiledEngine(Engine):
     """
 
     is_repeatable = True
-    model: Any
+    model: ModelT
     #: Owners of arrays in `memory` besides the terms.
     _owners: tuple[str, ...] = (LOAD,)
 
     def __init__(
         self,
-        model: NamedTuple,
+        model: ModelT,
         terms: dict[str, NamedTuple],
         setup: Setup,
         python_forces: dict[str, Callable] | None,
@@ -95,9 +104,7 @@ class CompiledEngine(Engine):
         self._workspaces: tuple[NamedTuple, ...] | None = None
         self._last = LastAdvance()
         self._dispatchers: dict[str, TermDispatcher] = {}
-        self._bound: tuple[tuple, Any] | None = (
-            None  # the step loop, with the objects that it is bound to
-        )
+        self._bound: tuple[tuple, Bound] | None = None  # with the objects that it is bound to
 
     @property
     def names(self) -> list[str]:
@@ -109,7 +116,7 @@ class CompiledEngine(Engine):
         """Name of a term -> its present workspace. Empty before the first use."""
         return dict(zip(self.names, self._workspaces or (), strict=False))
 
-    def change(self, model: NamedTuple, terms: dict[str, NamedTuple]) -> None:
+    def change(self, model: ModelT, terms: dict[str, NamedTuple]) -> None:
         self.model, self.terms = model, terms
         self._workspaces = None
         self.forget()
@@ -153,7 +160,7 @@ class CompiledEngine(Engine):
     ) -> bool:
         """Advance the system. Returns whether the load belongs to the new positions."""
 
-    def _bind(self, objects: tuple, make: Callable[[], Any]) -> Any:
+    def _bind(self, objects: tuple, make: Callable[[], Bound]) -> Bound:
         """What `make` returns, which is kept while it is bound to the same objects."""
         if self._bound is None or not _are_same(objects, self._bound[0]):
             self._bound = objects, make()
@@ -167,7 +174,7 @@ class CompiledEngine(Engine):
     def _new_dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         return TermDispatcher(workspaces, USES[use], with_rates=use == "steps")
 
-    def model_for(self, scheme: Scheme) -> Any:
+    def model_for(self, scheme: Scheme) -> ModelT:
         """The model with the rotor of a scheme. The exact rotor differs only for asymmetric
         bodies."""
         rotor = self.model.rotor

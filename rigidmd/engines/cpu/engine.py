@@ -1,7 +1,7 @@
 """The engine of molecules that runs compiled code on the CPU."""
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, cast
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -39,7 +39,7 @@ TRAJECTORY_FIELDS = ("energies", "known", "sums")
 DTYPES = {"double": np.float64, "mixed": np.float32}
 
 
-class CpuEngine(CompiledEngine):
+class CpuEngine(CompiledEngine[Model, Advance]):
     """An engine of molecules. For the first arguments see `CompiledEngine`.
 
     precision : arithmetic between sites. "mixed": pairs in single precision, sums and motion in
@@ -71,7 +71,7 @@ class CpuEngine(CompiledEngine):
     def _move(
         self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps
     ) -> bool:
-        model = cast(Model, self.model_for(integrator))
+        model = self.model_for(integrator)
 
         def new_advance(dispatcher: TermDispatcher) -> Advance:
             couplings = self._couplings_of(integrator, state)

@@ -47,6 +47,13 @@ def gromacs_points(molecule: Molecule) -> MassPoints:
     return body if fits and (np.diff(body.site) == 1).all() else mass_points(molecule, sites=False)
 
 
+#: Thermostat -> integrator and tcoupl.
+THERMOSTATS: dict[str | None, tuple[str, str]] = {
+    None: ("md-vv", "no"),
+    "nose_hoover": ("md-vv", "nose-hoover"),
+    "langevin": ("sd", "no"),
+    "velocity_rescaling": ("md", "v-rescale"),
+}
 _INTEGRATOR, *_LIMITS = moves("GROMACS", "molecules")
 #: What GROMACS can express, and how.
 TRANSLATIONS = Translations(
@@ -81,11 +88,8 @@ TRANSLATIONS = Translations(
         ),
         Key(
             "thermostat",
-            {  # integrator and tcoupl
-                None: ("md-vv", "no"),
-                "nose_hoover": ("md-vv", "nose-hoover"),
-                "langevin": ("sd", "no"),
-                "velocity_rescaling": ("md", "v-rescale"),
+            {
+                **{name: coupling for name, (_, coupling) in THERMOSTATS.items()},
                 "andersen": Missing("GROMACS' Andersen thermostat does not act on whole molecules"),
             },
         ),
@@ -278,7 +282,7 @@ def _settings(view: ForceFieldView, k: int) -> str:
 
     keeps = system.freedom_in(k).translation < 3 * len(system.model.species)
     interval = system.removes_momentum_every
-    integrator, _ = TRANSLATIONS.of("thermostat")[stage.thermostat]
+    integrator, _ = THERMOSTATS[stage.thermostat]
     settings: dict[str, object] = {
         "integrator": integrator,
         "dt": f"{stage.step:.12g}",
@@ -337,7 +341,7 @@ def _couplings(stage: Stage) -> dict[str, object]:
         return {"tcoupl": "no", "pcoupl": "no"}
     first, last = stage.temperatures
     settings: dict[str, object] = {
-        "tcoupl": TRANSLATIONS.of("thermostat")[stage.thermostat][1],
+        "tcoupl": TRANSLATIONS.of("thermostat")[stage.thermostat],
         "pcoupl": "no",
         "tc-grps": "System",
         "ref-t": f"{first:.12g}",

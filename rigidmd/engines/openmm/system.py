@@ -9,7 +9,7 @@ kJ/mol.
 import re
 from math import inf, pi, sqrt
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import erfc
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     import openmm
 
     Pairs = openmm.NonbondedForce | openmm.CustomNonbondedForce
+    PairsOrTail = Pairs | openmm.CustomVolumeForce
     PairsT = TypeVar("PairsT", openmm.NonbondedForce, openmm.CustomNonbondedForce)
 
 #: nm per Å.
@@ -251,8 +252,10 @@ def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openm
     separate : whether Lennard-Jones and Coulomb forces are separate even if one force can have
         both, which is faster: a step of 512 waters with PME takes 8 ms instead of 11 on two cores
     """
-    mm, view = library(), particles.view
-    made = mm.System()
+    import openmm
+
+    view = particles.view
+    made = openmm.System()
     for mass in particles.mass:
         made.addParticle(float(mass))
     if view.is_periodic:
@@ -270,10 +273,10 @@ def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openm
     excluded = particles.excluded()
     for force, group in _forces(particles, separate):
         force.setForceGroup(group)
-        for i, j in excluded if group != Group.TAIL else []:
-            if isinstance(force, mm.NonbondedForce):
+        for i, j in excluded:
+            if isinstance(force, openmm.NonbondedForce):
                 force.addException(i, j, 0.0, 1.0, 0.0)
-            else:
+            elif isinstance(force, openmm.CustomNonbondedForce):
                 force.addExclusion(i, j)
         made.addForce(force)
     return made
@@ -294,9 +297,10 @@ def _openmm_virtual_site(
     return mm.LocalCoordinatesSite(points, weight, [-1, 1, 0, 0], [-1, 0, 1, 0], [0, 0, 0])
 
 
-def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
+def _forces(particles: Layout, separate: bool) -> "list[tuple[PairsOrTail, int]]":
     """The forces of a system with their groups."""
-    forces, view = [], particles.view
+    forces: list[tuple[PairsOrTail, int]] = []
+    view = particles.view
     potential, coulomb, plain = view.lennard_jones, view.coulomb, _builtin_lennard_jones(view)
     has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (
         coulomb is not None and coulomb.cutoff == inf
@@ -487,9 +491,11 @@ def _velocity_verlet(dt: float) -> "openmm.CustomIntegrator":
     return made
 
 
-def step(integrator: Any, steps: int) -> None:
+def step(integrator: "openmm.Integrator", steps: int) -> None:
     """Take steps. Velocity Verlet starts and ends with half a kick."""
-    if not hasattr(integrator, "setGlobalVariableByName"):
+    import openmm
+
+    if not isinstance(integrator, openmm.CustomIntegrator):
         integrator.step(steps)
         return
     for kick, moving, count in ((0.5, 1, 1), (1.0, 1, steps - 1), (0.5, 0, 1)):
@@ -508,7 +514,7 @@ def integration_groups(stage: Stage) -> set[int]:
     return groups
 
 
-def extra_forces(view: ForceFieldView, k: int) -> list:
+def extra_forces(view: ForceFieldView, k: int) -> "list[openmm.Force]":
     """The forces of stage k in addition to its integrator: a barostat, and a momentum remover, so
     that OpenMM subtracts the degrees of freedom of the total momentum."""
     mm, stage, system = library(), view.system.scene.stages[k], view.system

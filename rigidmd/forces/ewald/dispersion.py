@@ -5,8 +5,8 @@ The pairs within the cutoff are in the Lennard-Jones potential, see
 `potentials.lennard_jones.ScreenedDispersion`.
 """
 
+from collections.abc import Sequence
 from math import inf, pi, sqrt
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from rigidmd.forces.ewald.errors import (
     real_error,
 )
 from rigidmd.forces.ewald.smooth import InverseR6
+from rigidmd.forces.inputs import ForceKeys, KeysAndValues, Molecule
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.parts import (
     Composition,
@@ -38,12 +39,12 @@ ACCURACY = 5e-5
 MOST_K_VECTORS_IN_ALL = 2e7  #: as for charges
 
 
-def dispersing_in(species: list[Any], counts: np.ndarray) -> Dispersing:
+def dispersing_in(species: Sequence[Molecule], counts: np.ndarray) -> Dispersing:
     """The strengths c of molecules, for estimates of errors."""
     return charges_in(species, counts, lambda m: m.dispersion, Dispersing)
 
 
-def settings(forces: Any, composition: Composition, cutoff: float | None) -> Settings:
+def settings(forces: ForceKeys, composition: Composition, cutoff: float | None) -> Settings:
     """The keys of [forces] that follow from the accuracy. cutoff : of Lennard-Jones, Å"""
     space, species, counts = composition.space, composition.species, composition.counts
     where, sites = f"forces.dispersion = {forces.dispersion!r}", dispersing_in(species, counts)
@@ -56,7 +57,7 @@ def settings(forces: Any, composition: Composition, cutoff: float | None) -> Set
     # of the real-space and of the reciprocal error
     part = _error(accuracy, species, counts) * sqrt(composition.filled / 2)
     beta = float(forces.dispersion_beta_per_A or alpha_for(sites, cutoff, space.volume, part))
-    numbers = {"dispersion_accuracy": accuracy, "dispersion_beta_per_A": beta}
+    numbers: KeysAndValues = {"dispersion_accuracy": accuracy, "dispersion_beta_per_A": beta}
     unreachable = (
         f"forces.dispersion_accuracy = {accuracy:g} cannot be reached at beta = {beta:.3g} 1/Å"
     )
@@ -91,7 +92,7 @@ def settings(forces: Any, composition: Composition, cutoff: float | None) -> Set
     return Settings(numbers | {"dispersion_order": order, "dispersion_grid": grid}, [])
 
 
-def _error(accuracy: float, species: list[Any], counts: np.ndarray) -> float:
+def _error(accuracy: float, species: Sequence[Molecule], counts: np.ndarray) -> float:
     """The error of a force (u Å/ps²) that is meant by an accuracy."""
     force_scales = [
         m.epsilon[m.epsilon > 0] / m.sigma[m.epsilon > 0]
@@ -113,8 +114,11 @@ def interactions(parts: SystemParts) -> Interactions:
     strengths = [m.dispersion[i] for m, i in zip(species, present, strict=True)]
     strength, sites = gather_per_molecule(strengths, parts.model.species), parts.sites(present)
     beta, cell, cutoff = forces.dispersion_beta_per_A, cell_of(parts.space), forces.cutoff_A
+    accuracy = forces.dispersion_accuracy
+    # they are defaults, or keys of the scene
+    assert beta is not None and cutoff is not None and accuracy is not None
     smooth, dispersing = InverseR6(beta), dispersing_in(species, counts)
-    k_space = _error(forces.dispersion_accuracy, species, counts) * sqrt(parts.filled / 2)
+    k_space = _error(accuracy, species, counts) * sqrt(parts.filled / 2)
     if forces.dispersion == "ewald":
         reciprocal = 2 * pi * np.linalg.inv(cell).T
         vectors = direct_sum.k_vectors_within(
@@ -128,6 +132,7 @@ def interactions(parts: SystemParts) -> Interactions:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 
         grid, order = forces.dispersion_grid, forces.dispersion_order
+        assert grid is not None and order is not None
         term = Pme(smooth, strength, sites, grid, order)
         how = f"grid {' x '.join(map(str, grid))}, splines of order {order}"
         k_space = pme_error(dispersing, beta, cell, grid, order)

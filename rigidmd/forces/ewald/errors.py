@@ -6,14 +6,15 @@ of 1 Å. For dispersion it is u Å/ps².
 """
 
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 from math import exp, inf, pi, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import erfcx, gammaincc
 
+from rigidmd.forces.inputs import Molecule
 from rigidmd.forces.neighbors.space import Space, longest_gaps
 
 MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
@@ -83,13 +84,13 @@ class Dispersing(Charges):
 
 
 def charges_in(
-    species: list[Any],
+    species: Sequence[Molecule],
     counts: np.ndarray,
-    of: Callable[[Any], np.ndarray] = lambda m: m.charges,
+    of: Callable[[Molecule], np.ndarray] = lambda m: m.charges,
     kind: type[Charges] = Charges,
 ) -> Charges:
-    """The charges, or other strengths `of` a molecule (s,), in `counts` molecules of each species,
-    each a `scene.models.Molecule`."""
+    """The charges, or other strengths `of` a molecule (s,), in `counts` molecules of each
+    species."""
     square, count, products, distances = 0.0, 0, [np.zeros(0)], [np.zeros(0)]
     for m, n in zip(species, map(int, counts), strict=True):
         charge, position = of(m)[of(m) != 0], m.positions_body[of(m) != 0]
@@ -135,7 +136,7 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
 
 
 def filled_fraction(
-    species: list[Any], counts: np.ndarray, space: Space, position: np.ndarray
+    species: Sequence[Molecule], counts: np.ndarray, space: Space, position: np.ndarray
 ) -> float:
     """The part of a periodic box that contains the molecules, at most 1, 1 for charges without
     size. The density of this part decides on the errors.

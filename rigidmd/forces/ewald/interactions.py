@@ -2,7 +2,6 @@
 molecules."""
 
 from math import inf, pi, prod, sqrt
-from typing import Any
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from rigidmd.forces.ewald.errors import (
     real_error,
 )
 from rigidmd.forces.ewald.smooth import InverseR
+from rigidmd.forces.inputs import ForceKeys, KeysAndValues
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
 from rigidmd.forces.parts import Composition, Interactions, Settings, SystemParts
@@ -49,7 +49,7 @@ LEAST_VACUUM = 0.5
 FIT_ERROR_FRACTION = 0.02
 
 
-def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
+def setting_errors(forces: ForceKeys, space: Space, cutoff: float) -> list[str]:
     """Messages on keys of [forces] that this box does not allow."""
     if space.volume == inf:
         instead = "use coulomb, the sum over all pairs"
@@ -59,14 +59,16 @@ def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
     return screening_errors("ewald_alpha_per_A", forces.ewald_alpha_per_A, cutoff)
 
 
-def settings(forces: Any, composition: Composition, cutoff: float, is_external: bool) -> Settings:
+def settings(
+    forces: ForceKeys, composition: Composition, cutoff: float, is_external: bool
+) -> Settings:
     """The keys of [forces] that follow from the accuracy. ewald_accuracy becomes None when all of
     them are set.
 
     cutoff : of Lennard-Jones, Å; is_external : whether another program computes the forces
     """
     usual = "plain" if forces.truncation == "plain" or is_external else "shift"
-    numbers: dict[str, Any] = {"ewald_truncation": forces.ewald_truncation or usual}
+    numbers: KeysAndValues = {"ewald_truncation": forces.ewald_truncation or usual}
     charges, cell = composition.charges, cell_of(composition.space)
     if charges.count == 0:
         return Settings(numbers, [])
@@ -153,7 +155,7 @@ def _default(value: object) -> str:
     return "" if value else " (the default)"
 
 
-def _number_of_k_vectors(forces: Any, radius: float | None, volume: float) -> float:
+def _number_of_k_vectors(forces: ForceKeys, radius: float | None, volume: float) -> float:
     """Approximate number of k-vectors within a radius (1/Å) and the limits of [forces]."""
     limit = forces.ewald_k_max
     boxed = (
@@ -169,13 +171,16 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
     these are only for the interactions of frozen molecules, and None without any. Raises
     SceneError."""
     forces, volume, cell = parts.scene.forces, parts.space.volume, cell_of(parts.space)
-    alpha, charges = forces.ewald_alpha_per_A, charges_in(parts.species, parts.counts)
+    alpha, cutoff, order = forces.ewald_alpha_per_A, forces.ewald_cutoff_A, forces.pme_order
+    assert alpha is not None and cutoff is not None  # they are defaults, or keys of the scene
+    charges = charges_in(parts.species, parts.counts)
     real, reciprocal = (
-        real_error(charges, alpha, forces.ewald_cutoff_A, volume),
+        real_error(charges, alpha, cutoff, volume),
         2 * pi * np.linalg.inv(cell).T,
     )
     if parts.grid is not None:
-        error, vectors = pme_error(charges, alpha, cell, parts.grid, forces.pme_order), None
+        assert order is not None
+        error, vectors = pme_error(charges, alpha, cell, parts.grid, order), None
         if not parts.moves[parts.model.species].all():
             vectors = direct_sum.k_vectors_within(
                 reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * error)
@@ -185,6 +190,7 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
     if isinstance(limit, int):
         limit = (limit, limit, limit)
     if radius is None:
+        assert limit is not None  # one of both is set
         vectors = direct_sum.k_vectors_up_to(limit, forces.ewald_k2_max, parts.basis)
     else:
         vectors = direct_sum.k_vectors_within(reciprocal, radius, limit, parts.basis)
@@ -212,6 +218,7 @@ def interactions(parts: SystemParts) -> Interactions:
         forces.ewald_cutoff_A,
         charge_e * COULOMB_CHARGE,
     )
+    assert alpha is not None and cutoff is not None
     shifted = forces.ewald_truncation == "shift"
     potential = screened_coulomb(charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * real)
     if parts.grid is None:
@@ -225,6 +232,7 @@ def interactions(parts: SystemParts) -> Interactions:
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 
+        assert forces.pme_order is not None
         reciprocal = Pme(InverseR(alpha), charge, sites, parts.grid, forces.pme_order)
         how = f"grid {' x '.join(map(str, parts.grid))}, splines of order {forces.pme_order}"
     terms = {"coulomb_real": parts.pair_forces(potential, sites), "coulomb_reciprocal": reciprocal}
@@ -284,7 +292,7 @@ def _arms(state: State, sites: BodySites | CentralSites) -> np.ndarray:
     return np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offsets())
 
 
-def _surface_strength(forces: Any) -> tuple[float, float, float]:
+def _surface_strength(forces: ForceKeys) -> tuple[float, float, float]:
     """See `corrections.SurfaceDipole`."""
     if forces.ewald_slab is None:
         return (2 * pi / (2 * forces.ewald_surface_permittivity + 1),) * 3
@@ -336,6 +344,7 @@ def _frozen_correction(
     """Constant energy and pressure that cancel the interactions between frozen molecules in sums
     over images. charge (s,) is 0 for sites that move."""
     state, forces, volume = parts.state, parts.scene.forces, parts.space.volume
+    assert forces.ewald_alpha_per_A is not None
     arms = _arms(state, sites)
     position = state.position[sites.molecule] + arms
     energy, force, virial = direct_sum.ewald_sum_in_numpy(

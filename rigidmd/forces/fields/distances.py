@@ -2,12 +2,13 @@
 groups."""
 
 from math import sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import implements, kernel
 from rigidmd.core.state import OK, State
+from rigidmd.forces.inputs import RestraintKeys
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
@@ -57,7 +58,7 @@ def _centre_in(state: State, members: np.ndarray, fraction: np.ndarray) -> np.nd
 
 
 def distance_restraint(
-    parts: SystemParts, entry: Any, where: str, faults: list[str]
+    parts: SystemParts, entry: RestraintKeys, where: str, faults: list[str]
 ) -> DistanceRestraint | None:
     """The term of one of fields.restraints with `between`."""
     state, n, before = parts.state, len(parts.model.species), len(faults)

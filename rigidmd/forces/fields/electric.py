@@ -7,12 +7,13 @@ less work is conserved as well as any Hamiltonian.
 """
 
 from math import cos, pi, radians, sin
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import implements, kernel
 from rigidmd.core.state import NOW, OK
+from rigidmd.forces.inputs import FieldKeys
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces, energy_rate
 from rigidmd.mechanics.translation import body_component, body_vector
@@ -55,10 +56,10 @@ class OscillatingField(NamedTuple):
 
 
 def term(
-    parts: SystemParts, fields: Any, where: str, faults: list[str]
+    parts: SystemParts, fields: FieldKeys, where: str, faults: list[str]
 ) -> ElectricField | OscillatingField | None:
     """The term of fields.electric_V_per_nm."""
-    if not any(fields.electric_V_per_nm):
+    if not any(fields.electric_V_per_nm or ()):
         return None
     charge = np.where(parts.moves, [m.charge for m in parts.species], 0.0)
     dipole = np.where(

@@ -1,11 +1,12 @@
 """A uniform gravitational field on molecules."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import implements
 from rigidmd.core.state import OK
+from rigidmd.forces.inputs import FieldKeys
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces
 from rigidmd.units import METRE_PER_S2
@@ -26,9 +27,9 @@ class Gravity(NamedTuple):
         return self.acceleration != 0
 
 
-def term(parts: SystemParts, fields: Any, where: str, faults: list[str]) -> Gravity | None:
+def term(parts: SystemParts, fields: FieldKeys, where: str, faults: list[str]) -> Gravity | None:
     """The term of fields.gravity_m_s2."""
-    if not any(fields.gravity_m_s2):
+    if not any(fields.gravity_m_s2 or ()):
         return None
     mass = np.where(parts.moves, parts.model.mass, 0.0)
     return Gravity(parts.model.species, mass, np.array(fields.gravity_m_s2) * METRE_PER_S2)

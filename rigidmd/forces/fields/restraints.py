@@ -1,13 +1,14 @@
 """Harmonic restraints that hold the centres of mass of some molecules at reference positions in the
 lab."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import implements
 from rigidmd.core.state import OK
 from rigidmd.forces.fields.distances import DistanceRestraint, distance_restraint
+from rigidmd.forces.inputs import RestraintKeys
 from rigidmd.forces.parts import SystemParts, select_by_number
 from rigidmd.forces.terms import add_forces
 from rigidmd.units import KJ_PER_MOL
@@ -30,7 +31,7 @@ class Restraints(NamedTuple):
 
 
 def term(
-    parts: SystemParts, entry: Any, where: str, faults: list[str]
+    parts: SystemParts, entry: RestraintKeys, where: str, faults: list[str]
 ) -> "Restraints | DistanceRestraint | None":
     """The term of one of fields.restraints."""
     if entry.between is not None:

@@ -5,13 +5,15 @@ See the theory chapter `interactions`. The Lennard-Jones 9-3 wall is not defined
 wall: a site there ends the evaluation with BEHIND_WALL.
 """
 
+from collections.abc import Sequence
 from math import inf, isnan
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.core.state import BEHIND_WALL, NOT_FINITE, OK, State
+from rigidmd.forces.inputs import Molecule, WallKeys
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites, locate_site, sites_of
 from rigidmd.forces.neighbors.space import Orthorhombic, Unbounded
 from rigidmd.forces.parts import SystemParts
@@ -76,7 +78,7 @@ class HarmonicWalls(NamedTuple):
 
 
 def term(
-    parts: SystemParts, walls: Any, where: str, faults: list[str]
+    parts: SystemParts, walls: WallKeys, where: str, faults: list[str]
 ) -> LennardJonesWalls | HarmonicWalls:
     """The term of one of fields.walls. The messages on the gap between walls follow those on the
     last of them."""
@@ -104,7 +106,7 @@ def term(
     return term_of_walls
 
 
-def _acted_on(walls: Any, species: list[Any], moves: np.ndarray) -> list[np.ndarray]:
+def _acted_on(walls: WallKeys, species: Sequence[Molecule], moves: np.ndarray) -> list[np.ndarray]:
     """Points (k, 3) of each species on which walls act, body frame, Å. None of frozen species."""
     offsets = [
         np.zeros((1, 3)) if walls.acts_on == "centres" else m.positions_body[m.epsilon > 0]
@@ -141,7 +143,7 @@ def _gap_errors(parts: SystemParts) -> list[str]:
     return faults
 
 
-def _protrusion(walls: Any, parts: SystemParts) -> float:
+def _protrusion(walls: WallKeys, parts: SystemParts) -> float:
     """Largest distance of interacting sites from the points on which walls act, Å."""
     farthest = 0.0
     for m, points in zip(parts.species, _acted_on(walls, parts.species, parts.moves), strict=True):
@@ -152,7 +154,7 @@ def _protrusion(walls: Any, parts: SystemParts) -> float:
     return farthest
 
 
-def range_of_centres(walls: Any, species: list[Any]) -> tuple[float, float]:
+def range_of_centres(walls: WallKeys, species: Sequence[Molecule]) -> tuple[float, float]:
     """Range (lower, upper) of centres of mass that is free for every orientation between walls,
     Å."""
     points = np.concatenate(_acted_on(walls, species, np.ones(len(species), bool)))

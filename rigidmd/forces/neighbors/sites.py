@@ -4,7 +4,7 @@ the bodies.
 Each potential has a list of the sites that take part in it. Sites of one molecule are consecutive.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numba import types
@@ -318,13 +318,22 @@ def position_pass(sites: BodySites | CentralSites, state: State, position: np.nd
     )
 
 
-def load_passes(
-    sites: BodySites | CentralSites, into: Evaluation, force: np.ndarray | InSlots, sums: Any
-) -> list[Pass]:
-    """The passes that add site forces (s, 3) to the load, and the sums of blocks to the tally.
+class SumsOfBlocks(Protocol):
+    """The sums of the blocks of a term."""
 
-    sums : has `tallies` (blocks, 10), energy and site virial, and `virial`, of `virial_buffer`
-    """
+    @property
+    def tallies(self) -> np.ndarray: ...  # (blocks, 10) energy and site virial
+    @property
+    def virial(self) -> np.ndarray: ...  # see `virial_buffer`
+
+
+def load_passes(
+    sites: BodySites | CentralSites,
+    into: Evaluation,
+    force: np.ndarray | InSlots,
+    sums: SumsOfBlocks,
+) -> list[Pass]:
+    """The passes that add site forces (s, 3) to the load, and the sums of blocks to the tally."""
     state, load, tally = into.state, into.load, into.tally
     blocks = blocks_of(len(state.position))
     passes = [

@@ -4,7 +4,7 @@ and torques themselves."""
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from rigidmd.core.user_modules import module_of
 from rigidmd.errors import describe_error
 from rigidmd.forces.poses.slopes import Hoisted, code_of, slopes_of
 from rigidmd.forces.poses.table import BodyTable, TableFormula
-from rigidmd.forces.poses.trace import Graph, Traced, TraceError
+from rigidmd.forces.poses.trace import Graph, Number, Traced, TraceError
 from rigidmd.units import KJ_PER_MOL
 
 AXES = "xyz"
@@ -89,7 +89,7 @@ class _Parameters:
         return self._leaves[name]
 
 
-def _called(function: Callable, name: str, poses: list, of_kinds: list) -> Any:
+def _called(function: Callable, name: str, poses: list, of_kinds: list) -> object:
     try:
         count = len(inspect.signature(function).parameters)
     except (TypeError, ValueError):
@@ -104,7 +104,7 @@ def _called(function: Callable, name: str, poses: list, of_kinds: list) -> Any:
         raise TraceError(f"{name} raised {describe_error(error)}") from error
 
 
-def _derived(name: str, energy: Any, r: np.ndarray, matrices: list[np.ndarray]) -> list[Any]:
+def _derived(name: str, energy: object, r: np.ndarray, matrices: list[np.ndarray]) -> list[Number]:
     """The energy, its slopes by r, and the torques on both bodies, -dE/d(angle) about the axes of
     the lab, in u Å²/ps²."""
     if isinstance(energy, np.ndarray) and energy.size == 1:
@@ -124,7 +124,7 @@ def _derived(name: str, energy: Any, r: np.ndarray, matrices: list[np.ndarray]) 
     return [energy, *slopes[:3], *torques]
 
 
-def _cross(u: Sequence[Any], v: Sequence[Any]) -> list[Any]:
+def _cross(u: np.ndarray, v: np.ndarray) -> list[Number]:
     return [
         u[1] * v[2] - u[2] * v[1],
         u[2] * v[0] - u[0] * v[2],
@@ -132,7 +132,7 @@ def _cross(u: Sequence[Any], v: Sequence[Any]) -> list[Any]:
     ]
 
 
-def _given(name: str, returned: tuple) -> list[Any]:
+def _given(name: str, returned: tuple) -> list[Number]:
     """The same of a function that returns energy, force on the second body, and both torques."""
     shapes = [np.asarray(value, object).shape for value in returned]
     if shapes != [(), (3,), (3,), (3,)]:

@@ -1,8 +1,11 @@
 """A potential of pairs of bodies as it is specified, before it is bound to a system."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from rigidmd.forces.poses.table import BodyTable
 
 Parameters = Mapping[str, float]
 Vector = tuple[float, float, float]
@@ -13,7 +16,7 @@ class BodyPairPotential:
     """A potential of pairs of bodies for `Simulation(scene, forces=[...])`, made by
     `body_pair_potential`."""
 
-    function: Any  # of (r, a, b), or a table
+    function: "Callable | BodyTable"  # of (r, a, b), or a table
     parameters: Mapping[str, Parameters]  # by species
     species: tuple[str, ...]  # on which it acts; none: on all
     pairs: Mapping[tuple[str, str], Parameters]

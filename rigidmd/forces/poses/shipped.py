@@ -1,13 +1,14 @@
 """The shipped pair potentials of bodies, and pair potentials from an expression, for scenes."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.forces.poses import gay_berne, multipoles, patch
 from rigidmd.forces.poses.gay_berne import GayBerne
+from rigidmd.forces.poses.trace import Number
 
 
 class Shipped(NamedTuple):
@@ -84,15 +85,15 @@ def function_of_text(energy: str, mixing: Mapping[str, str]) -> Callable:
         if symbol.name.startswith(prefix) and symbol.name.removeprefix(prefix) not in ANGLES
     )
 
-    def function(r: Any, u: Any, v: Any, p: Any, q: Any) -> Any:
+    def function(r: np.ndarray, u: np.ndarray, v: np.ndarray, p: object, q: object) -> Number:
         distance = np.sqrt(r @ r)
-        values = {DISTANCE: distance}
+        values: dict[str, Number] = {DISTANCE: distance}
         angles = ((u @ r) / distance, (v @ r) / distance, u @ v)
         values |= {prefix + name: angle for name, angle in zip(ANGLES, angles, strict=True)}
         for name in names:
             mean = MEANS[mixing.get(name, "arithmetic" if name[:3] == "sig" else "geometric")]
             values[prefix + name] = mean(getattr(p, name), getattr(q, name))
-        return _value(parsed, values)
+        return text_formulas.value_of(parsed, values)
 
     return function
 
@@ -102,22 +103,3 @@ MEANS: dict[str, Callable] = {
     "geometric": lambda x, y: np.sqrt(x * y),
     "harmonic": lambda x, y: 2 * x * y / (x + y),
 }
-
-
-def _value(expression: Any, values: Mapping[str, Any]) -> Any:
-    """The value of a SymPy expression with arithmetic and NumPy functions."""
-    if expression.is_Symbol:
-        return values[expression.name]
-    if expression.is_Number or expression.is_NumberSymbol:
-        return float(expression)
-    parts = [_value(part, values) for part in expression.args]
-    if expression.is_Add:
-        return sum(parts[1:], parts[0])
-    if expression.is_Mul:
-        product = parts[0]
-        for part in parts[1:]:
-            product = product * part
-        return product
-    if expression.is_Pow:
-        return parts[0] ** parts[1]
-    return getattr(np, expression.func.__name__)(*parts)

@@ -5,9 +5,8 @@ lines of Python, which are compiled.
 """
 
 from collections.abc import Callable, Container, Sequence
-from typing import Any
 
-from rigidmd.forces.poses.trace import Traced, computed, where
+from rigidmd.forces.poses.trace import Number, Traced, computed, where
 
 #: Kind of a node -> its code.
 _CODE = {
@@ -39,9 +38,9 @@ _SLOPES: dict[str, Callable] = {
 }
 
 
-def slopes_of(output: Traced, leaves: Sequence[Traced]) -> list[Any]:
+def slopes_of(output: Traced, leaves: Sequence[Traced]) -> list[Number]:
     """The slopes of a node by leaves; 0.0 by one on which it does not depend."""
-    slope: dict[int, Any] = {output.index: 1.0}
+    slope: dict[int, Number] = {output.index: 1.0}
     for node in reversed(_in_order([output])):
         above = slope.get(node.index, 0.0)
         if not node.inner or (isinstance(above, float) and above == 0):
@@ -73,7 +72,7 @@ def _in_order(outputs: Sequence[Traced], known: Container[int] = ()) -> list[Tra
 
 
 def code_of(
-    outputs: Sequence[Any], known: dict[int, str] | None = None
+    outputs: Sequence[Number], known: dict[int, str] | None = None
 ) -> tuple[list[str], list[str]]:
     """Lines that compute the nodes, and the text of each output, a node or a number.
 
@@ -120,7 +119,7 @@ class Hoisted:
     names : of the parameters, which are leaves
     """
 
-    def __init__(self, outputs: Sequence[Any], names: Sequence[str]):
+    def __init__(self, outputs: Sequence[Number], names: Sequence[str]):
         nodes = _in_order([output for output in outputs if isinstance(output, Traced)])
         fixed: set[int] = set()
         for node in nodes:

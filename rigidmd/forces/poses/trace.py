@@ -5,8 +5,7 @@ the computation. Equal nodes are one, and parts that are constant are computed h
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -33,8 +32,8 @@ class Graph:
 
     def node(self, kind: str, *parts: "Traced") -> "Traced":
         """A function of other nodes, simplified."""
-        numbers = [part.number for part in parts]
-        if all(number is not None for number in numbers):
+        numbers = [part.number for part in parts if part.number is not None]
+        if len(numbers) == len(parts):
             return self.constant(computed(kind, numbers))
         short = _SIMPLER[kind](self, *parts) if kind in _SIMPLER else None
         return self._node(kind, parts) if short is None else short
@@ -61,12 +60,12 @@ def _operators(kind: str) -> tuple[Callable, Callable]:
     """The methods of an operator, with the node as the first and as the second operand. NumPy
     applies them to the entries of arrays."""
 
-    def first(self: "Traced", other: Any):
+    def first(self: "Traced", other: "Number | np.ndarray"):
         if isinstance(other, np.ndarray):
             return NotImplemented
         return self.graph.node(kind, self, self._other(other))
 
-    def second(self: "Traced", other: Any):
+    def second(self: "Traced", other: "Number | np.ndarray"):
         if isinstance(other, np.ndarray):
             return NotImplemented
         return self.graph.node(kind, self._other(other), self)
@@ -90,7 +89,7 @@ class Traced:
         """The nodes of which it is a function."""
         return [part for part in self.parts if isinstance(part, Traced)]
 
-    def _other(self, value: Any) -> "Traced":
+    def _other(self, value: "Number") -> "Traced":
         if isinstance(value, Traced):
             return value
         return self.graph.constant(float(value))
@@ -109,7 +108,7 @@ class Traced:
     def __abs__(self):
         return self.absolute()
 
-    def __pow__(self, exponent: Any):
+    def __pow__(self, exponent: "Number | np.ndarray"):
         if isinstance(exponent, np.ndarray):
             return NotImplemented
         known = self._other(exponent)
@@ -117,7 +116,7 @@ class Traced:
             return (known * self.log()).exp()
         return self.graph.power(self, known.number)
 
-    def __rpow__(self, base: Any):
+    def __rpow__(self, base: "Number"):
         return self._other(base) ** self
 
     __lt__, __gt__ = _operators("less")
@@ -164,7 +163,9 @@ class Traced:
     def square(self):
         return self * self
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any):
+    def __array_ufunc__(
+        self, ufunc: np.ufunc, method: str, *inputs: "Number | np.ndarray", **options: object
+    ):
         """NumPy functions for single numbers and arrays."""
         if method != "__call__" or options:
             return NotImplemented
@@ -184,13 +185,23 @@ class Traced:
             return getattr(self, name)()
         raise TraceError(f"numpy.{name} has no slope here: use {', '.join(FUNCTIONS)}")
 
-    def __array_function__(self, function: Any, kinds: Any, arguments: Any, options: Any):
+    def __array_function__(
+        self,
+        function: Callable,
+        kinds: Iterable[type],
+        arguments: "Sequence[Number]",
+        options: Mapping[str, object],
+    ):
         if function is np.where and len(arguments) == 3:
             return where(*arguments)
         return NotImplemented
 
 
-def _as_objects(value: Any) -> np.ndarray:
+#: A number that is recorded, or a constant.
+Number = Traced | float
+
+
+def _as_objects(value: Number | np.ndarray) -> np.ndarray:
     array = np.empty((), object)
     if isinstance(value, np.ndarray):
         return value.astype(object)
@@ -206,7 +217,7 @@ def _each(function: Callable, *arrays: np.ndarray) -> np.ndarray:
     return result
 
 
-def where(condition: Any, yes: Any, no: Any) -> Any:
+def where(condition: Number, yes: Number, no: Number) -> Number:
     """`yes` or `no`; both are computed."""
     if not isinstance(condition, Traced):
         return yes if condition else no
@@ -255,7 +266,7 @@ _VALUES: dict[str, Callable] = {
 }
 
 
-def computed(kind: str, numbers: Sequence[Any]) -> float:
+def computed(kind: str, numbers: Sequence[float]) -> float:
     try:
         value = (_VALUES[kind] if kind in _VALUES else getattr(math, kind))(*numbers)
     except (ArithmeticError, ValueError):

@@ -2,12 +2,13 @@
 beyond it."""
 
 from math import inf, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import chosen_by_type, implements, kernel
 from rigidmd.compile.simd import inverse_root_and_cube, inverse_square_root, load, zeros
+from rigidmd.forces.inputs import ForceKeys
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.parts import Interactions, SystemParts
@@ -91,7 +92,7 @@ def interactions(parts: SystemParts) -> Interactions:
     return Interactions({"coulomb": parts.pair_forces(potential, sites)}, constants)
 
 
-def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
+def setting_errors(forces: ForceKeys, space: Space, cutoff: float) -> list[str]:
     """Messages on keys of [forces] that this box does not allow."""
     if forces.electrostatics == "coulomb" and space.volume < inf:
         return [

@@ -3,7 +3,7 @@ correction."""
 
 from collections.abc import Callable
 from math import inf, pi
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numba import types
@@ -12,6 +12,7 @@ from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.simd import inverse, inverse_square_root, load, polynomial, zeros
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.smooth import InverseR6
+from rigidmd.forces.inputs import CouplingKeys, Molecule
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import exclusion_groups
@@ -231,7 +232,7 @@ def interactions(parts: SystemParts) -> Interactions:
     )
 
 
-def _is_soft(coupling: Any, molecule: Any) -> bool:
+def _is_soft(coupling: CouplingKeys | None, molecule: Molecule) -> bool:
     """Whether [coupling] gives a molecule a soft core."""
     if coupling is None or molecule.name != coupling.species:
         return False

@@ -11,15 +11,17 @@ import ast
 import keyword
 import re
 from collections.abc import Callable, Mapping
-from math import copysign, cos, exp, isfinite, log, log10, pi, sin, sqrt
+from math import copysign, cos, exp, isfinite, log, log10, pi, prod, sin, sqrt
 from operator import add, mul, sub, truediv
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import numpy as np
 import sympy
 
 from rigidmd.core.toml import shorten_text
 from rigidmd.core.user_modules import module_of
 from rigidmd.errors import describe_error
+from rigidmd.forces.poses.trace import Number
 from rigidmd.forces.potentials.formulas import DISTANCE, Formula, FormulaError, Radial
 from rigidmd.units import KJ_PER_MOL
 
@@ -226,7 +228,7 @@ def _of_distance(formula, shared, r2, inverse1, inverse2):
 """
 
 
-def _powers_of(powers: Mapping[int, Any]) -> list[str]:
+def _powers_of(powers: Mapping[int, sympy.Symbol]) -> list[str]:
     """Lines that compute integer powers of r, each from smaller ones."""
     lines: dict[str, str] = {}
 
@@ -293,6 +295,22 @@ def parse_energy(energy: str, constants: Mapping[str, float] | None = None) -> s
     if parsed.has(sympy.zoo, sympy.nan, sympy.oo, sympy.I):
         raise FormulaError(f"{energy!r} is not finite")
     return parsed
+
+
+def value_of(expression: sympy.Basic, values: Mapping[str, Number]) -> Number:
+    """The value of an expression with arithmetic and NumPy functions."""
+    if isinstance(expression, sympy.Symbol):
+        return values[expression.name]
+    if isinstance(expression, sympy.Number | sympy.NumberSymbol):
+        return float(expression)
+    parts = [value_of(part, values) for part in expression.args]
+    if expression.is_Add:
+        return sum(parts[1:], parts[0])
+    if expression.is_Mul:
+        return prod(parts[1:], start=parts[0])
+    if expression.is_Pow:
+        return parts[0] ** parts[1]
+    return getattr(np, expression.func.__name__)(*parts)
 
 
 class _Part(NamedTuple):
