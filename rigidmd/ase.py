@@ -195,7 +195,8 @@ class RigidMD(Calculator):
         """
         assembly = self._assemble(atoms, stage_keys)
         fitted = assembly.fit(atoms)
-        stage, state = assembly.system.scene.stages[0], fitted.state.copy()
+        stage = assembly.system.scene.stages[0]
+        state = fitted.state.copy()
         found = minimise(assembly.system, state, stage)
         if not found.converged:
             warnings.warn(describe_minimum(found, stage), RigidMDWarning, stacklevel=2)
@@ -234,7 +235,8 @@ class RigidMD(Calculator):
             raise StructureError(SOURCE, [*error.errors, hint]) from None
         fitted = found.fit(atoms)
         if before is not None and before.bent <= min(self._tolerance, fitted.bent / CLEARLY_BETTER):
-            found, fitted = not_none(known), before
+            found = not_none(known)
+            fitted = before
         self._assembly, self._bent = found, fitted.bent
         return fitted
 
@@ -331,7 +333,8 @@ class _Assembly(NamedTuple):
 
     def fit(self, atoms: Atoms) -> _FittedAtoms:
         """Fit the molecules to atoms."""
-        rotation, cell = np.eye(3), None
+        rotation = np.eye(3)
+        cell = None
         if atoms.pbc.all():
             upright, first = standard_rotation(atoms.cell.array)
             cell, second = standard_rotation(self.basis @ upright)
@@ -408,10 +411,8 @@ class CalculatorForce(Force):
 
     def begin(self, system: System) -> None:
         """Make the atoms, and choose the properties that the calculator computes."""
-        can, periodic = (
-            self.calculator.implemented_properties,
-            bool(np.isfinite(system.state.cell).all()),
-        )
+        can = self.calculator.implemented_properties
+        periodic = bool(np.isfinite(system.state.cell).all())
         if missing := [name for name in ("energy", "forces") if name not in can]:
             raise UserForceError(f"the calculator has no {' and no '.join(missing)}")
         self._has_virial = periodic and "stress" in can
@@ -430,7 +431,9 @@ class CalculatorForce(Force):
 
     def on_sites(self, position: np.ndarray, state: State) -> tuple:
         """Energy, forces on all sites, and the molecular virial where there is a stress."""
-        sites, calculator, unit = self._sites, self.calculator, EV / KJ_PER_MOL
+        sites = self._sites
+        calculator = self.calculator
+        unit = EV / KJ_PER_MOL
         atom = sites.mass > 0
         self.atoms.positions[:] = position[atom]
         if self.atoms.pbc.all():
@@ -444,7 +447,8 @@ class CalculatorForce(Force):
                 calculator.calculate(self.atoms, wanted, changes)
             found = calculator.results
             energy = (found["free_energy"] if "free_energy" in found else found["energy"]) * unit
-            forces, stress = found["forces"], found["stress"] if self._has_virial else None
+            forces = found["forces"]
+            stress = found["stress"] if self._has_virial else None
         except Exception as error:  # calculators raise anything
             where = f"at step {state.step[NOW]}; {self._closest_atoms()}"
             raise UserForceError(
@@ -462,7 +466,8 @@ class CalculatorForce(Force):
     def _checked(self, what: str, given: object, *shapes: tuple[int, ...]) -> np.ndarray:
         """Values of the calculator as an array of real numbers in one of these shapes. Raises
         UserForceError."""
-        array, wanted = real_numbers(given), " or ".join(map(str, shapes))
+        array = real_numbers(given)
+        wanted = " or ".join(map(str, shapes))
         if array is None:
             kind = "masked or complex values" if hasattr(given, "dtype") else f"{given!r:.60}"
             problem = f"{kind} as {what}, not real numbers of the shape {wanted}"
@@ -474,18 +479,17 @@ class CalculatorForce(Force):
 
     def _closest_atoms(self) -> str:
         """A message with the two atoms of different molecules that are closest."""
-        owner, best, words = (
-            self._sites.molecule[self._sites.mass > 0],
-            np.inf,
-            "there is one molecule",
-        )
+        owner = self._sites.molecule[self._sites.mass > 0]
+        best = np.inf
+        words = "there is one molecule"
         for k in range(len(owner) - 1):
             others = np.flatnonzero(owner[k + 1 :] != owner[k]) + k + 1
             if (
                 len(others)
                 and (distances := self.atoms.get_distances(k, others, mic=True)).min() < best
             ):
-                best, other = distances.min(), others[distances.argmin()]
+                best = distances.min()
+                other = others[distances.argmin()]
                 one, two = (
                     f"{self.atoms.symbols[i]} of molecule {owner[i] + 1}" for i in (k, other)
                 )

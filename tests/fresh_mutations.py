@@ -126,8 +126,8 @@ FRESH: list[Mutation] = [
         "F15",
         "step for a bias of averages: BAOAB's is taken for twice as large",
         "run/pilot/sampling.py",
-        'UNBIASED, BIAS = "baoab", 1 / 24',
-        'UNBIASED, BIAS = "baoab", 1 / 12',
+        "BIAS = 1 / 24",
+        "BIAS = 1 / 12",
         ("test_auto.py::test_the_bias_asked_for_sets_the_step",),
     ),
     Mutation(

@@ -116,8 +116,8 @@ CORE = [
         "A12",
         "dielectric constant: <M>², which is 0, is taken off",
         "analysis/built_in/rotation.py",
-        "    centre, lost = np.zeros(3), 0.0",
-        "    centre, lost = runs.mean([M.mean(axis=0) for M in dipoles]), 0.0",
+        "    centre = np.zeros(3)",
+        "    centre = runs.mean([M.mean(axis=0) for M in dipoles])",
         (
             "test_analyse.py::test_the_dielectric_constant_of_independent_dipoles",
             "test_analyse.py::test_a_dielectric_constant_has_no_bias_of_short_runs",
@@ -305,8 +305,8 @@ RINGS = [
         "B21",
         "random numbers of every stage are those of the first",
         "assemble/build.py",
-        "    thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, k)",
-        "    thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, 0)",
+        "    key = key_of(system.scene.seed, THERMOSTAT, k)",
+        "    key = key_of(system.scene.seed, THERMOSTAT, 0)",
         ("test_wiring.py::test_stages_have_random_numbers_of_their_own",),
     ),
     Mutation(

@@ -62,7 +62,8 @@ def write_results(
                     f"{folder / name} exists and is not of an analysis. Rename {result.name}"
                 )
     add_to_folder(folder, [ANALYSIS, *new])
-    entries, curves = {}, [curve for result in results for curve in result.curves]
+    entries = {}
+    curves = [curve for result in results for curve in result.curves]
     for name, entry in known.items():
         entries[name] = entry.model_dump() | {"values": [value._asdict() for value in entry.values]}
     for result in [
@@ -143,7 +144,8 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
     OutputError."""
     results = []
     for name, entry in read_table(folder).items():
-        curves, used = [], entry.frames_used
+        curves = []
+        used = entry.frames_used
         for described in entry.curves:
             path = folder / f"{Path(described.file).name}.csv"
             read = read_columns(path)
@@ -256,8 +258,10 @@ def run_analyses(
 ) -> tuple[list[AnalysisResult], dict[str, str]]:
     """The results of analyses, and a sentence on each that has failed: analysis -> why. No analysis
     ends the others."""
-    entries, given = selected(names), {"viscosity_mPa_s": viscosity} | dict(options or {})
-    results, failed = [], {}
+    entries = selected(names)
+    given = {"viscosity_mPa_s": viscosity} | dict(options or {})
+    results = []
+    failed = {}
     for k, entry in enumerate(entries):
         progress(k / len(entries), entry.name)
         taken = given.keys() & signature(entry.function).parameters.keys()

@@ -37,7 +37,8 @@ class SampledLambda(NamedTuple):
     def decorrelated(self) -> np.ndarray:
         """Samples at intervals of the statistical inefficiency of the energies at the neighbours
         (m, lambdas)."""
-        k, last = self.number, self.changes.shape[1] - 1
+        k = self.number
+        last = self.changes.shape[1] - 1
         changes = np.nan_to_num(self.changes, nan=MOST).clip(-MOST, MOST)
         off = changes - changes.mean(axis=0)
         per_independent = [

@@ -20,7 +20,10 @@ from rigidmd.errors import OutputError
 NAME = "pmf"
 ABOUT, OVER = "potential of mean force along a restrained distance", "the distance of a restraint"
 #: Width of bins, Å; least decorrelated samples of a window and in a bin; samples of the bootstrap.
-WIDTH, LEAST_SAMPLES, LEAST_IN_BIN, RESAMPLED = 0.1, 10, 6, 50
+WIDTH = 0.1
+LEAST_SAMPLES = 10
+LEAST_IN_BIN = 6
+RESAMPLED = 50
 #: Fraction of the bins, at the largest distances, whose mean is the zero of the energy.
 OUTER = 0.1
 #: Overlap of neighbouring windows below which a window is missing between them (Klimovich, Shirts &
@@ -71,7 +74,8 @@ def potential_of_mean_force(
     counts = np.histogram(np.concatenate(samples), edges)[0]
     filled = counts >= LEAST_IN_BIN
     profile_of_all = _profile(windows, samples, thermal_energy, free, edges, filled)
-    rng, profiles = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    profiles = []
     for _ in range(RESAMPLED):
         drawn = [rng.choice(some, len(some)) for some in samples]
         again, _ = _free_energies(windows, drawn, thermal_energy, free)

@@ -82,7 +82,8 @@ def spectral_bands(runs: list[np.ndarray], interval: float) -> Bands:
     powers = [np.mean(np.abs(np.fft.rfft(series[:count], axis=0)) ** 2, axis=1) for series in runs]
     density = np.mean(powers, axis=0) * interval / count
     freedom = sum(series.shape[1] for series in runs)
-    first, edges = 1, [0]
+    first = 1
+    edges = [0]
     while first < len(density):
         edges.append(first)
         first = max(first + 1, int(first * RATIO)) if first >= ALONE else first + 1
@@ -100,7 +101,8 @@ def integral_of(runs: list[np.ndarray], interval: float) -> Limit | None:
     Models of one to three relaxations and a constant are fitted by their likelihood. Their limits
     are averaged with Akaike's weights, and differences between them are a part of the error.
     """
-    bands, span = spectral_bands(runs, interval), interval * min(map(len, runs))
+    bands = spectral_bands(runs, interval)
+    span = interval * min(map(len, runs))
     longest = longest_time(len(runs), span)
     limit = None
     for part in PARTS:
@@ -155,7 +157,8 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
         """Minus the logarithm of the likelihood, except for a constant."""
         return float(bands.freedom @ (np.log(density) + bands.density / density))
 
-    parameters, damping = np.clip(start, bottom, ceiling), 1e-2
+    parameters = np.clip(start, bottom, ceiling)
+    damping = 1e-2
     density, slopes = model(parameters)
     before = surprise(density)
     for _ in range(ITERATIONS):
@@ -173,7 +176,8 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
             if damping >= 1e6:
                 break
             continue
-        gain, before = before - after, after
+        gain = before - after
+        before = after
         parameters, density, slopes = tried, density_there, slopes_there
         damping = max(0.2 * damping, 1e-7)
         if gain < CLOSE:

@@ -237,7 +237,8 @@ def with_block_error(
     if runs.are_several:
         return runs.estimate([measure(run) for run in runs.members], conclude)
     frames = runs.first
-    value, size = np.asarray(conclude(measure(frames)), float), len(frames) // BLOCKS
+    value = np.asarray(conclude(measure(frames)), float)
+    size = len(frames) // BLOCKS
     blocks = range(len(frames) - size * BLOCKS, len(frames), size) if size > 1 else ()
     parts = [np.asarray(conclude(measure(frames[k : k + size])), float) for k in blocks]
     return value, error_of_mean(parts) if parts else np.full_like(value, np.nan)

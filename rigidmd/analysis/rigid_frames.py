@@ -203,9 +203,12 @@ def fit_frames(
     wrapped : whether centres are wrapped into the box. Their paths are made continuous
     progress : called with the fraction done
     """
-    fit, n, f = RigidFit(system), len(system.model.species), len(sites)
+    fit = RigidFit(system)
+    n = len(system.model.species)
+    f = len(sites)
     rotating = n if len(system.state.rotation) else 0
-    position, Q = np.empty((f, n, 3)), np.empty((f, rotating, 3, 3))
+    position = np.empty((f, n, 3))
+    Q = np.empty((f, rotating, 3, 3))
     velocity, L = (
         (None, None) if velocities is None else (np.empty((f, n, 3)), np.empty((f, rotating, 3)))
     )
@@ -271,7 +274,8 @@ def frames_of_start(scene: MolecularScene, count: int) -> RigidFrames:
     """The start of a scene as a number of frames, for molecules that do not move. Raises
     SceneError."""
     system = build(scene)
-    state, stage = system.state, system.scene.stages[-1]
+    state = system.state
+    stage = system.scene.stages[-1]
     shape = (count, len(system.model.species))
     return RigidFrames(
         system,
@@ -297,7 +301,8 @@ def frames_of_results(results: Results, start: float | None = None) -> RigidFram
     frames = results._frames
     if not frames:
         raise OutputError("this run has no frames (output.trajectory = false) to analyse")
-    count, cells = len(frames), np.array([frame.cell for frame in frames])
+    count = len(frames)
+    cells = np.array([frame.cell for frame in frames])
     positions, velocities = (
         np.array([getattr(frame, of) for frame in frames]) for of in ("positions", "velocities")
     )
@@ -319,7 +324,8 @@ def production_samples(record: Record) -> tuple[Stage, np.ndarray]:
 def earlier_production(record: Record) -> Iterator[tuple[Stage, np.ndarray]]:
     """The stages of motion before the last one whose set points do not change, and which samples
     belong to their equilibrated parts. Raises OutputError."""
-    columns, last = record.columns, _last_stage(record.system, record.columns)[0]
+    columns = record.columns
+    last = _last_stage(record.system, record.columns)[0]
     for k, stage in enumerate(record.system.scene.stages):
         if stage is last:
             return
@@ -394,7 +400,8 @@ def _rigid_frames(
 def _last_stage(system: System, columns: dict[str, np.ndarray]):
     """The last moving stage with samples, its start, end and equilibrated part, ps, and its samples
     of motion (l,)."""
-    time, stages = columns["time"], system.scene.stages
+    time = columns["time"]
+    stages = system.scene.stages
     if all(stage.is_minimisation for stage in stages):
         raise OutputError(
             "this run is a minimisation, in which no time passes: there is nothing to average"

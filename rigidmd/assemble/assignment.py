@@ -157,14 +157,16 @@ class Orders:
     def search(self, points: np.ndarray, limit: float) -> np.ndarray | None:
         """The best order (s,) for a molecule (s, 3) in which no atom deviates by more than a limit,
         Å, or None."""
-        best, least = None, np.inf
+        best = None
+        least = np.inf
         centred = points - points.mean(axis=0)
         for starts in self._starts(centred, 2 * limit):
             orders = self._refined(centred, starts)
             fit = fit_template(points[orders], self.molecule)
             square = np.where(fit.deviation <= limit, fit.square, np.inf)
             if square.min() < least:
-                best, least = orders[square.argmin()], square.min()
+                best = orders[square.argmin()]
+                least = square.min()
             if np.sqrt(least) <= self._certain:
                 break
         return best
@@ -232,7 +234,8 @@ class Orders:
     def _variants(self) -> np.ndarray:
         """A number for each of the orders `_alike` (k,), the same if each atom has the same
         parameters in them."""
-        alike, keys = self._alike, self._parameters[massive_sites(self.molecule)]
+        alike = self._alike
+        keys = self._parameters[massive_sites(self.molecule)]
         placed = np.empty_like(alike)
         np.put_along_axis(placed, alike, np.broadcast_to(keys, alike.shape), axis=1)
         fit = fit_template(self._template[alike], self.molecule)

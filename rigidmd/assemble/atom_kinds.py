@@ -36,7 +36,8 @@ def kinds_of(atoms: Atoms, species: list[Molecule]) -> list[str]:
     element of the scene. If the file has masses, names of sites and elements have priority over the
     mass, and the mass over the start of any other name.
     """
-    by_name, by_mass = {}, []
+    by_name = {}
+    by_mass = []
     for molecule in species:
         for name, label, mass in zip(
             molecule.site_names, labels_of(molecule), molecule.masses, strict=True

@@ -65,11 +65,13 @@ def build_body(
     mass, tensor, centre, points, names = inertia_of(scene)
     added_mass, added_inertia, displaced = carried_fluid(scene)
     if scene.changing_inertia is not None:
-        moments, axes = np.array(scene.changing_inertia.inertia_kg_m2[0]), np.eye(3)
+        moments = np.array(scene.changing_inertia.inertia_kg_m2[0])
+        axes = np.eye(3)
     else:
         moments, axes = principal(tensor)
     moments = moments + added_inertia
-    rotates, applied = bool(moments.any()), applied or {}
+    rotates = bool(moments.any())
+    applied = applied or {}
     faults = [*_body_errors(scene, centre, moments, axes, added_mass)]
     attitude = scene.start.attitude
     spin = axes.T @ scene.start.angular_velocity  # along the principal axes
@@ -131,7 +133,8 @@ def build_body(
 
 def has_finite_energy(system: BodySystem) -> bool:
     """Whether the energies of a body at its start are numbers."""
-    times, states = system.state.time[:1], State(*(array[None] for array in system.state))
+    times = system.state.time[:1]
+    states = State(*(array[None] for array in system.state))
     with np.errstate(over="ignore", invalid="ignore"):
         return all(
             bool(np.isfinite(values).all()) for values in energies(system, times, states).values()
@@ -140,13 +143,15 @@ def has_finite_energy(system: BodySystem) -> bool:
 
 def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
     """The state at the start. Spin (3,) along the principal axes, relative to the frame."""
-    start, time = scene.start, np.zeros(1)
+    start = scene.start
+    time = np.zeros(1)
     if isinstance(body.frame, InertialFrame):
         frame = np.zeros(3)
     else:
         frame = values_at(body.frame.angular_velocity, time)[0]
     position = velocity = np.zeros((0, 3))
-    rotation, momentum = np.zeros((0, 3, 3)), np.zeros((0, 3))
+    rotation = np.zeros((0, 3, 3))
+    momentum = np.zeros((0, 3))
     principal_rotation = attitude @ axes
     if rotates:
         rotation = principal_rotation[None].copy()
@@ -171,7 +176,8 @@ def _body_errors(
 ) -> Iterator[str]:
     """Messages on keys of any table that do not apply to this body, or would have no effect on
     it."""
-    fluid, rotates = scene.fluid, bool(moments.any())
+    fluid = scene.fluid
+    rotates = bool(moments.any())
     if not rotates:
         yield from _rotation_keys_of_point(scene)
         if scene.body.pinned:
@@ -216,7 +222,8 @@ def _body_errors(
 
 def _rotation_keys_of_point(scene: BodyScene) -> list[str]:
     """Messages on keys of rotation, which a point does not have."""
-    start, none = scene.start, type(scene.start)()
+    start = scene.start
+    none = type(scene.start)()
     named = [
         f"start.{key}"
         for key in type(start).model_fields
@@ -272,7 +279,8 @@ def _torque_errors(scene: BodyScene, axes: np.ndarray, moments: np.ndarray) -> I
 def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
     """Messages on integrators that cannot move this body, or lose their order; immersed: the fluid
     adds mass; has_functions: Python functions apply forces."""
-    run, resistance = scene.run, resistance_of(scene)
+    run = scene.run
+    resistance = resistance_of(scene)
     resisted = not isinstance(resistance, NoResistance)
     if run.is_auto:
         return []
@@ -341,7 +349,8 @@ def inertia_of(
         points = np.concatenate(outlines)
     elif body.solid is not None:
         shape = solid(body.solid.shape, mass, body.solid.dimensions)
-        points, tensor = shape.outline, np.diag(shape.inertia)
+        points = shape.outline
+        tensor = np.diag(shape.inertia)
     else:
         about_pivot = body.inertia_about == "pivot"
         points = _equal_ellipsoid(
@@ -398,7 +407,8 @@ def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     best = max(
         permutations(range(3)), key=lambda order: sum(abs(axes[k, order[k]]) for k in range(3))
     )
-    moments, axes = np.maximum(moments, 0.0)[list(best)], axes[:, best]
+    moments = np.maximum(moments, 0.0)[list(best)]
+    axes = axes[:, best]
     axes = axes * np.where(np.diag(axes) < 0, -1.0, 1.0)
     if np.linalg.det(axes) < 0:
         axes[:, np.abs(np.diag(axes)).argmin()] *= -1

@@ -29,7 +29,9 @@ def bonded_atoms(
         points = molecule.positions_body[sites]
         number = [numbers[labels_of(molecule)[s]] for s in sites]
         for i, j in shortest_links(points):
-            one, other, length = number[i], number[j], float(np.linalg.norm(points[i] - points[j]))
+            one = number[i]
+            other = number[j]
+            length = float(np.linalg.norm(points[i] - points[j]))
             reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
     if UNKNOWN in numbers:
         sites = [
@@ -58,7 +60,8 @@ def _endless(label: np.ndarray, i: np.ndarray, j: np.ndarray, step: np.ndarray) 
     """Components (labels of atoms) whose bonds i, j with vectors step (b, 3) close a ring through
     the periodic cell."""
     i, j, step = np.append(i, j), np.append(j, i), np.vstack([step, -step])
-    position, reached = np.zeros((len(label), 3)), np.zeros(len(label), bool)
+    position = np.zeros((len(label), 3))
+    reached = np.zeros(len(label), bool)
     reached[np.unique(label, return_index=True)[1]] = True
     while len(onward := np.flatnonzero(reached[i] & ~reached[j])):
         position[j[onward]] = position[i[onward]] + step[onward]

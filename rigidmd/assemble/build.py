@@ -67,7 +67,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         squares = mass[start.species] @ (velocity**2).sum(axis=1)
         thermal = float(squares) / (3 * len(start.species))
     scene = with_time_steps(scene, species, thermal / BOLTZMANN)
-    space, number = space_of(start.cell), residue_numbers(start)
+    space = space_of(start.cell)
+    number = residue_numbers(start)
     warnings = scene_warnings(scene, species)
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
@@ -278,7 +279,8 @@ def left_out(
     charged : whether a site has a charge
     without_tail : why the tail correction is omitted. Empty if it is included
     """
-    forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
+    forces = scene.forces
+    removal = scene.run.remove_momentum_interval_ps
     has_sums = any(name.endswith("_reciprocal") for name in terms)
     direct = has_sums and forces.electrostatics == "ewald" and forces.dispersion != "pme"
     method = forces.electrostatics
@@ -314,7 +316,8 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total
     momentum."""
     stage = system.scene.stages[k]
-    scheme, thermostat = stage.scheme, system.user_thermostat(k)
+    scheme = stage.scheme
+    thermostat = system.user_thermostat(k)
     if system.thermostat is None and stage.has_thermostat:
         thermostat = thermostat_of(system, k)
     if stage.is_hybrid and system.thermostat is None:
@@ -335,12 +338,14 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
 
 def thermostat_of(system: System, k: int) -> NamedTuple:
     stage = system.scene.stages[k]
-    thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, k)
+    thermal = _thermal(stage)
+    key = key_of(system.scene.seed, THERMOSTAT, k)
     return THERMOSTATS[stage.thermostat_kind](stage, thermal, system.freedom_in(k), key)
 
 
 def barostat_of(system: System, k: int) -> NamedTuple:
-    stage, key = system.scene.stages[k], key_of(system.scene.seed, BAROSTAT, k)
+    stage = system.scene.stages[k]
+    key = key_of(system.scene.seed, BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
     first, last = (tuple(x * BAR for x in ends) for ends in stage.pressures)
     pressure = Pressure(first, last, float(stage.steps))  # pyright: ignore[reportArgumentType]

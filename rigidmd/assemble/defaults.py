@@ -33,7 +33,8 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
     """A scene with those defaults that depend on an external engine, and notes on them."""
     if (program := scene.engine.program) is None:
         return scene, []
-    notes, stages = [f"computed by {scene.engine.title}"], []
+    notes = [f"computed by {scene.engine.title}"]
+    stages = []
     for k, stage in enumerate(scene.stages):
         defaults = {}
         if program.thermostat and stage.has_thermostat and stage.thermostat is None:
@@ -83,7 +84,8 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
         from rigidmd.forces.ewald import dispersion  # for these scenes only
 
         of_dispersion = dispersion.settings(scene.forces, composition, numbers["cutoff_A"])
-        numbers, faults = numbers | of_dispersion.numbers, of_dispersion.errors
+        numbers = numbers | of_dispersion.numbers
+        faults = of_dispersion.errors
     if scene.output.pressure_tensor_interval_ps and composition.space.volume == inf:
         why = "without which the pressure is not defined"
         faults.append(f"output.pressure_tensor_interval_ps needs a periodic box, {why}")
@@ -144,7 +146,8 @@ def _with_electrostatics(
 ) -> tuple[MolecularScene, list[str]]:
     """A scene with its method of electrostatics, tail correction and cutoff scheme of charges, and
     error messages."""
-    forces, faults = scene.forces, []
+    forces = scene.forces
+    faults = []
     method = forces.electrostatics
     if method is None:
         has_charges = any(m.charges.any() for m in composition.species)
@@ -208,7 +211,9 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[Json, 
 
     space = composition.space
     cutoff_A = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
-    cutoff, start, faults = cutoff_A or inf, forces.switch_start_A, []
+    cutoff = cutoff_A or inf
+    start = forces.switch_start_A
+    faults = []
     half = min(space.edges) / 2
     least = "the smallest of a_x, b_y, c_z" if isinstance(space, Triclinic) else "the shortest edge"
     limit = f"half {least} of the box, {half:.3f} Å"

@@ -63,7 +63,8 @@ def describe_system(system: System | BodySystem) -> str:
 
 
 def _describe_body(system: BodySystem) -> str:
-    scene, run = system.scene, system.scene.run
+    scene = system.scene
+    run = system.scene.run
     pinned = "" if system.translates else ", pinned"
     moments = " ".join(f"{x:.9g}" for x in system.inertia)
     about = "the centre of mass" if system.translates else "the pivot"

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 #: Two molecules overlap where the energy of two of their sites, without charges, is at least the
 #: larger of these: u Å²/ps², and a multiple of kT.
-CORE, CORE_IN_KT = 1000 * KJ_PER_MOL, 100.0
+CORE = 1000 * KJ_PER_MOL
+CORE_IN_KT = 100.0
 #: Opposite charges whose energy is below minus this multiple of kT lack a core between them.
 DEEPEST_IN_KT = 500.0
 
@@ -153,10 +154,12 @@ class Guest:
         rotation: np.ndarray,
     ) -> None:
         """Add the energies of a pair term to the trial energies."""
-        offset, owner = term.sites.offsets(), term.sites.molecule
+        offset = term.sites.offsets()
+        owner = term.sites.molecule
         is_guest = owner == len(self._host)
         fixed = self._without.positions_of(host, owner[~is_guest], offset[~is_guest])
-        at, first = np.flatnonzero(energy < inf), int(is_guest.argmax())
+        at = np.flatnonzero(energy < inf)
+        first = int(is_guest.argmax())
         arms = rotation[at].reshape(-1, 3) @ offset[is_guest].T
         sites = position[at, None] + arms.reshape(len(at), 3, is_guest.sum()).transpose(0, 2, 1)
         for pair in pairs:
@@ -176,7 +179,8 @@ class Guest:
 def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> System:
     """The system of some of its molecules, with added ones at the end, which move."""
     species = [*system.species, *added]
-    old, new = system.model, np.arange(len(system.species), len(species))
+    old = system.model
+    new = np.arange(len(system.species), len(species))
     mass = np.append(old.mass, [m.mass for m in added])
     inertia = np.vstack([old.inertia, *(m.inertia for m in added)])
     rotor = split_rotor(inertia)

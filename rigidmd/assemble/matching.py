@@ -148,7 +148,9 @@ class _Matcher:
         how : text for messages
         endless : first atoms of runs that are bonded to their own images
         """
-        atoms, kinds, n = self._atoms, self._kinds, len(runs)
+        atoms = self._atoms
+        kinds = self._kinds
+        n = len(runs)
         alike: dict[tuple, list[int]] = {}
         for number, run in enumerate(runs):
             residue = atoms.residue[run[0]]
@@ -250,7 +252,8 @@ class _Matcher:
         faults = {}
         # (groups, m)
         rms = np.array([np.where(g.fits, g.assigned.fit.rms, np.inf) for g in groups])
-        chosen, fitting = rms.argmin(axis=0), np.asarray(np.isfinite(rms))
+        chosen = rms.argmin(axis=0)
+        fitting = np.asarray(np.isfinite(rms))
         clear = np.where(np.eye(len(groups), dtype=bool)[chosen].T, np.inf, rms).min(axis=0)
         least = rms.min(axis=0) + EQUAL_OF_RADIUS * max(g.limit for g in groups) / self._tolerance
         doubtful = (fitting.sum(axis=0) > 1) & (least >= EXACTLY * clear)
@@ -309,7 +312,9 @@ class _Matcher:
     ) -> None:
         """Add notes on the molecules `rows` of a group: what else fits them. rms (groups, m), Å, as
         each of `names`"""
-        name, fit, count = self._name(group), group.assigned.fit, int(rows.sum())
+        name = self._name(group)
+        fit = group.assigned.fit
+        count = int(rows.sum())
         if not count:
             return
         orders = self._orders_of(group.candidate.species, group.candidate.classes[-1])

@@ -51,7 +51,8 @@ def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:
 
 def check_memory_of_samples(scene: "BodyScene") -> None:
     """Raise SceneError if the samples of a resolved scene of a body exceed the memory."""
-    run, interval = scene.run, not_none(scene.output.interval_s)
+    run = scene.run
+    interval = not_none(scene.output.interval_s)
     count = run.duration_s / (interval if run.is_auto else max(interval, run.timestep_s))
     _require(
         scene.source,
@@ -68,7 +69,8 @@ def check_memory(system: "System") -> None:
     try:
         needed = bytes_of(system)
     except MemoryError as error:  # of NumPy, with the shape of the array
-        shape, dtype = getattr(error, "shape", ()), getattr(error, "dtype", np.uint8)
+        shape = getattr(error, "shape", ())
+        dtype = getattr(error, "dtype", np.uint8)
         needed = max(prod(shape) * np.dtype(dtype).itemsize, int(free_memory()))
         free = format_gigabytes(free_memory())
         fault = (
@@ -109,7 +111,8 @@ def bytes_of(system: "System") -> int:
 
 def array_bytes(value: tuple) -> int:
     """Bytes of all arrays in nested tuples. Memory that several arrays use counts once."""
-    sizes, pending = {}, [value]
+    sizes = {}
+    pending = [value]
     while pending:
         part = pending.pop()
         if isinstance(part, tuple):

@@ -48,9 +48,13 @@ class Quantity(NamedTuple):
         size = abs(value)
         if size == 0 or self.least <= size <= self.most:
             return ""
-        bound, limit, cause = "below", self.least, self.if_small
+        bound = "below"
+        limit = self.least
+        cause = self.if_small
         if size > self.most:
-            bound, limit, cause = "above", self.most, self.if_large
+            bound = "above"
+            limit = self.most
+            cause = self.if_large
         return f"{where} is {value:.4g} {self.unit}, {bound} {limit:g}: {cause}"
 
 

@@ -100,7 +100,9 @@ def sites_of_geometry(
     """Sites with positions from a file and parameters from entries of the scene or a table, by atom
     name or else by element. `where` names the entries in messages. Raises StructureError with all
     errors."""
-    faults, sites, used = [], [], set()
+    faults = []
+    sites = []
+    used = set()
     available = list(dict.fromkeys(site.name for site in (*entries_of_scene, *table))) or ["none"]
     listed = ", ".join(available[:MOST_LISTED]) + (", ..." if len(available) > MOST_LISTED else "")
     hint = f"there are {listed}. The atoms of the file may have these names in place of elements"
@@ -140,7 +142,9 @@ def split_frozen(
 ) -> tuple[list[Molecule], np.ndarray, np.ndarray, list[str]]:
     """Species, index (n,) into them, mask of frozen species, error messages. A partly frozen
     species becomes two."""
-    species, index, faults = list(species), index.copy(), []
+    species = list(species)
+    index = index.copy()
+    faults = []
     frozen = [entry.frozen is True for entry in scene.molecules]
     for k, entry in enumerate(scene.molecules):
         of_species = index == k
@@ -175,7 +179,8 @@ def model_from_geometry(
         no interactions
     name : default: the name of the file. Raises StructureError or MoleculeError, with all errors.
     """
-    notes, source = [], [f"geometry of {geometry.name}"]
+    notes = []
+    source = [f"geometry of {geometry.name}"]
     atoms = read_geometry(geometry)
     names, elements = atoms.names, atoms.elements
     if parameters is None:
@@ -250,7 +255,8 @@ def _one_molecule(path: Path, atoms: Atoms, elements: list[str]) -> list[str]:
     with_mass = [k for k, element in enumerate(elements) if element != "X"]
     symbols = ["H" if elements[k] in HEAVY_HYDROGEN else elements[k] for k in with_mass]
     part = _parts(symbols, atoms.position[with_mass], None)
-    count, notes = part.max(initial=-1) + 1, []
+    count = part.max(initial=-1) + 1
+    notes = []
     if atoms.cell is not None:
         if _parts(symbols, atoms.position[with_mass], atoms.cell).max(initial=-1) + 1 < count:
             why = (

@@ -72,7 +72,8 @@ def describe_stage(stage: Stage) -> list[str]:
 
 
 def _barostat(stage: Stage) -> str:
-    kind, values = BAROSTATS[stage.barostat_kind], stage.barostat_values
+    kind = BAROSTATS[stage.barostat_kind]
+    values = stage.barostat_values
     title = kind.title or stage.barostat_kind.replace("_", " ")
     text = f"{_pressure(stage)} bar by {title}, {stage.pressure_coupling.replace('_', '-')}"
     if "barostat_time_ps" in values:

@@ -37,7 +37,8 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
             scene.source,
             ["box.vacuum_A: the cell has a large tilt. Give an equivalent cell without"],
         )
-    k, cell = "xyz".index(scene.box.vacuum_axis), configuration.cell.copy()
+    k = "xyz".index(scene.box.vacuum_axis)
+    cell = configuration.cell.copy()
     added = length / np.linalg.norm(cell[k]) * cell[k]
     images = np.floor(configuration.position @ np.linalg.inv(cell)[:, k])
     position = configuration.position - images[:, None] * cell[k] + 0.5 * added
@@ -46,7 +47,8 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
 
 
 def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configuration:
-    cell, counts = scene.box.cell, [entry.count or 0 for entry in scene.molecules]
+    cell = scene.box.cell
+    counts = [entry.count or 0 for entry in scene.molecules]
     framework = next((k for k, m in enumerate(species) if m.cell is not None), None)
     if framework is not None:
         return _about_framework(scene, species, framework, counts)
@@ -56,7 +58,8 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
     if cell is not None and (fault := cell_error(cell)):
         raise SceneError(scene.source, [f"box: {fault}"])
     if scene.structure is not None:
-        start, content = scene.structure, scene.embedded_files.get("structure.file")
+        start = scene.structure
+        content = scene.embedded_files.get("structure.file")
         path = scene.path(start.file) if content is None else Path(start.file)
         try:
             configuration = read_structure(
@@ -73,7 +76,8 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
             )
         except StructureError as error:
             raise StructureError(scene.structure_source, error.errors) from None
-        faults, present = [], np.bincount(configuration.species, minlength=len(species))
+        faults = []
+        present = np.bincount(configuration.species, minlength=len(species))
         for k, (entry, present_count) in enumerate(zip(scene.molecules, present, strict=True)):
             if entry.count is not None and entry.count != present_count:
                 faults.append(
@@ -89,7 +93,8 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
     n = sum(counts)
     sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
     check_memory_of_molecules(scene.source, n, sites)
-    cell, rng = not_none(cell), np.random.default_rng([scene.seed, LATTICE])
+    cell = not_none(cell)
+    rng = np.random.default_rng([scene.seed, LATTICE])
     configuration = Configuration(
         species=np.repeat(np.arange(len(species)), counts),
         position=_start_lattice(scene, species, n, np.diag(cell), rng),
@@ -107,7 +112,9 @@ def _about_framework(
     """A framework at its position in its cell, and molecules on a lattice, also inside its
     walls."""
     counts = [0 if k == framework else count for k, count in enumerate(counts)]
-    body, n, first = species[framework], sum(counts), sum(counts[:framework])
+    body = species[framework]
+    n = sum(counts)
+    first = sum(counts[:framework])
     cell, rotation = standard_rotation(not_none(body.cell))
     if fault := cell_error(cell):
         raise SceneError(scene.source, [f"the cell of {body.name}: {fault}"])
@@ -189,7 +196,9 @@ def _start_lattice(
 ) -> np.ndarray:
     """n random points (n, 3) of a nearly cubic lattice in a box with edges (3,), off the walls.
     Raises SceneError."""
-    low, high, faults = np.zeros(3), edges.copy(), []
+    low = np.zeros(3)
+    high = edges.copy()
+    faults = []
     for axis, name in enumerate(AXES):
         across = [walls for walls in scene.fields.walls if walls.direction == axis]
         if not across:
@@ -246,7 +255,8 @@ def overlaps(system: System) -> list[str]:
     cores = [np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species]
     widest = max((sigma.max() for sigma in cores), default=0.0)
     ranges = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
-    sigma, faults = gather_per_molecule(cores, system.model.species), []
+    sigma = gather_per_molecule(cores, system.model.species)
+    faults = []
     for i, j, distance in close_pairs(system, system.state, *ranges):
         if distance <= max(
             inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if sigma[i] > 0 and sigma[j] > 0 else 0.0

@@ -129,7 +129,8 @@ def with_reduced_cell(configuration: Configuration, whose: str, may_rotate: bool
     if may_rotate:
         cell, rotation = least_skewed_cell(given_cell)
     else:
-        cell, rotation = reduced_cell(given_cell), np.eye(3)
+        cell = reduced_cell(given_cell)
+        rotation = np.eye(3)
     if np.array_equal(cell, given_cell):
         return configuration
     basis = basis_of(cell @ rotation, given_cell)
@@ -334,7 +335,8 @@ def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], n
     n = len(matched.species)
     velocity, angular = np.zeros((n, 3)), np.zeros((n, 3))
     for k in np.unique(matched.species):
-        members, molecule = np.flatnonzero(matched.species == k), species[k]
+        members = np.flatnonzero(matched.species == k)
+        molecule = species[k]
         sites = massive_sites(molecule)
         masses = molecule.masses[sites]
         v = atoms.velocity[np.array([matched.atoms[m] for m in members])]
@@ -395,7 +397,9 @@ def _read_state(path: Path, species: list[Molecule]) -> Configuration:
     of_name = {molecule.name: molecule for molecule in species}
     models = () if saved.models is None else zip(saved.names, saved.models, strict=True)
     faults = [fault for name, model in models if (fault := _other_model(of_name[name], model))]
-    state, n, has_rotations = saved.state, len(saved.species), len(saved.state.rotation) > 0
+    state = saved.state
+    n = len(saved.species)
+    has_rotations = len(saved.state.rotation) > 0
     rotating = [name for name in saved.names if of_name[name].inertia.any()]
     if rotating and not has_rotations:
         faults.append(f"has no rotations, but {', '.join(rotating)} can rotate")

@@ -77,14 +77,16 @@ class FastMotion(NamedTuple):
 
 def fastest_motion(species: list[Molecule], temperature: float) -> FastMotion | None:
     """The fastest motion at a temperature, K. None without molecules or temperature."""
-    motions, thermal = [], BOLTZMANN * temperature
+    motions = []
+    thermal = BOLTZMANN * temperature
     for m in species if thermal > 0 else ():
         diameter = max(
             (sigma for sigma, depth in zip(m.sigma, m.epsilon, strict=True) if depth > 0),
             default=inf,
         )
         lightest = min((moment for moment in m.inertia if moment > 0), default=inf)
-        moving, rotating = diameter * sqrt(m.mass / thermal), sqrt(lightest / thermal)
+        moving = diameter * sqrt(m.mass / thermal)
+        rotating = sqrt(lightest / thermal)
         motions += [
             FastMotion(SWING_DIAMETERS * moving, SWING_DIAMETERS, "diameters", m.name, "moves"),
             FastMotion(
@@ -143,7 +145,8 @@ def with_time_steps(
 
     temperature : of velocities from a file, K
     """
-    moving, stages = _moving(scene, species), list(scene.stages)
+    moving = _moving(scene, species)
+    stages = list(scene.stages)
     for k, stage, of_stage in _given_steps(scene):
         if stage.timestep_fs is None:
             fastest = fastest_motion(moving, of_stage or temperature)
@@ -200,7 +203,8 @@ def step_warnings(scene: MolecularScene) -> list[str]:
     """Warnings of time steps that are unstable, inaccurate or needlessly short for these molecules
     in a liquid, and of orders that truncated forces do not allow. A step is unstable if a molecule
     at its thermal speed moves or rotates in it by more than `stable_angle` amplitudes."""
-    warnings, forces = [], scene.forces
+    warnings = []
+    forces = scene.forces
     ends = forces.cutoff_A is not None or scene.box.periodic
     jumps = ends and forces.lennard_jones and forces.truncation in ("plain", "shift")
     for k, stage, _ in _given_steps(scene):
@@ -237,7 +241,8 @@ def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
     """What is wrong with the step of a stage for a motion at a temperature, K. Empty if nothing
     is."""
     time, size, unit, name, does = fastest
-    longest, dt = fastest.longest_step(stage), stage.step
+    longest = fastest.longest_step(stage)
+    dt = stage.step
     limit = f"{longest / FEMTOSECOND:.3g} fs"
     if dt > longest:
         return (
@@ -258,7 +263,8 @@ def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
 
 def _accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
     """Like `_step_warning`, of steps that are stable and have large errors."""
-    dt, limit = stage.step, fastest.longest_step(stage)
+    dt = stage.step
+    limit = fastest.longest_step(stage)
     error = step_error(stage.scheme, dt / fastest.time)
     # hybrid Monte Carlo corrects the error of its steps
     if dt > limit or error <= INACCURATE or stage.is_hybrid:
@@ -310,8 +316,10 @@ def with_precision(
         why = f"stages.{seeks[0]} chooses its step for a small error"
     elif errors:
         k = min(errors, key=lambda k: errors[k])
-        precision, stage = precision_for(errors[k]), scene.stages[k]
-        step, ratio = f"{stage.integrator} at {stage.step_fs:g} fs", errors[k] / MIXED_ERROR
+        precision = precision_for(errors[k])
+        stage = scene.stages[k]
+        step = f"{stage.integrator} at {stage.step_fs:g} fs"
+        ratio = errors[k] / MIXED_ERROR
         times = f"{ratio:,.0f}" if ratio > 9 else f"{ratio:.1g}"
         single = f"that of single precision, {MIXED_ERROR:.0e}"
         why = f"the error of {step}, about {errors[k]:.0e} of the forces, is {times} times {single}"

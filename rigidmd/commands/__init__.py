@@ -4,4 +4,6 @@ what it prints."""
 from rigidmd.core.process import BY_SIGNAL
 from rigidmd.core.process import OUT_OF_TIME as OUT_OF_TIME
 
-BAD_INPUT, FAILED, INTERRUPTED = 2, 1, BY_SIGNAL + 2
+BAD_INPUT = 2
+FAILED = 1
+INTERRUPTED = BY_SIGNAL + 2

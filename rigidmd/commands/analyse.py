@@ -113,7 +113,8 @@ def _analyse(options: Options) -> int:
     if options.folder.endswith(".toml"):
         return _insert(options.folder, names, more, options.verbose)
     with progress_bar() as progress:
-        folder, request = Path(options.folder), (names, options.start, options.viscosity)
+        folder = Path(options.folder)
+        request = (names, options.start, options.viscosity)
         if is_sweep(folder):
             analysed = analyse_sweep(folder, *request, progress, options.figures, more)
             progress(1.0, "")

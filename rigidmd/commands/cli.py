@@ -158,10 +158,8 @@ def _parser(first: str = "") -> tuple[argparse.ArgumentParser, dict[str, argpars
     for name in [first] if first in names else names:
         import_module(f"{package.__name__}.{name}")
     for name, command in sorted(COMMANDS.items(), key=lambda item: item[1].position):
-        description, epilog = (
-            command.about[0].upper() + command.about[1:] + ".",
-            f"example:\n  {command.example}",
-        )
+        description = command.about[0].upper() + command.about[1:] + "."
+        epilog = f"example:\n  {command.example}"
         texts = {
             "help": command.about,
             "description": description,

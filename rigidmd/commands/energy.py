@@ -34,7 +34,8 @@ def _energy(options: Options) -> int:
                 scene.source,
                 [f"--unit {options.unit} is for molecules. The energy of a body is in J"],
             )
-        energies, unit = Simulation(scene)._start_energy(), "J"
+        energies = Simulation(scene)._start_energy()
+        unit = "J"
     else:
         unit = options.unit or "kJ/mol"
         energies = Simulation(scene)._start_energy(ENERGY_UNITS[unit], unit, options.accuracy)

@@ -96,10 +96,8 @@ def _write_model(options: Options) -> int:
             f"--from writes a custom model: leave out {options.model}, or name the model by --name"
         )
         raise MoleculeError("models", [problem])
-    geometry, parameters = (
-        Path(options.geometry),
-        Path(options.parameters) if options.parameters else None,
-    )
+    geometry = Path(options.geometry)
+    parameters = Path(options.parameters) if options.parameters else None
     path = Path(options.output or f"{geometry.stem}.toml")
     if options.draw:
         raise MoleculeError(

@@ -60,7 +60,8 @@ ROWS = 8
 def _modes(options: Options) -> int:
     from rigidmd.studies.normal_modes import FILE, animation_files, normal_modes, write_animation
 
-    scene, begin = read_scene(options), perf_counter()
+    scene = read_scene(options)
+    begin = perf_counter()
     names = (FILE, *(animation_files(scene) if options.animate else []))
 
     def write(folder: Path, modes: "NormalModes", command: str) -> list[Path]:
@@ -100,12 +101,13 @@ def _modes(options: Options) -> int:
 
 
 def _describe(modes: "NormalModes") -> Iterator[str]:
-    table, at, total, last = modes.table(), modes.wavenumber, modes.total, len(modes.rate) - 1
-    unstable, warm, is_whole = (
-        at[modes.rate < 0],
-        modes.temperature,
-        len(at) == len(modes.coordinates.index),
-    )
+    table = modes.table()
+    at = modes.wavenumber
+    total = modes.total
+    last = len(modes.rate) - 1
+    unstable = at[modes.rate < 0]
+    warm = modes.temperature
+    is_whole = len(at) == len(modes.coordinates.index)
     point = "a saddle point" if len(unstable) else "a minimum"
     yield (
         f"{modes.system.scene.name}: normal modes at {point} of the energy, {modes.energy:.8g}"
@@ -136,7 +138,8 @@ def _describe(modes: "NormalModes") -> Iterator[str]:
     if is_whole:
         yield f"  zero-point energy of the rigid model {modes.free_energy(0):.6g} kJ/mol"
     if is_whole and warm:
-        quantum, classical = modes.free_energy(warm), modes.free_energy(warm, quantum=False)
+        quantum = modes.free_energy(warm)
+        classical = modes.free_energy(warm, quantum=False)
         yield (
             f"  free energy of the vibrations at {warm:g} K: {quantum:.6g} kJ/mol, classical"
             f" {classical:.6g} kJ/mol"

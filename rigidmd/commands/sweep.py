@@ -166,7 +166,8 @@ def _run(options: Options, manifest: "Manifest") -> int:
     from rigidmd.studies.sweep.sweeping import jobs_and_threads
 
     began = time.monotonic()
-    count, before = len(manifest.points), len(manifest.points_in("finished"))
+    count = len(manifest.points)
+    before = len(manifest.points_in("finished"))
     print(
         f"{manifest.name}: {count} points in {manifest.folder}, {before} of them finished before",
         flush=True,
@@ -262,7 +263,8 @@ def print_limits(manifest: "Manifest", step: str) -> list[str]:
 
 
 def _collect(manifest: "Manifest", step: str | None) -> int:
-    count, finished = len(manifest.points), len(manifest.points_in("finished"))
+    count = len(manifest.points)
+    finished = len(manifest.points_in("finished"))
     print(f"{manifest.name}: {count} points in {manifest.folder}, {finished} of them finished")
     _print_results(manifest, step)
     return FAILED if finished < count else 0

@@ -223,11 +223,13 @@ class AppendedFile:
 
     def _difference(self, offset: int, first: bytes) -> str:
         """How the file differs from its size and checksum. Empty if it does not."""
-        checksum, left = 0, self._size
+        checksum = 0
+        left = self._size
         while left and (piece := bytearray(self._file.read(min(left, CHUNK)))):
             if left == self._size:
                 piece[offset : offset + len(first)] = first
-            checksum, left = zlib.crc32(piece, checksum), left - len(piece)
+            checksum = zlib.crc32(piece, checksum)
+            left = left - len(piece)
         if left:
             return f"is shorter than it was: {self._size} bytes are needed to continue it"
         return (

@@ -67,7 +67,8 @@ class Scheme(_SchemeFields):
         moving = [flow for flow in made.flows if flow.kind in (KICK, DRIFT)]
         for k, (one, other) in enumerate(zip(moving, reversed(moving), strict=True)):
             if not max(abs(a - b) for a, b in zip(one[:3], other[:3], strict=True)) <= ROUNDING:
-                n, pair = len(moving), f"{one.describe()} and {other.describe()}"
+                n = len(moving)
+                pair = f"{one.describe()} and {other.describe()}"
                 wrong = (
                     f"its flows {k + 1} and {n - k} of {n} differ ({pair}), so that it is not"
                     " time-reversible"
@@ -116,7 +117,8 @@ class Scheme(_SchemeFields):
         """This scheme, a composition of Verlet steps, with a volume that has inertia: volume kicks
         around the kicks of each step, and volume changes around the drift. See the theory chapter
         `sampling`."""
-        steps, flows = self.drifts, []
+        steps = self.drifts
+        flows = []
         for before, after in pairwise((0.0, *steps, 0.0)):
             flows += [
                 Flow(KICK, before / 2),

@@ -82,7 +82,8 @@ def free_memory() -> float:
         import psutil
 
         return min(float(psutil.virtual_memory().available), address_space_left())
-    free, group = _system_number("/proc/meminfo", "MemAvailable:") * 1024, "/sys/fs/cgroup/memory"
+    free = _system_number("/proc/meminfo", "MemAvailable:") * 1024
+    group = "/sys/fs/cgroup/memory"
     for limit, used in ((".max", ".current"), ("/memory.limit_in_bytes", "/memory.usage_in_bytes")):
         free = min(
             free, _system_number(f"{group}{limit}") - min(_system_number(f"{group}{used}"), 1e18)

@@ -20,7 +20,8 @@ if sys.platform == "win32":
     #: Arguments of `subprocess.Popen` for a process that gets no Ctrl-C of this one's terminal.
     SEPARATE_GROUP: Json = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
 else:
-    STOP_SIGNAL, CHECKPOINT_SIGNALS = signal.SIGTERM, (signal.SIGUSR1,)
+    STOP_SIGNAL = signal.SIGTERM
+    CHECKPOINT_SIGNALS = (signal.SIGUSR1,)
     SEPARATE_GROUP: Json = {"start_new_session": True}
 #: Number of the signal that ends a process at once, which Windows has no name for.
 KILL_SIGNAL = 9

@@ -219,7 +219,8 @@ def slope(time: ArrayLike, value: ArrayLike) -> Slope:
     rms = float(np.sqrt(np.mean(left**2)))
     if n < 2 * FEW_BLOCKS:
         return Slope(gradient, np.nan, rms)
-    short, long = max(1, n // MANY_BLOCKS), n // FEW_BLOCKS
+    short = max(1, n // MANY_BLOCKS)
+    long = n // FEW_BLOCKS
     fast, slow = _allan(left, short), _allan(left, long)
     walk = max(0.0, 3 * (slow * long - fast * short) / (long**2 - short**2))
     white = max(0.0, short * (fast - walk * short / 3))

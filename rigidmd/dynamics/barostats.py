@@ -421,7 +421,8 @@ def log_acceptance_of_volume(barostat, model, state, workspace, h):
 def log_acceptance_of_rescaling(barostat, model, state, workspace, h):
     before, after = volume_of(workspace.cell), volume_of(state.cell)
     matrix, inverse = workspace.matrices[0], workspace.matrices[1]
-    there, back = workspace.strain, np.zeros((2, 6))
+    there = workspace.strain
+    back = np.zeros((2, 6))
     drift(barostat, model, state, workspace, h, back[0], back[1])
     target = barostat.pressure
     x, y, z = (

@@ -149,7 +149,8 @@ def advance(
     the first of the next are done in one pass with the drift. If the status is not OK, state and
     registers are such that another call continues exactly where this one stopped.
     """
-    pending, progress = NO_PENDING_KICKS, registers.progress
+    pending = NO_PENDING_KICKS
+    progress = registers.progress
     while state.step[NOW] < until:
         while progress[DONE] < len(flows.kind):
             k = progress[DONE]
@@ -171,7 +172,8 @@ def advance(
                 else:
                     while progress[LOADED] < (1 if flows.gradient[k] == 0.0 else 2):
                         pending = apply_pending_kicks(model, code, state, load, pending)
-                        tau, known = flows.gradient[k] * dt * dt, progress[LOADED] == 1
+                        tau = flows.gradient[k] * dt * dt
+                        known = progress[LOADED] == 1
                         status = evaluate(model, state, load, terms, gradient_workspace, tau, known)
                         progress[LOADED] += status == OK
                         status = after_forces(couplings, flows, registers, status)
@@ -345,7 +347,10 @@ def _remove_momentum(arguments, block):
     """Remove the conserved components of the total momentum, in place: the same velocity from all
     molecules. The energy that this removes is entered in the energy ledger."""
     model, state = load_arguments(arguments)
-    mass, px, py, pz = 0.0, 0.0, 0.0, 0.0
+    mass = 0.0
+    px = 0.0
+    py = 0.0
+    pz = 0.0
     for m in range(len(state.velocity)):
         m_i = model.mass[model.species[m]]
         mass += m_i
@@ -388,7 +393,8 @@ def _displace_molecules(model, state, load, tau):
         for k in range(3):
             state.position[m, k] += tau_per_mass * load.force[m, k]
     for m in range(len(state.rotation)):
-        inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
+        inverse = model.inverse_inertia[model.species[m]]
+        n = load.torque_body[m]
         rotate_by_vector(
             state.rotation[m],
             tau * inverse[0] * n[0],
@@ -400,7 +406,8 @@ def _displace_molecules(model, state, load, tau):
 @implements(add_gyration, Model)
 def _add_gyration_of_molecules(model, load, tau, gain):
     for m in range(len(load.torque_body)):
-        inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
+        inverse = model.inverse_inertia[model.species[m]]
+        n = load.torque_body[m]
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
             gain.torque_body[m, k] += tau * (inverse[i] - inverse[j]) * n[i] * n[j]

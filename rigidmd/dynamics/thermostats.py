@@ -140,7 +140,8 @@ def thermostat_workspace() -> np.ndarray:
 
 def thermostat_code(thermostat: NamedTuple, model: NamedTuple) -> Code:
     """The tasks of a thermostat that act on blocks of molecules."""
-    state, workspace = EXAMPLE[0], thermostat_workspace()
+    state = EXAMPLE[0]
+    workspace = thermostat_workspace()
     tasks: dict[str, tuple] = {}
     if isinstance(thermostat, Langevin | Andersen | HybridMonteCarlo):
         apply = _apply_andersen if isinstance(thermostat, Andersen) else _apply_langevin
@@ -225,7 +226,8 @@ def _apply_langevin(arguments, block):
     passed, turned = thermostat.friction_translation * h, thermostat.friction_rotation * h
     keep, keep_turning = exp(-passed), exp(-turned)
     new = thermal_momenta(model, -thermal * expm1(-2 * passed), -thermal * expm1(-2 * turned))
-    words, numbers = np.empty((2, 4, BATCH), np.uint64), np.empty(6 * BATCH)
+    words = np.empty((2, 4, BATCH), np.uint64)
+    numbers = np.empty(6 * BATCH)
     heat = 0.0
     for start in range(first, end, BATCH):
         fill_normals(numbers, words, thermostat.key, draw, start, state.step[NOW])
@@ -242,7 +244,8 @@ def _apply_andersen(arguments, block):
     thermostat, model, state, workspace, h, draw = load_arguments(arguments)
     velocity, momentum = state.velocity, state.angular_momentum_body
     first, end = molecules_of_block(len(velocity), block, LANES)
-    step, missed = state.step[NOW], exp(-h / thermostat.time_constant)
+    step = state.step[NOW]
+    missed = exp(-h / thermostat.time_constant)
     thermal = ramp_value(thermostat.thermal_energy, state)
     new = thermal_momenta(model, thermal, thermal)
     heat = 0.0
@@ -284,7 +287,8 @@ YOSHIDA = (1 / (2 - 2 ** (1 / 3)), 1 - 2 / (2 - 2 ** (1 / 3)), 1 / (2 - 2 ** (1 
 def _apply_nose_hoover(thermostat, model, code, state, workspace, h, draw):
     thermal = ramp_value(thermostat.thermal_energy, state)
     moving, turning = kinetic_energies_of(model, code, state, workspace)
-    variables, links = state.extra_variables, 2 * thermostat.links
+    variables = state.extra_variables
+    links = 2 * thermostat.links
     scale, heat = move_chain(
         thermostat, variables[:links], thermal, moving, thermostat.freedom_translation, h
     )
@@ -302,7 +306,8 @@ def move_chain(thermostat, chain, thermal, kinetic, freedom, h):
     if freedom == 0:
         return 1.0, 0.0
     links = thermostat.links
-    eta, rate = chain[:links], chain[links:]
+    eta = chain[:links]
+    rate = chain[links:]
     before = chain_energy(thermostat, chain, thermal, freedom)
     scale = 1.0
     for factor in YOSHIDA:

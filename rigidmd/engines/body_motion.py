@@ -110,7 +110,9 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
     """Kinetic energy (less Omega . J in a rotating frame), potential energy, their sum, and work of
     other forces."""
     n = len(times)
-    kinetic, potential, about_origin = np.zeros(n), np.zeros(n), np.zeros((n, 3))
+    kinetic = np.zeros(n)
+    potential = np.zeros(n)
+    about_origin = np.zeros((n, 3))
     if system.rotates:
         rotation = states.rotation.reshape(n, 3, 3)
         momentum = states.angular_momentum_body.reshape(n, 3)

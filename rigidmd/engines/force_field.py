@@ -201,10 +201,8 @@ def _lennard_jones_kinds(system: System) -> list[list[int]]:
     """The Lennard-Jones kind of each site of each species. -1 for sites without Lennard-Jones
     forces."""
     kinds = [[-1] * len(m.masses) for m in system.species]
-    term, potential = (
-        system.terms.get("lennard_jones"),
-        _potential(system, "lennard_jones", LennardJones),
-    )
+    term = system.terms.get("lennard_jones")
+    potential = _potential(system, "lennard_jones", LennardJones)
     if potential is None or not isinstance(term, PairForces):
         return kinds
     sites = term.sites
@@ -297,7 +295,8 @@ def tail_of_formulas(view: ForceFieldView, volume: float) -> float:
     It has no code in common with `lennard_jones.tail`, with which it is compared: programs have no
     correction for most cutoff schemes, or one that counts sites of one molecule differently.
     """
-    count, total = np.bincount(view.kind, minlength=len(view.kinds)), 0.0
+    count = np.bincount(view.kind, minlength=len(view.kinds))
+    total = 0.0
     for i, j in combinations_with_replacement(range(len(view.kinds)), 2):
         if view.epsilon[i, j] == 0:
             continue
@@ -347,7 +346,8 @@ def _removed_by_truncation(
 def _distances_in_molecules(view: ForceFieldView, i: int, j: int) -> Iterator[tuple[float, int]]:
     """Distances (Å) of sites of the kinds i and j in one molecule, a site from itself included, and
     their numbers."""
-    species, sites = view.system.model.species, view.system.sites_per_molecule
+    species = view.system.model.species
+    sites = view.system.sites_per_molecule
     first = np.cumsum(sites) - sites
     for k, member, molecules in zip(
         *np.unique(species, return_index=True, return_counts=True), strict=True

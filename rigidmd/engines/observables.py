@@ -108,7 +108,8 @@ def observe(
     """
     load, tallies = engine.evaluate_current(state) if moved else engine.evaluate(state)
     components = {name: tally.energy for name, tally in tallies.items()} | system.constants
-    volume, tail_pressure = state.volume, 0.0
+    volume = state.volume
+    tail_pressure = 0.0
     if system.tail is not None:
         components["tail" if system.user_terms else "lennard_jones_tail"] = system.tail.energy(
             volume
@@ -117,7 +118,8 @@ def observe(
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
     sums = engine.sums(state, load) or sums_of_state(system.model, state, load)
     translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
-    potential, kinetic = sum(components.values()), translation + rotation
+    potential = sum(components.values())
+    kinetic = translation + rotation
     translation_corrected = translation + correction * sums.force
     rotation_corrected = rotation + correction * sums.torque
     flux = sums.momentum_flux + 2 * correction * sums.force_squares
@@ -128,11 +130,13 @@ def observe(
         ) * UNIT
         edges = edges_and_angles(state.cell)
     else:
-        pressure, edges = np.full((3, 3), nan), [nan] * 6
+        pressure = np.full((3, 3), nan)
+        edges = [nan] * 6
     tensor_bar = pressure / BAR
     # not in pilot runs, whose samples are in no log
     changes = [] if stage is None else _changes_with_lambda(system, state, potential)
-    energy, ledger = (potential + kinetic) / energy_unit, state.energy_ledger / energy_unit
+    energy = (potential + kinetic) / energy_unit
+    ledger = state.energy_ledger / energy_unit
     conserved = energy - float(ledger.sum())
     sample = Sample(
         step=int(state.step[NOW]),
@@ -180,7 +184,8 @@ def observe(
 
 def _changes_with_lambda(system: System, state: State, potential: float) -> list[float]:
     """Energies at each of coupling.lambdas less the present one, u Å²/ps²."""
-    coupling, changes = system.scene.coupling, []
+    coupling = system.scene.coupling
+    changes = []
     for value, engine in system.engines_at_lambda.items():
         if coupling is not None and value == coupling.value:
             changes.append(0.0)
@@ -206,7 +211,8 @@ def _temperature(kinetic: float, freedom: int) -> float:
 def describe_quantities(system: System) -> dict[str, str]:
     """Explanations for `rigidmd energy`: name of an energy of charges, `virial` or `pressure` ->
     text."""
-    method, descriptions = system.scene.forces.electrostatics, {}
+    method = system.scene.forces.electrostatics
+    descriptions = {}
     if method == "reaction_field" and system.cutoff < inf and "coulomb" in system.terms:
         descriptions = _describe_reaction_field(system)
     elif method in ("ewald", "pme"):

@@ -31,7 +31,8 @@ class RigidBodies:
     and centre."""
 
     def __init__(self, system: System, points: Points | None = None):
-        model, sites = system.model, system.sites if points is None else points
+        model = system.model
+        sites = system.sites if points is None else points
         self._inverse = model.inverse_inertia[model.species]
         self._molecule, self._body, self._weight = sites.molecule, sites.offset_body, sites.mass
         self._count = len(model.species)
@@ -134,7 +135,8 @@ def _tilted(rotation: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarra
         back[:, None], 2 * np.einsum("ni,nj->nij", across, across) - np.eye(3), np.eye(3)
     )
     old = np.where(back, -old, old)
-    cross, cosine = hat(np.cross(old, new)), np.einsum("ni,ni->n", old, new)
+    cross = hat(np.cross(old, new))
+    cosine = np.einsum("ni,ni->n", old, new)
     step = np.eye(3) + cross + cross @ cross / (1 + cosine)[:, None, None]
     return nearest_rotation(step @ by_180 @ rotation)
 
@@ -214,7 +216,9 @@ def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) ->
 def _points(molecule: Molecule, sites: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Masses, positions and sites of the points: the sites if just enough of them have mass, else a
     simplex."""
-    heavy, total, inertia = np.flatnonzero(molecule.masses > 0), molecule.mass, molecule.inertia
+    heavy = np.flatnonzero(molecule.masses > 0)
+    total = molecule.mass
+    inertia = molecule.inertia
     if not inertia.any():
         return np.array([total]), np.zeros((1, 3)), heavy[:1]
     if sites and _can_be_points(molecule, heavy):

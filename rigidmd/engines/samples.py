@@ -324,7 +324,8 @@ class Samples(SampleTable):
 
     def row(self, k: int) -> Sample:
         """Sample k. -1 for the last one."""
-        first, width = range(len(self))[k] * len(self._numbers), len(NUMBERS)
+        first = range(len(self))[k] * len(self._numbers)
+        width = len(NUMBERS)
         values = dict(zip(NUMBERS, self._values[first : first + width], strict=True))
         step, stage = int(values.pop("step")), int(values.pop("stage"))
         energies = self._values[first + width : first + len(self._numbers)]
@@ -338,7 +339,8 @@ class Samples(SampleTable):
 
     def latest(self, time: float, since: int) -> int:
         """Index of the last sample not later than a time (ps), at least `since`."""
-        width, at = len(self._numbers), self._numbers.index("time")
+        width = len(self._numbers)
+        at = self._numbers.index("time")
         rows = range(len(self))
         return max(
             since,
@@ -347,7 +349,8 @@ class Samples(SampleTable):
 
     def of_stage(self, k: int) -> "Samples":
         """The samples of stage k, which are contiguous."""
-        samples, width = Samples(self.stages, self.user_terms), len(self._numbers)
+        samples = Samples(self.stages, self.user_terms)
+        width = len(self._numbers)
         if len(rows := np.flatnonzero(self._column("stage") == k)):
             samples._values = self._values[rows[0] * width : (rows[-1] + 1) * width]
         return samples
@@ -403,7 +406,8 @@ def describe_equilibrated(
 ) -> str:
     """The equilibrated part of a stage that started at a time (ps), such as "the last 14.2 of 20
     ps"."""
-    time, start = of_stage["time"], equilibrated_from(of_stage, stage)
+    time = of_stage["time"]
+    start = equilibrated_from(of_stage, stage)
     all_of_stage = f"all {time[-1] - begin:.4g} ps"
     if stage.ramps:
         return f"{all_of_stage}, in which the set point changes"

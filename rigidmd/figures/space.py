@@ -29,7 +29,8 @@ PIXELS = 700
 def camera(eye: np.ndarray, up: np.ndarray = UP) -> np.ndarray:
     """An orthographic view from the direction `eye`: rows are to the right, upwards and towards the
     eye."""
-    toward, right = eye / np.linalg.norm(eye), np.cross(up, eye)
+    toward = eye / np.linalg.norm(eye)
+    right = np.cross(up, eye)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(toward, right), toward])
 
@@ -37,7 +38,8 @@ def camera(eye: np.ndarray, up: np.ndarray = UP) -> np.ndarray:
 def circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
     """The circle on the unit sphere at this polar angle (degrees) from a direction."""
     right, up, toward = camera(normal, np.eye(3)[np.abs(normal).argmin()])
-    angle, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
+    angle = np.linspace(0, 2 * np.pi, 361)[:, None]
+    polar = np.radians(polar)
     return np.sin(polar) * (np.cos(angle) * right + np.sin(angle) * up) + np.cos(polar) * toward
 
 
@@ -158,7 +160,8 @@ class View:
         from matplotlib.collections import EllipseCollection
 
         order = self.depth(centres).argsort()
-        flat, radius = self.flat(centres[order])[:, None], radius[order, None]
+        flat = self.flat(centres[order])[:, None]
+        radius = radius[order, None]
         colors = colors[order, None]
         size, lift, white = np.array(DISCS).T[..., None]  # of the discs (d, 1) of each sphere
         tint = colors + np.where(white > 0, 1 - colors, colors) * white
@@ -236,9 +239,11 @@ class View:
         spread = np.einsum("nik,nk,njk->nij", seen, semi**2, seen)
         weights = np.einsum("nik,nk,njk->nij", seen, semi**-2.0, seen)
         reach = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
-        low, size = self.centre - self.half, 2 * self.half
+        low = self.centre - self.half
+        size = 2 * self.half
         count = (PIXELS * self.half / self.half.max()).astype(int)
-        image, nearest = np.zeros((count[1], count[0], 4)), np.full(count[::-1], -np.inf)
+        image = np.zeros((count[1], count[0], 4))
+        nearest = np.full(count[::-1], -np.inf)
         light = LIGHT / np.linalg.norm(LIGHT)
         for middle, extent, weight, color in zip(middles, reach, weights, colors, strict=True):
             first = np.floor((middle[:2] - extent[:2] - low) / size * count).astype(int)
@@ -283,7 +288,8 @@ class View:
     ) -> np.ndarray | None:
         """Draw a named arrow, unless it is seen from its end. side : of the name, as arrows may
         coincide. Returns where the name is."""
-        tail, tip = self.flat(start), self.flat(start + vector)
+        tail = self.flat(start)
+        tip = self.flat(start + vector)
         size = float(np.linalg.norm(tip - tail))
         unit = self.half.max()
         if size < 0.02 * unit:

@@ -96,7 +96,8 @@ def inner_pairs(
 ) -> InnerPairs:
     """The pairs inside molecules, from the kinds (s_k,) and the positions (s_k, 3) of the sites of
     each species k, and the number of its molecules."""
-    rows, count = [np.zeros((0, 3))], [np.zeros(0)]
+    rows = [np.zeros((0, 3))]
+    count = [np.zeros(0)]
     for of_sites, position, molecules in zip(kinds, positions, counts, strict=True):
         distance = np.linalg.norm(position[:, None] - position, axis=2).round(FINE)
         one, other = np.broadcast_arrays(of_sites[:, None], of_sites)
@@ -180,7 +181,8 @@ def select_by_number(
     for first, last in ranges:
         text = f"{first}" if first == last else f"{first}-{last}"
         mask = of_species & (first <= number) & (number <= last)
-        fault, present = "", number[of_species]
+        fault = ""
+        present = number[of_species]
         if not mask.any() or last > present.max():
             existing = (
                 f"they have {present.min()} to {present.max()}"
@@ -195,7 +197,8 @@ def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.nda
     """values[k], an array (s_k, ...) of each species k, repeated for each molecule in order.
     Species (n,)."""
     sizes = np.array([len(array) for array in values])
-    begin, count = np.cumsum(sizes) - sizes, sizes[species]
+    begin = np.cumsum(sizes) - sizes
+    count = sizes[species]
     rows = np.repeat(begin[species] - np.cumsum(count) + count, count)
     rows += np.arange(len(rows))
     return np.concatenate(values)[rows]

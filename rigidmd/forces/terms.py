@@ -103,7 +103,8 @@ class Term:
     def passes(self, into: "Evaluation") -> list[Pass]:
         """Its passes: here one that calls `add_forces`."""
         state, load, tally, status = into
-        plain, tallied = (self, state, load, status), (self, state, load, tally, status)
+        plain = (self, state, load, status)
+        tallied = (self, state, load, tally, status)
         return [
             Pass("add forces", _add_plain, plain, when=FORCES_ONLY),
             Pass("add forces and energies", _add_tallied, tallied, when=TALLIED),

@@ -36,7 +36,8 @@ def connections(system: System, massless: bool = False) -> np.ndarray:
             [start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)]
         )
     first = 0 if system.translates else 1  # the pivot is the first point
-    points, body = system.points[first:], system.scene.body
+    points = system.points[first:]
+    body = system.scene.body
     if body.points is not None:
         pairs = first + shortest_links(points)
     elif body.solids is not None:
@@ -75,14 +76,16 @@ def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
     """
     starts = np.cumsum([0, *counts])
     edges = [start + _hull(points[start:end]) for start, end in pairwise(starts.tolist())]
-    joined, free = np.arange(starts[1]), np.arange(starts[1], len(points))
+    joined = np.arange(starts[1])
+    free = np.arange(starts[1], len(points))
     while len(free):
         distance = np.linalg.norm(points[joined, None] - points[free], axis=-1)
         i, j = np.unravel_index(distance.argmin(), distance.shape)
         edges.append(np.array([[joined[i], free[j]]]))
         solid = int(np.searchsorted(starts, free[j], side="right")) - 1
         new = np.arange(starts[solid], starts[solid + 1])
-        joined, free = np.concatenate([joined, new]), np.setdiff1d(free, new)
+        joined = np.concatenate([joined, new])
+        free = np.setdiff1d(free, new)
     return np.concatenate(edges)
 
 
@@ -122,7 +125,8 @@ def _sides(points: np.ndarray) -> list[np.ndarray]:
     normals = one[:, ::-1] * [-1, 1] if points.shape[1] == 2 else np.cross(one, other)
     size = np.linalg.norm(normals, axis=1)
     spans = size > THIN * size.max()
-    normals, first = normals[spans] / size[spans, None], first[spans]
+    normals = normals[spans] / size[spans, None]
+    first = first[spans]
     heights = normals @ points.T - np.einsum("ti,ti->t", normals, first)[:, None]
     tolerance = FLAT * np.abs(points).max()
     supports = (heights.min(axis=1) > -tolerance) | (heights.max(axis=1) < tolerance)

@@ -206,7 +206,8 @@ def make_whole(points: np.ndarray, cell: np.ndarray | None, reach: np.ndarray) -
     count, size, _ = points.shape
     if cell is None or size == 1:
         return points
-    unwrapped, molecule = points.copy(), np.arange(count)
+    unwrapped = points.copy()
+    molecule = np.arange(count)
     outside = np.ones((count, size), bool)
     distance = np.full((count, size), np.inf)  # of an atom outside from the tree
     newest = np.zeros(count, int)
@@ -214,7 +215,8 @@ def make_whole(points: np.ndarray, cell: np.ndarray | None, reach: np.ndarray) -
         outside[molecule, newest] = False
         steps = points - points[molecule, newest][:, None]
         steps = nearest_images(steps.reshape(-1, 3), cell).reshape(points.shape)
-        length, longest = np.linalg.norm(steps, axis=2), reach[newest]
+        length = np.linalg.norm(steps, axis=2)
+        longest = reach[newest]
         bonded = length < longest
         # bonds precede all other pairs, however short these are: hydrogen bonds to images of the
         # same molecule
@@ -235,7 +237,8 @@ def pairs_within(
     vectors (p, 3) from i to the image of j."""
     from scipy.spatial import KDTree
 
-    points, owner = position, np.arange(len(position))
+    points = position
+    owner = np.arange(len(position))
     if cell is not None:
         inverse = np.linalg.inv(cell)
         inside = position @ inverse

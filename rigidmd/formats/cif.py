@@ -87,7 +87,8 @@ class Block:
             if item.pair is not None:
                 self._raw[_tag(item.pair[0])] = [item.pair[1]]
             elif item.loop is not None:
-                values, width = item.loop.values, item.loop.width()
+                values = item.loop.values
+                width = item.loop.width()
                 self._raw |= {_tag(tag): values[k::width] for k, tag in enumerate(item.loop.tags)}
 
     def __contains__(self, tag: str) -> bool:
@@ -241,7 +242,8 @@ class AtomSites:
                 self.column("label_seq_id"), self.column("auth_seq_id"), strict=True
             )
         ]
-        residues, count = [], 0
+        residues = []
+        count = 0
         for k, name in enumerate(self.column("label_comp_id")):
             count += k == 0 or keys[k] != keys[k - 1]
             residues.append((parse_whole_number(numbers[k] or ""), name or "", count))

@@ -23,13 +23,15 @@ Lines = list[tuple[int, str]]
 def read_g96(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The frames of a .g96: blocks from a name to END, of which POSITION starts a frame."""
     frames: list[dict[str, Lines]] = []
-    block, content = "", []
+    block = ""
+    content = []
     for number, line in enumerate(lines, 1):
         text = line.strip()
         if text.startswith("#") or (not text and not block):
             continue
         if not block:
-            block, content = text, []
+            block = text
+            content = []
         elif text == "END":
             if block in POSITIONS:
                 frames.append({})
@@ -90,7 +92,8 @@ def _box(path: Path, frame: dict[str, Lines]) -> np.ndarray | None:
     words = [word for _, line in content for word in line.split()]
     if not words:
         return None
-    line, what = content[0][0], "the box, 3 or 9 numbers"
+    line = content[0][0]
+    what = "the box, 3 or 9 numbers"
     edges = numbers(path, line, words, what)
     if len(edges) not in (3, 9):
         raise unexpected(path, line, what, " ".join(words))

@@ -24,7 +24,8 @@ def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The frames of a .gro: title, number of atoms, atoms, box. Once or more."""
     while lines and not lines[-1].strip():
         lines.pop()
-    frames, first = [], 0
+    frames = []
+    first = 0
     while first < len(lines):
         promised = lines[first + 1].strip() if first + 1 < len(lines) else ""
         if (count := parse_whole_number(promised)) is None:
@@ -51,7 +52,8 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
     """The frame in lines `first` to `box`. Column width is the distance between decimal points, as
     in GROMACS."""
     names, residue = [], []
-    position, velocity = np.zeros((box - first - 2, 3)), np.full((box - first - 2, 3), np.nan)
+    position = np.zeros((box - first - 2, 3))
+    velocity = np.full((box - first - 2, 3), np.nan)
     points = (
         [m.start() for m in re.finditer(r"\.", lines[first + 2][20:])] if box > first + 2 else []
     )

@@ -59,7 +59,8 @@ class Particles(NamedTuple):
     def site_masses(self) -> np.ndarray | None:
         """Masses of the sites (s,), if the masses in each body add up to the mass of its central
         particle: HOOMD does not use masses of constituents, which may have any value."""
-        sites, body = self.sites, self.owner[self.sites]
+        sites = self.sites
+        body = self.owner[self.sites]
         total = np.bincount(body, self.mass[sites], len(self.owner))
         centres = np.unique(body)
         agrees = np.abs(total[centres] - self.mass[centres]) <= SAME_MASS * self.mass[centres]
@@ -122,7 +123,9 @@ class GsdReader:
         if n < 1 or position is None or position.shape != (n, 3):
             raise ValueError(f"frame {frame + 1} holds no positions of {n} particles")
         of = partial(self._of_particles, frame, n)
-        types, kind = ["A"], of("typeid", (), 0).astype(int)  # the default of the schema
+        # the default of the schema
+        types = ["A"]
+        kind = of("typeid", (), 0).astype(int)
         if (names := self._chunk(frame, "particles/types")) is not None:
             if names.ndim != 2 or names.dtype.itemsize != 1:
                 raise ValueError("its names of types are not text")
@@ -135,7 +138,9 @@ class GsdReader:
         if body.max() >= n:
             raise ValueError(f"frame {frame + 1} has a particle of a body that does not exist")
         body = np.where(body < 0, np.arange(n), body)
-        position, box, cell = position.astype(float), self._chunk(frame, "configuration/box"), None
+        position = position.astype(float)
+        box = self._chunk(frame, "configuration/box")
+        cell = None
         if box is not None and box.any():
             if box.shape != (6,):
                 raise ValueError(f"frame {frame + 1}: its box has {box.shape} numbers, must be 6")
@@ -149,7 +154,8 @@ class GsdReader:
         if not (length > 0).all():
             raise ValueError(f"frame {frame + 1} has an orientation of length 0")
         orientation /= length
-        step, time = self._chunk(frame, "configuration/step"), self._chunk(frame, f"log/{TIME}")
+        step = self._chunk(frame, "configuration/step")
+        time = self._chunk(frame, f"log/{TIME}")
         inertia = of("moment_inertia", (3,), 0).astype(float)
         moving = self._chunk(frame, "particles/velocity") is not None
         return Particles(
@@ -223,7 +229,8 @@ def _owners(body: np.ndarray, position: np.ndarray, inertia: np.ndarray) -> np.n
 def _whole_bodies(position: np.ndarray, body: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """Positions (N, 3) of a file without image numbers, in which the particles of each body are
     near each other."""
-    position, size = position.copy(), np.bincount(body, minlength=len(body))
+    position = position.copy()
+    size = np.bincount(body, minlength=len(body))
     order = np.argsort(body, kind="stable")
     for count in np.unique(size[size > 1]):
         members = order[size[body[order]] == count].reshape(-1, count)
@@ -336,7 +343,8 @@ class GsdFile(FrameFile["HOOMDTrajectory", "HoomdFrame"]):
         import gsd.hoomd
 
         system, sites = self._system, self._constituent
-        owner, n = system.sites.molecule[sites], len(state.position)
+        owner = system.sites.molecule[sites]
+        n = len(state.position)
         if len(state.rotation):
             orientation = to_quaternion(state.rotation)
         else:

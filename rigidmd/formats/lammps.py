@@ -113,7 +113,8 @@ def _data_atoms(
         if len(row.words) == 2
     }
     number_of = {label: number for number, label in labels.items()}
-    names, mass_of = dict(labels), {}
+    names = dict(labels)
+    mass_of = {}
     for row in sections.get("Masses", []):
         kind = number_of.get(row.words[0], row.words[0])
         [mass_of[kind]] = numbers(path, row.line, row.words[1:2] or [""], "a type and its mass")
@@ -122,7 +123,8 @@ def _data_atoms(
     declared = next((row.words[0] for row in head if row.words[1:] == ["atom", "types"]), "0")
     numbered = range(1, 1 + min(parse_whole_number(declared) or 0, len(rows)))
     column = _columns(path, style, rows, {*mass_of, *labels, *number_of, *map(str, numbered)})
-    width, whole_columns = len(column), [column[name] for name in ("id", "mol") if name in column]
+    width = len(column)
+    whole_columns = [column[name] for name in ("id", "mol") if name in column]
     for line, words, _ in rows:
         if len(words) < width or any(parse_whole_number(words[k]) is None for k in whole_columns):
             raise unexpected(path, line, f"an atom ({' '.join(column)})", " ".join(words))
@@ -176,7 +178,9 @@ def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[s
     """The columns of the atoms: by style or names after Atoms, else the only style that fits.
     Raises StructureError."""
     words = [COLUMN.get(word, word) for word in re.split(r"[\s,]+", style.lower())]
-    width, line, basic = len(rows[0].words), rows[0].line, STYLES["atomic"]
+    width = len(rows[0].words)
+    line = rows[0].line
+    basic = STYLES["atomic"]
     if words[0] == "hybrid":
         columns = list(
             dict.fromkeys([*basic, *(name for part in words[1:] for name in STYLES.get(part, ()))])
@@ -207,7 +211,8 @@ def _fits(columns: list[str], rows: list[Row], known: set[str]) -> bool:
     kind = columns.index("type")
     whole_columns = [k for k, name in enumerate(columns) if name in ("id", "mol")]
     for row in rows:
-        words, images = row.words, [word.lstrip("+-") for word in row.words[len(columns) :]]
+        words = row.words
+        images = [word.lstrip("+-") for word in row.words[len(columns) :]]
         if len(words) < len(columns) or len(images) not in (0, 3):
             return False
         if any(
@@ -339,7 +344,8 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
     position = of(*coordinates)
     if coordinates[0].startswith("xs"):
         position = low + position @ cell
-    flags, notes = re.findall(r"(?<=\s)[pfsm]{2}(?=\s|$)", lines[begin]), []
+    flags = re.findall(r"(?<=\s)[pfsm]{2}(?=\s|$)", lines[begin])
+    notes = []
     if not all("p" in flag for flag in flags):
         axes = ", ".join(x for x, flag in zip("abc", flags, strict=False) if "p" in flag)
         notes = [f"its cell is periodic along {axes} only and is not used"] if axes else []
@@ -402,7 +408,8 @@ def dump_box(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and cell (3, 3) of a dump, whose bounds enclose the cell. kinds : the words after
     BOX BOUNDS"""
-    bounds, general = table(path, rows, "the bounds of the box"), kinds[:1] == ["abc"]
+    bounds = table(path, rows, "the bounds of the box")
+    general = kinds[:1] == ["abc"]
     if bounds.shape not in ([(3, 4)] if general else [(3, 2), (3, 3)]):
         raise unexpected(path, rows[0][0], "the bounds of the box along x", " ".join(rows[0][1]))
     if general:

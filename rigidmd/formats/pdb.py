@@ -37,7 +37,10 @@ FREE = re.compile(r"\w{0,3}" + 3 * r"\s+([-+]?\d*\.\d*(?:[eEdD][-+]?\d+)?)" + r"
 
 def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The models of a .pdb, each with the last CRYST1 before it."""
-    models, body, cell, notes = [], [], None, []
+    models = []
+    body = []
+    cell = None
+    notes = []
     ends = next((line for line in reversed(lines) if line.strip()), "")
     if ends.startswith(("ATOM", "HETATM")):
         cut = ["it ends with an atom, without END: is it truncated?"]
@@ -91,8 +94,13 @@ def _pdb_model(
     path: Path, body: list[tuple[int, str]], cell: np.ndarray | None, notes: list[str]
 ) -> Atoms:
     """One model. Residues are renumbered, because their numbers may wrap or be missing."""
-    names, elements, residue, position, locations = [], [], [], [], set()
-    count, last = 0, None
+    names = []
+    elements = []
+    residue = []
+    position = []
+    locations = set()
+    count = 0
+    last = None
     for number, full in body:
         line, end, coordinates = _pdb_columns(path, number, full)
         position.append(coordinates)
@@ -101,7 +109,8 @@ def _pdb_model(
         elements.append(symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else "")
         locations.add(line[16:17].strip())
         if (here := line[17:28]) != last:  # name, chain, number and insertion code
-            count, last = count + 1, here
+            count = count + 1
+            last = here
         digits = re.match(r" *(\d+)", line[22:30])
         residue.append((int(digits[1]) if digits else None, line[17:21].strip(), count))
     if len(locations := locations - {""}) > 1:
@@ -168,7 +177,8 @@ def pdb_text(system: Topology) -> str:
     from 100,000 on have no bonds."""
     lines = ["TITLE     Written by rigidmd"]
     if box := dimensions(system.cell):
-        edges, angles = box[:3], box[3:]
+        edges = box[:3]
+        angles = box[3:]
         sizes = "".join(f"{edge:9.3f}" for edge in edges)
         lines.append(f"CRYST1{sizes}{''.join(f'{angle:7.2f}' for angle in angles)} P 1           1")
     rows = zip(

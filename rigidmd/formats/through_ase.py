@@ -119,7 +119,8 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
     """Atoms in Å, ps and u from ASE's, with its masses unless they are its standard ones. By
     default, names and residues are those in the arrays that ASE and rigidmd store, or else names
     are ASE's symbols."""
-    symbols, notes = atoms.get_chemical_symbols(), []
+    symbols = atoms.get_chemical_symbols()
+    notes = []
     if names is None and (stored := atoms.arrays.get(NAMES)) is not None:
         names = [str(name) for name in stored]
         # united atoms have names only
@@ -305,7 +306,8 @@ class TrajReader:
             info = cast(Json, item.get("info") or {})
             if cell.shape != (3, 3):
                 raise ValueError("it is damaged: a cell is not of shape (3, 3)")
-            n, m = len(self._atoms), self.sites - len(self._atoms)
+            n = len(self._atoms)
+            m = self.sites - len(self._atoms)
             sizes = {"positions": n, "momenta": n, MASSLESS: m, MASSLESS_VELOCITY: m}
             present = {name for name in sizes if name == "positions" or name in item}
             arrays = [
@@ -320,7 +322,8 @@ class TrajReader:
 
     def frame(self, k: int) -> Frame:
         stored = self.read(k)
-        positions, velocities = self._joined(stored.positions, stored.massless), None
+        positions = self._joined(stored.positions, stored.massless)
+        velocities = None
         if stored.momenta is not None:
             velocities = self._joined(
                 stored.momenta / self._mass[:, None] * ASE_VELOCITY, stored.massless_velocity

@@ -27,7 +27,9 @@ def read_xyz(
 ) -> list[Callable[[], Atoms]]:
     """The frames of a plain or extended .xyz through ASE, which needs elements, while many files
     have names. `atom_types`: name in the file, such as a type of LAMMPS -> name of the atom."""
-    labels, clean, at = [], [], 0
+    labels = []
+    clean = []
+    at = 0
     while at < len(lines):
         if not lines[at].strip():
             at += 1
@@ -60,7 +62,8 @@ def read_xyz(
                 words[column] = "H" if symbol in HEAVY_HYDROGEN else symbol or "X"
             clean.append(" ".join(words))
         at += 2 + count
-    frames, first = [], 0
+    frames = []
+    first = 0
     for atoms in read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), "extxyz") if clean else []:
         of_frame = labels[first : first + len(atoms)]
         first += len(atoms)
@@ -87,7 +90,9 @@ def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
 def _columns(properties: str) -> tuple[int | None, int | None, int]:
     """Columns of species and positions, or None, and their number: 0, 1 and 4 for
     `species:S:1:pos:R:3`."""
-    words, column, column_of = properties.split(":"), 0, {}
+    words = properties.split(":")
+    column = 0
+    column_of = {}
     for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
         column_of["species" if name.lower() == "symbols" else name.lower()] = column
         column += 1 if (columns := parse_whole_number(width)) is None else columns
@@ -114,7 +119,8 @@ def encoder(system: System, interval: float, velocities: bool) -> Encode:
         text = files.content(frame, write).removesuffix(b"\n\n") + b"\n"
         if not names:
             return text
-        head, rows = text.splitlines(keepends=True)[:2], text.splitlines()[2:]
+        head = text.splitlines(keepends=True)[:2]
+        rows = text.splitlines()[2:]
         return b"".join([*head, *(row + name for row, name in zip(rows, names, strict=True))])
 
     return encode

@@ -12,7 +12,10 @@ from rigidmd.core.toml import shorten_text
 from rigidmd.errors import OutputError, option, resume_command
 
 #: Names of files of a run. The scene names trajectory and topology.
-SCENE, LOG, MOTION, MOTION_NPZ = "scene.toml", "log.csv", "motion.csv", "motion.npz"
+SCENE = "scene.toml"
+LOG = "log.csv"
+MOTION = "motion.csv"
+MOTION_NPZ = "motion.npz"
 FINAL, LAST_GOOD, SUMMARY = "final.npz", "last_good_state.npz", "summary.json"
 CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint_previous.npz"
 #: Marks the folder of a run and lists the files that the run may write, one per line. `force` may

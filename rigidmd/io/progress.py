@@ -145,7 +145,8 @@ class _NotebookBar(Bar):
         done, total, elapsed = status["n"], status["total"], status["elapsed"]
         text = f"{done:.4g} of {total:.4g} {status['unit']}"
         if done >= total * (1 - 1e-9):
-            fraction, text = 1.0, f"{total:.4g} {status['unit']} in {elapsed:.3g} s"
+            fraction = 1.0
+            text = f"{total:.4g} {status['unit']} in {elapsed:.3g} s"
         else:
             fraction = done / total
             left = "" if self._ended or elapsed == 0 else self.left

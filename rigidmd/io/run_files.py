@@ -29,7 +29,10 @@ from rigidmd.scene.validation import Flag, Number, validation_messages
 
 #: Limits: bytes of a JSON file and of a CSV file, characters of a line of CSV, absolute value of a
 #: number.
-LARGEST_JSON, LARGEST_TABLE, LONGEST_LINE, LARGEST_NUMBER = 5e7, 4e9, 100_000, 1e100
+LARGEST_JSON = 5e7
+LARGEST_TABLE = 4e9
+LONGEST_LINE = 100_000
+LARGEST_NUMBER = 1e100
 
 T = TypeVar("T")
 adapter_of = lru_cache(TypeAdapter)

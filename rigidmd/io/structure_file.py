@@ -200,7 +200,8 @@ def _content(path: Path) -> bytes:
     """The uncompressed content of a file. Raises StructureError."""
     if (opened := PACKED.get(path.suffix.lower())) is None:
         return path.read_bytes()
-    pieces, size = [], 0
+    pieces = []
+    size = 0
     try:
         with opened(path) as file:
             while piece := file.read(PIECE):

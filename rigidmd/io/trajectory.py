@@ -221,7 +221,9 @@ def _whole_frames(reader: TrajectoryReader, path: Path, selected: range) -> Iter
 def _times_and_cells_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
     """Times (ps) and cells (3, 3) in lines between the frames of a text, which MDAnalysis
     ignores."""
-    times, cells, pattern = [], [], BY_EXTENSION[path.suffix].times
+    times = []
+    cells = []
+    pattern = BY_EXTENSION[path.suffix].times
     if pattern is None:
         return times, cells
     with path.open("rb") as file:

@@ -52,7 +52,8 @@ def write_json(
 
 def write_csv(path: Path, rows: Iterable[Sequence[object]], quote_text: bool = False) -> None:
     """Write rows as CSV, with texts in quotation marks where needed, or always."""
-    stream, quoting = io.StringIO(newline=""), csv.QUOTE_MINIMAL
+    stream = io.StringIO(newline="")
+    quoting = csv.QUOTE_MINIMAL
     if quote_text:
         quoting = csv.QUOTE_NONNUMERIC
     csv.writer(stream, quoting=quoting, lineterminator="\n").writerows(rows)

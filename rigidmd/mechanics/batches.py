@@ -31,7 +31,13 @@ LANES = lane_count(np.float64)  # bodies that are rotated together
 #: Rows of the constants of the species in each lane: axes a and b (as numbers), h g, h (1/I - g)
 #: about a, b and c, the square of the largest of these, and 1 if the axes a, b, c are left-handed,
 #: -1 if right-handed.
-AXIS_A, AXIS_B, COMMON, RATE, LARGEST_RATE2, HANDEDNESS, ROWS = 0, 1, 2, 3, 6, 7, 8
+AXIS_A = 0
+AXIS_B = 1
+COMMON = 2
+RATE = 3
+LARGEST_RATE2 = 6
+HANDEDNESS = 7
+ROWS = 8
 
 
 @kernel
@@ -127,9 +133,12 @@ def apply_langevin_group(model, state, keep, keep_momentum, noise, numbers, firs
     angular momentum. Returns the kinetic energy gained.
     """
     species, velocity, momentum = model.species, state.velocity, state.angular_momentum_body
-    kinds, constants = np.full(LANES, -1), np.empty(8 * LANES)
-    rotates, stride = len(momentum) > 0, len(numbers) // 6
-    gained, at = broadcast(0.0, velocity), 0
+    kinds = np.full(LANES, -1)
+    constants = np.empty(8 * LANES)
+    rotates = len(momentum) > 0
+    stride = len(numbers) // 6
+    gained = broadcast(0.0, velocity)
+    at = 0
     while first + LANES <= end:
         if _species_changed(kinds, species, first):
             for n in range(LANES):
@@ -204,7 +213,8 @@ def rotate_group(rotor, species, rotation, angular_momentum_body, first, end, h)
 
     def rotate_together(rotor, species, rotation, angular_momentum_body, first, end, h):
         align_stack()
-        constants, kinds = np.empty(ROWS * LANES), np.full(LANES, -1)
+        constants = np.empty(ROWS * LANES)
+        kinds = np.full(LANES, -1)
         whole = (1 << LANES) - 1
         about = (False, False, False)
         while first + LANES <= end:
@@ -260,7 +270,8 @@ def _set_constants(constants, kinds, rotor, h):
     for n in range(LANES):
         kind = kinds[n]
         a, b, c = rotor.order[kind, 0], rotor.order[kind, 1], rotor.order[kind, 2]
-        common, rates = h * rotor.common[kind], rotor.excess[kind]
+        common = h * rotor.common[kind]
+        rates = rotor.excess[kind]
         constants[AXIS_A * LANES + n], constants[AXIS_B * LANES + n] = a, b
         constants[COMMON * LANES + n] = common
         constants[RATE * LANES + n] = h * rates[a]

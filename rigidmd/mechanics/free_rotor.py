@@ -121,7 +121,8 @@ def rotate(rotor, species, rotation, angular_momentum_body, m, h):
 def rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h):
     """Rotate about L, which is constant, by the angle h g |L|, then about the axes. The two flows
     commute."""
-    L, rate = angular_momentum_body[m], h * rotor.common[species]
+    L = angular_momentum_body[m]
+    rate = h * rotor.common[species]
     rotate_by_vector(rotation[m], rate * L[0], rate * L[1], rate * L[2])
     a, b, c = rotor.order[species, 0], rotor.order[species, 1], rotor.order[species, 2]
     excess = rotor.excess[species]
@@ -152,15 +153,27 @@ def rotate_by_series(rotation, angular_momentum_body, m, inverse, h):
         terms[0, 2] = L[2] * inverse[2]
         terms[0, 3] = 1.0
         terms[0, 4:] = 0.0
-        w, x, y, z = 0.0, 0.0, 0.0, 0.0
+        w = 0.0
+        x = 0.0
+        y = 0.0
+        z = 0.0
         for k in range(MOST_TERMS):
-            g0, g1, g2, q0, q1, q2, q3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            g0 = 0.0
+            g1 = 0.0
+            g2 = 0.0
+            q0 = 0.0
+            q1 = 0.0
+            q2 = 0.0
+            q3 = 0.0
             for j in range(k + 1):
                 v0, v1, v2 = terms[k - j, 0], terms[k - j, 1], terms[k - j, 2]
                 g0 += terms[j, 1] * v2
                 g1 += terms[j, 2] * v0
                 g2 += terms[j, 0] * v1
-                p0, p1, p2, p3 = terms[j, 3], terms[j, 4], terms[j, 5], terms[j, 6]
+                p0 = terms[j, 3]
+                p1 = terms[j, 4]
+                p2 = terms[j, 5]
+                p3 = terms[j, 6]
                 q0 -= p1 * v0 + p2 * v1 + p3 * v2
                 q1 += p0 * v0 + p2 * v2 - p3 * v1
                 q2 += p0 * v1 + p3 * v0 - p1 * v2

@@ -244,7 +244,8 @@ def assemble_solids(parts: Sequence[Part]) -> Assembly:
     )
     mass = float(masses.sum())
     centre = masses @ positions / mass
-    tensor, outlines = np.zeros((3, 3)), []
+    tensor = np.zeros((3, 3))
+    outlines = []
     for part in parts:
         tensor_of_part = part.rotation @ np.diag(part.solid.inertia) @ part.rotation.T
         tensor += shifted_inertia(tensor_of_part, part.mass, part.position - centre)
@@ -272,7 +273,8 @@ def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.nd
     step = 0.4
     l = np.exp(np.arange(np.log(a.min()) - 40, np.log(a.max()) + 30, step))[:, None]  # noqa: E741
     weight = step * l * axes.prod() / (np.sqrt(a + l) * ((b + l) * (c + l)) ** 1.5)
-    near, far = weight.sum(axis=0), (l * weight).sum(axis=0)
+    near = weight.sum(axis=0)
+    far = (l * weight).sum(axis=0)
     displaced = 4 / 3 * np.pi * density * axes.prod()
     added_mass = displaced * alpha / (alpha[[1, 2, 0]] + alpha[[2, 0, 1]])
     difference = (following - last) * (following + last)

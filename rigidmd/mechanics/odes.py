@@ -70,7 +70,10 @@ def write_rotation(form, y, rotation):
 
         def from_quaternion(form, y, rotation):
             q = rotation[0]
-            w, a, b, c = y[0], y[1], y[2], y[3]
+            w = y[0]
+            a = y[1]
+            b = y[2]
+            c = y[3]
             q[0, 0] = w * w + a * a - b * b - c * c
             q[1, 1] = w * w - a * a + b * b - c * c
             q[2, 2] = w * w - a * a - b * b + c * c

@@ -36,9 +36,12 @@ def to_quaternion(rotation: np.ndarray) -> np.ndarray:
     is positive. No angle has cancellation (Shepperd 1978, J. Guid. Control 1, 223)."""
     q = np.asarray(rotation, dtype=float)
     xx, yy, zz = q[..., 0, 0], q[..., 1, 1], q[..., 2, 2]
-    wx, xw = q[..., 2, 1] - q[..., 1, 2], q[..., 2, 1] + q[..., 1, 2]
-    wy, yw = q[..., 0, 2] - q[..., 2, 0], q[..., 0, 2] + q[..., 2, 0]
-    wz, zw = q[..., 1, 0] - q[..., 0, 1], q[..., 1, 0] + q[..., 0, 1]
+    wx = q[..., 2, 1] - q[..., 1, 2]
+    xw = q[..., 2, 1] + q[..., 1, 2]
+    wy = q[..., 0, 2] - q[..., 2, 0]
+    yw = q[..., 0, 2] + q[..., 2, 0]
+    wz = q[..., 1, 0] - q[..., 0, 1]
+    zw = q[..., 1, 0] + q[..., 0, 1]
     products = _matrix(
         [1 + xx + yy + zz, wx, wy, wz],
         [wx, 1 + xx - yy - zz, zw, yw],

@@ -36,7 +36,8 @@ def interpolated_function(times, values) -> TimeFunction:
     after these times."""
     times, values = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
     if times[0] > 0:
-        times, values = np.insert(times, 0, 0.0), np.insert(values, 0, values[0], axis=0)
+        times = np.insert(times, 0, 0.0)
+        values = np.insert(values, 0, values[0], axis=0)
     slope = np.zeros_like(values)
     slope[:-1] = np.diff(values, axis=0) / np.diff(times)[:, None]
     return TimeFunction(times, values, slope, np.zeros_like(values))
@@ -44,7 +45,8 @@ def interpolated_function(times, values) -> TimeFunction:
 
 def pulse_function(vector, begin: float, end: float) -> TimeFunction:
     """A vector (3,) from time `begin` to time `end`, which may be infinite. Zero outside."""
-    on, off = np.asarray(vector, dtype=float), np.zeros(3)
+    on = np.asarray(vector, dtype=float)
+    off = np.zeros(3)
     pieces = [(0.0, off)] * (begin > 0) + [(max(begin, 0.0), on)] + [(end, off)] * (end < inf)
     times, values = (np.array(column) for column in zip(*pieces, strict=True))
     return TimeFunction(times, values, np.zeros_like(values), np.zeros_like(values))

@@ -88,8 +88,10 @@ def atoms_of_results(
         raise ValueError(
             "this run has no frames (output.trajectory = false). atoms() is the final state"
         )
-    indices, sites = _frame_indices(frame, len(frames)), _sites_of_frames(results)
-    frames_read, last = [], results._state
+    indices = _frame_indices(frame, len(frames))
+    sites = _sites_of_frames(results)
+    frames_read = []
+    last = results._state
     for k in indices:
         time = frames[k].time
         if k == len(frames) - 1 and last is not None and _same(time, float(last.time[NOW])):
@@ -174,7 +176,8 @@ def ase_results(
         state._replace(velocity=velocity, angular_momentum_body=momentum),
         energy_unit=EV,
     )
-    load, torque = observation.load, np.zeros_like(observation.load.force)
+    load = observation.load
+    torque = np.zeros_like(observation.load.force)
     if len(state.rotation):
         torque = np.einsum("nij,nj->ni", state.rotation, load.torque_body)
     if form == "sites":
@@ -198,7 +201,8 @@ def gradient_forces(
     atoms : as in `ase_results`
     """
     atom = system.sites.mass > 0
-    of_atom, mass = system.sites.molecule[atom], system.sites.mass[atom, None]
+    of_atom = system.sites.molecule[atom]
+    mass = system.sites.mass[atom, None]
     atom_force = mass * (force / system.model.mass[system.model.species][:, None])[of_atom]
     if len(state.rotation):
         arm, r = _arms(system, state, atoms)
@@ -245,7 +249,8 @@ def site_forces(
         np.add.at(on_sites, at, of_term)
     atom = system.sites.mass > 0
     atom_force = on_sites[atom] + _massless_forces_on_atoms(system, state, on_sites)[atom]
-    of_atom, n = system.sites.molecule[atom], len(state.position)
+    of_atom = system.sites.molecule[atom]
+    n = len(state.position)
     remainder = force - _sum_per_molecule(of_atom, atom_force, n)
     torque = torque - _sum_per_molecule(of_atom, np.cross(from_centre, atom_force), n)
     return atom_force + gradient_forces(system, state, remainder, torque, atoms)
@@ -266,7 +271,8 @@ def _sum_per_molecule(owner: np.ndarray, values: np.ndarray, n: int) -> np.ndarr
 
 def _site_indices(system: System, sites: BodySites | CentralSites) -> np.ndarray:
     """Index (s,) of the sites of a pair potential among all sites."""
-    offset, indices = sites.offsets(), np.zeros(len(sites.molecule), int)
+    offset = sites.offsets()
+    indices = np.zeros(len(sites.molecule), int)
     for kind in kinds_of(system):
         has_sites = np.diff(sites.first)[kind.index] > 0
         first = sites.first[kind.index[has_sites]]
@@ -284,7 +290,8 @@ def _massless_forces_on_atoms(system: System, state: State, force: np.ndarray) -
     on_atoms = np.zeros_like(force)
     for kind in kinds_of(system):
         m = kind.molecule
-        bare, heavy = np.flatnonzero(m.masses == 0), np.flatnonzero(m.masses > 0)
+        bare = np.flatnonzero(m.masses == 0)
+        heavy = np.flatnonzero(m.masses > 0)
         if len(bare) == 0:
             continue
         if len(state.rotation):
@@ -302,7 +309,8 @@ def _transfer_matrices(molecule: Molecule, site: int) -> np.ndarray:
     """Matrices (heavy, 3, 3), body frame, from the force on a massless site to forces on the atoms
     with the same total force and torque: by the coefficients of a site that is a linear combination
     of the atoms, or else the smallest."""
-    position, heavy = molecule.positions_body[site], molecule.positions_body[molecule.masses > 0]
+    position = molecule.positions_body[site]
+    heavy = molecule.positions_body[molecule.masses > 0]
     rows = np.vstack([heavy.T, np.ones(len(heavy))])
     weight = np.linalg.lstsq(rows, np.append(position, 1.0), rcond=COMBINATION_TOLERANCE)[0]
     if np.abs(rows @ weight - np.append(position, 1.0)).max() <= COMBINATION_TOLERANCE * max(

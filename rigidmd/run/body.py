@@ -151,7 +151,8 @@ class BodyWatch(Observer):
                 return FailedCheck(message, factor=angle / limits.turn_rad)
         if not limits.energy or not is_balanced(system):
             return None
-        start, now = self._start, energies_of(system, state)
+        start = self._start
+        now = energies_of(system, state)
         self.exchanged = max(
             self.exchanged, sum(abs(now[key] - start[key]) for key in ("potential", "work"))
         )
@@ -170,7 +171,8 @@ class BodyWatch(Observer):
 
         stable : the longest stable step, s
         """
-        system, dt = self._system, self._run._part.segment.dt
+        system = self._system
+        dt = self._run._part.segment.dt
         if isinstance(error, NotFiniteError):
             failed = FailedCheck("position or momentum of the body is not finite")
         elif isinstance(error, FailedCheck):
@@ -182,7 +184,8 @@ class BodyWatch(Observer):
             shorter = f"timestep_s below {stable:.2g}, where its spin and swing are stable"
         elif failed.factor is not None:
             shorter = f"timestep_s = {dt / failed.factor:.2g} or less"
-        inertia, advice = system.inertia, shorter
+        inertia = system.inertia
+        advice = shorter
         if failed.rotation_not_orthogonal:
             likely = "Q was changed from outside: a run only multiplies rotations"
             if isinstance(system.method, Solver):
@@ -268,7 +271,9 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def prepare(self) -> None:
-        system, run, compiled = self.system, self.scene.run, self.system.engine()
+        system = self.system
+        run = self.scene.run
+        compiled = self.system.engine()
         compiled.advance(
             compiled.begin(system.state, system.method), system.method, run.timestep_s, 0
         )
@@ -278,7 +283,8 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
                 " order 1. For friction and resistance use [friction] and [fluid], which keep"
                 " order 2. Otherwise integrator = 'dop853'"
             )
-        rate, angle = fastest_body_rate(system), stable_angle(system.method)
+        rate = fastest_body_rate(system)
+        angle = stable_angle(system.method)
         # some solvers choose their own steps
         if not self.scene.watch.stable_step or rate == 0 or angle == inf:
             return
@@ -315,7 +321,8 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         """Segments between the breaks in functions of time, in equal steps no longer than the
         timestep of the scene."""
         run = self.scene.run
-        segments, steps = [], 0
+        segments = []
+        steps = 0
         for begin, end in pairwise((0.0, *self.system.breaks(), run.steps * run.timestep_s)):
             exact = (end - begin) / run.timestep_s
             step_count = round(exact)
@@ -341,7 +348,8 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             return self.engine.evaluate(self.state)[0].force
 
     def default_observers(self) -> list[Observer]:
-        output, interval = self.scene.output, not_none(self.scene.output.interval_s)
+        output = self.scene.output
+        interval = not_none(self.scene.output.interval_s)
         self._sampler, self._watch = Sampler(interval), BodyWatch(self.simulation)
         files: list[Observer] = []
         if output.trajectory:
@@ -386,7 +394,8 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
 
     @property
     def headline(self) -> str:
-        system, run = self.system, self.scene.run
+        system = self.system
+        run = self.scene.run
         pinned = "" if system.translates else ", pinned"
         return (
             f"{self.scene.name}: one body ({system.kind}{pinned}), {system.degrees_of_freedom}"

@@ -77,7 +77,8 @@ def _finite_or_none(value: float | None) -> float | None:
 
 def _has_theory(system: BodySystem) -> bool:
     """Whether a rigid body is without all but steady forces."""
-    body, driven = system.body, (TimeDependentForce, PythonForce)
+    body = system.body
+    driven = (TimeDependentForce, PythonForce)
     return (
         isinstance(body.rotor, SplitRotor)
         and isinstance(body.resistance, NoResistance)
@@ -91,7 +92,8 @@ def _of_heavy_body(
 ) -> dict[str, Rate]:
     """Rates of a body on which a constant force acts. down (3,) : its direction. moment (3,) :
     force times point of action, principal axes, N m"""
-    axis, size = moment / np.linalg.norm(moment), float(np.linalg.norm(moment))
+    axis = moment / np.linalg.norm(moment)
+    size = float(np.linalg.norm(moment))
     path = _path_of_axis(motion, system.axes @ axis)
     polar, azimuth = _angles(path, -down)
     rates = {}
@@ -132,7 +134,8 @@ def _of_heavy_body(
 
 def _of_free_body(system: BodySystem, motion: Motion) -> dict[str, Rate]:
     """Rates of a body that no torque acts on."""
-    momentum, inertia = _vectors(motion, "L_lab")[0], system.inertia
+    momentum = _vectors(motion, "L_lab")[0]
+    inertia = system.inertia
     size = float(np.linalg.norm(momentum))
     if size == 0:
         return {}
@@ -152,7 +155,9 @@ def _of_free_body(system: BodySystem, motion: Motion) -> dict[str, Rate]:
     ):
         return {}
     middle = int(np.argsort(inertia)[1])
-    time, swings, period = motion["time"], omega[:, middle], free_body_period(inertia, omega[0])
+    time = motion["time"]
+    swings = omega[:, middle]
+    period = free_body_period(inertia, omega[0])
     rates = {"omega_period_s": Rate(_periods(time, swings, 0.0, swings)[0], period)}
     if np.abs(swings).max() * inertia[middle] > FLIP_COSINE * size:
         rates["flip_interval_s"] = Rate(

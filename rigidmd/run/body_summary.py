@@ -23,7 +23,8 @@ def summarise_body(
 ) -> dict:
     """The summary of a run of a single body, without its `provenance`. planned : steps of a run
     that ends in time"""
-    run, end = system.scene.run, float(motion["time"][-1])
+    run = system.scene.run
+    end = float(motion["time"][-1])
     steps = round(end / run.timestep_s) if interrupted else planned
     notes = system.notes
     if (

@@ -59,10 +59,13 @@ def heavy_top_motion(
     half = np.sqrt(max(0.25 * p * p - q, 0.0))  # rounding may make it negative at steady precession
     low, high = np.clip([cosine - 0.5 * p - half, cosine - 0.5 * p + half], -1.0, 1.0)
     top += cosine
-    rate, parameter = np.sqrt(alpha * (top - low)) / 2, (high - low) / (top - low)
-    angle, complement = 0.0, float(1 - parameter)
+    rate = np.sqrt(alpha * (top - low)) / 2
+    parameter = (high - low) / (top - low)
+    angle = 0.0
+    complement = float(1 - parameter)
     for pole in (1.0, -1.0):
-        weight, distance = w + c * (cosine - pole), 1 - pole * low
+        weight = w + c * (cosine - pole)
+        distance = 1 - pole * low
         # without weight the axis does not circle this pole
         if distance > 0 and abs(weight) > np.finfo(float).eps * (abs(w) + abs(c)):
             n = pole * (high - low) / distance

@@ -78,7 +78,9 @@ class StepCheck:
         """
         if self._is_within_limits(extent or largest_values(state, load), scheme, dt):
             return None
-        system, limits, model = self._system, self._limits, self._system.model
+        system = self._system
+        limits = self._limits
+        model = self._system.model
         for what, values in (("force", load.force), ("torque", load.torque_body)):
             if not np.isfinite(values).all():
                 m = int((~np.isfinite(values).all(axis=1)).argmax())
@@ -89,7 +91,8 @@ class StepCheck:
             size = kicks(model, load, self.thermal, dt * max(map(abs, scheme.kicks)))
             times = f"by {size.max():.3g} times its thermal size (watch.kick = {limits.kick:g})"
             measures.append((size, limits.kick, f"one kick changes a momentum of {{}} {times}"))
-        stride, between = dt * max(map(abs, scheme.drifts)), "between two force evaluations"
+        stride = dt * max(map(abs, scheme.drifts))
+        between = "between two force evaluations"
         if limits.move:
             way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
             part = (
@@ -124,7 +127,8 @@ class StepCheck:
         forces and velocities.
 
         It is nearly always true, and many times as fast as a check of each molecule."""
-        limits, stride = self._limits, dt * max(map(abs, scheme.drifts))
+        limits = self._limits
+        stride = dt * max(map(abs, scheme.drifts))
         if not largest.force + largest.torque < inf:
             return False
         if limits.kick and self.thermal > 0:
@@ -154,7 +158,8 @@ def check_sample(system: System, limits: Watch, since: Sample, now: Sample) -> F
     or with the kinetic energy at a thermostat's temperature if that is larger. In a minimisation
     only Q is checked.
     """
-    stage, fraction = system.scene.stages[now.stage], 1.0
+    stage = system.scene.stages[now.stage]
+    fraction = 1.0
     if limits.orthogonality and not now.orthogonality_error <= limits.orthogonality:
         message = (
             f"|QᵀQ - 1| is {now.orthogonality_error:.2g} (watch.orthogonality ="
@@ -172,7 +177,8 @@ def check_sample(system: System, limits: Watch, since: Sample, now: Sample) -> F
         return FailedCheck(f"{message}, {now.density:.3g} g/cm³", evaporated=True)
     if not limits.energy:
         return None
-    kinetic, per_kelvin = since.kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL
+    kinetic = since.kinetic
+    per_kelvin = 0.5 * BOLTZMANN / KJ_PER_MOL
     if stage.has_thermostat:
         kinetic = max(
             kinetic, per_kelvin * max(stage.temperatures) * system.freedom_in(now.stage).total

@@ -13,14 +13,18 @@ def rf(x: float, y: float, z: float) -> float:
         return inf
     mean = start = (x + y + z) / 3
     spread = (3 * SERIES_ERROR) ** (-1 / 6) * max(abs(start - one) for one in (x, y, z))
-    a, b, c, scale = x, y, z, 1.0
+    a = x
+    b = y
+    c = z
+    scale = 1.0
     while scale * spread > abs(mean):
         shift = sqrt(a) * sqrt(b) + sqrt(a) * sqrt(c) + sqrt(b) * sqrt(c)
         a, b, c, mean = ((one + shift) / 4 for one in (a, b, c, mean))
         scale /= 4
     u, v = ((start - one) * scale / mean for one in (x, y))
     w = -u - v
-    second, third = u * v - w * w, u * v * w
+    second = u * v - w * w
+    third = u * v * w
     series = 1 - second / 10 + third / 14 + second**2 / 24 - 3 * second * third / 44
     return series / sqrt(mean)
 
@@ -33,7 +37,10 @@ def rj(x: float, y: float, z: float, p: float) -> float:
     mean = start = (x + y + z + 2 * p) / 5
     product = (p - x) * (p - y) * (p - z)
     spread = (SERIES_ERROR / 4) ** (-1 / 6) * max(abs(start - one) for one in (x, y, z, p))
-    a, b, c, d = x, y, z, p
+    a = x
+    b = y
+    c = z
+    d = p
     scale, total = 1.0, 0.0
     while scale * spread > abs(mean):
         roots = [sqrt(one) for one in (a, b, c)]

@@ -53,7 +53,8 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
     """Errors of a system's Ewald sums at a state, of forces on sites and of the energy, compared
     with a more accurate sum: the entry `accuracy` of `rigidmd energy`, with energies in a unit of
     `size` u Å²/ps². Raises SceneError if it has no Ewald sums."""
-    scene, method = system.scene, system.scene.forces.electrostatics
+    scene = system.scene
+    method = system.scene.forces.electrostatics
     if system.force_error is None:
         problem = (
             f"--accuracy needs Ewald sums. forces.electrostatics is {method!r}, or no site has a"
@@ -93,7 +94,8 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
 def estimated_error(system: System, cell: np.ndarray) -> float:
     """Estimated rms error of Coulomb forces in another cell (3, 3), u Å/ps², with the Ewald sums of
     a system."""
-    term, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
+    term = system.terms["coulomb_reciprocal"]
+    volume = abs(float(np.linalg.det(cell)))
     counts = np.bincount(system.model.species, minlength=len(system.species))
     charges = charges_in(system.species, counts)
     cutoff = not_none(system.scene.forces.ewald_cutoff_A)
@@ -131,7 +133,8 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     charged = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
     engine = system.engine_of(charged, system.precision)
     _, tallies = engine.evaluate(state)
-    real, force = cast(PairForces, system.terms["coulomb_real"]), np.zeros((system.site_count, 3))
+    real = cast(PairForces, system.terms["coulomb_real"])
+    force = np.zeros((system.site_count, 3))
     for name in ("coulomb_real", "coulomb_reciprocal"):
         force = force + cast(HasSiteForces, engine.workspaces[name]).site_force
     position = np.empty_like(force)
@@ -167,7 +170,8 @@ def forces_inside(
 #: Displacements of molecules, in smallest diameters or radians, and strains of the box. A force is
 #: right if it agrees for one of them, as a pair that crosses a cutoff at which the energy jumps
 #: spoils a difference.
-STEP_FRACTIONS, STRAINS = (1e-4, 1e-5), (1e-5, 1e-6, 1e-7)
+STEP_FRACTIONS = (1e-4, 1e-5)
+STRAINS = (1e-5, 1e-6, 1e-7)
 #: Displacement in smallest diameters after which a wrong force is still wrong.
 DISPLACED = 0.01
 #: If energies have random errors, the first of these times this factor is used.
@@ -198,7 +202,8 @@ def check_forces(system: System, state: State) -> None:
 
 def _displaced(system: System, state: State) -> State:
     """A state with centres of mass displaced at random."""
-    moved, rng = state.copy(), np.random.default_rng(0)
+    moved = state.copy()
+    rng = np.random.default_rng(0)
     moved.position[:] += (
         DISPLACED * system.smallest_diameter * rng.uniform(-1, 1, state.position.shape)
     )
@@ -208,7 +213,8 @@ def _displaced(system: System, state: State) -> State:
 def velocity_notes(system: System, state: State) -> list[str]:
     """A note on each user-defined force that depends on the velocities: with other ones at the same
     positions it differs, by more than where nothing changes."""
-    rng, other = np.random.default_rng(0), state.copy()
+    rng = np.random.default_rng(0)
+    other = state.copy()
     speed = np.abs(state.velocity).max(initial=0.0) or 1.0
     spin = np.abs(state.angular_momentum_body).max(initial=0.0) or 1.0
     other.velocity[:] += speed * rng.standard_normal(other.velocity.shape)

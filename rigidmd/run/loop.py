@@ -111,7 +111,8 @@ class RunLoop:
     @property
     def is_complete(self) -> bool:
         """Whether all segments have been run."""
-        position, steps = self._part.record.position, int(self._part.state.step[NOW])
+        position = self._part.record.position
+        steps = int(self._part.state.step[NOW])
         is_last = position.segment + 1 == len(self._part.durations())
         return is_last and steps == position.first + self._part.segment.steps
 
@@ -125,7 +126,8 @@ class RunLoop:
             if self._next == self._open:
                 with self._running():
                     self._open()
-            part, total = self._part, sum(self._part.durations())
+            part = self._part
+            total = sum(self._part.durations())
             before = int(part.state.step[NOW])
             self._until = before + steps
             stack.enter_context(signal_handler(self._stop_by_signal, *stop_signals()))
@@ -161,7 +163,9 @@ class RunLoop:
         """Do everything before the first step: the folder, the checkpoint, compilation. All checks
         come before the first change of a file."""
         simulation, part = self._simulation, self._part
-        checkpoint, stays, changed = None, False, None
+        checkpoint = None
+        stays = False
+        changed = None
         if self._folder is not None:
             lock = FolderLock(self._folder)
             self._opened.callback(self._if_not_forked, lock.release)
@@ -169,7 +173,8 @@ class RunLoop:
             if self._resumes:
                 checkpoint, stays = self._read_checkpoint(self._folder)
         part.reset()
-        began, input_sha256 = clock.perf_counter(), resume.input_digests(simulation.scene)
+        began = clock.perf_counter()
+        input_sha256 = resume.input_digests(simulation.scene)
         scene = resume.plain(simulation.scene)
         if checkpoint is not None:
             with resume.as_checkpoint_errors(self._folder):
@@ -272,7 +277,9 @@ class RunLoop:
 
     def _finish(self) -> None:
         """Make the results, with all files written. Raises OutputError."""
-        simulation, part, notes = self._simulation, self._part, self._part.record.notes
+        simulation = self._simulation
+        part = self._part
+        notes = self._part.record.notes
         self._note_lost_files()
         results = Results(part.system, part.state, part.samples())
         results.interrupted = self.interrupted
@@ -354,7 +361,8 @@ class RunLoop:
     def _checkpoint(self) -> None:
         """Write a checkpoint, if the run has checkpoints and its engine can give its memory as
         arrays."""
-        part, record = self._part, self._part.record
+        part = self._part
+        record = self._part.record
         if (
             not self.checkpoints.writes
             or self._error is not None
@@ -400,7 +408,8 @@ class RunLoop:
 
     def _enter(self) -> None:
         """Enter the first segment, or the next one."""
-        part, position = self._part, self._part.record.position
+        part = self._part
+        position = self._part.record.position
         k = len(position.computing)
         part.segment = part.enter_segment(k)
         position.segment = k
@@ -413,7 +422,8 @@ class RunLoop:
 
     def _prepare(self) -> None:
         """Take the action of a segment, if it has one, before its steps."""
-        segment, observers = self._part.segment, self._observers.values()
+        segment = self._part.segment
+        observers = self._observers.values()
         self._schedule = ObservationSchedule(observers, segment)
         if segment.action is not None:
             began = clock.perf_counter()
@@ -426,7 +436,9 @@ class RunLoop:
 
     def _advance(self) -> None:
         """Advance to the next observation, or for about `SEGMENT_SECONDS`."""
-        part, segment, position = self._part, self._part.segment, self._part.record.position
+        part = self._part
+        segment = self._part.segment
+        position = self._part.record.position
         done = self._done
         if done >= segment.steps or self.interrupted:
             self._next = self._leave
@@ -461,7 +473,8 @@ class RunLoop:
 
     def _leave(self) -> None:
         """Leave a segment, with a checkpoint."""
-        segment, position = self._part.segment, self._part.record.position
+        segment = self._part.segment
+        position = self._part.record.position
         done, shown = self._done, self._shown
         if not (segment.action is not None and self.interrupted):
             self._checkpoint()

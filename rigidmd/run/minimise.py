@@ -73,7 +73,8 @@ def remove_overlaps(
             break
         # Each molecule moves along its own force by at most `length`, so overlaps do not slow down
         # the others.
-        shift, rotation = load.force * free[:, None], load.torque_body * rotates / arm
+        shift = load.force * free[:, None]
+        rotation = load.torque_body * rotates / arm
         # in a uniform field there are torques alone
         largest = np.abs(shift).max() or np.abs(rotation).max()
         shift, rotation = shift / largest, rotation / largest
@@ -94,7 +95,9 @@ def remove_overlaps(
         except BehindWallError:
             new_load, new_energy = load, inf
         if new_energy < energy:
-            load, energy, length = new_load, new_energy, min(1.2 * length, LONGEST_MOVE * scale)
+            load = new_load
+            energy = new_energy
+            length = min(1.2 * length, LONGEST_MOVE * scale)
             excess = float(kicks(model, load, thermal, dt).max())
             if excess <= 1:
                 break
@@ -173,7 +176,8 @@ class Enthalpy:
         """Energy and gradient at a state, which is not copied. Raises SimulationError."""
         load, tallies = self.engine.evaluate(state)
         parts = [*(tally.energy for tally in tallies.values()), *self._system.constants.values()]
-        volume, pressure = state.volume, np.full(6, nan)
+        volume = state.volume
+        pressure = np.full(6, nan)
         if volume < inf:
             virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
             pressure = np.array([virial[j, i] for i, j in COMPONENTS]) / volume
@@ -214,7 +218,9 @@ class Enthalpy:
         gained = other.energy - point.energy
         if not len(self._lengths):
             return gained
-        before, after, mean = point.state.volume, other.state.volume, self.target[:3].mean()
+        before = point.state.volume
+        after = other.state.volume
+        mean = self.target[:3].mean()
         deviation = self.target - np.where(np.arange(6) < 3, mean, 0.0)
         return (
             gained
@@ -335,7 +341,8 @@ def minimise(
         raise SimulationError(
             "energy or forces are not finite numbers: sites of different molecules coincide"
         )
-    overlap_steps, deepest = 0, max((m.epsilon.max() for m in system.species), default=0.0)
+    overlap_steps = 0
+    deepest = max((m.epsilon.max() for m in system.species), default=0.0)
     if deepest > 0 and enthalpy.free.any():
         lightest = float(system.model.mass[system.model.species][enthalpy.free].min())
         # in this step the limit of the force gives the lightest molecule a momentum of thermal size
@@ -346,7 +353,9 @@ def minimise(
         ).steps
     if overlap_steps:
         point = enthalpy.at(point.state)
-    descent, iterations, ended_by = _Descent(enthalpy), 0, ""
+    descent = _Descent(enthalpy)
+    iterations = 0
+    ended_by = ""
     while True:
         force, torque, deviation = enthalpy.largest(point)
         converged = (
@@ -361,9 +370,11 @@ def minimise(
         elif stop():
             ended_by = "interrupted"
         elif (lower := descent.step(point)) is not None:
-            point, iterations = lower, iterations + 1
+            point = lower
+            iterations = iterations + 1
             advanced(1)
-            largest, grown = system.scene.watch.volume, point.state.volume / start.state.volume
+            largest = system.scene.watch.volume
+            grown = point.state.volume / start.state.volume
             if point.state.volume < inf and largest and grown > largest:
                 raise SimulationError(
                     f"the box has grown to {grown:.3g} volumes of the start (watch.volume ="

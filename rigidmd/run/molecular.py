@@ -195,7 +195,9 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     def _remove_overlaps(self) -> None:
         """Compile the forces, and remove overlaps of a lattice."""
-        system, scene, first = self.system, self.scene, self.scene.stages[0]
+        system = self.system
+        scene = self.scene
+        first = self.scene.stages[0]
         for note in check_compiled_code(system, self.state):
             self.simulation._note(note)
         with user_errors_explained(system):
@@ -239,7 +241,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     def _compile_stage(self, k: int) -> None:
         """Compile what stage k runs, so that its computing time does not contain it."""
-        stage, state = self.scene.stages[k], self.state
+        stage = self.scene.stages[k]
+        state = self.state
         if stage.is_minimisation:
             precision = precision_of_minimisation(self.system, stage)
             enthalpy = Enthalpy(self.system, stage, state, precision)
@@ -265,7 +268,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     def restore(self, kept: Checkpoint) -> None:
         record = self.record
-        before, k = record.scene["stages"], record.position.segment
+        before = record.scene["stages"]
+        k = record.position.segment
         # integrators that were chosen stand in the scene of the folder
         decided = [
             then if now.is_auto else plain(chosen)
@@ -300,7 +304,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         self._compile_stage(k)
 
     def reenter_segment(self, k: int) -> Segment:
-        stage, step = self.scene.stages[k], self.scene.stages[k].step
+        stage = self.scene.stages[k]
+        step = self.scene.stages[k].step
         for force in self.system.python_forces.values():
             force.may_diverge = stage.is_hybrid
         if stage.is_minimisation:
@@ -316,7 +321,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         record = self.record
         record.moves[record.position.segment] = self.engine.moves or (0, 0)
         record.position.segment = k
-        was_auto, moves = self.scene.stages[k].is_auto, not self.scene.stages[k].is_minimisation
+        was_auto = self.scene.stages[k].is_auto
+        moves = not self.scene.stages[k].is_minimisation
         if self.scene.stages[k].volume:
             scale_to_mean_box(self.system, self.state, self.samples(), k)
         if was_auto:
@@ -401,7 +407,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             self.simulation._write_scene(self.simulation.folder)
 
     def is_replaced(self, moment: Moment) -> bool:
-        stages, k = self.scene.stages, moment.stage
+        stages = self.scene.stages
+        k = moment.stage
         if stages[k].is_minimisation and k not in self.record.minima:
             return True  # the start
         ended = moment.step == sum(stage.steps for stage in stages[: k + 1])
@@ -411,7 +418,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return ended and not ends_here and k + 1 < len(stages) and stages[k + 1].is_minimisation
 
     def is_finite(self) -> bool:
-        state, extent = self.state, self.engine.extent(self.state) or largest_values(self.state)
+        state = self.state
+        extent = self.engine.extent(self.state) or largest_values(self.state)
         return all(
             map(
                 isfinite,
@@ -457,7 +465,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         with interruptible(), user_errors_explained(self.system):
             if not self._is_sampled:
                 return observe(self.system, self.engine, self.state)
-            now, position = self.state, self.record.position
+            now = self.state
+            position = self.record.position
             moment = Moment(
                 self.simulation, int(now.step[NOW]), float(now.time[NOW]), position.segment
             )
@@ -470,14 +479,16 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return self.observe_now().force
 
     def default_observers(self) -> list[Observer]:
-        output, interval = self.scene.output, self.scene.output.log_interval_ps
+        output = self.scene.output
+        interval = self.scene.output.log_interval_ps
         check = checks.StepCheck(self.system, self.scene.watch)
         self._sampler, self._is_sampled = Sampler(self.simulation, interval, check), True
         # external engines check their steps themselves
         watch = [] if self.scene.engine.is_external else [StepWatch(self.simulation, check)]
         files: list[Observer] = []
         if output.trajectory:
-            velocities, wrapped = bool(output.velocities), output.positions == "wrapped"
+            velocities = bool(output.velocities)
+            wrapped = output.positions == "wrapped"
             files = [
                 Frames(
                     output.trajectory_interval_ps,
@@ -526,7 +537,9 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         yield "", self.state
         if (good := self._sampler.last_good) is None:
             return
-        first, system, method = int(good.step[NOW]), self.system, self.segment.method
+        first = int(good.step[NOW])
+        system = self.system
+        method = self.segment.method
         yield f"at step {first}, ", good
         steps = int(self.state.step[NOW]) - first
         short = 0 < steps * len(system.model.species) <= REPLAYED * checks.MOVES_PER_CHECK
@@ -550,7 +563,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     @property
     def headline(self) -> str:
-        system, asked = self.system, self.scene.threads or 0
+        system = self.system
+        asked = self.scene.threads or 0
         if asked > self.threads:
             hint = f" (the scene requests {asked}; this machine has no more)"
         else:
@@ -564,7 +578,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
     def _is_crystal(self) -> bool:
         """Whether the start is a crystal that only interactions of its molecules hold: from a CIF
         or a repeated cell, without fields and user-defined forces."""
-        scene, structure = self.scene, self.scene.structure
+        scene = self.scene
+        structure = self.scene.structure
         if (
             structure is None
             or not scene.box.periodic
@@ -593,7 +608,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             self.system, self._engine_of(moving[0] if moving else 0), self.state, energy_unit=1.0
         )
         forces = np.linalg.norm(observation.load.force, axis=1)
-        n, meaning = len(self.system.model.species), describe_quantities(self.system)
+        n = len(self.system.model.species)
+        meaning = describe_quantities(self.system)
         lattice_energy = observation.potential / size / n if self._is_crystal else None
         if lattice_energy is not None:
             meaning["lattice_energy"] = (

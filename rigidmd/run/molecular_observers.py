@@ -175,7 +175,8 @@ class StepWatch(Observer):
 
     def __init__(self, run: "Simulation", check: checks.StepCheck):
         self._run, self._check = run, check
-        interval, stages = run.scene.output.log_interval_ps, run.scene.stages
+        interval = run.scene.output.log_interval_ps
+        stages = run.scene.stages
         moving = [stage for stage in stages if not stage.is_minimisation]
         of_samples = [inf if stage.is_auto else interval / stage.step for stage in moving]
         every = checks.check_interval(run.system)

@@ -326,7 +326,8 @@ class Frames(GrowingFile[OpenTrajectory]):
         )
 
     def see(self, moment: Moment) -> None:
-        system, state = self._run.system, self._run._part.state
+        system = self._run.system
+        state = self._run._part.state
         if self._file is not None:
             self._file.write(state, moment.time, moment.step)
             self._frames.append(Frame(moment.time))

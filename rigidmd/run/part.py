@@ -167,14 +167,18 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
 
     def check_position(self) -> None:
         """Compare the position of a checkpoint with the scene and the state. Raises ValueError."""
-        position, state, count = self.record.position, self.state, len(self.durations())
+        position = self.record.position
+        state = self.state
+        count = len(self.durations())
         if position.segment >= count or len(position.computing) != position.segment:
             raise ValueError(f"it is of stage {position.segment} of {count}")
         first, time = 0, 0.0
         for before in map(self.reenter_segment, range(position.segment)):
-            first, time = first + before.steps, time + before.steps * before.dt
+            first = first + before.steps
+            time = time + before.steps * before.dt
         segment = self.reenter_segment(position.segment)
-        step, done = state.step.tolist(), int(state.step[NOW]) - first
+        step = state.step.tolist()
+        done = int(state.step[NOW]) - first
         if position.first != first or step[ORIGIN] != first or not 0 <= done <= segment.steps:
             raise ValueError(
                 f"step {step[NOW]} is not in a stage of {segment.steps} steps after"

@@ -60,7 +60,8 @@ class Record(Generic[SystemT]):
     @property
     def log(self: "Record[System]") -> samples.Samples:
         """The samples of a run of molecules. NaN in columns that log.csv does not have."""
-        names, unknown = self.system.more_columns, np.full(len(self.time), np.nan)
+        names = self.system.more_columns
+        unknown = np.full(len(self.time), np.nan)
         table = np.column_stack(
             [self.columns.get(name, unknown) for name in (*samples.NUMBERS, *names)]
         )
@@ -97,7 +98,8 @@ def read_record(folder: Path) -> Record:
     samples."""
     check_is_run(folder)
     scene = Scene.read(folder / SCENE)
-    summary, missing = read_json(folder / SUMMARY, Summary), []
+    summary = read_json(folder / SUMMARY, Summary)
+    missing = []
     resume = f"`rigidmd resume {shlex.quote(str(folder))}` continues it"
     if summary is None:
         ended = f"This run has not ended: there is no {SUMMARY}"
@@ -142,7 +144,9 @@ def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
 def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:
     """Index of the stage of each row. Stages with the same name are distinguished by their
     times."""
-    stage_of_row, first, end = np.full(len(names), len(stages) - 1), 0, 0.0
+    stage_of_row = np.full(len(names), len(stages) - 1)
+    first = 0
+    end = 0.0
     for k, stage in enumerate(stages[:-1]):
         end += stage.duration
         of_stage = (names[first:] == stage.label) & (time[first:] <= end + 0.5 * stage.step)

@@ -227,7 +227,8 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         accepted = stage["moves_accepted"] / stage["moves_tried"]
         rows.append(("box moves", f"{stage['moves_tried']}, {100 * accepted:.0f} % accepted"))
     if stage.get("acceptance_mean") is not None:
-        accepted, size = 100 * stage["acceptance_mean"], stage["abs_dH_kT_mean"]
+        accepted = 100 * stage["acceptance_mean"]
+        size = stage["abs_dH_kT_mean"]
         rows.append(("trajectories", f"{stage['trajectories']}, {accepted:.0f} % accepted"))
         balance = _with_error(stage["exp_minus_dH_mean"], stage["exp_minus_dH_error_mean"], 3)
         rows.append(

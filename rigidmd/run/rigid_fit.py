@@ -36,7 +36,8 @@ class RigidFit:
             raise OutputError("positions or velocities are not finite numbers")
         centre = np.empty((self._n, 3))
         Q = np.tile(np.eye(3), (self._n if self._rotates else 0, 1, 1))
-        velocity, L = np.empty((self._n, 3)), np.zeros((len(Q), 3))
+        velocity = np.empty((self._n, 3))
+        L = np.zeros((len(Q), 3))
         for kind in self._kinds:
             at = sites[kind.sites].astype(float)
             index = kind.index
@@ -57,7 +58,8 @@ class RigidFit:
             if self._rotates:
                 Q[index] = rotation
             if velocities is not None:
-                v, mass = velocities[kind.sites].astype(float), kind.molecule.masses
+                v = velocities[kind.sites].astype(float)
+                mass = kind.molecule.masses
                 mean = np.einsum("s,nsi->ni", mass, v) / kind.molecule.mass
                 velocity[index] = mean
                 if self._rotates:

@@ -166,7 +166,9 @@ def interruptible() -> Iterator[None]:
     if has_handler or threading.current_thread() is not threading.main_thread():
         yield
         return
-    pressed, again, ignored = False, [], sys.unraisablehook
+    pressed = False
+    again = []
+    ignored = sys.unraisablehook
 
     def interrupt(number: int) -> None:
         nonlocal pressed

@@ -157,7 +157,8 @@ def _table(stages: list[dict]) -> list[str]:
 def _stage_notes(stage: dict) -> list[str]:
     """Sentences on a stage that its numbers need."""
     notes = []
-    name, over = stage["name"], stage["means_over"] or ""
+    name = stage["name"]
+    over = stage["means_over"] or ""
     if stage["choice"]:
         notes.append(f"{name}: {stage['choice']}")
     if "," in over and "too short" not in over:

@@ -78,9 +78,12 @@ _BEGUN: "weakref.WeakSet[Simulation]" = weakref.WeakSet()
 
 def _as_warning(sentence: str) -> None:
     """Issue a Python warning that names the calling line outside this package."""
-    package, level, frame = str(Path(__file__).parent.parent), 1, sys._getframe()
+    package = str(Path(__file__).parent.parent)
+    level = 1
+    frame = sys._getframe()
     while frame is not None and frame.f_code.co_filename.startswith(package):
-        level, frame = level + 1, frame.f_back
+        level = level + 1
+        frame = frame.f_back
     warnings.warn(sentence, RigidMDWarning, stacklevel=level)
 
 
@@ -614,7 +617,8 @@ def run_together(
         k: error for k, future in enumerate(futures, 1) if (error := future.exception()) is not None
     }
     if failed:
-        error, which = next(iter(failed.values())), ", ".join(map(str, failed))
+        error = next(iter(failed.values()))
+        which = ", ".join(map(str, failed))
         error.add_note(
             f"of {len(futures)} runs at once these failed: {which}. This is the error of the first"
         )

@@ -94,7 +94,8 @@ def summarise(
         stable = record.stable[k] / FEMTOSECOND if k in record.stable else None
         choice = _choice(system, samples.of_stage(k), k, record.choices.get(k))
         stages.append(values | {"choice": choice, "stable_timestep_fs": stable})
-    removed, interval = None, system.removes_momentum_every
+    removed = None
+    interval = system.removes_momentum_every
     if interval is not None:
         removed = {
             "interval_ps": interval,
@@ -154,7 +155,8 @@ def _choice(system: System, samples: Samples, k: int, text: str | None) -> str |
     )
     if text is None or ENERGY_ERROR not in text or len(samples) < 2 or thermal == 0:
         return text
-    rms, time = float(np.sqrt(np.mean(samples["drift"] ** 2))) / thermal, samples["time"]
+    rms = float(np.sqrt(np.mean(samples["drift"] ** 2))) / thermal
+    time = samples["time"]
     return f"{text}. In the {time[-1] - time[0]:.4g} ps that ran it was {rms:.1e}"
 
 
@@ -219,7 +221,8 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     stage = system.scene.stages[k]
     freedom = system.freedom_in(k)
     level = float(temperature.mean())
-    line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
+    line = slope(time, drift)
+    thermal = BOLTZMANN / KJ_PER_MOL * level * freedom.total
     of_heat, uncertain = drift_of_thermostats(system, of_stage, k)
     allowed = _drift_limit(time[-1] - time[0]) * thermal
     if thermal > 0 and abs(line.value - of_heat) > allowed + STANDARD_ERRORS * hypot(
@@ -321,7 +324,8 @@ def drift_of_thermostats(system: System, of_stage: Samples, k: int) -> tuple[flo
     the mean (w dt)² of these motions, so that equal heats at both thermostats are not equal in it.
     See "Temperatures" in the theory chapter `errors`.
     """
-    stage, freedom = system.scene.stages[k], system.freedom_in(k)
+    stage = system.scene.stages[k]
+    freedom = system.freedom_in(k)
     if not (stage.has_thermostat and freedom.translation and freedom.rotation):
         return 0.0, 0.0
     if not THERMOSTATS[stage.thermostat_kind].by_motion:
@@ -374,12 +378,14 @@ def stage_summary(
 ) -> dict:
     """Values of one stage: means over its equilibrated part, and its drift since the last sample
     before it."""
-    of_stage, before = samples.of_stage(k), samples.of_stage(k - 1)
+    of_stage = samples.of_stage(k)
+    before = samples.of_stage(k - 1)
     first = before.row(-1) if len(before) else of_stage.row(0)
     stage = system.scene.stages[k]
     steady = equilibrated(of_stage, stage)
     begin = steady.row(0).time if len(steady) < len(of_stage) else first.time
-    n, steps = len(system.model.species), of_stage.row(-1).step - first.step
+    n = len(system.model.species)
+    steps = of_stage.row(-1).step - first.step
     speed = steps / computing if computing > 0 else None
     time, drift = of_stage["time"], of_stage["drift"]
     if len(before):
@@ -389,7 +395,8 @@ def stage_summary(
     temperatures = _means(steady, TEMPERATURES)
     potential = mean_and_error(steady["potential"] / n)
     pressure = mean_and_error(steady["pressure_bar"])
-    spread, duration = float(of_stage["kinetic"].std()), steps * stage.step
+    spread = float(of_stage["kinetic"].std())
+    duration = steps * stage.step
     thermal = (
         BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total
     )
@@ -442,7 +449,8 @@ def stage_summary(
         # standard deviation of the mean temperatures of such stages that start from states of a
         # canonical ensemble, see "Temperatures after a thermostat" in the theory chapter `errors`;
         # None if sampling hides it
-        level, freedom = steady["temperature"], system.freedom_in(k).total
+        level = steady["temperature"]
+        freedom = system.freedom_in(k).total
         square = 2 * level.mean() ** 2 / freedom - level.var() if freedom else 0.0
         values["temperature_scatter_K"] = sqrt(square) if square > 0 else None
     if stage.is_hybrid:

@@ -148,7 +148,8 @@ def body_trial_system(
         build_body(scene, applied)  # raises the error
     system = fits["velocity_verlet"]
     duration = min([span or run.duration_s, *system.breaks()])
-    engine, snapshots = system.engine(), [Snapshot(0.0, system.state)]
+    engine = system.engine()
+    snapshots = [Snapshot(0.0, system.state)]
     state = engine.begin(system.state, system.method)
     for step in range(0, COARSE_STEPS, COARSE_STEPS // COARSE_SAMPLES):
         engine.advance(

@@ -169,7 +169,8 @@ def measure_errors(
     engine, state, advance_to = begin_trial(system, trial)
     first = system.energy(engine, state)
     times, energies = [0.0], [0.0]
-    every, done = max(1, trial.steps // observations), 0
+    every = max(1, trial.steps // observations)
+    done = 0
     while done < trial.steps:
         now = min(every, trial.steps - done)
         try:

@@ -267,7 +267,8 @@ class Scene(Section, Displayed):
                 embedded_files or {}
             ):
                 continue
-            where, path = location_of(keys, text, overridden), folder / name
+            where = location_of(keys, text, overridden)
+            path = folder / name
             if not (embedded_files or is_within(key, overridden) or is_inside(path, folder)):
                 advice = f"move it there, or set it by {setting(key, 'PATH')}"
                 faults.append(

@@ -119,7 +119,8 @@ class Solid(Section):
         }
 
     def _errors(self):
-        expected, dimensions = set(SOLIDS[self.shape].dimensions), set(self.dimensions)
+        expected = set(SOLIDS[self.shape].dimensions)
+        dimensions = set(self.dimensions)
         if expected != dimensions:
             yield (
                 f"a {self.shape} has {' and '.join(sorted(expected))}, not"
@@ -221,8 +222,10 @@ class BodyTable(Section):
     def _errors(self):
         ways = [key for key in WAYS_OF_INERTIA if getattr(self, key)]
         parts = "".join(key for key in PARTS if getattr(self, key))
-        has_parts, has_centre = bool(parts), self.centre_of_mass_m is not None
-        about_pivot, has_mass = self.inertia_about == "pivot", self.mass_kg is not None
+        has_parts = bool(parts)
+        has_centre = self.centre_of_mass_m is not None
+        about_pivot = self.inertia_about == "pivot"
+        has_mass = self.mass_kg is not None
         faults = {
             f"give one of {', '.join(ways)}": len(ways) > 1,
             "mass_kg is missing": not (has_parts or has_mass),
@@ -239,7 +242,8 @@ class BodyTable(Section):
                 about_pivot and ways[:1] in (["solid"], ["solids"], ["points"])
             ),
         }
-        messages, tensor = [fault for fault, is_there in faults.items() if is_there], self.tensor
+        messages = [fault for fault, is_there in faults.items() if is_there]
+        tensor = self.tensor
         if messages or tensor is None or self.mass_kg is None:
             return messages
         if np.abs(tensor - tensor.T).max() > 1e-12 * np.abs(tensor).max():

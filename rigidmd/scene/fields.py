@@ -285,7 +285,8 @@ def field_notes(scene: "MolecularScene") -> list[str]:
 
 def field_errors(scene: "MolecularScene") -> Iterator[str]:
     """Messages on fields of a scene that contradict its other tables."""
-    fields, boxed = scene.fields, scene.box.periodic
+    fields = scene.fields
+    boxed = scene.box.periodic
     has_anchors = any(entry.between is None for entry in fields.restraints)
     held = has_anchors or any(species.frozen for species in scene.molecules)
     for k, walls in enumerate(fields.walls):

@@ -20,7 +20,8 @@ TABLES = {
 }
 MOST_LISTED = 8  # known keys in a message
 BOHR = 0.529177210903  # Å
-CELSIUS, ICE_POINT = ("C", "degC", "celsius"), 273.15
+CELSIUS = ("C", "degC", "celsius")
+ICE_POINT = 273.15
 #: By the unit of a key, the sizes of other units in it.
 OTHER_UNITS = {
     "ps": {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "µs": 1e6, "s": 1e12},
@@ -65,7 +66,8 @@ def hint_on_key(name: str, keys: list, value: object, model: type[BaseModel]) ->
     model
         The scene
     """
-    known, bare = known_keys(model, keys), UNIT.sub("", name)
+    known = known_keys(model, keys)
+    bare = UNIT.sub("", name)
     is_start = any(re.fullmatch(f"{re.escape(name)}_[a-zA-Z0-9_]+", key) for key in known)
     if converted := _other_unit(name, value, known):
         return converted
@@ -140,7 +142,8 @@ def _similarity(name: str, key: str) -> float:
 def _foreign(name: str, model: type[BaseModel]) -> str:
     """What a scene has for a setting of another program. Empty for other names."""
     for table, entries in tomllib.loads(FOREIGN_KEYS.read_text(encoding="utf-8")).items():
-        section, path = model.model_fields.get(table), [] if table == "scene" else [table]
+        section = model.model_fields.get(table)
+        path = [] if table == "scene" else [table]
         for key, text in entries.items():
             names, _, note = text.partition(": ")
             if plain_letters(name) not in map(plain_letters, names.split()):

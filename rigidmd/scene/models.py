@@ -348,7 +348,8 @@ def molecule(
 def with_masses(original: Molecule, masses: dict[str, float]) -> Molecule:
     """The same molecule with other masses (u) of isotopes, by site name or else element. Raises
     MoleculeError."""
-    faults, changed = [], {}
+    faults = []
+    changed = {}
     for key, mass in masses.items():
         sites = [i for i, name in enumerate(original.site_names) if name == key]
         sites = sites or [i for i, element in enumerate(original.elements) if element == key]

@@ -466,7 +466,8 @@ class MolecularScene(Scene):
     def rounded_times(self, stages: Sequence[int] | None = None) -> list[str]:
         """Notes on intervals and durations that are not a whole number of steps, of all stages or
         these."""
-        output, stages_of = self.output, {}
+        output = self.output
+        stages_of = {}
         of_run = [
             ("output.log_interval_ps", output.log_interval_ps),
             ("output.trajectory_interval_ps", output.trajectory and output.trajectory_interval_ps),
@@ -504,7 +505,8 @@ class MolecularScene(Scene):
         kind = Path(self.output.trajectory or "").suffix
         if not kind or not BY_EXTENSION[kind].even:
             return
-        interval, other = self.output.trajectory_interval_ps, f"use {Path(TRAJECTORY).suffix}"
+        interval = self.output.trajectory_interval_ps
+        other = f"use {Path(TRAJECTORY).suffix}"
         for k, stage in enumerate(self.stages):
             if stage.is_minimisation:
                 continue

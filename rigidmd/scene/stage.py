@@ -287,7 +287,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             yield f"pressure_bar: a tensor needs pressure_coupling = 'flexible', not {coupling!r}"
 
     def _barostat_errors(self):
-        name, kind = self.barostat_kind, BAROSTATS[self.barostat_kind]
+        name = self.barostat_kind
+        kind = BAROSTATS[self.barostat_kind]
         others = [
             other
             for other in BAROSTATS

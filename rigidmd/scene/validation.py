@@ -225,7 +225,8 @@ def _as_number(text: str, keys: list) -> str:
     match = WITH_UNIT.fullmatch(text)
     if not match:
         return ""
-    number, unit = float(match[1]), match[2]
+    number = float(match[1])
+    unit = match[2]
     if not unit:
         return f"{ADVICE}{match[1]} without quotes"
     key = KEY_WITH_UNIT.fullmatch(

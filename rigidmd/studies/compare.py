@@ -20,7 +20,8 @@ from rigidmd.run.resume import MADE_WITH, differences, keys_of
 
 #: Columns by which samples are matched: steps if they have the same times in both files, else
 #: times.
-STEP, TIMES = "Step", ("Time (ps)", "time")
+STEP = "Step"
+TIMES = ("Time (ps)", "time")
 Content = TypeVar("Content")
 BITS = 53  # bits of the significand of a float64
 
@@ -94,9 +95,11 @@ def compare(first: Path, second: Path) -> RunComparison:
         contents = []
         for path in (first / name, second / name):
             try:
-                content, why = read(path), f"{path} does not exist"
+                content = read(path)
+                why = f"{path} does not exist"
             except RigidMDError as error:
-                content, why = None, str(error)
+                content = None
+                why = str(error)
             if content is None:
                 found.missing.append(why)
             else:
@@ -233,7 +236,8 @@ def describe_run_comparison(found: RunComparison) -> str:
         rows.append((FINAL, ["the same to the last bit"]))
     rows += [("missing", [text]) for text in found.missing]
     cells = [("", "" if k else name, text) for name, texts in rows for k, text in enumerate(texts)]
-    verdict, samples = "the runs are not the same", found.samples
+    verdict = "the runs are not the same"
+    samples = found.samples
     if found.same:
         verdict = "the runs are the same to the last bit"
     elif samples is not None and samples.at is not None:

@@ -91,14 +91,17 @@ def _fit(
     size = np.linalg.norm(design, axis=0)
     inverse = np.linalg.pinv(design / size) / size[:, None]
     found = inverse @ (value / error)
-    chi2, freedom = float(((value / error - design @ found) ** 2).sum()), len(points) - len(columns)
+    chi2 = float(((value / error - design @ found) ** 2).sum())
+    freedom = len(points) - len(columns)
     errors = np.linalg.norm(inverse, axis=1)
     if exact is None:
         limit, limit_error = float(found[0]), float(errors[0])
         weights = dict(zip(points, (inverse[0] / error).tolist(), strict=True))
         found, errors = found[1:], errors[1:]
     else:
-        limit, limit_error, weights = exact, 0.0, {}
+        limit = exact
+        limit_error = 0.0
+        weights = {}
     slopes = {name: (float(b), float(e)) for name, b, e in zip(methods, found, errors, strict=True)}
     return BiasFit(limit, limit_error, slopes, weights, longest, order, chi2, freedom)
 
@@ -139,7 +142,8 @@ def means_of_runs(
     steps = {step: _at_step(runs.get(step, ()), together.get(step)) for step in names}
     known = all(at.variance is not None for at in steps.values())
     variances = [(at.variance if known else None) or 1.0 for at in steps.values()]
-    freedom, factor = sum(at.runs - 1 for at in steps.values()), 1.0
+    freedom = sum(at.runs - 1 for at in steps.values())
+    factor = 1.0
     if freedom >= LEAST_FREEDOM or (not known and together.keys() >= steps.keys()):
         squares = sum(
             at.squares / variance for at, variance in zip(steps.values(), variances, strict=True)

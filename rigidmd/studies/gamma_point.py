@@ -39,13 +39,15 @@ def periodic_basis(system: System, state: State, index: np.ndarray) -> np.ndarra
     Raises SceneError without a repeated cell, SimulationError if the crystal lacks the period of
     the unit cell.
     """
-    n, rotates = len(state.position), len(state.rotation) > 0
+    n = len(state.position)
+    rotates = len(state.rotation) > 0
     groups = _translated_copies(system, state)
     place = np.full(6 * n, -1)
     place[index] = np.arange(len(index))
     columns = []
     for group in groups:
-        first, moments = group[0], system.model.inverse_inertia[system.model.species[group[0]]]
+        first = group[0]
+        moments = system.model.inverse_inertia[system.model.species[group[0]]]
         root = np.where(moments > 0, 1 / np.sqrt(np.where(moments > 0, moments, 1.0)), 0.0)
         for k in range(3):
             if place[3 * first + k] >= 0:
@@ -72,7 +74,9 @@ def _translated_copies(system: System, state: State) -> list[np.ndarray]:
     repeat = np.array(cells_of(system))
     in_cells = state.position @ np.linalg.inv(state.cell) * repeat
     unit_cell = state.cell / repeat[:, None]
-    left, groups, species = np.arange(len(in_cells)), [], system.model.species
+    left = np.arange(len(in_cells))
+    groups = []
+    species = system.model.species
     while len(left):
         apart = in_cells[left] - in_cells[left[0]]
         off = np.linalg.norm((apart - np.round(apart)) @ unit_cell, axis=1)

@@ -227,7 +227,8 @@ def _responses(
     has_barostat: bool,
 ) -> dict[str, float]:
     """Response functions from fluctuations, with the part of the momenta as it is in theory."""
-    thermal, momenta = at.thermal_energy, 0.5 * GAS_CONSTANT * (3 * at.moving + at.rotation)
+    thermal = at.thermal_energy
+    momenta = 0.5 * GAS_CONSTANT * (3 * at.moving + at.rotation)
     of_enthalpy = at.count * with_enthalpy.potential + at.pressure * with_enthalpy.volume
     capacity = 1e3 * (momenta + of_enthalpy / thermal / at.temperature) / at.moving
     if not has_barostat:
@@ -331,7 +332,8 @@ class _Step(NamedTuple):
 
     def whitened(self) -> tuple[np.ndarray, np.ndarray]:
         """Design and values, for limits and slopes as unknowns, with errors of 1."""
-        unit, zero = np.eye(self.size), np.zeros((self.size, self.size))
+        unit = np.eye(self.size)
+        zero = np.zeros((self.size, self.size))
         rest = np.zeros((len(self.points) % 2, 2 * self.size))
         design = np.block([[unit, self.step**2 * unit], [zero, unit]])
         errors = np.array([point.error for point in self.points])
@@ -360,7 +362,8 @@ def _fit_steps(steps: Sequence[_Step]) -> list[BiasFit]:
     design, value = np.vstack(designs), np.concatenate(values)
     scale = np.linalg.norm(design, axis=0)
     inverse = np.linalg.pinv(design / scale) / scale[:, None]
-    found, errors = inverse @ value, np.linalg.norm(inverse, axis=1)
+    found = inverse @ value
+    errors = np.linalg.norm(inverse, axis=1)
     chi2 = float(((value - design @ found) ** 2).sum())
     size, longest = steps[0].size, steps[-1].step
     numbers = [*zip(found.tolist(), errors.tolist(), strict=True)]

@@ -82,7 +82,8 @@ class Coordinates:
     def __init__(self, system: System, state: State):
         self.system = system
         self.enthalpy, self.state = Enthalpy(system, Stage(ensemble="minimise"), state), state
-        model, species = system.model, system.model.species
+        model = system.model
+        species = system.model.species
         rotations = (
             np.sqrt(model.inverse_inertia[species[: len(state.rotation)]]) * self.enthalpy.arm
         )
@@ -156,7 +157,8 @@ class NormalModes:
         only some of the modes."""
         if len(self.rate) < len(self.coordinates.index):
             raise ValueError("a sum over all modes needs all of them: leave out count and gamma")
-        quanta, thermal = HBAR * self.rate[self.rate > 0], BOLTZMANN * temperature
+        quanta = HBAR * self.rate[self.rate > 0]
+        thermal = BOLTZMANN * temperature
         with np.errstate(divide="ignore"):
             x = quanta / thermal
         terms = quanta / 2 + thermal * np.log(-np.expm1(-x)) if quantum else thermal * np.log(x)
@@ -260,7 +262,9 @@ def normal_modes(
             simulation.scene.source, [f"mode {required} will not be computed: {among}"]
         )
     sizes = _find_minimum(system, state, minimise)
-    c, charges, cells = Coordinates(system, state), system.of_sites(lambda m: m.charges), 0
+    c = Coordinates(system, state)
+    charges = system.of_sites(lambda m: m.charges)
+    cells = 0
     if gamma:
         cells = prod(cells_of(system))
         square, vector, error = _periodic_modes(c, periodic_basis(system, state, c.index), progress)
@@ -276,7 +280,8 @@ def normal_modes(
     signed = np.where(
         np.abs(square) > ZERO * square[-1], np.sign(square) * np.sqrt(np.abs(square)), np.nan
     )
-    rate, weight = np.nan_to_num(signed), np.zeros((len(state.position), len(square)))
+    rate = np.nan_to_num(signed)
+    weight = np.zeros((len(state.position), len(square)))
     np.add.at(weight, c.index // 3 % len(weight), vector.T**2)
     slopes = np.array(
         [c.slope(q, lambda state: charges @ system.site_positions(state)) for q in vector]
@@ -303,7 +308,9 @@ def normal_modes(
 
 def _numbers(c: Coordinates, count: int | None, gamma: bool) -> np.ndarray:
     """The numbers (k,) of the modes to compute. Raises SceneError."""
-    d, fixed, scene = len(c.index), len(c.translations), c.system.scene
+    d = len(c.index)
+    fixed = len(c.translations)
+    scene = c.system.scene
     if gamma:
         if count is not None:
             raise SceneError(
@@ -330,11 +337,9 @@ def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, 
     torque (kJ/mol, Å), and why the minimisation stopped before the rounding of forces, if it
     did."""
     loose = Stage(ensemble="minimise")
-    enthalpy, keys, ended = (
-        Enthalpy(system, loose, state),
-        ("force_limit_kJ_mol_A", "torque_limit_kJ_mol"),
-        "",
-    )
+    enthalpy = Enthalpy(system, loose, state)
+    keys = ("force_limit_kJ_mol_A", "torque_limit_kJ_mol")
+    ended = ""
     if minimise:
         find_minimum(system, state, loose)
     stiff = _stiffness(enthalpy, system, state)
@@ -407,7 +412,8 @@ def _periodic_modes(
 def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The same of uniform translations and of the lowest and highest modes, by Lanczos. Errors by
     residuals."""
-    shape, size = (len(c.index),) * 2, min(len(c.index), max(2 * count + 1, KRYLOV))
+    shape = (len(c.index),) * 2
+    size = min(len(c.index), max(2 * count + 1, KRYLOV))
     start = c.relative(np.random.default_rng(0).standard_normal(len(c.index)))
 
     def largest(product: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
@@ -451,28 +457,25 @@ def write_animation(folder: Path, modes: NormalModes, number: int) -> None:
     for `view`."""
     from rigidmd.io.trajectory_file import open_trajectory, write_topology
 
-    c, system, scene, output = (
-        modes.coordinates,
-        modes.system,
-        modes.system.scene,
-        modes.system.scene.output,
-    )
+    c = modes.coordinates
+    system = modes.system
+    scene = modes.system.scene
+    output = modes.system.scene.output
     if not modes.is_vibration(number):
         raise SceneError(
             scene.source,
             [f"mode {number} is not a vibration that was computed, and has no animation"],
         )
     k = int(np.flatnonzero(modes.number == number)[0])
-    period, q = (
-        2 * pi / abs(modes.rate[k]),
-        AMPLITUDE / np.abs(c.scale * modes.vector[k]).max() * modes.vector[k],
-    )
+    period = 2 * pi / abs(modes.rate[k])
+    q = AMPLITUDE / np.abs(c.scale * modes.vector[k]).max() * modes.vector[k]
     write_scene(folder, scene)
     write_topology(folder / output.topology, system, c.state, False)
     log = Log(folder / LOG, False, None, tuple(system.user_terms))
     frames = open_trajectory(folder / str(output.trajectory), system, period / FRAMES, False, False)
     for step in range(PERIODS * FRAMES + 1):
-        state, time = c.at(np.cos(2 * pi * step / FRAMES) * q), period * step / FRAMES
+        state = c.at(np.cos(2 * pi * step / FRAMES) * q)
+        time = period * step / FRAMES
         state.velocity[:], state.angular_momentum_body[:], state.time[NOW], state.step[NOW] = (
             0,
             0,

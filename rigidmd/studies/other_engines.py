@@ -172,7 +172,8 @@ def verify(scene: Scene) -> Verification:
 def _short_run(system: System, state: State, other: ExternalEngine) -> list[Comparison]:
     """Compare the largest moves of sites on both engines from a state on, and the difference of
     their positions."""
-    rotor, span = other.rotor(system.model), STEPS * STEP * FEMTOSECOND
+    rotor = other.rotor(system.model)
+    span = STEPS * STEP * FEMTOSECOND
     here = (
         replace(system, model=system.model._replace(rotor=rotor)) if rotor is not None else system
     )
@@ -180,10 +181,12 @@ def _short_run(system: System, state: State, other: ExternalEngine) -> list[Comp
     if (
         rotor is not None
     ):  # both rotate bodies by the same composition of rotations: every step is the same
-        ends, step_error = [_sites_after(system, engine, state, STEPS) for engine in engines], 0.0
+        ends = [_sites_after(system, engine, state, STEPS) for engine in engines]
+        step_error = 0.0
     else:
         found = [_extrapolated(system, engine, state) for engine in engines]
-        ends, step_error = [end for end, _ in found], sum(error for _, error in found)
+        ends = [end for end, _ in found]
+        step_error = sum(error for _, error in found)
     difference = float(np.abs(ends[0] - ends[1]).max())
     moves = [float(np.abs(end - system.site_positions(state)).max()) for end in ends]
     worst = 0.0  # displacement (Å) of a site by an error of a force, per u Å/ps² and ps²/2
@@ -199,7 +202,8 @@ def _short_run(system: System, state: State, other: ExternalEngine) -> list[Comp
 
 def _sites_after(system: System, engine: Engine, state: State, steps: int) -> np.ndarray:
     """Site positions (s, 3) after the span of the short run, in this number of steps."""
-    scheme, dt = SCHEMES["velocity_verlet"], STEPS * STEP * FEMTOSECOND / steps
+    scheme = SCHEMES["velocity_verlet"]
+    dt = STEPS * STEP * FEMTOSECOND / steps
     moved = engine.begin(state, scheme)
     moved.begin_segment(0.0)
     engine.forget()
@@ -214,5 +218,6 @@ def _extrapolated(system: System, engine: Engine, state: State) -> tuple[np.ndar
     change = 0.0
     for order in range(1, HALVINGS):
         new = [b + (b - a) / (4**order - 1) for a, b in pairwise(table)]
-        change, table = float(np.abs(new[-1] - table[-1]).max()), new
+        change = float(np.abs(new[-1] - table[-1]).max())
+        table = new
     return table[0], change

@@ -75,7 +75,8 @@ def _results_of(record: Record) -> Results:
 def _state_of(record: Record) -> tuple[State | None, str]:
     """The final state of a run, or the state of its last checkpoint. If there is none, None and
     why."""
-    path, start = record.folder / FINAL, record.system.state
+    path = record.folder / FINAL
+    start = record.system.state
     try:
         if record.summary is not None and path.is_file():
             found = read_state(path).state

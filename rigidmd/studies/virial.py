@@ -30,7 +30,10 @@ from rigidmd.units import AVOGADRO, BOLTZMANN
 NEAREST, FARTHEST, FAR = 0.1, 1e5, 10.0
 #: Randomised sets of samples, whose scatter gives the error; samples in each, at first, at once
 #: and at most. Each has the rotations of a tetrahedron.
-SETS, FEWEST, AT_ONCE, MOST = 16, 2**9, 2**12, 2**18
+SETS = 16
+FEWEST = 2**9
+AT_ONCE = 2**12
+MOST = 2**18
 #: Intervals of each variable, their adaptations to the integrand, and the fraction of even samples.
 BINS, ADAPTATIONS, EVEN = 64, 4, 0.2
 #: Default error, relative to the larger of |B2| and |T dB2/dT|.
@@ -168,12 +171,15 @@ def integrate(
     """The coefficient of an energy, see `second_virial`. points : without orientations"""
     thermal = BOLTZMANN * np.asarray(temperatures, float)
     if points:
-        values, samples = _integral_of_points(energy, thermal), 1
+        values = _integral_of_points(energy, thermal)
+        samples = 1
         return _result(species, thermal, values, POINT_ERROR * np.abs(values), samples)
-    edges, samples = _adapted_edges(energy, thermal, seed + SETS), FEWEST
+    edges = _adapted_edges(energy, thermal, seed + SETS)
+    samples = FEWEST
     while True:
         sets = [_integral(energy, thermal, edges, samples, seed + k) for k in range(SETS)]
-        values, errors = np.mean(sets, axis=0), error_of_mean(sets)
+        values = np.mean(sets, axis=0)
+        errors = error_of_mean(sets)
         scale = np.abs(values).max(axis=0)
         requested = RELATIVE_ERROR * scale if error is None else np.full(len(scale), error)
         excess = float((errors[0] / requested).max())
@@ -268,7 +274,8 @@ def _adapted_edges(energy: Energy, thermal: np.ndarray, seed: int) -> np.ndarray
     """Edges (6, bins + 1) of variable intervals with equal numbers of samples, narrow where the
     integrand is large (Lepage 1978, J. Comput. Phys. 27, 192)."""
     even = np.linspace(0, 1, BINS + 1)
-    edges, points = np.tile(even, (6, 1)), _points(seed)
+    edges = np.tile(even, (6, 1))
+    points = _points(seed)
     for _ in range(ADAPTATIONS):
         u = points.random(AT_ONCE)
         size = np.abs(_samples(energy, thermal, edges, u))
@@ -286,7 +293,8 @@ def _integral(
     energy: Energy, thermal: np.ndarray, edges: np.ndarray, samples: int, seed: int
 ) -> np.ndarray:
     """The integrals (2, t) by randomised Sobol points."""
-    points, total = _points(seed), 0.0
+    points = _points(seed)
+    total = 0.0
     for begin in range(0, samples, AT_ONCE):
         u = points.random(min(AT_ONCE, samples - begin))
         total = total + _samples(energy, thermal, edges, u).sum(axis=2)
@@ -312,7 +320,9 @@ def _orientations(r: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Positions (12 m, 3) of the second molecule at distances (m,), and its rotations (12 m, 3, 3),
     from random numbers (m, 5)."""
     z, angle, one, other = 2 * u[:, 0] - 1, *(2 * pi * u[:, 1:4].T)
-    across, a, b = np.sqrt(1 - z**2), np.sqrt(1 - u[:, 4]), np.sqrt(u[:, 4])
+    across = np.sqrt(1 - z**2)
+    a = np.sqrt(1 - u[:, 4])
+    b = np.sqrt(u[:, 4])
     direction = np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
     quaternion = np.stack([a * np.sin(one), a * np.cos(one), b * np.sin(other), b * np.cos(other)])
     rotation = from_quaternion(quaternion.T)
@@ -337,7 +347,8 @@ def _guest_of(
         source=SOURCE,
     )
     system = build(scene.with_user_code(forces), user_code=False)
-    rotates, count = len(system.state.rotation) > 0, len(species)
+    rotates = len(system.state.rotation) > 0
+    count = len(species)
     rotation = np.tile(np.eye(3), (count, 1, 1)) if rotates else None
     state = state_of(position=np.zeros((count, 3)), rotation=rotation)
     return Guest(system, models[1], temperature, np.arange(count) == 0), state

@@ -31,14 +31,19 @@ if TYPE_CHECKING:
 EXTENSIONS = (".mp4", ".gif")
 #: Frames per second, length in seconds, and height in pixels of an animation; inches of its
 #: picture. A frame of a .gif lasts a whole number of hundredths of a second.
-RATE, SECONDS, HEIGHT = {".mp4": 25, ".gif": 12.5}, 10.0, {".mp4": 640, ".gif": 300}
+RATE = {".mp4": 25, ".gif": 12.5}
+SECONDS = 10.0
+HEIGHT = {".mp4": 640, ".gif": 300}
 INCHES = 5.0
 #: Most panels next to an animation, size of its name and clock, colour of the cursor of panels.
-PANELS, FONT, CURSOR = 3, 13, tuple(bytes.fromhex(WARM[1:]))
+PANELS = 3
+FONT = 13
+CURSOR = tuple(bytes.fromhex(WARM[1:]))
 #: Most frames of molecules that are read.
 MOST_FRAMES = 2000
 #: Most bytes of a .gif of the default height, which otherwise has every second or third frame only.
-GIF_BYTES, GIF_STEPS = 500_000, (1, 2, 3)
+GIF_BYTES = 500_000
+GIF_STEPS = (1, 2, 3)
 #: Colours of a .gif besides those of curves, the same in all frames, so that what is at rest is
 #: stored once.
 GIF_COLORS = 40

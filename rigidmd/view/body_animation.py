@@ -68,7 +68,9 @@ class BodyAnimation:
 
     def __init__(self, record: Record):
         self._record = record
-        system, columns, count = record.system, record.columns, len(record.time)
+        system = record.system
+        columns = record.columns
+        count = len(record.time)
         stride = -(-count // MOST_SAMPLES)
         rows = np.arange(0, count, stride)
         self.time, self.notes = record.time[rows], []
@@ -89,7 +91,8 @@ class BodyAnimation:
         middle = (position.max(0) + position.min(0)) / 2
         extent = float(np.linalg.norm(position - middle, axis=1).max())
         moves = extent > FIXED_FRACTION * (mesh.reach if turns else 0.0)
-        radius, enlarged = SPHERE * mesh.reach, 1.0
+        radius = SPHERE * mesh.reach
+        enlarged = 1.0
         if moves:
             enlarged = MIN_BODY_FRACTION * extent / mesh.reach
             enlarged = max(1.0, enlarged) if turns else enlarged

@@ -19,7 +19,8 @@ CIRCLE_CORNERS, MIN_THICKNESS = 24, 0.02
 LONGEST_FACE = 0.15
 #: Edges of a cuboid in half axes of the ellipsoid of the same inertia; thickness of a stem in its
 #: length.
-CUBOID_EDGES, STEM_THICKNESS = (12 / 5) ** 0.5, 0.06
+CUBOID_EDGES = (12 / 5) ** 0.5
+STEM_THICKNESS = 0.06
 EQUAL = "of the same mass and inertia"
 
 
@@ -41,7 +42,8 @@ class Mesh(NamedTuple):
 def mesh_of(system: BodySystem) -> Mesh:
     """The surface of a body: as the scene requests, its solids, its points joined, or a body of
     equal inertia."""
-    table, scene = system.scene.body, system.scene
+    table = system.scene.body
+    scene = system.scene
     mass, _, centre, _, _ = inertia_of(scene)
     wanted = scene.output.drawn_as
     if wanted is None and table.points is not None:
@@ -77,9 +79,13 @@ def mesh_of(system: BodySystem) -> Mesh:
         return _top_mesh(mass, moments, axes, symmetric, centre, table.pinned)
     # half axes of the ellipsoid
     lengths = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))
-    lengths, unit, shape = np.maximum(lengths, MIN_THICKNESS * lengths.max()), BALL, "ellipsoid"
+    lengths = np.maximum(lengths, MIN_THICKNESS * lengths.max())
+    unit = BALL
+    shape = "ellipsoid"
     if wanted != "ellipsoid":
-        lengths, unit, shape = CUBOID_EDGES * lengths, CUBOID, "cuboid"
+        lengths = CUBOID_EDGES * lengths
+        unit = CUBOID
+        shape = "cuboid"
     return unit._replace(
         vertices=(unit.vertices * lengths) @ axes.T + centre, about=f"the {shape} {EQUAL}"
     )
@@ -111,9 +117,11 @@ def _top_mesh(
     A cylinder has m r²/2 about its axis and m (3 r² + h²)/12 about the others: there is one for any
     two moments.
     """
-    along, across = moments[symmetric], moments[symmetric - 1]
+    along = moments[symmetric]
+    across = moments[symmetric - 1]
     far = float(np.linalg.norm(centre))
-    axis, right = axes[:, symmetric], axes[:, symmetric - 2]
+    axis = axes[:, symmetric]
+    right = axes[:, symmetric - 2]
     is_ball = bool(np.ptp(moments) <= EQUAL_MOMENTS * moments.max())
     if is_ball and far:
         right, _, axis = camera(centre, np.eye(3)[np.abs(centre).argmin()])
@@ -121,15 +129,11 @@ def _top_mesh(
         axis = -axis
     if is_ball:
         radius = float(np.sqrt(2.5 * along / mass))
-        half, rings = (
-            radius,
-            [(radius * np.sin(a), radius * np.cos(a)) for a in np.linspace(np.pi, 0, 13)],
-        )
+        half = radius
+        rings = [(radius * np.sin(a), radius * np.cos(a)) for a in np.linspace(np.pi, 0, 13)]
     else:
-        radius, height = (
-            float(np.sqrt(2 * along / mass)),
-            float(np.sqrt(max(12 * across - 6 * along, 0.0) / mass)),
-        )
+        radius = float(np.sqrt(2 * along / mass))
+        height = float(np.sqrt(max(12 * across - 6 * along, 0.0) / mass))
         radius, half = (
             max(radius, MIN_THICKNESS * height),
             max(height, MIN_THICKNESS * 2 * radius) / 2,
@@ -173,7 +177,9 @@ def _points_mesh(positions: np.ndarray, masses: np.ndarray) -> Mesh:
 
 def _joined(parts: list[Mesh], about: str) -> Mesh:
     """Several surfaces as one."""
-    faces, painted, start = [], [], 0
+    faces = []
+    painted = []
+    start = 0
     for part in parts:
         faces += [[start + corner for corner in face] for face in part.faces]
         painted += part.painted
@@ -185,7 +191,9 @@ def _cut(mesh: Mesh) -> Mesh:
     """The same surface with long faces of four corners in pieces. Faces are drawn from the furthest
     to the nearest, which is right where solids meet only if they are short."""
     longest = LONGEST_FACE * mesh.reach
-    vertices, faces, painted = [*mesh.vertices], [], []
+    vertices = [*mesh.vertices]
+    faces = []
+    painted = []
     for face, color in zip(mesh.faces, mesh.painted, strict=True):
         corners = mesh.vertices[face]
         sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
@@ -198,7 +206,8 @@ def _cut(mesh: Mesh) -> Mesh:
             np.linspace(0, 1, along + 1), np.linspace(0, 1, across + 1), indexing="ij"
         )
         weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=-1)
-        first, row = len(vertices), across + 1
+        first = len(vertices)
+        row = across + 1
         vertices += [*(weights @ corners).reshape(-1, 3)]
         for i, j in product(range(along), range(across)):
             corner = first + row * i + j
@@ -210,7 +219,8 @@ def _cut(mesh: Mesh) -> Mesh:
 def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:
     """A solid of revolution about axis 3 from circles (radius, z), from below. A quarter of its
     side is painted. A `closed` one is a ring, without discs at its ends."""
-    n, corner = CIRCLE_CORNERS, np.arange(CIRCLE_CORNERS)
+    n = CIRCLE_CORNERS
+    corner = np.arange(CIRCLE_CORNERS)
     angle = 2 * np.pi * corner / n
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     vertices = np.concatenate([np.column_stack([r * circle, np.full(n, z)]) for r, z in rings])
@@ -221,7 +231,8 @@ def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:
     painted = (corner < n // 4).tolist() * (len(rings) - 1)
     for k, order in ((0, -1), (len(rings) - 1, 1)):
         if rings[k][0] > 0 and not closed:
-            ends, middle = list(range(k * n, (k + 1) * n)), len(vertices)
+            ends = list(range(k * n, (k + 1) * n))
+            middle = len(vertices)
             vertices = np.vstack([vertices, [0.0, 0.0, rings[k][1]]])
             faces += [
                 [middle, *ends[: n // 4 + 1]][::order],

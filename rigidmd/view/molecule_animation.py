@@ -34,7 +34,8 @@ MAX_DEVIATION = 0.05
 #: Largest 16-bit number.
 LARGEST_INTEGER = 32_767
 #: Direction of the eye; fraction of white in the atoms that are furthest away.
-EYE, HAZE = np.array([0.45, -1.0, 0.33]), 0.5
+EYE = np.array([0.45, -1.0, 0.33])
+HAZE = 0.5
 #: Lengths of the scale, Å.
 SCALES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1)
 USAGE = (
@@ -61,7 +62,8 @@ def chemiscope_script() -> str:
 def frames_of(record: Record, max_frames: int) -> Frames:
     """Trajectory frames of a run of molecules, each molecule whole and inside the box. Raises
     OutputError if distances within molecules are not as in the molecules of this run."""
-    path, sites = record.trajectory, record.system.sites
+    path = record.trajectory
+    sites = record.system.sites
     frames = read_frames(path, len(sites.molecule), max_frames)
     pairs = np.flatnonzero(sites.molecule[1:] == sites.molecule[:-1])
     expected, actual = (
@@ -79,7 +81,8 @@ def inside(frames: Frames, sites: Sites) -> Frames:
     """The frames with the centre of each molecule inside the box. Molecules stay whole."""
     if frames.cells is None:
         return frames
-    count, columns = np.bincount(sites.molecule), np.swapaxes(frames.cells, 1, 2)
+    count = np.bincount(sites.molecule)
+    columns = np.swapaxes(frames.cells, 1, 2)
     centres = np.array(
         [[np.bincount(sites.molecule, x) / count for x in frame.T] for frame in frames.positions]
     )
@@ -167,9 +170,13 @@ class MoleculeAnimation:
 
     def page_part(self) -> PagePart:
         """The animation by chemiscope. Raises OutputError."""
-        code, frames, molecules = chemiscope_script(), self._frames, self._record.system
-        positions, elements = frames.positions[:, self._shown], self._elements
-        bonds, solids = massive_bonds(molecules), None
+        code = chemiscope_script()
+        frames = self._frames
+        molecules = self._record.system
+        positions = frames.positions[:, self._shown]
+        elements = self._elements
+        bonds = massive_bonds(molecules)
+        solids = None
         if self._solids is not None:
             poses = [
                 self._solids.poses(self._fit.bodies(frame, None)) for frame in frames.positions
@@ -183,7 +190,8 @@ class MoleculeAnimation:
                 "orientation": np.round(LARGEST_INTEGER * quaternion).astype("<i2"),
                 "color": np.round(255 * colors).astype("u1"),
             }
-            elements, bonds = ["X"] * positions.shape[1], []
+            elements = ["X"] * positions.shape[1]
+            bonds = []
         elif len(self._shown) < len(molecules.sites.mass):
             self.notes.append("Sites without mass are not drawn.")
         low, high = positions.min(), positions.max()

@@ -145,7 +145,8 @@ EYE = np.array([-0.4, 0.34, 0.85])
 INCHES, FONT = 7.0, 9.0
 #: Gaps between a sphere and its label in half widths, and steps of 22.5° from outward, by
 #: preference.
-GAPS, STEPS = (0.02, 0.08, 0.16, 0.26, 0.38, 0.52), sorted(range(-7, 9), key=abs)
+GAPS = (0.02, 0.08, 0.16, 0.26, 0.38, 0.52)
+STEPS = sorted(range(-7, 9), key=abs)
 
 
 def color_of(element: str) -> np.ndarray:
@@ -186,7 +187,8 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     _labels(view, m, radius, taken)
     length = 1.0 if half > 1.6 else 0.5
     view.scale(length, f"{length:g} Å")
-    title, plain = m.title or m.name, {"color": INK, "va": "top", "parse_math": False}
+    title = m.title or m.name
+    plain = {"color": INK, "va": "top", "parse_math": False}
     figure.text(0.03, 0.975, title, fontsize=min(13.0, 780 / len(title)), weight="bold", **plain)
     lines = [f"{m.name}: {m.description}"]
     if m.radius > 0:
@@ -241,10 +243,13 @@ def _axes(view: View, m: Molecule) -> list[np.ndarray]:
 
 def _labels(view: View, m: Molecule, radius: np.ndarray, taken: list[np.ndarray]) -> None:
     """Draw names and charges at the first free position, from outward on."""
-    centres, half = view.flat(m.positions_body), view.half.max()
+    centres = view.flat(m.positions_body)
+    half = view.half.max()
     height = FONT * 1.25 / 72 * 2 * half / (INCHES * 0.96)
-    points, inner = np.array(taken).reshape(-1, 2), 0.8 * radius[:, None]
-    lows, highs = np.vstack([points, centres - inner]), np.vstack([points, centres + inner])
+    points = np.array(taken).reshape(-1, 2)
+    inner = 0.8 * radius[:, None]
+    lows = np.vstack([points, centres - inner])
+    highs = np.vstack([points, centres + inner])
     for i in np.lexsort((-np.linalg.norm(centres, axis=1), m.masses > 0)):
         text = f"{m.site_names[i]} {m.charges[i]:+.5g}" if m.charges[i] else m.site_names[i]
         size = np.array([0.56 * height * len(text), height])

@@ -63,7 +63,8 @@ def simulation_html(simulation: Simulation) -> str:
 
 @html_of.register
 def results_html(results: Results) -> str:
-    summary, name = results.summary, results.system.scene.name
+    summary = results.summary
+    name = results.system.scene.name
     if isinstance(results.system, BodySystem):
         # "steps": not of a run that has not ended
         parts = [(body_title(summary), body_rows(summary))] if "steps" in summary else []

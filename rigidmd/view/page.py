@@ -42,7 +42,8 @@ class PagePart(NamedTuple):
 
 def page(title: str, parts: Iterable[str], style: str = "") -> str:
     """A whole page of HTML parts under a title (plain text), with more style."""
-    title_html, body = html.escape(title), "\n".join(part for part in parts if part)
+    title_html = html.escape(title)
+    body = "\n".join(part for part in parts if part)
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8">\
 <meta name="viewport" content="width=device-width,initial-scale=1">\

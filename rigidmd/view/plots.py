@@ -33,7 +33,8 @@ WIDTH, HEIGHT = 4.4, 2.3
 def plots_part(record: Record) -> str:
     """All plots as HTML. Attributes for the animation: data-box, the ends of the axis as fractions
     of the figure (left, right, top, bottom), data-from and data-to, the limits of its times."""
-    figures, times = [], timeline(record.system, record.columns)
+    figures = []
+    times = timeline(record.system, record.columns)
     for k, panel in enumerate(panels(record.system, record.columns)):
         figure = new_figure(WIDTH, HEIGHT, layout=None)
         (axis,) = draw_rows(figure, [[(times, panel)]], (0.0, 0.0, WIDTH, HEIGHT))
@@ -153,9 +154,11 @@ class LivePlot(Observer):
         self._run, self._due = run, 0.0
         scene = cast(MolecularScene | BodyScene, run.scene)
         if isinstance(scene, BodyScene):
-            described, every = BODY_COLUMNS, not_none(scene.output.interval_s)
+            described = BODY_COLUMNS
+            every = not_none(scene.output.interval_s)
         else:
-            described, every = run._part.samples().described, scene.output.log_interval_ps
+            described = run._part.samples().described
+            every = scene.output.log_interval_ps
         self.interval = every if self._asked is None else self._asked
         check_names(self._columns, described)
         self._spot = DisplayArea() if in_notebook() else None
@@ -174,7 +177,8 @@ class LivePlot(Observer):
     def _draw(self) -> None:
         if self._spot is None:
             return
-        began, samples = clock.monotonic(), self._run._part.samples()
+        began = clock.monotonic()
+        samples = self._run._part.samples()
         if len(samples) < 2:
             return
         described = samples.described

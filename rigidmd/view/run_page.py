@@ -103,7 +103,9 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
 def _stages(record: Record) -> Iterator[str]:
     """Means and drifts of the stages, as the summary has them, from log.csv, which a run that has
     not ended has too."""
-    system, samples, known = record.system, record.log, (record.summary or {}).get("stages", ())
+    system = record.system
+    samples = record.log
+    known = (record.summary or {}).get("stages", ())
     for row, k in enumerate(np.unique(samples["stage"]).tolist()):
         if not system.scene.stages[k].is_minimisation:
             ended = known[row] if row < len(known) else {}
@@ -115,7 +117,10 @@ def _stages(record: Record) -> Iterator[str]:
 
 def _analyses(record: Record) -> Iterator[str]:
     """Results of `rigidmd analyse`: values, analyses left out, figures."""
-    rows, left_out, figures, phrases = [], [], [], []
+    rows = []
+    left_out = []
+    figures = []
+    phrases = []
     for result, phrase in read_results(record.folder):
         if not result.values and not result.curves:
             left_out += [f"{result.name}: {note}" for note in result.notes]
@@ -153,7 +158,8 @@ def _body_table(record: Record) -> str:
 
 def _margins(record: Record) -> str:
     """Time steps compared with the longest stable ones."""
-    summary, rows = record.summary or {}, []
+    summary = record.summary or {}
+    rows = []
     unit = "s" if record.is_body else "fs"
     whole: Json = {"name": record.scene.name} | summary
     stages = [whole] if record.is_body else summary.get("stages", ())
@@ -175,7 +181,8 @@ MARGINS = ((0.5, GOOD, "safe"), (1.0, DOUBTFUL, "near the limit"), (float("inf")
 
 
 def _files(record: Record) -> str:
-    output, rows = record.scene.output, []
+    output = record.scene.output
+    rows = []
     about = ABOUT | {output.topology: "names and first positions, for viewers"}
     if output.trajectory:
         form = BY_EXTENSION[Path(output.trajectory).suffix]
@@ -192,7 +199,8 @@ def _files(record: Record) -> str:
 
 
 def _repeat(record: Record) -> Iterator[str]:
-    summary, folder = record.summary or {}, shlex.quote(str(record.folder))
+    summary = record.summary or {}
+    folder = shlex.quote(str(record.folder))
     yield code(
         f"rigidmd run {folder}/{SCENE} -o {folder}-again    # the same run\n"
         f"rigidmd compare {folder} {folder}-again    # to the same bits"
@@ -311,7 +319,8 @@ def write_gallery(
         run = folder / "runs" / example.name
         Simulation(scene, run, force).run()
         target, _ = write_view(run, folder / f"{example.name}.html")
-        animation, figure = BodyAnimation(read_record(run)), new_figure(INCHES, INCHES, layout=None)
+        animation = BodyAnimation(read_record(run))
+        figure = new_figure(INCHES, INCHES, layout=None)
         moment = np.interp(RUN_FRACTION, (0, 1), animation.time[[0, -1]])
         animation.draw(figure.add_axes((0, 0, 1, 1)), float(moment))
         picture = base64.b64encode(figure.png()[0]).decode()

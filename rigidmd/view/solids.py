@@ -48,11 +48,13 @@ def solids_of(system: System) -> Solids | None:
     rows: list[tuple] = []
     drawn: set[str] = set()
     for bodies in bodies_of_potentials(system):
-        name, potential = bodies.species.name, bodies.potential
+        name = bodies.species.name
+        potential = bodies.potential
         if name in drawn or type(potential.function) not in (GayBerne, Patch):
             continue
         drawn.add(name)
-        values, offset = potential.parameters[name], bodies.reference
+        values = potential.parameters[name]
+        offset = bodies.reference
         k = "xyz".index(potential.axis or "z")
         frame = bodies.frame[:, [k - 2, k - 1, k]]
         for m in bodies.molecule.tolist():

@@ -150,7 +150,8 @@ def _values(
     zero_loading: bool,
 ) -> list[Value]:
     """The chemical potential and what follows from it."""
-    moments, name = [trials.moments for trials in sets], guest.molecule.name
+    moments = [trials.moments for trials in sets]
+    name = guest.molecule.name
     volume, weight, energy = runs.mean([of_run.mean(axis=1) for of_run in moments])
     why = _why_refused(sets)
     if not weight > 0:

@@ -56,14 +56,16 @@ def slab_of(frames: RigidFrames, axis: str) -> Slab:
     if frames.cell[:, k, across].any() or frames.cell[:, across, k].any():
         raise OutputError(f"a slab needs an edge along {axis} at right angles to the others")
     height = frames.cell[:, k, k]
-    arms, masses = [np.zeros((len(frames), 0))], []
+    arms = [np.zeros((len(frames), 0))]
+    masses = []
     for kind in frames.kinds:
         for offset, mass in zip(kind.molecule.positions_body, kind.molecule.masses, strict=True):
             if mass > 0:
                 arm = frames.Q[:, kind.index, k] @ offset if frames.Q.shape[1] else 0.0
                 arms.append(frames.positions[:, kind.index, k] + arm)
                 masses.append(np.full(len(kind.index), mass))
-    at, mass = np.concatenate(arms, axis=1) / height[:, None], np.concatenate(masses)
+    at = np.concatenate(arms, axis=1) / height[:, None]
+    mass = np.concatenate(masses)
     middle = np.angle(np.exp(2j * np.pi * at) @ mass)[:, None] / (2 * np.pi)
 
     def centred(fraction: np.ndarray) -> np.ndarray:
@@ -83,7 +85,8 @@ def profile(z: np.ndarray, liquid: float, vapour: float, half: float, width: flo
 def fitted(z: np.ndarray, density: np.ndarray, height: float) -> np.ndarray:
     """Parameters of `profile` (densities in g/cm³, lengths in Å) for densities (bins,) at distances
     z in a box of this height. Raises OutputError."""
-    top, low = float(np.quantile(density, 0.95)), float(density[-len(z) // 5 :].mean())
+    top = float(np.quantile(density, 0.95))
+    low = float(density[-len(z) // 5 :].mean())
     half = float(np.sum(density - low) * (z[1] - z[0]) / max(top - low, 1e-9 * top))
     try:
         with warnings.catch_warnings():
@@ -239,7 +242,8 @@ def surface_tension(runs: Runs, axis: str = "z") -> AnalysisResult:
     )
     some = np.unique(np.linspace(fewest // 20, fewest - 1, 500).astype(int))
     result = AnalysisResult("surface_tension", f"surface tension across {axis}")
-    time, title = ("Time (ps)", samples[0][0][some]), "running mean (mN/m)"
+    time = ("Time (ps)", samples[0][0][some])
+    title = "running mean (mN/m)"
     result.curves.append(Curve("surface_tension", time, title, {title: running[some]}))
     is_cut = runs.system.scene.forces.dispersion == "cutoff"
     note = "of the forces in the run: without dispersion beyond the cutoff" if is_cut else ""

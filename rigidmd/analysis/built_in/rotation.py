@@ -102,7 +102,8 @@ def orientation(runs: Runs) -> AnalysisResult:
                     )
                     result.values.append(too_short(name, "ps", tau, None, why))
                     continue
-                low, note = int(C.argmin()), ""
+                low = int(C.argmin())
+                note = ""
                 if C[low] < -max(TAIL, 3 * float(np.nan_to_num(doubt[low]))):
                     note = (
                         f"to where C{l + 1} first falls below {TAIL:g}. At {time[low]:.3g} ps it is"
@@ -226,7 +227,8 @@ def spectrum(runs: Runs) -> AnalysisResult:
             ) -> np.ndarray:
                 """2 weight times the power of series (f, n, d) a wave number, sum over d and mean
                 over n. Cm."""
-                values, total = of(part, group), 0.0
+                values = of(part, group)
+                total = 0.0
                 for first in range(0, values.shape[1], 256):
                     some = values[:, first : first + 256].reshape(len(values), -1)
                     density = signal.welch(
@@ -242,11 +244,13 @@ def spectrum(runs: Runs) -> AnalysisResult:
 
             power.add(title, *with_group_error(runs, kind, states))
             top = int(np.argmax(power.columns[title][1:])) + 1
-            at, half = float(wavenumbers[top]), float(wavenumbers[1] / 2)
+            at = float(wavenumbers[top])
+            half = float(wavenumbers[1] / 2)
             result.values.append(
                 Value(f"highest peak of {title}", "1/cm", at, half, None, "half the resolution")
             )
-    highest, fine = 1 / (2 * interval * PER_CM), wavenumbers[1]
+    highest = 1 / (2 * interval * PER_CM)
+    fine = wavenumbers[1]
     resolved = f"wave numbers up to {highest:.4g}/cm, in steps of {fine:.2g}/cm"
     result.notes.append(f"frames every {interval:g} ps resolve {resolved}")
     return result
@@ -255,7 +259,8 @@ def spectrum(runs: Runs) -> AnalysisResult:
 def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[RigidFrames, Kind], np.ndarray]]]:
     """The velocities of a species by name: mass or moment of inertia, and a function that returns
     their series."""
-    name, moments = kind.name, kind.molecule.inertia.tolist()
+    name = kind.name
+    moments = kind.molecule.inertia.tolist()
     rates: dict[str, tuple[float, Callable[[RigidFrames, Kind], np.ndarray]]] = {
         f"V {name}": (
             kind.molecule.mass,
@@ -324,7 +329,8 @@ def dielectric(runs: Runs) -> AnalysisResult:
         np.mean([correlation_time_of(runs, [M[:, k] for M in dipoles]) for k in range(3)])
     )
     cause = _broken_symmetry(runs)
-    centre, lost = np.zeros(3), 0.0
+    centre = np.zeros(3)
+    lost = 0.0
     if cause:
         centre = runs.mean([M.mean(axis=0) for M in dipoles])
         lost = min(0.5, 2 * correlation / runs.span)
@@ -351,7 +357,8 @@ def dielectric(runs: Runs) -> AnalysisResult:
         f"{surroundings} around, {electrostatics}. Correlation time of the dipole"
         f" {correlation:.3g} ps"
     )
-    name, value = "dielectric constant", float(epsilon)
+    name = "dielectric constant"
+    value = float(epsilon)
     result.values.append(converged_value(name, "1", value, spread, runs.span, correlation, note))
     for k, axis in enumerate("xyz"):
         mean, doubt = mean_of_series(runs, [M[:, k] / DEBYE for M in dipoles])

@@ -193,7 +193,8 @@ def _peaks(
     def peak_of(g: np.ndarray, top: int) -> np.ndarray:
         low, middle, high = g[top - 1 : top + 2]
         shift = _shift_of_vertex(low, middle, high)
-        position, height = r[top] + shift * width, middle - 0.25 * (low - high) * shift
+        position = r[top] + shift * width
+        height = middle - 0.25 * (low - high) * shift
         return np.array([position, height, within(g, valley(g, top))])
 
     def peak_near(g: np.ndarray) -> np.ndarray:
@@ -374,7 +375,8 @@ def density_profile(runs: Runs, axis: str = "z", bins: int = 100) -> AnalysisRes
     )
 
     def profile(part: RigidFrames, kind: Kind) -> np.ndarray:
-        across, total = np.linalg.inv(part.cell)[:, :, k], np.zeros(bins)
+        across = np.linalg.inv(part.cell)[:, :, k]
+        total = np.zeros(bins)
         for site, mass in enumerate(kind.molecule.masses):
             at = part.positions[:, kind.index]
             if part.Q.shape[1]:

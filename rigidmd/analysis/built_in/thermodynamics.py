@@ -190,7 +190,8 @@ def response(runs: Runs) -> AnalysisResult:
     result = AnalysisResult("response", "response functions", notes=_notes(runs, samples.matter))
     per_gram = samples.matter.count / samples.matter.mass
     for k, name in enumerate(samples.names):
-        unit, error = UNITS[name].name, errors[k]
+        unit = UNITS[name].name
+        error = errors[k]
         tau = float(runs.mean([correlation_time(series[k], interval) for series in changes]))
         value = converged_value(name, unit, float(values[k]), error, span, tau, least=LEAST)
         result.values.append(value)
@@ -209,7 +210,8 @@ def response(runs: Runs) -> AnalysisResult:
 
 def _check_conditions(runs: Runs) -> None:
     """Raise OutputError where fluctuations do not give response functions."""
-    stage, need = runs.first.stage, "response functions need"
+    stage = runs.first.stage
+    need = "response functions need"
     if min(len(run.columns["time"]) for run in runs.members) < 2:
         raise OutputError(f"{need} samples: set output.log_interval_ps to less than the run")
     if stage.ramps:
@@ -259,7 +261,8 @@ def thermal_energy_of(run: RigidFrames) -> float:
 def _pair_of(run: RigidFrames) -> np.ndarray:
     """x and y in each sample (2, l), see `Fluctuations`."""
     stage, columns = run.stage, run.columns
-    energy, other = KJ_PER_MOL * columns["potential"], np.zeros(len(columns["potential"]))
+    energy = KJ_PER_MOL * columns["potential"]
+    other = np.zeros(len(columns["potential"]))
     if stage.ensemble == "npt":
         other = 1e3 * columns["volume"]
         energy = energy + BAR * stage.pressures[0][0] * other

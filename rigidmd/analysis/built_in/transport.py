@@ -45,7 +45,8 @@ def squared_displacement(path: np.ndarray, lags: int) -> np.ndarray:
     12, 201)."""
     path = path - path.mean(axis=0)
     squares = np.einsum("fnd,fnd->f", path, path)
-    n, frames = path.shape[1], len(path)
+    n = path.shape[1]
+    frames = len(path)
     before, after = np.cumsum(squares), np.cumsum(squares[::-1])
     lag = np.arange(lags)
     both = (before[frames - 1 - lag] + after[frames - 1 - lag]) / (frames - lag) / n
@@ -59,7 +60,8 @@ BEND = (
 #: Yeh & Hummer 2004, J. Phys. Chem. B 108, 15873: cubic boxes.
 YEH_HUMMER = 2.837297
 #: One mPa s in u/(Å ps), and 1e-9 m²/s in Å²/ps.
-MPA_S, NM2_PER_S = BAR * 1e4, 0.1
+MPA_S = BAR * 1e4
+NM2_PER_S = 0.1
 
 
 def interval_and_lags(runs: Runs, what: str) -> tuple[float, int]:
@@ -299,7 +301,8 @@ def _curves_of(
     )
     ends = 0.5 * (correlations + correlations[:, :1])  # by the trapezoidal rule
     running = factor * interval * (np.cumsum(correlations, axis=1) - ends)
-    time, title = interval * np.arange(lags), "integral (mPa s)"
+    time = interval * np.arange(lags)
+    title = "integral (mPa s)"
     columns = {title: running.mean(axis=0), "fit (mPa s)": factor * model.integral(time)}
     errors = {title: running.std(axis=0, ddof=1) / np.sqrt(len(running))}
     memory = {"correlation": correlations.mean(axis=0) / correlations[:, 0].mean()}

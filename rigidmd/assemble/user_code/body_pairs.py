@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from rigidmd.forces.poses.formulas import PoseFormula
 
 #: In the log, for a function without a name, or with the name of a column.
-DEFAULT_NAME, UNNAMED = "body_pairs", ("", "<lambda>", "energy")
+DEFAULT_NAME = "body_pairs"
+UNNAMED = ("", "<lambda>", "energy")
 #: The switch begins at this fraction of the cutoff.
 SWITCH_START = 0.9
 
@@ -93,7 +94,8 @@ def body_pair_potential(
 
         if parameters or pairs:
             raise ValueError("parameters and pairs would have no effect on a table: give species")
-        energy, name = read_body_table(Path(function)), name or DEFAULT_NAME
+        energy = read_body_table(Path(function))
+        name = name or DEFAULT_NAME
     elif not callable(function):
         raise ValueError(f"{function!r:.60} is not a function of (r, a, b)")
     else:

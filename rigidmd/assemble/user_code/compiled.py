@@ -33,7 +33,8 @@ def check_compiled_code(system: System, state: State) -> list[str]:
             arguments = term, state.copy(), no_load(state), np.zeros(TALLY_SIZE)
             faults += _faults(name, function, arguments)
     for name, thermostat, h in _thermostats(system):
-        after, function = state.copy(), THERMOSTATS[type(thermostat)]
+        after = state.copy()
+        function = THERMOSTATS[type(thermostat)]
         if wrong := _faults(name, function, (thermostat, system.model, after, h, 0)):
             faults += wrong
         elif _kinetic_energy(system, state) == 0:
@@ -91,7 +92,8 @@ def _missing_heat(system: System, before: State, after: State) -> tuple[float, f
     """Change of the kinetic energy, the heat in the ledger, and the kinetic energy, if the first
     two differ."""
     old, new = _kinetic_energy(system, before), _kinetic_energy(system, after)
-    change, heat = new - old, float(after.energy_ledger[HEAT] - before.energy_ledger[HEAT])
+    change = new - old
+    heat = float(after.energy_ledger[HEAT] - before.energy_ledger[HEAT])
     return (
         (change, heat, max(old, new)) if abs(change - heat) > LEDGER_ERROR * max(old, new) else None
     )

@@ -134,7 +134,8 @@ class BoundForce:
             raise UserForceError(f"the force {name} must define one of on_sites and on_molecules")
         self.calls, self.seconds = 0, 0.0
         self._called("begin", system)
-        n, turns = len(system.state.velocity), len(system.state.rotation) > 0
+        n = len(system.state.velocity)
+        turns = len(system.state.rotation) > 0
         self.term = PythonForces(n, turns, changes_momentum(force), bool(force.tied_to_places))
 
     def __call__(self, workspace: PythonForcesWorkspace, state: State) -> None:
@@ -176,9 +177,11 @@ class BoundForce:
 
     def _of_sites(self, position: np.ndarray, state: State) -> tuple:
         energy, force, virial, _ = self._parts(self._called("on_sites", position, state), 3)
-        on_sites, molecule = np.zeros(position.shape), self.system.sites.molecule
+        on_sites = np.zeros(position.shape)
+        molecule = self.system.sites.molecule
         self._fill(on_sites, force, "forces", molecule, 1.0)
-        total, torque = np.zeros((len(state.velocity), 3)), None
+        total = np.zeros((len(state.velocity), 3))
+        torque = None
         np.add.at(total, molecule, on_sites)
         if len(state.rotation):
             lab = np.zeros_like(total)

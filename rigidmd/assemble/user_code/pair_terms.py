@@ -167,7 +167,8 @@ def _bound_pairs(
     if system.scene.forces.tail_correction:
         counts = np.bincount(system.model.species, minlength=len(system.species))
         inside = inner_pairs(*of_species, counts)
-    pairs, errors = {}, list[str]()
+    pairs = {}
+    errors = list[str]()
     for i, j, parameters in types.pairs(errors):
         try:
             tail_without = None if inside is None else inside.between(i, j)
@@ -192,7 +193,8 @@ def _compiled_potential(
     first = next(iter(pairs.values()))
     # a type without interaction has the numbers of any other, so that its energy is finite
     numbers = np.tile(np.array(first.numbers)[:, None, None], (count, count))
-    terms, interacts = np.zeros((4, count, count)), np.zeros((count, count))
+    terms = np.zeros((4, count, count))
+    interacts = np.zeros((count, count))
     for (i, j), pair in pairs.items():
         for one, other in ((i, j), (j, i)):
             numbers[:, one, other] = pair.numbers
@@ -373,7 +375,8 @@ class SiteTypes:
     ) -> dict[str, float] | None:
         mixed = {}
         for name, a in first.items():
-            b, usual = second[name], "arithmetic" if name.lower().startswith("sig") else "geometric"
+            b = second[name]
+            usual = "arithmetic" if name.lower().startswith("sig") else "geometric"
             if a == b:
                 mixed[name] = a
             elif (rule := self._potential.mixing.get(name, usual)) == "arithmetic":

@@ -34,7 +34,9 @@ def read_columns(path: Path) -> Columns:
         reason = f"cannot be read as text: {error}"
     if reason:
         raise PairPotentialError(f"{path}: {reason}")
-    names, rows, faults = COLUMNS, [], []
+    names = COLUMNS
+    rows = []
+    faults = []
     lines = [
         (k, line.partition("#")[0].replace(",", " ").split())
         for k, line in enumerate(text.splitlines(), 1)

@@ -96,7 +96,8 @@ def on_page_markdown(markdown, page, config, files):
 
 def _key_anchors(content: str) -> str:
     """An anchor for each key in a table: #stages-timestep_fs below the heading `[[stages]]`."""
-    heading, known = "", set()
+    heading = ""
+    known = set()
 
     def anchor(found: re.Match) -> str:
         nonlocal heading
@@ -119,7 +120,9 @@ def on_page_content(content, page, config, files):
         content = _key_anchors(content)
 
     def equation(found: re.Match) -> str:
-        tag, opening, tex = found[1], found[2], html.unescape(found[3])
+        tag = found[1]
+        opening = found[2]
+        tex = html.unescape(found[3])
         display = "block" if opening == r"\[" else "inline"
         return f'<{tag} class="arithmatex">{convert(tex.strip(), display=display)}</{tag}>'
 

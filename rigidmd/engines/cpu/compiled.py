@@ -296,7 +296,8 @@ class CompiledEngine(Engine, Generic[ModelT, Bound]):
 
     def passes(self, state: State) -> dict[str, list[Pass]]:
         """Name of a term -> its passes at a state, in their order. Nothing is compiled."""
-        load, status = no_load(state), np.zeros(1, np.int64)
+        load = no_load(state)
+        status = np.zeros(1, np.int64)
         into = Evaluation(state, load, np.zeros(TALLY_SIZE), status)
         workspaces = zip(self.names, self.new_workspaces(state), strict=False)
         return {name: trait(workspace, "passes")(into) for name, workspace in workspaces}

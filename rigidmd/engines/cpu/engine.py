@@ -108,7 +108,8 @@ class CpuEngine(CompiledEngine[Model, Advance]):
         return used if integrator.trajectory_steps else used._replace(trajectory=None)
 
     def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        moving, last = self._dispatchers.get("steps"), self._last
+        moving = self._dispatchers.get("steps")
+        last = self._last
         is_current = state is last.state and last.is_current
         if (
             self.load is None

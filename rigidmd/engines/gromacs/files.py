@@ -185,9 +185,12 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
         RigidBodies(system, extra).points(state) if len(extra.mass) else np.zeros((2, 0, 3))
     )
     width = DECIMALS + 5
-    rows, s, e = [], 0, 0
+    rows = []
+    s = 0
+    e = 0
     for n, k in enumerate(species):
-        m, added = system.species[k], bodies[k].extra
+        m = system.species[k]
+        added = bodies[k].extra
         count = len(m.masses)
         names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(added))]
         positions = np.concatenate([at[s : s + count], extra_positions[e : e + added]])
@@ -215,7 +218,8 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     lines = [f"; {in_comment(system.scene.in_short)}", "; Written by rigidmd.", ""]
     lines += ["[ defaults ]", "; nbfunc comb-rule gen-pairs", "1 2 no", ""]
     lines += ["[ atomtypes ]", "; name mass charge ptype sigma_nm epsilon_kJ_mol"]
-    sigma, epsilon = view.sigma * NM, view.epsilon / KJ_PER_MOL
+    sigma = view.sigma * NM
+    epsilon = view.epsilon / KJ_PER_MOL
     for k, kind in enumerate(kinds):
         parameters = f"{kind.mass:.10g} 0 A {sigma[k, k]:.12g} {epsilon[k, k]:.12g}"
         lines.append(f"K{k + 1} {parameters} ; {in_comment(kind.name)}")
@@ -224,7 +228,8 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     lines += ["", "[ nonbond_params ]", "; i j func sigma_nm epsilon_kJ_mol"]
     pairs = [(i, j) for i in range(len(kinds)) for j in range(i, len(kinds))]
     lines += [f"K{i + 1} K{j + 1} 1 {sigma[i, j]:.12g} {epsilon[i, j]:.12g}" for i, j in pairs]
-    index, names = system.model.species, distinct([as_identifier(m.name) for m in system.species])
+    index = system.model.species
+    names = distinct([as_identifier(m.name) for m in system.species])
     for k in sorted(set(index.tolist())):
         start = int(np.searchsorted(system.sites.molecule, int(np.flatnonzero(index == k)[0])))
         kind = view.kind[start : start + len(system.species[k].masses)]
@@ -274,7 +279,8 @@ def _molecule(
 
 def _settings(view: ForceFieldView, k: int) -> str:
     system = view.system
-    scene, stage = system.scene, system.scene.stages[k]
+    scene = system.scene
+    stage = system.scene.stages[k]
     cutoff = system.cutoff * NM
 
     def every(interval: float) -> int:
@@ -319,7 +325,8 @@ def _settings(view: ForceFieldView, k: int) -> str:
 
 
 def _coulomb(view: ForceFieldView) -> dict[str, object]:
-    potential, mesh = view.coulomb, view.system.terms.get("coulomb_reciprocal")
+    potential = view.coulomb
+    mesh = view.system.terms.get("coulomb_reciprocal")
     settings: dict[str, object] = {
         "coulombtype": TRANSLATIONS.of("forces.electrostatics")[view.electrostatics]
     }
@@ -357,7 +364,8 @@ def _couplings(stage: Stage) -> dict[str, object]:
         }
         settings["annealing-temp"] = f"{first:.12g} {last:.12g}"
     if stage.has_barostat:
-        pressure, count = stage.pressures[0], 1 if stage.pressure_coupling == "isotropic" else 2
+        pressure = stage.pressures[0]
+        count = 1 if stage.pressure_coupling == "isotropic" else 2
         settings |= {
             "pcoupl": TRANSLATIONS.of("barostat")[stage.barostat],
             "pcoupltype": TRANSLATIONS.of("pressure_coupling")[stage.pressure_coupling],

@@ -67,7 +67,8 @@ def ellipsoids(view: ForceFieldView) -> list[Ellipsoids]:
 
 def atoms(view: ForceFieldView) -> Points:
     """The sites of a system, and behind them its ellipsoids."""
-    sites, added = view.system.sites, ellipsoids(view)
+    sites = view.system.sites
+    added = ellipsoids(view)
     count = sum(len(kind.molecule) for kind in added)
     offsets = [np.tile(kind.offset_body, (len(kind.molecule), 1)) for kind in added]
     return Points(

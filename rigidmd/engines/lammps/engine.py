@@ -123,7 +123,8 @@ class LammpsEngine(ExternalEngine):
             return None
         inverse = model.rotor.inverse_inertia
         largest_first = np.argsort(-model.inertia, axis=1, kind="stable")
-        none, zero = np.full(len(inverse), NO_SYMMETRY), np.zeros(len(inverse))
+        none = np.full(len(inverse), NO_SYMMETRY)
+        zero = np.zeros(len(inverse))
         return model.rotor._replace(
             symmetry=none, common=zero, excess=inverse.copy(), order=largest_first
         )
@@ -134,7 +135,8 @@ class LammpsEngine(ExternalEngine):
     def _send(self, state: State) -> None:
         if same_state(self._known_state, state):
             return
-        view, folder = self._view, self._process.folder
+        view = self._view
+        folder = self._process.folder
         files.write_data(folder / files.DATA, view, state)
         files.write_tables(folder / files.TABLES, view)
         energies = [
@@ -180,7 +182,9 @@ class LammpsEngine(ExternalEngine):
         received = self._bodies.state(state, position, rows[:, 7:10] * PER_PS, cell)
         for mine, its in zip(state[:5], received[:5], strict=True):
             mine[:] = its
-        n, force, virial = len(energies), rows[:, 10:13] * files.KCAL, np.zeros((3, 3))
+        n = len(energies)
+        force = rows[:, 10:13] * files.KCAL
+        virial = np.zeros((3, 3))
         # the symmetric part of the molecular virial, from the atomic virial as a pressure
         if view.is_periodic:
             xx, yy, zz, xy, xz, yz = np.array(printed[n : n + 6]) * files.ATMOSPHERE * state.volume

@@ -45,9 +45,15 @@ ENTRIES, INNERMOST = 8000, 0.3
 #: One more than the largest seed.
 SEEDS = 900_000_000
 
-DATA, SETTINGS, INPUT, TABLES = "data.lammps", "settings.lammps", "in.lammps", "tables.lammps"
+DATA = "data.lammps"
+SETTINGS = "settings.lammps"
+INPUT = "in.lammps"
+TABLES = "tables.lammps"
 #: Names of groups, and of the fixes that move the first two.
-BODIES, POINTS, FROZEN, SITES = "bodies", "points", "frozen", "sites"
+BODIES = "bodies"
+POINTS = "points"
+FROZEN = "frozen"
+SITES = "sites"
 
 _INTEGRATOR, *_LIMITS = moves("LAMMPS", "rigid bodies")
 #: What LAMMPS can express, and how.
@@ -135,7 +141,8 @@ TRANSLATIONS = Translations(
 
 
 def _ranks_without_molecules(view: ForceFieldView) -> str:
-    ranks, molecules = view.scene.engine.options.get("ranks", 1), len(view.system.model.species)
+    ranks = view.scene.engine.options.get("ranks", 1)
+    molecules = len(view.system.model.species)
     return f"{ranks} ranks for {molecules} molecules" if ranks > molecules else ""
 
 
@@ -150,7 +157,8 @@ class PairStyle(NamedTuple):
 def write_data(path: Path, view: ForceFieldView, state: State) -> None:
     """Write the data file: box, masses, atoms with images, velocities. Site k of the system is atom
     k + 1, and ellipsoids follow."""
-    system, added = view.system, ellipsoids(view)
+    system = view.system
+    added = ellipsoids(view)
     points = atoms(view)
     position, velocity = RigidBodies(system, points).points(state)
     image = np.zeros(position.shape, int)
@@ -159,7 +167,9 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
     lines = [f"LAMMPS data file, units = real, of {system.scene.name}, written by rigidmd", ""]
     lines += [f"{len(position)} atoms", f"{len(view.kinds) + len(added)} atom types"]
     lines += [f"{len(position) - system.site_count} ellipsoids"] if added else []
-    low, high, tilt = position.min(axis=0) - 1, position.max(axis=0) + 1, ()
+    low = position.min(axis=0) - 1
+    high = position.max(axis=0) + 1
+    tilt = ()
     if view.is_periodic:
         image = np.floor(position @ np.linalg.inv(state.cell)).astype(int)
         position = position - image @ state.cell
@@ -185,7 +195,8 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
     charge = np.append(view.charge, np.zeros(len(position) - system.site_count))
     rows = zip(points.molecule + 1, kinds, charge, points.mass, position, image, strict=True)
     for i, (molecule, kind, q, mass, (x, y, z), (nx, ny, nz)) in enumerate(rows, 1):
-        at, images = f"{_num(x)} {_num(y)} {_num(z)}", f"{nx} {ny} {nz}"
+        at = f"{_num(x)} {_num(y)} {_num(z)}"
+        images = f"{nx} {ny} {nz}"
         if added:  # whether it is an ellipsoid, then its density, or the mass of a point
             flag = int(i > system.site_count)
             of_atom = f"{molecule} {_num(q)} {flag} {_num(mass or NO_MASS)}"
@@ -214,7 +225,8 @@ def _num(number: SupportsFloat) -> str:
 
 def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     """The commands that define the system and its forces, without fixes that move it."""
-    system, forces = view.system, view.system.scene.forces
+    system = view.system
+    forces = view.system.scene.forces
     boundary = "p p p" if view.is_periodic else "s s s"
     styles = pair_styles(view)
     names = (
@@ -318,7 +330,8 @@ def _coulomb(view: ForceFieldView) -> PairStyle | None:
     charge = [kind.charge for kind in view.kinds]
     charged = [k for k, q in enumerate(charge) if q != 0]
     pairs = [(i, j) for i in charged for j in charged if i <= j]
-    cutoff, plain = _num(_cutoff(potential.cutoff)), dict.fromkeys(pairs, "")
+    cutoff = _num(_cutoff(potential.cutoff))
+    plain = dict.fromkeys(pairs, "")
     if isinstance(potential, ScreenedCoulomb):
         return PairStyle("coul/long", cutoff, plain, modify="pair_modify pair coul/long table 0")
     if potential.cutoff == inf:
@@ -332,7 +345,8 @@ def _coulomb(view: ForceFieldView) -> PairStyle | None:
 
 
 def _gay_berne(view: ForceFieldView, name: str) -> PairStyle:
-    potential, coefficients = view.system.body_pairs[name], {}
+    potential = view.system.body_pairs[name]
+    coefficients = {}
     kinds = enumerate(ellipsoids(view), len(view.kinds))
     members = [(k, kind) for k, kind in kinds if kind.potential == name]
     for (i, one), (j, other) in combinations_with_replacement(members, 2):
@@ -384,14 +398,18 @@ def fixes(view: ForceFieldView, k: int) -> list[str]:
     """The fixes that move the molecules in stage k."""
     stage = view.system.scene.stages[k]
     seed = (view.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1
-    kind, links = "nve" if stage.is_minimisation else stage.ensemble, stage.nose_hoover_links
-    at, langevin = " ".join(map(_num, stage.temperatures)), []
+    kind = "nve" if stage.is_minimisation else stage.ensemble
+    links = stage.nose_hoover_links
+    at = " ".join(map(_num, stage.temperatures))
+    langevin = []
     if stage.thermostat_kind == "langevin":
         damping = f"{at} {_num(1e3 / stage.frictions[0])}"
-        of_bodies, of_points = f"rigid/small molecule langevin {damping} {seed}", "nve"
+        of_bodies = f"rigid/small molecule langevin {damping} {seed}"
+        of_points = "nve"
         langevin = [f"fix {POINTS}_bath {POINTS} langevin {damping} {seed + 1} tally yes"]
     else:
-        of_bodies, of_points = f"rigid/{kind}/small molecule", kind
+        of_bodies = f"rigid/{kind}/small molecule"
+        of_points = kind
         # LAMMPS has the inverse of an angular frequency, a scene its period
         if stage.has_thermostat:
             chain = f" temp {at} {_num(1e3 * stage.thermostat_time / (2 * pi))}"
@@ -410,7 +428,8 @@ def fixes(view: ForceFieldView, k: int) -> list[str]:
 
 def _barostat(view: ForceFieldView, stage: Stage) -> str:
     """Pressures, atm, without the tail correction, which the forces lack, and damping time, fs."""
-    tail, volume = view.system.tail, view.system.state.volume
+    tail = view.system.tail
+    volume = view.system.state.volume
     tail_pressure = 0.0 if tail is None else tail.pressure(volume)
     first, last = (
         [(bar * BAR - tail_pressure) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures
@@ -427,7 +446,8 @@ def _barostat(view: ForceFieldView, stage: Stage) -> str:
 
 def input_script(view: ForceFieldView) -> str:
     """The input script of the whole run: settings, and all stages except minimisations."""
-    system, output = view.system, view.system.scene.output
+    system = view.system
+    output = view.system.scene.output
     hint = (
         "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps"
     )

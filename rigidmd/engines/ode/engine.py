@@ -36,7 +36,10 @@ FORMS: dict[str, AttitudeForm] = dict(
 #: A step of DOP853 is at the limit of stability if step times eigenvalue is above STABLE. STIFF
 #: such steps show a stiff problem, MILD other steps in a row restart the count. Relative changes
 #: below ROUNDED within a step are rounding.
-STABLE, STIFF, MILD, ROUNDED = 6.1, 200, 6, 1e-14
+STABLE = 6.1
+STIFF = 200
+MILD = 6
+ROUNDED = 1e-14
 
 
 class OdeEngine(BodyEngine):
@@ -105,7 +108,8 @@ class OdeEngine(BodyEngine):
             self._adaptive(form, state, solver, dt, until)
             return
         y = state.extra_variables
-        cursor, stages = np.zeros(1, np.int64), np.zeros((5, len(y)))
+        cursor = np.zeros(1, np.int64)
+        stages = np.zeros((5, len(y)))
         while status := rk4(
             form, self.model, self._workspaces, state, self.load, y, stages, dt, until, cursor
         ):
@@ -127,7 +131,8 @@ class OdeEngine(BodyEngine):
     def check(
         self, state: State, integrator: Scheme | Solver, dt: float, start: State | None
     ) -> None:
-        solver, variables = _as_solver(integrator), len(state.extra_variables) // 3
+        solver = _as_solver(integrator)
+        variables = len(state.extra_variables) // 3
         if solver.name != RK4:
             time, length = state.extra_variables[:2]
             scales = state.extra_variables[2 + 2 * variables :]
@@ -137,7 +142,8 @@ class OdeEngine(BodyEngine):
                 scales, self.variables(start, integrator)[2 + 2 * variables :]
             ):
                 raise ValueError("the scales of its variables differ from the start")
-        repeated, memory = state.copy(), self.memory() or {}
+        repeated = state.copy()
+        memory = self.memory() or {}
         try:
             self.advance(repeated, integrator, dt, int(state.step[NOW]))
         except (SimulationError, ValueError) as error:
@@ -169,7 +175,8 @@ class OdeEngine(BodyEngine):
             begun[:], y_begin[:] = (state.time[NOW], 0.0), y
             scales[:] = self._scales(solver, state, y)
             self._restart = False
-        variables_before, running = state.extra_variables.copy(), self._solver
+        variables_before = state.extra_variables.copy()
+        running = self._solver
         if running is None:
             if is_singular(form, y_begin, y_begin, 0.0):
                 raise SingularError(y_begin[1], begun[0])
@@ -213,7 +220,8 @@ class OdeEngine(BodyEngine):
         IV.2)."""
         if isinstance(running, Radau):
             return
-        h, stages = running.t - running.t_old, running.K
+        h = running.t - running.t_old
+        stages = running.K
         last = running.y_old + h * (running.A[-1, :-1] @ stages[: len(running.A) - 1])
         change = np.linalg.norm(running.y - last)
         moved = change > ROUNDED * np.linalg.norm(running.y)
@@ -259,7 +267,8 @@ class OdeEngine(BodyEngine):
         """Scales of all variables except the work, from their values and the forces over the
         duration of the run."""
         load, _ = self.evaluate(state)
-        form, duration = _form(solver, state), solver.duration
+        form = _form(solver, state)
+        duration = solver.duration
         parts = [np.ones(form.variables)]
         if len(state.rotation):
             inertia = max(

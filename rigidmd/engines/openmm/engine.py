@@ -77,7 +77,8 @@ class OpenmmEngine(ExternalEngine):
     ):
         mm = library()
         super().__init__(system, stage)
-        view, platforms = self._view, _platforms()
+        view = self._view
+        platforms = _platforms()
         if platform not in platforms:
             known = "" if platform in PLATFORMS else f". OpenMM knows {', '.join(PLATFORMS)}"
             cuda = "; pip install 'openmm[cuda12]' installs it" if platform == "CUDA" else ""
@@ -134,7 +135,8 @@ class OpenmmEngine(ExternalEngine):
                 ._value
             )
             # the forces on mass points include those of virtual sites
-            bodies, force = self._particles.bodies, on_all[self._particles.point] * FORCE
+            bodies = self._particles.bodies
+            force = on_all[self._particles.point] * FORCE
             position = bodies.points(state)[0]
             virial = self._virial(state, bodies.intramolecular_virial(position, force))
             self._evaluated = (
@@ -226,9 +228,11 @@ class OpenmmEngine(ExternalEngine):
             energies = {"lennard_jones": energy(Group.LENNARD_JONES)}
         else:
             energies = {}
-        view, potential = self._view, self._view.coulomb
+        view = self._view
+        potential = self._view.coulomb
         if isinstance(potential, ScreenedCoulomb):
-            alpha, charge = potential.alpha, view.charge * COULOMB_CHARGE
+            alpha = potential.alpha
+            charge = view.charge * COULOMB_CHARGE
             even = background(float(charge.sum()) ** 2, alpha).strength / state.volume
             energies["coulomb_real"] = energy(Group.COULOMB_PAIRS) - self._excluded_energy(
                 state, alpha
@@ -249,7 +253,8 @@ class OpenmmEngine(ExternalEngine):
 
     def _excluded_energy(self, state: State, alpha: float) -> float:
         """The reciprocal energy of excluded pairs, which OpenMM subtracts."""
-        view, total = self._view, 0.0
+        view = self._view
+        total = 0.0
         species = view.system.model.species
         for k, m in enumerate(view.system.species):
             count = int(((species == k) & ~view.frozen).sum())
@@ -274,7 +279,8 @@ class OpenmmEngine(ExternalEngine):
         If the scene has no output of the pressure tensor, only the trace is computed and each axis
         gets a third. That takes two energies instead of twelve at each observation.
         """
-        virial, strain = np.zeros((3, 3)), STRAIN[self._precision == "double"]
+        virial = np.zeros((3, 3))
+        strain = STRAIN[self._precision == "double"]
         if not self._view.is_periodic:
             return virial
         groups = self._groups - {Group.TAIL}

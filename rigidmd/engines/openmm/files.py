@@ -25,7 +25,10 @@ from rigidmd.engines.openmm.system import (
 if TYPE_CHECKING:
     from openmm.app import Topology
 
-SYSTEM, STATE, TOPOLOGY, SCRIPT = "system.xml", "state.xml", "topology.pdb", "run.py"
+SYSTEM = "system.xml"
+STATE = "state.xml"
+TOPOLOGY = "topology.pdb"
+SCRIPT = "run.py"
 
 #: The script, with names in braces for which `write_openmm` has values.
 TEXT = Path(__file__).with_name("run.txt").read_text(encoding="utf-8")
@@ -85,10 +88,12 @@ def _topology(particles: Layout) -> "Topology":
     """Names of all particles. Mass points without a site are called P1, P2, ..."""
     from openmm import app
 
-    made, system = app.Topology(), particles.view.system
+    made = app.Topology()
+    system = particles.view.system
     chain = made.addChain()
     for k in system.model.species:
-        m, extra = system.species[k], particles.of_species[k].extra
+        m = system.species[k]
+        extra = particles.of_species[k].extra
         residue = made.addResidue(str(m.residue_names[0]), chain)
         names = [*m.site_names, *(f"P{j + 1}" for j in range(extra))]
         for name, symbol in zip(names, [*m.elements, *["X"] * extra], strict=True):

@@ -215,7 +215,8 @@ def layout(view: ForceFieldView) -> Layout:
     """The particles that represent a system: for each molecule its sites, in order, then its other
     mass points."""
     system = view.system
-    species, frozen = system.model.species, system.model.inverse_mass == 0
+    species = system.model.species
+    frozen = system.model.inverse_mass == 0
     bodies = [
         mass_points(m, bool(is_frozen)) for m, is_frozen in zip(system.species, frozen, strict=True)
     ]
@@ -226,7 +227,8 @@ def layout(view: ForceFieldView) -> Layout:
         mass.append(np.zeros_like(of_particles) if is_frozen else of_particles)
     count = np.array([len(of_species) for of_species in mass])[species]
     sites = system.sites_per_molecule
-    first, molecule = np.cumsum(count) - count, np.repeat(np.arange(len(species)), count)
+    first = np.cumsum(count) - count
+    molecule = np.repeat(np.arange(len(species)), count)
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
     points = Points(
         np.repeat(np.arange(len(species)), [len(local[k]) for k in species]),
@@ -261,7 +263,8 @@ def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openm
     if view.is_periodic:
         made.setDefaultPeriodicBoxVectors(*(cell * NM).tolist())
     for a, k in zip(particles.first, view.system.model.species, strict=True):
-        body, where = particles.of_species[k], (particles.local[k] + a).tolist()
+        body = particles.of_species[k]
+        where = (particles.local[k] + a).tolist()
         if view.frozen[particles.molecule[a]]:
             continue
         for i, j, distance in body.distances:
@@ -301,7 +304,9 @@ def _forces(particles: Layout, separate: bool) -> "list[tuple[PairsOrTail, int]]
     """The forces of a system with their groups."""
     forces: list[tuple[PairsOrTail, int]] = []
     view = particles.view
-    potential, coulomb, plain = view.lennard_jones, view.coulomb, _builtin_lennard_jones(view)
+    potential = view.lennard_jones
+    coulomb = view.coulomb
+    plain = _builtin_lennard_jones(view)
     has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (
         coulomb is not None and coulomb.cutoff == inf
     )
@@ -361,7 +366,8 @@ def _nonbonded(
     lennard_jones: tuple[np.ndarray, np.ndarray] | None,
 ) -> "openmm.NonbondedForce":
     """A NonbondedForce between charges (s,) of sites, and with sigma and epsilon of kinds."""
-    view, rows = particles.view, np.zeros((len(particles.mass), 3))
+    view = particles.view
+    rows = np.zeros((len(particles.mass), 3))
     force = _within(library().NonbondedForce(), view, cutoff)
     force.setUseDispersionCorrection(False)
     rows[:, 1] = 1.0
@@ -449,7 +455,8 @@ TOLERANCES = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 
 def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> "openmm.Integrator":
     """The integrator of stage k. A minimisation gets velocity Verlet."""
-    mm, stage = library(), view.system.scene.stages[k]
+    mm = library()
+    stage = view.system.scene.stages[k]
     dt = stage.step
     if stage.thermostat_kind == "langevin":
         made = mm.LangevinMiddleIntegrator(stage.temperatures[0], stage.frictions[0], dt)
@@ -517,7 +524,9 @@ def integration_groups(stage: Stage) -> set[int]:
 def extra_forces(view: ForceFieldView, k: int) -> "list[openmm.Force]":
     """The forces of stage k in addition to its integrator: a barostat, and a momentum remover, so
     that OpenMM subtracts the degrees of freedom of the total momentum."""
-    mm, stage, system = library(), view.system.scene.stages[k], view.system
+    mm = library()
+    stage = view.system.scene.stages[k]
+    system = view.system
     forces = []
     if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int(
         (~view.frozen).sum()

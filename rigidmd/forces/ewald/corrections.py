@@ -78,9 +78,11 @@ class SurfaceWorkspace(NamedTuple):
 @implements(terms.add_forces, SurfaceWorkspace)
 def _add_surface_dipole(term, state, load, tally):
     compute_site_positions(term.sites, state, term.position)
-    volume, energy = volume_of(state.cell), 0.0
+    volume = volume_of(state.cell)
+    energy = 0.0
     for k in range(3):
-        dipole, per_dipole_square = 0.0, term.strength[k] / volume
+        dipole = 0.0
+        per_dipole_square = term.strength[k] / volume
         for i in range(len(term.charge)):
             dipole += term.charge[i] * term.position[i, k]
         for i in range(len(term.charge)):

@@ -145,7 +145,8 @@ class EwaldSum(NamedTuple):
         return isinstance(self.smooth, InverseR)
 
     def workspace(self, setup: Setup) -> "EwaldWorkspace":
-        s, k_vectors = len(self.charge), self.k_vectors
+        s = len(self.charge)
+        k_vectors = self.k_vectors
         slots = -(-s // lane_count(np.float64)) * lane_count(np.float64)
         angles = (3, int(k_vectors.most.max()) + 1, slots)
         sums = KSpaceSums(
@@ -179,7 +180,8 @@ class EwaldWorkspace(NamedTuple):
 
     def passes(self, into: Evaluation) -> list[Pass]:
         """Positions. Strengths, if the cell has changed. Phases, structure factors, and forces."""
-        sums, content = self.sums, (self.smooth, self.k_vectors, self.sums)
+        sums = self.sums
+        content = (self.smooth, self.k_vectors, self.sums)
         blocks = len(sums.tallies)
         return [
             position_pass(self.sites, into.state, sums.position),
@@ -277,10 +279,12 @@ def _sum_structure_factors(arguments, block):
     """S(k) of the columns of a block, with energy and virial. Then S(k) is multiplied by 2 strength
     for the forces."""
     smooth, k_vectors, sums = load_arguments(arguments)
-    column, width = k_vectors.column, lanes_of(sums.charge)
+    column = k_vectors.column
+    width = lanes_of(sums.charge)
     sums.tallies[block] = 0.0
     for c in range(k_vectors.bounds[block], k_vectors.bounds[block + 1]):
-        first, count = column[c, 3], k_vectors.count[c]
+        first = column[c, 3]
+        count = k_vectors.count[c]
         for n in range(count):
             sums.real[first + n] = 0.0
             sums.imaginary[first + n] = 0.0
@@ -328,8 +332,10 @@ def add_k_vector(tally, energy, n, b, smooth):
 @task(count_references=False)
 def _compute_forces(arguments, block):
     _smooth, k_vectors, sums = load_arguments(arguments)
-    column, width = k_vectors.column, lanes_of(sums.charge)
-    blocks, vectors = len(sums.tallies), len(sums.charge) // width
+    column = k_vectors.column
+    width = lanes_of(sums.charge)
+    blocks = len(sums.tallies)
+    vectors = len(sums.charge) // width
     for at in range(
         width * (vectors * block // blocks), width * (vectors * (block + 1) // blocks), width
     ):
@@ -375,7 +381,9 @@ def ewald_sum_in_numpy(
     NumPy."""
     reciprocal = 2 * pi * np.linalg.inv(cell).T
     turns = position @ reciprocal.T
-    energy, force, virial = 0.0, np.zeros_like(position), np.zeros((3, 3))
+    energy = 0.0
+    force = np.zeros_like(position)
+    virial = np.zeros((3, 3))
     for (x, y, z, _), count in zip(k_vectors.column, k_vectors.count, strict=True):
         n = np.stack([np.full(count, x), np.full(count, y), z + np.arange(count)], axis=1)
         k = n @ reciprocal

@@ -47,7 +47,8 @@ def dispersing_in(species: Sequence[Molecule], counts: np.ndarray) -> Dispersing
 def settings(forces: ForceKeys, composition: Composition, cutoff: float | None) -> Settings:
     """The keys of [forces] that follow from the accuracy. cutoff : of Lennard-Jones, Å"""
     space, species, counts = composition.space, composition.species, composition.counts
-    where, sites = f"forces.dispersion = {forces.dispersion!r}", dispersing_in(species, counts)
+    where = f"forces.dispersion = {forces.dispersion!r}"
+    sites = dispersing_in(species, counts)
     if space.volume == inf or cutoff is None:
         return Settings({}, [f"{where} needs a periodic box. Use cutoff"])
     if sites.count == 0:
@@ -104,30 +105,30 @@ def _error(accuracy: float, species: Sequence[Molecule], counts: np.ndarray) -> 
 
 def interactions(parts: SystemParts) -> Interactions:
     """The sum over k-vectors, and its constants."""
-    forces, species, counts, volume = (
-        parts.scene.forces,
-        parts.species,
-        parts.counts,
-        parts.space.volume,
-    )
+    forces = parts.scene.forces
+    species = parts.species
+    counts = parts.counts
+    volume = parts.space.volume
     present = [np.flatnonzero(m.dispersion) for m in species]
     strengths = [m.dispersion[i] for m, i in zip(species, present, strict=True)]
-    strength, sites = gather_per_molecule(strengths, parts.model.species), parts.sites(present)
-    beta, cell, cutoff = forces.dispersion_beta_per_A, cell_of(parts.space), forces.cutoff_A
+    strength = gather_per_molecule(strengths, parts.model.species)
+    sites = parts.sites(present)
+    beta = forces.dispersion_beta_per_A
+    cell = cell_of(parts.space)
+    cutoff = forces.cutoff_A
     accuracy = forces.dispersion_accuracy
     # they are defaults, or keys of the scene
     assert beta is not None and cutoff is not None and accuracy is not None
-    smooth, dispersing = InverseR6(beta), dispersing_in(species, counts)
+    smooth = InverseR6(beta)
+    dispersing = dispersing_in(species, counts)
     k_space = _error(accuracy, species, counts) * sqrt(parts.filled / 2)
     if forces.dispersion == "ewald":
         reciprocal = 2 * pi * np.linalg.inv(cell).T
         vectors = direct_sum.k_vectors_within(
             reciprocal, k_cutoff_for(dispersing, beta, reciprocal, k_space)
         )
-        term, how = (
-            direct_sum.EwaldSum(smooth, strength, sites, vectors),
-            f"{vectors.total} k-vectors",
-        )
+        term = direct_sum.EwaldSum(smooth, strength, sites, vectors)
+        how = f"{vectors.total} k-vectors"
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 

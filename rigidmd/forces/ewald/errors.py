@@ -91,26 +91,30 @@ def charges_in(
 ) -> Charges:
     """The charges, or other strengths `of` a molecule (s,), in `counts` molecules of each
     species."""
-    square, count, products, distances = 0.0, 0, [np.zeros(0)], [np.zeros(0)]
+    square = 0.0
+    count = 0
+    products = [np.zeros(0)]
+    distances = [np.zeros(0)]
     for m, n in zip(species, map(int, counts), strict=True):
-        charge, position = of(m)[of(m) != 0], m.positions_body[of(m) != 0]
+        charge = of(m)[of(m) != 0]
+        position = m.positions_body[of(m) != 0]
         count += n * len(charge)
         square += n * float(charge @ charge)
         i, j = np.tril_indices(len(charge), -1)
-        product, distance = (
-            2 * n * (charge[i] * charge[j]),
-            np.linalg.norm(position[i] - position[j], axis=1),
-        )
+        product = 2 * n * (charge[i] * charge[j])
+        distance = np.linalg.norm(position[i] - position[j], axis=1)
         if len(charge) > MANY_CHARGES:
             bins = np.rint(distance / COARSE).astype(int)
-            product, distance = np.bincount(bins, product), COARSE * np.arange(bins.max() + 1)
+            product = np.bincount(bins, product)
+            distance = COARSE * np.arange(bins.max() + 1)
         products.append(product)
         distances.append(np.round(distance, FINE))
     # sums of the products over pairs of one distance, in order of appearance
     distance, first, which = np.unique(
         np.concatenate(distances), return_index=True, return_inverse=True
     )
-    sums, order = np.zeros(len(first)), np.argsort(first)
+    sums = np.zeros(len(first))
+    order = np.argsort(first)
     np.add.at(sums, which, np.concatenate(products))
     rounded = [round(d, FINE) for d in distance[order].tolist()]
     return kind(count, square, tuple(zip(sums[order].tolist(), rounded, strict=True)))
@@ -281,7 +285,8 @@ def _fastest_grid(
     if grid is None:
         sizes = (tuple(fft_size(edge / h) for edge in edges) for h in sensible)
         grids = list(dict.fromkeys(sizes))  # neighbouring spacings often have the same grid
-    best, cheapest = None, inf
+    best = None
+    cheapest = inf
     for p in ORDERS if order is None else (order,):
         k = bisect_left(
             grids, -error, key=lambda of, p=p: -pme_error(charges, alpha, cell, of, p, proxy_points)
@@ -290,7 +295,8 @@ def _fastest_grid(
             # measured with 12288 sites, orders 4 to 8, grids of 32³ to 54³
             cost = charges.count * (20 + 2.4 * p**2) + 8.0 * float(np.prod(grids[k]))
             if cost < cheapest:
-                best, cheapest = (grids[k], p), cost
+                best = (grids[k], p)
+                cheapest = cost
     return cheapest, best
 
 
@@ -302,7 +308,8 @@ def fastest_cutoff(
 
     filled : see `filled_fraction`
     """
-    volume, cutoffs = abs(float(np.linalg.det(cell))), np.arange(SHORTEST_CUTOFF, longest, 0.5)
+    volume = abs(float(np.linalg.det(cell)))
+    cutoffs = np.arange(SHORTEST_CUTOFF, longest, 0.5)
     rows = tuple(map(tuple, cell.tolist()))
 
     @cache

@@ -69,7 +69,8 @@ def settings(
     """
     usual = "plain" if forces.truncation == "plain" or is_external else "shift"
     numbers: KeysAndValues = {"ewald_truncation": forces.ewald_truncation or usual}
-    charges, cell = composition.charges, cell_of(composition.space)
+    charges = composition.charges
+    cell = cell_of(composition.space)
     if charges.count == 0:
         return Settings(numbers, [])
     accuracy = forces.ewald_accuracy or ACCURACY
@@ -170,7 +171,9 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
     """Errors of real space and of k-space (e²/Å², see `ewald.errors`), and the k-vectors. With PME
     these are only for the interactions of frozen molecules, and None without any. Raises
     SceneError."""
-    forces, volume, cell = parts.scene.forces, parts.space.volume, cell_of(parts.space)
+    forces = parts.scene.forces
+    volume = parts.space.volume
+    cell = cell_of(parts.space)
     alpha, cutoff, order = forces.ewald_alpha_per_A, forces.ewald_cutoff_A, forces.pme_order
     assert alpha is not None and cutoff is not None  # they are defaults, or keys of the scene
     charges = charges_in(parts.species, parts.counts)
@@ -180,7 +183,8 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
     )
     if parts.grid is not None:
         assert order is not None
-        error, vectors = pme_error(charges, alpha, cell, parts.grid, order), None
+        error = pme_error(charges, alpha, cell, parts.grid, order)
+        vectors = None
         if not parts.moves[parts.model.species].all():
             vectors = direct_sum.k_vectors_within(
                 reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * error)
@@ -213,11 +217,9 @@ def interactions(parts: SystemParts) -> Interactions:
         _errors(parts),
     )
     real, k_space = real / sqrt(parts.filled), k_space / sqrt(parts.filled)
-    alpha, cutoff, charge = (
-        forces.ewald_alpha_per_A,
-        forces.ewald_cutoff_A,
-        charge_e * COULOMB_CHARGE,
-    )
+    alpha = forces.ewald_alpha_per_A
+    cutoff = forces.ewald_cutoff_A
+    charge = charge_e * COULOMB_CHARGE
     assert alpha is not None and cutoff is not None
     shifted = forces.ewald_truncation == "shift"
     potential = screened_coulomb(charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * real)
@@ -259,7 +261,8 @@ def interactions(parts: SystemParts) -> Interactions:
         ),
     ]
     frozen_sites = ~parts.moves[parts.model.species][sites.molecule]
-    net, net_frozen = charge.sum(), charge[frozen_sites].sum()
+    net = charge.sum()
+    net_frozen = charge[frozen_sites].sum()
     neutral = abs(net) <= NEUTRAL * np.abs(charge).sum()
     if not neutral:
         terms["coulomb_background"] = corrections.background(net**2 - net_frozen**2, alpha)
@@ -303,15 +306,19 @@ def _surface_strength(forces: ForceKeys) -> tuple[float, float, float]:
 def _checked_slab(parts: SystemParts, sites: BodySites | CentralSites, charge: np.ndarray) -> str:
     """A note on the vacuum around a slab. Raises SceneError where it is too thin, and for other
     wrong geometries."""
-    k, cell, faults = "xyz".index(parts.scene.forces.ewald_slab), cell_of(parts.space), []
+    k = "xyz".index(parts.scene.forces.ewald_slab)
+    cell = cell_of(parts.space)
+    faults = []
     across = [i for i in range(3) if i != k]
     if cell[k, across].any() or cell[across, k].any():
         faults.append("the edge along the normal must be at right angles to the others")
-    height, lateral = cell[k, k], float(np.linalg.norm(cell[across], axis=1).max())
+    height = cell[k, k]
+    lateral = float(np.linalg.norm(cell[across], axis=1).max())
     centre = parts.state.position[:, k]
     sorted_at = np.sort((centre[sites.molecule] + _arms(parts.state, sites)[:, k]) % height)
     gaps = np.diff(sorted_at, append=sorted_at[0] + height)
-    gap, boundary = float(gaps.max()), sorted_at[gaps.argmax()] + gaps.max() / 2
+    gap = float(gaps.max())
+    boundary = sorted_at[gaps.argmax()] + gaps.max() / 2
     note = (
         f"{gap:.3g} Å along {parts.scene.forces.ewald_slab} are empty, {gap / lateral:.2g} of the"
         " longest edge across"
@@ -343,7 +350,9 @@ def _frozen_correction(
 ) -> tuple[float, float]:
     """Constant energy and pressure that cancel the interactions between frozen molecules in sums
     over images. charge (s,) is 0 for sites that move."""
-    state, forces, volume = parts.state, parts.scene.forces, parts.space.volume
+    state = parts.state
+    forces = parts.scene.forces
+    volume = parts.space.volume
     assert forces.ewald_alpha_per_A is not None
     arms = _arms(state, sites)
     position = state.position[sites.molecule] + arms

@@ -120,7 +120,8 @@ class Pme(NamedTuple):
         grid, order = self.grid, self.order
         kind = np.dtype(setup.dtype)
         pair = np.complex64 if kind == np.float32 else np.complex128
-        s, width = len(self.charge), 4 if order <= 4 else 8
+        s = len(self.charge)
+        width = 4 if order <= 4 else 8
         usable_blocks = min(max(BLOCKS, grid[0] // PLANES), MOST_BLOCKS, grid[0] // order)
         blocks = max(1, usable_blocks) if np.prod(grid) > SERIAL_POINTS else 1
         value = np.zeros((order, width))
@@ -360,7 +361,8 @@ def _spread_charges(arguments, block):
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     na, nb, nc = mesh.points[0], mesh.points[1], mesh.points[2]
     order = len(spline.nodes)
-    grid, weight = mesh.grid, mesh.weight[block]
+    grid = mesh.grid
+    weight = mesh.weight[block]
     grid[low:high] = 0
     for before in range(min(high - low + order - 1, na)):
         corner = low - order + 1 + before
@@ -407,7 +409,8 @@ def convolve_block(smooth, mesh, tallies, block):
     for x in range(spectrum.shape[0]):
         for y in range(low, high):
             for z in range(spectrum.shape[2]):
-                value, strength = spectrum[x, y, z], mesh.influence[x, y, z]
+                value = spectrum[x, y, z]
+                strength = mesh.influence[x, y, z]
                 spectrum[x, y, z] = value * strength
                 if tallies is not None and x + y + z > 0:
                     # components n_c and -n_c are stored once, unless they are the same
@@ -446,7 +449,8 @@ def _interpolate_forces(arguments, block):
     _smooth, charge, spline, mesh = load_arguments(arguments)
     na = mesh.points[0]
     order = len(spline.nodes)
-    grid, weight = mesh.grid, mesh.weight[block]
+    grid = mesh.grid
+    weight = mesh.weight[block]
     for n in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
         i = mesh.order[n]
         store(weight, 0, weights_at(spline, mesh.offset[i, 0]))

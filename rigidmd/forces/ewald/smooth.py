@@ -78,7 +78,8 @@ def _slope_of_dispersion(smooth, k2):
     b = sqrt(k2) / (2 * smooth.alpha)
     if b > LARGEST_B:
         return 0.0
-    fall, rest = exp(-b * b), sqrt(pi) * b * erfc(b)
+    fall = exp(-b * b)
+    rest = sqrt(pi) * b * erfc(b)
     return (
         3
         * (fall - rest)

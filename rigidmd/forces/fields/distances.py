@@ -61,7 +61,9 @@ def distance_restraint(
     parts: SystemParts, entry: RestraintKeys, where: str, faults: list[str]
 ) -> DistanceRestraint | None:
     """The term of one of fields.restraints with `between`."""
-    state, n, before = parts.state, len(parts.model.species), len(faults)
+    state = parts.state
+    n = len(parts.model.species)
+    before = len(faults)
     groups = [np.array(group) - 1 for group in entry.groups]
     if largest := [int(group.max()) + 1 for group in groups if group.max() >= n]:
         faults.append(f"{where}.between: molecule {largest[0]} does not exist; there are 1 to {n}")

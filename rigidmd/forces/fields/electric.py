@@ -96,7 +96,8 @@ def _add_field(term, state, load, tally, factor):
         for k in range(3):
             load.force[m, k] += factor * term.charge[kind] * term.field[k]
     for m in range(len(state.rotation)):
-        mu, q = term.dipole_body[term.species[m]], state.rotation[m]
+        mu = term.dipole_body[term.species[m]]
+        q = state.rotation[m]
         x, y, z = body_vector(q, term.field)
         a, b, c = factor * x, factor * y, factor * z
         load.torque_body[m, 0] += mu[1] * c - mu[2] * b

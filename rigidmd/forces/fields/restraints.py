@@ -36,7 +36,8 @@ def term(
     """The term of one of fields.restraints."""
     if entry.between is not None:
         return distance_restraint(parts, entry, where, faults)
-    index, names = parts.model.species, list(dict.fromkeys(m.name for m in parts.species))
+    index = parts.model.species
+    names = list(dict.fromkeys(m.name for m in parts.species))
     name = entry.species or names[0]
     of_species = np.array([m.name == name for m in parts.species])[index]
     wrong = (

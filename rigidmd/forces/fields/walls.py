@@ -57,7 +57,8 @@ class LennardJonesWalls(NamedTuple):
         )
         if depth < 0:
             return None
-        wall, axis = self.lower if x[site] <= self.lower else self.upper, "xyz"[self.axis]
+        wall = self.lower if x[site] <= self.lower else self.upper
+        axis = "xyz"[self.axis]
         return (
             int(m[site]),
             f"has a site at {axis} = {x[site]:.6g} Å, behind the wall at {axis} = {wall:g} Å",
@@ -82,7 +83,8 @@ def term(
 ) -> LennardJonesWalls | HarmonicWalls:
     """The term of one of fields.walls. The messages on the gap between walls follow those on the
     last of them."""
-    points, index = _acted_on(walls, parts.species, parts.moves), parts.model.species
+    points = _acted_on(walls, parts.species, parts.moves)
+    index = parts.model.species
     faults += [
         f"{where}: {m.name} has no site with Lennard-Jones parameters, and would pass the walls. "
         "Use acts_on = 'centres'"
@@ -94,7 +96,8 @@ def term(
     if walls.kind == "harmonic":
         term_of_walls = HarmonicWalls(*positions, walls.stiffness_kJ_mol_A2 * KJ_PER_MOL, sites)
     else:
-        epsilon, cutoff = walls.epsilon_kJ_mol * KJ_PER_MOL, walls.cutoff_A or inf
+        epsilon = walls.epsilon_kJ_mol * KJ_PER_MOL
+        cutoff = walls.cutoff_A or inf
         term_of_walls = LennardJonesWalls(*positions, walls.sigma_A, epsilon, cutoff, sites)
         if (behind := term_of_walls.behind(parts.state)) is not None:
             m, reason = behind
@@ -118,19 +121,22 @@ def _acted_on(walls: WallKeys, species: Sequence[Molecule], moves: np.ndarray) -
 def _gap_errors(parts: SystemParts) -> list[str]:
     """Messages on walls that do not fit into a periodic box, or too close to their periodic
     images."""
-    fields, space = parts.scene.fields, parts.space
+    fields = parts.scene.fields
+    space = parts.space
     if isinstance(space, Unbounded):
         return []
     if not isinstance(space, Orthorhombic):
         return ["fields.walls need a box with right angles, or none"]
-    faults, cutoff = [], parts.scene.forces.cutoff_A or inf
+    faults = []
+    cutoff = parts.scene.forces.cutoff_A or inf
     for axis, name in enumerate("xyz"):
         if (bounds := fields.bounds(axis)) is None:
             continue
         protrusion = min(
             _protrusion(walls, parts) for walls in fields.walls if walls.direction == axis
         )
-        width, edge = bounds[1] - bounds[0], space.edges[axis]
+        width = bounds[1] - bounds[0]
+        edge = space.edges[axis]
         least = width + 2 * protrusion + cutoff
         if edge < least:
             sites = f", {2 * protrusion:.3g} Å by which sites may protrude," if protrusion else ""

@@ -114,9 +114,12 @@ def wrap_sites(arguments, block):
     or is not finite.
     """
     pairs, sites, state = load_arguments(arguments)
-    clusters, cell, lead = pairs.clusters, pairs.cell, pairs.times[LEAD_TIME]
+    clusters = pairs.clusters
+    cell = pairs.cell
+    lead = pairs.times[LEAD_TIME]
     max_distance = MAX_DISTANCE * (pairs.cutoff + pairs.skin)
-    extent, local = clusters.extent[block], clusters.local
+    extent = clusters.extent[block]
+    local = clusters.local
     for k in range(3):
         extent[k], extent[3 + k] = inf, -inf
     first, end = _molecules_of_block(sites, len(clusters.extent), block)
@@ -244,7 +247,9 @@ def set_origins(arguments, block):
     """Set origins and references of newly sorted clusters. The origin is the centre of the bounding
     box."""
     pairs, sites, state = load_arguments(arguments)
-    clusters, cell, lead = pairs.clusters, pairs.cell, pairs.times[LEAD_TIME]
+    clusters = pairs.clusters
+    cell = pairs.cell
+    lead = pairs.times[LEAD_TIME]
     width = lanes_of(clusters.local)
     order, origin, reference = clusters.order, clusters.origin, clusters.reference
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
@@ -296,7 +301,8 @@ def _pair_up(order, at, width, first, end):
     another. `at` has their positions and is reordered with them."""
     vectors = 2 * (first // width) * width
     for a in range(first, end - 2, 2):
-        nearest, nearest2 = a + 1, inf
+        nearest = a + 1
+        nearest2 = inf
         for b in range(a + 1, end):
             d2 = 0.0
             for n in range(vectors, vectors + 3 * width, width):
@@ -333,7 +339,8 @@ def set_local(arguments, block):
         for i in range(sites.first[m], sites.first[m + 1]):
             x, y, z = _in_brick(clusters.boxes, cell, i, locate_site(sites, state, m, i))
             slot = load_scalar(clusters.slot, i)
-            at, c = index_of_x(slot, width), 4 * (np.uint32(slot) // np.uint32(width))
+            at = index_of_x(slot, width)
+            c = 4 * (np.uint32(slot) // np.uint32(width))
             local[np.uint64(at)] = x - load_scalar(origin, c)
             local[np.uint64(at + width)] = y - load_scalar(origin, c + 1)
             local[np.uint64(at + 2 * width)] = z - load_scalar(origin, c + 2)
@@ -349,7 +356,8 @@ def measure_displacements(arguments, block):
     """Set `moved`, and `largest_displacement` of a block, infinite if a displacement exceeds half
     the skin."""
     pairs = load_arguments(arguments)
-    clusters, limit = pairs.clusters, 0.5 * (pairs.skin - pairs.slack[0])
+    clusters = pairs.clusters
+    limit = 0.5 * (pairs.skin - pairs.slack[0])
     width = lanes_of(clusters.local)
     local, reference = clusters.local, clusters.reference
     full = (1 << width) - 1

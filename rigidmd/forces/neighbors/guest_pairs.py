@@ -132,7 +132,8 @@ def add_guest_energies(potential, core, guest, host, guest_strength, host_streng
     energy (m,) : u Å²/ps²; becomes inf where two sites are nearer than `core`
     """
     periodic = cell[0, 0] < inf
-    reach, least = potential.cutoff * potential.cutoff, core * core
+    reach = potential.cutoff * potential.cutoff
+    least = core * core
     for m in range(len(guest)):
         total = 0.0
         for a in range(guest.shape[1]):

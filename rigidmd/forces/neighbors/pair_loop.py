@@ -95,7 +95,8 @@ class PairForces(NamedTuple):
         potential, sites = self.potential, self.sites
         reach = _diameter(sites) if np.array_equal(self.group, sites.molecule) else inf
         pairs = empty_list(setup.cell, self.group, reach, potential.cutoff, setup.skin, setup.dtype)
-        blocks, slots = len(pairs.needed), len(pairs.clusters.order)
+        blocks = len(pairs.needed)
+        slots = len(pairs.clusters.order)
         sums = PairSums(
             forces=pairs.clusters.scratch,  # no list is built while forces are summed
             forces_behind=_buffer_behind(pairs, blocks, int(pairs.needed[:, WINDOW].max())),
@@ -145,8 +146,12 @@ class PairWorkspace(NamedTuple):
     def passes(self, into: Evaluation) -> list[Pass]:
         """Update of the list. Forces of rows, with what else is needed. Their sums on sites and
         molecules."""
-        pairs, sums, sites, tallies = self.pairs, self.sums, self.sites, self.sums.tallies
-        blocks, content = len(tallies), (self.slot_potential, pairs, sums)
+        pairs = self.pairs
+        sums = self.sums
+        sites = self.sites
+        tallies = self.sums.tallies
+        blocks = len(tallies)
+        content = (self.slot_potential, pairs, sums)
         moved = (self.list_code, pairs, sites, into.state, into.status)
         numbers = (self.potential, self.slot_potential, pairs, sums, into.status)
         passes = [
@@ -154,7 +159,8 @@ class PairWorkspace(NamedTuple):
             Pass("numbers of sites in its order, if it is new", _arrange_numbers, numbers),
             Pass("forces of pairs", _sum_forces, (*content, None, None), blocks, FORCES_ONLY),
         ]
-        energies, virials = (*content, tallies, tallies), (*content, tallies, None)
+        energies = (*content, tallies, tallies)
+        virials = (*content, tallies, None)
         when = WITH_ENERGIES if self.needs_virials else TALLIED
         passes.append(Pass("forces and energies of pairs", _sum_forces, energies, blocks, when))
         if self.needs_virials:
@@ -170,7 +176,8 @@ class PairWorkspace(NamedTuple):
     def with_capacity(self, cell: np.ndarray) -> "PairWorkspace":
         """With the capacity that the last build of the list needed."""
         pairs = lists.with_capacity(self.pairs, cell)
-        forces_behind, clusters = self.sums.forces_behind, int(pairs.needed[:, WINDOW].max())
+        forces_behind = self.sums.forces_behind
+        clusters = int(pairs.needed[:, WINDOW].max())
         if 3 * lane_count(forces_behind.dtype) * clusters > forces_behind.shape[1]:
             forces_behind = _buffer_behind(pairs, len(forces_behind), int(1.1 * clusters) + 1)
         return self._replace(pairs=pairs, sums=self.sums._replace(forces_behind=forces_behind))
@@ -219,7 +226,8 @@ def _diameter(sites: BodySites | CentralSites) -> float:
     around them."""
     if not isinstance(sites, BodySites) or not len(sites.molecule):
         return 0.0
-    starts, offsets = np.unique(sites.kind[np.diff(sites.first) > 0]), sites.offset_body
+    starts = np.unique(sites.kind[np.diff(sites.first) > 0])
+    offsets = sites.offset_body
     extents = np.maximum.reduceat(offsets, starts) - np.minimum.reduceat(offsets, starts)
     return float(np.linalg.norm(extents, axis=1).max())
 
@@ -299,11 +307,9 @@ def block_forces(potential, pairs, into, tallies, energies, block):
     align_stack()
     clusters = pairs.clusters
     width = lanes_of(clusters.local)
-    forces, behind, force_at_change = (
-        into.forces,
-        into.forces_behind[block],
-        into.force_at_change[block],
-    )
+    forces = into.forces
+    behind = into.forces_behind[block]
+    force_at_change = into.force_at_change[block]
     bounds = (clusters.bounds[block], clusters.bounds[block + 1])
     forces[3 * width * bounds[0] : 3 * width * bounds[1]] = 0.0
     behind[: 3 * width * pairs.needed[block, WINDOW]] = 0.0
@@ -315,10 +321,8 @@ def block_forces(potential, pairs, into, tallies, energies, block):
     moved = largest_displacement(pairs)
     first_met = first_entry = first_special = 0
     for c in range(bounds[0], bounds[1]):
-        neighbors, origin_vector = (
-            pairs.neighbors[block, first_met:],
-            pairs.origin_vector[block, 3 * first_met :],
-        )
+        neighbors = pairs.neighbors[block, first_met:]
+        origin_vector = pairs.origin_vector[block, 3 * first_met :]
         for i in range(width * c, width * (c + 1), 2):
             at = 2 * width * c + i
             here = (
@@ -330,7 +334,8 @@ def block_forces(potential, pairs, into, tallies, energies, block):
                 ),
             )
             still = (zero, zero, zero)
-            sums, number = (still, still, zero), 0
+            sums = (still, still, zero)
+            number = 0
             for n in range(first_special, pairs.masked_end[i // 2]):
                 other, image, between = _displacements(
                     pairs, c, here, neighbors, origin_vector, masked[n, 0]
@@ -407,10 +412,8 @@ def _change_image(pairs, number, now, sums, force_at_change, tally):
         if number != 0:
             at = 4 * number
             a, b, c = pairs.shift[at], pairs.shift[at + 1], pairs.shift[at + 2]
-            fx, fy = (
-                sum_lanes(x - load(force_at_change, 0)),
-                sum_lanes(y - load(force_at_change, width)),
-            )
+            fx = sum_lanes(x - load(force_at_change, 0))
+            fy = sum_lanes(y - load(force_at_change, width))
             fz = sum_lanes(z - load(force_at_change, 2 * width))
             _add_symmetric_virial(tally, (-fx * a, -fx * b, -fx * c, -fy * b, -fy * c, -fz * c))
         store(force_at_change, 0, x)
@@ -459,7 +462,8 @@ def load_origin_vector(pairs, c, neighbors, vectors, number):
         return stored
 
     def computed(pairs, c, neighbors, vectors, number):
-        origin, image = pairs.clusters.origin, load_scalar(neighbors, number)
+        origin = pairs.clusters.origin
+        image = load_scalar(neighbors, number)
         there = load_four(pairs.shift, 4 * image_number(image)) + load_four(
             origin, 4 * cluster_of(image)
         )
@@ -493,7 +497,8 @@ def _interact(
     two, of_two = _masked_pair(potential, i + 1, width * other, between[1][3], masks[1])
     first, end = bounds
     turn = len(pairs.clusters.origin) // 4 if other < end else 0
-    at, there = other - end + turn, forces_behind
+    at = other - end + turn
+    there = forces_behind
     if (other >= first) & (other < end):
         at, there = other, forces
     at = 3 * width * at
@@ -569,7 +574,8 @@ def gather_block(pairs, forces, forces_behind, tallies, block):
 @kernel(inline=True)
 def _gathered(pairs, forces, forces_behind, c):
     """The forces on the sites of a cluster, in double precision."""
-    width, bounds = lanes_of(pairs.clusters.local), pairs.clusters.bounds
+    width = lanes_of(pairs.clusters.local)
+    bounds = pairs.clusters.bounds
     at = 3 * width * c
     x, y, z = (
         to_double(load(forces, at)),
@@ -579,7 +585,8 @@ def _gathered(pairs, forces, forces_behind, c):
     for b in range(len(forces_behind)):
         behind = behind_block(bounds, b, c)
         if 0 <= behind < pairs.needed[b, WINDOW]:
-            there, at = forces_behind[b], 3 * width * behind
+            there = forces_behind[b]
+            at = 3 * width * behind
             x, y = x + to_double(load(there, at)), y + to_double(load(there, at + width))
             z = z + to_double(load(there, at + 2 * width))
     return x, y, z

@@ -73,7 +73,8 @@ def _fill_block(pairs, block, capacity):
     """Fill the rows of one block. Entries beyond the capacity are counted but not stored. Returns
     0, or the capacity needed for candidates if it is too small. The rows are then incomplete."""
     clusters = pairs.clusters
-    arity, rows = lanes_of(pairs.tree.low), lanes_of(clusters.local) // 2
+    arity = lanes_of(pairs.tree.low)
+    rows = lanes_of(clusters.local) // 2
     scratch = Scratch(
         np.empty((len(pairs.tree.level), 2), np.int64),
         np.empty(3),
@@ -106,7 +107,10 @@ def _fill_block(pairs, block, capacity):
 def _find_families(pairs, first, end, scratch):
     """Find families of clusters that may be within reach of clusters first ... end - 1. Returns
     their number, which may exceed the capacity."""
-    tree, into, low, high = pairs.tree, scratch.family, scratch.low, scratch.high
+    tree = pairs.tree
+    into = scratch.family
+    low = scratch.low
+    high = scratch.high
     radius = _reach(pairs)
     families = 0
     for image in range(pairs.counters[IMAGES_FOUND]):
@@ -122,7 +126,8 @@ def _find_families(pairs, first, end, scratch):
         if not reaches:
             continue
         count = len(pairs.clusters.origin) // 4
-        stack, radius2 = scratch.stack, radius * radius
+        stack = scratch.stack
+        radius2 = radius * radius
         found = families_within_reach(
             tree, low, high, radius2, first, end, count, stack, into, families
         )
@@ -149,7 +154,8 @@ def _find_candidates(pairs, c, scratch, families):
     radius = _reach(pairs)
     candidates = 0
     for n in range(families):
-        first, image = arity * cluster_of(scratch.family[n]), image_number(scratch.family[n])
+        first = arity * cluster_of(scratch.family[n])
+        image = image_number(scratch.family[n])
         at = 4 * image
         low = (
             tree.low[0, c] - shift[at],
@@ -174,7 +180,9 @@ def _find_candidates(pairs, c, scratch, families):
 def _fill_rows(pairs, block, c, scratch, candidates):
     width = lanes_of(pairs.clusters.local)
     rows = width // 2
-    entries, masked, filled = pairs.entries[block], pairs.masked[block], scratch.filled
+    entries = pairs.entries[block]
+    masked = pairs.masked[block]
+    filled = scratch.filled
     radius2 = _reach(pairs) ** 2
     count = _find_kinds(pairs, c, scratch, candidates)
     _store_neighbors(pairs, block, c, scratch, count)
@@ -182,7 +190,8 @@ def _fill_rows(pairs, block, c, scratch, candidates):
     for row in range(rows):
         r = rows * c + row
         here = scratch.sorted[row]
-        begin, size = filled[ENTRIES], scratch.kind_end[row, SHELLS - 1]
+        begin = filled[ENTRIES]
+        size = scratch.kind_end[row, SHELLS - 1]
         filled[ENTRIES] += size
         if filled[ENTRIES] <= len(entries):
             for n in range(size):
@@ -203,11 +212,9 @@ def _fill_rows(pairs, block, c, scratch, candidates):
 @kernel(inline=True)
 def _store_neighbors(pairs, block, c, scratch, count):
     """Store the neighbours of a cluster: the first of the candidates."""
-    there, origin_vector, filled = (
-        pairs.neighbors[block],
-        pairs.origin_vector[block],
-        scratch.filled,
-    )
+    there = pairs.neighbors[block]
+    origin_vector = pairs.origin_vector[block]
+    filled = scratch.filled
     first = filled[NEIGHBORS]
     for n in range(count):
         other, image = cluster_of(scratch.candidate[n]), image_number(scratch.candidate[n])
@@ -332,7 +339,8 @@ def _mark_entries_to_mask(pairs, c, kind, candidate, at):
     """Set the kind of a candidate to NEEDS_MASK in the rows for which it needs a mask."""
     clusters = pairs.clusters
     width = lanes_of(clusters.local)
-    other, last = cluster_of(candidate), len(clusters.origin) // 4 - 1
+    other = cluster_of(candidate)
+    last = len(clusters.origin) // 4 - 1
     all_lanes = (1 << width) - 1
     special = all_lanes
     if other != c and c != last and other != last:
@@ -356,7 +364,9 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     reference = clusters.reference
     width = lanes_of(reference)
     all_lanes = (1 << width) - 1
-    c, other, image = i // width, cluster_of(candidate), image_number(candidate)
+    c = i // width
+    other = cluster_of(candidate)
+    image = image_number(candidate)
     at = 2 * width * c + i
     start = 3 * width * other
     dx = reference[at] + _origin_vector(pairs, c, other, image, 0) - load(reference, start)

@@ -43,7 +43,8 @@ def blocks_of(molecules):
 def molecules_of_block(molecules, block, together):
     """First and end of the molecules of a block: whole groups of `together` molecules, except the
     last."""
-    blocks, groups = blocks_of(molecules), (molecules + together - 1) // together
+    blocks = blocks_of(molecules)
+    groups = (molecules + together - 1) // together
     return together * (groups * block // blocks), min(
         molecules, together * (groups * (block + 1) // blocks)
     )
@@ -141,7 +142,8 @@ def site_vector(vectors, i):
         return lambda vectors, i: (vectors[i, 0], vectors[i, 1], vectors[i, 2])
 
     def from_slot(vectors, i):
-        value, width = vectors.value, lanes_of(vectors.value)
+        value = vectors.value
+        width = lanes_of(vectors.value)
         at = index_of_x(load_scalar(vectors.slot, i), width)
         return (
             load_scalar(value, at),
@@ -182,12 +184,10 @@ def predict_site(sites, state, m, i, lead):
         )
 
     def predict_site(sites, state, m, i, lead):
-        q, centre, velocity, momentum = (
-            state.rotation[m],
-            state.position[m],
-            state.velocity[m],
-            state.angular_momentum_body[m],
-        )
+        q = state.rotation[m]
+        centre = state.position[m]
+        velocity = state.velocity[m]
+        momentum = state.angular_momentum_body[m]
         row = sites.kind[m] - sites.first[m] + i
         offset, inverse = sites.offset_body[row], sites.inverse_inertia[row]
         # Cayley rotation by 2 atan(|a|) about a = lead omega / 2, which keeps distances within a

@@ -91,7 +91,8 @@ def _is_valid(work, state):
         return False
     if cutoff == inf:
         return True
-    built, strain2 = pairs.built_cell, 0.0
+    built = pairs.built_cell
+    strain2 = 0.0
     periodic = cell[0, 0] < inf
     changed = False
     if periodic:
@@ -129,7 +130,8 @@ def _is_valid(work, state):
 def sort_points(arguments, block):
     """Whether the list has to be built, and then the bins of its points."""
     work, state, status = load_arguments(arguments)
-    pairs, n = work.pairs, len(work.term.kind)
+    pairs = work.pairs
+    n = len(work.term.kind)
     if _is_valid(work, state):
         return
     pairs.counters[MUST_BUILD] = 1
@@ -181,7 +183,8 @@ def _bounds(point, cell):
 @kernel
 def _choose_bins(work, cell, low, high):
     """Bins at least as wide as the reach of the list, and no more than there are bodies."""
-    bins, reach = work.pairs.bins, work.term.cutoff + work.pairs.skin
+    bins = work.pairs.bins
+    reach = work.term.cutoff + work.pairs.skin
     n = len(work.term.kind)
     for k in range(3):
         # the cell is close to right angles: edges along the axes are its widths but for its slant
@@ -239,7 +242,8 @@ def list_pairs(arguments, block):
     bins, point = pairs.bins, pairs.point
     periodic = cell[0, 0] < inf
     reach2 = (term.cutoff + pairs.skin) ** 2
-    entries, capacity = pairs.entries[block], pairs.entries.shape[1]
+    entries = pairs.entries[block]
+    capacity = pairs.entries.shape[1]
     first, last = rows_of_block(len(term.kind), block)
     count = 0
     for i in range(first, last):

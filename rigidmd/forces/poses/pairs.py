@@ -61,7 +61,8 @@ class BodyPairsWorkspace(NamedTuple):
     def passes(self, into: Evaluation) -> list[Pass]:
         """Reference points; the list; pairs; sums on bodies."""
         blocks = blocks_of(len(self.term.kind))
-        plain, tallied = (self, into.state, None), (self, into.state, self.tallies)
+        plain = (self, into.state, None)
+        tallied = (self, into.state, self.tallies)
         return [
             Pass("reference points of bodies", _place_points, (self, into.state), blocks),
             Pass("whether the list is valid", sort_points, (self, into.state, into.status)),
@@ -139,7 +140,9 @@ def _add_pairs(arguments, block):
 def _pairs_of_block(work, state, tallies, block):
     """Forces and torques into the loads of a block, energy and virial into its tally."""
     term, pairs, cell = work.term, work.pairs, state.cell
-    load, entries, point = work.loads[block], pairs.entries[block], pairs.point
+    load = work.loads[block]
+    entries = pairs.entries[block]
+    point = pairs.point
     first, last = rows_of_block(len(term.kind), block)
     for m in range(len(load)):
         for k in range(6):

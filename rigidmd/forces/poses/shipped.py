@@ -69,7 +69,8 @@ def shipped_function(
 
 #: In a text: the distance; cosines of the angles of the axes of the first and the second body with
 #: the vector from the first to the second, and with each other.
-DISTANCE, ANGLES = "r", ("a_r", "b_r", "a_b")
+DISTANCE = "r"
+ANGLES = ("a_r", "b_r", "a_b")
 
 
 def function_of_text(energy: str, mixing: Mapping[str, str]) -> Callable:

@@ -20,7 +20,8 @@ from rigidmd.compile import implements, kernel
 from rigidmd.forces.poses.pairs import pair_slopes
 from rigidmd.units import KJ_PER_MOL
 
-GRID, ENERGY = ("r_A", "theta_1_deg", "theta_2_deg", "phi_deg"), "energy_kJ_mol"
+GRID = ("r_A", "theta_1_deg", "theta_2_deg", "phi_deg")
+ENERGY = "energy_kJ_mol"
 FEWEST = 4  # points along an edge of the grid
 #: Tolerance of equal energies, relative to the largest one, and of even steps, relative to a step.
 SAME, EVEN = 1e-6, 1e-6
@@ -80,7 +81,8 @@ def _errors(arrays: dict[str, np.ndarray]) -> Iterator[str]:
             yield f"{name} must have {FEWEST} points or more in even ascending steps"
         if name != "r_A" and not np.allclose(points[[0, -1]], [0, 180]):
             yield f"{name} must run from 0 to 180"
-    energy, shape = arrays[ENERGY], tuple(len(arrays[name]) for name in GRID)
+    energy = arrays[ENERGY]
+    shape = tuple(len(arrays[name]) for name in GRID)
     if energy.shape != shape:
         yield f"{ENERGY} has the shape {energy.shape}, must have {shape}"
     if not np.isfinite(energy).all() or not arrays["r_A"][0] > 0:
@@ -173,7 +175,8 @@ def _limited(cosine):
 
 @implements(pair_slopes, TableFormula)
 def _of_table(formula, p, r, a, b):
-    axis, distance = int(p[6]), sqrt(_dot(r, r))
+    axis = int(p[6])
+    distance = sqrt(_dot(r, r))
     n = (r[0] / distance, r[1] / distance, r[2] / distance)
     u, v = (a[0, axis], a[1, axis], a[2, axis]), (b[0, axis], b[1, axis], b[2, axis])
     c, d, e = _limited(_dot(u, n)), _limited(_dot(v, n)), _dot(u, v)

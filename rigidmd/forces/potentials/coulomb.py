@@ -83,7 +83,8 @@ def interactions(parts: SystemParts) -> Interactions:
     cutoff."""
     forces, (sites, charge) = parts.scene.forces, parts.charged()
     cutoff = (forces.cutoff_A if forces.electrostatics == "reaction_field" else None) or inf
-    start, name = forces.switch_start_A or cutoff, forces.reaction_field_truncation or "plain"
+    start = forces.switch_start_A or cutoff
+    name = forces.reaction_field_truncation or "plain"
     potential = reaction_field(charge, cutoff, forces.reaction_field_permittivity, name, start)
     constants = {}
     if cutoff < inf:

@@ -42,7 +42,8 @@ class CustomPotential(NamedTuple):
     def for_slots(self, slots: int, dtype: type) -> "CustomOneKind | CustomManyKinds":
         """What the pair loop reads: numbers if all sites are of one kind, else tables for all
         slots."""
-        head, kinds = self[:4], self.parameters.shape[1]
+        head = self[:4]
+        kinds = self.parameters.shape[1]
         if kinds == 1:
             return CustomOneKind(*head, tuple(float(x) for x in self.terms_of_kinds[:, 0, 0]))
         count = len(self.parameters) + 5
@@ -89,7 +90,8 @@ def _pair_of_one_kind(potential, i, j, r2):
 @implements(pairs.pair, CustomManyKinds, chooses=True, inline=True)
 def _pair(potential, i, j, r2):
     types = dict(zip(CustomManyKinds._fields, potential.types, strict=True))
-    formula, truncation = types["formula"].instance_class, types["truncation"]
+    formula = types["formula"].instance_class
+    truncation = types["truncation"]
     names = [
         f"load(potential.table, at + {5 + p} * potential.stride)"
         for p in range(len(formula._fields))

@@ -129,10 +129,8 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
 def _class_for(kind: type, function: Callable) -> type:
     """A new class for a function, by which compiled code finds it: with the values that the
     function uses now."""
-    module, name = (
-        function.__module__,
-        f"{kind.__qualname__.rpartition('.')[2]}_of_{function.__name__}",
-    )
+    module = function.__module__
+    name = f"{kind.__qualname__.rpartition('.')[2]}_of_{function.__name__}"
     formula_class = type(
         name, (kind,), {"__module__": module, "__qualname__": name, "uses_root": True}
     )
@@ -221,7 +219,8 @@ def formula_of_table(
             else CubicHermiteSpline(r[rows], values, -KJ_PER_MOL * f[rows])
         )
 
-    spline, coarse = interpolated(slice(None)), interpolated(slice(None, None, 2))
+    spline = interpolated(slice(None))
+    coarse = interpolated(slice(None, None, 2))
     slope = spline(r[[0, -1]], 1) / (2 * r[[0, -1]])  # by r²
     if not slope[0] < 0:
         raise FormulaError(
@@ -303,7 +302,8 @@ def _check_intervals(name: str, r: np.ndarray, cutoff: float) -> None:
 
 def _check_forces(name: str, r: np.ndarray, u: np.ndarray, f: np.ndarray, high: float) -> None:
     """Raise FormulaError if forces f are not -du/dr between the rows with energies up to `high`."""
-    gained, mean = np.diff(u), 0.5 * (f[1:] + f[:-1]) * np.diff(r)
+    gained = np.diff(u)
+    mean = 0.5 * (f[1:] + f[:-1]) * np.diff(r)
     off = np.where(np.maximum(u[1:], u[:-1]) <= high, np.abs(gained + mean), 0.0)
     k = int(off.argmax())
     if off[k] > WRONG_FORCE * np.abs(gained).max(where=u[:-1] <= high, initial=0.0):

@@ -80,7 +80,8 @@ class LennardJones(NamedTuple):
     def for_slots(self, slots: int, dtype: type) -> "LennardJonesOneKind | LennardJonesManyKinds":
         """What the pair loop reads: numbers if all sites are of one kind, else a table for all
         slots."""
-        head, kinds = self[:4], len(self.c12)
+        head = self[:4]
+        kinds = len(self.c12)
         c12, c6 = (float(self.c12[0, 0]), float(self.c6[0, 0])) if kinds == 1 else (1.0, 1.0)
         dispersion = self.dispersion
         if isinstance(dispersion, ScreenedDispersion):
@@ -168,7 +169,9 @@ def lennard_jones(
 
 def interactions(parts: SystemParts) -> Interactions:
     """The Lennard-Jones forces of a scene, with forces.lennard_jones. Raises SceneError."""
-    forces, species, index = parts.scene.forces, parts.species, parts.model.species
+    forces = parts.scene.forces
+    species = parts.species
+    index = parts.model.species
     named = _sites_of_pairs(parts)
     indices = [
         np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)
@@ -253,7 +256,8 @@ def _with_soft_core(
     soft : whether each species has a soft core; whole : whether each kind has none, these first
     inner : the pairs inside molecules, None without tail corrections
     """
-    forces, sites = parts.scene.forces, parts.sites(indices)
+    forces = parts.scene.forces
+    sites = parts.sites(indices)
     is_whole = ~np.array(soft)[parts.model.species]
     kinds = int(whole.sum())
     softened = soft_core(
@@ -285,7 +289,9 @@ def _with_soft_core(
 def _sites_of_pairs(parts: SystemParts) -> list[np.ndarray]:
     """Masks (pairs, 2, sites) for each species: whether the first or second name of forces.pairs
     means the site. Raises SceneError."""
-    entries, species, faults = parts.scene.forces.pairs, parts.species, []
+    entries = parts.scene.forces.pairs
+    species = parts.species
+    faults = []
     is_meant = [np.zeros((len(entries), 2, len(m.site_names)), bool) for m in species]
     for n, entry in enumerate(entries):
         for side, text in enumerate(entry.sites):
@@ -371,10 +377,8 @@ def energy_and_force(potential, c12, c6, r2):
 
         def of_many(potential, c12, c6, r2):
             inverse2, inverse1 = inverses(potential.truncation, potential.addend12, r2)
-            six, terms = (
-                inverse2 * inverse2 * inverse2,
-                mixed(potential.terms12, potential.terms6, c12, c6),
-            )
+            six = inverse2 * inverse2 * inverse2
+            terms = mixed(potential.terms12, potential.terms6, c12, c6)
             of12 = c12 * (12 + switch_term(potential.truncation, potential.addend12, r2 * inverse1))
             of6 = c6 * (6 + switch_term(potential.truncation, potential.addend6, r2 * inverse1))
             u, w = (c12 * six - c6) * six + terms[0], (of12 * six - of6) * six * inverse2
@@ -386,10 +390,8 @@ def energy_and_force(potential, c12, c6, r2):
 
         def with_correction(potential, c12, c6, r2):
             inverse2 = inverse(r2)
-            six, terms = (
-                inverse2 * inverse2 * inverse2,
-                mixed(potential.terms12, potential.terms6, c12, c6),
-            )
+            six = inverse2 * inverse2 * inverse2
+            terms = mixed(potential.terms12, potential.terms6, c12, c6)
             u, w = (c12 * six - c6) * six + terms[0], (12 * c12 * six - 6 * c6) * six * inverse2
             w = w + correction(potential.truncation, potential.correction, r2)
             return truncated(potential.truncation, terms, potential.correction, r2, 0.0, u, w)
@@ -398,10 +400,8 @@ def energy_and_force(potential, c12, c6, r2):
 
     def of_one(potential, c12, c6, r2):
         inverse2, inverse1 = inverses(potential.truncation, potential.addend12, r2)
-        six, terms = (
-            inverse2 * inverse2 * inverse2,
-            mixed(potential.terms12, potential.terms6, c12, c6),
-        )
+        six = inverse2 * inverse2 * inverse2
+        terms = mixed(potential.terms12, potential.terms6, c12, c6)
         of12 = 12 * c12 + switch_term(potential.truncation, potential.addend12, r2 * inverse1)
         of6 = 6 * c6 + switch_term(potential.truncation, potential.addend6, r2 * inverse1)
         u, w = (c12 * six - c6) * six + terms[0], (of12 * six - of6) * six * inverse2

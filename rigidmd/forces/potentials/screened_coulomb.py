@@ -124,7 +124,8 @@ def force_table(alpha: float, cutoff: float) -> tuple[np.float32, np.ndarray, fl
     # get the first cubic.
     density = np.float32(INTERVALS / cutoff**2 * (1 - 8 * np.finfo(np.float32).eps))
     node, weight = np.polynomial.legendre.leggauss(64 + int(8 * alpha * cutoff))
-    s, weight = 0.5 * (1 + node), 0.5 * weight
+    s = 0.5 * (1 + node)
+    weight = 0.5 * weight
 
     def exact(x):
         """Force over r, (..., INTERVALS), at x within all intervals."""
@@ -166,7 +167,8 @@ def _series(x: float, power: int) -> np.ndarray:
     to powers of t.
     """
     node, weight = np.polynomial.legendre.leggauss(64 + int(8 * x))
-    s, weight = 0.5 * (1 + node), 0.5 * weight
+    s = 0.5 * (1 + node)
+    weight = 0.5 * weight
     k = np.arange(16 + int(8 * x))
     bessel = ive(k[:, None], 0.5 * (x * s) ** 2) @ (weight * s**power)
     return np.where(k == 0, 1, 2) * (-1.0) ** k * bessel

@@ -28,7 +28,10 @@ from rigidmd.units import KJ_PER_MOL
 #: Functions and operators that the text of an energy may have.
 FUNCTIONS = {"exp": exp, "log": log, "sqrt": sqrt, "sin": sin, "cos": cos}
 OPERATORS = {ast.Add: add, ast.Sub: sub, ast.Mult: mul, ast.Div: truediv, ast.Pow: pow}
-MAX_TEXT_LENGTH, MAX_POWER, MAX_NODES, MAX_DEPTH = 2000, 200, 200, 20
+MAX_TEXT_LENGTH = 2000
+MAX_POWER = 200
+MAX_NODES = 200
+MAX_DEPTH = 20
 #: decimal digits of numbers in a formula, before or behind the point, with powers multiplied out
 MAX_DIGITS = 300
 #: Prefixes of the parameters of a formula and of what is computed from them, so that no name occurs
@@ -92,7 +95,8 @@ def _derivative(e: sympy.Expr, r: sympy.Symbol, known: dict[sympy.Expr, sympy.Ex
     """The derivative by r. SymPy's derivative determines the sign of every part, in a time like
     2**depth."""
     if e not in known:
-        args, inner = e.args, [_derivative(part, r, known) for part in e.args]
+        args = e.args
+        inner = [_derivative(part, r, known) for part in e.args]
         if not inner:
             derivative = sympy.Integer(e == r)
         elif e.is_Add:
@@ -174,7 +178,8 @@ def _hoisted(u: sympy.Expr, r: sympy.Symbol) -> tuple[dict[sympy.Symbol, sympy.E
     for term in sympy.Add.make_args(u):
         factor, rest = term.as_independent(r, as_Add=False)
         of[rest] = of.get(rest, sympy.Integer(0)) + factor
-    hoisted, total = {}, sympy.Integer(0)
+    hoisted = {}
+    total = sympy.Integer(0)
     for k, (rest, factor) in enumerate(of.items()):
         if factor.free_symbols:
             symbol = sympy.Symbol(f"{CONSTANT_PREFIX}{k}", real=True)
@@ -360,7 +365,8 @@ def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
             case ast.Name(id=name):
                 return _Part(sympy.Symbol(f"{PARAMETER_PREFIX}{name}", real=True), None, 0.0)
             case ast.UnaryOp(op=ast.USub() | ast.UAdd() as op, operand=of):
-                part, sign = inner(of, 0), 1 if isinstance(op, ast.UAdd) else -1
+                part = inner(of, 0)
+                sign = 1 if isinstance(op, ast.UAdd) else -1
                 return part._replace(
                     value=sign * part.value, number=part.number and sign * part.number
                 )

@@ -116,7 +116,8 @@ NO_SWITCH = ()
 #: The error of a `SwitchCorrection`, relative to its largest value, and its numbers of
 #: coefficients: each compiles other code, and the first is enough for a switch over the last sixth
 #: of the cutoff.
-CORRECTION_ERROR, COEFFICIENTS = 2e-7, (12, 18)
+CORRECTION_ERROR = 2e-7
+COEFFICIENTS = (12, 18)
 
 
 def switch_term_of(
@@ -134,10 +135,8 @@ def switch_term_of(
     ):
         return NO_SWITCH
     k, series = SWITCH_SERIES[type(truncation)]
-    start, width = (
-        Fraction(truncation.start),
-        Fraction(truncation.cutoff) - Fraction(truncation.start),
-    )
+    start = Fraction(truncation.start)
+    width = Fraction(truncation.cutoff) - Fraction(truncation.start)
     t, left = Polynomials([Fraction(0), Fraction(1)]), Polynomials([Fraction(1), Fraction(-1)])
     r = start + width * t
     fall = sum((c * t ** (n + 1) for n, c in enumerate(series)), t * 0)  # of S, less 1, over t^k
@@ -304,7 +303,8 @@ def removed_energy(
             for x in r.tolist()
         ]
     elif not isinstance(truncation, Unmodified):
-        switched, switch = r > truncation.start, SWITCH_FUNCTIONS[type(truncation)]
+        switched = r > truncation.start
+        switch = SWITCH_FUNCTIONS[type(truncation)]
         removed[switched] = energy(r[switched]) * [
             1 - switch(truncation, x)[0] for x in r[switched].tolist()
         ]

@@ -38,7 +38,10 @@ MARGIN = 0.95
 SAFETY = 0.65
 #: Length of the pilot run of the best step: part of the run; least and most, in short pilot runs;
 #: its repetitions.
-LONG_PILOT_PART, LONG_PILOT_MIN, LONG_PILOT_MAX, CORRECTIONS = 0.05, 10.0, 100.0, 3
+LONG_PILOT_PART = 0.05
+LONG_PILOT_MIN = 10.0
+LONG_PILOT_MAX = 100.0
+CORRECTIONS = 3
 REMEDIES = (
     "truncation = 'smooth_switch', a longer cutoff_A or a shorter stage make the walk of the energy"
     " smaller"
@@ -77,11 +80,13 @@ class _Search:
 
     def best(self) -> Trial | None:
         """The trial with the fewest forces. None if no trial is within the target."""
-        best, cheapest = None, inf
+        best = None
+        cheapest = inf
         for name in CANDIDATES:
             trial = self._longest_step(name, cheapest) if name in self.longest else None
             if trial is not None and self.cost(trial) < cheapest:
-                best, cheapest = trial, self.cost(trial)
+                best = trial
+                cheapest = self.cost(trial)
         return best
 
     def cost(self, trial: Trial) -> float:
@@ -97,7 +102,8 @@ class _Search:
 
     def expected(self, trial: Trial, timestep: float | None = None) -> float:
         """Error over the time. At another step by the order of the integrator."""
-        name, step = trial.integrator, timestep or trial.timestep
+        name = trial.integrator
+        step = timestep or trial.timestep
         regular = self.slow_factor.get(name, 1.0) * getattr(trial, self.error)
         regular *= (step / trial.timestep) ** self.system.methods[name].order
         return sqrt(regular**2 + self.walk_square(name, step, self.time))
@@ -130,7 +136,8 @@ class _Search:
         """The trial with the longest step within the target. None without one, or if all cost more
         than `cheapest`."""
         longest = step = self.longest[name]
-        good, bad = None, inf
+        good = None
+        bad = inf
         for _ in range(MAX_TRIALS):
             trial = self.trial(name, step)
             if not trial.diverged:
@@ -168,9 +175,13 @@ def choose(
     the run over which an error of the energy has to hold, if not the span. Raises SimulationError.
     """
     if energy is not None:
-        target, error, exact = energy, "energy_rms", None
+        target = energy
+        error = "energy_rms"
+        exact = None
     else:
-        target, error, duration = not_none(trajectory), "trajectory_error", None
+        target = not_none(trajectory)
+        error = "trajectory_error"
+        duration = None
         exact = _reference(system, target)
     search = _Search(system, target, error, longest, exact)
     first = search.best()
@@ -184,8 +195,11 @@ def choose(
             f"no integrator keeps its error below {target:g} with any step tried"
             + "".join(reached[:1])
         )
-    best, per = first, "ps" if system.time_unit == "fs" else "s"
-    value, over, words = getattr(best, error), f"over {system.span:.3g} {per}", ""
+    best = first
+    per = "ps" if system.time_unit == "fs" else "s"
+    value = getattr(best, error)
+    over = f"over {system.span:.3g} {per}"
+    words = ""
     if duration is not None and duration > system.span:
         best, value, words = _best_for_duration(search, best, duration)
         over = f"over {duration:.4g} {per}"
@@ -214,12 +228,15 @@ def choose(
 def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[Trial, float, str]:
     """The best trial for a run that is longer than its pilots, its expected error, and a phrase
     about the pilot run. Raises SimulationError if none survives its pilot run."""
-    span, target = search.system.span, search.target
+    span = search.system.span
+    target = search.target
     search.energy_walk, search.time = measure_energy_walk(search.system, first.timestep), duration
     search.target = SAFETY * target
     length = max(LONG_PILOT_MIN * span, LONG_PILOT_PART * duration)
     length = min(duration, LONG_PILOT_MAX * span, length)
-    best, value, pilot_trial = first, search.expected(first), first
+    best = first
+    value = search.expected(first)
+    pilot_trial = first
     for _ in range(CORRECTIONS):
         if (candidate := search.best()) is None:
             break

@@ -44,7 +44,9 @@ class EnergyWalk(NamedTuple):
 def weight(scheme: Scheme, jump: float) -> float:
     """w of an integrator. The sum of b² for a jump below 0, where the errors of kicks are
     independent."""
-    at, kicks, n = 0.0, [], np.arange(1.0, 1000.0)
+    at = 0.0
+    kicks = []
+    n = np.arange(1.0, 1000.0)
     for flow in scheme.flows:
         at += flow.fraction if flow.kind == DRIFT else 0.0
         kicks += [(flow.fraction, at)] if flow.kind == KICK else []
@@ -57,7 +59,8 @@ def weight(scheme: Scheme, jump: float) -> float:
 def measure_energy_walk(system: TrialSystem, timestep: float) -> EnergyWalk:
     """The walk, from two pilot runs at about this step (in the unit of the system) and at half of
     it."""
-    scheme, rates = cast(Scheme, system.methods[PILOT_INTEGRATOR].scheme), []
+    scheme = cast(Scheme, system.methods[PILOT_INTEGRATOR].scheme)
+    rates = []
     for _ in range(3):
         rates = [_rate(system, timestep / part, part * STEPS) for part in (1, 2)]
         if None not in rates:
@@ -81,5 +84,6 @@ def _rate(system: TrialSystem, timestep: float, steps: int) -> float | None:
     trials.measure_errors(system, trial, None, STEPS)
     if trial.diverged:
         return None
-    energy, spacing = np.array(trial.energies), steps / STEPS * timestep * system.time_size
+    energy = np.array(trial.energies)
+    spacing = steps / STEPS * timestep * system.time_size
     return min(float(np.mean((energy[m:] - energy[:-m]) ** 2)) / (m * spacing) for m in LAGS)

@@ -25,7 +25,8 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: The integrator for averages, and its largest bias of U, in kT per degree of freedom and in (w
 #: dt)²: one of two parts, which cancel in harmonic motions.
-UNBIASED, BIAS = "baoab", 1 / 24
+UNBIASED = "baoab"
+BIAS = 1 / 24
 #: Step and length of the pilot run, in radians of the faster mean motion, translation or rotation;
 #: its samples.
 PILOT_STEP, PILOT_RADIANS, PILOT_SAMPLES = 0.15, 50.0, 25
@@ -47,7 +48,8 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     SimulationError."""
     stage = system.scene.stages[k]
     target = not_none(stage.bias_kT)
-    stiffest, rate = stiffest_mode(system, state), mean_square_rate(system, state, k)
+    stiffest = stiffest_mode(system, state)
+    rate = mean_square_rate(system, state, k)
     decided = stage.with_integrator(UNBIASED, stage.step_fs)
     if rate > 0:
         stable = stable_angle(decided.scheme) / stiffest.rate if stiffest else inf
@@ -67,7 +69,9 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
 def mean_square_rate(system: System, state: State, k: int) -> float:
     """Mean w² of a degree of freedom (1/ps²) in stage k, over the second half of a pilot run from a
     state on."""
-    stage, freedom, engine = system.scene.stages[k], system.freedom_in(k), system.engine()
+    stage = system.scene.stages[k]
+    freedom = system.freedom_in(k)
+    engine = system.engine()
     thermal = BOLTZMANN * max(stage.temperatures)
 
     def square_rates(now: State) -> np.ndarray:
@@ -123,7 +127,8 @@ def _begun(
 #: Integrators that are tried for hybrid Monte Carlo, from the shortest step to the longest one.
 TRIED = ("velocity_verlet", "two_stage", "srkn_4")
 #: Steps that are tried, as fractions of the longest stable one, and trajectories with each.
-FRACTIONS, TRAJECTORIES = (0.2, 0.28, 0.4, 0.56, 0.8), 16
+FRACTIONS = (0.2, 0.28, 0.4, 0.56, 0.8)
+TRAJECTORIES = 16
 #: Minimum acceptance with which longer steps are tried.
 LEAST_ACCEPTANCE = 0.2
 #: Steps of the first trajectories, which leave the lattice of a start, whose forces are not those
@@ -147,7 +152,8 @@ def choose_for_sampling(system: System, state: State, k: int) -> tuple[Stage, st
         return decided.model_copy(update={"trajectory_steps": steps})
 
     now, _ = _acceptance(system, state, k, with_steps(TRIED[0], stage.step_fs, WARMING_STEPS))
-    stiffest, rate = stiffest_mode(system, now), mean_square_rate(system, now, k)
+    stiffest = stiffest_mode(system, now)
+    rate = mean_square_rate(system, now, k)
     if stiffest is None or rate == 0:
         raise SimulationError(
             f"stages.{k}: nothing sets a step for integrator = 'auto'. Name an integrator and a"

@@ -94,6 +94,7 @@ def _fit_step(timestep: float, duration: float, interval: float | None) -> float
     if interval is None:
         interval = duration / SAMPLES if duration / SAMPLES >= timestep else duration
     (a, b), (c, d) = (Fraction(repr(span)).as_integer_ratio() for span in (duration, interval))
-    common, longest = float(Fraction(gcd(a * d, c * b), b * d)), min(timestep, interval)
+    common = float(Fraction(gcd(a * d, c * b), b * d))
+    longest = min(timestep, interval)
     span = common if common >= MIN_STEP_FRACTION * longest else duration
     return span / ceil(span / longest * (1 - 1e-9))

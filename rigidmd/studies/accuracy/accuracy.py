@@ -218,7 +218,8 @@ def describe_accuracy(measured: IntegratorAccuracy, verbose: bool = False) -> li
 
 def recommendations(measured: IntegratorAccuracy) -> list[str]:
     """Sentences on the cheapest integrator for each accuracy, and `remarks`."""
-    s, lines = measured.trial_system, []
+    s = measured.trial_system
+    lines = []
     for error, best, faster, rivals in cheapest(measured):
         faster = f": {faster}" if faster else ""
         rivals = f". Equally fast within timing noise: {rivals}" if rivals else ""
@@ -303,7 +304,9 @@ COMMON = "velocity_verlet"  # integrator to compare with
 def cheapest(measured: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
     """For each error of the energy, and of Q or X: the cheapest integrator, how much faster than
     `COMMON` it is, others that are as fast. Errors with the same answer are one row."""
-    s, rows, unit = measured.trial_system, [], measured.trial_system.time_unit
+    s = measured.trial_system
+    rows = []
+    unit = measured.trial_system.time_unit
     rotates = any(not np.isnan(t.rotation_error) for t in measured.trials)
     # A motion of a body with the right energy is not advised if QᵀQ or another invariant is worse.
     energy = "energy_rms" if s.time_unit == "fs" else "conservation_error"
@@ -326,10 +329,8 @@ def cheapest(measured: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
             rivals = {
                 name: r.step for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow
             }
-            chosen, faster = (
-                f"{best} at {at.step:.2g} {unit}{f' ({at.limit})' if at.limit else ''}",
-                "",
-            )
+            chosen = f"{best} at {at.step:.2g} {unit}{f' ({at.limit})' if at.limit else ''}"
+            faster = ""
             if common and COMMON not in rivals:
                 faster = (
                     f"{common.seconds / at.seconds:.1f} times faster than {COMMON} at"
@@ -400,7 +401,8 @@ def accuracy_figure(measured: IntegratorAccuracy):
                 for t in measured.trials
                 if t.integrator == name and not t.diverged and getattr(t, error) > 0
             ]
-            times, errors = [t.time / s.span for t in trials], [getattr(t, error) for t in trials]
+            times = [t.time / s.span for t in trials]
+            errors = [getattr(t, error) for t in trials]
             style = curve_style(k)
             axis.loglog(times, errors, ms=3.5, lw=1.2, label=name, **style)
             low, high = (

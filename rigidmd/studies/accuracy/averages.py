@@ -106,7 +106,8 @@ class Averages:
 
     def bias(self, run: AverageRun, quantity: AveragedQuantity) -> tuple[float, float] | None:
         """Mean less limit and its error, in the quantity's unit of biases. None without a mean."""
-        point, fit = self.point(run, quantity), self.fit(quantity)
+        point = self.point(run, quantity)
+        fit = self.fit(quantity)
         if point is None or fit is None:
             return None
         value, error = fit.bias(point)
@@ -225,7 +226,8 @@ def measure_averages(
     whole = sum(run.forces_per_ps for _, run in plan)
     done = 0.0
     for changed, run in plan:
-        part, length = run.forces_per_ps / whole, changed.duration
+        part = run.forces_per_ps / whole
+        length = changed.duration
 
         def report_progress(moment, before=done, part=part, length=length):
             progress(before + part * min(1.0, moment.time / length))

@@ -127,7 +127,8 @@ def write_averages(folder: Path, averages: Averages, command: str) -> list[Path]
 
 
 def to_json(averages: Averages, command: str) -> dict:
-    quantities, methods = {}, averages.methods
+    quantities = {}
+    methods = averages.methods
     for quantity in averages.quantities:
         quantities[quantity.name] = {"unit": quantity.unit}
         if (fit := averages.fit(quantity)) is not None:

@@ -96,7 +96,8 @@ class IntegratorAccuracy:
             limit = "kept from its longest stable step"
         else:
             limit = "its longest step tried"
-        step, up = float(min(step, longest)), tried[::-1]
+        step = float(min(step, longest))
+        up = tried[::-1]
         seconds = np.exp(
             np.interp(np.log(step), np.log([t.timestep for t in up]), np.log([t.time for t in up]))
         )
@@ -138,7 +139,8 @@ def measure(
     if extend:
         result.trials = trials = _extended(system, trials, exact)
     good = [trial for trial in trials if not trial.diverged]
-    done, total = 0.0, len(good) * repeats
+    done = 0.0
+    total = len(good) * repeats
     for _ in range(repeats):
         for trial in good:
             trial.seconds.append(time_span(system, trial))
@@ -168,7 +170,8 @@ def time_span(system: TrialSystem, trial: Trial) -> float:
     The cost of a call without steps is subtracted: 15 µs, as much as 200 steps of a free body.
     """
     engine, state, advance_to = begin_trial(system, trial)
-    begun, done = state.copy(), 0
+    begun = state.copy()
+    done = 0
 
     def seconds_of(steps: int) -> float:
         began = clock.perf_counter()
@@ -196,7 +199,9 @@ def time_span(system: TrialSystem, trial: Trial) -> float:
                 raise
             start_again()
             continue
-        calls, spans, done = calls + call, spans + 1, done + trial.steps
+        calls = calls + call
+        spans = spans + 1
+        done = done + trial.steps
         if not system.can_continue:
             start_again()
     return (computing - calls if computing > calls else computing) / spans

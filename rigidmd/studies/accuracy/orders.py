@@ -41,7 +41,8 @@ def convergence(measured: IntegratorAccuracy, integrator: str, error: str) -> Co
     ]
     tried.sort(key=lambda trial: -trial.timestep)
     lowest = REFERENCE_MARGIN * measured.reference_error if error in OF_TRAJECTORY else 0.0
-    local, last = [], len(tried)
+    local = []
+    last = len(tried)
     for k, (longer, shorter) in enumerate(pairwise(tried), 1):
         fall = log(getattr(longer, error) / getattr(shorter, error))
         slope = fall / log(longer.timestep / shorter.timestep)

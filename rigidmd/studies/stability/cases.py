@@ -10,7 +10,11 @@ from rigidmd.core.state import State
 from rigidmd.core.toml import Json, parse_toml
 from rigidmd.run.results import Results
 
-RIGHT, REFUSED, REPORTED, UNDETECTED, CRASH = "right", "refused", "reported", "undetected", "crash"
+RIGHT = "right"
+REFUSED = "refused"
+REPORTED = "reported"
+UNDETECTED = "undetected"
+CRASH = "crash"
 #: A run is bounded while the errors of conserved quantities stay below this fraction of the kinetic
 #: energy.
 BOUND = 0.1
@@ -86,7 +90,8 @@ class Case(NamedTuple):
         for row in self.rows:
             keys = _layered(self.common, row, quick)
             setting = keys.pop("setting", "")
-            values, bisect = keys.pop("values", [nan]), keys.pop("bisect", [False])
+            values = keys.pop("values", [nan])
+            bisect = keys.pop("bisect", [False])
             for x in values:
                 trial = Trial(setting.format(x), **insert(keys, x))
                 for built in BUILDERS[trial.build](trial, x):

@@ -69,7 +69,8 @@ def lattice(trial: Trial, density: float) -> Trials:
 @builder
 def touching_charges(trial: Trial, x: float) -> Trials:
     system = system_of(trial)
-    state, offsets = system.state, system.sites.offset_body
+    state = system.state
+    offsets = system.sites.offset_body
     state.rotation[:] = np.eye(3)
     state.position[:] = [[10, 10, 10], 10 + offsets[1] - offsets[5]]
     yield trial._replace(state=state)

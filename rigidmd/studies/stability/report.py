@@ -69,7 +69,8 @@ def conclusions(results: Results) -> list[str]:
     unexpected = [_unexpected(result) for result in results if result.is_unexpected]
     counts = verdict_counts(results)
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
-    runs, cases = sum(counts.values()), len({result.case.name for result in results})
+    runs = sum(counts.values())
+    cases = len({result.case.name for result in results})
     warnings = sum(len(result.warnings) for result in results)
     total = (
         f"{'failed' if failures else 'passed'}: {cases} cases, {runs} runs: {verdicts};"
@@ -150,7 +151,10 @@ def write_stability(folder: Path, results: Results, command: str) -> list[Path]:
 
 
 def _csv_row(result: TrialResult) -> list[object]:
-    case, trial, outcome, limit = result.case, result.trial, result.outcome, result.limit
+    case = result.case
+    trial = result.trial
+    outcome = result.outcome
+    limit = result.limit
     row = [case.name, case.group, "run" if limit is None else "longest step", trial.setting]
     row += [result.integrator, trial.step if limit is None else limit.longest, case.step_unit]
     if limit is None:

@@ -74,7 +74,8 @@ class TrialResult(NamedTuple):
     @property
     def verdict(self) -> str:
         """Empty for a longest step."""
-        outcome, has_answer = self.outcome, RIGHT in self.trial.expected
+        outcome = self.outcome
+        has_answer = RIGHT in self.trial.expected
         if self.limit is not None:
             return ""
         if outcome.crash or outcome.message:
@@ -126,9 +127,11 @@ def run_cases(
 
 
 def run_trial(case: Case, trial: Trial, integrator: str) -> TrialResult:
-    began, warnings = clock.perf_counter(), []
+    began = clock.perf_counter()
+    warnings = []
     run = partial(attempt, trial, integrator, warnings.append)
-    outcome, limit = Outcome(), None
+    outcome = Outcome()
+    limit = None
     if trial.is_bisected:
         limit = longest_step(run, trial.step, trial.bound)
     else:
@@ -217,7 +220,8 @@ def longest_step(run: Callable[[float], Outcome], start: float, bound: float = B
     reported, because a step that is far too long can seem stable again.
     """
     outcomes: dict[float, Outcome] = {}
-    good, bad = 0.0, inf
+    good = 0.0
+    bad = inf
 
     def is_limited() -> bool:
         return good > 0 and bad < inf

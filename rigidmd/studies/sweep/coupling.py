@@ -51,13 +51,17 @@ def write_free_energy(manifest: Manifest, figures: str) -> tuple[AnalysisResult,
 
 
 def _free_energy(manifest: Manifest) -> tuple[AnalysisResult, Json]:
-    folder, points = manifest.folder, manifest.points_in("finished")
+    folder = manifest.folder
+    points = manifest.points_in("finished")
     if manifest.keys.keys() - {SEED} != {KEY}:
         raise OutputError(f"{folder}: {NAME} needs a sweep over {KEY} alone, and over {SEED}")
     lambdas = sorted({float(point.values[KEY]) for point in points})
     if len(lambdas) < 2:
         raise OutputError(f"{folder}: {NAME} needs two values of {KEY} that have finished")
-    runs, temperatures, uses, volumes = [], set(), [], []
+    runs = []
+    temperatures = set()
+    uses = []
+    volumes = []
     for point in points:
         record, stage, production = production_of(folder / point.folder)
         if stage.temperature_K is None or stage.ramps:
@@ -90,7 +94,9 @@ def _free_energy(manifest: Manifest) -> tuple[AnalysisResult, Json]:
 
 def _parts(coupling: Coupling, lambdas: list[float]) -> list[tuple[str, float, float]]:
     """Names of differences of the free energy, with their first and last lambda."""
-    first, middle, last = lambdas[0], not_none(coupling.charges_from), lambdas[-1]
+    first = lambdas[0]
+    middle = not_none(coupling.charges_from)
+    last = lambdas[-1]
     whole = OF_ALL if (first, last) == (0, 1) else f"free energy from lambda {first:g} to {last:g}"
     parts = [(whole, first, last)]
     if first < middle < last and middle in lambdas:

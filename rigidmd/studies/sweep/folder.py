@@ -28,7 +28,10 @@ from rigidmd.io.folder import (
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json
 
-MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
+MANIFEST = SWEEP
+TABLE = "sweep.csv"
+FIGURE = "sweep.png"
+SCRIPT = "sweep.sbatch"
 FILES = (MANIFEST, TABLE, FIGURE, SCRIPT)
 State = Literal["waiting", "running", "finished", "interrupted", "failed"]
 SEED = "seed"  # the key whose values make replicas

@@ -213,7 +213,8 @@ def read_points(path: Path, axes: Sequence[Axis], trusted: Sequence[str] = ()) -
     digest = cache(file_digest)  # each file is read once
     points_of: dict[str, list[str]] = defaultdict(list)  # error -> descriptions of its points
     build_errors: dict[str, RigidMDError | None] = {}  # values without the seed -> error
-    scene, unused = None, list(trusted)
+    scene = None
+    unused = list(trusted)
     for values in all_values:
         try:
             scene = Scene.read(path, manifest.overrides(values))

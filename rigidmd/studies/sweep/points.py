@@ -84,8 +84,11 @@ def trusted_by(sweep: Manifest, point: SweepPoint, trust: Sequence[str]) -> list
 
 def run_point(point: SweepPoint, common: CommonSettings) -> tuple[int, float]:
     """Run a point. Returns its exit code and the seconds that it took. Raises RigidMDError."""
-    began, sweep, outputs = clock.monotonic(), common.sweep, common.outputs
-    words, walltime = ["-m", "rigidmd.core.bound_process"], []
+    began = clock.monotonic()
+    sweep = common.sweep
+    outputs = common.outputs
+    words = ["-m", "rigidmd.core.bound_process"]
+    walltime = []
     if _requested_signal(outputs):
         return BY_SIGNAL + STOP_SIGNAL, 0.0
     if common.ends_at is not None:
@@ -248,7 +251,8 @@ class _Messages:
 
     def read(self, points: Iterable[SweepPoint]) -> None:
         for point in points:
-            name, path = point.folder, self._outputs / point.folder
+            name = point.folder
+            path = self._outputs / point.folder
             if not path.is_file():
                 continue
             point.state, point.message = "running", None

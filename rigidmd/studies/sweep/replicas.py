@@ -107,7 +107,8 @@ def _analyse_combinations(
     short = short_keys(manifest.keys)
     combinations = []
     table = Table(manifest.folder, [], [], [], together=manifest.keys)
-    begun, count = 0, len(manifest.points)
+    begun = 0
+    count = len(manifest.points)
     for values, points in manifest.combinations():
         folders = [manifest.folder / point.folder for point in points if point.state == "finished"]
         if not folders:

@@ -200,7 +200,8 @@ def write_slurm_script(
 
     walltime : wall time of a job, s. Raises OutputError.
     """
-    folder, here = str(manifest.folder.absolute()), str(Path.cwd())
+    folder = str(manifest.folder.absolute())
+    here = str(Path.cwd())
     script = f"{folder}/{SCRIPT}"
     for text in (manifest.scene, script, here, *trust):
         if UNSAFE.search(text):

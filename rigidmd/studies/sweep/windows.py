@@ -61,7 +61,8 @@ def write_mean_force(manifest: Manifest, figures: str) -> tuple[AnalysisResult, 
 
 def _mean_force(manifest: Manifest) -> tuple[AnalysisResult, Json]:
     """The potential of mean force, and the samples used, as analysis.json has them."""
-    folder, points = manifest.folder, manifest.points_in("finished")
+    folder = manifest.folder
+    points = manifest.points_in("finished")
     if not points:
         raise OutputError(f"{folder}: no point of the sweep has finished")
     keys = manifest.keys.keys() - {SEED}
