@@ -139,7 +139,11 @@ def test_wrapped_paths_become_continuous(mixture):
     cells = np.array([now.cell for now in moved])
     whole, wrapped = (
         fit_frames(
-            mixture, np.array([mixture.site_positions(now, put) for now in moved]), None, cells, put
+            mixture,
+            np.array([mixture.site_positions(now, put) for now in moved]),
+            None,
+            cells,
+            wrapped=put,
         )
         for put in (False, True)
     )
@@ -154,7 +158,7 @@ def test_wrapped_paths_become_continuous(mixture):
     with pytest.raises(
         OutputError, match=r"move by 0\.\d\d of the box between two frames, .* wrapped"
     ):
-        fit_frames(mixture, far, None, cells[:4], True)
+        fit_frames(mixture, far, None, cells[:4], wrapped=True)
 
 
 def test_paths_are_unwrapped_by_the_cell_of_each_frame(mixture):

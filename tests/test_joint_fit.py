@@ -82,7 +82,7 @@ def sampled(rng, step, has_barostat, samples, correction=0.0, reads_kinetic=True
     values = means[:, None] + SIZES[:, None] * (series @ root.T).T
     if not has_barostat:
         values[1:3] = 0.0
-    return results_of_samples(values, at, has_barostat)
+    return results_of_samples(values, at, has_barostat=has_barostat)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_springs_have_the_bias_of_theory(correction, bias):
         nothing = np.zeros(4000)
         series = [potential / COUNT, nothing, nothing, kinetic, squares, squares]
         at = conditions(step, False, correction)
-        runs[step] = [results_of_samples(np.array(series), at, False)]
+        runs[step] = [results_of_samples(np.array(series), at, has_barostat=False)]
         assert runs[step][0].values[MEAN_SQUARE] == pytest.approx(x, rel=0.06)
         expected = bias * omega**2 * 1e-6 * FREEDOM * THERMAL / COUNT
         slope, error = (

@@ -114,7 +114,7 @@ def test_a_notebook_shows_the_bar_in_one_place(cell, capsys, monkeypatch):
 
 
 def test_a_bar_that_ends_early_waits_for_nothing(cell):
-    with progress.progress_of(100, "iterations", None) as bar:
+    with progress.progress_of(100, "iterations", shown=None) as bar:
         bar.update(40)
     assert re.fullmatch(r"40 %: 40 of 100 iterations, 00:00", cell[0][-1]["text/plain"])
 

@@ -589,7 +589,7 @@ def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=1, **
         )
     record = MolecularRecord()
     record.position.computing = [1.0]
-    return summarise(system, record, rows, state, 0.0, 1.0, False)
+    return summarise(system, record, rows, state, 0.0, 1.0, interrupted=False)
 
 
 def noted(*given, **made):
@@ -1101,7 +1101,7 @@ def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
         tmp_path / "log.csv",
         Simulation(small_scene({"argon": 5}, 30.0)).run().samples.rows,
     )
-    file = run_files.Log(path, False)
+    file = run_files.Log(path, tensor=False)
 
     def lines():
         return len(path.read_text().splitlines()) - 1
@@ -1336,7 +1336,7 @@ def test_every_bar_has_the_rate_of_what_it_has_seen(monkeypatch, capsys, kind):
         lambda self, bundle, metadata=None: shown.append(bundle["text/plain"]),
     )
     monkeypatch.setattr(sys.stderr, "isatty", lambda: kind == "terminal", raising=False)
-    with progress.progress_of(100.0, "ps", True) as bar:
+    with progress.progress_of(100.0, "ps", shown=True) as bar:
         for before in (70.0, 0.0):
             bar.skip(before)
             now[0] += 1000.0

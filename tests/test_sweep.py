@@ -726,7 +726,7 @@ def long_sweep(argon, folder, **more):
 
 def finish(manifest, jobs=2, receive=lambda name, line: None, pool=None):
     """Run what is left of a sweep, and return the signal that stopped it."""
-    bar = progress_of(1.0, "points", False)
+    bar = progress_of(1.0, "points", shown=False)
     with bar, pool or ThreadPoolExecutor(jobs) as executor:
         return sweep_points.run_points(manifest, executor, bar, receive=receive)
 

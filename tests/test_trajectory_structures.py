@@ -67,7 +67,9 @@ def make(folder, ending, **species):
     moved.position[:] += [40.0, 1.0, -3.0]
     moved.velocity[:] *= 2.0
     path = folder / f"old{ending}"
-    file = open_trajectory(path, system, 1.0, ending in (".trr", ".gsd", ".nc"), False)
+    file = open_trajectory(
+        path, system, 1.0, velocities=ending in (".trr", ".gsd", ".nc"), wrapped=False
+    )
     for k, state in enumerate((system.state, moved)):
         file.write(state, float(k), k)
     file.close()
@@ -89,13 +91,13 @@ def test_all_readers_find_the_frames_of_many_steps_and_boxes_that_change(tmp_pat
         state.cell[:] *= 1 + 0.02 * k
     times = 4.3e6 + 0.1 * np.arange(len(STEPS))  # ps, which single precision rounds to halves
     whole, parts = tmp_path / f"whole{ending}", tmp_path / f"parts{ending}"
-    file = open_trajectory(whole, system, 0.1, False, False)
+    file = open_trajectory(whole, system, 0.1, velocities=False, wrapped=False)
     for state, time, step in zip(states, times, STEPS, strict=True):
         file.write(state, time, step)
     file.close()
     kept = None
     for first, last in ((0, 2), (2, 5)):  # a run that resumes writes the same bytes
-        file = open_trajectory(parts, system, 0.1, False, False, kept)
+        file = open_trajectory(parts, system, 0.1, velocities=False, wrapped=False, kept=kept)
         if kept is not None:
             file.cut()
         for k in range(first, last):
@@ -151,7 +153,7 @@ def test_each_molecule_of_a_universe_is_one_fragment(tmp_path, model, sites, kep
     system = build(small_scene({model: 8}, 20.0))
     state = system.state
     if kept == "files":
-        file = open_trajectory(tmp_path / "t.xtc", system, 1.0, False, False)
+        file = open_trajectory(tmp_path / "t.xtc", system, 1.0, velocities=False, wrapped=False)
         for k in range(2):
             file.write(state, float(k), k)
         file.close()
@@ -177,7 +179,7 @@ def test_united_atoms_of_own_trajectories(tmp_path, ending, frame):
     moved = system.state.copy()
     moved.position[:] += [3.0, 1.0, -2.0]
     path = tmp_path / f"old{ending}"
-    file = open_trajectory(path, system, 1.0, False, False)
+    file = open_trajectory(path, system, 1.0, velocities=False, wrapped=False)
     for k, state in enumerate((system.state, moved)):
         file.write(state, float(k), k)
     file.close()
@@ -421,7 +423,7 @@ def test_sites_without_elements_are_read_from_all_trajectories(ending, tmp_path)
     """Two heavy sites of one mass, and massless charges."""
     system = build(small_scene({"co2_2cljq": 5}, 30.0))
     path = tmp_path / f"old{ending}"
-    file = open_trajectory(path, system, 1.0, False, False)
+    file = open_trajectory(path, system, 1.0, velocities=False, wrapped=False)
     file.write(system.state, 0.0, 0)
     file.close()
     write_topology(tmp_path / "topology.gro", system, system.state, wrapped=False)

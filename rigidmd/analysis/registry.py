@@ -61,7 +61,9 @@ def built_in(
             return function(as_runs(frames), *arguments, **options)
 
         name = function.__name__
-        KNOWN[name] = Analysis(name, about, analysis, position, False, on_request)
+        KNOWN[name] = Analysis(
+            name, about, analysis, position, is_user=False, on_request=on_request
+        )
         return analysis
 
     return add
@@ -134,7 +136,7 @@ def register(function: UserFunction) -> UserFunction:
         )
         return result
 
-    KNOWN[name] = Analysis(name, about, analysis, inf, True)
+    KNOWN[name] = Analysis(name, about, analysis, inf, is_user=True)
     return function
 
 

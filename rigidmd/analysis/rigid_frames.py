@@ -194,6 +194,7 @@ def fit_frames(
     sites: np.ndarray,
     velocities: np.ndarray | None,
     cells: np.ndarray,
+    *,
     wrapped: bool,
     progress: Callable[[float], object] = lambda fraction: None,
 ) -> tuple[Bodies, list[str]]:
@@ -307,7 +308,13 @@ def frames_of_results(results: Results, start: float | None = None) -> RigidFram
         np.array([getattr(frame, of) for frame in frames]) for of in ("positions", "velocities")
     )
     stored = Frames(
-        np.array([frame.time for frame in frames]), positions, cells, count, 1, False, velocities
+        time=np.array([frame.time for frame in frames]),
+        positions=positions,
+        cells=cells,
+        count=count,
+        stride=1,
+        is_cut=False,
+        velocities=velocities,
     )
     columns = {name: results[name] for name in results.units}
     return _rigid_frames(system, columns, stored, results._tensor, start, [], lambda fraction: None)
@@ -377,7 +384,7 @@ def _rigid_frames(
     cells = np.tile(NO_CELL, (len(keep), 1, 1)) if stored.cells is None else stored.cells[keep]
     wrapped = system.scene.output.positions == "wrapped"
     bodies, corrections = fit_frames(
-        system, stored.positions[keep], velocities, cells, wrapped, progress
+        system, stored.positions[keep], velocities, cells, wrapped=wrapped, progress=progress
     )
     samples = shown & (columns["time"] >= begin - slack) & (columns["time"] <= last + slack)
     if tensor is not None:

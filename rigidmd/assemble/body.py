@@ -77,7 +77,9 @@ def build_body(
     spin = axes.T @ scene.start.angular_velocity  # along the principal axes
     if rotates and ((moments == 0) & (np.abs(spin) > 1e-12 * np.abs(spin).max(initial=0.0))).any():
         faults.append("start: the body rotates about an axis without inertia")
-    faults += _integrator_errors(scene, bool(added_mass.any()), bool(applied))
+    faults += _integrator_errors(
+        scene, immersed=bool(added_mass.any()), has_functions=bool(applied)
+    )
     taken = {
         "gravity",
         "buoyancy",
@@ -90,7 +92,9 @@ def build_body(
     if faults:
         raise SceneError(scene.source, faults)
 
-    scene = body_with_defaults(scene, rotates, float(np.linalg.norm(points, axis=1).max()))
+    scene = body_with_defaults(
+        scene, rotates=rotates, radius=float(np.linalg.norm(points, axis=1).max())
+    )
     check_memory_of_samples(scene)
     rotor = rotor_of(scene, moments, added_inertia, axes) if rotates else NoRotor()
     translation = NoTranslation(mass) if scene.body.pinned else FreeTranslation(mass)
@@ -276,7 +280,7 @@ def _torque_errors(scene: BodyScene, axes: np.ndarray, moments: np.ndarray) -> I
                 yield f"applied.{k}: nothing resists a torque about the axis of a linear body"
 
 
-def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
+def _integrator_errors(scene: BodyScene, *, immersed: bool, has_functions: bool) -> list[str]:
     """Messages on integrators that cannot move this body, or lose their order; immersed: the fluid
     adds mass; has_functions: Python functions apply forces."""
     run = scene.run
@@ -511,7 +515,7 @@ def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray
     if scene.frame is not None and scene.frame.origin_acceleration_m_s2 is not None:
         force = _time_function(scene.frame, -mass * np.array(scene.frame.origin_acceleration_m_s2))
         terms["origin_acceleration"] = _force(
-            force, constant_function(np.zeros(3)), at_centre, False
+            force, constant_function(np.zeros(3)), at_centre, follows_body=False
         )
     for k, entry in enumerate(scene.applied):
         force, torque = (
@@ -521,7 +525,7 @@ def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray
         if entry.axes == "body":
             force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)
         at = axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0))
-        terms[f"applied_{k}"] = _force(force, torque, at, entry.axes == "body")
+        terms[f"applied_{k}"] = _force(force, torque, at, follows_body=entry.axes == "body")
     return terms
 
 
@@ -529,7 +533,7 @@ def _rotated(course: TimeFunction, matrix: np.ndarray) -> TimeFunction:
     return TimeFunction(course.times, *(part @ matrix.T for part in course[1:]))
 
 
-def _force(force: TimeFunction, torque: TimeFunction, point: np.ndarray, follows_body: bool):
+def _force(force: TimeFunction, torque: TimeFunction, point: np.ndarray, *, follows_body: bool):
     """The term of a force: with a potential energy if it is constant in the lab, else the ledger
     has its work."""
     if (

@@ -13,7 +13,7 @@ FARTHEST = 900.0
 ORTHOGONALITY, ORTHOGONALITY_OF_SOLVERS = 1e-9, 0.1
 
 
-def body_with_defaults(scene: BodyScene, rotates: bool, radius: float) -> BodyScene:
+def body_with_defaults(scene: BodyScene, *, rotates: bool, radius: float) -> BodyScene:
     """A scene of a single body with all defaults; rotates: it has an orientation; radius: of its
     trajectory, m."""
     run, watch = scene.run, scene.watch

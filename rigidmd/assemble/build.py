@@ -130,7 +130,12 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         residue_number=number,
         from_lattice=scene.structure is None,
         left_out=left_out(
-            scene, acting.terms, model, space, any(m.charges.any() for m in species), without_tail
+            scene,
+            acting.terms,
+            model,
+            space,
+            charged=any(m.charges.any() for m in species),
+            without_tail=without_tail,
         ),
         precision_reason=precision_reason,
         force_error=acting.force_error,
@@ -272,7 +277,13 @@ def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndar
 
 
 def left_out(
-    scene: MolecularScene, terms: dict, model: Model, space: Space, charged: bool, without_tail: str
+    scene: MolecularScene,
+    terms: dict,
+    model: Model,
+    space: Space,
+    *,
+    charged: bool,
+    without_tail: str,
 ) -> list[str]:
     """What is not compiled for this scene, and why.
 

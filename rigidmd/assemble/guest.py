@@ -130,7 +130,7 @@ class Guest:
             energy[energy > limit] = inf
             rotates = len(self._with.state.rotation) > 0
             for k in np.flatnonzero(energy < inf):
-                trial = _with_trial(host, position[k], rotation[k], rotates)
+                trial = _with_trial(host, position[k], rotation[k], rotates=rotates)
                 energy[k] += _total(self._engines[0], trial) - alone
         energy += constant
         if (energy < -DEEPEST_IN_KT * self._thermal).any():
@@ -195,7 +195,7 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
     state = _selected(system.state, host)
     rotates = len(system.state.rotation) > 0 or bool(inertia.any())  # also of frozen molecules
     for _ in added:
-        state = _with_trial(state, np.zeros(3), np.eye(3), rotates)
+        state = _with_trial(state, np.zeros(3), np.eye(3), rotates=rotates)
     scene = system.scene
     if scene.from_python != scene.user_code.names:
         missing = missing_user_code(scene.from_python, scene.user_code.names)
@@ -254,7 +254,9 @@ def _selected(state: State, members: np.ndarray) -> State:
     return state_of(position=state.position[members], rotation=rotation, cell=state.cell)
 
 
-def _with_trial(state: State, position: np.ndarray, rotation: np.ndarray, rotates: bool) -> State:
+def _with_trial(
+    state: State, position: np.ndarray, rotation: np.ndarray, *, rotates: bool
+) -> State:
     """A state with one more molecule at the end."""
     before = (
         state.rotation if len(state.rotation) else np.tile(np.eye(3), (len(state.position), 1, 1))

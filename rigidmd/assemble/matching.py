@@ -278,7 +278,7 @@ class _Matcher:
     def _name(self, group: _Group) -> str:
         return self._species[group.candidate.species].name
 
-    def _misfit(self, groups: list[_Group], row: int, search: bool) -> str:
+    def _misfit(self, groups: list[_Group], row: int, *, search: bool) -> str:
         """Why a molecule fits no species. search : whether for better orders, beyond the limit"""
         off = np.array([group.assigned.fit.deviation[row] for group in groups])
         mirrored = []

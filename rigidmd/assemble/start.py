@@ -228,7 +228,7 @@ def _lattice_shape(edges: np.ndarray, n: int) -> np.ndarray:
 
     An edge shorter than half the spacing has one point, and the other edges set the spacing.
     """
-    long = np.full(3, True)
+    long = np.ones(3, dtype=bool)
     while True:
         spacing = (edges[long].prod() / n) ** (1 / long.sum())
         thin = long & (edges < 0.5 * spacing)

@@ -92,7 +92,15 @@ def read_structure(
             _check_box(path, configuration.cell, [])
     else:
         configuration = _read_molecules(
-            path, species, cell_of_scene, periodic, tolerance, frame, atom_types, topology, content
+            path,
+            species,
+            cell_of_scene,
+            periodic=periodic,
+            tolerance=tolerance,
+            frame=frame,
+            atom_types=atom_types,
+            topology=topology,
+            content=content,
         )
     cell = None if not periodic else configuration.cell if cell_of_scene is None else cell_of_scene
     if (
@@ -120,7 +128,9 @@ def read_structure(
     )
 
 
-def with_reduced_cell(configuration: Configuration, whose: str, may_rotate: bool) -> Configuration:
+def with_reduced_cell(
+    configuration: Configuration, whose: str, *, may_rotate: bool
+) -> Configuration:
     """The same configuration in a cell with small tilts. Rotated, if this allows a longer cutoff.
     `whose` is the owner of the lattice, for the note."""
     if configuration.cell is None:
@@ -175,6 +185,7 @@ def _read_molecules(
     path: Path,
     species: list[Molecule],
     scene_cell,
+    *,
     periodic: bool,
     tolerance: float,
     frame,

@@ -92,16 +92,18 @@ def _accuracy(options: Options) -> int:
         sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
         write_study(
             folder,
-            options.force,
-            averages_report.FILES,
-            "compiling, and running what comes before the last stage",
-            lambda progress: measure_averages(scene, integrators, timesteps, sample, progress),
-            lambda biases: [
+            force=options.force,
+            files=averages_report.FILES,
+            begins="compiling, and running what comes before the last stage",
+            measure=lambda progress: measure_averages(
+                scene, integrators, timesteps, sample, progress
+            ),
+            describe=lambda biases: [
                 averages_report.table_text(biases),
                 "",
                 *averages_report.bias_conclusions(biases),
             ],
-            averages_report.write_averages,
+            write=averages_report.write_averages,
         )
         return 0
     if options.sample_ps is not None:
@@ -109,11 +111,11 @@ def _accuracy(options: Options) -> int:
     settings = integrators, timesteps, options.span, options.repeats
     write_study(
         folder,
-        options.force,
-        accuracy.FILES,
-        "compiling and running the reference",
-        lambda progress: accuracy.measure_accuracy(scene, *settings, progress),
-        lambda errors: accuracy.describe_accuracy(errors, options.verbose),
-        accuracy.write_accuracy,
+        force=options.force,
+        files=accuracy.FILES,
+        begins="compiling and running the reference",
+        measure=lambda progress: accuracy.measure_accuracy(scene, *settings, progress),
+        describe=lambda errors: accuracy.describe_accuracy(errors, verbose=options.verbose),
+        write=accuracy.write_accuracy,
     )
     return 0

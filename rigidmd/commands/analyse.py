@@ -111,7 +111,7 @@ def _analyse(options: Options) -> int:
     names = [*options.only, *(text for text in options.requests if "=" not in text)]
     more = dict(parse_override(text) for text in options.requests if "=" in text)
     if options.folder.endswith(".toml"):
-        return _insert(options.folder, names, more, options.verbose)
+        return _insert(options.folder, names, more, verbose=options.verbose)
     with progress_bar() as progress:
         folder = Path(options.folder)
         request = (names, options.start, options.viscosity)
@@ -124,7 +124,7 @@ def _analyse(options: Options) -> int:
                     f"{len(of.files)} files in {of.files[0].parent}" if of.files else "no results"
                 )
                 print(f"{of.title or folder}: {runs}, {files}")
-                _print_results(of.results, of.failed, options.verbose)
+                _print_results(of.results, of.failed, verbose=options.verbose)
                 print()
             print(f"values of all in {folder / ANALYSES}")
             if options.extrapolate is not None:
@@ -149,7 +149,7 @@ def _analyse(options: Options) -> int:
     )
     for note in used["notes"]:
         print(f"  {note}")
-    _print_results(done.results, done.failed, options.verbose)
+    _print_results(done.results, done.failed, verbose=options.verbose)
     print(
         f"\n{len(done.files)} files in {options.folder}, values in {done.files[0].name}. `rigidmd"
         " report` shows them"
@@ -157,7 +157,7 @@ def _analyse(options: Options) -> int:
     return FAILED if names and done.failed else 0
 
 
-def _insert(path: str, names: list[str], more: dict[str, object], verbose: bool) -> int:
+def _insert(path: str, names: list[str], more: dict[str, object], *, verbose: bool) -> int:
     """Print the results of insertion into the frozen molecules of a scene."""
     from rigidmd.analysis.files import run_analyses
     from rigidmd.analysis.registry import check_options, selected
@@ -176,11 +176,11 @@ def _insert(path: str, names: list[str], more: dict[str, object], verbose: bool)
     results, failed = run_analyses(runs, names, options={"zero_loading": True} | more)
     for result in results:  # trials at rest have no time
         result.values = [value._replace(correlation_ps=None) for value in result.values]
-    _print_results(results, failed, verbose)
+    _print_results(results, failed, verbose=verbose)
     return FAILED if failed else 0
 
 
-def _print_results(results: list, failed: dict[str, str], verbose: bool) -> None:
+def _print_results(results: list, failed: dict[str, str], *, verbose: bool) -> None:
     from rigidmd.analysis.report import results_text
 
     print(*results_text(results, failed), sep="\n")

@@ -154,7 +154,7 @@ SCENE = (
 
 
 def add_engine(
-    parser: argparse.ArgumentParser, default: str = "the scene's", itself: bool = True
+    parser: argparse.ArgumentParser, default: str = "the scene's", *, itself: bool = True
 ) -> None:
     """Add the options that set the table [engine] of a scene; itself : rigidmd is one of the
     engines."""
@@ -207,7 +207,7 @@ def file_about_run(options: Options, default: str, extensions: tuple[str, ...]) 
     folder = Path(options.folder)
     check_is_run(folder)
     if options.output:
-        check_target(Path(options.output), extensions, options.force)
+        check_target(Path(options.output), extensions, force=options.force)
         return Path(options.output)
     add_to_folder(folder, [default])
     return folder / default
@@ -215,6 +215,7 @@ def file_about_run(options: Options, default: str, extensions: tuple[str, ...]) 
 
 def write_study(
     folder: Path,
+    *,
     force: bool,
     files: tuple[str, ...],
     begins: str,
@@ -230,7 +231,7 @@ def write_study(
     """
     from rigidmd.io.folder import FolderLock, check_folder, make_folder
 
-    check_folder(folder, force, names=files)
+    check_folder(folder, force=force, names=files)
     with FolderLock(folder) as lock:
         with progress_bar(begins) as progress:
             result = measure(progress)

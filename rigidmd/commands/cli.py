@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
         (
             warn(str(message))
             if issubclass(category, RigidMDWarning)
-            else others(message, category, *where, **more)
+            else default_showwarning(message, category, *where, **more)
         )
 
     try:
@@ -80,7 +80,8 @@ def main(arguments: list[str] | None = None) -> int:
         check_address_space()
         streams = checked_streams(lasting=options.writes)
         with warnings.catch_warnings(), without_local_settings(), streams, worded_by(CommandLine()):
-            others, warnings.showwarning = warnings.showwarning, show
+            default_showwarning = warnings.showwarning
+            warnings.showwarning = show
             return options.command(options)
     except RigidMDError as error:
         print(f"rigidmd: {error}", file=sys.stderr)

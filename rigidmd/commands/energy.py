@@ -38,7 +38,9 @@ def _energy(options: Options) -> int:
         unit = "J"
     else:
         unit = options.unit or "kJ/mol"
-        energies = Simulation(scene)._start_energy(ENERGY_UNITS[unit], unit, options.accuracy)
+        energies = Simulation(scene)._start_energy(
+            ENERGY_UNITS[unit], unit, measure_accuracy=options.accuracy
+        )
     if options.json:
         print(json.dumps(energies, indent=2))
     elif isinstance(scene, BodyScene):

@@ -44,7 +44,12 @@ def _film(options: Options) -> int:
     path = file_about_run(options, default_name(), EXTENSIONS)
     with progress_bar() as progress:
         path, notes = write_film(
-            Path(options.folder), path, options.seconds, options.plots, options.height, progress
+            Path(options.folder),
+            path,
+            options.seconds,
+            with_plots=options.plots,
+            height=options.height,
+            progress=progress,
         )
     for note in notes:
         print(note)

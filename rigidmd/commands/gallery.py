@@ -30,7 +30,12 @@ def _gallery(options: Options) -> int:
     bodies = selected_bodies(options.names)
     if folder.is_dir():
         for name in (INDEX, *(f"{body.name}.html" for body in bodies)):
-            check_target(folder / name, (".html",), options.force)
+            check_target(folder / name, (".html",), force=options.force)
     command = shlex.join(["rigidmd", "gallery", *options.names])
-    print_page(write_gallery(folder, options.names, options.force, command, announce), [])
+    print_page(
+        write_gallery(
+            folder, options.names, force=options.force, command=command, progress=announce
+        ),
+        [],
+    )
     return 0

@@ -79,7 +79,7 @@ def _models(options: Options) -> int:
         print(molecule_text(molecule))
         return 0
     path = Path(options.output or f"{Path(options.model).stem}.png")
-    write_molecule_figure(path, molecule, options.force)
+    write_molecule_figure(path, molecule, force=options.force)
     print(f"{molecule.name} is drawn in {path}")
     return 0
 
@@ -105,7 +105,11 @@ def _write_model(options: Options) -> int:
         )
     file, molecule, notes = model_from_geometry(geometry, parameters, options.custom_name)
     check_target(
-        path, (".toml",), options.force, "model", [geometry, *([parameters] if parameters else [])]
+        path,
+        (".toml",),
+        force=options.force,
+        what="model",
+        inputs=[geometry, *([parameters] if parameters else [])],
     )
     write_model(path, file)
     print(f"{path}: {molecule.name}, {molecule.description}; {file.source}")

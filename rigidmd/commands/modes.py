@@ -90,12 +90,12 @@ def _modes(options: Options) -> int:
     folder = Path(options.output or f"runs/{scene.name}-modes")
     write_study(
         folder,
-        options.force,
-        names,
-        "minimising",
-        compute,
-        lambda modes: list(describe(modes)),
-        write,
+        force=options.force,
+        files=names,
+        begins="minimising",
+        measure=compute,
+        describe=lambda modes: list(describe(modes)),
+        write=write,
     )
     return 0
 

@@ -21,7 +21,7 @@ def _new(options: Options) -> int:
     example = find_example(options.name)
     path = Path(options.output or f"{example.name}{example.path.suffix}")
     read = Scene.read(example.path).inputs.values() if example.kind == "scene" else ()
-    written = copy_example(example, path, options.force, read)
+    written = copy_example(example, path, force=options.force, read=read)
     if example.name != options.name:
         print(
             f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}). This is"

@@ -80,7 +80,7 @@ def run(options: Options) -> int:
     from rigidmd.io.folder import check_folder
 
     if not options.resume:
-        check_folder(folder, options.force)  # before anything slow is imported
+        check_folder(folder, force=options.force)  # before anything slow is imported
     from rigidmd.run import Simulation
 
     simulation = Simulation(
@@ -94,7 +94,7 @@ def run(options: Options) -> int:
     )
     print(simulation._introduction(), flush=True)
     results = simulation.run(progress=True)
-    print(simulation._conclusion(results, options.verbose))
+    print(simulation._conclusion(results, verbose=options.verbose))
     names = f": {', '.join(path.name for path in results.files)}" if options.verbose else ""
     print(f"\nresults in {folder}{names}")
     quoted = shlex.quote(str(folder))

@@ -25,11 +25,13 @@ def _stability(options: Options) -> int:
     folder = Path(options.output) if options.output else Path("runs") / "stability"
     results = write_study(
         folder,
-        options.force,
-        FILES,
-        "",
-        lambda progress: list(run_cases(options.case, options.quick, progress)),
-        lambda results: summary(results, options.verbose),
-        write_stability,
+        force=options.force,
+        files=FILES,
+        begins="",
+        measure=lambda progress: list(
+            run_cases(options.case, quick=options.quick, progress=progress)
+        ),
+        describe=lambda results: summary(results, verbose=options.verbose),
+        write=write_stability,
     )
     return FAILED if any(result.failure for result in results) else 0

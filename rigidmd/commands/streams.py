@@ -58,14 +58,14 @@ def open_streams() -> None:
 
 
 @contextlib.contextmanager
-def checked_streams(lasting: bool) -> Iterator[None]:
+def checked_streams(*, lasting: bool) -> Iterator[None]:
     """Within it a stream that cannot be written raises OutputError, or BrokenPipeError if its
     reader has gone.
 
     lasting : raise neither. The stream goes silent
     """
-    stdout = cast(TextIO, _Checked(sys.stdout, lasting))
-    stderr = cast(TextIO, _Checked(sys.stderr, lasting))
+    stdout = cast(TextIO, _Checked(sys.stdout, lasting=lasting))
+    stderr = cast(TextIO, _Checked(sys.stderr, lasting=lasting))
     with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
         yield
         stdout.flush()
@@ -75,7 +75,7 @@ class _Checked:
     """A text stream that goes silent when it cannot be written, and raises an error unless it is a
     lasting one."""
 
-    def __init__(self, stream: TextIO, lasting: bool):
+    def __init__(self, stream: TextIO, *, lasting: bool):
         self._stream, self._lasting = stream, lasting
 
     def write(self, text: str) -> int:

@@ -182,7 +182,7 @@ def _run(options: Options, manifest: "Manifest") -> int:
             executor = cluster(options.scheduler)
             threads = options.threads or 1  # a thread of a worker of dask for each point
             where = f"on the cluster {options.scheduler}"
-        with progress_of(left, "points", True) as bar, executor as pool:
+        with progress_of(left, "points", shown=True) as bar, executor as pool:
             print(f"  {where}, {threads} thread{'s' if threads > 1 else ''} each", flush=True)
             settings = options.walltime, options.trust, _message_printer()
             stopped = run_points(manifest, pool, bar, threads, *settings)

@@ -74,7 +74,7 @@ def _virial(options: Options) -> int:
     for path in options.trust:
         trust(path)
     if options.output:
-        check_target(Path(options.output), (".csv",), options.force)
+        check_target(Path(options.output), (".csv",), force=options.force)
     settings = dict(parse_override(text) for text in options.overrides)
     results = []
     with progress_bar() as progress:

@@ -207,7 +207,9 @@ class Scheme(_SchemeFields):
 def composed(name: str, steps: tuple[float, ...], order: int, source: str, **flags: int) -> Scheme:
     """Velocity Verlet steps of these lengths in succession; neighbouring kicks are merged."""
     kicks = tuple((a + b) / 2 for a, b in pairwise((0.0, *steps, 0.0)))
-    return Scheme(name, _alternating(kicks, steps), order, False, source, **flags)
+    return Scheme(
+        name, _alternating(kicks, steps), order, exact_rotor=False, source=source, **flags
+    )
 
 
 def split(
@@ -229,7 +231,14 @@ def split(
         )
         wrong = f"{counts}: kicks must be one more than drifts, and gradients as many as kicks"
         raise ValueError(f"integrator {name}: {wrong}; a fraction may be 0")
-    return Scheme(name, _alternating(kicks, drifts, gradients), order, True, source, **flags)
+    return Scheme(
+        name,
+        _alternating(kicks, drifts, gradients),
+        order,
+        exact_rotor=True,
+        source=source,
+        **flags,
+    )
 
 
 def _alternating(

@@ -123,7 +123,7 @@ def series_of(name: str) -> list[str]:
 
 
 def copy_example(
-    example: Example, path: Path, force: bool, read: Iterable[Path] = ()
+    example: Example, path: Path, *, force: bool, read: Iterable[Path] = ()
 ) -> list[Path]:
     """Copy an example to `path`, with the files that it reads. Returns the paths written. Raises
     OutputError."""

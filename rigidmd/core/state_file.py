@@ -125,7 +125,7 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
 
 
 def array_errors(
-    arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]], exact: bool = True
+    arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]], *, exact: bool = True
 ) -> dict[str, str]:
     """Name -> what is wrong with it, of the arrays of a state that have another shape, or values
     that no state has.

@@ -175,14 +175,14 @@ def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.
             if all(len(p) == 1 and p[0] == pulling[0][0] for p in pulling):
                 k = "xyz"[pulling[0][0]]
                 errors[f"L_{k}"] = _relative(momentum[k] - momentum[k][0], size.max())
-    axis = _kept_axis(system, arms, driven)
+    axis = _kept_axis(system, arms, driven=driven)
     if axis is not None:
         along = columns[f"L_body_{axis + 1}"]
         errors[f"L_{axis + 1}"] = _relative(along - along[0], size.max())
     return errors
 
 
-def _kept_axis(system: BodySystem, arms: list[np.ndarray], driven: bool) -> int | None:
+def _kept_axis(system: BodySystem, arms: list[np.ndarray], *, driven: bool) -> int | None:
     """The symmetry axis of a body if no torque acts about it, so that L along it is conserved."""
     body = system.body
     if (

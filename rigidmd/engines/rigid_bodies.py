@@ -199,21 +199,21 @@ class MassPoints(NamedTuple):
         return distances
 
 
-def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:
+def mass_points(molecule: Molecule, *, frozen: bool = False, sites: bool = True) -> MassPoints:
     """The mass points of a molecule. All sites of a frozen one. `sites`: they may be sites, if
     enough have mass."""
     if frozen:
         return MassPoints(
             molecule.masses, molecule.positions_body, np.arange(len(molecule.masses)), {}
         )
-    mass, position, site = _points(molecule, sites)
+    mass, position, site = _points(molecule, sites=sites)
     limit = OFF * molecule.radius
     others = np.setdiff1d(np.arange(len(molecule.masses)), site).tolist()
     virtual = {k: _virtual_site(position, molecule.positions_body[k], limit) for k in others}
     return MassPoints(mass, position, site, virtual)
 
 
-def _points(molecule: Molecule, sites: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _points(molecule: Molecule, *, sites: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Masses, positions and sites of the points: the sites if just enough of them have mass, else a
     simplex."""
     heavy = np.flatnonzero(molecule.masses > 0)

@@ -47,7 +47,7 @@ MARKERS = "os^Dv*PX<>"
 DASHES = ((), (5, 1.5), (1.5, 1.2), (6, 1.5, 1.5, 1.5))
 
 
-def curve_style(k: int, connected: bool = True) -> dict:
+def curve_style(k: int, *, connected: bool = True) -> dict:
     """Style of the k-th of many curves: the colours of the palette, then other dashes and markers.
     Without lines if the points are not connected."""
     rounds, color = divmod(k, len(COLORS))

@@ -21,7 +21,7 @@ def _is_molecular(system: System) -> "TypeIs[MolecularSystem]":
     return hasattr(system, "species")
 
 
-def connections(system: System, massless: bool = False) -> np.ndarray:
+def connections(system: System, *, massless: bool = False) -> np.ndarray:
     """Pairs (b, 2) of sites that are joined: bonds of molecules, or of a body the edges of the hull
     of each solid or the shortest links between points, with links between solids and from a pinned
     body to its pivot. `massless`: whether massless sites are joined to their nearest atoms, so that

@@ -151,7 +151,9 @@ def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[flo
 
 def encoder(system: System, interval: float, velocities: bool) -> Encode:
     """Models, each with its time in a remark and its box before it. Bonds are in the topology."""
-    files = FrameFiles(system, velocities, "PDB", {"multiframe": True, "bonds": None})
+    files = FrameFiles(
+        system, velocities=velocities, name="PDB", options={"multiframe": True, "bonds": None}
+    )
 
     def encode(frame: Frame, k: int) -> bytes:
         def write(writer, atoms):

@@ -190,7 +190,7 @@ def _residues(atoms) -> list[tuple] | None:
     return [(int(n), str(name)) for n, name in zip(numbers, names, strict=True)]
 
 
-def atoms_of_system(system: MolecularSystem, state: State, wrapped: bool = False) -> "ase.Atoms":
+def atoms_of_system(system: MolecularSystem, state: State, *, wrapped: bool = False) -> "ase.Atoms":
     """A state of a system as an `ase.Atoms`, see `atoms_of_sites`."""
     return atoms_of_sites(
         system,

@@ -50,7 +50,7 @@ def dimensions(cell: np.ndarray | None) -> list[float] | None:
     return None if cell is None or cell[0, 0] == inf else edges_and_angles(cell)
 
 
-def universe_of(system: System, velocities: bool = False) -> "mda.Universe":
+def universe_of(system: System, *, velocities: bool = False) -> "mda.Universe":
     """An MDAnalysis Universe of all sites, one residue per molecule, without bonds."""
     import MDAnalysis as mda
 
@@ -88,9 +88,14 @@ class FrameFiles:
     of its writer."""
 
     def __init__(
-        self, system: System, velocities: bool, name: str, options: dict[str, object] | None = None
+        self,
+        system: System,
+        *,
+        velocities: bool,
+        name: str,
+        options: dict[str, object] | None = None,
     ):
-        self._universe = universe_of(system, velocities)
+        self._universe = universe_of(system, velocities=velocities)
         self._name = name
         self._options = options or {}
         self.sites: int = len(system.sites.name)
@@ -236,18 +241,20 @@ def _compressed_xtc(positions: np.ndarray, box: np.ndarray, step: int, time: flo
 
 
 def trr_encoder(system: System, interval: float, velocities: bool) -> Encode:
-    files = FrameFiles(system, velocities, "TRR")
+    files = FrameFiles(system, velocities=velocities, name="TRR")
     return lambda frame, k: files.content(frame._replace(step=step_in_32_bits(frame.step)))
 
 
 def dcd_encoder(system: System, interval: float, velocities: bool) -> Encode:
-    files = FrameFiles(system, velocities, "DCD", {"dt": interval})
+    files = FrameFiles(system, velocities=velocities, name="DCD", options={"dt": interval})
     size = 80 + 12 * files.sites
     return lambda frame, k: files.content(frame)[0 if k == 0 else -size :]
 
 
 def netcdf_encoder(system: System, interval: float, velocities: bool) -> Encode:
-    files = FrameFiles(system, velocities, "NCDF", {"velocities": velocities})
+    files = FrameFiles(
+        system, velocities=velocities, name="NCDF", options={"velocities": velocities}
+    )
     size = 4 + 12 * files.sites * (1 + velocities)
     return lambda frame, k: files.content(frame)[
         0 if k == 0 else -size - 48 * (frame.cell is not None) :

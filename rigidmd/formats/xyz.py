@@ -101,7 +101,7 @@ def _columns(properties: str) -> tuple[int | None, int | None, int]:
 
 def encoder(system: System, interval: float, velocities: bool) -> Encode:
     """Extended XYZ, for OVITO and ASE: box and time are in the comment line."""
-    files = FrameFiles(system, velocities, "XYZ")
+    files = FrameFiles(system, velocities=velocities, name="XYZ")
     # names of all sites, where elements do not name all that have mass
     nameless = bool(((system.sites.element == "X") & (system.sites.mass > 0)).any())
     names = [f" {name}\n".encode() for name in system.sites.name] if nameless else []

@@ -33,6 +33,7 @@ def elsewhere() -> str:
 
 def check_folder(
     folder: Path,
+    *,
     force: bool,
     inputs: Iterable[Path] = (),
     names: Iterable[str] = (),
@@ -195,7 +196,7 @@ class RunMark:
     """Recognises the last run in a folder, by its scene file, which no other run leaves
     unchanged."""
 
-    def __init__(self, folder: Path, is_complete: bool):
+    def __init__(self, folder: Path, *, is_complete: bool):
         self._folder, self.is_complete = folder, is_complete
         self._written = self._last_written()
 

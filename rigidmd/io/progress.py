@@ -23,7 +23,7 @@ def in_notebook() -> bool:
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
-def is_shown(shown: bool | None) -> bool:
+def is_shown(*, shown: bool | None) -> bool:
     """Whether progress is shown: None shows it only in a notebook."""
     return in_notebook() if shown is None else shown
 
@@ -55,12 +55,12 @@ def announce(sentence: str, spot: DisplayArea) -> None:
 
 
 def progress_of(
-    total: float, unit: str, shown: bool | None, spot: DisplayArea | None = None
+    total: float, unit: str, *, shown: bool | None, spot: DisplayArea | None = None
 ) -> "Bar":
     """A bar for a `with` statement. Its `update` is called with each advance, in `unit` of time.
     `shown`: None shows it only in a notebook. `spot`: the area in which a notebook shows it, also
     at the end."""
-    if not is_shown(shown):
+    if not is_shown(shown=shown):
         return Bar(disable=True)
     if in_notebook():
         return _NotebookBar(spot or DisplayArea(), total=total, unit=unit)

@@ -217,6 +217,7 @@ class Log(AppendedFile):
     def __init__(
         self,
         path: Path,
+        *,
         tensor: bool,
         kept: Sequence[int] | None = None,
         user_terms: Sequence[str] = (),

@@ -51,12 +51,14 @@ def universe(system: System | BodySystem, state: State, wrapped: bool = True) ->
     return u
 
 
-def _connect(u: mda.Universe, system: System | BodySystem, massless: bool = True) -> None:
+def _connect(u: mda.Universe, system: System | BodySystem, *, massless: bool = True) -> None:
     """Add charges and bonds. Earlier bonds are replaced."""
     if hasattr(u.atoms, "bonds"):
         u.del_TopologyAttr("bonds")
     u.add_TopologyAttr("charges", charges(system))
-    u.add_TopologyAttr("bonds", [tuple(pair) for pair in connections(system, massless).tolist()])
+    u.add_TopologyAttr(
+        "bonds", [tuple(pair) for pair in connections(system, massless=massless).tolist()]
+    )
 
 
 def in_memory(system: System | BodySystem, frames: Sequence[Frame]) -> mda.Universe:

@@ -29,6 +29,7 @@ def open_trajectory(
     path: Path,
     system: "System | BodySystem",
     interval: float,
+    *,
     velocities: bool,
     wrapped: bool,
     kept: Sequence[int] | None = None,
@@ -39,7 +40,9 @@ def open_trajectory(
     return TrajectoryFile(path, system, interval, velocities, wrapped, kept)
 
 
-def write_topology(path: Path, system: "System | BodySystem", state: State, wrapped: bool) -> None:
+def write_topology(
+    path: Path, system: "System | BodySystem", state: State, *, wrapped: bool
+) -> None:
     """Write names, molecules and first positions for viewers. Raises SimulationError if the format
     cannot hold one."""
     positions = system.site_positions(state, wrapped)

@@ -17,6 +17,7 @@ from rigidmd.errors import OutputError, option
 def check_target(
     path: Path,
     extensions: tuple[str, ...],
+    *,
     force: bool,
     what: str = "file",
     inputs: Iterable[Path] = (),
@@ -50,7 +51,7 @@ def write_json(
     write_text(path, f"{text}\n")
 
 
-def write_csv(path: Path, rows: Iterable[Sequence[object]], quote_text: bool = False) -> None:
+def write_csv(path: Path, rows: Iterable[Sequence[object]], *, quote_text: bool = False) -> None:
     """Write rows as CSV, with texts in quotation marks where needed, or always."""
     stream = io.StringIO(newline="")
     quoting = csv.QUOTE_MINIMAL
@@ -151,5 +152,5 @@ class Table(NamedTuple, Generic[Row]):
         write_csv(
             path,
             [[column.header for column in self.columns], *map(self.values, self.rows)],
-            quote_text,
+            quote_text=quote_text,
         )

@@ -73,7 +73,9 @@ def atoms_of_results(
     def final() -> "ase.Atoms":
         """The final state, exactly, with its energy, forces and stress."""
         state = results.state
-        last_atoms = atoms_of_system(system, state, system.scene.output.positions == "wrapped")
+        last_atoms = atoms_of_system(
+            system, state, wrapped=system.scene.output.positions == "wrapped"
+        )
         last_atoms.info["time_ps"] = float(state.time[NOW])
         if results._is_stored:
             return with_logged_energy(last_atoms, float(state.time[NOW]))

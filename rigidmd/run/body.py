@@ -211,7 +211,7 @@ class MotionFiles(Observer):
 
     _names = (MOTION, MOTION_NPZ)
 
-    def __init__(self, sampler: Sampler, npz: bool):
+    def __init__(self, sampler: Sampler, *, npz: bool):
         self._sampler, self._npz = sampler, npz
 
     def end(self, run: "Simulation", results: "Results") -> None:
@@ -356,7 +356,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             velocities = not_none(format_of(output.trajectory)).velocities
             files = [Frames(interval, not_none(output.topology), output.trajectory, velocities)]
         if self.simulation.folder is not None:
-            files = [SceneFile(), *files, MotionFiles(self._sampler, output.npz)]
+            files = [SceneFile(), *files, MotionFiles(self._sampler, npz=output.npz)]
             files += self._figures() if output.figures else []
         return [*files, self._sampler, self._watch]
 
@@ -374,7 +374,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         computing = sum(self.record.position.computing)
         interrupted = self.simulation._is_interrupted
         summary = summarise_body(
-            self.system, samples, steps, preparing, wall, computing, interrupted
+            self.system, samples, steps, preparing, wall, computing, interrupted=interrupted
         )
         summary["stable_timestep_s"] = self.record.stable
         if self.engine.is_stiff:
@@ -404,7 +404,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         )
 
     def start_energy(
-        self, size: float = 1.0, unit: str = "J", measure_accuracy: bool = False
+        self, size: float = 1.0, unit: str = "J", *, measure_accuracy: bool = False
     ) -> Json:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the
         body's."""

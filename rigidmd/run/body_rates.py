@@ -191,7 +191,12 @@ def _angles(path: np.ndarray, pole: np.ndarray) -> tuple[np.ndarray, np.ndarray 
 
 
 def _periods(
-    time: np.ndarray, values: np.ndarray, level: float, other: np.ndarray, both_ways: bool = False
+    time: np.ndarray,
+    values: np.ndarray,
+    level: float,
+    other: np.ndarray,
+    *,
+    both_ways: bool = False,
 ) -> tuple[float | None, float | None]:
     """The mean time between passages of samples (t,) through a level, and the mean rate of another
     series (t,) from the first to the last passage. None if there are less than two, or a period has

@@ -19,6 +19,7 @@ def summarise_body(
     preparing: float,
     wall: float,
     computing: float,
+    *,
     interrupted: bool,
 ) -> dict:
     """The summary of a run of a single body, without its `provenance`. planned : steps of a run

@@ -28,6 +28,7 @@ class FailedCheck(SimulationError):
         message: str,
         molecule: int | None = None,
         factor: float | None = None,
+        *,
         rotation_not_orthogonal: bool = False,
         evaporated: bool = False,
     ):

@@ -74,7 +74,7 @@ class RunLoop:
     _schedule: ObservationSchedule  # of the current segment
 
     def __init__(
-        self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None
+        self, simulation: "Simulation", *, force: bool, resumes: bool, deadline: float | None
     ):
         self._simulation, self._folder = simulation, simulation.folder
         self._part = simulation._part
@@ -89,7 +89,7 @@ class RunLoop:
         self.has_begun = False  # whether the files of the folder are those of this run
         self._error: Exception | None = None  # of an observer
         self._failed_before: list[Observer] = []
-        self._bar, self._progress = progress_of(0.0, "", False), False
+        self._bar, self._progress = progress_of(0.0, "", shown=False), False
         self._wall = 0.0  # seconds before the time since which it runs
         self._since = clock.perf_counter()
         self._preparing = 0.0  # seconds
@@ -116,7 +116,7 @@ class RunLoop:
         is_last = position.segment + 1 == len(self._part.durations())
         return is_last and steps == position.first + self._part.segment.steps
 
-    def drive(self, steps: float, progress: bool | None) -> None:
+    def drive(self, steps: float, *, progress: bool | None) -> None:
         """Let the run advance by at most this number of steps, or to its end."""
         self._progress = progress
         with contextlib.ExitStack() as stack:
@@ -132,7 +132,10 @@ class RunLoop:
             self._until = before + steps
             stack.enter_context(signal_handler(self._stop_by_signal, *stop_signals()))
             self._bar = progress_of(
-                total, part.time_unit, progress if total > 0 else False, self._simulation._spot
+                total,
+                part.time_unit,
+                shown=progress if total > 0 else False,
+                spot=self._simulation._spot,
             )
             stack.enter_context(self._bar).skip(float(part.state.time[NOW]))
             self._since = clock.perf_counter()
@@ -191,7 +194,7 @@ class RunLoop:
         elif self._folder is not None:
             source = simulation.scene.path(Path(simulation.scene.source).name)
             inputs = [*simulation.scene.inputs.values(), *([source] if source.is_file() else [])]
-            run_folder.check_folder(self._folder, self._force, inputs, names)
+            run_folder.check_folder(self._folder, force=self._force, inputs=inputs, names=names)
         if checkpoint is None:
             for warning in part.system.warnings:
                 simulation._note(warning)

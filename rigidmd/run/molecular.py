@@ -119,7 +119,9 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         self.reset()
 
     def atoms(self) -> "ase.Atoms":
-        return atoms_of_system(self.system, self.state, self.scene.output.positions == "wrapped")
+        return atoms_of_system(
+            self.system, self.state, wrapped=self.scene.output.positions == "wrapped"
+        )
 
     def start(self) -> OverlapRemoval | None:
         """Go to the state before the first step, from which a run starts. Returns the removal of
@@ -137,7 +139,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             if not stage.is_minimisation:
                 break
             self.enter_segment(k)
-            self._minimise(False)
+            self._minimise(progress=False)
         return self.state
 
     def reset(self) -> None:
@@ -352,7 +354,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         k = self.record.position.segment
         stage = self.scene.stages[k]
         with progress_of(
-            stage.most_iterations, "iterations", progress, self.simulation._spot
+            stage.most_iterations, "iterations", shown=progress, spot=self.simulation._spot
         ) as bar:
 
             def advance(count: float) -> None:
@@ -505,7 +507,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             files = [
                 SceneFile(names.values()),
                 *files,
-                LogFile(interval, output.pressure_tensor),
+                LogFile(interval, tensor=output.pressure_tensor),
                 FinalState(),
             ]
             files += [Figures(["energy"], ["png"])] if output.figures else []
@@ -523,7 +525,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             self.state,
             preparing,
             wall,
-            self.simulation._is_interrupted,
+            interrupted=self.simulation._is_interrupted,
         )
 
     def explain(self, error: SimulationError) -> str:
@@ -592,7 +594,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         form = format_of(structure.file)
         return (form is not None and form.crystals) or structure.repeat != (1, 1, 1)
 
-    def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
+    def start_energy(self, size: float, unit: str, *, measure_accuracy: bool = False) -> dict:
         """Energies, virial, pressure and largest force at the start. Energies in a unit of `size` u
         Å²/ps².
 

@@ -29,11 +29,13 @@ class LogFile(GrowingFile[Log]):
     ends = reads_energies = True
     _names = (LOG,)
 
-    def __init__(self, interval: float, tensor: bool):
+    def __init__(self, interval: float, *, tensor: bool):
         self.interval, self._tensor = interval, tensor
 
     def begin(self, run: "Simulation") -> None:
-        self._file = Log(run.path(LOG), self._tensor, self.kept, run.system.more_columns)
+        self._file = Log(
+            run.path(LOG), tensor=self._tensor, kept=self.kept, user_terms=run.system.more_columns
+        )
 
     def see(self, moment: Moment) -> None:
         not_none(self._file).write(moment.sample)

@@ -315,14 +315,21 @@ class Frames(GrowingFile[OpenTrajectory]):
         from rigidmd.io.trajectory_file import open_trajectory, write_topology
 
         if self.kept is None:
-            write_topology(run.path(self._names[0]), run.system, run._part.state, self._wrapped)
+            write_topology(
+                run.path(self._names[0]), run.system, run._part.state, wrapped=self._wrapped
+            )
         elif (
             self.kept[-1:] != [len(self._frames)] or (self.times > run._part.state.time[NOW]).any()
         ):
             raise ValueError("the times of its frames are not those of a run")
         path = run.path(self._names[1])
         self._file = open_trajectory(
-            path, run.system, self.interval, self._velocities, self._wrapped, self.kept
+            path,
+            run.system,
+            self.interval,
+            velocities=self._velocities,
+            wrapped=self._wrapped,
+            kept=self.kept,
         )
 
     def see(self, moment: Moment) -> None:

@@ -147,7 +147,7 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
 
     @abstractmethod
     def start_energy(
-        self, size: float = 1.0, unit: str = "J", measure_accuracy: bool = False
+        self, size: float = 1.0, unit: str = "J", *, measure_accuracy: bool = False
     ) -> Json:
         """Energies and forces at the start."""
 

@@ -203,7 +203,7 @@ def describe_changes(before: Mapping[str, object]) -> str | None:
     )
 
 
-def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True) -> State:
+def state_from(arrays: Mapping[str, np.ndarray], like: State, *, exact: bool = True) -> State:
     """The state in a checkpoint of a run whose states have arrays like `like`. Raises ValueError,
     KeyError.
 
@@ -212,7 +212,7 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True
     state = State(*(np.array(arrays[name], order="C") for name in State._fields))
     shapes = {name: expected.shape for name, expected in zip(State._fields, like, strict=True)}
     for name, problem in array_errors(
-        dict(zip(State._fields, state, strict=True)), shapes, exact
+        dict(zip(State._fields, state, strict=True)), shapes, exact=exact
     ).items():
         raise ValueError(f"{name} of its state {problem}")
     for name, array, expected in zip(State._fields, state, like, strict=True):

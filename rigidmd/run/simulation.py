@@ -334,7 +334,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """A few lines for the start of a run."""
         return "\n".join([self._part.headline, *(f"  {note}" for note in self._part.system.notes)])
 
-    def _conclusion(self, results: Results, verbose: bool = False) -> str:
+    def _conclusion(self, results: Results, *, verbose: bool = False) -> str:
         """The summary as text, without the notes of the introduction and the warnings that were
         issued."""
         text_of = self._part.summary_text if verbose else self._part.short_summary
@@ -352,7 +352,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
             raise RuntimeError("the run has begun. close() ends it")
         return self._part
 
-    def _molecules(self, begun: bool = False) -> "MolecularRun":
+    def _molecules(self, *, begun: bool = False) -> "MolecularRun":
         """The part of molecules. Raises TypeError for a body, RuntimeError within a run unless it
         may have `begun`."""
         part = self._part if begun else self._before_run()
@@ -404,11 +404,11 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         self._before_run().take_threads(count)
 
     def _start_energy(
-        self, size: float = 1.0, unit: str = "J", measure_accuracy: bool = False
+        self, size: float = 1.0, unit: str = "J", *, measure_accuracy: bool = False
     ) -> Json:
         """Energies and forces at the start. For the arguments see `MolecularRun.start_energy`, a
         body has none."""
-        return self._before_run().start_energy(size, unit, measure_accuracy)
+        return self._before_run().start_energy(size, unit, measure_accuracy=measure_accuracy)
 
     # The run.
 
@@ -440,7 +440,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
             raise TypeError(
                 f"run() runs the whole scene: for {progress!r:.20} steps use step({progress!r:.20})"
             )
-        return cast(Results, self._drive(inf, progress).results)
+        return cast(Results, self._drive(inf, progress=progress).results)
 
     def step(self, count: int = 1) -> int:
         """Advance by a number of steps, as `run` does. Returns the number done: fewer at the end of
@@ -457,7 +457,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """
         if count < 1:
             raise ValueError(f"step({count}): at least one step")
-        return self._drive(count, False).advanced
+        return self._drive(count, progress=False).advanced
 
     def close(self) -> None:
         """End a run that `step` has started, with all files, as `stop` ends it: it can be resumed.
@@ -498,7 +498,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """Print a sentence before something slow."""
         if self._user_say is not None:
             self._user_say(sentence)
-        elif is_shown(self._progress):
+        elif is_shown(shown=self._progress):
             announce(sentence, self._spot)
 
     def _must_end(self) -> bool:
@@ -510,7 +510,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         """Whether the run ends before the end of its scene."""
         return self._loop is not None and self._loop.interrupted
 
-    def _drive(self, steps: float, progress: bool | None) -> RunLoop:
+    def _drive(self, steps: float, *, progress: bool | None) -> RunLoop:
         """Let the run advance by at most this number of steps, or to its end. A new one starts
         after its end."""
         if self._loop is None:
@@ -519,7 +519,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
             if not resume and self._earlier is not None and self._earlier.is_there:
                 resume = self._earlier.can_continue
                 force = force or not resume
-            self._loop = RunLoop(self, force, resume, self._deadline)
+            self._loop = RunLoop(self, force=force, resumes=resume, deadline=self._deadline)
             _BEGUN.add(self)
         loop = self._loop
         if loop.is_running:
@@ -528,12 +528,12 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
             )
         self._progress, self._spot = progress, DisplayArea()
         try:
-            loop.drive(steps, progress)
+            loop.drive(steps, progress=progress)
         finally:
             if loop.has_ended:
                 self._loop = None
                 if self.folder is not None and loop.has_begun:
-                    self._earlier = run_folder.RunMark(self.folder, loop.is_complete)
+                    self._earlier = run_folder.RunMark(self.folder, is_complete=loop.is_complete)
                 _BEGUN.discard(self)
         return loop
 

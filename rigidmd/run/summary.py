@@ -74,6 +74,7 @@ def summarise(
     state: State,
     preparing: float,
     wall: float,
+    *,
     interrupted: bool,
 ) -> dict:
     """The summary of a run of molecules, without its `provenance`. Seconds as in

@@ -52,7 +52,10 @@ ELECTROSTATICS = {
     ),
     "ewald": Method("ewald.interactions", (*_EWALD, *_K_VECTORS), sums_images=True),
     "pme": Method(
-        "ewald.interactions", (*_EWALD, "pme_order", "pme_grid"), True, conserves_momentum=False
+        "ewald.interactions",
+        (*_EWALD, "pme_order", "pme_grid"),
+        sums_images=True,
+        conserves_momentum=False,
     ),
     "damped_shifted_force": Method("potentials.screened_coulomb", ("damping_per_A",)),
     "coulomb": Method("potentials.coulomb"),

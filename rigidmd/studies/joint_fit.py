@@ -115,7 +115,7 @@ def results_of_run(record: Record[System]) -> RunResults | str:
         columns["force_squares"] + columns["torque_squares"],
         columns["force_squares"],
     )
-    return results_of_samples(np.array(samples), at, stage.has_barostat)
+    return results_of_samples(np.array(samples), at, has_barostat=stage.has_barostat)
 
 
 def _conditions(record: Record[System], stage: Stage) -> Conditions:
@@ -145,19 +145,21 @@ class _Samples(NamedTuple):
     of_forces: np.ndarray  # sum F²/m
 
 
-def results_of_samples(samples: np.ndarray, at: Conditions, has_barostat: bool) -> RunResults:
+def results_of_samples(samples: np.ndarray, at: Conditions, *, has_barostat: bool) -> RunResults:
     """Results of series (6, l) of `_Samples`."""
     length = samples.shape[1] // BLOCKS
     if length == 0:
         return RunResults({}, {}, np.zeros((BLOCKS, 0)), 0)
     blocks = samples[:, -BLOCKS * length :].reshape(len(samples), BLOCKS, length)
-    values = _evaluate(blocks, at, has_barostat)
-    without = [_evaluate(np.delete(blocks, k, 1), at, has_barostat) for k in range(BLOCKS)]
+    values = _evaluate(blocks, at, has_barostat=has_barostat)
+    without = [
+        _evaluate(np.delete(blocks, k, 1), at, has_barostat=has_barostat) for k in range(BLOCKS)
+    ]
     table = np.array([list(found.values()) for found in without])
     changes = (table - table.mean(axis=0)) * sqrt((BLOCKS - 1) / BLOCKS)
     errors = dict(zip(values, np.linalg.norm(changes, axis=0).tolist(), strict=True))
     series = _Samples(*samples)
-    averaged = dict(zip(_observables(has_barostat), series, strict=False))
+    averaged = dict(zip(_observables(has_barostat=has_barostat), series, strict=False))
     averaged[BALANCE] = series.kinetic + at.correction * at.step**2 * series.squares
     errors |= {name: mean_and_error(values)[1] for name, values in averaged.items()}
     known = all(map(_is_long, averaged.values()))
@@ -170,11 +172,11 @@ def _is_long(series: np.ndarray) -> bool:
     return len(series) >= LEAST_SAMPLES * inefficiency(series - series.mean())
 
 
-def _observables(has_barostat: bool) -> list[str]:
+def _observables(*, has_barostat: bool) -> list[str]:
     return [POTENTIAL, VOLUME, DENSITY] if has_barostat else [POTENTIAL]
 
 
-def _evaluate(blocks: np.ndarray, at: Conditions, has_barostat: bool) -> dict[str, float]:
+def _evaluate(blocks: np.ndarray, at: Conditions, *, has_barostat: bool) -> dict[str, float]:
     """Means, their slopes over dt² (per fs²), and responses at constant pressure or volume."""
     means = blocks.mean(axis=(1, 2))
     deviations = blocks - means[:, None, None]
@@ -190,7 +192,7 @@ def _evaluate(blocks: np.ndarray, at: Conditions, has_barostat: bool) -> dict[st
     with_enthalpy = _Samples(*enthalpy)
     hotter = _heating(mean, at)
     denser = _compression(mean, at, hotter) if has_barostat else 0.0
-    found = dict(zip(_observables(has_barostat), means.tolist(), strict=False))
+    found = dict(zip(_observables(has_barostat=has_barostat), means.tolist(), strict=False))
     for k, name in enumerate(list(found)):
         direct = -with_squares[k] / 24
         if name == POTENTIAL:
@@ -202,7 +204,7 @@ def _evaluate(blocks: np.ndarray, at: Conditions, has_barostat: bool) -> dict[st
     set_energy = at.freedom * at.thermal_energy / 2
     found[MEAN_SQUARE] = float(at.step**2 * mean.squares / at.freedom / at.thermal_energy)
     found[BALANCE] = float(mean.kinetic + at.correction * at.step**2 * mean.squares - set_energy)
-    return found | _responses(mean, with_volume, with_enthalpy, at, has_barostat)
+    return found | _responses(mean, with_volume, with_enthalpy, at, has_barostat=has_barostat)
 
 
 def _heating(mean: _Samples, at: Conditions) -> float:
@@ -224,6 +226,7 @@ def _responses(
     with_volume: _Samples,
     with_enthalpy: _Samples,
     at: Conditions,
+    *,
     has_barostat: bool,
 ) -> dict[str, float]:
     """Response functions from fluctuations, with the part of the momenta as it is in theory."""
@@ -251,7 +254,9 @@ def fit_jointly(runs: Mapping[float, Sequence[RunResults]]) -> JointLimits:
     """Limits from the results of the runs at each step (fs). Empty if they are too short."""
     names = next((list(of.values) for of_step in runs.values() for of in of_step), [])
     averaged = {name for name in names if slope_name(name) in names} | {BALANCE}
-    points = {name: means_of_runs(_with_errors(runs, name, name in averaged)) for name in names}
+    points = {
+        name: means_of_runs(_with_errors(runs, name, of_series=name in averaged)) for name in names
+    }
     if not names or not all(points.values()):
         return JointLimits({}, {})
     slopes = [name for name in names if slope_name(name) in names]
@@ -272,7 +277,7 @@ def fit_jointly(runs: Mapping[float, Sequence[RunResults]]) -> JointLimits:
 
 
 def _with_errors(
-    runs: Mapping[float, Sequence[RunResults]], name: str, of_series: bool
+    runs: Mapping[float, Sequence[RunResults]], name: str, *, of_series: bool
 ) -> dict[float, list[tuple[float, float | None]]]:
     """The values of a result at each step with their errors.
 

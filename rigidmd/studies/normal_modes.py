@@ -251,7 +251,7 @@ def normal_modes(
         )
     state = (simulation.state if simulation is scene else simulation._settle()).copy()
     system = cast(System, simulation.system)
-    numbers = _numbers(Coordinates(system, state), count, gamma)
+    numbers = _numbers(Coordinates(system, state), count, gamma=gamma)
     if required is not None and required not in numbers:
         among = (
             f"there are {numbers[-1]} modes"
@@ -261,7 +261,7 @@ def normal_modes(
         raise SceneError(
             simulation.scene.source, [f"mode {required} will not be computed: {among}"]
         )
-    sizes = _find_minimum(system, state, minimise)
+    sizes = _find_minimum(system, state, minimise=minimise)
     c = Coordinates(system, state)
     charges = system.of_sites(lambda m: m.charges)
     cells = 0
@@ -306,7 +306,7 @@ def normal_modes(
     )
 
 
-def _numbers(c: Coordinates, count: int | None, gamma: bool) -> np.ndarray:
+def _numbers(c: Coordinates, count: int | None, *, gamma: bool) -> np.ndarray:
     """The numbers (k,) of the modes to compute. Raises SceneError."""
     d = len(c.index)
     fixed = len(c.translations)
@@ -332,7 +332,9 @@ def _last_temperature(scene: MolecularScene) -> float:
     return temperature
 
 
-def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, float, float, str]:
+def _find_minimum(
+    system: System, state: State, *, minimise: bool
+) -> tuple[float, float, float, str]:
     """Move a state to a minimum, in place, or check that it is one: energy, largest force and
     torque (kJ/mol, Å), and why the minimisation stopped before the rounding of forces, if it
     did."""
@@ -470,9 +472,11 @@ def write_animation(folder: Path, modes: NormalModes, number: int) -> None:
     period = 2 * pi / abs(modes.rate[k])
     q = AMPLITUDE / np.abs(c.scale * modes.vector[k]).max() * modes.vector[k]
     write_scene(folder, scene)
-    write_topology(folder / output.topology, system, c.state, False)
-    log = Log(folder / LOG, False, None, tuple(system.user_terms))
-    frames = open_trajectory(folder / str(output.trajectory), system, period / FRAMES, False, False)
+    write_topology(folder / output.topology, system, c.state, wrapped=False)
+    log = Log(folder / LOG, tensor=False, kept=None, user_terms=tuple(system.user_terms))
+    frames = open_trajectory(
+        folder / str(output.trajectory), system, period / FRAMES, velocities=False, wrapped=False
+    )
     for step in range(PERIODS * FRAMES + 1):
         state = c.at(np.cos(2 * pi * step / FRAMES) * q)
         time = period * step / FRAMES

@@ -55,7 +55,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
         raise SceneError(
             scene.source, ["export supports molecules only, and this is a single body"]
         )
-    check_folder(folder, force, what="export", marker=MARKER)
+    check_folder(folder, force=force, what="export", marker=MARKER)
     program = programs()[to]
     # a scene for an engine that scenes cannot name has the defaults of rigidmd
     engine = EngineChoice.model_validate({"name": to}) if program.engine else EngineChoice()

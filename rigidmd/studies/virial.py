@@ -236,7 +236,7 @@ def _integral_of_points(energy: Energy, thermal: np.ndarray) -> np.ndarray:
     integral, _, details = quad_vec(
         shell, *ends, epsabs=1e-200, epsrel=POINT_ERROR, norm="max", points=limits, full_output=True
     )
-    _check_end(shell(ends[1]), integral, details.success)
+    _check_end(shell(ends[1]), integral, success=details.success)
     return integral
 
 
@@ -308,7 +308,7 @@ def _integral(
     return integral + shells[0] / 3
 
 
-def _check_end(left: np.ndarray, integral: np.ndarray, success: bool = True) -> None:
+def _check_end(left: np.ndarray, integral: np.ndarray, *, success: bool = True) -> None:
     """Raise SimulationError where the integrand has not vanished at FARTHEST."""
     if not success or np.abs(left).max() > LEFT * np.abs(integral).max():
         raise SimulationError(

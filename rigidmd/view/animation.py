@@ -68,6 +68,7 @@ def write_film(
     folder: Path,
     path: Path,
     seconds: float = SECONDS,
+    *,
     with_plots: bool = False,
     height: int | None = None,
     progress: Callable[[float], object] = lambda fraction: None,
@@ -89,7 +90,7 @@ def write_film(
     notes = [*record.missing, *animation.notes, *notes]
     notes += animation.film_notes(times[1] - times[0], seconds)
     pixels = 2 * round((height or HEIGHT[kind]) / 2)
-    frames = _frames(record, animation, times, pixels, with_plots, progress)
+    frames = _frames(record, animation, times, pixels, with_plots=with_plots, progress=progress)
     with atomic_file(path) as temporary:
         try:
             if kind == ".gif":
@@ -116,6 +117,7 @@ def _frames(
     animation: BodyAnimation | MoleculeAnimation,
     times: np.ndarray,
     pixels: int,
+    *,
     with_plots: bool,
     progress: Callable[[float], object],
 ) -> Iterator[np.ndarray]:

@@ -76,7 +76,7 @@ def mesh_of(system: BodySystem) -> Mesh:
     moments, axes = principal(tensor)
     symmetric = axis_of_symmetry(moments)
     if wanted in (None, "top") and symmetric is not None:
-        return _top_mesh(mass, moments, axes, symmetric, centre, table.pinned)
+        return _top_mesh(mass, moments, axes, symmetric, centre, pinned=table.pinned)
     # half axes of the ellipsoid
     lengths = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))
     lengths = np.maximum(lengths, MIN_THICKNESS * lengths.max())
@@ -109,6 +109,7 @@ def _top_mesh(
     axes: np.ndarray,
     symmetric: int,
     centre: np.ndarray,
+    *,
     pinned: bool,
 ) -> Mesh:
     """The homogeneous cylinder, or ball, of these moments, on a stem if its pivot lies on the axis
@@ -216,7 +217,7 @@ def _cut(mesh: Mesh) -> Mesh:
     return mesh._replace(vertices=np.array(vertices), faces=faces, painted=painted)
 
 
-def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:
+def _revolve(rings: list[tuple[float, float]], *, closed: bool = False) -> Mesh:
     """A solid of revolution about axis 3 from circles (radius, z), from below. A quarter of its
     side is painted. A `closed` one is a ring, without discs at its ends."""
     n = CIRCLE_CORNERS
@@ -260,6 +261,6 @@ UNITS = {
     "cone": _revolve([(0.0, -0.75), (1.0, 0.25)]),
     "ring": _revolve(
         [(1 + 0.06 * np.cos(a), 0.5 * np.sin(a)) for a in [*np.linspace(0, 2 * np.pi, 9)[:8], 0]],
-        True,
+        closed=True,
     ),
 }

@@ -155,11 +155,11 @@ def color_of(element: str) -> np.ndarray:
     return np.array([int(digits[k : k + 2], 16) for k in (1, 3, 5)]) / 255
 
 
-def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
+def write_molecule_figure(path: Path, m: Molecule, *, force: bool = False) -> None:
     """Draw a molecule into a file, whose extension sets the format. Raises OutputError."""
     from matplotlib.patches import Circle
 
-    check_target(path, EXTENSIONS, force, "figure")
+    check_target(path, EXTENSIONS, force=force, what="figure")
     is_flat = m.planar or m.kind in ("point", "linear")
     matrix = np.eye(3) if is_flat else camera(EYE, np.array([0.0, 1.0, 0.0]))
     covalent = np.array([COVALENT.get(element, 0.0) for element in m.elements])

@@ -82,7 +82,7 @@ def plot(results: Results, *columns: str, log: bool = False) -> Picture:
         return figures[wanted[0]]
     check_names(columns, results.samples.described, figures)
     record = record_of(results.system, results.samples, results.summary, list(columns))
-    return columns_figure(record, columns, results.samples.described, log)
+    return columns_figure(record, columns, results.samples.described, log=log)
 
 
 def check_names(
@@ -99,7 +99,7 @@ def check_names(
 
 
 def columns_figure(
-    record: Record, names: Sequence[str], described: dict[str, Column], log: bool = False
+    record: Record, names: Sequence[str], described: dict[str, Column], *, log: bool = False
 ) -> Picture:
     """Columns against time, with one panel for each unit."""
     units: dict[str, list[str]] = {}

@@ -303,6 +303,7 @@ def selected_bodies(names: list[str]) -> list[Example]:
 def write_gallery(
     folder: Path,
     names: list[str],
+    *,
     force: bool,
     command: str,
     progress: Callable[[str], object] = lambda name: None,

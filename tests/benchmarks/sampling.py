@@ -343,7 +343,7 @@ def run_openmm(run: Run, folder: Path, start: Path) -> tuple:
     import openmm
 
     sites = dict(np.load(start / "sites.npz"))
-    system, force = openmm_system(sites, CUTOFF / 10, SWITCH)
+    system, force = openmm_system(sites, CUTOFF / 10, separate=SWITCH)
     force.setNonbondedMethod(openmm.NonbondedForce.PME)
     if run.ensemble == "npt":
         barostat = openmm.MonteCarloBarostat(1.0, TEMPERATURE)

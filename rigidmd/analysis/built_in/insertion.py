@@ -110,7 +110,7 @@ def insertion(
     except InputError as error:
         raise OutputError(str(error)) from None
     result = AnalysisResult("insertion", f"insertion of {molecule.name}")
-    result.values = _values(runs, sets, guest, thermal, host, zero_loading)
+    result.values = _values(runs, sets, guest, thermal, host, zero_loading=zero_loading)
     result.notes = [_note(sets, guest, thermal)]
     if axis:
         result.curves = [_profile(sets, thermal, axis)]
@@ -147,6 +147,7 @@ def _values(
     guest: Guest,
     thermal: float,
     host: np.ndarray,
+    *,
     zero_loading: bool,
 ) -> list[Value]:
     """The chemical potential and what follows from it."""

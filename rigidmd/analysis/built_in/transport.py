@@ -29,7 +29,7 @@ def correlation(series: np.ndarray, lags: int) -> np.ndarray:
     together."""
     frames = len(series)
     flat = series.reshape(frames, -1)
-    size = int(fft.next_fast_len(frames + lags, True) or 0)
+    size = int(fft.next_fast_len(frames + lags, real=True) or 0)
     power = np.zeros(size // 2 + 1)
     chunk = max(1, AT_ONCE // size)
     for first in range(0, flat.shape[1], chunk):

@@ -97,7 +97,8 @@ class OpenmmEngine(ExternalEngine):
         verlet = mm.VerletIntegrator(0.001)
         try:
             evaluated, moved = (
-                openmm_system(self._particles, system.state.cell, apart) for apart in (True, False)
+                openmm_system(self._particles, system.state.cell, separate=apart)
+                for apart in (True, False)
             )
             for force in extra_forces(view, stage):
                 moved.addForce(force)

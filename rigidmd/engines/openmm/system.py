@@ -218,7 +218,8 @@ def layout(view: ForceFieldView) -> Layout:
     species = system.model.species
     frozen = system.model.inverse_mass == 0
     bodies = [
-        mass_points(m, bool(is_frozen)) for m, is_frozen in zip(system.species, frozen, strict=True)
+        mass_points(m, frozen=bool(is_frozen))
+        for m, is_frozen in zip(system.species, frozen, strict=True)
     ]
     local, mass = [], []
     for m, body, is_frozen in zip(system.species, bodies, frozen, strict=True):
@@ -248,7 +249,7 @@ def layout(view: ForceFieldView) -> Layout:
     )
 
 
-def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openmm.System":
+def openmm_system(particles: Layout, cell: np.ndarray, *, separate: bool) -> "openmm.System":
     """The `openmm.System` with all forces except a barostat, and the initial cell (3, 3).
 
     separate : whether Lennard-Jones and Coulomb forces are separate even if one force can have
@@ -274,7 +275,7 @@ def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openm
                 int(a) + k, _openmm_virtual_site(where, site.weight.tolist(), site.cross)
             )
     excluded = particles.excluded()
-    for force, group in _forces(particles, separate):
+    for force, group in _forces(particles, separate=separate):
         force.setForceGroup(group)
         for i, j in excluded:
             if isinstance(force, openmm.NonbondedForce):
@@ -300,7 +301,7 @@ def _openmm_virtual_site(
     return mm.LocalCoordinatesSite(points, weight, [-1, 1, 0, 0], [-1, 0, 1, 0], [0, 0, 0])
 
 
-def _forces(particles: Layout, separate: bool) -> "list[tuple[PairsOrTail, int]]":
+def _forces(particles: Layout, *, separate: bool) -> "list[tuple[PairsOrTail, int]]":
     """The forces of a system with their groups."""
     forces: list[tuple[PairsOrTail, int]] = []
     view = particles.view
@@ -408,7 +409,7 @@ def _custom(
     return _within(force, particles.view, cutoff)
 
 
-def _custom_lennard_jones(particles: Layout, step: bool = False) -> "Pairs":
+def _custom_lennard_jones(particles: Layout, *, step: bool = False) -> "Pairs":
     """The Lennard-Jones potential as a formula, or its step at the cutoff. Linear in c12 and c6,
     from tables of kinds. Kind 0 is for mass points without a site."""
     view = particles.view

@@ -222,7 +222,9 @@ def interactions(parts: SystemParts) -> Interactions:
     charge = charge_e * COULOMB_CHARGE
     assert alpha is not None and cutoff is not None
     shifted = forces.ewald_truncation == "shift"
-    potential = screened_coulomb(charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * real)
+    potential = screened_coulomb(
+        charge_e, cutoff, alpha, shifted=shifted, error=FIT_ERROR_FRACTION * real
+    )
     if parts.grid is None:
         assert vectors is not None  # with PME only, there may be none
         reciprocal = direct_sum.EwaldSum(InverseR(alpha), charge, sites, vectors)

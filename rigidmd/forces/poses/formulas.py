@@ -46,7 +46,9 @@ def formula_of_poses(
     """
     if isinstance(function, BodyTable):
         row = function.row(axis).tolist()
-        return PoseFormula(TableFormula, lambda first, second: row, TABLE_OPERATIONS, True)
+        return PoseFormula(
+            TableFormula, lambda first, second: row, TABLE_OPERATIONS, is_derived=True
+        )
     name = getattr(function, "__name__", "a potential")
     graph = Graph()
     r = np.array([graph.leaf(letter) for letter in AXES], object)

@@ -212,7 +212,7 @@ def interactions(parts: SystemParts) -> Interactions:
             [m.dispersion[i] for m, i in zip(species, indices, strict=True)], index
         )
         added = screened_dispersion(
-            strength, forces.dispersion_beta_per_A, cutoff, forces.truncation == "shift"
+            strength, forces.dispersion_beta_per_A, cutoff, shifted=forces.truncation == "shift"
         )
         potential = potential._replace(dispersion=added)
     names = [
@@ -339,7 +339,7 @@ def _pair(potential, i, j, r2):
 
 
 def screened_dispersion(
-    strength: np.ndarray, beta: float, cutoff: float, shifted: bool
+    strength: np.ndarray, beta: float, cutoff: float, *, shifted: bool
 ) -> ScreenedDispersion:
     """What is added for sites with c (s,), square root of u Å⁸/ps². shifted : whether it is 0 at
     the cutoff"""

@@ -197,7 +197,7 @@ class ScreenedCoulomb(NamedTuple):
 
 
 def screened_coulomb(
-    charge_e: np.ndarray, cutoff: float, alpha: float, shifted: bool = False, error: float = 0.0
+    charge_e: np.ndarray, cutoff: float, alpha: float, *, shifted: bool = False, error: float = 0.0
 ) -> ScreenedCoulomb:
     """The potential for sites with charges (s,) in e.
 

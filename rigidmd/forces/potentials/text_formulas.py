@@ -375,7 +375,11 @@ def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
             case ast.BinOp(op=op, left=left, right=right) if type(op) in OPERATORS:
                 is_power = isinstance(op, ast.Pow)
                 return _combined(
-                    OPERATORS[type(op)], inner(left, int(is_power)), inner(right), is_power, what
+                    OPERATORS[type(op)],
+                    inner(left, int(is_power)),
+                    inner(right),
+                    is_power=is_power,
+                    what=what,
                 )
             case ast.Call(func=ast.Name(id=name), args=[of], keywords=[]) if name in FUNCTIONS:
                 part = inner(of)
@@ -402,7 +406,9 @@ def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
     raise FormulaError(f"{what} is not allowed in a formula")
 
 
-def _combined(function: Callable, first: _Part, second: _Part, is_power: bool, what: str) -> _Part:
+def _combined(
+    function: Callable, first: _Part, second: _Part, *, is_power: bool, what: str
+) -> _Part:
     """Two parts under an operator. Raises FormulaError."""
     if first.number is not None and second.number is not None:
         return _number(function(first.number, second.number), what)

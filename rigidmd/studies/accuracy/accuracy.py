@@ -198,7 +198,7 @@ def table_text(measured: IntegratorAccuracy) -> str:
     return text + trial_table(measured).text()
 
 
-def describe_accuracy(measured: IntegratorAccuracy, verbose: bool = False) -> list[str]:
+def describe_accuracy(measured: IntegratorAccuracy, *, verbose: bool = False) -> list[str]:
     """The answer first: the fastest integrator for each error, measured orders, all trials, and
     remarks."""
     fastest = [("target error", "fastest integrator", f"compared with {COMMON}")]

@@ -88,7 +88,7 @@ class Case(NamedTuple):
 
     def trials(self, quick: bool) -> Iterator[Trial]:
         for row in self.rows:
-            keys = _layered(self.common, row, quick)
+            keys = _layered(self.common, row, quick=quick)
             setting = keys.pop("setting", "")
             values = keys.pop("values", [nan])
             bisect = keys.pop("bisect", [False])
@@ -99,7 +99,7 @@ class Case(NamedTuple):
                         yield built._replace(is_bisected=is_bisected)
 
 
-def _layered(common: Json, row: Json, quick: bool) -> Json:
+def _layered(common: Json, row: Json, *, quick: bool) -> Json:
     """The keys of a row, after the keys of the layers above it."""
     like = (common | row).get("like")
     keys: Json = {"scene": {}}

@@ -55,7 +55,7 @@ MESSAGES = 3  # messages of a case at most
 Results = list[TrialResult]
 
 
-def summary(results: Results, verbose: bool = False) -> list[str]:
+def summary(results: Results, *, verbose: bool = False) -> list[str]:
     """The verdict, failures, the table, and the warnings if it is verbose."""
     lines = [*conclusions(results), "", table_text(results)]
     if verbose:

@@ -110,6 +110,7 @@ def selected_cases(names: list[str] | None) -> list[Case]:
 
 def run_cases(
     names: list[str] | None = None,
+    *,
     quick: bool = False,
     progress: Callable[[float, str], object] = lambda fraction, name: None,
 ) -> Iterator[TrialResult]:

@@ -131,7 +131,7 @@ def _is_number(value: object) -> bool:
     return type(value) in (int, float)
 
 
-def draw_table(table: Table, columns: list[str], connected: bool = True) -> "Picture":
+def draw_table(table: Table, columns: list[str], *, connected: bool = True) -> "Picture":
     """A panel for each column against the first key with numbers, else the first key. Without keys
     against the seed."""
     rows = [row for row in table.rows if row.runs]
@@ -154,7 +154,7 @@ def draw_table(table: Table, columns: list[str], connected: bool = True) -> "Pic
         curves.setdefault(label, []).append(row)
     values = [row.values[key] for row in rows]
     for axis, column in zip(axes, columns, strict=True):
-        _draw(axis, curves, key, column, connected)
+        _draw(axis, curves, key, column, connected=connected)
         axis.set_xlabel(axis_label(key, table.together.get(key, ())), fontsize=9, color=INK)
         if numbers and all(float(value).is_integer() for value in values):
             axis.locator_params(axis="x", integer=True)
@@ -172,7 +172,7 @@ def _draw_band(axis: "Axes", mean: float, error: float | None) -> None:
 
 
 def _draw(
-    axis: "Axes", curves: dict[str, list[SweepRow]], key: str, column: str, connected: bool
+    axis: "Axes", curves: dict[str, list[SweepRow]], key: str, column: str, *, connected: bool
 ) -> None:
     """Draw a column against a key, a curve for each label."""
     from matplotlib.transforms import ScaledTranslation  # slow to import
@@ -194,7 +194,7 @@ def _draw(
             ms=3.5,
             capsize=2.5,
             elinewidth=0.9,
-            **curve_style(k, connected),
+            **curve_style(k, connected=connected),
         )
         if np.isfinite(errors).any():
             for artist in curve.get_children():

@@ -287,7 +287,7 @@ def order_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
     return [axis._replace(swept=axis.swept or [*axis.keys] in keys.values()) for axis in axes]
 
 
-def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> None:
+def merge_manifests(folder: Path, fresh: Manifest, *, force: bool) -> None:
     """Give a manifest the folder of the sweep, and the points that the sweep there already has.
 
     force : remove an existing sweep. Raises OutputError, also if its scene differs.

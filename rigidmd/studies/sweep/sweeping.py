@@ -94,7 +94,7 @@ def open_sweep(
     if step is not None:
         step_key(manifest, step, Scene.read(scene, manifest.overrides(manifest.points[0].values)))
     with FolderLock(folder) as lock:
-        merge_manifests(folder, manifest, force)
+        merge_manifests(folder, manifest, force=force)
         with writing(folder, "made", f"; {elsewhere()}"):
             folder.mkdir(parents=True, exist_ok=True)
         add_to_folder(folder, FILES)
@@ -171,7 +171,7 @@ def sweep(
     with open_sweep(Path(scene), axes_of(sets), where, trust=trust, force=force) as manifest:
         count = len(manifest.unfinished)
         jobs, threads = jobs_and_threads(count, jobs, threads)
-        bar = progress_of(count, "points", progress if count else False)
+        bar = progress_of(count, "points", shown=progress if count else False)
         with bar, ThreadPoolExecutor(jobs) as executor:
             stopped = run_points(manifest, executor, bar, threads, trust=trust)
         if stopped is not None:
