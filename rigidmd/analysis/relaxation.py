@@ -34,10 +34,10 @@ ERROR_FACTOR = 1.15
 class Bands(NamedTuple):
     """A spectral density in bands of frequencies, each array (b,)."""
 
-    frequency: np.ndarray  # mean of each band
+    frequency: np.ndarray  # mean of each band, 1/ps
     density: np.ndarray  # mean of each band: twice the integral of the correlation at frequency 0
     #: Half the number of degrees of freedom of the chi² distribution of each mean
-    freedom: np.ndarray
+    half_freedom: np.ndarray
 
 
 class Relaxations(NamedTuple):
@@ -129,7 +129,7 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
     """The most likely model with a number of relaxations, by Fisher's scoring in the logarithms of
     its parameters, with the damping of Levenberg and Marquardt."""
     squares = (2 * np.pi * bands.frequency) ** 2
-    top = float(np.average(bands.density[:6], weights=bands.freedom[:6]))
+    top = float(np.average(bands.density[:6], weights=bands.half_freedom[:6]))
     low = float(bands.density[-1])
     shortest = 0.5 / (2 * np.pi * float(bands.frequency[-1]))
     times = np.geomspace(4 * shortest, max(8 * shortest, longest / 3), count + 2)[1:-1]
@@ -155,14 +155,14 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
 
     def surprise(density: np.ndarray) -> float:
         """Minus the logarithm of the likelihood, except for a constant."""
-        return float(bands.freedom @ (np.log(density) + bands.density / density))
+        return float(bands.half_freedom @ (np.log(density) + bands.density / density))
 
     parameters = np.clip(start, bottom, ceiling)
     damping = 1e-2
     density, slopes = model(parameters)
     before = surprise(density)
     for _ in range(ITERATIONS):
-        weighted = slopes * bands.freedom[:, None]
+        weighted = slopes * bands.half_freedom[:, None]
         downhill = weighted.T @ (bands.density / density - 1)
         fisher = weighted.T @ slopes
         step = np.linalg.lstsq(
@@ -182,15 +182,17 @@ def _fit(bands: Bands, count: int, longest: float) -> Relaxations:
         damping = max(0.2 * damping, 1e-7)
         if gain < CLOSE:
             break
-    weighted = slopes * bands.freedom[:, None]
+    weighted = slopes * bands.half_freedom[:, None]
     parts = np.exp(parameters[:count])
     times = np.exp(parameters[count:-1])
     plateau = float(np.exp(parameters[-1]))
     of_limit = np.concatenate([parts, np.zeros(count), [plateau]])
     variance = float(of_limit @ np.linalg.pinv(weighted.T @ slopes, hermitian=True) @ of_limit)
-    residual = bands.freedom * (bands.density / density - 1)
+    residual = bands.half_freedom * (bands.density / density - 1)
     groups = np.array_split(np.arange(len(residual)), GROUPS)
-    chi2 = sum(float(residual[group].sum() ** 2 / bands.freedom[group].sum()) for group in groups)
+    chi2 = sum(
+        float(residual[group].sum() ** 2 / bands.half_freedom[group].sum()) for group in groups
+    )
     score = 2 * before + 2 * (2 * count + 1)
     return Relaxations(
         0.5 * plateau, 0.5 * parts, times, 0.5 * np.sqrt(max(0.0, variance)), score, chi2

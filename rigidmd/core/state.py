@@ -76,8 +76,9 @@ class State(NamedTuple):
     @property
     def volume(self) -> float:
         """Volume of the cell, Å³. Infinite without a box."""
-        (a, _, _), (_, b, _), (_, _, c) = self.cell.tolist()
-        return a * b * c
+        # the cell is lower triangular: its determinant is the product of its diagonal
+        (ax, _, _), (_, by, _), (_, _, cz) = self.cell.tolist()
+        return ax * by * cz
 
     @property
     def is_finite(self) -> bool:

@@ -214,10 +214,14 @@ class View:
         nearest = np.full(base.shape[:2], -np.inf)
         image = np.zeros((*nearest.shape, 4))
         for semi, color in solids:
-            weight = semi**-2.0
-            a, b, c = view[2] ** 2 @ weight, base @ (weight * view[2]), base**2 @ weight - 1
+            inverse_squares = semi**-2.0
+            # The line of sight base + depth view[2] meets the surface where
+            # a depth² + 2 b depth + c = 0. The larger root is in front.
+            a = view[2] ** 2 @ inverse_squares
+            b = base @ (inverse_squares * view[2])
+            c = base**2 @ inverse_squares - 1
             depth = (np.sqrt(np.maximum(b * b - a * c, 0)) - b) / a
-            normal = (base + depth[..., None] * view[2]) * weight
+            normal = (base + depth[..., None] * view[2]) * inverse_squares
             normal /= np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-300)
             tint = 0.38 - 0.28 * np.clip(normal @ (LIGHT @ view), 0, 1)[..., None]
             visible = (b * b >= a * c) & (depth > nearest + 1e-6 * max(right, up))

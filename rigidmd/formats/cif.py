@@ -177,7 +177,7 @@ def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
     except NoSymmetry as error:
         reason = "its atoms are disordered, or have another symmetry than it states"
         raise structure_error(path, f"{error} in the cell: {reason}{_as_read(notes)}") from None
-    owner = contents.owner
+    owner = contents.source_atom
     notes += _contents(block, kinds, contents, cell, len(operations))
     return Atoms(
         [names[k] for k in owner],
@@ -484,7 +484,7 @@ def _contents(
     states."""
     from ase.data import atomic_masses, atomic_numbers
 
-    count = Counter(kinds[k] for k in contents.owner)
+    count = Counter(kinds[k] for k in contents.source_atom)
     massive = {kind: n for kind, n in count.items() if is_element(kind) or kind in HEAVY_HYDROGEN}
     mass = sum(
         n * (HEAVY_HYDROGEN[e] if e in HEAVY_HYDROGEN else atomic_masses[atomic_numbers[e]])
@@ -496,15 +496,16 @@ def _contents(
     if order > 1:
         composition = " ".join(f"{kind}{n}" for kind, n in sorted(count.items()))
         origin = (
-            f"{len(kinds)} atom{'s' * (len(kinds) > 1)} in the file, {contents.special} on special"
-            " positions"
+            f"{len(kinds)} atom{'s' * (len(kinds) > 1)} in the file,"
+            f" {contents.special_count} on special positions"
         )
         notes.append(
             f"its cell of {volume:.5g} Å³ holds {composition}, {density:.4g} g/cm³, from {origin}"
         )
-    if contents.copies:
+    if contents.copy_count:
         notes.append(
-            f"{contents.copies} atoms of the file are images of others by symmetry and count once"
+            f"{contents.copy_count} atoms of the file are images of others by symmetry"
+            " and count once"
         )
     stated = number_of(block.first("_exptl_crystal_density_diffrn"))[0]
     if stated > 0 and abs(density - stated) > SAME_DENSITY * stated:

@@ -208,10 +208,10 @@ def name_of(operations: np.ndarray) -> str:
 class UnitCell(NamedTuple):
     """The atoms in a unit cell that symmetry operations make of the atoms of a file."""
 
-    owner: np.ndarray  # (m,) atom of the file
+    source_atom: np.ndarray  # (m,) atom of the file
     fractional: np.ndarray  # (m, 3)
-    special: int  # atoms of the file on special positions
-    copies: int  # atoms of the file that are images of others, and so are omitted
+    special_count: int  # atoms of the file on special positions
+    copy_count: int  # atoms of the file that are images of others, and so are omitted
 
 
 def unit_cell(
@@ -231,15 +231,20 @@ def unit_cell(
         _images(x, SAME_ATOM * radius, operations, cell)
         for x, radius in zip(fractional, radii, strict=True)
     ]
-    owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    source_atom = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     images = np.concatenate(parts) if parts else np.zeros((0, 3))
-    special = sum(len(part) < len(operations) for part in parts)
+    special_count = sum(len(part) < len(operations) for part in parts)
     reach = SAME_ATOM * float(radii.max(initial=0.0))
     i, j, step = pairs_within(images @ cell, cell, reach)
     distance = np.linalg.norm(step, axis=1)
-    first, second = np.minimum(owner[i], owner[j]), np.maximum(owner[i], owner[j])
+    first, second = (
+        np.minimum(source_atom[i], source_atom[j]),
+        np.maximum(source_atom[i], source_atom[j]),
+    )
     near = (distance <= SAME_ATOM * np.minimum(radii[first], radii[second])) & (first != second)
     copies = set()
+    # Pairs are not transitive: an atom that is a copy itself makes no other atom a copy. Which
+    # atoms remain depends on the order of the pairs.
     for one, other, length in zip(
         first[near].tolist(), second[near].tolist(), distance[near].tolist(), strict=True
     ):
@@ -247,8 +252,13 @@ def unit_cell(
             raise NoSymmetry(f"atoms {one + 1} and {other + 1} are {length:.2g} Å apart")
         if one not in copies:
             copies.add(other)
-    is_unique = ~np.isin(owner, list(copies))
-    return UnitCell(owner[is_unique], images[is_unique], special, len(copies))
+    is_unique = ~np.isin(source_atom, list(copies))
+    return UnitCell(
+        source_atom=source_atom[is_unique],
+        fractional=images[is_unique],
+        special_count=special_count,
+        copy_count=len(copies),
+    )
 
 
 def _images(

@@ -329,7 +329,8 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
             if abs(exact - step_count) > 1e-9 * max(1.0, exact):
                 step_count = ceil(exact)
             # nothing lies between two breaks that are equal to rounding
-            dt = (end - begin) / step_count if step_count not in (0, exact) else run.timestep_s
+            is_whole = step_count == exact
+            dt = run.timestep_s if step_count == 0 or is_whole else (end - begin) / step_count
             segments.append(Segment(self.system.method, dt, step_count, steps))
             steps += step_count
         return segments

@@ -9,6 +9,8 @@ from rigidmd.engines.system import System
 from rigidmd.formats.cells import cell_of
 from rigidmd.scene.validation import not_none
 
+A3_PER_NM3 = 1000.0
+
 
 def scale_to_mean_box(system: System, state: State, samples: Samples, k: int) -> None:
     """Scale a state before stage k, in place, if this stage continues in the mean box of the stage
@@ -25,7 +27,7 @@ def scale_to_mean_box(system: System, state: State, samples: Samples, k: int) ->
         cell_of([float(steady[name].mean()) for name in ("a", "b", "c", "alpha", "beta", "gamma")])
     )
     cell = np.where(state.cell == 0, 0.0, mean)  # right angles stay exact
-    cell *= np.cbrt(1000 * steady["volume"].mean() / np.prod(np.diag(cell)))
+    cell *= np.cbrt(A3_PER_NM3 * steady["volume"].mean() / np.prod(np.diag(cell)))
     engine = system.engine()
     before = observe(system, engine, state, energy_unit=1.0).potential
     state.position[:] = state.position @ np.tril(np.linalg.solve(state.cell, cell))

@@ -54,7 +54,7 @@ class Scratch(NamedTuple):
     # ((capacity + 1) * rows,) uint8 kind of candidate n in row k of the cluster, at n * rows + k
     kind: np.ndarray
     # (rows, KINDS) uint32 entries of each kind, then the next index (unsigned: not tested)
-    kind_end: np.ndarray
+    kind_offset: np.ndarray
     sorted: np.ndarray  # (rows of a cluster, capacity) uint16 entries in the order of their kinds
     filled: np.ndarray  # (5,) of the block so far, see PairList.needed
 
@@ -191,13 +191,15 @@ def _fill_rows(pairs, block, c, scratch, candidates):
         r = rows * c + row
         here = scratch.sorted[row]
         begin = filled[ENTRIES]
-        size = scratch.kind_end[row, SHELLS - 1]
+        size = scratch.kind_offset[row, SHELLS - 1]
         filled[ENTRIES] += size
         if filled[ENTRIES] <= len(entries):
             for n in range(size):
                 entries[begin + n] = here[n]
         pairs.row_end[r] = min(filled[ENTRIES], len(entries))
-        for n in range(scratch.kind_end[row, OUT_OF_REACH], scratch.kind_end[row, NEEDS_MASK]):
+        for n in range(
+            scratch.kind_offset[row, OUT_OF_REACH], scratch.kind_offset[row, NEEDS_MASK]
+        ):
             entry = np.int64(here[n])
             first_of_row = _mask_of_lanes(pairs, 2 * r, scratch.candidate[entry], radius2)
             second = _mask_of_lanes(pairs, 2 * r + 1, scratch.candidate[entry], radius2)
@@ -231,36 +233,39 @@ def _store_neighbors(pairs, block, c, scratch, count):
 
 @kernel(inline=True)
 def _sort_by_kind(pairs, c, scratch, count):
-    """Write the entries of each row of a cluster by their kinds. `kind_end` then has the end of
-    each kind. The rows are done together: while an entry of one row waits for the entry before it,
-    the other rows proceed."""
+    """Write the entries of each row of a cluster by their kinds, by a counting sort. `kind_offset`
+    then has the end of each kind. The rows are done together: while an entry of one row waits for
+    the entry before it, the other rows proceed."""
     rows = lanes_of(pairs.clusters.local) // 2
-    kind_end, kind = scratch.kind_end, scratch.kind
-    kind_end[:] = 0
+    kind_offset, kind = scratch.kind_offset, scratch.kind
+    kind_offset[:] = 0
+    # 1. Count the entries of each kind.
     for n in range(count):
         for row in range(rows):
-            kind_end[row, load_scalar(kind, n * rows + row)] += 1
+            kind_offset[row, load_scalar(kind, n * rows + row)] += 1
+    # 2. From the counts, find the start of each kind.
     for row in range(rows):
-        _begin_kinds(pairs.beyond[rows * c + row], kind_end[row])
+        _first_of_kinds(pairs.beyond[rows * c + row], kind_offset[row])
+    # 3. Write each entry at the offset of its kind, which moves from the start to the end.
     for n in range(count):
         for row in range(rows):
             k = load_scalar(kind, n * rows + row)
-            scratch.sorted[row, kind_end[row, k]] = n
-            kind_end[row, k] += 1
+            scratch.sorted[row, kind_offset[row, k]] = n
+            kind_offset[row, k] += 1
 
 
 @kernel(inline=True)
-def _begin_kinds(beyond, kind_end):
-    """Where the entries of each kind start in a row, from their numbers. How many are beyond each
-    shell. `beyond` is limited by its type: entries above the limit are treated as if they were
-    inside the shell."""
+def _first_of_kinds(beyond, kind_offset):
+    """Replace the numbers of each kind in a row by their exclusive prefix sum, where the entries
+    of each kind start. Store how many are beyond each shell. `beyond` is limited
+    by its type: entries above the limit are treated as if they were inside the shell."""
     inside = 0
     for k in range(SHELLS):
-        inside += kind_end[k]
+        inside += kind_offset[k]
     begin = 0
     for k in range(KINDS):
-        size = kind_end[k]
-        kind_end[k] = begin
+        size = kind_offset[k]
+        kind_offset[k] = begin
         begin += size
         if k < SHELLS:
             beyond[k] = min(inside - begin, MAX_BEYOND)

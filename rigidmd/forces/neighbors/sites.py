@@ -137,11 +137,12 @@ def index_of_x(slot, width):
 
 @chosen_by_type(inline=True)
 def site_vector(vectors, i):
-    """(x, y, z) of site i in an array (s, 3) or `InSlots`."""
+    """(x, y, z) of site i in an array (s, 3) or `InSlots`. The type of `vectors` chooses the
+    function at compile time."""
     if isinstance(vectors, types.Array):
         return lambda vectors, i: (vectors[i, 0], vectors[i, 1], vectors[i, 2])
 
-    def from_slot(vectors, i):
+    def load_from_slot(vectors, i):
         value = vectors.value
         width = lanes_of(vectors.value)
         at = index_of_x(load_scalar(vectors.slot, i), width)
@@ -151,7 +152,7 @@ def site_vector(vectors, i):
             load_scalar(value, at + 2 * width),
         )
 
-    return from_slot
+    return load_from_slot
 
 
 @chosen_by_type(inline=True)

@@ -40,7 +40,7 @@ def add_trial_energies(
 @kernel(from_python=True)
 def _add_energies(term, kinds, point, pose, trial_point, trial_pose, cell, energy):
     """Points (n, 3) and poses (n, 3, 3) of bodies with `kinds`, and those (m, ...) of trials."""
-    kind = term.kind[len(term.kind) - 1]
+    trial_kind = term.kind[len(term.kind) - 1]  # the last body of the term is the trial
     for m in range(len(energy)):
         if energy[m] == inf:
             continue
@@ -55,11 +55,14 @@ def _add_energies(term, kinds, point, pose, trial_point, trial_pose, cell, energ
             r = sqrt(x * x + y * y + z * z)
             if r >= term.cutoff:
                 continue
-            if kind <= kinds[j]:
-                numbers = term.parameters[kind, kinds[j]]
+            # Parameters are stored for (lower kind, higher kind) only: otherwise swap the bodies
+            # and reverse the vector between them.
+            if trial_kind <= kinds[j]:
+                numbers = term.parameters[trial_kind, kinds[j]]
                 value = pair_slopes(term.formula, numbers, (x, y, z), trial_pose[m], pose[j])[0]
             else:
-                numbers = term.parameters[kinds[j], kind]
+                numbers = term.parameters[kinds[j], trial_kind]
                 value = pair_slopes(term.formula, numbers, (-x, -y, -z), pose[j], trial_pose[m])[0]
             total += switch(term, r)[0] * value
+        # nan and -inf become +inf, as an overlap has
         energy[m] = energy[m] + total if isfinite(total) else inf

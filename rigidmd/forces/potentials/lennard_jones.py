@@ -247,42 +247,51 @@ def _with_soft_core(
     potential: LennardJones,
     indices: list[np.ndarray],
     soft: list[bool],
-    whole: np.ndarray,
-    inner: InnerPairs | None,
+    plain_kinds: np.ndarray,
+    intramolecular_pairs: InnerPairs | None,
 ) -> Interactions:
     """Lennard-Jones forces between the sites without a soft core, and those of all others.
 
     potential, indices : of all sites, by species
-    soft : whether each species has a soft core; whole : whether each kind has none, these first
-    inner : the pairs inside molecules, None without tail corrections
+    soft : whether each species has a soft core
+    plain_kinds : whether each kind has none; these are first
+    intramolecular_pairs : the pairs inside molecules, None without tail corrections
     """
     forces = parts.scene.forces
     sites = parts.sites(indices)
-    is_whole = ~np.array(soft)[parts.model.species]
-    kinds = int(whole.sum())
+    is_plain_molecule = ~np.array(soft)[parts.model.species]
+    plain_count = int(plain_kinds.sum())
     softened = soft_core(
         potential.c12,
         potential.c6,
         potential.kind,
-        ~whole,
+        ~plain_kinds,
         parts.scene.coupling.lennard_jones,
         potential.truncation,
         forces.truncation,
     )
     # one group of all molecules without a soft core, which have no pairs here
-    terms = {"soft_core": PairForces(softened, sites, exclusion_groups(sites, is_whole))}
-    tails = [] if inner is None else [tail_of_soft_core(softened, inner)]
-    if kinds:
-        rest = potential._replace(
-            kind=potential.kind[whole[potential.kind]],
-            c12=potential.c12[:kinds, :kinds],
-            c6=potential.c6[:kinds, :kinds],
+    terms = {"soft_core": PairForces(softened, sites, exclusion_groups(sites, is_plain_molecule))}
+    tails = (
+        [] if intramolecular_pairs is None else [tail_of_soft_core(softened, intramolecular_pairs)]
+    )
+    if plain_count:
+        plain_potential = potential._replace(
+            kind=potential.kind[plain_kinds[potential.kind]],
+            c12=potential.c12[:plain_count, :plain_count],
+            c6=potential.c6[:plain_count, :plain_count],
         )
-        of_rest = [c[: 0 if one else None] for c, one in zip(indices, soft, strict=True)]
-        terms["lennard_jones"] = parts.pair_forces(rest, parts.sites(of_rest))
-        if inner is not None:
-            inside = InnerPairs(*(column[whole[inner.one]] for column in inner))
-            tails.append(tail(rest, inside))
+        no_sites = np.zeros(0, dtype=int)
+        plain_sites = [
+            no_sites if is_soft else of_species
+            for of_species, is_soft in zip(indices, soft, strict=True)
+        ]
+        terms["lennard_jones"] = parts.pair_forces(plain_potential, parts.sites(plain_sites))
+        if intramolecular_pairs is not None:
+            inside = InnerPairs(
+                *(column[plain_kinds[intramolecular_pairs.one]] for column in intramolecular_pairs)
+            )
+            tails.append(tail(plain_potential, inside))
     return Interactions(terms, {}, tail=sum_of_tails([one for one in tails if one is not None]))
 
 

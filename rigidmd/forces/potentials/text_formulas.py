@@ -197,11 +197,12 @@ def _source(energy: str, total, force, fields: list, r) -> str:
         n = int(power.exp)
         return powers.setdefault(n, sympy.Symbol(f"r_{'to' if n > 0 else 'over'}_{abs(n)}"))
 
-    def whole(e):
+    def is_integer_power_of_r(e):  # r itself is not one for sympy
         return e.is_Pow and e.base == r and e.exp.is_Integer
 
     shared, (u, w) = sympy.cse(
-        [e.replace(whole, named) for e in (total, force)], symbols=sympy.numbered_symbols("part_")
+        [e.replace(is_integer_power_of_r, named) for e in (total, force)],
+        symbols=sympy.numbered_symbols("part_"),
     )
     lines = [f"{symbol} = {_code(e)}" for symbol, e in shared]
     used = {r} & set().union(*(e.free_symbols for e in (u, w, *(e for _, e in shared))))

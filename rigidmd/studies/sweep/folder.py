@@ -152,19 +152,21 @@ def read_manifest(folder: Path) -> Manifest:
 def clear_sweep(folder: Path, names: Iterable[str]) -> None:
     """Remove the files of a sweep, and the files of its runs in folders with these names. Raises
     OutputError."""
-    inner_folders = [folder / name for name in names if not (folder / name).is_symlink()]
-    for cleared in [*inner_folders, folder]:
-        if not cleared.is_dir():
+    run_folders = [folder / name for name in names if not (folder / name).is_symlink()]
+    for run_or_sweep_folder in [*run_folders, folder]:
+        if not run_or_sweep_folder.is_dir():
             continue
-        with writing(cleared, "cleared"):
-            for path in (cleared / name for name in written_by_runs(cleared)):
+        with writing(run_or_sweep_folder, "cleared"):
+            for path in (
+                run_or_sweep_folder / name for name in written_by_runs(run_or_sweep_folder)
+            ):
                 for written in (path, *offsets_of(path)):
                     written.unlink(missing_ok=True)
-            (cleared / MARKER).unlink(missing_ok=True)
-            if cleared != folder:
-                (cleared / LOCK).unlink(missing_ok=True)
+            (run_or_sweep_folder / MARKER).unlink(missing_ok=True)
+            if run_or_sweep_folder != folder:
+                (run_or_sweep_folder / LOCK).unlink(missing_ok=True)
                 with contextlib.suppress(OSError):  # it holds other files
-                    cleared.rmdir()
+                    run_or_sweep_folder.rmdir()
 
 
 def short_keys(keys: Iterable[str]) -> dict[str, str]:
