@@ -268,6 +268,8 @@ HOVER = {
     "scene": "MolecularScene | BodyScene",
     "simulation": "Simulation",
     "simulation.state": "State",
+    'rigidmd.Simulation("water.toml").system': "System | BodySystem",
+    'rigidmd.Simulation("water.toml").scene': "MolecularScene | BodyScene",
     "results": "Results",
     'results["energy"]': "ndarray[",
     "results.universe()": "Universe",
