@@ -13,20 +13,23 @@ from pathlib import Path
 
 import pytest
 
-#: Files that take longest with cold kernels, the longest first: a file is run by one worker, so
-#: they begin first. The first two have no kernels in common, which both workers would compile.
+#: Files that begin first, about the longest first: a file is run by one worker. Neighbours have few
+#: kernels in common: of two workers that need one kernel, one waits until the other has compiled it.
 LONGEST = (
     "forces",
     "body_engine",
     "docs",
+    "structures",
+    "figures",
     "run",
     "ewald",
+    "bodies",
+    "lammps",
     "resume",
     "sweep",
     "compile",
     "dispersion",
     "python",
-    "bodies",
     "view",
     "ase",
     "strangers",
