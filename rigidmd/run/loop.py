@@ -200,8 +200,11 @@ class RunLoop:
             self._resume_observers(checkpoint)
             if changed is not None:
                 simulation._note(changed)
+            step = int(part.state.step[NOW])
             simulation._announce(
-                f"continuing from step {part.state.step[NOW]}, the last checkpoint"
+                f"the run had ended at step {step} (--until lengthens it): writing its results again"
+                if self.is_complete
+                else f"continuing from step {step}, the last checkpoint"
             )
         if self._folder is not None and stays:
             run_folder.add_to_folder(self._folder, names)
