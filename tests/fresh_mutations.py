@@ -84,7 +84,7 @@ FRESH: list[Mutation] = [
         "analysis/built_in/transport.py",
         "0.5 * (correlations + correlations[:, :1])",
         "correlations[:, :1]",
-        ("test_analyse.py::test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest",),
+        ("test_analyse.py::test_a_viscosity_has_the_correlation_time_of_the_stress",),
     ),
     Mutation(
         "F11",
@@ -283,7 +283,7 @@ FRESH: list[Mutation] = [
         "engines/observables.py",
         "{'xyz'[j]}\": (i, j)",
         "{'xyz'[j]}\": (j, j)",
-        ("test_analyse_runs.py::test_results_in_memory_and_from_the_folder_agree",),
+        ("test_python.py::test_observers_see_the_units_of_the_log",),
     ),
     Mutation(
         "F35",

@@ -13,20 +13,23 @@ from pathlib import Path
 
 import pytest
 
-#: Files that take longest with cold kernels, the longest first: a file is run by one worker, so
-#: they begin first. The first two have no kernels in common, which both workers would compile.
+#: Files that begin first, about the longest first: a file is run by one worker. Neighbours have few
+#: kernels in common: of two workers that need one kernel, one waits until the other has compiled it.
 LONGEST = (
     "forces",
     "body_engine",
     "docs",
+    "structures",
+    "figures",
     "run",
     "ewald",
+    "bodies",
+    "lammps",
     "resume",
     "sweep",
     "compile",
     "dispersion",
     "python",
-    "bodies",
     "view",
     "ase",
     "strangers",
@@ -130,6 +133,7 @@ TIERS = {
             "total_momentum_is_taken_out_at_steps_that_the_scene_decides",
             "waves_of_a_cell_that_a_file_describes_otherwise",
         ),
+        "test_fault_driver.py": ("runs_survive_mixed_faults",),
         "test_faults.py": ("*",),
         "test_fields.py": ("adding_a_field_*",),
         "test_figures.py": ("figures_of_a_run_and_of_a_molecule_take_any_name*",),
@@ -217,7 +221,6 @@ TIERS = {
             "adding_an_integrator_to_a_scene",
         ),
         "test_engine_settings.py": ("adding_an_engine_takes_a_folder_and_a_file",),
-        "test_fault_driver.py": ("runs_survive_mixed_faults",),
         "test_faults.py": ("a_run_that_is_stopped_by_signals_goes_on*",),
         "test_forces.py": (
             "a_list_with_almost_no_skin_is_built_at_every_step[mixed*",

@@ -6,6 +6,7 @@ from math import inf
 
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from support import history, noise_with_memory, small_scene, system_of
 
@@ -889,6 +890,9 @@ def test_a_viscosity_has_the_correlation_time_of_the_stress():
     assert found["fit (mPa s)"][-1] == pytest.approx(
         found["integral (mPa s)"][-1], abs=3 * found["integral (mPa s) error"][-1]
     )
+    integral = found["integral (mPa s)"]
+    expected = cumulative_trapezoid(found["correlation"], initial=0)
+    assert integral / integral[1] == pytest.approx(expected / expected[1], rel=1e-9)
 
 
 def test_a_viscosity_needs_stresses_long_enough_and_close_enough():

@@ -103,7 +103,9 @@ def test_observers_see_the_units_of_the_log():
             assert getattr(reading.sample, name) == pytest.approx(results[name][k], nan_ok=True)
         assert reading.momentum.shape == (3,)
         assert reading.sample.momentum == pytest.approx(np.linalg.norm(reading.momentum))
-        assert reading.sample.pressure_xy == reading.pressure_tensor_bar[0, 1]
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            shear = getattr(reading.sample, f"pressure_{'xyz'[i]}{'xyz'[j]}")
+            assert shear == reading.pressure_tensor_bar[i, j]
     # forces are the slopes of the energy that is given
     system, engine, state = simulation.system, simulation.engine, simulation.state.copy()
     energy = []
@@ -268,6 +270,8 @@ HOVER = {
     "scene": "MolecularScene | BodyScene",
     "simulation": "Simulation",
     "simulation.state": "State",
+    'rigidmd.Simulation("water.toml").system': "System | BodySystem",
+    'rigidmd.Simulation("water.toml").scene': "MolecularScene | BodyScene",
     "results": "Results",
     'results["energy"]': "ndarray[",
     "results.universe()": "Universe",

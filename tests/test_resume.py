@@ -177,6 +177,9 @@ def again(stopped, tmp_path):
 def test_the_command_resume_goes_on_and_lengthens(again, capsys):
     folder = str(again / "run")
     assert cli.main(["resume", folder]) == 0
+    assert "continuing from step" in capsys.readouterr().err
+    assert cli.main(["resume", folder]) == 0
+    assert re.search(r"had ended at step \d+ \(--until lengthens it\)", capsys.readouterr().err)
     assert read_checkpoint(again / "run" / CHECKPOINT).values["of"]["run"]["position"]["first"] == 0
     assert (
         cli.main(["run", str(again / "water.toml"), "-o", folder, "--resume", "--until", "0.12ps"])

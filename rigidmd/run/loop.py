@@ -208,9 +208,6 @@ class RunLoop:
             self._resume_observers(checkpoint)
             if changed is not None:
                 simulation._note(changed)
-            simulation._announce(
-                f"continuing from step {part.state.step[NOW]}, the last checkpoint"
-            )
         if self._folder is not None and stays:
             run_folder.add_to_folder(self._folder, names)
             with writing(self._folder):
@@ -408,6 +405,12 @@ class RunLoop:
         self._next = self._prepare
         part = self._part
         part.segment = part.reenter_segment(part.record.position.segment)
+        step = int(part.state.step[NOW])
+        self._simulation._announce(
+            f"the run had ended at step {step} (--until lengthens it): writing its results again"
+            if self.is_complete
+            else f"continuing from step {step}, the last checkpoint"
+        )
 
     def _enter(self) -> None:
         """Enter the first segment, or the next one."""

@@ -35,8 +35,8 @@ def short_summary(summary: dict, known: Container[str] = ()) -> str:
 
 
 def _stage_lines(stages: list[dict]) -> list[str]:
-    """A line for each stage: its number, name, and how it ran."""
-    cells = [[f"{k}", stage["name"], _how(stage)] for k, stage in enumerate(stages, 1)]
+    """A line for each stage: its number in keys, name, and how it ran."""
+    cells = [[f"{k}", stage["name"], _how(stage)] for k, stage in enumerate(stages)]
     return [f"  {line}" for line in columns_text(cells, left=(0, 1, 2)).splitlines()]
 
 
