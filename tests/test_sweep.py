@@ -711,8 +711,8 @@ def test_values_of_numpy_in_a_sweep(argon, tmp_path):
 
 #: Three points that take a while.
 LONG = {
-    "stages.0.duration_ps": 150.0,
-    "output.trajectory_interval_ps": 5.0,
+    "stages.0.duration_ps": 600.0,
+    "output.trajectory_interval_ps": 20.0,
     "output.log_interval_ps": 1.0,
     "seed": range(1, 4),
 }
@@ -791,7 +791,7 @@ def test_a_killed_process_loses_its_point_alone_and_a_signal_stops_all(argon, wh
         os.kill(os.getpid(), signal.SIGTERM)
 
     end = when_running(folder, stop_later)
-    stopped = finish(manifest)
+    stopped = finish(manifest, jobs=1)  # the next point has only begun when the signal comes
     end()
     assert stopped == signal.SIGTERM
     assert names_in(manifest, "failed") == killed

@@ -416,13 +416,15 @@ def open_cache(function: Callable) -> FunctionCache | NullCache:
     return found
 
 
-def _index_of(function: Callable, opened: FunctionCache) -> CacheIndex:
-    """The index of a function. Of one of the package its definitions decide, not the line, time and
-    size of a file."""
-    name, stamp = opened._impl.filename_base, opened._cache_file._source_stamp
+def _index_of(function: Callable, cache: FunctionCache) -> CacheIndex:
+    """The index of the compiled code of a function. A function of the package is identified by its
+    definitions, so that a line that moves or a file that is touched compiles nothing again."""
+    name = cache._impl.filename_base
+    stamp = cache._cache_file._source_stamp
     if _is_of_package(function.__module__) and "<locals>" not in function.__qualname__:
-        name, stamp = re.sub(r"-\d+\.py", ".py", name), ""
-    index = CacheIndex(opened.cache_path, name, stamp)
+        name = re.sub(r"-\d+\.py", ".py", name)  # Numba's name of the file has the line
+        stamp = ""
+    index = CacheIndex(cache.cache_path, name, stamp)
     index.function = function
     return index
 

@@ -197,7 +197,8 @@ def _add_no_force(term, state, load, tally):
 #: forces and virials, and energies only where these take no extra time.
 FORCES_ONLY, WITH_ENERGIES, WITH_VIRIALS = 1, 2, 4
 TALLIED = WITH_ENERGIES | WITH_VIRIALS
-#: For `compute_load`: forces into the other load.
+#: For `compute_load`: forces at the displaced positions of a force gradient, into a second load, as
+#: the forces of the state are still needed.
 INTO_OTHER_LOAD = 8
 
 
