@@ -722,6 +722,13 @@ def test_a_film_in_which_a_body_turns_too_far_between_frames_says_so(
     assert any("times between two frames" in sentence for sentence in told) == strobes
 
 
+def test_a_point_at_rest_is_drawn(tmp_path):
+    scene = {"body": {"mass_kg": 1.0}, "start": {"position_m": [0, 0, 100]}}
+    scene["run"] = {"duration_s": 0.1, "timestep_s": 0.01}
+    Simulation(Scene.from_dict(scene), tmp_path / "rest").run()
+    assert cli.main(["view", str(tmp_path / "rest")]) == 0
+
+
 def test_a_body_without_a_solid_is_drawn_as_the_cuboid_of_its_inertia():
     lengths = np.array([1.0, 2.0, 3.0])
     inertia = 2.0 / 12 * (lengths @ lengths - lengths**2)

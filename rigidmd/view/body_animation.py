@@ -75,7 +75,7 @@ class BodyAnimation:
         rows = np.arange(0, count, stride)
         self.time, self.notes = record.time[rows], []
         if stride > 1:
-            self.notes.append(f"{len(rows)} of {count} samples are shown: every {stride}th.")
+            self.notes.append(f"{len(rows)} of {count} samples are shown, one in {stride}.")
         mesh = mesh_of(system)
         self.notes.append(f"The body is drawn as {mesh.about}.")
 
@@ -102,9 +102,11 @@ class BodyAnimation:
                 times = f"{enlarged:.3g} times larger than to scale"
                 self.notes.append(f"The body is drawn {times}.")
         else:
-            self.unit, self.position = 1.08 * radius, np.zeros_like(position)
-            Q = of(*(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))).reshape(-1, 3, 3)
-            path = radius / self.unit * (Q @ self.axis)
+            self.unit = 1.08 * radius
+            self.position = path = np.zeros_like(position)
+            if turns:
+                Q = of(*(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))).reshape(-1, 3, 3)
+                path = radius / self.unit * (Q @ self.axis)
         self.sphere = 0.0 if moves else radius / self.unit
         still = np.tile([1.0, 0, 0, 0], (len(rows), 1))
         self.quaternion = of("qw", "qx", "qy", "qz") if turns else still
