@@ -312,7 +312,7 @@ def test_what_an_ensemble_lacks_is_said():
                 "counts": {"spce": 4},
                 "fields": {"electric_V_per_nm": [0.0, 0.0, 0.1], "electric_frequency_per_ps": 1.0},
             },
-            "an oscillating field acts",
+            "static forces, and these depend on time: electric_field",
         ),
         (
             {"ensemble": "nve"},

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidmd.analysis.conditions import Condition, check_conditions, trajectory
 from rigidmd.analysis.result import (
     AnalysisResult,
     Curve,
@@ -42,27 +43,35 @@ class Analysis(NamedTuple):
     position: float  # among all; user-defined ones are at the end
     is_user: bool
     on_request: bool = False  # not among all, because it takes long or needs options
+    needs: tuple[Condition, ...] = (trajectory,)
 
 
 KNOWN: dict[str, Analysis] = {}
 
 
 def built_in(
-    about: str, position: float = inf, on_request: bool = False
+    about: str,
+    position: float = inf,
+    on_request: bool = False,
+    needs: tuple[Condition, ...] = (trajectory,),
 ) -> Callable[[Function], Function]:
     """Register a built-in analysis under its function's name in `Runs`, which takes the frames of
-    one run too."""
+    one run too. `needs` lists its conditions, see `rigidmd.analysis.conditions`: they are checked
+    before it runs."""
 
     def add(function: Function) -> Function:
+        name = function.__name__
+
         @wraps(function)
         def analysis(
             frames: RigidFrames | Runs, *arguments: object, **options: object
         ) -> AnalysisResult:
-            return function(as_runs(frames), *arguments, **options)
+            runs = as_runs(frames)
+            check_conditions(name, runs, needs)
+            return function(runs, *arguments, **options)
 
-        name = function.__name__
         KNOWN[name] = Analysis(
-            name, about, analysis, position, is_user=False, on_request=on_request
+            name, about, analysis, position, is_user=False, on_request=on_request, needs=needs
         )
         return analysis
 
@@ -111,6 +120,7 @@ def register(function: UserFunction) -> UserFunction:
     def analysis(frames: RigidFrames | Runs) -> AnalysisResult:
         """Means and errors of its values."""
         runs = as_runs(frames)
+        check_conditions(name, runs, [trajectory])
         every = [_series_of(function, name, run) for run in runs.members]
         columns = {
             title: [of_run[title] for of_run in every if title in of_run] for title in every[0]

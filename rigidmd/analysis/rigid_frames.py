@@ -95,6 +95,24 @@ class RigidFrames:
         """Volume of the cell in each frame (f,), Å³."""
         return np.linalg.det(self.cell)
 
+    @cached_property
+    def stages(self) -> list[Stage]:
+        """The stages of the frames, the last one first."""
+        known = self.system.scene.stages
+        index = self._stage_of_samples
+        return [self.stage, *(known[k] for k in np.unique(index) if known[k] is not self.stage)]
+
+    @property
+    def begin_of_stage(self) -> float:
+        """Time (ps) from which on all frames are of `stage`."""
+        earlier = self._stage_of_samples != self.system.scene.stages.index(self.stage)
+        return float(self.columns["time"][1:][earlier].max(initial=self.time[0]))
+
+    @property
+    def _stage_of_samples(self) -> np.ndarray:
+        """Index of the stage of each sample but the first, with which a stage begins."""
+        return self.columns["stage"][1:] if "stage" in self.columns else np.zeros(0, int)
+
     @property
     def thermal_energy(self) -> float:
         """kB T at the mean temperature of the samples, u Å²/ps²."""
@@ -365,6 +383,8 @@ def _rigid_frames(
         )
     elif start < first:
         notes.append(f"frames before {first:g} ps belong to an earlier stage")
+    if stage.ramps:
+        notes.append("the set temperature or pressure changes: averages are over the whole ramp")
     if not stage.keeps_momentum:
         notes.append(
             f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and"

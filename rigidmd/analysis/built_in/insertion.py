@@ -9,6 +9,7 @@ import numpy as np
 
 from rigidmd.analysis.built_in.interfaces import BIN, slab_of
 from rigidmd.analysis.built_in.thermodynamics import thermal_energy_of
+from rigidmd.analysis.conditions import box, check_conditions, equilibrium, static, trajectory
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
     BLOCKS,
@@ -26,7 +27,6 @@ from rigidmd.assemble.guest import Guest, model_named
 from rigidmd.core.state import state_of
 from rigidmd.core.statistics import error_of_mean
 from rigidmd.errors import InputError, OutputError
-from rigidmd.forces.terms import trait
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
@@ -58,7 +58,12 @@ class Trials(NamedTuple):
         return self.volume * np.array([np.ones(len(mean)), mean, product])
 
 
-@built_in("excess chemical potential and Henry constant by insertion", position=97, on_request=True)
+@built_in(
+    "excess chemical potential and Henry constant by insertion",
+    position=97,
+    on_request=True,
+    needs=(trajectory, box),
+)
 def insertion(
     runs: Runs,
     model: str = "",
@@ -82,13 +87,8 @@ def insertion(
 
     Raises OutputError.
     """
-    if not runs.has_box:
-        raise OutputError("insertion needs a box")
     if trials < 1:
         raise OutputError("insertion needs one trial or more in each frame")
-    driven = [name for name, term in runs.system.terms.items() if trait(term, "time_dependent")]
-    if driven:
-        raise OutputError(f"the energy depends on time: {', '.join(driven)}")
     frozen = runs.system.model.inverse_mass[runs.system.model.species] == 0
     if zero_loading and not frozen.any():
         raise OutputError("zero loading needs frozen molecules, and the run has none")
@@ -97,9 +97,12 @@ def insertion(
         raise OutputError("insertion at another temperature, above 0 K, needs zero_loading=true")
     if not (model or runs.moving):
         raise OutputError("insertion needs a molecule, such as model=methane_trappe")
-    thermal = BOLTZMANN * (temperature or 0) or float(
-        runs.mean([thermal_energy_of(run) for run in runs.members])
-    )
+    if temperature is None:
+        check_conditions("insertion", runs, [equilibrium])
+        thermal = float(runs.mean([thermal_energy_of(run) for run in runs.members]))
+    else:
+        check_conditions("insertion", runs, [static])
+        thermal = BOLTZMANN * temperature
     try:
         molecule = model_named(model or runs.moving[0].name, runs.system.species)
         guest = Guest(runs.system, molecule, thermal / BOLTZMANN, host)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
+from rigidmd.analysis.conditions import box, trajectory
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
     AnalysisResult,
@@ -49,8 +50,6 @@ def slab_of(frames: RigidFrames, axis: str) -> Slab:
     """A slab, centred in each frame. Raises OutputError."""
     if axis not in ("x", "y", "z"):
         raise OutputError(f"unknown axis {axis!r}. Name x, y or z")
-    if not frames.has_box:
-        raise OutputError("a slab needs a box")
     k = "xyz".index(axis)
     across = [i for i in range(3) if i != k]
     if frames.cell[:, k, across].any() or frames.cell[:, across, k].any():
@@ -148,7 +147,11 @@ def _changes_of_fit(z: np.ndarray, densities: np.ndarray, parameters: np.ndarray
     return parameters + (densities - profile(z, *parameters)) @ np.linalg.pinv(slopes).T
 
 
-@built_in("interfaces of a slab: coexisting densities, width, orientation", position=32)
+@built_in(
+    "interfaces of a slab: coexisting densities, width, orientation",
+    position=32,
+    needs=(trajectory, box),
+)
 def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
     """Liquid and vapour densities, slab thickness and interface width, from a fit of
 
@@ -218,7 +221,9 @@ def _mean_cosine(runs: Runs, profiles: Profiles, kind: Kind) -> np.ndarray:
     )
 
 
-@built_in("surface tension of a slab from the pressure tensor", position=105)
+@built_in(
+    "surface tension of a slab from the pressure tensor", position=105, needs=(trajectory, box)
+)
 def surface_tension(runs: Runs, axis: str = "z") -> AnalysisResult:
     """Surface tension (mN/m) of the two interfaces of a slab: L/2 <P_N - P_T> (Kirkwood & Buff
     1949), with the edge L and the pressure P_N along the normal, and the mean pressure P_T across

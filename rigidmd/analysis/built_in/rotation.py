@@ -8,6 +8,7 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from rigidmd.analysis.built_in.transport import correlation, interval_and_lags, squared_displacement
+from rigidmd.analysis.conditions import box, equilibrium, motion, trajectory, velocities
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
     BLOCKS,
@@ -23,7 +24,6 @@ from rigidmd.analysis.result import (
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs
 from rigidmd.errors import OutputError
-from rigidmd.formats import written
 from rigidmd.mechanics.inertia import rotational_freedom
 from rigidmd.run.rigid_fit import Kind
 from rigidmd.scene.validation import not_none
@@ -50,6 +50,7 @@ def _axes(kind: Kind) -> list[int]:
 @built_in(
     "orientational correlation C1 and C2 about each body axis, and rotational diffusion",
     position=70,
+    needs=(trajectory, motion),
 )
 def orientation(runs: Runs) -> AnalysisResult:
     """C_l(t) = <P_l(u(0)·u(t))>, l = 1, 2, of principal axes u, correlation times (ps), rotational
@@ -179,18 +180,15 @@ def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) ->
 
 
 @built_in(
-    "spectra and correlations of velocities, angular velocities and angular momenta", position=80
+    "spectra and correlations of velocities, angular velocities and angular momenta",
+    position=80,
+    needs=(trajectory, motion, velocities),
 )
 def spectrum(runs: Runs) -> AnalysisResult:
     """Densities of states (cm) for translation and for rotation about each body axis, from the
     power of velocities and angular velocities, and their correlation functions. The integral over
     wave numbers is a molecule's number of degrees of freedom. Needs frames with velocities, every
     few fs. Raises OutputError."""
-    if any(run.velocities is None or run.L is None for run in runs.members):
-        kinds = " or ".join(written(lambda form: form.velocities))
-        raise OutputError(
-            f"a spectrum needs velocities in the frames: a trajectory file of type {kinds} has them"
-        )
     interval, lags = interval_and_lags(runs, "a spectrum")
     size = min(runs.frame_count // BLOCKS, runs.shortest)
     result = AnalysisResult("spectrum", "densities of states")
@@ -311,7 +309,11 @@ def total_dipole(frames: RigidFrames) -> np.ndarray:
     return total
 
 
-@built_in("dielectric constant from the fluctuation of the total dipole", position=90)
+@built_in(
+    "dielectric constant from the fluctuation of the total dipole",
+    position=90,
+    needs=(trajectory, box, equilibrium),
+)
 def dielectric(runs: Runs) -> AnalysisResult:
     """The static dielectric constant, with the boundary condition of the scene: tin foil or a
     permittivity around the sphere of Ewald sums or the cavity of a reaction field (Neumann 1983,
@@ -388,8 +390,6 @@ def _permittivity_around(runs: Runs) -> float:
     tin foil. Raises OutputError where the fluctuation of the dipole gives no dielectric
     constant."""
     forces = runs.system.scene.forces
-    if not runs.has_box:
-        raise OutputError("a dielectric constant needs a box")
     if not any(m.charges.any() for m in runs.system.species):
         raise OutputError("a dielectric constant needs molecules with charges")
     if runs.system.scene.fields.electric_V_per_nm is not None:

@@ -6,6 +6,7 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 
+from rigidmd.analysis.conditions import box, trajectory
 from rigidmd.analysis.pair_histogram import count_pairs, heights
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
@@ -43,7 +44,11 @@ BOND_DISTANCE, BOND_ANGLE = 3.5, 30.0
 BONDING = ("N", "O", "F")  # donors and acceptors of hydrogen bonds
 
 
-@built_in("radial distribution functions g(r) of sites of different molecules", position=10)
+@built_in(
+    "radial distribution functions g(r) of sites of different molecules",
+    position=10,
+    needs=(trajectory, box),
+)
 def rdf(
     runs: Runs,
     first: str = "",
@@ -68,8 +73,6 @@ def rdf(
     ------
     OutputError
     """
-    if not runs.has_box:
-        raise OutputError("g(r) needs a box, which defines a density to compare with")
     half = 0.5 * float(min(heights(cell).min() for run in runs.members for cell in run.cell))
     largest = min(half, LARGEST) if largest is None else largest
     if not 0 < width < largest <= half * (1 + 1e-9):
@@ -272,7 +275,7 @@ def _first_top(g: np.ndarray) -> int:
     return top
 
 
-@built_in("structure factor S(k) of the centres of mass", position=20)
+@built_in("structure factor S(k) of the centres of mass", position=20, needs=(trajectory, box))
 def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> AnalysisResult:
     """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box.
 
@@ -287,8 +290,6 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
     ------
     OutputError
     """
-    if not runs.has_box:
-        raise OutputError("a structure factor needs a box")
     thinned, notes = _thinned(runs, ENOUGH_MOLECULES_K)
     reciprocal = 2 * np.pi * np.linalg.inv(thinned.mean_cell).T
     shortest = float(heights(reciprocal).min())
@@ -357,7 +358,7 @@ def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.n
     return vectors[chosen], bin_of[chosen]
 
 
-@built_in("profile of the density along an axis of the box", position=30)
+@built_in("profile of the density along an axis of the box", position=30, needs=(trajectory, box))
 def density_profile(runs: Runs, axis: str = "z", bins: int = 100) -> AnalysisResult:
     """Mass density (g/cm³) of each species along an edge of the box: x, y or z for a, b or c.
     Raises OutputError."""
@@ -365,8 +366,6 @@ def density_profile(runs: Runs, axis: str = "z", bins: int = 100) -> AnalysisRes
         raise OutputError(
             f"unknown axis {axis!r}. Name x, y or z (the edges a, b and c of the box)"
         )
-    if not runs.has_box:
-        raise OutputError("a profile of the density needs a box")
     if bins < 1:
         raise OutputError(f"a profile needs at least one bin, not {bins}")
     k = "xyz".index(axis)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.analysis.conditions import equilibrium, trajectory
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
     AnalysisResult,
@@ -166,7 +167,11 @@ class Samples:
         return (above - below) / (2 * CHANGE)
 
 
-@built_in("heat capacities, compressibility, thermal expansion, pressure coefficient", position=95)
+@built_in(
+    "heat capacities, compressibility, thermal expansion, pressure coefficient",
+    position=95,
+    needs=(trajectory, equilibrium),
+)
 def response(runs: Runs) -> AnalysisResult:
     """Response functions from fluctuations: in nvt and nve c_v and the thermal pressure coefficient
     gamma_V = (dp/dT)_V. In npt also c_p, the compressibility kappa_T and the thermal expansion
@@ -214,10 +219,6 @@ def _check_conditions(runs: Runs) -> None:
     need = "response functions need"
     if min(len(run.columns["time"]) for run in runs.members) < 2:
         raise OutputError(f"{need} samples: set output.log_interval_ps to less than the run")
-    if stage.ramps:
-        raise OutputError(f"{need} constant conditions, and those of this stage change")
-    if runs.system.scene.fields.electric_frequency_per_ps is not None:
-        raise OutputError(f"{need} equilibrium, and an oscillating field acts")
     if stage.ensemble not in RESPONSES:
         raise OutputError(
             f"{need} nvt, npt or nve: {stage.ensemble} keeps the enthalpy, and fluctuates otherwise"

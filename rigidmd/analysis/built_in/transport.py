@@ -4,6 +4,7 @@ error."""
 import numpy as np
 from scipy import fft
 
+from rigidmd.analysis.conditions import box, equilibrium, motion, trajectory
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.relaxation import Relaxations, integral_of, longest_time
 from rigidmd.analysis.result import (
@@ -80,7 +81,9 @@ def interval_and_lags(runs: Runs, what: str) -> tuple[float, int]:
     return runs.interval, lags
 
 
-@built_in("mean squared displacement of the centres of mass", position=50)
+@built_in(
+    "mean squared displacement of the centres of mass", position=50, needs=(trajectory, motion)
+)
 def msd(runs: Runs) -> AnalysisResult:
     """Mean squared displacement (Å²) of each species against time, all origins, up to a tenth
     of the frames. Paths continue through the faces of the box, without the scaling by a barostat.
@@ -97,7 +100,11 @@ def msd(runs: Runs) -> AnalysisResult:
     return AnalysisResult("msd", "mean squared displacement", curves=[curve])
 
 
-@built_in("diffusion coefficient, with the correction for the size of the box", position=60)
+@built_in(
+    "diffusion coefficient, with the correction for the size of the box",
+    position=60,
+    needs=(trajectory, motion),
+)
 def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResult:
     """D for each species (1e-9 m²/s) from the slope of its mean squared displacement, and D in an
     infinite box.
@@ -215,7 +222,11 @@ SHOWN_TIMES = 6.0
 COMPONENTS = 5
 
 
-@built_in("viscosity from the pressure tensor, by Green and Kubo", position=100)
+@built_in(
+    "viscosity from the pressure tensor, by Green and Kubo",
+    position=100,
+    needs=(trajectory, box, motion, equilibrium),
+)
 def viscosity(runs: Runs) -> AnalysisResult:
     """Shear viscosity (mPa s): V/kT times the time integral over the autocorrelation of five
     independent pressure components (output.pressure_tensor_interval_ps).
@@ -224,8 +235,6 @@ def viscosity(runs: Runs) -> AnalysisResult:
     periodogram (`rigidmd.analysis.relaxation`). It has no time at which it would be cut off. The
     error follows from the likelihood and from the choice of the model. Raises OutputError.
     """
-    if not runs.has_box:
-        raise OutputError("a viscosity needs a box")
     stresses = [_stresses(run) for run in runs.members]
     interval = _interval_of(runs)
     length = interval * sum(map(len, stresses))

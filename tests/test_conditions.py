@@ -1,0 +1,129 @@
+"""Analyses against the conditions of a run: each has a right result or a message on why it has none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support import history, small_scene
+
+from rigidmd.analysis.registry import KNOWN
+from rigidmd.analysis.runs import Runs
+from rigidmd.assemble.build import build
+from rigidmd.errors import OutputError
+from rigidmd.mechanics.rotation import random_rotations
+
+EDGE, COUNT, FRAMES = 16.0, 12, 60
+NVT = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 6.0}
+NPT = NVT | {"ensemble": "npt", "pressure_bar": 1.0}
+OF_AVERAGES = ("rdf", "structure_factor", "density_profile", "hydrogen_bonds", "nematic")
+IN_TIME = ("msd", "diffusion", "orientation", "spectrum", "viscosity")
+OF_EQUILIBRIUM = ("dielectric", "response", "insertion", "viscosity")
+
+
+def made_up(stages=(NVT,), molecules=None, edge=EDGE, frames=FRAMES, **sections):
+    """Frames of molecules that walk and rotate at random, with all samples."""
+    molecules = molecules or [{"model": "spce", "count": COUNT}]
+    sections = {"forces": {"cutoff_A": 5.0}} | sections
+    system = build(small_scene({}, edge, molecules=molecules, stages=[*stages], **sections))
+    rng = np.random.default_rng(5)
+    time = 0.1 * np.arange(frames)
+    walk = np.cumsum(0.1 * rng.standard_normal((frames, *system.state.position.shape)), axis=0)
+    moving = system.model.inverse_mass[system.model.species] > 0
+    shape = (frames, len(moving))
+    rotates = len(system.state.rotation) > 0
+    samples = {
+        name: 300 + 9 * rng.standard_normal(frames) for name in ("temperature", "pressure_bar")
+    }
+    samples["temperature_translation"] = samples["temperature"]
+    samples |= {"time": time, "potential": -400 + 5 * rng.standard_normal(frames)}
+    samples |= {"volume": system.state.volume / 1e3 * (1 + 0.01 * rng.standard_normal(frames))}
+    samples["stage"] = np.full(frames, len(system.scene.stages) - 1)
+    tensor = np.column_stack([time, 300 * rng.standard_normal((frames, 6))])
+    momenta = rng.standard_normal((frames, shape[1] if rotates else 0, 3))
+    made = history(
+        system,
+        time,
+        system.state.position + walk * moving[:, None],
+        system.state.cell,
+        random_rotations(rng, frames * shape[1]).reshape(*shape, 3, 3) if rotates else None,
+        rng.standard_normal((*shape, 3)),
+        momenta,
+        tensor,
+    )
+    return replace(made, columns=samples)
+
+
+def refused(name, frames, **options):
+    with pytest.raises(OutputError) as caught:
+        KNOWN[name].function(frames, **options)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("stage", "words"),
+    [
+        (NVT | {"name": "cooling", "temperature_K": [300.0, 100.0]}, "cooling the temperature"),
+        (NPT | {"name": "pressing", "pressure_bar": [1.0, 1000.0]}, "pressing the pressure"),
+    ],
+)
+def test_values_of_equilibrium_are_refused_on_a_ramp(stage, words):
+    frames = made_up([stage])
+    for name in {*IN_TIME, *OF_EQUILIBRIUM}:
+        found = refused(name, frames)
+        assert (
+            found.startswith(f"{name} needs constant conditions: in the stage") and words in found
+        )
+    for name in OF_AVERAGES:
+        assert KNOWN[name].function(frames, **({"axis": "z"} if name == "nematic" else {})).curves
+
+
+def test_frames_of_stages_that_differ_are_refused_with_the_time_to_begin_at():
+    frames = made_up([NVT | {"temperature_K": 350.0}, NVT | {"name": "after"}])
+    stage = np.where(frames.time < 2.05, 0, 1)
+    mixed = replace(frames, columns=frames.columns | {"stage": stage})
+    words = "temperature_K differs in the stages nvt and after. Use frames from 2 ps on"
+    for name in {*IN_TIME, *OF_EQUILIBRIUM}:
+        assert refused(name, mixed) == f"{name} needs constant conditions: {words}"
+    # a stage begins with the last sample of the one before it
+    first = replace(frames, columns=frames.columns | {"stage": np.minimum(1, np.arange(FRAMES))})
+    assert KNOWN["dielectric"].function(first).values
+
+
+def test_runs_of_different_temperatures_are_refused():
+    both = Runs((made_up(), made_up([NVT | {"temperature_K": 310.0}])))
+    for name in {*IN_TIME, *OF_EQUILIBRIUM}:
+        assert refused(name, both).endswith("temperature_K differs between the runs")
+
+
+def test_samples_of_hybrid_monte_carlo_have_no_motion():
+    frames = made_up([NVT | {"thermostat": "hybrid_monte_carlo"}])
+    for name in IN_TIME:
+        assert "needs motion in time, and the stage nvt samples by hybrid" in refused(name, frames)
+    assert KNOWN["dielectric"].function(frames).values
+
+
+def test_a_field_that_oscillates_has_no_equilibrium():
+    field = {"electric_V_per_nm": [0.0, 0.0, 0.1], "electric_frequency_per_ps": 1.0}
+    frames = made_up(fields=field)
+    for name in OF_EQUILIBRIUM:
+        assert "static forces, and these depend on time: electric_field" in refused(name, frames)
+    assert KNOWN["msd"].function(frames).curves
+
+
+def test_what_is_missing_in_a_run_is_named():
+    frames = made_up()
+    bare = replace(frames, velocities=None, L=None)
+    assert refused("spectrum", bare).startswith("spectrum needs velocities in the frames")
+    open_space = replace(frames, cell=np.full_like(frames.cell, np.inf))
+    for name in (
+        "rdf",
+        "structure_factor",
+        "density_profile",
+        "dielectric",
+        "insertion",
+        "viscosity",
+    ):
+        assert refused(name, open_space).startswith(f"{name} needs a box")
+    for name in KNOWN:
+        if name not in ("response", "viscosity") and not KNOWN[name].is_user:
+            assert refused(name, frames[:1]).startswith(f"{name} needs the frames of a trajectory")
