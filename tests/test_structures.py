@@ -35,7 +35,7 @@ from rigidmd.formats.cells import (
     reduced_cell,
     standard_rotation,
 )
-from rigidmd.io.structure_file import read_geometry
+from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.io.trajectory_file import TrajectoryFile, write_topology
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import Scene
@@ -1512,6 +1512,68 @@ def test_lammps_data(units, velocity_unit, molecule_ids, tmp_path):
     else:
         assert found.velocity is None
         assert any("does not name its units" in note for note in found.notes)
+
+
+#: Å, u and Å/ps in the units of LAMMPS.
+SCALES = {
+    "si": (1e-10, 1.66053907e-27, 100.0),
+    "cgs": (1e-8, 1.66053907e-24, 1e4),
+    "electron": (1 / 0.529177211, 1.0, 1.95163e-3),
+    "micro": (1e-4, 1.66053907e-12, 100.0),
+    "nano": (0.1, 1.66053907e-6, 100.0),
+    "Metal": (1.0, 1.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("units", SCALES)
+@pytest.mark.parametrize("form", ["data", "dump"])
+def test_units_of_lammps(units, form, tmp_path):
+    """Lengths, masses (from which elements follow) and velocities of each system of units."""
+    length, mass, speed = SCALES[units]
+    lines = [
+        f"{k} 1 {' '.join(f'{x:.9e}' for x in length * np.array([k, 2.0, 3.0]))}" for k in (1, 2)
+    ]
+    edge = f"0 {8 * length:.9e}"
+    if form == "data":
+        text = (
+            f"made by me, units = {units}\n\n2 atoms\n1 atom types\n"
+            + "".join(f"{edge} {x}lo {x}hi\n" for x in "xyz")
+            + f"\nMasses\n\n1 {39.948 * mass:.9e}\n\nAtoms # atomic\n\n"
+            + "\n".join(lines)
+            + f"\n\nVelocities\n\n1 {speed:.9e} 0 0\n2 {speed:.9e} 0 0\n"
+        )
+    else:
+        bounds = f"ITEM: BOX BOUNDS pp pp pp\n{edge}\n{edge}\n{edge}\n"
+        text = (
+            f"ITEM: UNITS\n{units}\nITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n2\n{bounds}"
+            "ITEM: ATOMS id type x y z mass vx vy vz\n"
+            + "".join(f"{line} {39.948 * mass:.9e} {speed:.9e} 0 0\n" for line in lines)
+        )
+    path = tmp_path / ("a.data" if form == "data" else "a.lammpstrj")
+    path.write_text(text)
+    found = read_atoms(path)
+    assert found.position == pytest.approx(np.array([[1.0, 2, 3], [2, 2, 3]]), rel=1e-6)
+    assert found.cell == pytest.approx(8 * np.eye(3), rel=1e-6)
+    assert found.masses == pytest.approx([39.948, 39.948], rel=1e-6)
+    assert found.elements == ["Ar", "Ar"]
+    assert found.velocity == pytest.approx(np.array([[1.0, 0, 0]] * 2), rel=1e-5)
+
+
+@pytest.mark.parametrize("units", ["lj", "LJ", "furlong", ""])
+def test_unknown_units_of_lammps_are_refused(units, tmp_path):
+    truth = Truth(["spce", "argon", "spce"], 12)
+    path = tmp_path / "a.data"
+    path.write_text(lammps(truth, f"LAMMPS data file, units = {units}", 1.0))
+    says = "units of sigma.*convert it to real" if units.lower() == "lj" else "expected real, metal"
+    with pytest.raises(StructureError, match=f"line 1: its units are '{units}'.*{says}"):
+        read_atoms(path)
+    path.write_text(lammps(truth, "a melt of six repeat units, from units made by hand", 1.0))
+    assert "its velocities are not used" in " ".join(read_atoms(path).notes)
+    dump = tmp_path / "a.lammpstrj"
+    water = Truth(["tip4p2005"] * 2, 12)
+    dump.write_text(dump_of(water, "id element x y z", units=units or " "))
+    with pytest.raises(StructureError, match=f"line 2: its units are '{units}'.*{says}"):
+        read_atoms(dump)
 
 
 def repartitioned(truth, labels=("", ""), section="") -> str:

@@ -54,7 +54,12 @@ COLUMN = {
     "atom-type": "type",
     "charge": "q",
 }
-UNITS = re.compile(r"units\s*=?\s*(real|metal|si|cgs|electron)\b")
+#: Systems of units with a length in metres. Those named lj have none.
+KNOWN_UNITS = ("real", "metal", "si", "cgs", "electron", "micro", "nano")
+#: In the first line of a data file, which may be any text: "units = real", "units real".
+UNITS = re.compile(
+    rf"\bunits(?:\s*=\s*(\w*)|\s+({'|'.join((*KNOWN_UNITS, 'lj'))})\b)", re.IGNORECASE
+)
 #: Columns with labels of types in a dump.
 LABELS = ("typelabel", "label")
 #: Columns of coordinates in a dump: wrapped, unwrapped, and both in units of the edges.
@@ -107,6 +112,8 @@ def _data_atoms(
 ) -> Atoms:
     """The atoms in order of their numbers. style: the comment after Atoms"""
     rows = sections["Atoms"]
+    stated = UNITS.search(title)
+    units = _known_units(path, 1, (stated[1] or stated[2] or "") if stated else None)
     labels = {
         row.words[0]: row.words[1]
         for row in sections.get("Atom Type Labels", [])
@@ -117,7 +124,8 @@ def _data_atoms(
     mass_of = {}
     for row in sections.get("Masses", []):
         kind = number_of.get(row.words[0], row.words[0])
-        [mass_of[kind]] = numbers(path, row.line, row.words[1:2] or [""], "a type and its mass")
+        [mass] = numbers(path, row.line, row.words[1:2] or [""], "a type and its mass")
+        mass_of[kind] = mass * _unit(units, "mass")
         if kind not in names and len(row.comment.split()) == 1:
             names[kind] = row.comment
     declared = next((row.words[0] for row in head if row.words[1:] == ["atom", "types"]), "0")
@@ -170,7 +178,7 @@ def _data_atoms(
         words_of_atoms = [moving.get(row.words[column["id"]], (0, ["nan"] * 3)) for row in rows]
         velocity = table(path, words_of_atoms, "an atom and its three velocities")
     return _in_our_units(
-        atoms, velocity, title, "its first line does not name its units ('units = real')"
+        atoms, velocity, units, "its first line does not name its units ('units = real')"
     )
 
 
@@ -258,40 +266,52 @@ def _residues(numbers_of: Iterable[str]) -> list[tuple]:
     return [(number, "") for number in numbers_read] if any(numbers_read) else []
 
 
-def _in_our_units(atoms: Atoms, velocity: np.ndarray | None, title: str, unknown: str) -> Atoms:
-    """Atoms in Å, ps and u. If the title names no units, lengths are in Å and velocities are not
-    used."""
+def _known_units(path: Path, line: int, name: str | None) -> str:
+    """Units that a line names, in lower case. "" if it names none. Raises StructureError."""
+    if name is None or name.lower() in KNOWN_UNITS:
+        return (name or "").lower()
+    if name.lower() == "lj":
+        advice = "lengths in units of sigma, which the file does not have: convert it to real"
+    else:
+        advice = f"expected {', '.join(KNOWN_UNITS)}"
+    raise structure_error(path, f"line {line}: its units are {name[:20]!r}, {advice}")
+
+
+def _unit(units: str, quantity: str) -> float:
+    """A unit of LAMMPS in Å, Å/ps or u. 1 if the file does not name its units."""
     from ase.calculators.lammps import convert
 
-    if (units := UNITS.search(title)) is None:
+    factor = ASE_VELOCITY if quantity == "velocity" else 1.0
+    return factor * convert(1.0, quantity, units, "ASE") if units else 1.0
+
+
+def _in_our_units(atoms: Atoms, velocity: np.ndarray | None, units: str, unknown: str) -> Atoms:
+    """Atoms in Å and ps. If the file names no units, lengths are in Å and velocities are not
+    used."""
+    if not units:
         unit_notes = [] if velocity is None else [f"{unknown}: its velocities are not used"]
         return atoms._replace(notes=[*atoms.notes, *unit_notes])
-
-    def converted(values, quantity):
-        return None if values is None else convert(values, quantity, units[1], "ASE")
-
-    speed = converted(velocity, "velocity")
+    length = _unit(units, "distance")
     return atoms._replace(
-        position=converted(atoms.position, "distance"),
-        cell=converted(atoms.cell, "distance"),
-        masses=converted(atoms.masses, "mass"),
+        position=atoms.position * length,
+        cell=None if atoms.cell is None else atoms.cell * length,
         velocity=None
-        if speed is None
-        else np.where(np.isfinite(speed), speed * ASE_VELOCITY, np.nan),
+        if velocity is None
+        else np.where(np.isfinite(velocity), velocity * _unit(units, "velocity"), np.nan),
     )
 
 
 def read_dump(
     path: Path, lines: list[str], atom_types: dict[str, str] | None
 ) -> list[Callable[[], Atoms]]:
-    units = next(
-        (
-            lines[k + 1].strip()
-            for k, line in enumerate(lines[:-1])
-            if line.startswith("ITEM: UNITS")
-        ),
-        "",
-    )
+    named = {
+        lines[k + 1].strip(): k + 2
+        for k, line in enumerate(lines[:-1])
+        if line.startswith("ITEM: UNITS")
+    }
+    if len(named) > 1:
+        raise structure_error(path, f"names several units, {', '.join(named)}: keep one")
+    units = next((_known_units(path, line, name) for name, line in named.items()), "")
     starts = [k for k, line in enumerate(lines) if line.startswith("ITEM: TIMESTEP")]
     parts = pairwise([*starts, len(lines)])
     return [
@@ -350,7 +370,7 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
         axes = ", ".join(x for x, flag in zip("abc", flags, strict=False) if "p" in flag)
         notes = [f"its cell is periodic along {axes} only and is not used"] if axes else []
         cell = None
-    masses = of("mass")[:, 0] if "mass" in columns else None
+    masses = of("mass")[:, 0] * _unit(units, "mass") if "mass" in columns else None
     columns_of_names = {
         name: texts(name) for name in ("type", "element", *LABELS) if name in columns
     }
@@ -369,7 +389,7 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
     return _in_our_units(
         frame_atoms,
         velocity,
-        f"units {units}",
+        units,
         "it does not name its units (dump_modify units yes)",
     )
 
