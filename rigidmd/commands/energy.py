@@ -71,7 +71,8 @@ def _print_molecules(name: str, energies: Json, unit: str) -> None:
         print(f"  {key.replace('_', ' ')}: {text}")
     if error := energies.get("accuracy"):
         print(f"Coulomb forces on sites, compared with {error['reference']}")
-        relative = f"{error['relative']:.2g} of it, {error['in_e2_per_A2']:.2g} e²/Å²"
+        relative = "" if error["relative"] is None else f"{error['relative']:.2g} of it, "
+        relative += f"{error['in_e2_per_A2']:.2g} e²/Å²"
         rows = [
             ("rms force", error["rms_force_per_A"], f"{unit}/Å"),
             ("rms error", error["rms_error_per_A"], f"{unit}/Å: {relative}"),

@@ -19,8 +19,7 @@ from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.ewald.errors import (
     charges_in,
     filled_fraction,
-    k_cutoff_of_count,
-    k_space_error,
+    left_out_error,
     pme_error,
     real_error,
 )
@@ -54,13 +53,8 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
     with a more accurate sum: the entry `accuracy` of `rigidmd energy`, with energies in a unit of
     `size` u Å²/ps². Raises SceneError if it has no Ewald sums."""
     scene = system.scene
-    method = system.scene.forces.electrostatics
-    if system.force_error is None:
-        problem = (
-            f"--accuracy needs Ewald sums. forces.electrostatics is {method!r}, or no site has a"
-            " charge"
-        )
-        raise SceneError(scene.source, [problem])
+    if reason := _reason_without_errors(system):
+        raise SceneError(scene.source, [f"--accuracy measures errors of Ewald sums: {reason}"])
     accuracy = max(REFERENCE_ERROR * system.force_error / COULOMB, MIN_REFERENCE_ERROR)
     settings = (
         "ewald_alpha_per_A",
@@ -73,7 +67,7 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
     changes = dict.fromkeys(settings) | {"electrostatics": "ewald", "ewald_accuracy": accuracy}
     forces = scene.forces.model_copy(update=changes)
     reference = build(scene.model_copy(update={"forces": forces, "precision": "double"}))
-    moves = mobile(system.model)[cast(PairForces, system.terms["coulomb_real"]).sites.molecule]
+    moves = _charged_sites_that_move(system)
     coulomb, energy = _coulomb(system, state)
     exact, exact_energy = _coulomb(reference, state)
     error = np.linalg.norm((coulomb - exact)[moves], axis=1)
@@ -83,12 +77,29 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
         "reference": next(note for note in reference.notes if note.startswith("ewald")),
         "rms_force_per_A": force / size,
         "rms_error_per_A": measured / size,
-        "relative": measured / force,
+        "relative": measured / force if force else None,  # one ion feels no force
         "in_e2_per_A2": measured / COULOMB,
         "estimated_per_A": system.force_error / size,
         "largest_error_per_A": float(error.max()) / size,
         "energy_error": (energy - exact_energy) / size,
     }
+
+
+def _reason_without_errors(system: System) -> str:
+    """Why the errors of Ewald sums cannot be measured. Empty if they can."""
+    method = system.scene.forces.electrostatics
+    if method not in ("ewald", "pme"):
+        return f"forces.electrostatics is {method!r}"
+    if system.force_error is None:
+        return "no site has a charge"
+    if not _charged_sites_that_move(system).any():
+        return "all molecules with charges are frozen"
+    return ""
+
+
+def _charged_sites_that_move(system: System) -> np.ndarray:
+    """Whether the molecule of each charged site (s,) moves."""
+    return mobile(system.model)[cast(PairForces, system.terms["coulomb_real"]).sites.molecule]
 
 
 def estimated_error(system: System, cell: np.ndarray) -> float:
@@ -100,9 +111,7 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     charges = charges_in(system.species, counts)
     cutoff = not_none(system.scene.forces.ewald_cutoff_A)
     if isinstance(term, EwaldSum):
-        reciprocal = k_space_error(
-            charges, term.smooth.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume
-        )
+        reciprocal = left_out_error(charges, term.smooth.alpha, term.k_vectors, cell)
     else:
         term = cast("Pme", term)
         reciprocal = pme_error(charges, term.smooth.alpha, cell, term.grid, term.order)
@@ -134,15 +143,12 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     engine = system.engine_of(charged, system.precision)
     _, tallies = engine.evaluate(state)
     real = cast(PairForces, system.terms["coulomb_real"])
-    force = np.zeros((system.site_count, 3))
-    for name in ("coulomb_real", "coulomb_reciprocal"):
-        force = force + cast(HasSiteForces, engine.workspaces[name]).site_force
-    position = np.empty_like(force)
+    position = np.empty((len(real.sites.molecule), 3))
     compute_site_positions(real.sites, state, position)
     potential = cast(ScreenedCoulomb, real.potential)
-    force = force + forces_inside(
-        potential.charge, position, real.sites.first, InverseR(potential.alpha)
-    )
+    force = forces_inside(potential.charge, position, real.sites.first, InverseR(potential.alpha))
+    for name in ("coulomb_real", "coulomb_reciprocal"):
+        force = force + cast(HasSiteForces, engine.workspaces[name]).site_force
     constants = sum(
         energy for name, energy in system.constants.items() if name.startswith("coulomb")
     )

@@ -42,6 +42,17 @@ class KVectors(NamedTuple):
         """Number of vectors, with their negatives."""
         return 2 * int(self.count.sum())
 
+    def contains(self, n_x: int, n_y: np.ndarray, n_z: np.ndarray) -> np.ndarray:
+        """Whether each n of a plane is in the sum, (len(n_y), len(n_z))."""
+        x, y, first = self.column[:, :3].T
+        last = first + self.count - 1
+        is_inside = np.zeros((len(n_y), len(n_z)), bool)
+        for sign in (1, -1):
+            row = {int(sign * y[c]): c for c in np.flatnonzero(sign * x == n_x)}
+            for k, c in ((k, row[n]) for k, n in enumerate(n_y.tolist()) if n in row):
+                is_inside[k] |= (sign * n_z >= first[c]) & (sign * n_z <= last[c])
+        return is_inside
+
 
 def k_vectors_up_to(
     largest: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = SAME_BASIS

@@ -8,12 +8,13 @@ of 1 Å. For dispersion it is u Å/ps².
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
-from math import exp, inf, pi, sqrt
+from math import ceil, exp, inf, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import erfcx, gammaincc
 
+from rigidmd.forces.ewald.direct_sum import KVectors
 from rigidmd.forces.inputs import Molecule
 from rigidmd.forces.neighbors.space import Space, longest_gaps
 
@@ -32,6 +33,11 @@ MAX_GRID_POINTS = 2**16  # along an edge: enough for 0.1 mm
 #: Distances inside molecules that agree to FINE digits (Å) count as equal, with MANY_CHARGES those
 #: in bins of COARSE Å.
 FINE, COARSE, MANY_CHARGES = 6, 0.1, 200
+
+
+#: Sums over the k-vectors that are left out end where exp(-k²/2 alpha²) has fallen by this
+#: exponent, and have about this number of vectors at most.
+LOG_SMALLEST, MAX_LEFT_OUT = 14.0, 1e6
 
 
 class Charges(NamedTuple):
@@ -179,6 +185,29 @@ def k_cutoff_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: 
 
     radius = least if left(0.0) <= 0 else brentq(left, 0.0, longest)
     return max(radius, least) * (1 + 1e-9)
+
+
+def left_out_error(charges: Charges, alpha: float, k_vectors: KVectors, cell: np.ndarray) -> float:
+    """Error from the k-vectors that a sum leaves out in a cell (3, 3): the sum over them, in place
+    of the integral of `k_space_error`, so that the set may have any shape."""
+    volume = abs(float(np.linalg.det(cell)))
+    reciprocal = 2 * pi * np.linalg.inv(cell).T
+    nearest = ((k_vectors.most + 1) * np.linalg.norm(reciprocal, axis=1)).min()  # along an axis
+    radius = sqrt(nearest**2 + 2 * LOG_SMALLEST * alpha**2)
+    # in a large box every stride-th vector along each axis stands for stride³ of them
+    stride = ceil((radius**3 * volume / (6 * pi**2 * MAX_LEFT_OUT)) ** (1 / 3))
+    largest = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi * stride)).astype(int)
+    x, y, z = (stride * np.arange(-n, n + 1) for n in largest.tolist())
+    k = np.linspace(0.0, radius, 2000)[1:]
+    spectrum = charges.force_spectrum(alpha, k) * charges.form(k) / k**2
+    square = 0.0
+    for n_x in x.tolist():
+        n = np.stack(np.broadcast_arrays(n_x, y[:, None], z), axis=-1)
+        length = np.linalg.norm(n @ reciprocal, axis=-1)
+        left_out = (length > 0) & (length <= radius) & ~k_vectors.contains(n_x, y, z)
+        square += float(np.interp(length[left_out], k, spectrum).sum())
+    square *= stride**3 * 2 * pi**2 / volume  # dk has V k² dk/2 pi² vectors
+    return sqrt(charges.square / charges.count * square / volume)
 
 
 def k_cutoff_of_count(count: int, volume: float) -> float:

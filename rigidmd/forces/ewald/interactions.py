@@ -16,8 +16,7 @@ from rigidmd.forces.ewald.errors import (
     charges_in,
     fastest_cutoff,
     k_cutoff_for,
-    k_cutoff_of_count,
-    k_space_error,
+    left_out_error,
     pme_error,
     pme_grid_for,
     real_error,
@@ -202,11 +201,7 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
         raise SceneError(
             parts.scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no k-vector"]
         )
-    return (
-        real,
-        k_space_error(charges, alpha, k_cutoff_of_count(vectors.total, volume), volume),
-        vectors,
-    )
+    return real, left_out_error(charges, alpha, vectors, cell), vectors
 
 
 def interactions(parts: SystemParts) -> Interactions:
