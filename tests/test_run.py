@@ -1274,6 +1274,31 @@ def test_a_signal_of_the_program_s_own_is_left_to_it():
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+@pytest.mark.skipif(
+    not Path("/proc/self/status").is_file(), reason="only Linux shows handlers in C"
+)
+def test_handlers_of_signals_in_c_are_left_to_the_program(tmp_path):
+    """Python names no handler for what `faulthandler` registers, and its own would replace it."""
+    program = """
+import faulthandler, os, signal, sys
+import rigidmd
+faulthandler.register(signal.SIGUSR1, sys.stdout)
+scene = rigidmd.Scene.from_dict({
+    "box": {"lengths_A": 20.0}, "molecules": [{"model": "argon", "count": 10}],
+    "start": {"temperature_K": 90.0}, "stages": [{"duration_ps": 0.02}],
+    "output": {"figures": False},
+})
+rigidmd.Simulation(scene, "run").run()
+sys.stdout.flush()
+os.kill(os.getpid(), signal.SIGUSR1)
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "most recent call first" in ended.stdout
+
+
 def test_off_a_terminal_lines_say_how_far_it_is(monkeypatch, capsys):
     now = [0.0]
     monkeypatch.setattr(progress.clock, "monotonic", lambda: now[0])

@@ -90,6 +90,25 @@ def test_a_run_is_what_it_returned(run):
     assert snapshot(folder) == before
 
 
+def test_columns_of_user_defined_forces_are_read(tmp_path):
+    forces = {"cutoff_A": 8.0, "custom": [{"name": "wide", "energy": "1e5/r**12"}]}
+    scene = small_scene({"argon": 12}, 20.0, forces=forces)
+    returned = Simulation(scene, tmp_path / "run").run()
+    results = rigidmd.read_run(tmp_path / "run")
+    assert list(results) == list(returned)
+    assert results.units == returned.units
+    assert results["wide"] == pytest.approx(returned["wide"], rel=1e-15)
+    assert (results["wide"] > 0).all()
+
+
+def test_a_log_with_a_column_twice_is_refused(run, tmp_path):
+    folder = Path(shutil.copytree(run[0], tmp_path / "twice"))
+    log = folder / "log.csv"
+    log.write_text(log.read_text().replace('"T_rot (K)"', '"T_trans (K)"'))
+    with pytest.raises(OutputError, match=r"log.csv has the column 'T_trans \(K\)' twice"):
+        rigidmd.read_run(folder)
+
+
 def test_a_run_that_was_moved_is_read_where_it_is(run, tmp_path):
     folder, returned = run
     moved = Path(shutil.copytree(folder, tmp_path / "moved"))

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
@@ -177,6 +178,32 @@ def test_simulations_on_all_threads_at_once_have_the_bits_of_each_alone():
         one.join()
     for a, b in zip(alone, together, strict=True):
         assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))
+
+
+def test_other_threads_read_energies_while_a_run_begins_and_goes_on():
+    """Two threads that use one engine at once end in a segmentation fault, or in another run."""
+    stages = [{"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 4.0, "timestep_fs": 10.0}]
+    scene = small_scene({"argon": 40}, 20.0, stages=stages, output={"log_interval_ps": 0.01})
+    alone = Simulation(scene).run()
+    simulation = Simulation(scene)
+    has_ended = threading.Event()
+
+    def read() -> int:
+        count = 0
+        while not has_ended.is_set():
+            values = simulation.energy, simulation.observation.potential, *simulation.forces.flat
+            assert np.isfinite(values).all()
+            count += 1
+        return count
+
+    with ThreadPoolExecutor(2) as pool:
+        readers = [pool.submit(read) for _ in range(2)]
+        try:
+            results = simulation.run()
+        finally:
+            has_ended.set()
+        assert all(reader.result() > 1 for reader in readers)
+    assert results.state.position.tobytes() == alone.state.position.tobytes()
 
 
 def test_other_threads_of_python_go_on_while_steps_are_taken():

@@ -19,6 +19,29 @@ from rigidmd.errors import SettingError
 PROCESS_LOCK = threading.RLock()
 
 
+class FairLock:
+    """A reentrant lock. A thread that waits gets it before the one that has just released it."""
+
+    def __init__(self) -> None:
+        self._queue, self._lock = threading.Lock(), threading.Lock()
+        self._owner: int | None = None
+        self._depth = 0
+
+    def __enter__(self) -> None:
+        thread = threading.get_ident()
+        if self._owner != thread:
+            with self._queue:
+                self._lock.acquire()
+            self._owner = thread
+        self._depth += 1
+
+    def __exit__(self, *error: object) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self._owner = None
+            self._lock.release()
+
+
 @contextlib.contextmanager
 def ignore_warnings() -> Iterator[None]:
     """Hide all warnings within the block. Python has one list of warning filters for all

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 from rigidmd.core.toml import Json
 
@@ -25,6 +26,18 @@ else:
     SEPARATE_GROUP: Json = {"start_new_session": True}
 #: Number of the signal that ends a process at once, which Windows has no name for.
 KILL_SIGNAL = 9
+
+
+def has_handler(number: int) -> bool:
+    """Whether this program handles a signal: in Python, or in C as `faulthandler.register` does,
+    which only Linux shows."""
+    if signal.getsignal(number) != signal.SIG_DFL:
+        return True
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("SigCgt:"):
+                return bool(int(line.split()[1], 16) >> (number - 1) & 1)
+    return False
 
 
 def stop_process(process: subprocess.Popen) -> None:

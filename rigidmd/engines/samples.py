@@ -154,20 +154,21 @@ def lambda_column(value: float) -> tuple[str, Column]:
     )
 
 
+def energy_column(name: str) -> Column:
+    """The column of the energy of a user-defined force."""
+    return Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")
+
+
 def more_columns(names: Sequence[str]) -> dict[str, Column]:
     """The columns of user-defined forces, of restrained distances, of other values of lambda and of
     the trajectories of hybrid Monte Carlo."""
-
-    def energy(name):
-        return Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")
-
     known = OF_TRAJECTORIES | dict(
         distance_column(int(match[1])) for name in names if (match := DISTANCE.fullmatch(name))
     )
     known |= dict(
         lambda_column(float(match[1])) for name in names if (match := LAMBDA.fullmatch(name))
     )
-    return {name: known.get(name) or energy(name) for name in names}
+    return {name: known.get(name) or energy_column(name) for name in names}
 
 
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]

@@ -159,6 +159,8 @@ def read_columns(path: Path) -> Columns | None:
         with writing(path, "read"), path.open(encoding="utf-8", newline="") as file:
             rows = csv.reader(_lines(file))
             head = next(rows, [])
+            if repeated := [header for header in head if head.count(header) > 1]:
+                raise OutputError(f"{path} has the column {repeated[0]!r} twice")
             lines = [line for line in rows if len(line) == len(head)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise OutputError(f"{path} cannot be read: {error}") from None

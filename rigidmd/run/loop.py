@@ -17,7 +17,6 @@ import numpy as np
 from rigidmd.compile.cache import compiling_announced, describe_cache
 from rigidmd.core.files import LostFileError, writing
 from rigidmd.core.process import PROCESS_LOCK
-from rigidmd.core.signals import CHECKPOINT_SIGNALS
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines.protocol import Halted, NotFiniteError
 from rigidmd.errors import OutputError, RigidMDError, SimulationError, resume_command
@@ -33,6 +32,7 @@ from rigidmd.run.schedule import (
     SEGMENT_SECONDS,
     CheckpointSchedule,
     ObservationSchedule,
+    checkpoint_signals,
     interruptible,
     signal_handler,
     stop_signals,
@@ -121,10 +121,10 @@ class RunLoop:
         self._progress = progress
         with contextlib.ExitStack() as stack:
             stack.enter_context(
-                signal_handler(self._simulation._ask_for_checkpoint, *CHECKPOINT_SIGNALS)
+                signal_handler(self._simulation._ask_for_checkpoint, *checkpoint_signals())
             )
             if self._next == self._open:
-                with self._running():
+                with self._running(), self._part.lock:
                     self._open()
             part = self._part
             total = sum(self._part.durations())
@@ -417,7 +417,8 @@ class RunLoop:
         part = self._part
         position = self._part.record.position
         k = len(position.computing)
-        part.segment = part.enter_segment(k)
+        with part.lock:
+            part.segment = part.enter_segment(k)
         position.segment = k
         position.first = int(part.state.step[NOW])
         position.seconds = 0.0
@@ -433,7 +434,8 @@ class RunLoop:
         self._schedule = ObservationSchedule(observers, segment)
         if segment.action is not None:
             began = clock.perf_counter()
-            segment.action(self._progress)
+            with self._part.lock:
+                segment.action(self._progress)
             self._part.record.position.seconds = clock.perf_counter() - began
             self._notify(0, [each.interval is not None or each.ends for each in observers])
         self._shown, self._pace = None, inf
@@ -461,9 +463,10 @@ class RunLoop:
         )
         began = clock.perf_counter()
         try:
-            part.engine.advance(
-                part.state, segment.method, segment.dt, position.first + to, with_energies
-            )
+            with part.lock:
+                part.engine.advance(
+                    part.state, segment.method, segment.dt, position.first + to, with_energies
+                )
         except Halted:
             self._next = self._leave
             return

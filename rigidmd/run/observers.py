@@ -62,7 +62,9 @@ class Moment:
     def observation(self) -> "Observation | Any":
         """Evaluated at its first use, for all observers: an `Observation` of molecules, in the
         units of the log, or the `Pose` of a body, in SI units."""
-        return self._run._part.observe(self)
+        part = self._run._part
+        with part.lock:
+            return part.observe(self)
 
     @property
     def sample(self) -> "Sample":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar, cast
 import numpy as np
 
 from rigidmd.core.integrators import SCHEMES
+from rigidmd.core.process import FairLock
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.core.toml import Json
 from rigidmd.engines.protocol import Engine
@@ -52,6 +53,8 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
 
     def __init__(self, simulation: "Simulation"):
         self.simulation = simulation
+        #: Held while the engine computes: other threads may read observables.
+        self.lock = FairLock()
 
     @property
     def scene(self):

@@ -60,7 +60,10 @@ class Record(Generic[SystemT]):
     @property
     def log(self: "Record[System]") -> samples.Samples:
         """The samples of a run of molecules. NaN in columns that log.csv does not have."""
-        names = self.system.more_columns
+        more = self.system.more_columns
+        # energies of user-defined forces, which the system is read without
+        known = {*samples.IN_LOGS, *more}
+        names = (*(name for name in self.columns if name not in known), *more)
         unknown = np.full(len(self.time), np.nan)
         table = np.column_stack(
             [self.columns.get(name, unknown) for name in (*samples.NUMBERS, *names)]
@@ -128,7 +131,12 @@ def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
     lambdas = () if scene.coupling is None else scene.coupling.lambdas
     more = distances | dict(map(samples.lambda_column, lambdas))
     known = HEADERS | {column.header: name for name, column in more.items()}
-    headers = {known[header]: header for header in read.cells if header in known}
+    unit = samples.energy_column("").header
+    headers = {
+        known.get(header) or header.removesuffix(unit): header
+        for header in read.cells
+        if header in known or header.endswith(unit)
+    }
     if lacking := [name for name in ("step", "time", "stage_name") if name not in headers]:
         header = samples.COLUMNS[lacking[0]].header
         raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {header!r}")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.signals import STOP_SIGNAL
+from rigidmd.core.signals import CHECKPOINT_SIGNALS, STOP_SIGNAL, has_handler
 from rigidmd.io.checkpoint import Checkpoint, write_checkpoint
 from rigidmd.run.observers import Observer, above_zero
 
@@ -146,12 +146,14 @@ def signal_handler(handler: Callable[[int], None], *numbers: int) -> Iterator[No
 
 
 def stop_signals() -> list[int]:
-    """The signals that end runs: Ctrl-C, and SIGTERM (on Windows Ctrl-Break) unless the program has
-    its own handler."""
-    return [
-        signal.SIGINT,
-        *([STOP_SIGNAL] if signal.getsignal(STOP_SIGNAL) == signal.SIG_DFL else []),
-    ]
+    """The signals that end runs: Ctrl-C, and SIGTERM (on Windows Ctrl-Break) unless the program
+    handles it."""
+    return [signal.SIGINT, *([] if has_handler(STOP_SIGNAL) else [STOP_SIGNAL])]
+
+
+def checkpoint_signals() -> list[int]:
+    """The signals that request a checkpoint, unless the program handles them."""
+    return [number for number in CHECKPOINT_SIGNALS if not has_handler(number)]
 
 
 #: Seconds until a Ctrl-C is repeated that came where Python ignores exceptions.

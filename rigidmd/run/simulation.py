@@ -27,7 +27,6 @@ import numpy as np
 
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.display import Displayed
-from rigidmd.core.signals import CHECKPOINT_SIGNALS
 from rigidmd.core.state import State
 from rigidmd.core.toml import Json
 from rigidmd.errors import RigidMDError, RigidMDWarning, SceneError
@@ -37,7 +36,12 @@ from rigidmd.io.scene_file import write_scene
 from rigidmd.run.loop import RunLoop
 from rigidmd.run.observers import as_observer
 from rigidmd.run.results import Results
-from rigidmd.run.schedule import checked_walltime, signal_handler, stop_signals
+from rigidmd.run.schedule import (
+    checked_walltime,
+    checkpoint_signals,
+    signal_handler,
+    stop_signals,
+)
 from rigidmd.scene import BodyScene, Scene
 
 if TYPE_CHECKING:
@@ -284,7 +288,7 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     @property
     def observation(self) -> "Observation | Pose":
         """Observables of the current state, before, within and after a run. Each use evaluates the
-        forces.
+        forces. Another thread waits for the steps that are being computed.
 
         An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log. The `Pose` of a body,
         in SI units.
@@ -294,19 +298,22 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         SimulationError
             If the forces cannot be evaluated.
         """
-        return self._part.observe_now()
+        with self._part.lock:
+            return self._part.observe_now()
 
     @property
     def energy(self) -> float:
         """Potential plus kinetic energy of the current state, kJ/mol, for a body J. `observation`
         has both."""
-        return self._part.energy_now()
+        with self._part.lock:
+            return self._part.energy_now()
 
     @property
     def forces(self) -> np.ndarray:
         """Forces (n, 3) on the centres of mass at the current state, lab frame, kJ/mol/Å. On a body
         (1, 3) in N, empty if it is pinned."""
-        return self._part.forces_now()
+        with self._part.lock:
+            return self._part.forces_now()
 
     @property
     def notes(self) -> list[str]:
@@ -388,7 +395,9 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
     def atoms(self) -> "ase.Atoms":
         """The current state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers
         may call it."""
-        return self._molecules(begun=True).atoms()
+        part = self._molecules(begun=True)
+        with part.lock:
+            return part.atoms()
 
     def compile(self) -> None:
         """Compile what a run needs, or read it from the cache, without running: before a course, or
@@ -605,7 +614,7 @@ def run_together(
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(signal_handler(stop, *stop_signals()))
-        stack.enter_context(signal_handler(ask_for_checkpoints, *CHECKPOINT_SIGNALS))
+        stack.enter_context(signal_handler(ask_for_checkpoints, *checkpoint_signals()))
         pool = stack.enter_context(ThreadPoolExecutor(jobs or MOST_THREADS, "run"))
         futures = [pool.submit(run, simulation) for simulation in simulations]
         running = set(futures)

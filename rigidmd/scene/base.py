@@ -43,6 +43,7 @@ from rigidmd.scene.validation import (
     Section,
     exact_names,
     is_within,
+    limit_number,
     location_of,
     numbers_out_of_range,
     setting,
@@ -260,6 +261,8 @@ class Scene(Section, Displayed):
             )
         wrong = numbers_out_of_range(data, *kind.SIZES)
         faults += [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]
+        for keys, _ in wrong:  # checks of whole tables calculate with all numbers
+            limit_number(data, keys, *kind.SIZES)
         faults += kind.contradictions(data, text)
         for keys, name in values_in(data):
             key = ".".join(map(str, keys))
@@ -281,7 +284,8 @@ class Scene(Section, Displayed):
         try:
             scene = kind.model_validate(complete, context=rows)
         except ValidationError as error:
-            faults += validation_messages(error, kind, text, overridden)
+            reported = [keys for keys, _ in wrong]
+            faults += validation_messages(error, kind, text, overridden, reported)
         if scene is None or faults:
             raise SceneError(
                 source, [fault + _removal_hint(fault, data, overridden) for fault in faults]

@@ -5,9 +5,10 @@ import ast
 import inspect
 import re
 from collections.abc import Collection, Container, Iterable
-from functools import cache
+from functools import cache, reduce
 from itertools import pairwise
-from math import isfinite
+from math import copysign, isfinite
+from operator import getitem
 from typing import Annotated, Literal, TypeVar, overload
 
 from pydantic import (
@@ -115,10 +116,18 @@ def not_none(value: T | None) -> T:
 
 
 def validation_messages(
-    error: ValidationError, model: type[BaseModel], text: str = "", overridden: Iterable[str] = ()
+    error: ValidationError,
+    model: type[BaseModel],
+    text: str = "",
+    overridden: Iterable[str] = (),
+    reported: Iterable[list] = (),
 ) -> list[str]:
     """One message for each error of pydantic: line (if the TOML text is given), key, what was
-    expected. Keys in `overridden` are set by the command line and have no line."""
+    expected.
+
+    overridden : keys that are set by the command line and have no line
+    reported : paths of keys that have messages already
+    """
     faults: dict[tuple, list[str]] = {}
     for detail in error.errors(include_url=False):
         unknown = detail["type"] == "extra_forbidden"  # the last key is text of the user
@@ -132,11 +141,12 @@ def validation_messages(
         faults.setdefault(tuple(keys), []).append(sentence)
     # pydantic reports one error for each type that a value may have: join them. An error inside a
     # value is more specific than an error of the whole value.
-    around = {keys[:depth] for keys in faults for depth in range(1, len(keys))}
+    known = set(map(tuple, reported))
+    around = {keys[:depth] for keys in {*faults, *known} for depth in range(1, len(keys))}
     return [
         f"{location_of(list(keys), text, overridden)}: {_either(list(dict.fromkeys(sentences)))}"
         for keys, sentences in faults.items()
-        if keys not in around
+        if keys not in around | known
     ]
 
 
@@ -152,6 +162,14 @@ def numbers_out_of_range(data: object, least: float, largest: float) -> list[tup
         and not least <= abs(value) <= largest
         and isfinite(value)
     ]
+
+
+def limit_number(data: Json, keys: list, least: float, largest: float) -> None:
+    """Replace the number at a path of keys by the nearest one of the same sign whose absolute value
+    is in these limits."""
+    *path, last = keys
+    table = reduce(getitem, path, data)
+    table[last] = copysign(min(max(abs(table[last]), least), largest), table[last])
 
 
 def _either(sentences: list[str]) -> str:
