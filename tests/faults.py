@@ -66,7 +66,7 @@ FAULTS = (
     "allocation",
     "limit",
 )
-HANGS = 300.0  # s, after which an attempt has hung, however busy the machine is
+HANGS = 900.0  # s, after which an attempt has hung, however busy the machine is
 #: Functions that work on files, by the name that a C function has.
 FILE_CALLS = (
     "write",

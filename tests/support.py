@@ -138,7 +138,6 @@ def gmx(folder: Path, *arguments, text: str = "") -> str:
         input=text,
         capture_output=True,
         text=True,
-        timeout=120,
     )
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-1500:]
     return done.stdout

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from processes import search_path
 from support import BODIES, ROOT, small_scene
 
 from rigidmd.assemble.build import build
@@ -576,7 +577,7 @@ def test_a_term_of_somebody_elses_spoils_no_cache(tmp_path):
     ):
         environment = os.environ | {
             "RIGIDMD_CACHE": str(tmp_path / "cache"),
-            "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path, path))),
+            **search_path(tmp_path, path),
         }
         done = subprocess.run(
             [sys.executable, "-c", script],

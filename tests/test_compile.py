@@ -25,6 +25,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.typing.templates import ConcreteTemplate
+from processes import search_path, with_settings
 
 from rigidmd.compile import (
     BoundTask,
@@ -40,6 +41,7 @@ from rigidmd.compile import (
 from rigidmd.compile.cache import CacheIndex, cache_folder, compiling_announced
 from rigidmd.compile.front_end import UNUSED_PASSES
 from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
+from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.compile.records import (
     ARRAY_FIELDS,
     array_format,
@@ -184,7 +186,7 @@ def test_an_inner_kernel_is_kept_and_linked_into_other_kernels_later(tmp_path):
     (tmp_path / "own.py").write_text(LATER)
     environment = os.environ | {
         "RIGIDMD_CACHE": str(tmp_path / "cache"),
-        "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
+        **search_path(tmp_path),
     }
     for name, printed in (
         ("twice", "[2. 4.] 0"),
@@ -397,15 +399,21 @@ def with_compilers(count: str, asked: str, tmp_path) -> subprocess.CompletedProc
     environment = os.environ | {
         "RIGIDMD_CACHE": str(tmp_path / "cache"),
         "RIGIDMD_COMPILERS": count,
-        "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests"))),
+        **search_path(ROOT / "tests"),
     }
     return subprocess.run(
-        [sys.executable, "-c", asked], env=environment, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", asked], env=environment, capture_output=True, text=True
     )
 
 
+two_cores = pytest.mark.skipif(
+    MOST_THREADS < 2, reason="where there is one core, one process compiles"
+)
+
+
+@two_cores
 def test_a_second_process_compiles_the_last_tasks_first(tmp_path):
-    done = with_compilers("2", BOTH.replace("WAIT", "120"), tmp_path)
+    done = with_compilers("2", BOTH.replace("WAIT", "900"), tmp_path)
     assert done.stdout.split("\n")[0] == "[1, 1]", done.stderr
 
 
@@ -433,9 +441,7 @@ print(len(made), Code(add=(_add, contents[0])).address("add") == made[1][0].addr
 """
 
 
-@pytest.mark.skipif(
-    (os.cpu_count() or 1) < 2, reason="where there is one core, one process compiles"
-)
+@two_cores
 def test_codes_are_planned_and_then_compiled_together(tmp_path):
     """First without addresses; then with them; once more only planned, since nothing is left to
     compile."""
@@ -482,12 +488,8 @@ MACHINE = (
 
 def machine_with(**settings):
     """Bits of vectors, and the name of the cache, where the environment has these settings."""
-    environment = {
-        key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")
-    } | settings
-    done = subprocess.run(
-        [sys.executable, "-c", MACHINE], env=environment, cwd=ROOT, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", MACHINE]
+    done = subprocess.run(command, env=with_settings(**settings), capture_output=True, text=True)
     return done.stdout.split()
 
 
@@ -566,7 +568,8 @@ def compiled_in(folders, tmp_path, before=""):
         (tmp_path / "own.py").write_text(KERNEL)
     environment = os.environ | {
         "RIGIDMD_CACHE": str(folders[0]),
-        "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
+        "XDG_CACHE_HOME": str(tmp_path / "numba"),  # where Numba tries to write in its turn
+        **search_path(tmp_path),
     }
     command = [sys.executable, "-c", f"{before}\n{WITH_CACHES}", *map(str, folders)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
@@ -636,7 +639,7 @@ def hits_with(tmp_path, before: str, value: str) -> int:
     script = f"{before}\nfrom sums import double; double({value}); print(sum(double.stats.cache_hits.values()))"
     environment = os.environ | {
         "RIGIDMD_CACHE": str(tmp_path / "cache"),
-        "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
+        **search_path(tmp_path),
     }
     done = subprocess.run(
         [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
@@ -733,7 +736,7 @@ def test_without_a_home_folder_the_cache_is_a_temporary_one(home, tmp_path):
         "print(cache.describe_cache(), cache.is_persistent(), cache.cache_folder())"
     )
     environment = {name: value for name, value in os.environ.items() if name != "RIGIDMD_CACHE"}
-    environment |= {"TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    environment |= {"TMPDIR": str(tmp_path)}
     (tmp_path / "here").mkdir()
     done = subprocess.run(
         [sys.executable, "-c", script],

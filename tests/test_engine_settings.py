@@ -555,7 +555,6 @@ print(json.dumps(results))
 """
 
 
-@pytest.mark.timeout(900)  # a process that compiles
 def test_adding_an_engine_takes_a_folder_and_a_file(tmp_path):
     folder, programs = tmp_path / "engines" / "mirror", tmp_path / "programs"
     folder.mkdir(parents=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import ROOT
+from processes import WAIT, process, search_path, wait_until
 
 import rigidmd
 from rigidmd.commands import cli
@@ -44,6 +44,7 @@ temperature_K = 298.0
 duration_ps = 0.1
 """
 TRAJECTORY = "trajectory.xtc"
+PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 #: So long that a test ends it, without the estimate of the longest stable step that a long run
 #: makes.
 LONG = ("--set", "stages.0.duration_ps=1000", "--set", "watch.stable_step=false")
@@ -75,24 +76,8 @@ def command(scene: Path, folder: Path, *more: str) -> list[str]:
 
 def ran(arguments: list[str], **options) -> subprocess.CompletedProcess:
     """A finished process, with what it wrote."""
-    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
-    return subprocess.run(
-        arguments, timeout=300, env=environment() | options.pop("env", {}), **options
-    )
-
-
-def environment() -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": str(ROOT)}
-
-
-def started(arguments: list[str], log: Path) -> subprocess.Popen:
-    """A process that has begun to write its log."""
-    process = subprocess.Popen(
-        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment()
-    )
-    while process.poll() is None and not (log.exists() and log.stat().st_size > 2000):
-        time.sleep(0.005)
-    return process
+    options = PIPES | options
+    return subprocess.run(arguments, env=os.environ | options.pop("env", {}), **options)
 
 
 def same(scene: Path, folder: Path) -> bool:
@@ -151,11 +136,13 @@ def test_a_disk_that_fills(size, scene, disk, tmp_path):
 
 
 def test_a_folder_that_is_removed_meanwhile(scene, tmp_path):
-    run = started(command(scene, tmp_path / "run", *LONG), tmp_path / "run" / LOG)
-    (tmp_path / "run").rename(
-        tmp_path / "gone"
-    )  # at once: one file after another may leave a checkpoint for a moment
-    said = run.communicate(timeout=60)[1].decode()
+    log = tmp_path / "run" / LOG
+    with process(command(scene, tmp_path / "run", *LONG), **PIPES) as run:
+        wait_until(lambda: log.exists() and log.stat().st_size > 2000, run)
+        (tmp_path / "run").rename(
+            tmp_path / "gone"
+        )  # at once: one file after another may leave a checkpoint for a moment
+        said = run.communicate()[1].decode()
     assert run.returncode == 2
     # the file that the run is writing to, or the next one, whichever it notices first
     assert (
@@ -209,8 +196,7 @@ def test_a_poor_environment(changed, scene, tmp_path):
     done = subprocess.run(
         command(scene, folder),
         capture_output=True,
-        env=kept | changed | {"PYTHONPATH": str(ROOT)},
-        timeout=300,
+        env=kept | changed | search_path(),
     )
     assert done.returncode == 0, done.stderr
     assert b"rigidmd view" in done.stdout
@@ -226,15 +212,11 @@ def test_a_run_that_is_stopped_by_signals_goes_on(sent, scene, tmp_path):
     """At 25 random moments each, preparing included."""
     rng = np.random.default_rng(int(sent))
     for _ in range(25):
-        run = subprocess.Popen(
-            command(scene, tmp_path / "run", "--resume", "--set", "stages.0.duration_ps=0.5"),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=environment(),
-        )
-        time.sleep(float(rng.uniform(1.0, 8.0)))  # not while Python itself starts
-        run.send_signal(sent)
-        said = run.communicate(timeout=120)[1].decode()
+        words = ("--resume", "--set", "stages.0.duration_ps=0.5")
+        with process(command(scene, tmp_path / "run", *words), **PIPES) as run:
+            time.sleep(float(rng.uniform(1.0, 8.0)))  # not while Python itself starts
+            run.send_signal(sent)
+            said = run.communicate(timeout=WAIT)[1].decode()
         assert run.returncode in (0, 128 + sent, -sent), said
         assert "Traceback" not in said
     shutil.copytree(scene.parent / "whole", tmp_path / "whole")
@@ -277,15 +259,11 @@ def test_a_command_that_is_interrupted_while_it_compiles(scene, tmp_path):
     rng = np.random.default_rng(4)
     for k in range(9):
         cache = {"RIGIDMD_CACHE": str(tmp_path / f"cache{k}")}
-        run = subprocess.Popen(
-            command(scene, tmp_path / f"run{k}"),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=environment() | cache,
-        )
-        time.sleep(float(rng.uniform(1.0, 20.0)))
-        run.send_signal(signal.SIGINT)
-        said = run.communicate(timeout=300)[1].decode()
+        environ = os.environ | cache
+        with process(command(scene, tmp_path / f"run{k}"), env=environ, **PIPES) as run:
+            time.sleep(float(rng.uniform(1.0, 20.0)))
+            run.send_signal(signal.SIGINT)
+            said = run.communicate(timeout=WAIT)[1].decode()
         assert run.returncode == 130, said
         assert "Traceback" not in said and "no compiled object" not in said
     assert ran(command(scene, tmp_path / "last"), env=cache).returncode == 0
@@ -294,19 +272,14 @@ def test_a_command_that_is_interrupted_while_it_compiles(scene, tmp_path):
 
 @pytest.mark.soak
 def test_two_first_compilations_at_once(scene, tmp_path):
-    environ = environment() | {"RIGIDMD_CACHE": str(tmp_path / "cache")}
-    both = [
-        subprocess.Popen(
-            command(scene, tmp_path / f"run{k}"),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=environ,
-        )
-        for k in range(2)
-    ]
-    for k, run in enumerate(both):
-        assert b"Traceback" not in run.communicate(timeout=900)[1] and run.returncode == 0
-        assert same(scene, tmp_path / f"run{k}")
+    options = {"env": os.environ | {"RIGIDMD_CACHE": str(tmp_path / "cache")}} | PIPES
+    with (
+        process(command(scene, tmp_path / "run0"), **options) as first,
+        process(command(scene, tmp_path / "run1"), **options) as second,
+    ):
+        for run in (first, second):
+            assert b"Traceback" not in run.communicate(timeout=WAIT)[1] and run.returncode == 0
+    assert same(scene, tmp_path / "run0") and same(scene, tmp_path / "run1")
 
 
 def test_a_run_that_was_killed_at_its_first_file_begins_again(scene, tmp_path):

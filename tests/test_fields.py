@@ -854,7 +854,6 @@ print(json.dumps({
 """
 
 
-@pytest.mark.timeout(900)  # processes that compile
 def test_adding_a_field_takes_two_files(tmp_path):
     files = {
         "scene/fields.py": edited(

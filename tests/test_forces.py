@@ -967,7 +967,6 @@ print(json.dumps({
 """
 
 
-@pytest.mark.timeout(900)  # processes that compile
 def test_adding_a_pair_potential_takes_two_files(tmp_path):
     files = {
         "scene/forces.py": edited(

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from itertools import product
@@ -21,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import process, wait_until
 from scenes import FORTY_WATERS, MINIMISE, NPH, NPT, NVE, NVT, forty_waters
 from stops import contents, same_after_stops, stopped_at
 from support import ROOT, small_scene
@@ -597,7 +599,7 @@ for end in {ends}:
         break
 """
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=again, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", program], cwd=again, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     for end in ends:
@@ -1035,14 +1037,11 @@ def killed(command: list[str], after: float) -> int:
     """Kill a command this many seconds after it has written to its log; its exit code."""
     log = Path(command[command.index("-o") + 1]) / "log.csv"
     before = log.stat().st_mtime_ns if log.exists() else None
-    run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while run.poll() is None and (not log.exists() or log.stat().st_mtime_ns == before):
-        time.sleep(0.005)
-    try:
-        return run.wait(after)
-    except subprocess.TimeoutExpired:
-        run.kill()
-        return run.wait()
+    with process(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
+        wait_until(lambda: log.exists() and log.stat().st_mtime_ns != before, run)
+        with suppress(subprocess.TimeoutExpired):
+            run.wait(after)
+    return run.returncode
 
 
 @pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.soak)])
@@ -1109,7 +1108,7 @@ def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     scene = (stopped / "water.toml").read_text().replace("duration_ps = 0.1", "duration_ps = 12.0")
     (tmp_path / "water.toml").write_text(scene)
     path = f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"
-    environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PATH": path}
     subprocess.run(["bash", "job.sh"], cwd=tmp_path, env=environment, check=True)
     assert len((tmp_path / "jobs").read_text().splitlines()) >= 2
     assert cli.main(["run", str(tmp_path / "water.toml"), "-o", str(tmp_path / "whole")]) == 0

@@ -8,7 +8,7 @@ import re
 import signal
 import subprocess
 import sys
-import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import MDAnalysis as mda
@@ -16,6 +16,7 @@ import numba
 import numpy as np
 import pytest
 from MDAnalysis.lib.formats.libmdaxdr import XTCFile
+from processes import process, wait_until
 from support import MOLECULES, ROOT, built, observe, shaken, small_scene
 
 import rigidmd
@@ -553,9 +554,11 @@ def test_two_engines_agree_by_the_size_of_each_quantity(density, gap, agrees):
     )
 
 
-def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=1, **made):
+def summarised(
+    stage, counts=None, momentum=0.0, truncation="switch", seed=1, before=(), after=(), **made
+):
     """The summary of made-up samples of one stage: values (n,) of columns; others are still or
-    noise."""
+    noise. The stages before and after it have one sample each."""
     rng, n = np.random.default_rng(seed), len(next(iter(made.values())))
     given = {
         "ensemble": "nvt",
@@ -566,21 +569,24 @@ def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=1, **
     scene = small_scene(
         counts or {"spce": 40},
         16.0,
-        stages=[given],
+        stages=[*before, given, *after],
         forces={"cutoff_A": 7.9, "truncation": truncation},
     )
-    system = build(scene)
+    system, made_stage = build(scene), len(before)
     state = system.state.copy()
     mass = float(system.model.mass[system.model.species].sum())
     state.velocity[:] = [momentum * np.sqrt(BOLTZMANN * 300.0 / mass), 0.0, 0.0]
-    rows = Samples(["nvt"])
-    for k in range(n):
+    rows = Samples([one.label for one in scene.stages])
+    samples = [(k, None) for k in range(made_stage)]
+    samples += [(made_stage, k) for k in range(n)]
+    samples += [(k, None) for k in range(made_stage + 1, len(scene.stages))]
+    for k, (of_stage, index) in enumerate(samples):
         plain = {name: 300.0 + rng.standard_normal() for name in COLUMNS if "temperature" in name}
-        own = {name: float(values[k]) for name, values in made.items()}
+        own = {} if index is None else {name: float(made[name][index]) for name in made}
         row = (
             dict.fromkeys(COLUMNS, 0.0)
             | plain
-            | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
+            | {"stage_name": "", "step": k, "stage": of_stage, "kinetic": 100.0}
         )
         rows.append(
             Sample(
@@ -588,7 +594,7 @@ def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=1, **
             )
         )
     record = MolecularRecord()
-    record.position.computing = [1.0]
+    record.position.computing = [1.0] * len(scene.stages)
     return summarise(system, record, rows, state, 0.0, 1.0, interrupted=False)
 
 
@@ -679,34 +685,44 @@ def test_a_drift_has_a_verdict(slope, noise, verdict):
     assert summarised(KEPT, drift=drift[:10])["stages"][0]["drift_verdict"] is None
 
 
-def test_constant_energy_after_a_thermostat_explains_its_temperature():
-    warm = {
-        "ensemble": "npt",
-        "temperature_K": [80.0, 100.0],
-        "pressure_bar": 10.0,
-        "duration_ps": 0.5,
-    }
-    stages = [{"ensemble": "minimise"}, warm, {"duration_ps": 5.0}, {"duration_ps": 0.1}]
-    results = Simulation(
-        small_scene({"argon": 40}, 19.0, stages=stages, output={"log_interval_ps": 0.01})
-    ).run()
-    _, one, two, three = results.summary["stages"]
+@pytest.mark.parametrize(
+    ("off", "spread", "hint"),
+    [
+        (-0.5, 3.0, ""),
+        (-50.0, 3.0, ", less than this: equilibrate longer"),
+        (30.0, 20.0, None),  # more than a canonical ensemble has: sampling hides the scatter
+    ],
+)
+def test_constant_energy_after_a_thermostat_explains_its_temperature(off, spread, hint):
+    """Temperatures of 40 argon atoms, with 117 degrees of freedom, scatter by 2 T²/117 less their
+    variance at constant energy."""
+    warm = {"ensemble": "npt", "temperature_K": [80.0, 100.0], "pressure_bar": 10.0}
+    nve = {"ensemble": "nve", "temperature_K": None}
+    noise = np.random.default_rng(2).standard_normal(400)
+    series = 100.0 + off + spread * (noise - noise.mean()) / noise.std()
+    found = summarised(
+        nve,
+        {"argon": 40},
+        before=[warm | {"duration_ps": 0.5}],
+        after=[{"ensemble": "nve", "duration_ps": 0.1}],
+        temperature=series,
+    )
+    one, two, three = found["stages"]
     assert one["set_temperature_K"] == (80.0, 100.0) and "temperature_scatter_K" not in one
     assert "temperature_scatter_K" not in three  # nothing was drawn at its start
-    steady = results["temperature"][
-        (results["stage"] == 2) & (results["time"] > two["equilibrated_from_ps"] - 1e-9)
-    ]
-    square = 2 * steady.mean() ** 2 / 117 - steady.var()
-    assert two["temperature_scatter_K"] == pytest.approx(np.sqrt(square))
     assert two["temperature_before_K"] == 100.0
-    text = summary_text(results.summary)
-    off = two["temperature_K"] - 100.0
+    text = summary_text(found | {"scene": "made up"})
+    assert "set point 80 to 100 K" in text and "set point 10 bar" in text
+    if hint is None:
+        assert two["temperature_scatter_K"] is None and "from the 100 K before" not in text
+        return
+    level, variance = 100.0 + off, spread**2
+    scatter = np.sqrt(2 * level**2 / 117 - variance)
+    assert two["temperature_scatter_K"] == pytest.approx(scatter, rel=1e-9)
     assert (
         f"{off:+.2g} K from the 100 K before: an NVE stage keeps the energy at its start. Such"
-        in text
+        f" temperatures scatter by {scatter:.2g} K{hint}\n" in text
     )
-    assert ("equilibrate longer" in text) == (abs(off) > 3 * two["temperature_scatter_K"])
-    assert "set point 80 to 100 K" in text and "set point 10 bar" in text
 
 
 @pytest.mark.soak
@@ -726,7 +742,7 @@ def test_temperatures_at_constant_energy_scatter_as_estimated():
     ]
     found = [results.summary["stages"][1] for results in run_together(runs) if results]
     measured = np.std([stage["temperature_K"] for stage in found], ddof=1)
-    estimated = np.sqrt(np.mean([stage["temperature_scatter_K"] ** 2 for stage in found]))
+    estimated = np.sqrt(np.mean([(stage["temperature_scatter_K"] or 0.0) ** 2 for stage in found]))
     assert measured == pytest.approx(estimated, rel=3 / np.sqrt(2 * 39))
 
 
@@ -1191,23 +1207,17 @@ def test_observers_cannot_write_to_the_state():
         ).run()
 
 
+@contextmanager
 def running(tmp_path, lines):
     """A long argon run in another process, once its log has this many lines: (process, its
     folder)."""
     scene, out = str(ROOT / "systems" / "argon.toml"), tmp_path / "out"
     arguments = ["run", scene, "-o", str(out), "--set", "stages.0.duration_ps=1000"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rigidmd", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 120
-    while not ((out / "log.csv").exists() and (out / "log.csv").read_text().count("\n") > lines):
-        assert time.monotonic() < deadline, "the run did not get going"
-        assert process.poll() is None, process.stderr.read()
-        time.sleep(0.05)
-    return process, out
+    command = [sys.executable, "-m", "rigidmd", *arguments]
+    log, pipe = out / "log.csv", subprocess.PIPE
+    with process(command, stdout=pipe, stderr=pipe, text=True) as run:
+        wait_until(lambda: log.exists() and log.read_text().count("\n") > lines, run)
+        yield run, out
 
 
 def frames_in(folder):
@@ -1219,12 +1229,12 @@ def frames_in(folder):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_stops_with_a_summary_and_its_code(number, code, tmp_path):
     """Ctrl-C, and what a batch system sends when time is up: maybe more than once."""
-    process, folder = running(tmp_path, 3)
-    process.send_signal(number)
-    if number == signal.SIGTERM:
-        process.send_signal(number)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == code
+    with running(tmp_path, 3) as (run, folder):
+        run.send_signal(number)
+        if number == signal.SIGTERM:
+            run.send_signal(number)
+        out, err = run.communicate()
+    assert run.returncode == code
     assert "interrupted" in out
     assert "Traceback" not in err
     assert json.loads((folder / "summary.json").read_text())["interrupted"]
@@ -1518,9 +1528,8 @@ def test_a_name_in_a_figure_costs_no_summary(tmp_path):
 
 
 def test_a_killed_run_leaves_a_readable_log_and_trajectory(tmp_path):
-    process, folder = running(tmp_path, 100)
-    process.kill()
-    process.communicate()
+    with running(tmp_path, 100) as (_, folder):
+        pass
     with (folder / "log.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) >= 99

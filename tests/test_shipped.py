@@ -8,6 +8,7 @@ import sys
 import tomllib
 
 import pytest
+from processes import process
 from support import BODIES, ROOT, SYSTEMS
 
 from rigidmd.commands.cli import main
@@ -150,19 +151,17 @@ def test_help_uses_a_pager_on_a_terminal(terminal):
         "-c",
         "import sys; from rigidmd.commands.cli import main; main(['help', 'top'])",
     ]
-    settings = {"env": os.environ | {"PAGER": "sed s/^/paged:/", "TERM": "xterm"}, "timeout": 60}
+    settings = {"env": os.environ | {"PAGER": "sed s/^/paged:/", "TERM": "xterm"}}
     if not terminal:
         out = subprocess.run(command, **settings, capture_output=True, text=True).stdout
         assert out.startswith("# ") and "paged:" not in out
         return
     leader, follower = pty.openpty()
-    process = subprocess.Popen(
-        command, env=settings["env"], stdin=follower, stdout=follower, stderr=follower
-    )
-    os.close(follower)
-    out = b""
-    while b"\n" not in out:
-        out += os.read(leader, 1000)
-    os.close(leader)
-    process.wait(60)
+    with process(command, **settings, stdin=follower, stdout=follower, stderr=follower) as pages:
+        os.close(follower)
+        out = b""
+        while b"\n" not in out:
+            out += os.read(leader, 1000)
+        os.close(leader)
+        pages.wait()
     assert out.startswith(b"paged:# ")

@@ -314,7 +314,7 @@ print(hashlib.sha256(b"".join(a.tobytes() for a in state)).hexdigest())
 def test_the_same_bits_for_any_number_of_threads(precision):
     ends = set()
     for threads in ("1", "16"):  # two: test_dynamics.py
-        environment = os.environ | {"NUMBA_NUM_THREADS": threads, "PYTHONPATH": str(ROOT)}
+        environment = os.environ | {"NUMBA_NUM_THREADS": threads}
         done = subprocess.run(
             [sys.executable, "-c", SAME_BITS, precision],
             cwd=ROOT,

@@ -1,12 +1,18 @@
-"""The tiers of tests: which tests are extended; the record of the soak tier."""
+"""The tiers of tests: which tests are extended; the record of the soak tier; processes of
+tests."""
 
 import ast
 import re
+import subprocess
 import sys
 
+import pytest
 import soak
 from hooks import TIERS, pattern_in, tier_of
+from processes import process
 from support import ROOT
+
+import rigidmd
 
 
 def test_the_record_names_the_last_run_and_the_last_one_that_passed(tmp_path, capsys):
@@ -56,3 +62,22 @@ def test_every_pattern_of_a_tier_names_a_test():
             assert any(name.startswith(f"test_{function}") for name in names), (file, pattern)
             assert pattern_in(tier, file, f"test_{pattern.replace('*', '')}"), (file, pattern)
     assert tier_of("test_run.py", "test_every_system_runs_a_few_steps[water]") is None
+
+
+def test_processes_import_the_package_that_the_tests_import(tmp_path):
+    """Not the one in their working directory, which may be a checkout."""
+    (tmp_path / "rigidmd").mkdir()
+    (tmp_path / "rigidmd" / "__init__.py").touch()
+    command = [sys.executable, "-c", "import rigidmd; print(rigidmd.__file__)"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.strip() == rigidmd.__file__, done.stderr
+
+
+def test_no_process_outlives_its_test():
+    command = [sys.executable, "-c", "import time; time.sleep(1000)"]
+    with (
+        pytest.raises(ValueError, match="of the test"),
+        process(command, stdout=subprocess.PIPE) as asleep,
+    ):
+        raise ValueError("an error of the test")
+    assert asleep.returncode is not None and asleep.stdout.closed

@@ -13,12 +13,13 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import WAIT, process, wait_until
 from support import ROOT
 
 import rigidmd
@@ -735,9 +736,10 @@ def names_in(manifest, *states):
     return [point.folder for point in manifest.points_in(*states)]
 
 
+@contextmanager
 def when_running(folder, act):
-    """Call `act(name)` with the first point of a sweep whose log has grown, from another thread.
-    Returns a function that ends the thread."""
+    """Within the block, call `act(name)` with the first point of a sweep whose log has grown, from
+    another thread."""
     ended = threading.Event()
 
     def watch():
@@ -750,12 +752,11 @@ def when_running(folder, act):
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
-
-    def end():
+    try:
+        yield
+    finally:
         ended.set()
         thread.join()
-
-    return end
 
 
 @pytest.fixture(scope="module")
@@ -768,11 +769,11 @@ def whole(argon, tmp_path_factory):
 
 def kill_run(folder):
     """Kill the process of a run in a folder."""
-    for process in Path("/proc").glob("[0-9]*"):
+    for path in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
-            words = (process / "cmdline").read_bytes().split(b"\0")
+            words = (path / "cmdline").read_bytes().split(b"\0")
             if str(folder).encode() in words:
-                os.kill(int(process.name), signal.SIGKILL)
+                os.kill(int(path.name), signal.SIGKILL)
 
 
 def test_a_killed_process_loses_its_point_alone_and_a_signal_stops_all(argon, whole, tmp_path):
@@ -790,9 +791,8 @@ def test_a_killed_process_loses_its_point_alone_and_a_signal_stops_all(argon, wh
             time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGTERM)
 
-    end = when_running(folder, stop_later)
-    stopped = finish(manifest, jobs=1)  # the next point has only begun when the signal comes
-    end()
+    with when_running(folder, stop_later):
+        stopped = finish(manifest, jobs=1)  # the next point has only begun when the signal comes
     assert stopped == signal.SIGTERM
     assert names_in(manifest, "failed") == killed
     assert names_in(manifest, "interrupted", "waiting")
@@ -809,11 +809,8 @@ def test_a_second_interrupt_ends_all_points_at_once(argon, tmp_path):
     folder = tmp_path / "sweep"
     manifest = long_sweep(argon, folder, **{"stages.0.duration_ps": 1e6})
 
-    end = when_running(folder, lambda name: [os.kill(os.getpid(), signal.SIGINT) for _ in "12"])
-    began = time.monotonic()
-    assert finish(manifest) == signal.SIGINT
-    end()
-    assert time.monotonic() - began < 120
+    with when_running(folder, lambda name: [os.kill(os.getpid(), signal.SIGINT) for _ in "12"]):
+        assert finish(manifest) == signal.SIGINT
     assert not names_in(manifest, "finished", "failed")
 
 
@@ -822,14 +819,13 @@ def test_points_end_with_their_sweep(argon, tmp_path):
     folder = tmp_path / "sweep"
     words = ["--set", "seed=1,2", "--set", "stages.0.duration_ps=1e6", "-o", str(folder)]
     command = [sys.executable, "-m", "rigidmd", "sweep", str(argon), *words, "--jobs", "1"]
-    sweep = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     moving = threading.Event()
-    end = when_running(folder, lambda name: moving.set())
-    assert moving.wait(300)
-    end()
-    sweep.kill()
-    sweep.wait()
-    wait_for_folder(folder / "seed=1", 60.0)
+    with (
+        process(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as sweep,
+        when_running(folder, lambda name: moving.set()),
+    ):
+        wait_until(moving.is_set, sweep)
+    wait_for_folder(folder / "seed=1", WAIT)
     assert (folder / "seed=1" / "checkpoint.npz").is_file()
     assert len(list(folder.glob(".points-*"))) == 1
     assert cli.main([*command[3:], "--walltime", "0:00:01"]) == 75
@@ -923,13 +919,12 @@ def test_a_sweep_that_is_killed_goes_on(argon, tmp_path):
         "2",
     ]
     command = [sys.executable, "-m", "rigidmd", "sweep", *arguments, "-o", str(tmp_path / "parts")]
-    parent = subprocess.Popen(command, start_new_session=True)
-    while sum(state == "finished" for state in states_or_none(tmp_path / "parts").values()) < 6:
-        time.sleep(0.1)
-    parent.kill()
-    parent.wait()
+    with process(command, start_new_session=True) as parent:
+        wait_until(
+            lambda: list(states_or_none(tmp_path / "parts").values()).count("finished") >= 6, parent
+        )
     for point in (tmp_path / "parts").glob("seed=*"):
-        wait_for_folder(point, 60.0)
+        wait_for_folder(point, WAIT)
     done = written(tmp_path / "parts")
     assert 6 <= len(done) < 24
     assert cli.main(["sweep", *arguments, "-o", str(tmp_path / "parts")]) == 0
@@ -968,12 +963,17 @@ def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
     distributed = pytest.importorskip("distributed")
     folder = tmp_path / "sweep"
     manifest = long_sweep(argon, folder)
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, protocol="tcp"
-    ) as cluster:
-        end = when_running(folder, lambda name: os.kill(os.getpid(), signal.SIGTERM))
+    with (
+        distributed.LocalCluster(
+            n_workers=1,
+            threads_per_worker=2,
+            processes=False,
+            dashboard_address=None,
+            protocol="tcp",
+        ) as cluster,
+        when_running(folder, lambda name: os.kill(os.getpid(), signal.SIGTERM)),
+    ):
         stopped = finish(manifest, pool=sweep_points.cluster(cluster.scheduler_address))
-        end()
     assert stopped == signal.SIGTERM
     assert manifest.unfinished and not manifest.points_in("failed")
     again = long_sweep(argon, folder)
@@ -1016,7 +1016,6 @@ for part in spec.split(","):
         (tmp_path / "bin" / name).chmod(0o755)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("PYTHONPATH", str(Path(rigidmd.__file__).parents[1]))
 
 
 def test_a_script_for_slurm(argon, finished, slurm, capsys):

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numba
 import numpy as np
 import pytest
+from processes import search_path
 from support import ROOT, small_scene
 from thread_kernels import count_blocks, counted, run_blocks
 
@@ -73,8 +74,7 @@ def test_every_block_is_done_once_by_many_more_threads():
     script = "from thread_kernels import counted; assert all((counted(n, 10, 2000)[:, 0] == 2000).all() for n in range(1, 9))"
     done = subprocess.run(
         [sys.executable, "-c", script],
-        cwd=ROOT / "tests",
-        env=os.environ | {"NUMBA_NUM_THREADS": "24"},
+        env=os.environ | {"NUMBA_NUM_THREADS": "24"} | search_path(ROOT / "tests"),
         capture_output=True,
         text=True,
     )
@@ -325,10 +325,9 @@ assert met(10**12) == [1, 1]
 def test_a_helper_helps_then_sleeps_and_is_woken():
     """Two blocks that wait for each other need two threads. Where no helper comes, this hangs until
     its limit."""
-    path = os.pathsep.join(map(str, (ROOT, ROOT / "tests")))
-    environment = os.environ | {"NUMBA_NUM_THREADS": "2", "PYTHONPATH": path}
+    environment = os.environ | {"NUMBA_NUM_THREADS": "2"} | search_path(ROOT / "tests")
     done = subprocess.run(
-        [sys.executable, "-c", HELPER], env=environment, capture_output=True, text=True, timeout=240
+        [sys.executable, "-c", HELPER], env=environment, capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -363,9 +362,9 @@ assert threading.active_count() == 1, threading.enumerate()
 
 
 def test_one_thread_that_is_asked_for_has_no_helpers():
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests")))}
+    environment = os.environ | search_path(ROOT / "tests")
     done = subprocess.run(
-        [sys.executable, "-c", ALONE], env=environment, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", ALONE], env=environment, capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -379,10 +378,9 @@ assert (counted(64, 100, 2000)[:, 0] == 2000).all()
 
 @pytest.mark.parametrize("threads", ["7", "32"])
 def test_there_may_be_more_threads_than_cores_and_the_process_ends(threads):
-    path = os.pathsep.join(map(str, (ROOT, ROOT / "tests")))
-    environment = os.environ | {"NUMBA_NUM_THREADS": threads, "PYTHONPATH": path}
+    environment = os.environ | {"NUMBA_NUM_THREADS": threads} | search_path(ROOT / "tests")
     done = subprocess.run(
-        [sys.executable, "-c", MORE], env=environment, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", MORE], env=environment, capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (0, "")
 

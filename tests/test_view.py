@@ -92,7 +92,6 @@ def shown(page, out, at=None, size="420,700"):
         ],
         check=True,
         capture_output=True,
-        timeout=120,
     )
     return imread(out)[:, :, :3]
 
