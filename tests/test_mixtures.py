@@ -436,7 +436,7 @@ def removed_power(r, p, cutoff, start, truncation):
     if r == 0 and truncation == "force_shift":
         return (1 + p) * cutoff**-p
     r = r or 1.5
-    return r**-p - inverse_power(np.array([r]), p, cutoff, start, truncation)[0]
+    return r**-p - inverse_power(r, p, cutoff, start, truncation)
 
 
 @pytest.mark.parametrize(("name", "edge"), [("argon", 5.3), ("co2_trappe", 5.7)])
