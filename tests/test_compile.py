@@ -31,6 +31,7 @@ from rigidmd.compile import (
     BoundTask,
     Code,
     NumbaStruct,
+    TaskArguments,
     call,
     call_blocks,
     kernel,
@@ -466,19 +467,23 @@ def test_a_wrong_number_of_compilers_is_one_sentence(named, tmp_path):
 
 
 def test_the_cache_folder_is_swept_of_nothing_but_our_own(tmp_path):
-    old = [
-        tmp_path / "thesis",
-        tmp_path / "kernels-0123456789abcdef",
-        tmp_path / "0123456789abcdef",
+    sources = "sources-0123456789abcdef.json"
+    folders = [
+        tmp_path / name for name in ("thesis", "kernels-0123456789abcdef", "0123456789abcdef")
     ]
-    for folder in old:
+    files = [tmp_path / name for name in (sources, f"my-{sources}", "sources-of-mine.json")]
+    for folder in folders:
         folder.mkdir()
-        os.utime(folder, (1e9, 1e9))
+    for file in files:
+        file.touch()
+    for path in (*folders, *files):
+        os.utime(path, (1e9, 1e9))
     asked = "from rigidmd.compile.cache import cache_folder; cache_folder()"
     subprocess.run(
         [sys.executable, "-c", asked], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True
     )
-    assert [folder.exists() for folder in old] == [True, False, True]
+    assert [folder.exists() for folder in folders] == [True, False, True]
+    assert [file.exists() for file in files] == [False, True, True]
 
 
 MACHINE = (
@@ -568,7 +573,7 @@ def compiled_in(folders, tmp_path, before=""):
         (tmp_path / "own.py").write_text(KERNEL)
     environment = os.environ | {
         "RIGIDMD_CACHE": str(folders[0]),
-        "XDG_CACHE_HOME": str(tmp_path / "numba"),  # where Numba tries to write in its turn
+        "XDG_CACHE_HOME": str(tmp_path / "numba"),  # where Numba tries to write next
         **search_path(tmp_path),
     }
     command = [sys.executable, "-c", f"{before}\n{WITH_CACHES}", *map(str, folders)]
@@ -618,6 +623,36 @@ def test_a_cache_that_cannot_be_written_is_read(kept):
     )
     assert compiled_in([kept / "cache"], kept, read_only) == [("42 1", "")]
     assert sorted(kept.rglob("*")) == before
+
+
+def test_a_function_of_another_text_is_compiled_whatever_its_time_and_size(tmp_path):
+    caches = [tmp_path / "cache"]
+    assert compiled_in(caches, tmp_path) == [("42 0", "")]
+    path = tmp_path / "own.py"
+    before = path.stat()
+    path.write_text(KERNEL.replace("2 * x", "3 * x"))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert path.stat().st_size == before.st_size
+    shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)  # the byte code of Python is as old
+    assert compiled_in(caches, tmp_path) == [("63 0", "")]
+
+
+def test_code_of_a_task_is_found_by_the_classes_of_its_arguments():
+    """A kernel reaches what implements functions for the potentials in its records, so that their
+    definitions are part of its key."""
+    from rigidmd.forces.potentials import coulomb, lennard_jones
+
+    index = CacheIndex("/nowhere", "f", 0)
+
+    def path_for(content):
+        return index._index_for(((TaskArguments(content),), ()))._index_path
+
+    number = types.float64
+    classes = (lennard_jones.LennardJonesOneKind, coulomb.ReactionField)
+    terms = [types.NamedTuple([number] * len(one._fields), one) for one in classes]
+    nested = [types.Tuple([number, types.Tuple([one])]) for one in terms]
+    assert len({path_for(content) for content in (number, *terms)}) == 3
+    assert [path_for(content) for content in nested] == [path_for(content) for content in terms]
 
 
 # --- the index of the cache, which several processes change ---------------------------------------

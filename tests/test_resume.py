@@ -974,6 +974,25 @@ def test_every_flipped_bit_of_a_checkpoint_is_seen(again):
         assert all(np.array_equal(found.arrays[name], array) for name, array in kept.arrays.items())
 
 
+@pytest.mark.parametrize("size", [10, 300_000])
+def test_an_array_of_another_checkpoint_is_seen(size, tmp_path):
+    """Each array is right by itself, whatever its size; together they are of two runs."""
+    for folder, value in (("one", 1.0), ("two", 2.0)):
+        (tmp_path / folder).mkdir()
+        arrays = {"a": np.full(size, value), "b": np.full(7, value)}
+        write_checkpoint(tmp_path / folder, Checkpoint({"of": {}}, arrays))
+    one, two = (tmp_path / folder / CHECKPOINT for folder in ("one", "two"))
+    assert np.array_equal(read_checkpoint(one).arrays["a"], np.ones(size))
+    with zipfile.ZipFile(one) as first, zipfile.ZipFile(two) as second:
+        members = {name: first.read(name) for name in first.namelist()}
+        members["a.npy"] = second.read("a.npy")
+    with zipfile.ZipFile(one, "w") as mixed:
+        for name, content in members.items():
+            mixed.writestr(name, content)
+    with pytest.raises(CheckpointError, match="its contents differ from those that were written"):
+        read_checkpoint(one)
+
+
 def test_a_folder_without_a_checkpoint(again, capsys):
     for name in (CHECKPOINT, PREVIOUS):
         (again / "run" / name).unlink()

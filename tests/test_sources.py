@@ -105,6 +105,7 @@ def test_an_edited_docstring_compiles_nothing_and_an_edited_number_does(tmp_path
     environment = os.environ | {
         "RIGIDMD_CACHE": str(tmp_path / "cache"),
         "PYTHONPATH": str(tmp_path),
+        "PYTHONDONTWRITEBYTECODE": "1",  # Python itself finds that by time and size
     }
 
     def asked() -> str:
@@ -126,6 +127,11 @@ def test_an_edited_docstring_compiles_nothing_and_an_edited_number_does(tmp_path
     other.write_text(f"{other.read_text()}\nUNRELATED = 1\n")
     assert asked() == "1 1"
     path.write_text(re.sub("SERIAL_MOLECULES = [0-9]+", "SERIAL_MOLECULES = 50", edited))
+    assert asked() == "16 0"
+    before = path.stat()  # which a copy or an image may give to another text
+    path.write_text(re.sub("SERIAL_MOLECULES = [0-9]+", "SERIAL_MOLECULES = 60", edited))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert path.stat().st_size == before.st_size
     assert asked() == "16 0"
     path.write_text(text)
     assert asked() == "1 1"

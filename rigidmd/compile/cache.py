@@ -148,8 +148,12 @@ def _temporary_folder() -> str | None:
 
 
 def _remove_unused(base: Path) -> None:
-    """Remove the folders that were not used for a month, and in the others the files of which this
-    is true."""
+    """Remove the folders and lists of sources that were not used for a month, and in the other
+    folders the files of which this is true."""
+    for path in base.glob("sources-*.json"):
+        with contextlib.suppress(OSError):
+            if re.fullmatch(r"sources-[0-9a-f]{16}\.json", path.name) and _is_unused(path):
+                path.unlink()
     for folder in base.iterdir():
         if not re.fullmatch(r"kernels-[0-9a-f]{16}", folder.name) or not folder.is_dir():
             continue
@@ -418,9 +422,12 @@ def open_cache(function: Callable) -> FunctionCache | NullCache:
 
 def _index_of(function: Callable, cache: FunctionCache) -> CacheIndex:
     """The index of the compiled code of a function. A function of the package is identified by its
-    definitions, so that a line that moves or a file that is touched compiles nothing again."""
+    definitions, so that a line that moves compiles nothing again; another one by its line and the
+    text of its file, if it has one."""
     name = cache._impl.filename_base
-    stamp = cache._cache_file._source_stamp
+    stamp = cache._cache_file._source_stamp  # of a file its time and size, which may stay
+    with contextlib.suppress(OSError):
+        stamp = sources.text_digest(Path(inspect.getfile(function)).read_bytes())
     if _is_of_package(function.__module__) and "<locals>" not in function.__qualname__:
         name = re.sub(r"-\d+\.py", ".py", name)  # Numba's name of the file has the line
         stamp = ""
