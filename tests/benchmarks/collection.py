@@ -5,11 +5,10 @@ documentation.
     python tests/benchmarks/collection.py --force    # measures again
     python tests/benchmarks/collection.py --pages    # writes the page again, from the data
 
-writes rigidmd/docs/evidence/data/collection/NAME.csv (all trials) and NAME.json (advice, versions,
-machine), rigidmd/docs/images/collection_NAME.png and rigidmd/docs/evidence/collection.md.
+writes evidence/data/collection/NAME.csv (all trials) and NAME.json (advice, versions, machine),
+images/collection_NAME.png and evidence/collection.md in rigidmd/docs, or the folder of --to.
 """
 
-import argparse
 import json
 import shlex
 import sys
@@ -19,15 +18,18 @@ from pathlib import Path
 from platform import python_version
 
 import numpy as np
+from command_line import SMOKE, new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from rigidmd.errors import RigidMDError
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "rigidmd" / "docs"
-DATA, PAGE = DOCS / "evidence" / "data" / "collection", DOCS / "evidence" / "collection.md"
 SMOOTH = ("threads=1", "forces.truncation=smooth_switch")
 LIQUID = ("stages.equilibration.duration_ps=5", *SMOOTH)
-REPEATS = 3
+REPEATS = 2 if SMOKE else 3
+INTEGRATORS = ["velocity_verlet", "srkn_4"] if SMOKE else None  # all that suit a scene
+SMOKE_SETTINGS = ("stages.0.duration_ps=0.1", "stages.1.duration_ps=0.1", "molecules.0.count=150")
 TARGETS = (1e-3, 1e-5, 1e-7)  # errors of the energy in the table of all scenes
 #: Name -> what it is, file, settings.
 SCENES = {
@@ -93,14 +95,21 @@ def command_of(name: str) -> str:
     return f"rigidmd accuracy systems/{file}.toml --repeats {REPEATS}{overrides}"
 
 
-def measure(name: str) -> None:
+def data_of(docs: Path) -> Path:
+    """The folder of the data below a folder of the documentation."""
+    return docs / "evidence" / "data" / "collection"
+
+
+def measure(name: str, docs: Path) -> None:
     """Measure a scene and write its table, picture and advice."""
     from rigidmd.scene import Scene, parse_override
     from rigidmd.studies.accuracy import accuracy
 
     _, file, settings = SCENES[name]
+    if SMOKE and "top" not in file:
+        settings = (*settings, *SMOKE_SETTINGS)
     scene = Scene.read(ROOT / "systems" / f"{file}.toml", dict(map(parse_override, settings)))
-    found = accuracy.measure_accuracy(scene, repeats=REPEATS)
+    found = accuracy.measure_accuracy(scene, INTEGRATORS, repeats=REPEATS)
     system, reached = found.trial_system, {}
     for target in TARGETS:
         points = {
@@ -135,12 +144,14 @@ def measure(name: str) -> None:
         "reached": reached,
         "advice": accuracy.recommendations(found),
     }
-    DATA.mkdir(exist_ok=True)
-    accuracy.trial_table(found).write(DATA / f"{name}.csv")
+    data = data_of(docs)
+    data.mkdir(parents=True, exist_ok=True)
+    accuracy.trial_table(found).write(data / f"{name}.csv")
     figure = accuracy.accuracy_figure(found)
     figure.lay_out(100)
-    figure.savefig(DOCS / "images" / f"collection_{name}.png", dpi=85)
-    (DATA / f"{name}.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    (docs / "images").mkdir(exist_ok=True)
+    figure.savefig(docs / "images" / f"collection_{name}.png", dpi=85)
+    (data / f"{name}.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
 def table(titles: list[str], rows: list[list[str]]) -> str:
@@ -198,12 +209,13 @@ def machines_of(found: dict[str, dict]) -> str:
     return "Measured with " + "; with ".join(lines) + "."
 
 
-def page_text() -> str:
+def page_text(docs: Path = DOCS) -> str:
     """The page, from the data."""
+    data = data_of(docs)
     found = {
-        name: json.loads((DATA / f"{name}.json").read_text(encoding="utf-8"))
+        name: json.loads((data / f"{name}.json").read_text(encoding="utf-8"))
         for name in SCENES
-        if (DATA / f"{name}.json").is_file()
+        if (data / f"{name}.json").is_file()
     }
     heads = [f"energy error of {target:.0e}" for target in TARGETS]
     return (
@@ -245,19 +257,26 @@ def page_text() -> str:
     )
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def main() -> None:
+    """Measure the scenes, and write the page."""
+    parser = new_parser(__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--force", action="store_true")
     parser.add_argument("--pages", action="store_true")
-    options = parser.parse_args()
+    options = read_options(parser, DOCS, names=["nitrogen", "heavy_top_3"])
+    docs = options.to
     for name in [] if options.pages else options.names or SCENES:
-        if options.force or not (DATA / f"{name}.json").is_file():
+        if options.force or not (data_of(docs) / f"{name}.json").is_file():
             print(name, flush=True)
             try:
-                measure(name)
-            except Exception as error:  # the other scenes do not depend on it
+                measure(name, docs)
+            except RigidMDError as error:  # the other scenes do not depend on it
+                if SMOKE:
+                    raise
                 print(f"{name} failed: {error}")
-    PAGE.write_text(page_text(), encoding="utf-8")
+    (docs / "evidence").mkdir(exist_ok=True)
+    (docs / "evidence" / "collection.md").write_text(page_text(docs), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,15 +1,14 @@
 """`rigidmd run` and `gmx mdrun` as their users start them, alternating: all settings that the
 physics leaves open are the defaults of each program.
 
-    python tests/benchmarks/defaults.py --rounds 3 --seconds 10 --json defaults.json
+    python tests/benchmarks/defaults.py --rounds 3 --seconds 10 --to FOLDER
 
 The programs start from the same positions and velocities (those of peers.py), at constant energy
 with a step of 2 fs, and use all cores; no variable is set. Each reports its own speed:
 `steps_per_s` of summary.json, `Performance` of md.log. `gmx` is the one on PATH: put that of this
-processor first.
+processor first. All readings are in FOLDER/defaults.json.
 """
 
-import argparse
 import json
 import os
 import re
@@ -18,11 +17,22 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from peer_engines import Gromacs, call, environment, gro, leapfrog_velocity, program, top
-from peers import WORKLOADS, start_of
+from command_line import SMOKE, new_parser, read_options
+from peer_engines import (
+    Absent,
+    Gromacs,
+    Rigidmd,
+    call,
+    environment,
+    gro,
+    leapfrog_velocity,
+    program,
+    top,
+)
+from peers import WORKLOADS, start_folder, write_sites
 
 STEP = 2.0  # fs
-PILOT_STEPS = 400
+PILOT_STEPS = 20 if SMOKE else 400
 
 
 def workload(name: str, cutoff: float, charges: str) -> dict:
@@ -49,10 +59,8 @@ def toml(value) -> str:
 def run_rigidmd(case: dict, folder: Path, steps: int) -> float:
     """Steps/s of `rigidmd run`. The scene states what the molecules are, their start and the cutoff,
     and no more."""
-    work, start = (
-        WORKLOADS[case["start"]],
-        start_of(case["start"], "own").sites_file.parent / "start.npz",
-    )
+    work = WORKLOADS[case["start"]]
+    start = start_folder(case["start"]) / "start.npz"
     forces = {"cutoff_A": case["cutoff"]}
     if case["charges"] == "reaction_field":
         forces["electrostatics"] = "reaction_field"
@@ -74,7 +82,7 @@ def run_rigidmd(case: dict, folder: Path, steps: int) -> float:
 
 def run_gromacs(case: dict, folder: Path, steps: int) -> float:
     """Steps/s of `gmx mdrun`."""
-    sites = dict(np.load(start_of(case["start"], "own").sites_file))
+    sites = dict(np.load(case["sites"]))
     kind = {"reaction_field": "reaction-field", "pme": "PME", "none": "cut-off"}[case["charges"]]
     options = {
         "integrator": "md",
@@ -101,48 +109,52 @@ def run_gromacs(case: dict, folder: Path, steps: int) -> float:
 RUNS = {"rigidmd": run_rigidmd, "gromacs": run_gromacs}
 
 
+def measure(case: dict, engines: list[str], rounds: int, seconds: float) -> dict[str, list[float]]:
+    """Readings of each program, steps/s."""
+    readings: dict[str, list[float]] = {engine: [] for engine in engines}
+    with tempfile.TemporaryDirectory() as folder:
+        steps = {}
+        for engine in engines:  # compiles, and shows how many steps fit into the seconds
+            rate = RUNS[engine](case, Path(folder), PILOT_STEPS)
+            steps[engine] = max(PILOT_STEPS, round(seconds * rate))
+        for _ in range(rounds):
+            for engine in engines:
+                readings[engine].append(RUNS[engine](case, Path(folder), steps[engine]))
+    return readings
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser(__doc__)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each run")
     parser.add_argument("--cases", default="", help="words that a case has to contain")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    options = read_options(parser, Path("runs/defaults"), rounds=1, seconds=0.0)
     for name in os.environ.keys() - environment().keys():
         del os.environ[name]
-    print(Gromacs.version())
+    versions = {"rigidmd": Rigidmd.version()}
+    try:
+        versions["gromacs"] = Gromacs.version()
+    except Absent as error:
+        print(f"GROMACS is skipped: {error}")
+    print(*versions.values(), sep="\n")
     found = {}
     for name, case in CASES.items():
         if options.cases not in name:
             continue
-        readings = {program: [] for program in RUNS}
-        with tempfile.TemporaryDirectory() as folder:
-            steps = {}
-            for (
-                engine,
-                run,
-            ) in RUNS.items():  # compiles, and shows how many steps fit into the seconds
-                steps[engine] = max(
-                    PILOT_STEPS, round(options.seconds * run(case, Path(folder), PILOT_STEPS))
-                )
-            for _ in range(options.rounds):
-                for engine, run in RUNS.items():
-                    readings[engine].append(run(case, Path(folder), steps[engine]))
-        ours, theirs = (median(readings[engine]) for engine in RUNS)
-        found[name] = readings | {"ratio": ours / theirs, "settings": case.get("settings")}
-        ranges = ", ".join(
-            f"{engine} {min(r):.0f} to {max(r):.0f}" for engine, r in readings.items()
-        )
-        print(
-            f"{name}: rigidmd {ours:.0f}, GROMACS {theirs:.0f} steps/s, ratio {ours / theirs:.2f} ({ranges})",
-            flush=True,
-        )
-    if options.json:
-        options.json.write_text(
-            json.dumps({"gromacs": Gromacs.version(), "cases": found}, indent=1) + "\n"
-        )
+        case["sites"] = write_sites(WORKLOADS[case["start"]], start_folder(case["start"]))
+        readings = measure(case, list(versions), options.rounds, options.seconds)
+        middle = {engine: median(values) for engine, values in readings.items()}
+        found[name] = {**readings, "settings": case.get("settings")}
+        told = [
+            f"{engine} {middle[engine]:.0f} ({min(values):.0f} to {max(values):.0f})"
+            for engine, values in readings.items()
+        ]
+        if "gromacs" in middle:
+            found[name]["ratio"] = middle["rigidmd"] / middle["gromacs"]
+            told.append(f"ratio {found[name]['ratio']:.2f}")
+        print(f"{name}, steps/s: {', '.join(told)}", flush=True)
+    whole = {"versions": versions, "cases": found}
+    (options.to / "defaults.json").write_text(json.dumps(whole, indent=1) + "\n")
 
 
 if __name__ == "__main__":

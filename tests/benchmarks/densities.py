@@ -7,22 +7,25 @@ errors.
 thread each, both at once. rigidmd: baoab with Langevin friction, stochastic cell rescaling, mixed
 precision. GROMACS: leap-frog, v-rescale, C-rescale. Both measure the kinetic energy where harmonic
 motions leave no time-step error in positions. Errors are standard errors by pymbar's statistical
-inefficiency. The first tenth of each run is omitted.
+inefficiency. The first tenth of each run is omitted. FOLDER of --to gets densities.json.
 """
 
-import argparse
 import json
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from peer_engines import Gromacs, call, environment, gro, program, sites_of, top
+from command_line import SMOKE, new_parser, read_options
+from peer_engines import Absent, Gromacs, call, environment, gro, program, sites_of, top
 from pymbar import timeseries
 
 from rigidmd import Scene, Simulation
 
-COUNT, CUTOFF, TEMPERATURE, STEP = 512, 9.0, 298.15, 2.0  # Å, K, fs
+COUNT = 343 if SMOKE else 512
+CUTOFF, TEMPERATURE, STEP = 9.0, 298.15, 2.0  # Å, K, fs
+TO_REST = 0.1 if SMOKE else 5.0  # ps, before GROMACS
 EVERY = 0.1  # ps between samples
 RELAXATION = 0.4  # ps, of the barostats: shorter than the time of the volume, near 1 ps, so that it barely lengthens it
 
@@ -56,14 +59,14 @@ def own_density(model: str, duration: float) -> np.ndarray:
     """Density over time by rigidmd, g/cm³."""
     npt = {"ensemble": "npt", "pressure_bar": 1.0, "barostat_time_ps": RELAXATION}
     results = Simulation(Scene.from_dict(scene(model, npt | {"duration_ps": duration}))).run(
-        progress=True
+        progress=not SMOKE
     )
     return results["density"][1:]
 
 
 def begin_gromacs(model: str, duration: float, folder: Path) -> subprocess.Popen:
     """A run of GROMACS in the folder, begun."""
-    nvt = {"ensemble": "nvt", "duration_ps": 5.0}
+    nvt = {"ensemble": "nvt", "duration_ps": TO_REST}
     simulation = Simulation(Scene.from_dict(scene(model, nvt)))
     state = simulation.run().state
     sites = sites_of(simulation.system, state)
@@ -138,15 +141,15 @@ def average(values: np.ndarray) -> tuple[float, float]:
 
 def main() -> None:
     """Run both engines for each model and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = new_parser(__doc__)
     parser.add_argument("--models", default="spce,tip4p2005")
     parser.add_argument("--duration", type=float, default=2000.0, metavar="PS")
-    parser.add_argument("--output", metavar="FILE", help="also keep the figures as JSON")
-    options = parser.parse_args()
+    options = read_options(parser, Path("runs/densities"), duration=2.0)
     found = {}
-    print(f"{Gromacs.version()}; {options.duration:g} ps each")
+    try:
+        print(f"{Gromacs.version()}; {options.duration:g} ps each")
+    except Absent as error:
+        sys.exit(f"GROMACS is not installed: {error}")
     print("| model | rigidmd, g/cm³ | GROMACS, g/cm³ | difference, % |\n|---|---|---|---|")
     for model in options.models.split(","):
         with tempfile.TemporaryDirectory() as name:
@@ -165,8 +168,7 @@ def main() -> None:
         ]
         print(f"| {model} | {' | '.join(told)} |", flush=True)
         found[model] = {"rigidmd": own, "gromacs": other, "duration_ps": options.duration}
-    if options.output:
-        Path(options.output).write_text(json.dumps(found, indent=1) + "\n")
+    (options.to / "densities.json").write_text(json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

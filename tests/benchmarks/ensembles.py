@@ -2,17 +2,16 @@
 
     python tests/benchmarks/ensembles.py --workloads W1,W2 --rounds 5
 
-All move the same start in steps of 2 fs in mixed precision, in turns in one process, and nobody
-observations. The thermostats and barostats have their default strengths. The workloads are those of
+All move the same start in steps of 2 fs in mixed precision, in turns in one process, without observations. The thermostats and barostats have their default strengths. The workloads are those of
 peers.py.
 """
 
-import argparse
 import statistics
 import sys
 from pathlib import Path
 
-from peers import WORKLOADS, choice, start_of
+from command_line import SMOKE, choice, new_parser, read_options
+from peers import WORKLOADS, start_folder
 from scaling import STEP, speed
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -29,7 +28,7 @@ STAGES = {
     "npt, monte_carlo": {"ensemble": "npt", "barostat": "monte_carlo"} | WARM | PRESSED,
     "nph, piston": {"ensemble": "nph"} | PRESSED,
 }
-WARM_UP = 200
+WARM_UP, FEWEST_STEPS = (10, 10) if SMOKE else (200, 50)
 
 
 def measure(
@@ -43,10 +42,10 @@ def measure(
     movers = []
     for k in range(len(stages)):
         row, engine = integrator_of_stage(run.system, k), run.system.engine()
-        movers.append((engine, engine.begin(run.state, row), row))
+        movers.append((engine, engine.begin(run.state.copy(), row), row))
 
     warm = [speed(*mover, WARM_UP) for mover in movers]
-    steps = max(50, round(seconds * warm[0]))
+    steps = max(FEWEST_STEPS, round(seconds * warm[0]))
     found = [[speed(*mover, steps) for mover in movers] for _ in range(rounds)]
     return {
         name: (
@@ -59,16 +58,16 @@ def measure(
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = new_parser(__doc__)
     names = list(WORKLOADS)
     parser.add_argument(
         "--workloads", type=choice(names), default=["W1", "W2"], help=f"of {','.join(names)}; W1,W2"
     )
     parser.add_argument("--rounds", type=int, default=5, help="5")
     parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement; 2")
-    asked = parser.parse_args()
+    asked = read_options(parser, workloads=["W1"], rounds=1, seconds=0.0)
     found = {
-        name: measure(name, start_of(name, "own").sites_file.parent, asked.rounds, asked.seconds)
+        name: measure(name, start_folder(name), asked.rounds, asked.seconds)
         for name in asked.workloads
     }
     print(f"| steps/s, and over nve | {' | '.join(found)} |\n|---|{'---|' * len(found)}")

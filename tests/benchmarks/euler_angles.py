@@ -2,12 +2,13 @@
 
     python tests/benchmarks/euler_angles.py
 
-writes rigidmd/docs/images/euler_angles.png.
+writes euler_angles.png in rigidmd/docs/images, or the folder of --to.
 """
 
 from pathlib import Path
 
 import numpy as np
+from command_line import new_parser, read_options
 from matplotlib.figure import Figure
 
 INK, LAB, BODY = "#1f2430", "#2b6f9e", "#c8553d"
@@ -127,6 +128,8 @@ axes.text(
     color=INK,
     fontsize=13,
 )
-figure.savefig(
-    Path(__file__).parents[2] / "rigidmd" / "docs" / "images" / "euler_angles.png", dpi=130
-)
+
+
+if __name__ == "__main__":
+    images = Path(__file__).parents[2] / "rigidmd" / "docs" / "images"
+    figure.savefig(read_options(new_parser(__doc__), images).to / "euler_angles.png", dpi=130)

@@ -3,12 +3,15 @@ draws its box of water.
 
     python tests/benchmarks/figures.py
 
-writes water_energy.png (energy.png of the run) and water_box.png in rigidmd/docs/images.
+writes water_energy.png (energy.png of the run) and water_box.png in rigidmd/docs/images, or the
+folder of --to.
 """
 
 import shutil
 import tempfile
 from pathlib import Path
+
+from command_line import SMOKE, new_parser, read_options
 
 from rigidmd import Scene, Simulation
 from rigidmd.figures.style import new_figure, save_files
@@ -17,6 +20,7 @@ from rigidmd.view.molecule_animation import MoleculeAnimation
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "rigidmd" / "docs" / "images"
+CHANGES = {"stages.production.duration_ps": 0.2} if SMOKE else {}
 
 
 def write_images(folder: Path, images: Path) -> None:
@@ -30,10 +34,11 @@ def write_images(folder: Path, images: Path) -> None:
 
 def main() -> None:
     """Run and draw."""
+    images = read_options(new_parser(__doc__), IMAGES).to
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "water"
-        Simulation(Scene.read(ROOT / "systems" / "water.toml"), run).run()
-        write_images(run, IMAGES)
+        Simulation(Scene.read(ROOT / "systems" / "water.toml", CHANGES), run).run()
+        write_images(run, images)
 
 
 if __name__ == "__main__":

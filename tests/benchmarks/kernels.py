@@ -4,57 +4,47 @@ vector width.
     python tests/benchmarks/kernels.py --workloads W1,W2,W3 --bits 512,256,128
 
 The liquids are those of peers.py. A lane is one site of a vector that meets another site; it is
-useful if the two are inside the cutoff and act on one another. Times are the shortest of many
-calls, since other programs can only add to them. A kernel is called several times by compiled code,
-and what a call from Python takes with no kernel at all, some milliseconds to find the types of so
-many arrays, is taken off. Each width runs in a process of its own, since it is chosen when the
-package is imported.
+useful if the two are inside the cutoff and act on one another. The parts of a step are the passes of
+its program (`rigidmd check --program`), called one by one in their order. Times are the shortest of
+many calls, since other programs can only add to them; a call from Python takes some 0.01 ms of each.
+A build of
+the neighbour list is divided by the number of steps between two. Each width runs in a process of its
+own, since it is chosen when the package is imported.
 """
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import time
+from argparse import SUPPRESS
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import literally, njit
-from peers import WORKLOADS, choice, numbers, start_of
+from command_line import SMOKE, SMOKE_OPTION, choice, new_parser, numbers, read_options
+from numba import njit
+from peers import WORKLOADS, start_folder
 from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
-from rigidmd.compile import SIMD_BITS, call, call_blocks, pack_arguments
+from rigidmd.compile import SIMD_BITS, Rows
 from rigidmd.core.integrators import SCHEMES
-from rigidmd.core.state import State, no_load
-from rigidmd.engines.cpu.engine import DTYPES
+from rigidmd.core.state import State
+from rigidmd.engines.cpu.engine import DTYPES, CpuEngine
+from rigidmd.engines.cpu.program import run_single_row
 from rigidmd.forces.neighbors.lists import BUILDS, MASKED, end_of_row, largest_displacement
 from rigidmd.forces.neighbors.pair_loop import PairWorkspace
-from rigidmd.forces.neighbors.sites import blocks_of, compute_site_positions
+from rigidmd.forces.neighbors.sites import compute_site_positions
+from rigidmd.forces.terms import FORCES_ONLY
 
 STEP = 2e-3  # ps
-STEPS = 100  # before anything is measured, so that lists are of a usual age; and of the rate of a whole step
-SECONDS = 0.5  # for each measurement
-TIMES = 10  # that a kernel is called at once
-MESH = ("scale", "spread", "convolve", "back", "forces")  # tasks in blocks
-ENDINGS = ("shift", "switch", "smooth_switch")
-
-
-@njit
-def run_blocks(code, name, content, blocks, times):
-    """All blocks of a task on this thread, this many times."""
-    for _ in range(times):
-        call_blocks(code, literally(name), pack_arguments(content), blocks)
-
-
-@njit
-def run_once(code, name, content, times):
-    """A task that has one block, this many times."""
-    for _ in range(times):
-        call(code, literally(name), pack_arguments(content))
+#: Before anything is measured, so that lists are of a usual age; and of the rate of a whole step.
+STEPS = 10 if SMOKE else 100
+CALLS = 2 if SMOKE else 100  # of each part
+TRUNCATIONS = ("shift", "switch", "smooth_switch")
+PAIRS, UPDATE = "forces of pairs", "update the neighbour list"  # texts of passes
 
 
 @njit
@@ -72,16 +62,11 @@ def entries_that_matter(pairs):
     return found
 
 
-def milliseconds(function, *arguments) -> float:
-    """Shortest time of a kernel, ms."""
-    function(*arguments, 1)
-    taken = {0: [], TIMES: []}
-    while sum(taken[TIMES]) < SECONDS or len(taken[TIMES]) < 5:
-        for times, own in taken.items():
-            began = time.perf_counter()
-            function(*arguments, times)
-            own.append(time.perf_counter() - began)
-    return max(0.0, 1e3 * (min(taken[TIMES]) - min(taken[0])) / TIMES)
+def milliseconds(call, *arguments) -> float:
+    """The time of a call, ms."""
+    began = time.perf_counter()
+    call(*arguments)
+    return 1e3 * (time.perf_counter() - began)
 
 
 def useful_pairs(term: PairWorkspace, state: State) -> int:
@@ -101,173 +86,145 @@ def lanes_of(term: PairWorkspace) -> int:
     return int(rows) * 2 * 4 * len(pairs.clusters.order) // len(pairs.clusters.origin)
 
 
-def measure(job: dict) -> list[dict]:
-    """Rows of both tables for one workload, precision and truncation, in this process' vector width."""
+class Part(NamedTuple):
+    """A pass of the forces, without energies."""
+
+    term: str
+    text: str
+    row: int
+
+
+def parts_of(engine: CpuEngine, state: State) -> list[Part]:
+    """The parts of the forces of a step."""
+    passes = [(name, one.text) for name, some in engine.passes(state).items() for one in some]
+    when = engine.rows_of_steps().when
+    return [Part(*passes[k], k) for k in range(len(when)) if when[k] & FORCES_ONLY]
+
+
+def measure(job: dict) -> dict:
+    """Costs of pairs, and times of the parts of a step, of one workload, precision and truncation,
+    in this process' vector width."""
     work = WORKLOADS[job["workload"]]
-    folder = start_of(job["workload"], "own").sites_file.parent
-    scene = Scene.from_dict(work.scene(job["ending"], precision=job["precision"]), folder)
+    scene = Scene.from_dict(
+        work.scene(job["truncation"], precision=job["precision"]), start_folder(job["workload"])
+    )
     simulation = Simulation(scene)
-    engine, state = simulation.engine, simulation.state
+    engine, state = simulation.engine, simulation.state.copy()
     engine.threads = 1
     scheme = SCHEMES["velocity_verlet"]
     engine.advance(state, scheme, STEP, STEPS)
-    builds = {name: builds_of(own) for name, own in engine.workspaces.items()}
-    began = time.perf_counter()
-    engine.advance(state, scheme, STEP, 2 * STEPS)
-    step = 1e3 * (time.perf_counter() - began) / STEPS
-    common = {
-        **job,
-        "bits": SIMD_BITS,
-        "lanes": SIMD_BITS // (8 * DTYPES[job["precision"]]().itemsize),
-        "step": step,
-    }
-    found = []
-    for name, term in engine.workspaces.items():
-        if isinstance(term, PairWorkspace):
-            every = STEPS / max(1, builds_of(term) - builds[name])
-            found.append(
-                common
-                | {"kernel": f"{name}, {type(term.slot_potential).__name__}"}
-                | of_pairs(term, state, every)
+    builds = builds_of(engine)
+    step = milliseconds(engine.advance, state, scheme, STEP, 2 * STEPS) / STEPS
+    builds = {name: number - builds[name] for name, number in builds_of(engine).items()}
+
+    rows, parts = engine.rows_of_steps(), parts_of(engine, state)
+    calls = [
+        [milliseconds(run_single_row, rows, part.row) for part in parts] for _ in range(1 + CALLS)
+    ]
+    pairs, times = [], []
+    for part, spent in zip(parts, np.min(calls[1:], axis=0).tolist(), strict=True):
+        term = engine.workspaces[part.term]
+        times.append([f"{part.term}: {part.text}", spent])
+        if part.text == UPDATE:
+            build = shortest_build(term, rows, part.row)
+            every = STEPS / max(1, builds[part.term])
+            times.append([f"{part.term}: a build in {every:.0f} steps", build / every])
+        if part.text == PAIRS:
+            lanes, useful = lanes_of(term), useful_pairs(term, state)
+            pairs.append(
+                {
+                    "kernel": f"{part.term}, {type(term.slot_potential).__name__}",
+                    "per_pair": 1e6 * spent / useful,
+                    "per_lane": 1e6 * spent / lanes,
+                    "useful": useful / lanes,
+                }
             )
-        elif hasattr(term, "mesh"):
-            found.append(common | {"kernel": name, "mesh": of_mesh(term)})
-    return found
+    times.append(["kicks, drifts, and all else", max(0.0, step - sum(spent for _, spent in times))])
+    lanes = SIMD_BITS // (8 * np.dtype(DTYPES[job["precision"]]).itemsize)
+    return {**job, "lanes": lanes, "step": step, "pairs": pairs, "times": times}
 
 
-def builds_of(term: NamedTuple) -> int:
-    """Builds of its list so far; 0 if it has none."""
-    return int(term.pairs.counters[BUILDS]) if isinstance(term, PairWorkspace) else 0
+def shortest_build(term: PairWorkspace, rows: Rows, k: int) -> float:
+    """The time of an update that builds the list, ms."""
+    taken = []
+    for _ in range(CALLS):
+        term.renew_list()
+        taken.append(milliseconds(run_single_row, rows, k))
+    return min(taken)
 
 
-def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
-    """Times of the kernels of a pair potential between pairs, whose list is built again every this many steps."""
-    load = no_load(state)
-    pairs, blocks = term.pairs, len(term.pairs.needed)
-    code, lists, content = (
-        term.code,
-        term.list_code,
-        (term.slot_potential, pairs, term.sums, None, None),
-    )
-    placed, on_sites = (pairs, term.sites, state), (term.sites, state, load, term.forces_in_slots)
-    lanes, useful = lanes_of(term), useful_pairs(term, state)
-    forces = milliseconds(run_blocks, code, "forces", content, blocks)
-    gather = milliseconds(run_blocks, code, "gather", (pairs, term.sums, None), blocks)
-    follow = milliseconds(run_blocks, lists, "displacements", pairs, blocks)
-    place = milliseconds(run_blocks, lists, "local", placed, blocks)
-    loads = milliseconds(run_blocks, code, "load", on_sites, blocks_of(len(state.position)))
-    build = (  # in their order: each needs what the one before it leaves
-        milliseconds(run_blocks, lists, "wrap", placed, blocks)
-        + milliseconds(run_blocks, lists, "bin", placed, blocks)
-        + milliseconds(run_once, lists, "sort", pairs)
-        + milliseconds(run_blocks, lists, "origins", placed, blocks)
-        + place
-        + follow
-        + milliseconds(run_once, lists, "boxes", pairs)
-        + milliseconds(run_blocks, lists, "fill", pairs, blocks)
-    )
+def builds_of(engine: CpuEngine) -> dict[str, int]:
+    """Builds of neighbour lists so far, by term."""
     return {
-        "every": every,
-        "per_pair": 1e6 * forces / useful,
-        "per_lane": 1e6 * forces / lanes,
-        "useful": useful / lanes,
-        "parts": {
-            "pairs": forces,
-            "gather": gather,
-            "follow": follow,
-            "sites": place + loads,
-            "list": build / every,
-        },
+        name: int(term.pairs.counters[BUILDS])
+        for name, term in engine.workspaces.items()
+        if isinstance(term, PairWorkspace)
     }
 
 
-def of_mesh(term: NamedTuple) -> dict[str, float]:
-    """Times of the kernels of the mesh, ms."""
-    content, blocks = (term.smooth, term.charge, term.spline, term.mesh), len(term.mesh.tallies)
-    content_of = {"convolve": (term.smooth, term.mesh, None)}
-    times = {
-        task: milliseconds(run_blocks, term.code, task, content_of.get(task, content), blocks)
-        for task in MESH
-    }
-    return times | {"sort": milliseconds(run_once, term.code, "sort", content)}
+def run_job(workload: str, precision: str, truncation: str, bits: int) -> dict:
+    """`measure` in a process with this vector width."""
+    job = {"workload": workload, "precision": precision, "truncation": truncation}
+    done = subprocess.run(
+        [sys.executable, __file__, "--job", json.dumps(job), *SMOKE_OPTION],
+        env=os.environ | {"RIGIDMD_SIMD_BITS": str(bits), "NUMBA_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        sys.exit(done.stderr)
+    print(".", end="", file=sys.stderr, flush=True)
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def main() -> None:
     """Measure and print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = new_parser(__doc__)
     parser.add_argument(
-        "--workloads", type=choice(WORKLOADS), default=list(WORKLOADS), help="W1,W2,W3"
+        "--workloads", type=choice(WORKLOADS), default=list(WORKLOADS), help="W1,W2,W3,W4"
     )
     parser.add_argument(
         "--bits", type=numbers(int), default=[SIMD_BITS], help="vector widths; 512,256,128"
     )
     parser.add_argument(
-        "--endings",
-        type=choice(ENDINGS),
-        default=list(ENDINGS),
+        "--truncations",
+        type=choice(TRUNCATIONS),
+        default=list(TRUNCATIONS),
         help="of mixed precision; double has the first of them",
     )
-    parser.add_argument("--job", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
+    parser.add_argument("--job", help=SUPPRESS)
+    asked = read_options(parser, workloads=["W2"], truncations=["shift"])
     if asked.job:
         print(json.dumps(measure(json.loads(asked.job))))
         return
-    rows = []
-    for bits in asked.bits:
-        for workload in asked.workloads:
-            start_of(workload, "own")
-            for precision, ending in [
-                *(("mixed", ending) for ending in asked.endings),
-                ("double", asked.endings[0]),
-            ]:
-                job = {"workload": workload, "precision": precision, "ending": ending}
-                command = [sys.executable, __file__, "--job", json.dumps(job)]
-                environment = os.environ | {
-                    "RIGIDMD_SIMD_BITS": str(bits),
-                    "NUMBA_NUM_THREADS": "1",
-                }
-                done = subprocess.run(command, env=environment, capture_output=True, text=True)
-                if done.returncode:
-                    sys.exit(done.stderr)
-                rows += json.loads(done.stdout.splitlines()[-1])
-                print(".", end="", file=sys.stderr, flush=True)
-    of_pair, of_waves = [r for r in rows if "parts" in r], [r for r in rows if "mesh" in r]
+    cases = [("mixed", truncation) for truncation in asked.truncations]
+    cases.append(("double", asked.truncations[0]))
+    for workload in asked.workloads:
+        start_folder(workload)
+    found = [
+        run_job(workload, *case, bits)
+        for bits in asked.bits
+        for workload in asked.workloads
+        for case in cases
+    ]
     print(
-        "\n| | kernel | precision | ending | lanes | ns a useful pair | ns a lane | useful lanes |\n"
+        "\n| | kernel | precision | truncation | lanes | ns a useful pair | ns a lane | useful lanes |\n"
         + "|---" * 8
         + "|"
     )
-    for r in of_pair:
-        print(
-            f"| {r['workload']} | {r['kernel']} | {r['precision']} | {r['ending']} | {r['lanes']} "
-            f"| {r['per_pair']:.2f} | {r['per_lane']:.2f} | {100 * r['useful']:.0f} % |"
-        )
-    print(
-        "\n| ms of a step | lanes | "
-        + " | ".join(of_pair[0]["parts"])
-        + " | list every | the step |\n"
-        + "|---" * 9
-        + "|"
-    )
-    for r in of_pair:
-        if r["ending"] == asked.endings[0]:
-            parts = " | ".join(f"{part:.3f}" for part in r["parts"].values())
+    for one in found:
+        for pair in one["pairs"]:
             print(
-                f"| {r['workload']} {r['kernel'].partition(',')[0]}, {r['precision']} | {r['lanes']} | {parts} "
-                f"| {r['every']:.1f} steps | {r['step']:.2f} |"
+                f"| {one['workload']} | {pair['kernel']} | {one['precision']} | {one['truncation']} | {one['lanes']} "
+                f"| {pair['per_pair']:.2f} | {pair['per_lane']:.2f} | {100 * pair['useful']:.0f} % |"
             )
-    if of_waves:
+    for one in found:
         print(
-            "\n| ms of a step | lanes | "
-            + " | ".join(of_waves[0]["mesh"])
-            + " |\n"
-            + "|---" * 8
-            + "|"
+            f"\n{one['workload']}, {one['precision']}, {one['truncation']}, {one['lanes']} lanes: "
+            f"{one['step']:.2f} ms a step\n\n| part | ms of a step |\n|---|---|"
         )
-    for r in of_waves:
-        if r["ending"] == asked.endings[0]:
-            parts = " | ".join(f"{part:.3f}" for part in r["mesh"].values())
-            print(f"| {r['workload']} {r['kernel']}, {r['precision']} | {r['lanes']} | {parts} |")
+        for text, spent in one["times"]:
+            print(f"| {text} | {spent:.3f} |")
 
 
 if __name__ == "__main__":

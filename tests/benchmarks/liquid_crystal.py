@@ -1,14 +1,14 @@
 """The nematic order parameter of GB(3, 5, 2, 1) along an isotherm, from crystals of parallel rods.
 
-    python tests/benchmarks/liquid_crystal.py FOLDER --temperature 0.95 --densities 0.28,0.30,0.32
+    python tests/benchmarks/liquid_crystal.py --to FOLDER --temperature 0.95 --densities 0.28,0.30,0.32
 
 Density and temperature in units of the potential. A run in FOLDER that was interrupted is resumed.
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
+from command_line import SMOKE, new_parser, read_options
 
 import rigidmd
 from rigidmd import Scene, Simulation
@@ -17,6 +17,7 @@ from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 WIDTH, DEPTH = 4.0, 3.5  # Å, kJ/mol
 #: Edges (Å) of a cell of two rods at the density 0.32, and how often it is repeated.
 CELL, DENSITY, REPEAT = (5.2, 5.2, 14.793), 0.32, [7, 7, 3]
+MELTING = 1 if SMOKE else 50  # ps
 SITES = [
     {"name": name, "mass_u": 100, "position_A": [0, 0, z]} for name, z in (("A", 2), ("B", -2))
 ]
@@ -36,7 +37,7 @@ def crystal(density: float) -> str:
 
 
 def scene(folder: Path, density: float, temperature: float, ps: float) -> Scene:
-    """Rods at a density and a temperature: 50 ps of melting, and a production."""
+    """Rods at a density and a temperature: melting, and a production."""
     path = folder / f"crystal_{density:g}.gro"
     path.write_text(crystal(density))
     stage = {
@@ -53,7 +54,7 @@ def scene(folder: Path, density: float, temperature: float, ps: float) -> Scene:
                 ]
             },
             "stages": [
-                {"name": "melting", "duration_ps": 50, "timestep_fs": 5} | stage,
+                {"name": "melting", "duration_ps": MELTING, "timestep_fs": 5} | stage,
                 {"name": "production", "duration_ps": ps, "timestep_fs": 8} | stage,
             ],
             "output": {"log_interval_ps": 0.5, "trajectory_interval_ps": 0.5, "figures": False},
@@ -63,18 +64,18 @@ def scene(folder: Path, density: float, temperature: float, ps: float) -> Scene:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
+    parser = new_parser(__doc__)
     parser.add_argument("--temperature", type=float, default=0.95)
     parser.add_argument("--densities", default="0.28,0.30,0.31,0.32,0.33")
     parser.add_argument("--ps", type=float, default=400)
-    options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
+    options = read_options(
+        parser, Path("runs/liquid_crystal"), densities="0.28,0.32", ps=4 * MELTING
+    )
     densities = [float(text) for text in options.densities.split(",")]
     runs = [
         Simulation(
-            scene(options.folder, density, options.temperature, options.ps),
-            options.folder / f"{density:g}",
+            scene(options.to, density, options.temperature, options.ps),
+            options.to / f"{density:g}",
         )
         for density in densities
     ]

@@ -5,7 +5,7 @@ double and mixed precision.
     dimer_6_double dimer_6_mixed
     python tests/benchmarks/long_run.py            # draws the figure and prints the table
 
-writes rigidmd/docs/evidence/data/long_run.json and rigidmd/docs/images/long_run.png. A curve is the
+writes evidence/data/long_run.json and images/long_run.png in rigidmd/docs, or the folder of --to. A curve is the
 root mean square change of a quantity in n steps, over all pairs of samples n steps from each other in one
 run: a random walk of rounding errors has slope 1/2 (Brouwer 1937), a drift slope 1, a bounded error
 slope 0. The change over the whole run is one number besides.
@@ -17,6 +17,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from command_line import SMOKE, new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
@@ -25,10 +26,7 @@ from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis
 from rigidmd.run.trial_systems import body_trial_system, molecular_trial_system
 
 ROOT = Path(__file__).parents[2]
-DATA, IMAGE = (
-    ROOT / "rigidmd" / "docs" / part
-    for part in ("evidence/data/long_run.json", "images/long_run.png")
-)
+SMOKE_STEPS = 4000
 #: Name -> text of the legend, scene, overrides, integrator, rotor, time step (s or fs), steps.
 CASES = {
     "top_exact": (
@@ -92,10 +90,8 @@ QUANTITIES = {
     "energy": "energy / kinetic energy",
     "QTQ": "orthogonality, QQᵀ per entry",
 }
-FINE, COARSE = (
-    1000,
-    20_000,
-)  # samples 10 steps from each other at the start, then evenly over the run
+#: Samples 10 steps from each other at the start, then evenly over the run.
+FINE, COARSE = (100, 100) if SMOKE else (1000, 20_000)
 FITTED = (1e3, 1e7)  # steps between which a slope is fitted
 
 
@@ -118,6 +114,7 @@ def trial_system(scene: str, overrides: dict, rotor: str):
 def run(name: str) -> dict:
     """Run a case; root mean square changes over lags, changes over the whole run, and seconds."""
     _, scene, overrides, integrator, rotor, step, steps = CASES[name]
+    steps = SMOKE_STEPS if SMOKE else steps
     system, in_double = trial_system(scene, overrides, rotor)
     method = system.methods[integrator]
     scheme, engine, judge = (
@@ -190,7 +187,7 @@ def fitted_slope(changes: list) -> float:
     )
 
 
-def draw(cases: dict) -> None:
+def draw(cases: dict, path: Path) -> None:
     """Root mean square change over steps, a panel for each quantity."""
     figure = new_figure(11, 4.4)
     axes = figure.subplots(1, 3)
@@ -228,7 +225,7 @@ def draw(cases: dict) -> None:
         ncols=4,
         labelcolor=INK,
     )
-    figure.savefig(IMAGE, dpi=110)
+    figure.savefig(path, dpi=110)
 
 
 def table(cases: dict) -> str:
@@ -247,16 +244,27 @@ def table(cases: dict) -> str:
     return "\n".join(lines)
 
 
-if __name__ == "__main__":
-    for name in sys.argv[1:]:
+def main() -> None:
+    """Run the cases, draw and print all."""
+    parser = new_parser(__doc__)
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES))
+    options = read_options(parser, ROOT / "rigidmd" / "docs", cases=list(CASES))
+    data, image = options.to / "evidence/data/long_run.json", options.to / "images/long_run.png"
+    for file in (data, image):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    for name in options.cases:
         found = run(name)
-        cases = json.loads(DATA.read_text()) if DATA.is_file() else {}
-        DATA.write_text(
+        cases = json.loads(data.read_text()) if data.is_file() else {}
+        data.write_text(
             json.dumps(cases | {name: found}, indent=1)
             .replace("\n    ", " ")
             .replace("\n   ]", "]")
             + "\n"
         )
-    cases = json.loads(DATA.read_text())
-    draw(cases)
+    cases = json.loads(data.read_text())
+    draw(cases, image)
     print(table(cases))
+
+
+if __name__ == "__main__":
+    main()

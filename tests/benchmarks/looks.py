@@ -1,4 +1,4 @@
-"""What observations cost: steps per second of a run with its default output, against the values of the engine
+"""What observations cost: steps per second of a run with its default output, relative to the engine
 alone.
 
     python tests/benchmarks/looks.py --workloads 216,W1,W2,W3 --rounds 5
@@ -10,13 +10,13 @@ time is that of its stages, observations included; the figure and the summary co
 smallest box of scaling.py; the others are those of peers.py.
 """
 
-import argparse
 import statistics
 import sys
 import tempfile
 from pathlib import Path
 
-from peers import WORKLOADS, choice, start_of
+from command_line import SMOKE, choice, new_parser, read_options
+from peers import WORKLOADS, start_folder
 from scaling import STEP, relax, speed
 from scaling import scene as small
 
@@ -26,7 +26,7 @@ from rigidmd.core.integrators import SCHEMES
 
 SMALL = "216"
 VERLET = SCHEMES["velocity_verlet"]
-WARM_UP = 200
+WARM_UP, FEWEST_STEPS = (10, 10) if SMOKE else (200, 100)
 
 
 def scene(name: str, folder: Path, duration: float, **output) -> Scene:
@@ -44,7 +44,7 @@ def scene(name: str, folder: Path, duration: float, **output) -> Scene:
 def measure(name: str, folder: Path, rounds: int, seconds: float) -> dict:
     """Median steps per second of the engine and of the run, and the median of their ratios."""
     alone = Simulation(scene(name, folder, 1.0, trajectory=False))
-    engine, state = alone.engine, alone.state
+    engine, state = alone.engine, alone.state.copy()
 
     def of_engine(steps: int) -> float:
         return speed(engine, state, VERLET, steps)
@@ -57,8 +57,8 @@ def measure(name: str, folder: Path, rounds: int, seconds: float) -> dict:
             )
 
     of_engine(WARM_UP)
-    steps = max(100, round(seconds * of_engine(WARM_UP)))
-    of_run(100)
+    steps = max(FEWEST_STEPS, round(seconds * of_engine(WARM_UP)))
+    of_run(FEWEST_STEPS)
     found = []
     for _ in range(rounds):
         before, run, after = of_engine(steps // 2), of_run(steps), of_engine(steps // 2)
@@ -73,18 +73,18 @@ def measure(name: str, folder: Path, rounds: int, seconds: float) -> dict:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = new_parser(__doc__)
     names = [SMALL, *WORKLOADS]
     parser.add_argument(
         "--workloads", type=choice(names), default=names, help=f"of {','.join(names)}; all"
     )
     parser.add_argument("--rounds", type=int, default=5, help="5")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each measurement; 10")
-    asked = parser.parse_args()
+    asked = read_options(parser, workloads=[SMALL, "W1"], rounds=1, seconds=0.0)
     print("| | engine, steps/s | run, steps/s | run over engine |\n|---|---|---|---|")
     for name in asked.workloads:
         with tempfile.TemporaryDirectory() as made:
-            folder = Path(made) if name == SMALL else start_of(name, "own").sites_file.parent
+            folder = Path(made) if name == SMALL else start_folder(name)
             if name == SMALL:
                 relax(folder)
             found = measure(name, folder, asked.rounds, asked.seconds)

@@ -1,7 +1,7 @@
 """What is measured of liquid water at 298.15 K, with errors: g(r), D, orientation, viscosity,
 dielectric constant.
 
-    python tests/benchmarks/measured.py --model spce --count 512 --duration 500 -o runs/measured
+    python tests/benchmarks/measured.py --model spce --count 512 --duration 500 --to runs/measured
     python tests/benchmarks/measured.py --model spce --count 216 --duration 3000 --interval 0.2
     --only dielectric
 
@@ -9,9 +9,10 @@ PME, 10 Å (9 Å of 216), steps of 2 fs, mixed precision, the density given. The
 keeps all figures.
 """
 
-import argparse
 import sys
 from pathlib import Path
+
+from command_line import SMOKE, new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
@@ -53,26 +54,23 @@ def scene(
 
 
 def main() -> None:
-    """Run the liquid, analyse it, print what was found."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Run the liquid, analyse it, and print the results."""
+    parser = new_parser(__doc__)
     parser.add_argument("--model", default="spce")
     parser.add_argument("--count", type=int, default=512)
     parser.add_argument("--density", type=float, default=0.997, metavar="G_CM3")
     parser.add_argument("--duration", type=float, default=500.0, metavar="PS")
     parser.add_argument("--interval", type=float, default=0.1, metavar="PS")
     parser.add_argument("--only", type=lambda text: text.split(","), default=[], metavar="NAMES")
-    parser.add_argument("-o", "--output", type=Path, default=Path("runs/measured"), metavar="DIR")
-    options = parser.parse_args()
+    options = read_options(parser, Path("runs/measured"), count=256, duration=2.0, interval=0.01)
     only = options.only
     water = scene(
         options.model, options.count, options.density, options.duration, options.interval, only
     )
-    Simulation(water, options.output).run(progress=True)
-    done = analyse_folder(options.output, only)
-    for told in [*done.frames_used["notes"], *done.results]:
-        print(told)
+    Simulation(water, options.to).run(progress=not SMOKE)
+    done = analyse_folder(options.to, only)
+    for line in [*done.frames_used["notes"], *done.results]:
+        print(line)
 
 
 if __name__ == "__main__":

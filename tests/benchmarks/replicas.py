@@ -10,7 +10,6 @@ log every 0.1 ps, all files but the trajectory and figures. A time is that of al
 scene to the last file, the start of processes included; compiled code is in the cache.
 """
 
-import argparse
 import os
 import statistics
 import subprocess
@@ -20,7 +19,7 @@ import time
 from pathlib import Path
 
 import tomli_w
-from peers import choice
+from command_line import SMOKE, choice, new_parser, read_options
 from scaling import STEP, speed
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -41,7 +40,8 @@ SYSTEMS = {
     "6": {"box": {"lengths_A": 7.0, "periodic": False}},
 }
 TEMPERATURES = {"216": 298.0, "27": 298.0, "6": 150.0}
-TO_REST, WARM_UP = 1.0, 500  # ps, steps
+TO_REST, WARM_UP = (0.05, 10) if SMOKE else (1.0, 500)  # ps, steps
+SECONDS_ALONE = 0.0 if SMOKE else 1.0
 
 
 def data(name: str, duration: float, seed: int = 1) -> dict:
@@ -65,7 +65,7 @@ def bare_speed(name: str, seconds: float) -> float:
     """Steps per second of the engine alone on one core, from a state that has come to rest."""
     simulation = Simulation(Scene.from_dict(data(name, TO_REST)))
     simulation._take_threads(1)
-    state = simulation.run().state
+    state = simulation.run().state.copy()
     engine, scheme = simulation.engine, row(simulation.system, 0)
 
     warm = speed(engine, state, scheme, WARM_UP)
@@ -110,8 +110,8 @@ def measure(
     name: str, replicas: int, rounds: int, seconds: float
 ) -> tuple[float, dict[str, float]]:
     """The engine alone on all cores, and the median of each way: steps of all replicas a second."""
-    bare = [bare_speed(name, 1.0)]
-    duration = STEP * round(seconds * bare[0])
+    bare = [bare_speed(name, SECONDS_ALONE)]
+    duration = STEP * max(WARM_UP, round(seconds * bare[0]))
     found: dict[str, list[float]] = {way: [] for way in WAYS}
     for k in range(rounds + 1):
         for way, run in WAYS.items():
@@ -121,7 +121,7 @@ def measure(
                 spent = time.perf_counter() - began
             if k:  # the first round fills the cache
                 found[way].append(replicas * round(duration / STEP) / spent)
-        bare.append(bare_speed(name, 1.0))
+        bare.append(bare_speed(name, SECONDS_ALONE))
     return CORES * statistics.median(bare), {
         way: statistics.median(speeds) for way, speeds in found.items()
     }
@@ -129,7 +129,7 @@ def measure(
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = new_parser(__doc__)
     names = list(SYSTEMS)
     parser.add_argument(
         "--systems", type=choice(names), default=names, help=f"of {','.join(names)}; all"
@@ -139,7 +139,7 @@ def main() -> None:
     parser.add_argument(
         "--seconds", type=float, default=4.0, help="of computing for each replica on one core; 4"
     )
-    asked = parser.parse_args()
+    asked = read_options(parser, systems=["27"], replicas=2, rounds=1, seconds=0.0)
     print(
         f"| SPC/E | engine alone, {CORES} times one core | {' | '.join(WAYS)} |\n|---|---|{'---|' * len(WAYS)}"
     )

@@ -1,9 +1,8 @@
 """What an average costs: total error against computing time, for methods of rigidmd, GROMACS and
 OpenMM.
 
-    python tests/benchmarks/sampling.py runs/sampling --rounds 4
-    python tests/benchmarks/sampling.py runs/sampling --collect --json sampling.json --figure
-    sampling.png
+    python tests/benchmarks/sampling.py --to runs/sampling --rounds 4
+    python tests/benchmarks/sampling.py --to runs/sampling --collect
 
 512 SPC/E waters at 298.15 K; cutoff 9 Å, Lennard-Jones switched over the last Å with tail
 corrections, PME. All engines have the same forces, one thread, and otherwise the settings that
@@ -13,7 +12,7 @@ first peak of g(r) of oxygens and D at 0.997 g/cm³, and the density at 1 bar.
 Many short runs (6 ps to relax, 48 ps sampled) from a few starts, in rounds of all methods and
 steps; a step of 1 fs in one round of four. Each leaves a small file, so that the command continues
 where it was stopped, and several of them share the work: `--next N` does N runs and fails if none
-is left. Then, of each average,
+is left. Then sampling.json and sampling.png are written next to them: of each average,
 
 - the bias of a method at a step: its mean less the limit of all engines and methods at a step of
   zero, one weighted fit linear in dt² (`extrapolate`);
@@ -27,23 +26,23 @@ The total error after a time t is sqrt(bias² + variance / t); of the square of 
 error is taken off.
 """
 
-import argparse
 import json
 import resource
 import sys
 import tempfile
 import time
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from command_line import SMOKE, new_parser, read_options
 from matplotlib.figure import Figure
 from peer_engines import (
+    ENGINES,
+    Absent,
     Failed,
-    Gromacs,
-    OpenMM,
-    Rigidmd,
     call,
     gro,
     openmm_system,
@@ -60,12 +59,17 @@ from rigidmd.figures.style import FAINT, INK
 from rigidmd.studies.extrapolation import MeanAtStep, extrapolate
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
-COUNT, TEMPERATURE, DENSITY, CUTOFF, SWITCH = 512, 298.15, 0.997, 9.0, 1.0  # K, g/cm³, Å
-EVERY, RELAXED, FRAMES = 0.12, 50, 450  # ps between frames; frames to relax, and all of a run
+COUNT = 343 if SMOKE else 512
+TEMPERATURE, DENSITY, CUTOFF, SWITCH = 298.15, 0.997, 9.0, 1.0  # K, g/cm³, Å
+#: Time between frames in ps; frames to relax, and all of a run.
+EVERY, RELAXED, FRAMES = (0.024, 2, 18) if SMOKE else (0.12, 50, 450)
+START_STEPS = 50 if SMOKE else 6000  # of 2 fs, from one start to the next
 NS = (FRAMES - RELAXED) * EVERY * 1e-3  # sampled by a run
 STARTS, BLOCKS = 4, 8  # blocks of a run, whose scatter is that of its average; two for D
 PEAK = (2.70, 2.80)  # Å, the shell around the first maximum of g(r) in which its height is averaged
-LAGS = (2.0, 8.0)  # ps between which the mean square displacement is taken as a straight line
+LAGS = (
+    (0.05, 0.15) if SMOKE else (2.0, 8.0)
+)  # ps between which the mean square displacement is taken as a straight line
 KT_PER_FREEDOM = 6 * BOLTZMANN * TEMPERATURE / KJ_PER_MOL  # of a molecule, kJ/mol
 RARE = 1.0  # fs: this step is run in one of four rounds only
 
@@ -169,16 +173,31 @@ class Run(NamedTuple):
 
 
 def runs(rounds: int) -> list[Run]:
-    """All runs, round by round."""
+    """All runs, round by round, of the engines that are installed."""
     found = []
     for number, ensemble in product(range(rounds), ("nvt", "npt")):
         for name, method in METHODS.items():
+            if method.engine not in installed():
+                continue
             steps = method.steps if ensemble == "nvt" else method.dense
+            steps = steps[:2] if SMOKE else steps
             found += [
                 Run(ensemble, name, step, number)
                 for step in steps
                 if step > RARE or number % STARTS == 0
             ]
+    return found
+
+
+@cache
+def installed() -> dict[str, str]:
+    """The engines that are installed, with their versions; the others are printed."""
+    found = {}
+    for name in dict.fromkeys(method.engine for method in METHODS.values()):
+        try:
+            found[name] = ENGINES[name].version()
+        except Absent as error:
+            print(f"{name} is skipped: {error}")
     return found
 
 
@@ -216,9 +235,11 @@ def make_starts(folder: Path) -> None:
     from peers import WORKLOADS, write_start
 
     stage = {"ensemble": "nvt", "integrator": "baoab", "thermostat": "langevin", "timestep_fs": 2.0}
-    simulation = simulate(scene(stage | {"duration_ps": 12.0 * (1 + STARTS)}, start=False), folder)
+    simulation = simulate(
+        scene(stage | {"duration_ps": 0.002 * START_STEPS * (1 + STARTS)}, start=False), folder
+    )
     for k in range(-1, STARTS):
-        simulation.step(6000)
+        simulation.step(START_STEPS)
         if k >= 0:
             state, system = simulation.state, simulation.system
             (folder / f"start{k}").mkdir(exist_ok=True)
@@ -343,7 +364,7 @@ def run_openmm(run: Run, folder: Path, start: Path) -> tuple:
     import openmm
 
     sites = dict(np.load(start / "sites.npz"))
-    system, force = openmm_system(sites, CUTOFF / 10, separate=SWITCH)
+    system, force = openmm_system(sites, CUTOFF / 10, switch=SWITCH)
     force.setNonbondedMethod(openmm.NonbondedForce.PME)
     if run.ensemble == "npt":
         barostat = openmm.MonteCarloBarostat(1.0, TEMPERATURE)
@@ -407,6 +428,8 @@ def do(run: Run, folder: Path) -> None:
                 run, Path(scratch), folder / f"start{run.round % STARTS}"
             )
         except (Failed, RigidMDError) as error:
+            if SMOKE:
+                raise
             run.file(folder).write_text(json.dumps({"failure": str(error)[:300]}) + "\n")
             return
     blocks = np.split(np.arange(RELAXED + 1, FRAMES + 1), BLOCKS)
@@ -638,28 +661,21 @@ def draw(result: dict, path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("folder", type=Path, help="of the runs; what is there is not run again")
+    parser = new_parser(__doc__)
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument(
         "--next", type=int, metavar="N", help="do N runs; exit status 1 if none is left"
     )
     parser.add_argument("--collect", action="store_true", help="run nothing")
-    parser.add_argument("--json", type=Path, help="what was found, and the averages of all runs")
-    parser.add_argument("--figure", type=Path)
-    options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
-    if not options.collect and not (options.folder / f"start{STARTS - 1}" / "sites.npz").exists():
-        make_starts(options.folder)
+    options = read_options(parser, Path("runs/sampling"), rounds=1)
+    folder = options.to
+    if not options.collect and not (folder / f"start{STARTS - 1}" / "sites.npz").exists():
+        make_starts(folder)
     if options.next:
-        sys.exit(
-            0 if any([do_next(options.folder, options.rounds) for _ in range(options.next)]) else 1
-        )
-    while not options.collect and do_next(options.folder, options.rounds):
+        sys.exit(0 if any([do_next(folder, options.rounds) for _ in range(options.next)]) else 1)
+    while not options.collect and do_next(folder, options.rounds):
         pass
-    found = read(options.folder)
+    found = read(folder)
     there = {ensemble for ensemble, _, _ in found}
     result = {
         name: analyse(name, found)
@@ -667,21 +683,16 @@ def main() -> None:
         if quantity.ensemble in there
     }
     print_tables(result)
-    if options.json:
-        versions = [engine.version() for engine in (Rigidmd, Gromacs, OpenMM)]
-        tables = {
-            name: one | {"points": [p._asdict() for p in one["points"]]}
-            for name, one in result.items()
-        }
-        every = [
-            {"ensemble": e, "method": m, "step_fs": s, "runs": results}
-            for (e, m, s), results in found.items()
-        ]
-        options.json.write_text(
-            json.dumps({"versions": versions, **tables, "all": every}, indent=1) + "\n"
-        )
-    if options.figure:
-        draw(result, options.figure)
+    tables = {
+        name: one | {"points": [p._asdict() for p in one["points"]]} for name, one in result.items()
+    }
+    every = [
+        {"ensemble": e, "method": m, "step_fs": s, "runs": results}
+        for (e, m, s), results in found.items()
+    ]
+    whole = {"versions": list(installed().values()), **tables, "all": every}
+    (folder / "sampling.json").write_text(json.dumps(whole, indent=1) + "\n")
+    draw(result, folder / "sampling.png")
 
 
 if __name__ == "__main__":

@@ -1,30 +1,30 @@
 """What a step of liquid SPC/E costs from 216 molecules to millions, on one core and on several:
 time and memory.
 
-    python tests/benchmarks/scaling.py --copies 1,2,4,8,17 --cores 1,2 --precision mixed --figure
-    scaling.png
+    python tests/benchmarks/scaling.py --copies 1,2,4,8,17 --cores 1,2 --precision mixed --to FOLDER
 
 The liquid is W1 of peers.py: cutoff 9 Å, reaction field, steps of 2 fs at constant energy. A box
 of 216 waters that has come to rest is copied along each edge, so every size is the same liquid.
 Each size runs in a process of its own, so that its peak of memory is its own. The start is the time
 from the state on disk to the end of the first step. Lists are built before the clock of the steps
 starts, and rebuilt while it runs. No variable about threads is set: it is measured as users have
-it.
+it. The figure is FOLDER/scaling.png.
 """
 
-import argparse
 import json
 import resource
 import subprocess
 import sys
 import tempfile
 import time
+from argparse import SUPPRESS
 from pathlib import Path
 
 import numpy as np
+from command_line import SMOKE, SMOKE_OPTION, new_parser, numbers, read_options
 from matplotlib.figure import Figure
 from peer_engines import environment
-from peers import WORKLOADS, numbers, write_start
+from peers import WORKLOADS, write_start
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from rigidmd import Scene, Simulation
@@ -36,8 +36,9 @@ WORK = WORKLOADS["W1"]
 UNIT = 216  # molecules in the box that is copied, whose edge is little more than twice the cutoff
 EDGE = WORK.edge * (UNIT / WORK.count) ** (1 / 3)  # Å
 STEP = 2e-3  # ps
-FEWEST_STEPS = 20
-SECONDS = 3.0
+FEWEST_STEPS = 5 if SMOKE else 20
+SECONDS = 0.0 if SMOKE else 3.0
+TO_REST = 0.1 if SMOKE else 10.0  # ps
 
 
 def scene(copies: int, precision: str, **changes) -> dict:
@@ -54,7 +55,7 @@ def relax(folder: Path) -> None:
         "ensemble": "nvt",
         "temperature_K": WORK.temperature,
         "timestep_fs": 2.0,
-        "duration_ps": 10.0,
+        "duration_ps": TO_REST,
         "thermostat_time_ps": 0.1,
     }
     state = (
@@ -90,7 +91,7 @@ def measure(job: dict) -> dict:
             Scene.from_dict(scene(job["copies"], job["precision"]), Path(folder))
         )
         start = time.perf_counter() - began
-    engine, state = simulation.engine, simulation.state
+    engine, state = simulation.engine, simulation.state.copy()
     scheme, done = SCHEMES["velocity_verlet"], 1
     began = time.perf_counter()
     engine.advance(state, scheme, STEP, done)
@@ -144,15 +145,14 @@ def draw(rows: list[dict], cores: list[int], path: Path) -> None:
 
 def main() -> None:
     """Measure every size and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = new_parser(__doc__)
     parser.add_argument(
         "--copies", type=numbers(int), default=[1, 2, 4, 8, 17], help="along each edge; 1,2,4,8,17"
     )
     parser.add_argument("--cores", type=numbers(int), default=[1, 2], help="1,2")
     parser.add_argument("--precision", choices=("double", "mixed"), default="mixed")
-    parser.add_argument("--figure", type=Path, help="file for a picture")
-    parser.add_argument("--job", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
+    parser.add_argument("--job", help=SUPPRESS)
+    asked = read_options(parser, Path("runs/scaling"), copies=[1, 2], cores=[1])
     if asked.job:
         print(json.dumps(measure(json.loads(asked.job))))
         return
@@ -173,7 +173,7 @@ def main() -> None:
                 "precision": asked.precision,
                 "folder": folder,
             }
-            command = [sys.executable, __file__, "--job", json.dumps(job)]
+            command = [sys.executable, __file__, "--job", json.dumps(job), *SMOKE_OPTION]
             done = subprocess.run(command, env=environment(), capture_output=True, text=True)
             if done.returncode:
                 sys.exit(done.stderr)
@@ -186,9 +186,7 @@ def main() -> None:
                 f"| {n:,} | {found['start']:.1f} |{costs} {rate:.3g} | {found['arrays'] / n / 1e3:.2f} | {found['peak'] / 1e9:.2f} |",
                 flush=True,
             )
-
-        if asked.figure:
-            draw(rows, asked.cores, asked.figure)
+    draw(rows, asked.cores, asked.to / "scaling.png")
 
 
 if __name__ == "__main__":

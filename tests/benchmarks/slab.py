@@ -1,8 +1,8 @@
 """Density and surface tension of a slab of water by rigidmd and by GROMACS: the same model, box,
 cutoffs and sums.
 
-    python tests/benchmarks/slab.py runs/slab --engine rigidmd --temperature 300 --ps 1000
-    python tests/benchmarks/slab.py runs/slab --engine gromacs --temperature 300 --ps 1000
+    python tests/benchmarks/slab.py --engine rigidmd --temperature 300 --ps 1000 --to runs/slab
+    python tests/benchmarks/slab.py --engine gromacs --temperature 300 --ps 1000 --to runs/slab
 
 systems/water_slab.toml, for the time that is given after 60 ps of equilibration. GROMACS has the
 export of that scene with the settings below, among them sums of dispersion over images (LJ-PME,
@@ -11,24 +11,25 @@ of its version 2022 is none for a slab that fills a third of the box. Both are a
 functions, GROMACS after its own 60 ps.
 """
 
-import argparse
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+from command_line import SMOKE, new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from rigidmd.analysis.built_in.interfaces import Slab, fitted
+from rigidmd.analysis.built_in.interfaces import BIN, fitted
 from rigidmd.core.statistics import mean_and_error
+from rigidmd.units import GRAM_PER_CM3
 
 SCENE = Path(__file__).parents[2] / "systems" / "water_slab.toml"
-EQUILIBRATION, BLOCKS = 60.0, 10
-TIMESTEP, SAMPLES, FRAMES = (
-    0.002,
-    25,
-    600,
-)  # ps; steps between pressure tensors and between frames of GROMACS
+EQUILIBRATION = 0.1 if SMOKE else 60.0  # ps
+BLOCKS = 2 if SMOKE else 10
+TIMESTEP = 0.002  # ps
+#: Steps between pressure tensors and between frames of GROMACS.
+SAMPLES, FRAMES = (5, 5) if SMOKE else (25, 600)
 SETTINGS = {
     "integrator": "md",
     "dt": TIMESTEP,
@@ -52,6 +53,8 @@ SETTINGS = {
 def by_rigidmd(folder: Path, temperature: float, ps: float) -> None:
     """Run the scene on one thread and print its density and surface tension."""
     changes = ["threads=1", f"stages.production.duration_ps={ps:g}"]
+    changes += [f"stages.equilibration.duration_ps={EQUILIBRATION:g}"]
+    changes += ["output.trajectory_interval_ps=0.03"] if SMOKE else []
     changes += [
         f"stages.{stage}.temperature_K={temperature:g}" for stage in ("equilibration", "production")
     ]
@@ -129,8 +132,14 @@ def measured(folder: Path) -> tuple[str, str]:
     middle = np.angle(np.exp(2j * np.pi * at) @ mass)[:, None] / (2 * np.pi)
     distance = ((at - middle + 0.5) % 1.0 - 0.5) * height
 
+    edges = np.linspace(0.0, height / 2, int(height / 2 / BIN) + 1)
+
     def density(part: np.ndarray) -> float:
-        return float(fitted(Slab(2, area, height, part, np.zeros((len(part), 0)), mass))[0][0])
+        """Of the liquid, from the profile of some frames as `rigidmd analyse` has it."""
+        weights = np.broadcast_to(mass, part.shape) / len(part)
+        masses = np.histogram(np.abs(part), edges, weights=weights)[0]
+        profile = masses / (2 * area * np.diff(edges)) / GRAM_PER_CM3
+        return float(fitted(0.5 * (edges[1:] + edges[:-1]), profile, height)[0])
 
     blocks = [density(part) for part in np.array_split(distance, BLOCKS)]
     spread = np.std(blocks, ddof=1) / np.sqrt(BLOCKS)
@@ -140,17 +149,20 @@ def measured(folder: Path) -> tuple[str, str]:
     )
 
 
+ENGINES = {"rigidmd": by_rigidmd, "gromacs": by_gromacs}
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description="Density and surface tension of a slab by rigidmd or GROMACS."
-    )
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--engine", choices=["rigidmd", "gromacs"], required=True)
+    parser = new_parser(__doc__)
+    parser.add_argument("--engine", choices=list(ENGINES), default="rigidmd", help="rigidmd")
     parser.add_argument("--temperature", type=float, default=300.0, help="K; 300")
     parser.add_argument("--ps", type=float, default=1000.0, help="1000")
-    given = parser.parse_args()
-    run = by_rigidmd if given.engine == "rigidmd" else by_gromacs
-    run(given.folder / f"{given.engine}_{given.temperature:g}", given.temperature, given.ps)
+    options = read_options(parser, Path("runs/slab"), ps=0.3)
+    for engine in ENGINES if SMOKE else [options.engine]:
+        if engine == "gromacs" and not shutil.which("gmx"):
+            sys.exit("GROMACS is not installed: there is no gmx on PATH")
+        run, temperature = ENGINES[engine], options.temperature
+        run(options.to / f"{engine}_{temperature:g}", temperature, options.ps)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What a custom pair potential costs, compared with the built-in Lennard-Jones with the same
 truncation, in turns.
 
-python tests/benchmarks/user_potential.py [molecules] [rounds]
+    python tests/benchmarks/user_potential.py --molecules 4000 --rounds 9
 """
 
 import sys
@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from command_line import SMOKE, new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import rigidmd
 from rigidmd.assemble.build import build
 from rigidmd.assemble.build import integrator_of_stage as row
 
-STEPS = 40
+STEPS = 5 if SMOKE else 40
 
 
 class Mie(NamedTuple):
@@ -52,12 +53,16 @@ def potentials(epsilon: float, sigma: float) -> dict[str, rigidmd.PairPotential 
 
 def main() -> None:
     """Print the median of the ratios of each potential."""
-    count, rounds = (int(x) for x in (*sys.argv[1:], 4000, 9)[:2])
+    parser = new_parser(__doc__)
+    parser.add_argument("--molecules", type=int, default=4000, help="4000")
+    parser.add_argument("--rounds", type=int, default=9, help="9")
+    options = read_options(parser, molecules=400, rounds=1)
+    count, rounds = options.molecules, options.rounds
     print(
         f"{count} argon, cut-off 9 Å, steps of 4 fs; time of a step relative to the built-in potential"
     )
-    for precision in ("double", "mixed"):
-        for truncation in ("plain", "switch"):
+    for precision in ("mixed",) if SMOKE else ("double", "mixed"):
+        for truncation in ("switch",) if SMOKE else ("plain", "switch"):
             scene = rigidmd.Scene.from_dict(
                 {
                     "precision": precision,
