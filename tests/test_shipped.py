@@ -3,9 +3,11 @@ holds."""
 
 import os
 import pty
+import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 
 import pytest
 from processes import process
@@ -41,6 +43,31 @@ def test_every_package_and_every_data_file_is_in_the_wheel():
         if file.is_file() and (file.suffix not in (".py", ".pyc") or file.parent in scripts)
     }
     assert held == there
+
+
+def test_a_wheel_has_nothing_of_an_earlier_build(tmp_path):
+    """README's command again after an update in which a module has moved."""
+    ignored = shutil.ignore_patterns(".*", "build", "*.egg-info", "tests", "docs", "__pycache__")
+    checkout = shutil.copytree(ROOT, tmp_path / "checkout", ignore=ignored)
+    (checkout / "rigidmd" / "moved.py").touch()
+    (checkout / "build" / "lib" / "rigidmd").mkdir(parents=True)  # of a version that built there
+    (checkout / "build" / "lib" / "rigidmd" / "former.py").touch()
+    module, built = checkout / "rigidmd" / "moved.py", []
+    for name in ("first", "second"):
+        command = [sys.executable, "-m", "pip", "wheel", "--no-deps", ".", "-w", tmp_path / name]
+        done = subprocess.run(command, cwd=checkout, capture_output=True, text=True)
+        if "No matching distribution found for setuptools" in done.stderr:
+            pytest.skip("no package index, from which pip takes setuptools")
+        assert done.returncode == 0, done.stderr
+        with zipfile.ZipFile(next((tmp_path / name).glob("*.whl"))) as wheel:
+            built.append({one for one in wheel.namelist() if ".dist-info/" not in one})
+        module = module.replace(checkout / "rigidmd" / "core" / "moved.py")
+    first, second = built
+    assert first - second == {"rigidmd/moved.py"} and second - first == {"rigidmd/core/moved.py"}
+    assert "rigidmd/former.py" not in first | second
+    files = {one for one in second if one.endswith(".py")}
+    modules = {str(one.relative_to(checkout)) for one in (checkout / "rigidmd").rglob("*.py")}
+    assert {one for one in files if "/systems/" not in one} == modules
 
 
 def test_the_scenes_shipped_are_those_of_systems():
