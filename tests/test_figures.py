@@ -76,6 +76,7 @@ def test_every_figure_shows_names_as_they_are_written():
 
 #: Names that users give: Matplotlib reads formulas between dollar signs, and fails at most of
 #: these.
+PNG = b"\x89PNG"
 NAMES = ["$`$", "$a$ $", r"\frac{$x$", "$$", "$(x) ${v}", r"\$a$", "a_b^c", "%(x)s {} <b>"]
 
 
@@ -120,10 +121,12 @@ def test_figures_of_a_run_and_of_a_molecule_take_any_name(name, staged, tmp_path
         )
     )
     for figure in figures:
-        figure.png()
+        assert figure.png()[0].startswith(PNG)
+    assert any(name in text.get_text() for text in figures[-1].findobj(Text))
     molecule = load_model("spce")
     own = replace(molecule, name=name, title=name, source=name, site_names=(name,) * 3)
     write_molecule_figure(tmp_path / "own.png", own, force=False)
+    assert (tmp_path / "own.png").read_bytes().startswith(PNG)
 
 
 STAGES = ["minimise", "equilibration", "a short one", "another", "quench", "production at 300 K"]

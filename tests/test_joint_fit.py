@@ -125,7 +125,6 @@ def test_pulls_of_joint_limits_have_unit_width(
         for name, (_, fit) in found.responses.items():
             responses.setdefault(name, []).append(fit.limit)
     for name, values in pulls.items():
-        print(name, np.mean(values), np.std(values), np.mean(ratios[name]), np.max(ratios[name]))
         assert abs(np.mean(values)) < 0.4, name
         assert 0.7 < np.std(values) < 1.35, name
         assert max(ratios[name]) <= 1, name

@@ -174,7 +174,6 @@ def test_a_run_of_an_ideal_gas_of_rotors_has_its_responses(barostat):
     }
     results = Simulation(Scene.from_dict(scene)).run(progress=False)
     found = rigidmd.analysis.response(results)
-    print(found)
     exact = {"c_p": (2.5 + (count + 1) / count) * R, "kappa_T": 1e6 / pressure}
     exact |= {"alpha_p": 1e3 / 300, "c_v": 2.5 * R, "gamma_V": pressure / 300}
     for name, value in exact.items():
