@@ -722,19 +722,45 @@ def test_a_list_with_almost_no_skin_is_built_at_every_step(precision):
 
 
 def test_the_pressure_of_an_ideal_gas():
-    """Molecules beyond each other's reach: P V = 2/3 of the energy of translation, whatever
-    rotates."""
+    """Molecules beyond each other's reach: P V = N k T_trans, whatever rotates, also where the total
+    momentum is zero."""
     system, engine, state = built(
         {"nitrogen": 12}, 200.0, forces={"cutoff_A": 8.0, "truncation": "shift"}
     )
     seen = observe(system, engine, state)
     assert seen.potential == 0.0 and seen.kinetic_rotation > 0.0
-    mass = system.model.mass[system.model.species]
-    expected = float(mass @ (state.velocity**2).sum(axis=1)) / (3 * state.volume) / BAR
+    expected = 12 * BOLTZMANN * seen.temperature_translation / state.volume / BAR
     assert seen.pressure_bar == pytest.approx(expected, rel=1e-12)
-    assert expected * state.volume * BAR == pytest.approx(
-        11 * BOLTZMANN * seen.temperature_translation, rel=1e-12
-    )
+
+
+WALLS = {"axis": "z", "kind": "harmonic", "positions_A": [5.0, 50.0], "stiffness_kJ_mol_A2": 4.0}
+KEPT = {"ensemble": "nvt", "temperature_K": 300.0, "duration_ps": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("counts", "stage", "sections", "axes"),
+    [
+        ({"nitrogen": 5}, KEPT, {}, [1, 1, 1]),
+        ({"nitrogen": 5}, {"duration_ps": 1.0}, {}, [1, 1, 1]),
+        ({"nitrogen": 5}, KEPT | {"thermostat": "langevin"}, {}, [0, 0, 0]),
+        ({"nitrogen": 5}, KEPT | {"thermostat": "hybrid_monte_carlo"}, {}, [0, 0, 0]),
+        ({"nitrogen": 1}, KEPT, {}, [1, 1, 1]),
+        ({"nitrogen": 5}, KEPT, {"fields": {"walls": [WALLS]}}, [1, 1, 0]),
+    ],
+)
+def test_the_pressure_contains_the_total_momentum_where_it_is_zero(counts, stage, sections, axes):
+    """kT/V along each axis along which it is conserved."""
+    forces = {"cutoff_A": 8.0, "truncation": "shift"}
+    system, engine, state = built(counts, 60.0, forces=forces, stages=[stage], **sections)
+    state.velocity[:] -= state.velocity.mean(axis=0)
+    seen = observe(system, engine, state, stage=0)
+    mass = system.model.mass[system.model.species]
+    flux = np.einsum("n,ni,nj->ij", mass, state.velocity, state.velocity)
+    several = sum(counts.values()) > 1
+    thermal = BOLTZMANN * (seen.temperature_translation if several else seen.temperature)
+    expected = (flux + thermal * np.diag(axes)) / state.volume / BAR
+    assert thermal > 0
+    assert seen.pressure_tensor_bar == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
 def test_the_self_energy_of_the_reaction_field():

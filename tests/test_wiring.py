@@ -16,6 +16,7 @@ from rigidmd.core.state import NOW, ORIGIN, REMOVED
 from rigidmd.dynamics import barostats, step_loop, thermostats
 from rigidmd.dynamics.model import draw_momenta, remove_momentum
 from rigidmd.dynamics.noise import BAROSTAT
+from rigidmd.errors import SceneError
 
 #: In u, Å and ps, from SI: 1 u = 1.66053906660e-27 kg.
 KILOGRAM = 1 / 1.66053906660e-27
@@ -201,6 +202,8 @@ def test_a_piston_has_the_period_that_was_asked_for():
     """1/M of a mass M on the spring 1/(compressibility V): (2 pi/period)² compressibility V."""
     box = barostat_of(system_of(NPH | {"barostat_time_ps": 0.4}), 0)
     assert box.inverse_mass == pytest.approx((2 * pi / 0.4) ** 2 * 8e-5 / BAR * 14.0**3)
+    count = sum(COUNTS.values())
+    assert box.exponent == pytest.approx(count / (count - 1))  # with the total momentum at rest
     pressed(box.pressure)
 
 
@@ -218,6 +221,18 @@ def test_the_total_momentum_is_taken_out_at_its_interval_where_it_is_kept(thermo
     )
     rests = [flow.every for flow in own.flows if flow.kind == REMOVE_MOMENTUM]
     assert rests == ([25] if thermostat == "velocity_rescaling" else [])
+
+
+@pytest.mark.parametrize("thermostat", ["velocity_rescaling", "hybrid_monte_carlo"])
+def test_an_interval_beyond_the_run_fits_into_64_bits(thermostat):
+    """A picosecond has 1e23 steps of 1e-20 fs."""
+    stage = NVT | {"thermostat": thermostat, "duration_ps": 4e-23, "timestep_fs": 1e-20}
+    if thermostat == "hybrid_monte_carlo":
+        with pytest.raises(SceneError, match="a trajectory of hybrid_monte_carlo is more than"):
+            system_of(stage)
+        return
+    rests = [flow.every for flow in row(system_of(stage), 0).flows if flow.kind == REMOVE_MOMENTUM]
+    assert rests == [10**12]
 
 
 # what the step makes of them
@@ -398,4 +413,5 @@ def test_temperatures_and_pressures_have_the_corrected_kinetic_energy():
     assert found.kinetic == at_ends.kinetic and found.conserved == at_ends.conserved
     squares = np.einsum("ni,nj->ij", found.load.force, found.load.force / mass[:, None])
     gained_tensor = found.pressure_tensor_bar - at_ends.pressure_tensor_bar
-    assert gained_tensor == pytest.approx(dt**2 / 6 * squares / state.volume / BAR, rel=1e-6)
+    expected = dt**2 / 6 * squares + KELVIN * gained * np.eye(3)  # with the momentum at rest
+    assert gained_tensor == pytest.approx(expected / state.volume / BAR, rel=1e-6)

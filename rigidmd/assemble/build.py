@@ -343,7 +343,7 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
         else:
             scheme = scheme.with_barostat(barostat, stage.moves_every)
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
-        scheme = scheme.with_momentum_removal(max(1, round(interval / stage.step)))
+        scheme = scheme.with_momentum_removal(stage.steps_of(interval))
     return scheme
 
 
@@ -360,7 +360,7 @@ def barostat_of(system: System, k: int) -> NamedTuple:
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
     first, last = (tuple(x * BAR for x in ends) for ends in stage.pressures)
     pressure = Pressure(first, last, float(stage.steps))  # pyright: ignore[reportArgumentType]
-    x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
+    x, y, z = map(float, system.at_rest_in(k))
     confinement = Confinement(
         _thermal(stage),
         pressure,

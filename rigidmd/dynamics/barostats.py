@@ -7,7 +7,7 @@ and the centres of mass from the right. The virial is W_ij = sum F_i R_j in `tal
 The energy added to the molecules is in `state.energy_ledger[WORK]`.
 """
 
-from math import exp, log, sqrt
+from math import exp, inf, log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -88,6 +88,9 @@ class Piston(NamedTuple):
 
     pressure: Pressure
     inverse_mass: float  # 1/M, Å⁴/u
+    # a: velocities follow V^(-a/3). 1, or 3 N over the translational degrees of freedom, so that
+    # the kinetic part of the pressure contains a total momentum that is kept at zero
+    exponent: float
     tail: tuple[float, float]
 
     variables = 1  # how many numbers it has in `state.extra_variables`
@@ -129,6 +132,7 @@ BAROSTATS = {
     "piston": lambda stage, given: Piston(
         given.pressure,
         given.compressibility * given.volume * (2 * np.pi / stage.barostat_time) ** 2,
+        3 * given.molecules / (3 * given.molecules - sum(given.at_rest) or inf),
         given.tail,
     ),
 }
@@ -210,7 +214,7 @@ def move_piston(barostat, state, h):
     after = volume + h * barostat.inverse_mass * state.extra_variables[-1]
     scale = (after / volume) ** (1 / 3)
     scale_array(state.position, scale)
-    scale_array(state.velocity, 1 / scale)
+    scale_array(state.velocity, scale**-barostat.exponent)
     scale_array(state.cell, scale)
     state.energy_ledger[WORK] -= target_pressure(barostat.pressure, state, 0) * (after - volume)
 
@@ -268,9 +272,8 @@ def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, dr
         progress[LOADED] = 1
     volume = volume_of(state.cell)
     virial = workspace.tally[0, 1] + workspace.tally[0, 5] + workspace.tally[0, 9]
-    pressure = (2 * translational_energy(model, state) + virial) / (3 * volume) + barostat.tail[
-        1
-    ] / volume**2
+    momenta = 2 * barostat.exponent * translational_energy(model, state)
+    pressure = (momenta + virial) / (3 * volume) + barostat.tail[1] / volume**2
     before = state.extra_variables[-1]
     state.extra_variables[-1] += h * (pressure - target_pressure(barostat.pressure, state, 0))
     state.energy_ledger[WORK] -= (

@@ -1,7 +1,7 @@
 """Observables of molecules at one state: energies, temperatures, pressure, momentum and the
 orthogonality of Q."""
 
-from math import hypot, inf, nan
+from math import hypot, inf, isfinite, nan
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -103,8 +103,9 @@ def observe(
     trajectories : the columns `OF_TRAJECTORIES`, if the scene has them
 
     The pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen &
-    Tildesley 2017, 2.7.2). Its tensor is the symmetric part. The rest is the rate at which
-    orientations gain angular momentum, 0 on average.
+    Tildesley 2017, 2.7.2), and kB T/V along each axis along which the total momentum is kept at
+    zero: its mean in a liquid, see the theory chapter `sampling`. Its tensor is the symmetric part.
+    The rest is the rate at which orientations gain angular momentum, 0 on average.
     """
     load, tallies = engine.evaluate_current(state) if moved else engine.evaluate(state)
     components = {name: tally.energy for name, tally in tallies.items()} | system.constants
@@ -120,10 +121,18 @@ def observe(
     translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
     potential = sum(components.values())
     kinetic = translation + rotation
-    translation_corrected = translation + correction * sums.force
-    rotation_corrected = rotation + correction * sums.torque
-    flux = sums.momentum_flux + 2 * correction * sums.force_squares
+    translation_corrected, rotation_corrected, flux = translation, rotation, sums.momentum_flux
+    if correction:  # else squares of forces may exceed the range of numbers
+        translation_corrected = translation + correction * sums.force
+        rotation_corrected = rotation + correction * sums.torque
+        flux = flux + 2 * correction * sums.force_squares
     freedom = system.freedom if stage is None else system.freedom_in(stage)
+    temperature = _temperature(translation_corrected + rotation_corrected, freedom.total)
+    of_translation = _temperature(translation_corrected, freedom.translation)
+    if (at_rest := system.at_rest_in(stage)).any() and freedom.total:
+        # a single molecule has no other momentum than the total one
+        missing = of_translation if freedom.translation else temperature
+        flux = flux + BOLTZMANN * missing * np.diag(at_rest)
     if boxed := volume < inf:
         pressure = (flux + (virial + virial.T) / 2) / volume + (
             system.constant_pressure + tail_pressure
@@ -144,11 +153,11 @@ def observe(
         potential=potential / energy_unit,
         kinetic=kinetic / energy_unit,
         energy=energy,
-        temperature=_temperature(translation_corrected + rotation_corrected, freedom.total),
+        temperature=temperature,
         volume=volume * 1e-3 if boxed else nan,
         density=system.mass / volume / GRAM_PER_CM3 if boxed else nan,
         stage_name=system.scene.stages[stage or 0].label,
-        temperature_translation=_temperature(translation_corrected, freedom.translation),
+        temperature_translation=of_translation,
         temperature_rotation=_temperature(rotation_corrected, freedom.rotation),
         pressure_bar=float(pressure.trace()) / (3 * BAR),
         drift=conserved - (conserved if origin is None else origin),
@@ -160,8 +169,8 @@ def observe(
         **{name: float(tensor_bar[at]) for name, at in COMPONENTS.items()},
         conserved=conserved,
         stage=stage or 0,
-        force_squares=sums.force / energy_unit,
-        torque_squares=sums.torque / energy_unit,
+        force_squares=sums.force / energy_unit if isfinite(sums.force) else nan,
+        torque_squares=sums.torque / energy_unit if isfinite(sums.torque) else nan,
         user_energies=(
             *(components[name] / energy_unit for name in system.user_terms),
             *(term.distance_in(state) for term in system.distances.values()),
@@ -225,6 +234,9 @@ def describe_quantities(system: System) -> dict[str, str]:
     if system.space.volume == inf:
         return descriptions
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
+    if axes := int(system.at_rest_in(None).sum()):
+        momentum = "the total momentum, which is zero"
+        pressure += f", and {'' if axes == 3 else f'{axes}/3 of '}kB T_trans/V of {momentum}"
     if system.external:
         virial += (
             ", of the forces between molecules. Fields, walls and restraints do not contribute"

@@ -56,7 +56,13 @@ class Sample(NamedTuple):
     ]
     temperature_rotation: Annotated[float, Column("T_rot (K)", "K", "temperature of rotation")]
     pressure_bar: Annotated[
-        float, Column("Pressure (bar)", "bar", "molecular pressure, tail correction included")
+        float,
+        Column(
+            "Pressure (bar)",
+            "bar",
+            "molecular pressure, with the tail correction and kB T/V of a total momentum that is"
+            " kept at zero",
+        ),
     ]
     drift: Annotated[
         float, Column("Drift (kJ/mole)", "kJ/mol", "change of `conserved` since the stage began")

@@ -164,6 +164,11 @@ class System:
             return not getattr(self.thermostat, "changes_momentum", False)
         return self.scene.stages[k].keeps_momentum
 
+    def at_rest_in(self, k: int | None) -> np.ndarray:
+        """Whether each component (3,) of the total momentum is kept at zero, in stage k or, with
+        None, at the start."""
+        return self.model.keeps_momentum & (k is None or self.keeps_momentum_in(k))
+
     @property
     def last_freedom(self) -> DegreesOfFreedom:
         """Degrees of freedom in the last stage that is not a minimisation."""

@@ -268,7 +268,8 @@ def _pair_of(run: RigidFrames) -> np.ndarray:
         other = 1e3 * columns["volume"]
         energy = energy + BAR * stage.pressures[0][0] * other
     elif run.has_box:
-        freedom = run.system.freedom_in(run.system.scene.stages.index(stage)).translation
+        k = run.system.scene.stages.index(stage)
+        freedom = run.system.freedom_in(k).translation + run.system.at_rest_in(k).sum()
         momenta = BOLTZMANN * freedom * columns["temperature_translation"]
         other = BAR * columns["pressure_bar"] - momenta / (3 * run.volume.mean())
     return np.array([energy / thermal_energy_of(run), other])
