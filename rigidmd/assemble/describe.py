@@ -26,7 +26,7 @@ from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.molecules import name_of
-from rigidmd.scene.validation import not_none
+from rigidmd.scene.validation import not_none, number_of_steps
 from rigidmd.units import BAR, KJ_PER_MOL
 
 #: Precision of forces, for reports. Times: docs/evidence/benchmarks.md.
@@ -107,7 +107,7 @@ def _describe_body(system: BodySystem) -> str:
     lines.append(
         f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}"
     )
-    every = max(1, round(not_none(scene.output.interval_s) / run.timestep_s))
+    every = number_of_steps(not_none(scene.output.interval_s), run.timestep_s)
     lines += [f"a sample every {every * run.timestep_s:g} s", *system.notes]
     return "\n".join(lines)
 

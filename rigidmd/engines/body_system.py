@@ -20,7 +20,7 @@ from rigidmd.mechanics.time_functions import TimeFunction, piece_at, values_at
 from rigidmd.mechanics.translation import FluidTranslation, InertialFrame
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
-from rigidmd.scene.validation import not_none
+from rigidmd.scene.validation import not_none, number_of_steps
 
 Component = TypeVar("Component", bound=NamedTuple)
 
@@ -75,7 +75,7 @@ class BodySystem:
             ("run.duration_s", run.duration_s),
             ("output.interval_s", is_set and interval),
         ):
-            used = duration and max(1, round(duration / dt)) * dt
+            used = duration and number_of_steps(duration, dt) * dt
             if not run.is_auto and duration and abs(used - duration) > 1e-9 * duration:
                 notes.append(
                     f"{key} = {duration:g} is not a whole number of steps of {dt:g} s:"

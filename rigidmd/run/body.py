@@ -34,7 +34,7 @@ from rigidmd.run.resume import Arrays, NotNegative, RunRecord, check_same_scene,
 from rigidmd.run.schedule import Segment, interruptible
 from rigidmd.run.stable_step import body_step_warnings, fastest_body_rate
 from rigidmd.scene import BodyScene
-from rigidmd.scene.validation import not_none
+from rigidmd.scene.validation import not_none, number_of_steps
 
 if TYPE_CHECKING:
     from rigidmd.run.results import Results
@@ -108,7 +108,7 @@ class BodyWatch(Observer):
     def __init__(self, run: "Simulation"):
         self._run, self._system, self._limits = run, run.system, run.scene.watch
         system = run.system
-        every = max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
+        every = number_of_steps(not_none(run.scene.output.interval_s), run.scene.run.timestep_s)
         # half a second of computing
         step_limit = EVALUATIONS_PER_CHECK // getattr(system.method, "force_evaluations", 1)
         self.steps = min(step_limit, SAMPLES_PER_CHECK * every)

@@ -20,6 +20,7 @@ from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.signals import CHECKPOINT_SIGNALS, STOP_SIGNAL, has_handler
 from rigidmd.io.checkpoint import Checkpoint, write_checkpoint
 from rigidmd.run.observers import Observer, above_zero
+from rigidmd.scene.validation import number_of_steps
 
 
 class Segment(NamedTuple):
@@ -50,7 +51,7 @@ class ObservationSchedule:
                 interval = above_zero(
                     observer.interval, f"the interval of {type(observer).__name__}"
                 )
-                every = max(1, round(interval / (segment.dt * together))) * together
+                every = number_of_steps(interval, segment.dt, together)
                 self._regular.append((every, segment.steps_before))
 
     def next_observation(self, done: int) -> int:

@@ -51,6 +51,7 @@ from rigidmd.scene.body_forces import (
 )
 from rigidmd.scene.integrators import MovedByScheme
 from rigidmd.scene.validation import (
+    MOST_STEPS,
     MOST_TABLES,
     Flag,
     Limit,
@@ -64,6 +65,7 @@ from rigidmd.scene.validation import (
     Vector,
     location_of,
     not_none,
+    number_of_steps,
 )
 
 Matrix = tuple[Vector, Vector, Vector]
@@ -72,7 +74,6 @@ Quaternion = tuple[Number, Number, Number, Number]
 #: A rotation matrix with fewer than about nine digits is an error without `project`.
 LARGEST_ORTHOGONALITY_ERROR = 1e-9
 FURTHEST_FROM_ROTATION = 0.1
-MOST_STEPS = 1e12
 #: Keys of [body] that give the inertia, of which a body has at most one.
 WAYS_OF_INERTIA = ("solid", "solids", "points", "inertia_kg_m2", "inertia_tensor_kg_m2")
 #: Those of them that are tables of parts with masses and positions.
@@ -431,7 +432,7 @@ class Run(MovedByScheme):
 
     @property
     def steps(self) -> int:
-        return round(self.duration_s / self.timestep_s)
+        return number_of_steps(self.duration_s, self.timestep_s)
 
 
 class BodyOutput(Section):

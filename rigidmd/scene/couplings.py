@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple, Protocol, get_args
 
 from pydantic import Field, Strict
 
-from rigidmd.scene.validation import NameIn, Number, Positive, Section
+from rigidmd.scene.validation import NameIn, Number, Positive, Section, number_of_steps
 
 Values = dict[str, float]  # of keys
 Six = tuple[float, float, float, float, float, float]
@@ -130,7 +130,7 @@ THERMOSTATS = {
         "trajectories from new momenta, accepted or rejected: averages without a time-step error",
         "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216",
         {
-            "trajectory_steps": lambda stage: max(1, round(TRAJECTORY_PS / stage.step)),
+            "trajectory_steps": lambda stage: number_of_steps(TRAJECTORY_PS, stage.step),
             "momentum_refreshment": 1.0,
         },
         on_molecules=True,

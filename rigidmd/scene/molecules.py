@@ -19,8 +19,9 @@ from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
 from rigidmd.scene.models import SIZES
 from rigidmd.scene.species import SPECIES_FILES, Box, Molecules, Start, Structure
-from rigidmd.scene.stage import MOST_STEPS, Stage
+from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import (
+    MOST_STEPS,
     MOST_TABLES,
     Count,
     Flag,

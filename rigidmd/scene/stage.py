@@ -20,6 +20,7 @@ from rigidmd.scene.couplings import (
 )
 from rigidmd.scene.integrators import MovedByScheme
 from rigidmd.scene.validation import (
+    MOST_STEPS,
     Count,
     NameIn,
     Positive,
@@ -27,10 +28,9 @@ from rigidmd.scene.validation import (
     ShortName,
     TrajectoryError,
     not_none,
+    number_of_steps,
 )
 from rigidmd.units import FEMTOSECOND
-
-MOST_STEPS = 1e12
 
 Ensemble = Literal["nve", "nvt", "npt", "nph", "minimise"]
 
@@ -222,6 +222,11 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             yield f"bias_kT is for averages at a temperature, and {self.ensemble} has no thermostat"
         if not self.duration / self.step < MOST_STEPS:
             yield f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps"
+        elif not self.steps_together < MOST_STEPS:
+            yield (
+                f"a trajectory of {self.thermostat_kind} is more than {MOST_STEPS:g} steps: set"
+                " trajectory_steps or a longer timestep_fs"
+            )
         if self.duration < 0.5 * self.step and not self.is_minimisation:
             yield (
                 f"duration_ps = {self.duration_ps:g} is less than one step of {self.step_fs:g} fs"
@@ -351,11 +356,9 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         return self.steps_of(self.duration) if self.duration else 0
 
     def steps_of(self, interval: float) -> int:
-        """The nearest number of steps to an interval (ps), at least one step or trajectory. At most
-        `MOST_STEPS`, which no stage has."""
-        together = self.steps_together
-        steps = min(interval / self.step, MOST_STEPS)
-        return max(1, round(steps / together)) * together
+        """The nearest number of steps to an interval (ps), at least one step or trajectory, see
+        `number_of_steps`."""
+        return number_of_steps(interval, self.step, self.steps_together)
 
     @property
     def steps_together(self) -> int:

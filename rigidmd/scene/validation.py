@@ -109,6 +109,16 @@ class NameIn:
         return {"enum": list(self.names), "type": "string"}
 
 
+#: No run or stage has as many steps.
+MOST_STEPS = 1e12
+
+
+def number_of_steps(interval: float, step: float, together: int = 1) -> int:
+    """The nearest number of steps to an interval, at least 1 and a multiple of `together`. A longer
+    interval than `MOST_STEPS` has about these, which no run reaches: kernels count in 64 bits."""
+    return max(1, round(min(interval / step, MOST_STEPS) / together)) * together
+
+
 def not_none(value: T | None) -> T:
     """The value of an optional key that validation or defaults have set."""
     assert value is not None, "the scene is not validated or not resolved"

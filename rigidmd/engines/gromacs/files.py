@@ -283,9 +283,6 @@ def _settings(view: ForceFieldView, k: int) -> str:
     stage = system.scene.stages[k]
     cutoff = system.cutoff * NM
 
-    def every(interval: float) -> int:
-        return max(1, round(interval / stage.step))
-
     keeps = system.freedom_in(k).translation < 3 * len(system.model.species)
     interval = system.removes_momentum_every
     integrator, _ = THERMOSTATS[stage.thermostat]
@@ -294,11 +291,11 @@ def _settings(view: ForceFieldView, k: int) -> str:
         "dt": f"{stage.step:.12g}",
         "nsteps": stage.steps,
         "comm-mode": "Linear" if keeps else "None",
-        "nstcomm": every(interval) if interval else 100,
-        "nstlog": every(scene.output.log_interval_ps),
-        "nstenergy": every(scene.output.log_interval_ps),
+        "nstcomm": stage.steps_of(interval) if interval else 100,
+        "nstlog": stage.steps_of(scene.output.log_interval_ps),
+        "nstenergy": stage.steps_of(scene.output.log_interval_ps),
         "nstxout-compressed": (
-            every(scene.output.trajectory_interval_ps) if scene.output.trajectory else 0
+            stage.steps_of(scene.output.trajectory_interval_ps) if scene.output.trajectory else 0
         ),
         "continuation": "yes",
         "gen-vel": "no",

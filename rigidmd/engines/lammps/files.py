@@ -473,8 +473,8 @@ def input_script(view: ForceFieldView) -> str:
     for k, stage in enumerate(system.scene.stages):
         if stage.is_minimisation:
             continue
-        every = max(1, round(output.log_interval_ps / stage.step))
-        frames = max(1, round(output.trajectory_interval_ps / stage.step))
+        every = stage.steps_of(output.log_interval_ps)
+        frames = stage.steps_of(output.trajectory_interval_ps)
         stage_fixes = fixes(view, k)
         lines += [
             "",

@@ -64,7 +64,7 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
             others.append(f"besides{number}_{n + 1}.xml")
             text[others[-1]] = serialize(other)
         intervals = (scene.output.log_interval_ps, scene.output.trajectory_interval_ps)
-        every, frame = (max(1, round(interval / stage.step)) for interval in intervals)
+        every, frame = map(stage.steps_of, intervals)
         rows.append(f"    {(stage.label, stage.steps, every, frame, file, others)!r},")
     names = {"system": SYSTEM, "state": STATE, "topology": TOPOLOGY, "kick": KICK, "moves": MOVES}
     values = {"title": in_comment(scene.in_short), "stages": "\n".join(rows), **names}
