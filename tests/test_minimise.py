@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from support import shaken, small_scene
+from support import ROOT, shaken, small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
@@ -30,7 +30,7 @@ from rigidmd.run.schedule import CheckpointSchedule
 from rigidmd.scene import Scene
 from rigidmd.scene.models import load_model
 from rigidmd.studies.accuracy.accuracy import measure_accuracy
-from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
+from rigidmd.units import BAR, BOLTZMANN, COULOMB, GRAM_PER_CM3, KJ_PER_MOL
 from rigidmd.view.run_page import write_report
 
 MIXTURE = {"argon": 4, "nitrogen": 4, "spce": 6}
@@ -447,6 +447,50 @@ def test_charges_that_nothing_keeps_apart():
         match=r"no lower bound: P of molecule 1 .* and M of molecule 2 .*forces.pairs",
     ):
         simulation.run()
+
+
+def test_atoms_that_are_nearly_in_one_place():
+    """The squares of their forces exceed the range of numbers."""
+    scene = small_scene({"argon": 2}, None, stages=[stage_of()])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        results, minimum = minimum_of(scene, state_of([[0.0, 0.0, 0.0], [1e-12, 0.0, 0.0]]))
+    assert minimum["converged"]
+    assert results["potential"][-1] == pytest.approx(-WELL / KJ_PER_MOL, rel=1e-3)
+    assert np.isnan(results["force_squares"][0]) and np.isfinite(results["force_squares"][-1])
+
+
+#: Models whose charges have no repulsion of their own.
+BARE = [
+    name
+    for name in sorted(path.stem for path in (ROOT / "rigidmd" / "models").glob("*.toml"))
+    if ((load_model(name).charges != 0) & (load_model(name).epsilon == 0)).any()
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "seeds"),
+    [
+        ("tip5p", 3),
+        *(pytest.param(name, 3, marks=pytest.mark.extended) for name in BARE),
+        *(pytest.param(name, 20, marks=pytest.mark.soak) for name in BARE),
+    ],
+)
+def test_models_with_bare_charges_are_minimised_from_every_lattice(name, seeds):
+    """Opposite charges get as near as 0.9 Å in TIP5P."""
+    edge = np.cbrt(64 * load_model(name).mass / GRAM_PER_CM3)
+    for seed in range(1, seeds + 1):
+        scene = small_scene(
+            {name: 64},
+            float(edge),
+            forces={"cutoff_A": 6.0},
+            stages=[stage_of(most_iterations=400)],
+            seed=seed,
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RigidMDWarning)  # of the number of iterations
+            minimum = minimum_of(scene)[1]
+        assert abs(minimum["energy_after_kJ_mol_per_molecule"]) < 100  # no charge is in another
 
 
 def test_a_box_that_nothing_holds_together():

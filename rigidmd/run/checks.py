@@ -26,9 +26,9 @@ from rigidmd.scene.molecules import Watch, name_of
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 #: Opposite charges without repulsion count as collapsed below this fraction of the smallest
-#: diameter; the hydrogen of a hydrogen bond stays at half of it. The second fraction is for
-#: molecules without any repulsion.
-CHARGED_OVERLAP, CHARGES_OVERLAP = 0.3, 1.0
+#: diameter. The hydrogen of a hydrogen bond stays at half of it, in TIP5P at 0.28 from the lone
+#: pair, with a barrier at 0.02. The second fraction is for molecules without any repulsion.
+CHARGED_OVERLAP, CHARGES_OVERLAP = 0.1, 1.0
 #: Maximum number of moves of molecules between two checks.
 MOVES_PER_CHECK = 250_000
 
