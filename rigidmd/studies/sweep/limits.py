@@ -45,6 +45,8 @@ RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 #: Kinds of limits: of each average by itself; of energy and volume together, with the slopes that
 #: fluctuations predict; of responses, which fluctuations give.
 INDEPENDENT, JOINT, FLUCTUATIONS = "independent", "joint", "fluctuations"
+#: Relative rounding error of a mean of equal numbers.
+ROUNDING = 1e-12
 
 
 class Limit(NamedTuple):
@@ -177,8 +179,10 @@ class _Average:
 
     @property
     def is_constant(self) -> bool:
-        values = {value for measured in self.runs.values() for value, _ in measured}
-        return len(values | {result.value for result in self.together.values()}) == 1
+        """Whether all values agree to rounding, as edges of a box that does not change."""
+        values = [value for measured in self.runs.values() for value, _ in measured]
+        values = np.array(values + [result.value for result in self.together.values()])
+        return bool(np.ptp(values) <= ROUNDING * np.abs(values).max())
 
 
 def extrapolate_sweep(manifest: Manifest, key: str) -> Limits:
