@@ -926,6 +926,29 @@ def test_too_dense_to_pack(capsys, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+STRONG = """sites = [{ name = "A", mass_u = 20.0, position_A = [0.0, 0.0, 0.0], sigma_A = 3.0, \
+epsilon_K = 50.0, charge_e = 1e6 }]"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("= 300", "= 1e-30", ["the molecules fit into the box", "1e-30 K are too low"]),
+        ("= 300", "= 1e-6", ["the molecules fit into the box", "1e-06 K are too low"]),
+        ('model = "spce"', f'name = "ion"\n{STRONG}', ["a charge_e is 1e+06 e, above 1000"]),
+    ],
+)
+def test_forces_that_no_step_follows(old, new, expected, capsys, tmp_path):
+    """The reason is not the density."""
+    scene = tmp_path / "strong.toml"
+    scene.write_text(GOOD.replace(old, new))
+    assert main(["run", str(scene), "-o", str(tmp_path / "out")]) == 2
+    message = capsys.readouterr().err
+    assert all(part in message for part in expected), message
+    assert "density" not in message
+    assert not (tmp_path / "out").exists()
+
+
 def test_output_folders(capsys, tmp_path):
     full = tmp_path / "mine"
     full.mkdir()

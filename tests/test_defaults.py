@@ -9,6 +9,7 @@ from math import erfc, inf, sqrt
 import numpy as np
 import pytest
 from scipy.special import erfcinv
+from stops import stopped_at
 from support import ROOT
 
 from rigidmd import Scene, Simulation, resolve
@@ -319,6 +320,11 @@ def test_a_run_says_its_precision_and_energy_is_in_double(tmp_path):
     summary = simulation.run().summary
     assert summary["precision"] == "mixed"
     assert summary["precision_reason"].startswith("mixed: the error of baoab at 4 fs")
+    run = tmp_path / "run"
+    Simulation(scene(), run, observers=stopped_at({2})).run()
+    assert main(["resume", str(run)]) == 0
+    resumed = json.loads((run / "summary.json").read_text())
+    assert resumed["precision_reason"] == summary["precision_reason"]
     energy = Simulation(scene())._start_energy(KJ_PER_MOL, "kJ/mol")
     exact = Simulation(scene(precision="double"))._start_energy(KJ_PER_MOL, "kJ/mol")
     assert energy["components"] == exact["components"]

@@ -79,6 +79,8 @@ REFUSED = {
     "density": Quantity(
         "g/cm³", 0.0, 25.0, "", "is it in kg/m³, or an edge in nm?", heaviest_site=300.0
     ),
+    # no step at any temperature follows the forces of such charges, and no grid resolves them
+    "charge_e": Quantity("e", 0.0, 1e3, "", "is it in another unit?"),
 }
 
 
@@ -89,7 +91,11 @@ def scene_errors(
     mass = float(counts @ np.array([m.mass for m in species]))
     density = 0.0 if space.volume == inf else mass / space.volume / GRAM_PER_CM3
     key = "box.density_g_cm3" if scene.box.density_g_cm3 is not None else "the density of the box"
-    values = {"density": (scene.box.density_g_cm3 or density, key)}
+    charge = max(float(np.abs(m.charges).max()) for m in species)
+    values = {
+        "density": (scene.box.density_g_cm3 or density, key),
+        "charge_e": (0.0 if scene.forces.electrostatics == "none" else charge, "a charge_e"),
+    }
     heaviest = max(m.masses.max() for m in species)
     limits = {name: limit for name, limit in REFUSED.items() if heaviest <= limit.heaviest_site}
     refusals = (limit.outside(*values[name]) for name, limit in limits.items())

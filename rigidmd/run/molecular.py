@@ -64,6 +64,7 @@ class MolecularRecord(RunRecord):
     """The record of a run of molecules. Dictionaries have the indices of stages."""
 
     stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
+    precision_reason: str = ""  # where the scene of the start has precision = "auto"
     removal: OverlapRemoval | None = None
     #: Integrators and steps that were chosen, with the reasons
     choices: dict[Count, str] = field(default_factory=dict)
@@ -73,6 +74,9 @@ class MolecularRecord(RunRecord):
     minima: dict[Count, Minimum] = field(default_factory=dict)
 
 
+#: Sites that fill a smaller fraction of the box fit into it: as spheres of diameter sigma they fill
+#: 0.4 to 0.55 of a liquid.
+LOOSE = 0.5
 #: States between the last good one and a failure that are searched for its cause.
 REPLAYED = 20
 
@@ -144,6 +148,7 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
 
     def reset(self) -> None:
         super().reset()
+        self.record.precision_reason = self._start.precision_reason
         self._is_sampled = False  # whether `_sampler` belongs to the current state
         self._set_stages(self._start.scene.stages)  # an earlier run may have chosen an integrator
         self.engine = self.system.engine()
@@ -234,11 +239,23 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
                     f" first time step would change a momentum by {excess:.2g} times its thermal"
                     " size. Shorten it, or weaken the field"
                 )
+        kick = (
+            f"after {removal.steps} steps of overlap removal the first time step would change a"
+            f" momentum by {removal.excess:.2g} times its thermal size"
+        )
+        diameters = system.of_sites(lambda m: np.where(m.epsilon > 0, m.sigma, 0.0))
+        packed = np.pi / 6 * float((diameters**3).sum()) / self.state.volume
+        overlapping = checks.most_overlapping_pair(system, self.state, None)
+        if overlapping is None or packed < LOOSE:
+            return (
+                f"{kick}, though the molecules fit into the box: for the forces between them"
+                f" {thermal / BOLTZMANN:.3g} K are too low, or {dt / FEMTOSECOND:.3g} fs too long."
+                " Are charges and epsilon right? If so, begin with a stage with ensemble ="
+                " 'minimise', raise start.temperature_K or shorten timestep_fs of the first stage"
+            )
         return (
-            f"the molecules cannot be packed at {system.density:.3g} g/cm³ without overlap: after"
-            f" {removal.steps} steps of overlap removal the first time step would change a momentum"
-            f" by {removal.excess:.2g} times its thermal size. Lower the density, enlarge the box"
-            " or shorten timestep_fs of the first stage"
+            f"the molecules cannot be packed at {system.density:.3g} g/cm³ without overlap: {kick}."
+            " Lower the density, enlarge the box or shorten timestep_fs of the first stage"
         )
 
     def _compile_stage(self, k: int) -> None:

@@ -118,7 +118,7 @@ def summarise(
         "cutoff_A": system.cutoff if np.isfinite(system.cutoff) else None,
         "positions": scene.output.positions if scene.output.trajectory and system.density else None,
         "precision_reason": (
-            f"{system.precision}: {system.precision_reason}" if system.precision_reason else None
+            f"{system.precision}: {record.precision_reason}" if record.precision_reason else None
         ),
         "overlap_removal_steps": record.removal.steps if record.removal else 0,
         "preparing_s": preparing,
