@@ -338,9 +338,9 @@ RINGS = [
     Mutation(
         "B25",
         "cell rescaling with Langevin counts as if the total momentum were kept",
-        "assemble/build.py",
-        "    x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))",
-        "    x, y, z = map(float, system.model.keeps_momentum | system.keeps_momentum_in(k))",
+        "engines/system.py",
+        "        return self.model.keeps_momentum & (k is None or self.keeps_momentum_in(k))",
+        "        return self.model.keeps_momentum | (k is None or self.keeps_momentum_in(k))",
         ("test_wiring.py::test_cell_rescaling_knows_whether_the_total_momentum_is_kept",),
     ),
     Mutation(

@@ -154,10 +154,10 @@ def known(monkeypatch):
     Over 20 ps the walk of srkn_4 at 5 fs is 1e-4.
     """
 
-    def make(jump):
+    def make(jump, seed=1):
         true, rng = (
             EnergyWalk(1e-9 / EnergyWalk(1.0, jump, 600).rate(SCHEMES["srkn_4"], 5e-3), jump, 600),
-            np.random.default_rng(1),
+            np.random.default_rng(seed),
         )
 
         def regular(scheme, dt):
@@ -206,6 +206,17 @@ def known(monkeypatch):
     return make
 
 
+def told_over_true(known, jump, target):
+    """Ratio of the reported to the true error of a choice, rms over pilots with other noise. It is
+    below 1, as the choice favours schemes with little noise in their pilot."""
+    ratios = []
+    for seed in range(30):
+        trial_system, longest, error = known(jump, seed)
+        found = choose(trial_system, longest, target, duration=20.0)
+        ratios.append(found.error / error(found))
+    return np.sqrt(np.mean(np.square(ratios)))
+
+
 @pytest.mark.parametrize("target", [1e-4, 1e-6])
 @pytest.mark.parametrize("jump", [0.0, 2.0, 5.0])
 def test_the_error_asked_for_holds_over_the_whole_run_and_not_only_the_pilot(jump, target, known):
@@ -213,14 +224,14 @@ def test_the_error_asked_for_holds_over_the_whole_run_and_not_only_the_pilot(jum
     found = choose(trial_system, longest, target, duration=20.0)
     assert target / 5 < error(found) < target
     assert "over 20 ps for a target of" in found.reason
-    assert found.error == pytest.approx(error(found), rel=0.5)
     assert error(choose(trial_system, longest, target)) > error(found)
+    assert told_over_true(known, jump, target) == pytest.approx(1.0, rel=0.3)
 
 
 def test_a_walk_that_no_step_makes_smaller_is_reported_with_what_helps(known):
-    trial_system, longest, error = known(-1.0)
+    trial_system, longest, _ = known(-1.0)
     found = choose(trial_system, longest, 2e-5, duration=20.0)
-    assert found.error == pytest.approx(error(found), rel=0.5)
+    assert told_over_true(known, -1.0, 2e-5) == pytest.approx(1.0, rel=0.3)
     assert found.error > 2e-5
     assert (
         "No step tried keeps the target over that time: truncation = 'smooth_switch', a longer"

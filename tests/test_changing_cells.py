@@ -102,7 +102,7 @@ def test_an_ideal_gas_has_its_volumes_through_a_whole_run():
         "ensemble": "npt",
         "temperature_K": 300.0,
         "pressure_bar": pressure,
-        "duration_ps": 240.0,
+        "duration_ps": 120.0,
         "timestep_fs": 1.0,
         "thermostat": "langevin",
         "barostat": "monte_carlo",
@@ -122,10 +122,10 @@ def test_an_ideal_gas_has_its_volumes_through_a_whole_run():
     tried, accepted = (
         results.summary["stages"][0][key] for key in ("moves_tried", "moves_accepted")
     )
-    assert tried == 240_000 and 0.3 < accepted / tried < 0.95
+    assert tried == 120_000 and 0.3 < accepted / tried < 0.95
     volumes = results["volume"][50:] * 1e-27 / unit  # from nm³
     blocks = volumes[: len(volumes) // 20 * 20].reshape(20, -1).mean(axis=1)
     error = blocks.std(ddof=1) / np.sqrt(20)
-    assert error < 0.075
+    assert error < 0.106
     assert abs(volumes.mean() - (n + 1)) < 4 * error
-    assert volumes.var() == pytest.approx(n + 1, rel=0.15)
+    assert volumes.var() == pytest.approx(n + 1, rel=0.2)
