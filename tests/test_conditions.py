@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support import history, small_scene
 
+from rigidmd.analysis.options import check_options, options_of
 from rigidmd.analysis.registry import KNOWN
 from rigidmd.analysis.runs import Runs
 from rigidmd.assemble.build import build
@@ -53,7 +54,7 @@ def made_up(stages=(NVT,), molecules=None, edge=EDGE, frames=FRAMES, **sections)
     return replace(made, columns=samples)
 
 
-def refused(name, frames, **options):
+def refused(name, frames, /, **options):
     with pytest.raises(OutputError) as caught:
         KNOWN[name].function(frames, **options)
     return str(caught.value)
@@ -127,3 +128,60 @@ def test_what_is_missing_in_a_run_is_named():
     for name in KNOWN:
         if name not in ("response", "viscosity") and not KNOWN[name].is_user:
             assert refused(name, frames[:1]).startswith(f"{name} needs the frames of a trajectory")
+
+
+EXTREMES = {
+    float: [-1.0, 0.0, 5e-324, 1e-300, 1e30, 1e300, np.inf, np.nan, "3", None, True, [1.0]],
+    int: [-1, 0, 10**6 + 1, 10**30, 2.5, np.nan, "3", None, True],
+    str: ["nothing", 3, None, "x" * 300],
+    bool: [1, "true", None],
+}
+
+
+def kind_of(option):
+    return type(option.default) if option.default is not None else float
+
+
+WALK = [
+    (name, key, value)
+    for name, entry in KNOWN.items()
+    if not entry.is_user
+    for key, option in options_of(entry.function).items()
+    for value in EXTREMES[kind_of(option)]
+]
+
+
+@pytest.fixture(scope="module")
+def water():
+    return made_up()
+
+
+@pytest.mark.parametrize(("name", "key", "value"), WALK)
+def test_options_beyond_their_range_are_refused_in_one_sentence(water, name, key, value):
+    option = options_of(KNOWN[name].function)[key]
+    if (value is None and option.default is None) or (key == "seed" and value in (0, 10**6 + 1)):
+        return
+    found = refused(name, water, **{key: value})
+    assert found.count("\n") == 0 and len(found) < 700
+    if not isinstance(value, str):
+        assert key in found
+
+
+def test_options_at_the_ends_of_their_range_are_right_or_refused(water):
+    for entry in KNOWN.values():
+        for key, option in {} if entry.is_user else options_of(entry.function).items():
+            limits = next(iter(getattr(option.annotation, "__metadata__", ())), None)
+            for value in limits or ():
+                value = kind_of(option)(value)
+                try:
+                    result = entry.function(water, **{key: value})
+                except OutputError:
+                    continue
+                assert all(v.value is None or np.isfinite(v.value) for v in result.values)
+
+
+def test_options_are_checked_on_the_command_line_before_frames_are_read():
+    with pytest.raises(OutputError, match=r"^trials: 'many' is not like trials=1000$"):
+        check_options([KNOWN["insertion"].function], {"trials": "many"})
+    with pytest.raises(OutputError, match=r"unknown option 'trial'.* trials"):
+        check_options([KNOWN["insertion"].function], {"trial": 3})

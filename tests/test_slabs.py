@@ -372,5 +372,5 @@ def test_what_is_no_slab_is_refused():
     for analysis in (interfaces, surface_tension):
         with pytest.raises(OutputError, match=r"no slab between two vapours|no profile of a slab"):
             analysis(frames)
-        with pytest.raises(OutputError, match="unknown axis 'n'"):
+        with pytest.raises(OutputError, match="axis is 'n', must be x or y or z"):
             analysis(frames, "n")

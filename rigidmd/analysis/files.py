@@ -11,7 +11,8 @@ from typing import NamedTuple
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from rigidmd.analysis.curve_figure import curve_figure
-from rigidmd.analysis.registry import analysis_order, check_options, is_built_in, selected
+from rigidmd.analysis.options import check_options
+from rigidmd.analysis.registry import analysis_order, is_built_in, selected
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.analysis.runs import Runs, as_runs
@@ -203,7 +204,8 @@ def analyse_folder(
     figures : type of the figures, one of FIGURES
     options : other arguments of analyses; each gets those that it takes
     """
-    check_options(selected(names), options or {})  # before frames are read
+    entries = selected(names)
+    check_options([entry.function for entry in entries], options or {})  # before frames are read
 
     def reading(fraction):
         return progress(READING * fraction, "reading frames")

@@ -4,7 +4,6 @@ import runpy
 from collections.abc import Callable, Mapping
 from functools import wraps
 from importlib import import_module
-from inspect import signature
 from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidmd.analysis.conditions import Condition, check_conditions, trajectory
+from rigidmd.analysis.options import check_value, options_of
 from rigidmd.analysis.result import (
     AnalysisResult,
     Curve,
@@ -26,7 +26,6 @@ from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs, as_runs
 from rigidmd.core.files import unreadable_reason
 from rigidmd.errors import OutputError
-from rigidmd.scene.base import format_override
 from rigidmd.scene.validation import did_you_mean
 
 Function = Callable[..., AnalysisResult]
@@ -61,12 +60,16 @@ def built_in(
 
     def add(function: Function) -> Function:
         name = function.__name__
+        known = options_of(function)
 
         @wraps(function)
         def analysis(
             frames: RigidFrames | Runs, *arguments: object, **options: object
         ) -> AnalysisResult:
             runs = as_runs(frames)
+            for key, value in [*zip(known, arguments, strict=False), *options.items()]:
+                if key in known:
+                    check_value(known[key], value)
             check_conditions(name, runs, needs)
             return function(runs, *arguments, **options)
 
@@ -158,24 +161,6 @@ def selected(names: list[str]) -> list[Analysis]:
             hint = did_you_mean(name, known) or ";"
             raise OutputError(f"unknown analysis {name!r}{hint} there are {', '.join(known)}")
     return [KNOWN[name] for name in names or known if names or not KNOWN[name].on_request]
-
-
-def check_options(entries: list[Analysis], options: Mapping[str, object]) -> None:
-    """Raise OutputError for options that none of the analyses takes, or of another type."""
-    known: dict[str, object] = {}
-    for entry in entries:
-        _, *parameters = signature(entry.function).parameters.values()
-        known |= {parameter.name: parameter.default for parameter in parameters}
-    for key, value in options.items():
-        if key not in known:
-            hint = did_you_mean(key, known) or ";"
-            taken = ", ".join(known) or "none"
-            raise OutputError(f"unknown option {key!r} of these analyses{hint} there are {taken}")
-        default = known[key]
-        kind = (int, float) if default is None or type(default) is float else type(default)
-        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            example = "1.5" if default is None else format_override(key, default)
-            raise OutputError(f"{key}: {value!r} is not like {example}")
 
 
 def analysis_order(name: str) -> float:

@@ -23,8 +23,9 @@ from rigidmd.run.results import Results
 from rigidmd.run.rigid_fit import Bodies, Kind, RigidFit, kinds_of
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
+from rigidmd.scene.species import Molecules
 from rigidmd.scene.stage import Stage
-from rigidmd.scene.validation import did_you_mean, not_none
+from rigidmd.scene.validation import did_you_mean
 from rigidmd.units import BOLTZMANN
 
 EVEN = 1e-3  # two intervals between frames that differ by less than this fraction are equal
@@ -289,12 +290,21 @@ def frames_of_folder(
         raise OutputError(f"{path}: {error}") from None
 
 
-def frames_of_start(scene: MolecularScene, count: int) -> RigidFrames:
+def frames_of_start(scene: MolecularScene, count: int, model: str = "") -> RigidFrames:
     """The start of a scene as a number of frames, for molecules that do not move. Raises
-    SceneError."""
+    SceneError.
+
+    model : of a trial molecule. If it is not a species of the scene, it becomes one without a
+        molecule, whose sites [forces] may name
+    """
+    if model and model not in [entry.label for entry in scene.molecules]:
+        key = "file" if model.endswith(".toml") else "model"
+        trial = Molecules.model_construct(**{key: model}, count=0)
+        scene = scene.model_copy(update={"molecules": (*scene.molecules, trial)})
     system = build(scene)
     state = system.state
-    stage = system.scene.stages[-1]
+    stages = system.scene.stages
+    stage = next((stage for stage in reversed(stages) if stage.has_thermostat), stages[-1])
     shape = (count, len(system.model.species))
     return RigidFrames(
         system,
@@ -305,7 +315,7 @@ def frames_of_start(scene: MolecularScene, count: int) -> RigidFrames:
         np.broadcast_to(state.rotation, (count, *state.rotation.shape)),
         None,
         None,
-        {"temperature": np.full(count, not_none(system.scene.start.temperature_K))},
+        {"temperature": np.full(count, system.scene.start.temperature_K or 0.0)},
     )
 
 

@@ -37,7 +37,10 @@ if TYPE_CHECKING:
 #: larger of these: u Å²/ps², and a multiple of kT.
 CORE = 1000 * KJ_PER_MOL
 CORE_IN_KT = 100.0
-#: Opposite charges whose energy is below minus this multiple of kT lack a core between them.
+#: Sites lack a repulsive core between them where the energy of a trial molecule is below minus the
+#: larger of these: u Å²/ps², times the square of its charge if that is above 1 e, and a multiple of
+#: kT. The energy of a monovalent ion in water is -300 to -500 kJ/mol.
+DEEPEST = 1250 * KJ_PER_MOL
 DEEPEST_IN_KT = 500.0
 
 
@@ -95,6 +98,11 @@ class Guest:
         )
 
     @property
+    def interacts(self) -> bool:
+        """Whether a force acts on it."""
+        return bool(self._pairs or self._poses or self._engines)
+
+    @property
     def has_tail(self) -> bool:
         return self._with.tail is not None
 
@@ -111,8 +119,8 @@ class Guest:
         """Energies (m,) of trial molecules in a state of the system, u Å²/ps²; inf where it
         overlaps.
 
-        position (m, 3) centres of mass, Å; rotation (m, 3, 3). Raises SceneError where opposite
-        charges have no core.
+        position (m, 3) centres of mass, Å; rotation (m, 3, 3). Raises SceneError where sites that
+        attract each other have no core.
         """
         host = _selected(state, self._host)
         energy = np.zeros(len(position))
@@ -133,13 +141,15 @@ class Guest:
                 trial = _with_trial(host, position[k], rotation[k], rotates=rotates)
                 energy[k] += _total(self._engines[0], trial) - alone
         energy += constant
-        if (energy < -DEEPEST_IN_KT * self._thermal).any():
-            deepest = energy.min() / KJ_PER_MOL
+        deepest = DEEPEST * max(1.0, self.molecule.charge**2)
+        if (energy < -max(deepest, DEEPEST_IN_KT * self._thermal)).any():
+            lowest = energy.min() / KJ_PER_MOL
             raise SceneError(
                 self._with.scene.source,
                 [
-                    f"the energy of {self.molecule.name} falls to {deepest:.3g} kJ/mol: opposite"
-                    " charges meet without a repulsive core between them"
+                    f"the energy of {self.molecule.name} falls to {lowest:.3g} kJ/mol: sites that"
+                    " attract each other, such as opposite charges, meet without a repulsive core"
+                    " between them"
                 ],
             )
         return energy

@@ -63,7 +63,7 @@ class _List(argparse.Action):
     ),
     argument(
         "--viscosity",
-        type=number(float, 1e-300, 1e12, "a viscosity above 0"),
+        type=number(float, 1e-6, 1e12, "a viscosity from 1e-6 to 1e12"),
         metavar="VALUE",
         help=(
             "viscosity in mPa s for the finite-size correction of D (default: measured in the run)"
@@ -160,7 +160,8 @@ def _analyse(options: Options) -> int:
 def _insert(path: str, names: list[str], more: dict[str, object], *, verbose: bool) -> int:
     """Print the results of insertion into the frozen molecules of a scene."""
     from rigidmd.analysis.files import run_analyses
-    from rigidmd.analysis.registry import check_options, selected
+    from rigidmd.analysis.options import check_options
+    from rigidmd.analysis.registry import KNOWN
     from rigidmd.analysis.rigid_frames import frames_of_start
     from rigidmd.analysis.runs import Runs
     from rigidmd.errors import OutputError
@@ -171,8 +172,9 @@ def _insert(path: str, names: list[str], more: dict[str, object], *, verbose: bo
             f"{path} is a scene, and only insertion needs no run: `rigidmd analyse {path} insertion"
             " model=NAME`, or `rigidmd run` first"
         )
-    check_options(selected(names), more)
-    runs = Runs((frames_of_start(MolecularScene.read(path), FRAMES),))
+    check_options([KNOWN["insertion"].function], more)
+    model = str(more.get("model", ""))
+    runs = Runs((frames_of_start(MolecularScene.read(path), FRAMES, model),))
     results, failed = run_analyses(runs, names, options={"zero_loading": True} | more)
     for result in results:  # trials at rest have no time
         result.values = [value._replace(correlation_ps=None) for value in result.values]

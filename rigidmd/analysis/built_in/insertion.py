@@ -3,13 +3,14 @@
 `chemical_potential`."""
 
 from math import ceil
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from rigidmd.analysis.built_in.interfaces import BIN, slab_of
 from rigidmd.analysis.built_in.thermodynamics import thermal_energy_of
 from rigidmd.analysis.conditions import box, check_conditions, equilibrium, static, trajectory
+from rigidmd.analysis.options import Count, Seed, Temperature
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
     BLOCKS,
@@ -31,30 +32,38 @@ from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
 TRIALS = 1000  # in each frame
+MOST_TRIALS = 5e7  # 8 bytes each in several arrays
 #: The sum of the weights must be worth this number of equal trials, and of equal frames.
 FEWEST_TRIALS, FEWEST_FRAMES = 100.0, 5.0
 LARGEST = 0.01  # fraction of the trials of which messages give the part of the sum
 #: Å³ u⁻¹ (kT)⁻¹ in mol/(kg Pa): 1 u is 1e-3 kg/mol, and 1 bar is 1e5 Pa.
 PER_KG_PA = 1e3 * BAR * 1e-5
+LARGEST_LOGARITHM = 690.0  # of a number
 
 
 class Trials(NamedTuple):
     """Trials in the frames of a run.
 
-    volume (f,) Å³; weight (f, t) exp(-u/kT); energy (f, t) u/kT, 0 where the weight is; height
-    (f, t) distance along a normal from the middle of a slab, Å, in a profile
+    volume (f,) Å³; energy (f, t) u/kT, inf where molecules overlap; height (f, t) distance along a
+    normal from the middle of a slab, Å, in a profile; lowest : the lowest energy of all runs, u/kT
     """
 
     volume: np.ndarray
-    weight: np.ndarray
     energy: np.ndarray
     height: np.ndarray
+    lowest: float = 0.0
+
+    @property
+    def weight(self) -> np.ndarray:
+        """exp(-u/kT) over its largest value (f, t)."""
+        return np.exp(self.lowest - self.energy)
 
     @property
     def moments(self) -> np.ndarray:
         """V, V w and V w u/kT, with the weights w, of each frame (3, f)."""
-        mean = self.weight.mean(axis=1)
-        product = (self.weight * self.energy).mean(axis=1)
+        weight = self.weight
+        energy = np.where(weight > 0, self.energy, 0.0)
+        mean, product = (values.mean(axis=1) for values in (weight, weight * energy))
         return self.volume * np.array([np.ones(len(mean)), mean, product])
 
 
@@ -67,11 +76,11 @@ class Trials(NamedTuple):
 def insertion(
     runs: Runs,
     model: str = "",
-    trials: int = TRIALS,
+    trials: Count = TRIALS,
     zero_loading: bool = False,
-    axis: str = "",
-    seed: int = 1,
-    temperature: float | None = None,
+    axis: Literal["", "x", "y", "z"] = "",
+    seed: Seed = 1,
+    temperature: Temperature | None = None,
 ) -> AnalysisResult:
     """Excess chemical potential of a model by trial insertions into the frames of a run, and its
     fugacity or Henry constant; in frozen molecules also the heat of adsorption at zero loading.
@@ -87,14 +96,14 @@ def insertion(
 
     Raises OutputError.
     """
-    if trials < 1:
-        raise OutputError("insertion needs one trial or more in each frame")
+    if trials * runs.frame_count > MOST_TRIALS:
+        raise OutputError(f"insertion has at most {MOST_TRIALS:.0e} trials in all frames together")
     frozen = runs.system.model.inverse_mass[runs.system.model.species] == 0
     if zero_loading and not frozen.any():
         raise OutputError("zero loading needs frozen molecules, and the run has none")
     host = frozen if zero_loading else np.ones(len(frozen), bool)
-    if temperature is not None and not (zero_loading and temperature > 0):
-        raise OutputError("insertion at another temperature, above 0 K, needs zero_loading=true")
+    if temperature is not None and not zero_loading:
+        raise OutputError("insertion at another temperature needs zero_loading=true")
     if not (model or runs.moving):
         raise OutputError("insertion needs a molecule, such as model=methane_trappe")
     if temperature is None:
@@ -103,21 +112,65 @@ def insertion(
     else:
         check_conditions("insertion", runs, [static])
         thermal = BOLTZMANN * temperature
+    if not thermal > 0:
+        raise OutputError(
+            "insertion needs a temperature above 0 K, from a stage with a thermostat, from"
+            " start.temperature_K or, with zero_loading=true, from temperature=300"
+        )
     try:
         molecule = model_named(model or runs.moving[0].name, runs.system.species)
         guest = Guest(runs.system, molecule, thermal / BOLTZMANN, host)
+        left_out = _left_out(runs, guest, host)
         sets = [
             _trials_of(run, guest, thermal, trials, axis, np.random.default_rng([seed, k]))
             for k, run in enumerate(runs.members)
         ]
     except InputError as error:
         raise OutputError(str(error)) from None
+    lowest = min(float(trials.energy.min()) for trials in sets)
+    sets = [trials._replace(lowest=lowest if np.isfinite(lowest) else 0.0) for trials in sets]
     result = AnalysisResult("insertion", f"insertion of {molecule.name}")
     result.values = _values(runs, sets, guest, thermal, host, zero_loading=zero_loading)
+    if left_out:
+        note = "; ".join(filter(None, [result.values[0].note, left_out]))
+        result.values[0] = result.values[0]._replace(note=note)
     result.notes = [_note(sets, guest, thermal)]
     if axis:
         result.curves = [_profile(sets, thermal, axis)]
     return result
+
+
+def _left_out(runs: Runs, guest: Guest, host: np.ndarray) -> str:
+    """What of the trial molecule or of the run has no part in its energy, for a note. Raises
+    OutputError where a value would not be of this molecule."""
+    molecule, scene = guest.molecule, runs.system.scene
+    name, forces, coupling = molecule.name, scene.forces, scene.coupling
+    if coupling is not None and coupling.species == name and coupling.value < 1:
+        raise OutputError(
+            f"the run scales the interactions of {name} ({coupling.in_short}), and would scale the"
+            " trial molecule too: insert a model of another name, or use a run at lambda = 1"
+        )
+    if not guest.interacts and (molecule.charges.any() or molecule.epsilon.any()):
+        raise OutputError(f"no force of the run acts on {name}: see [forces] of its scene")
+    acting = [runs.system.species[k] for k in np.unique(runs.system.model.species[host])]
+    charged = [other.name for other in acting if other.charges.any()]
+    if molecule.charges.any() and charged and forces.electrostatics == "none":
+        raise OutputError(
+            f"electrostatics = 'none' ignores the charges of {name} and of {', '.join(charged)}:"
+            " set forces.electrostatics = 'pme', or insert a model without charges"
+        )
+    notes = {
+        f"no other molecule has a charge, and the charges of {name} act on nothing": (
+            molecule.charges.any() and not charged
+        ),
+        f"forces.lennard_jones is false, also for {name}": (
+            molecule.epsilon.any() and not forces.lennard_jones
+        ),
+        f"the run has {'' if coupling is None else coupling.in_short}": (
+            coupling is not None and coupling.value < 1
+        ),
+    }
+    return "; ".join(note for note, applies in notes.items() if applies)
 
 
 def _trials_of(
@@ -140,8 +193,7 @@ def _trials_of(
             edge = run.cell[f, slab.axis, slab.axis]
             middle = run.positions[f, 0, slab.axis] - slab.centre[f, 0]
             height[f] = (position[:, slab.axis] - middle + edge / 2) % edge - edge / 2
-    weight = np.exp(-energy / thermal)
-    return Trials(run.volume, weight, np.where(weight > 0, energy / thermal, 0.0), height)
+    return Trials(run.volume, energy / thermal, height)
 
 
 def _values(
@@ -160,6 +212,8 @@ def _values(
     why = _why_refused(sets)
     if not weight > 0:
         return [Value(f"mu_ex of {name}", "kJ/mol", None, None, None, why)]
+    lowest = sets[0].lowest
+    log_weight = np.log(weight) - lowest
 
     def value(title: str, unit: str, value: float, size: float, changes: list[np.ndarray]) -> Value:
         """A value with an error from what each frame changes in it, in units of `size`."""
@@ -172,14 +226,25 @@ def _values(
 
     unit = thermal / KJ_PER_MOL
     ratio = [w / weight - v / volume for v, w, _ in moments]
-    values = [value(f"mu_ex of {name}", "kJ/mol", -np.log(weight / volume) * unit, unit, ratio)]
+    mu = (np.log(volume) - log_weight) * unit
+    values = [value(f"mu_ex of {name}", "kJ/mol", mu, unit, ratio)]
+
+    def exponential(title: str, unit: str, factor: float, exponent: float) -> Value:
+        """A value factor exp(exponent), of which each frame changes a fraction."""
+        logarithm = np.log(factor) + exponent
+        if abs(logarithm) > LARGEST_LOGARITHM:
+            note = f"exp({logarithm:.6g}) is beyond the range of numbers: use mu_ex"
+            return Value(title, unit, None, None, None, note)
+        number = float(np.exp(logarithm))
+        return value(title, unit, number, number, ratio)
+
     species = runs.system.model.species[host]
     if zero_loading:
-        henry = weight / (runs.system.model.mass[species].sum() * thermal) * PER_KG_PA
+        factor = PER_KG_PA / (runs.system.model.mass[species].sum() * thermal)
         heat = [(u - w * energy / weight) / weight for _, w, u in moments]
         return [
             *values,
-            value(f"Henry constant of {name}", "mol/(kg Pa)", henry, henry, ratio),
+            exponential(f"Henry constant of {name}", "mol/(kg Pa)", factor, log_weight),
             value(
                 f"heat of adsorption of {name}",
                 "kJ/mol",
@@ -195,17 +260,17 @@ def _values(
             if same.any()
             else (f"Henry constant of {name}", len(same))
         )
-        pressure = count * thermal / weight / BAR
-        values.append(value(title, "bar", pressure, pressure, ratio))
+        values.append(exponential(title, "bar", count * thermal / BAR, -log_weight))
     return values
 
 
 def _why_refused(sets: list[Trials]) -> str:
     """Why the mean of the weights is not to be trusted; empty if it is."""
-    weight = np.sort(np.concatenate([trials.weight.ravel() for trials in sets]))[::-1]
+    weights = [trials.weight for trials in sets]
+    weight = np.sort(np.concatenate([of_run.ravel() for of_run in weights]))[::-1]
     if not weight[0] > 0:
         return f"the molecule overlaps in all of {len(weight)} trials"
-    frames = np.concatenate([trials.weight.sum(axis=1) for trials in sets])
+    frames = np.concatenate([of_run.sum(axis=1) for of_run in weights])
     worth, of_frames = (w.sum() ** 2 / (w**2).sum() for w in (weight, frames))
     if worth >= FEWEST_TRIALS and of_frames >= FEWEST_FRAMES:
         return ""
@@ -218,8 +283,8 @@ def _why_refused(sets: list[Trials]) -> str:
 
 
 def _note(sets: list[Trials], guest: Guest, thermal: float) -> str:
-    count = sum(trials.weight.size for trials in sets)
-    fits = sum(np.count_nonzero(trials.weight) for trials in sets)
+    count = sum(trials.energy.size for trials in sets)
+    fits = sum(np.count_nonzero(np.isfinite(trials.energy)) for trials in sets)
     return (
         f"{count} trials at {thermal / BOLTZMANN:.5g} K, of which {100 * fits / count:.2f} % do not"
         f" overlap; {'with' if guest.has_tail else 'without'} tail correction"
@@ -232,18 +297,23 @@ def _profile(sets: list[Trials], thermal: float, axis: str) -> Curve:
     height = np.concatenate([trials.height for trials in sets])
     weight = np.concatenate([trials.weight for trials in sets])
     half = np.abs(height).max()
-    bins = np.linspace(-half, half, max(2, round(2 * half / BIN)) + 1)
+    count = max(2, round(2 * half / BIN))
+    edges = np.linspace(-half, half, count + 1)
+    bin_of = np.minimum(((height + half) * (count / (2 * half))).astype(int), count - 1)
 
     def potential(rows: slice) -> np.ndarray:
-        sums, _ = np.histogram(height[rows], bins, weights=weight[rows])
-        counts, _ = np.histogram(height[rows], bins)
+        index = bin_of[rows].ravel()
+        # `histogram` takes differences of a sum over all bins, in which small weights are lost
+        sums = np.bincount(index, weight[rows].ravel(), minlength=count)
+        counts = np.bincount(index, minlength=count)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return -thermal / KJ_PER_MOL * np.log(np.where(sums > 0, sums / counts, np.nan))
+            logarithm = np.log(np.where(sums > 0, sums / counts, np.nan))
+        return thermal / KJ_PER_MOL * (sets[0].lowest - logarithm)
 
     size = len(height) // BLOCKS
     parts = [potential(slice(k * size, (k + 1) * size)) for k in range(BLOCKS)] if size else []
     values = potential(slice(None))
     errors = error_of_mean(parts) if parts else np.full_like(values, np.nan)
-    curve = Curve("insertion", (f"{axis} (A)", (bins[1:] + bins[:-1]) / 2), "mu_ex (kJ/mol)", {})
+    curve = Curve("insertion", (f"{axis} (A)", (edges[1:] + edges[:-1]) / 2), "mu_ex (kJ/mol)", {})
     curve.add("mu_ex", values, errors)
     return curve

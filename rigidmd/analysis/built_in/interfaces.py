@@ -8,6 +8,7 @@ import numpy as np
 from scipy import optimize
 
 from rigidmd.analysis.conditions import box, trajectory
+from rigidmd.analysis.options import Axis
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
     AnalysisResult,
@@ -48,8 +49,6 @@ class Slab(NamedTuple):
 
 def slab_of(frames: RigidFrames, axis: str) -> Slab:
     """A slab, centred in each frame. Raises OutputError."""
-    if axis not in ("x", "y", "z"):
-        raise OutputError(f"unknown axis {axis!r}. Name x, y or z")
     k = "xyz".index(axis)
     across = [i for i in range(3) if i != k]
     if frames.cell[:, k, across].any() or frames.cell[:, across, k].any():
@@ -152,7 +151,7 @@ def _changes_of_fit(z: np.ndarray, densities: np.ndarray, parameters: np.ndarray
     position=32,
     needs=(trajectory, box),
 )
-def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
+def interfaces(runs: Runs, axis: Axis = "z") -> AnalysisResult:
     """Liquid and vapour densities, slab thickness and interface width, from a fit of
 
     rho(z) = (rho_l + rho_v)/2 - (rho_l - rho_v)/2 tanh((z - z0)/d)
@@ -224,7 +223,7 @@ def _mean_cosine(runs: Runs, profiles: Profiles, kind: Kind) -> np.ndarray:
 @built_in(
     "surface tension of a slab from the pressure tensor", position=105, needs=(trajectory, box)
 )
-def surface_tension(runs: Runs, axis: str = "z") -> AnalysisResult:
+def surface_tension(runs: Runs, axis: Axis = "z") -> AnalysisResult:
     """Surface tension (mN/m) of the two interfaces of a slab: L/2 <P_N - P_T> (Kirkwood & Buff
     1949), with the edge L and the pressure P_N along the normal, and the mean pressure P_T across
     it. Raises OutputError."""

@@ -93,8 +93,6 @@ def _axis_body(runs: Runs, kind: Kind, axis: str) -> np.ndarray | None:
         for bodies in bodies_of_potentials(runs.system)
         if bodies.species.name == molecule.name and bodies.potential.axis
     ]
-    if axis not in ("", *"xyz"):
-        raise OutputError(f"axis is {axis!r}, must be x, y or z")
     if molecule.kind == "linear":
         return np.eye(3)[0]
     if not molecule.inertia.any() or not (named := [axis] if axis else of_potentials):

@@ -3,10 +3,12 @@
 from collections.abc import Callable
 from functools import partial
 from itertools import combinations_with_replacement, product
+from typing import Annotated
 
 import numpy as np
 
 from rigidmd.analysis.conditions import box, trajectory
+from rigidmd.analysis.options import Axis, Count, Limits
 from rigidmd.analysis.pair_histogram import count_pairs, heights
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
@@ -33,6 +35,8 @@ ENOUGH_MOLECULES, ENOUGH_MOLECULES_K = 200_000, 100_000
 FEWEST, MOST = 20, 500  # frames
 #: Å: largest distance and width of bins of g(r), unless others are given.
 LARGEST, WIDTH = 10.0, 0.05
+#: Å: lengths that may be given; most bins of g(r), and most wave vectors of S(k).
+LENGTHS, MOST_BINS, MOST_VECTORS = Limits(1e-4, 1e6), 20_000, 5e7
 #: 1/Å: largest wave vector and width of bins of S(k); most wave vectors of a bin.
 K_MAX, K_WIDTH, VECTORS_PER_BIN = 8.0, 0.1, 24
 #: Blocks of frames for errors of peaks; least fraction of the variance of blocks by which their
@@ -53,8 +57,8 @@ def rdf(
     runs: Runs,
     first: str = "",
     second: str = "",
-    largest: float | None = None,
-    width: float = WIDTH,
+    largest: Annotated[float, LENGTHS] | None = None,
+    width: Annotated[float, LENGTHS] = WIDTH,
 ) -> AnalysisResult:
     """g(r) of two sites, elements or species (centres of mass). Default: all pairs of elements, in
     mixtures of species.
@@ -78,6 +82,10 @@ def rdf(
     if not 0 < width < largest <= half * (1 + 1e-9):
         asked = f"g(r) up to {largest:g} Å in bins of {width:g} Å"
         raise OutputError(f"{asked} is not possible: half the box is {half:.4g} Å")
+    if largest > MOST_BINS * width:
+        raise OutputError(f"g(r) has at most {MOST_BINS} bins: use a larger width than {width:g} Å")
+    if second and not first:
+        raise OutputError(f"g(r): second is {second!r}: name the first site too")
     pairs = [(first, second or first)] if first else _pairs(runs)
     thinned, notes = _thinned(runs, ENOUGH_MOLECULES)
     bins = int(largest / width + 1e-9)
@@ -276,7 +284,9 @@ def _first_top(g: np.ndarray) -> int:
 
 
 @built_in("structure factor S(k) of the centres of mass", position=20, needs=(trajectory, box))
-def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> AnalysisResult:
+def structure_factor(
+    runs: Runs, name: str = "", largest: Annotated[float, Limits(1e-6, 1e3)] = K_MAX
+) -> AnalysisResult:
     """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box.
 
     Parameters
@@ -296,6 +306,13 @@ def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> Anal
     if not largest > shortest:
         why = f"this box has no wave vector shorter than {largest:g} 1/Å"
         raise OutputError(f"{why}. The shortest is {shortest:.3g} 1/Å")
+    count = 2 / 3 * np.pi * largest**3 / abs(np.linalg.det(reciprocal))
+    if count > MOST_VECTORS:
+        fitting = largest * (MOST_VECTORS / count) ** (1 / 3)
+        raise OutputError(
+            f"this box has {count:.2g} wave vectors below {largest:g} 1/Å, more than"
+            f" {MOST_VECTORS:.2g}: use largest={fitting:.2g} or less"
+        )
     vectors, bin_of = _k_vectors(reciprocal, largest)
     bins = int(bin_of.max()) + 1
     used, members = np.unique(bin_of, return_inverse=True)
@@ -359,15 +376,9 @@ def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.n
 
 
 @built_in("profile of the density along an axis of the box", position=30, needs=(trajectory, box))
-def density_profile(runs: Runs, axis: str = "z", bins: int = 100) -> AnalysisResult:
+def density_profile(runs: Runs, axis: Axis = "z", bins: Count = 100) -> AnalysisResult:
     """Mass density (g/cm³) of each species along an edge of the box: x, y or z for a, b or c.
     Raises OutputError."""
-    if axis not in ("x", "y", "z"):
-        raise OutputError(
-            f"unknown axis {axis!r}. Name x, y or z (the edges a, b and c of the box)"
-        )
-    if bins < 1:
-        raise OutputError(f"a profile needs at least one bin, not {bins}")
     k = "xyz".index(axis)
     height = float(
         runs.mean([np.mean([heights(cell)[k] for cell in run.cell]) for run in runs.members])
@@ -400,7 +411,9 @@ def density_profile(runs: Runs, axis: str = "z", bins: int = 100) -> AnalysisRes
 
 @built_in("hydrogen bonds for each molecule, by distances and angles", position=40)
 def hydrogen_bonds(
-    runs: Runs, distance: float = BOND_DISTANCE, angle: float = BOND_ANGLE
+    runs: Runs,
+    distance: Annotated[float, Limits(0.1, 20)] = BOND_DISTANCE,
+    angle: Annotated[float, Limits(0.1, 180)] = BOND_ANGLE,
 ) -> AnalysisResult:
     """Mean number of hydrogen bonds of a molecule, as donor and acceptor: heavy sites (N, O, F)
     closer than `distance` (Å), with an angle to the bond of the hydrogen below `angle` (degrees).
@@ -408,6 +421,8 @@ def hydrogen_bonds(
     if not any(_donors(kind.molecule) for kind in runs.kinds):
         why = "no molecule has a hydrogen bonded to nitrogen, oxygen or fluorine"
         raise OutputError(f"{why}: there are no hydrogen bonds")
+    if runs.has_box and distance > 0.5 * heights(runs.mean_cell).min():
+        raise OutputError(f"hydrogen bonds of {distance:g} Å are longer than half the box")
     thinned, notes = _thinned(runs, ENOUGH_MOLECULES)
     number = len(runs.system.model.species)
     # (f, n) each

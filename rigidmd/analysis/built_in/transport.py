@@ -1,10 +1,13 @@
 """Correlation functions. Mean squared displacement, diffusion and viscosity, each with its
 error."""
 
+from typing import Annotated
+
 import numpy as np
 from scipy import fft
 
 from rigidmd.analysis.conditions import box, equilibrium, motion, trajectory
+from rigidmd.analysis.options import Limits
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.relaxation import Relaxations, integral_of, longest_time
 from rigidmd.analysis.result import (
@@ -105,7 +108,9 @@ def msd(runs: Runs) -> AnalysisResult:
     position=60,
     needs=(trajectory, motion),
 )
-def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResult:
+def diffusion(
+    runs: Runs, viscosity_mPa_s: Annotated[float, Limits(1e-6, 1e12)] | None = None
+) -> AnalysisResult:
     """D for each species (1e-9 m²/s) from the slope of its mean squared displacement, and D in an
     infinite box.
 
@@ -118,8 +123,6 @@ def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResul
     ------
     OutputError
     """
-    if viscosity_mPa_s is not None and not 0 < viscosity_mPa_s < np.inf:
-        raise OutputError(f"viscosity_mPa_s must be a number above 0, not {viscosity_mPa_s:g}")
     interval, lags = interval_and_lags(runs, "a diffusion coefficient")
     first = max(1, int((lags - 1) * FIT_FROM / FIT_TO))
     time = interval * np.arange(first, lags)

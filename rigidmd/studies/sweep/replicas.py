@@ -9,7 +9,8 @@ from typing import NamedTuple
 from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_frames
 from rigidmd.analysis.free_energy import NAME as FREE_ENERGY
 from rigidmd.analysis.mean_force import NAME as MEAN_FORCE
-from rigidmd.analysis.registry import check_options, selected
+from rigidmd.analysis.options import check_options
+from rigidmd.analysis.registry import selected
 from rigidmd.analysis.result import AnalysisResult
 from rigidmd.analysis.rigid_frames import MOST_NUMBERS, RigidFrames, frames_of_folder
 from rigidmd.analysis.runs import Runs, as_runs
@@ -77,7 +78,7 @@ def analyse_sweep(
     combinations = []
     others = [name for name in names if name not in OF_SWEEPS]
     if others or not names:
-        check_options(selected(others), options or {})
+        check_options([entry.function for entry in selected(others)], options or {})
         analyse = partial(
             analyse_frames, names=others, viscosity=viscosity, figures=figures, options=options
         )
