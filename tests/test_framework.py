@@ -136,6 +136,28 @@ def test_another_temperature(tmp_path):
         insertion(frames_of_start(scene_in(tmp_path), 20), "argon", temperature=350.0)
 
 
+def test_forces_may_name_the_sites_of_the_inserted_model(tmp_path):
+    """The parameters of the mixing rule, by name, and others."""
+    forces = {"cutoff_A": 6.0, "electrostatics": "none"}
+
+    def energies(pairs):
+        scene = scene_in(tmp_path, forces=forces | {"pairs": pairs})
+        system = frames_of_start(scene, 2, "methane_trappe").system
+        assert len(system.state.position) == 1
+        return energies_in(system, "methane_trappe")
+
+    def pair(epsilon):
+        return [{"sites": ["O", "CH4"], "sigma_A": 3.5, "epsilon_kJ_mol": epsilon}]
+
+    none, weak, strong = energies([]), energies(pair(0.5)), energies(pair(2.0))
+    assert not np.allclose(none[np.isfinite(none)][:5], weak[np.isfinite(none)][:5])
+    fits = np.isfinite(weak) & np.isfinite(strong)
+    silent = energies(pair(0.0))[fits]
+    np.testing.assert_allclose(strong[fits] - silent, 4 * (weak[fits] - silent), rtol=1e-9)
+    with pytest.raises(SceneError, match="no site is 'CH4'"):
+        build(scene_in(tmp_path, forces=forces | {"pairs": pair(0.5)}))
+
+
 REFUSED = {
     "no entry of sites": {"sites": SITES[:1]},
     "occupied only partly": {
