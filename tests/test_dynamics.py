@@ -298,9 +298,10 @@ def test_rotations_become_orthogonal_again():
 
 
 def test_no_drift_beyond_its_error_at_one_femtosecond_over_twenty_picoseconds(liquid):
-    """With four starts together: the error of a single slope is known to a third only, and one in
-    fifty passes three of it by chance. Over 48 starts the slopes of 20 ps had a mean of 0.0006 and
-    a standard deviation of 0.017 kJ/mol/ns."""
+    """With four starts together: the error of a single slope is known to a third only. Over 48
+    starts the slopes of 20 ps had a mean of 0.0006 and a standard deviation of 0.017 kJ/mol/ns,
+    which is the error here. Another processor rounds otherwise and has other trajectories: one in
+    16,000 passes four of it by chance."""
     system, engine, state = liquid
     lines = []
     for seed in range(4):
@@ -314,7 +315,7 @@ def test_no_drift_beyond_its_error_at_one_femtosecond_over_twenty_picoseconds(li
         lines.append(slope(times, energies))
     drift = np.mean([line.value for line in lines])
     error = np.sqrt(np.mean([line.error**2 for line in lines]) / len(lines))
-    assert abs(drift) < 3 * error
+    assert abs(drift) * 1000 < 4 * 0.017 / 2
     assert error * 1000 < 0.04  # kJ/mol/ns per molecule: small enough to mean something
 
 
