@@ -98,23 +98,36 @@ print(blocks_of(100), sum(blocks_of.stats.cache_hits.values()))
 """
 
 
-def test_an_edited_docstring_compiles_nothing_and_an_edited_number_does(tmp_path):
+@pytest.fixture
+def package(tmp_path):
+    """A module of a copy of the package, and a function that asks for its results: the number of
+    blocks, and how often its code was read."""
     ignored = shutil.ignore_patterns("docs", "__pycache__", "models")
     shutil.copytree(ROOT / "rigidmd", tmp_path / "rigidmd", ignore=ignored)
-    path = tmp_path / "rigidmd" / "forces" / "neighbors" / "sites.py"
     environment = os.environ | {
         "RIGIDMD_CACHE": str(tmp_path / "cache"),
         "PYTHONPATH": str(tmp_path),
         "PYTHONDONTWRITEBYTECODE": "1",  # Python itself finds that by time and size
     }
 
-    def asked() -> str:
-        command = [sys.executable, "-c", ASKED]
-        done = subprocess.run(
-            command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
-        )
-        return done.stdout.strip()
+    def asked(**more) -> str:
+        command, environ = [sys.executable, "-c", ASKED], environment | more
+        done = subprocess.run(command, env=environ, cwd=tmp_path, capture_output=True, text=True)
+        return done.stdout.strip() or done.stderr.splitlines()[-1]
 
+    return tmp_path / "rigidmd" / "forces" / "neighbors" / "sites.py", asked
+
+
+def edited_unseen(path, old, new):
+    """Change a text, but not the time or the size of its file, as a copy or an image may."""
+    before, text = path.stat(), path.read_text()
+    assert text.count(old) == 1 and len(old) == len(new)
+    path.write_text(text.replace(old, new))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def test_an_edited_docstring_compiles_nothing_and_an_edited_number_does(package):
+    path, asked = package
     text = path.read_text()
     assert [asked(), asked()] == ["1 0", "1 1"]
     edited = text.replace('"""Number of blocks', '"""\n    The number of blocks').replace(
@@ -128,10 +141,17 @@ def test_an_edited_docstring_compiles_nothing_and_an_edited_number_does(tmp_path
     assert asked() == "1 1"
     path.write_text(re.sub("SERIAL_MOLECULES = [0-9]+", "SERIAL_MOLECULES = 50", edited))
     assert asked() == "16 0"
-    before = path.stat()  # which a copy or an image may give to another text
-    path.write_text(re.sub("SERIAL_MOLECULES = [0-9]+", "SERIAL_MOLECULES = 60", edited))
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-    assert path.stat().st_size == before.st_size
+    edited_unseen(path, "SERIAL_MOLECULES = 50", "SERIAL_MOLECULES = 60")
     assert asked() == "16 0"
     path.write_text(text)
     assert asked() == "1 1"
+
+
+def test_byte_code_of_an_earlier_text_is_refused(package):
+    """Python would run it, and its machine code would be stored as that of the present text."""
+    path, asked = package
+    assert asked(PYTHONDONTWRITEBYTECODE="") == "1 0"
+    edited_unseen(path, "SERIAL_MOLECULES = 128", "SERIAL_MOLECULES = 127")
+    assert "is byte code of an earlier sites.py" in asked()
+    shutil.rmtree(path.parent / "__pycache__")
+    assert asked() == "1 0"

@@ -17,12 +17,14 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import cache
+from importlib.machinery import SourceFileLoader
+from importlib.util import cache_from_source
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
 from rigidmd.core.files import untrusted_reason, write_text
-from rigidmd.errors import OutputError
+from rigidmd.errors import OutputError, SettingError
 
 PACKAGE = Path(__file__).parent.parent
 COMPILER = "rigidmd.compile"
@@ -198,11 +200,23 @@ def source_of(module: str) -> Source:
     text = path.read_bytes()
     digest, stored = text_digest(text), _stored.get(module)
     if stored is None or stored[0] != digest:
+        _require_byte_code_of(module, path, text)
         source = read_source(text.decode())
         stored = _stored[module] = [digest, source.definitions, source.imports]
         _stored[""] = []  # there is something new
     _, definitions, imports = stored
     return Source({name: Definition(*one) for name, one in definitions.items()}, imports)
+
+
+def _require_byte_code_of(module: str, path: Path, text: bytes) -> None:
+    """Raises SettingError if Python runs byte code of another text. It finds that by the time and
+    the size of the file, and machine code of it would be stored as that of the present text."""
+    loader = SourceFileLoader(module, str(path))
+    if loader.get_code(module) != loader.source_to_code(text, str(path)):
+        raise SettingError(
+            f"{cache_from_source(path)} is byte code of an earlier {path.name}, whose time and size"
+            " were those of the present one: remove it, and begin again"
+        )
 
 
 def read_stored(folder: Path) -> None:
