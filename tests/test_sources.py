@@ -100,7 +100,7 @@ print(blocks_of(100), sum(blocks_of.stats.cache_hits.values()))
 
 @pytest.fixture
 def package(tmp_path):
-    """A module of a copy of the package, and a function that asks for its results: the number of
+    """A module of a copy of the package, and a function that runs it: it returns the number of
     blocks, and how often its code was read."""
     ignored = shutil.ignore_patterns("docs", "__pycache__", "models")
     shutil.copytree(ROOT / "rigidmd", tmp_path / "rigidmd", ignore=ignored)
@@ -148,7 +148,7 @@ def test_an_edited_docstring_compiles_nothing_and_an_edited_number_does(package)
 
 
 def test_byte_code_of_an_earlier_text_is_refused(package):
-    """Python would run it, and its machine code would be stored as that of the present text."""
+    """Python would run it, and its machine code would be stored for the present text."""
     path, asked = package
     assert asked(PYTHONDONTWRITEBYTECODE="") == "1 0"
     edited_unseen(path, "SERIAL_MOLECULES = 128", "SERIAL_MOLECULES = 127")

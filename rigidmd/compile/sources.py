@@ -209,13 +209,13 @@ def source_of(module: str) -> Source:
 
 
 def _require_byte_code_of(module: str, path: Path, text: bytes) -> None:
-    """Raises SettingError if Python runs byte code of another text. It finds that by the time and
-    the size of the file, and machine code of it would be stored as that of the present text."""
+    """Raises SettingError if Python runs byte code of another text. It finds byte code by the time
+    and the size of the file. Machine code made from it would be stored for the present text."""
     loader = SourceFileLoader(module, str(path))
     if loader.get_code(module) != loader.source_to_code(text, str(path)):
         raise SettingError(
-            f"{cache_from_source(path)} is byte code of an earlier {path.name}, whose time and size"
-            " were those of the present one: remove it, and begin again"
+            f"{cache_from_source(path)} is byte code of an earlier {path.name}, which had the same"
+            " time and size: remove it, and begin again"
         )
 
 
