@@ -320,7 +320,7 @@ def test_every_folder_of_code_is_a_package_that_is_installed():
 
 
 def test_the_top_level_holds_what_it_should():
-    allowed = {"pyproject.toml", "rigidmd", "tests", "systems", "README.md", "LICENSE"}
+    allowed = {"pyproject.toml", "setup.py", "rigidmd", "tests", "systems", "README.md", "LICENSE"}
     listed = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
     )
