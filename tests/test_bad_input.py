@@ -1260,7 +1260,7 @@ def test_a_run_that_blows_up_says_so_and_keeps_the_last_good_state(tmp_path):
 @pytest.mark.parametrize("number", [5e-324, 1e-310, 1e-31, 1e300, -1e300])
 @pytest.mark.parametrize("key", ["stages.0.timestep_fs", "start.temperature_K"])
 def test_checks_of_tables_do_not_calculate_with_numbers_out_of_range(key, number, tmp_path):
-    """Each such number has one message, beside those of other keys."""
+    """Each such number has one message, next to those of other keys."""
     path = tmp_path / "good.toml"
     path.write_text(GOOD)
     with pytest.raises(SceneError) as raised:

@@ -181,7 +181,7 @@ def test_simulations_on_all_threads_at_once_have_the_bits_of_each_alone():
 
 
 def test_other_threads_read_energies_while_a_run_begins_and_goes_on():
-    """Two threads that use one engine at once end in a segmentation fault, or in another run."""
+    """Two threads that use one engine at once end in a crash, or in another run."""
     stages = [{"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 4.0, "timestep_fs": 10.0}]
     scene = small_scene({"argon": 40}, 20.0, stages=stages, output={"log_interval_ps": 0.01})
     alone = Simulation(scene).run()
