@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import pytest
+from processes import search_path
 from support import ROOT
 
 FOLDER = ROOT / "tests" / "benchmarks"
@@ -31,7 +32,7 @@ def test_the_smallest_form_runs_and_leaves_the_checkout_alone(script, tmp_path):
     done = subprocess.run(
         [sys.executable, script, "--smoke"],
         cwd=tmp_path,
-        env=os.environ | {"TMPDIR": str(tmp_path)},
+        env=os.environ | search_path(FOLDER) | {"TMPDIR": str(tmp_path)},
         capture_output=True,
         text=True,
     )
@@ -47,7 +48,7 @@ def test_the_smallest_form_runs_and_leaves_the_checkout_alone(script, tmp_path):
 def test_files_go_to_the_folder_that_is_given(tmp_path):
     before = files()
     command = [sys.executable, FOLDER / "euler_angles.py", "--to", tmp_path / "new" / "folder"]
-    subprocess.run(command, check=True, cwd=tmp_path)
+    subprocess.run(command, check=True, cwd=tmp_path, env=os.environ | search_path(FOLDER))
     assert (tmp_path / "new" / "folder" / "euler_angles.png").stat().st_size > 10_000
     assert files() == before
 
