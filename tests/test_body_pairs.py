@@ -16,6 +16,7 @@ from support import bits_with
 import rigidmd
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build
+from rigidmd.assemble.guest import Guest
 from rigidmd.compile import kernel
 from rigidmd.core.statistics import slope
 from rigidmd.engines.body_pairs import bodies_of_potentials
@@ -32,6 +33,8 @@ from rigidmd.forces.poses.slopes import code_of, slopes_of
 from rigidmd.forces.poses.table import read_body_table
 from rigidmd.forces.poses.trace import Graph, TraceError
 from rigidmd.run.rigid_fit import Bodies
+from rigidmd.scene.models import read_molecule
+from rigidmd.studies.virial import second_virial
 from rigidmd.units import BOLTZMANN, COULOMB, DEBYE, KJ_PER_MOL
 from rigidmd.view.solids import solids_of
 
@@ -660,6 +663,134 @@ def test_bodies_that_do_not_rotate_have_no_such_potential():
         build(scene(tables, molecules=[{"model": "argon", "count": 10}]))
 
 
+LINES = {"along": [0.0, 0.0, 1.0], "across": [1.0, 0.0, 0.0], "oblique": [0.6, 0.0, 0.8]}
+
+
+def line(name: str, count: int = 6) -> dict:
+    """Two masses on a line."""
+    ends = [[sign * x for x in LINES[name]] for sign in (1.0, -1.0)]
+    sites = [{"name": f"A{k}", "mass_u": 20.0, "position_A": x} for k, x in enumerate(ends)]
+    return {"name": name, "count": count, "sites": sites}
+
+
+DISK = body("disc", 6)
+DOT = {"name": "dot", "count": 6, "sites": [{"name": "A", "mass_u": 20.0, "position_A": [0, 0, 0]}]}
+SHIPPED = {
+    "gay_berne": ROD,
+    "dipole": {"dipole_D": 2.0},
+    "quadrupole": {"quadrupole_D_A": 3.0},
+    "patch": {"sigma_A": 4.0, "epsilon_kJ_mol": 2.0, "width": 0.3},
+}
+
+
+def errors_of(molecules, tables=None, forces=(), folder=".") -> str:
+    """What building a scene of molecules says."""
+    data = {
+        "box": {"lengths_A": 40.0},
+        "molecules": molecules,
+        "threads": 1,
+        "start": {"temperature_K": 200.0},
+        "forces": {"cutoff_A": 12.0, "bodies": [tables] if tables else []},
+        "stages": [{"duration_ps": 0.05, "timestep_fs": 5.0}],
+    }
+    try:
+        build(Scene.from_dict(data, folder).with_user_code(forces))
+    except SceneError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("potential", SHIPPED)
+def test_torques_that_nothing_resists_are_refused(potential):
+    """On points, and about the line of linear bodies, whatever the other body is; not on frozen
+    bodies, and not about a line that is the axis of the potential."""
+
+    def error(*molecules, **more) -> str:
+        parameters = {m["name"]: SHIPPED[potential] for m in molecules}
+        return errors_of(list(molecules), {"potential": potential, "parameters": parameters} | more)
+
+    for other in (DISK, line("along")):
+        assert "dot is a point: nothing resists" in error(DOT, other)
+        assert "dot is a point: nothing resists" in error(other, DOT | {"count": 1})
+        assert not error(DOT | {"frozen": True}, other)
+        assert "across is linear: nothing resists the torque" in error(line("across"), other)
+        assert "Use axis = 'x'" in error(other, line("across"))
+        assert "must lie along z" in error(other, line("oblique"))
+    assert not error(line("across"), DISK, axis="x")
+    assert not error(DISK)
+    for reference, message in (((0.0, 0.0, 0.4), ""), ((0.3, 0.0, 0.4), "must be on the line")):
+        found = error(line("along"), DISK, references={"along": reference})
+        assert message in found if message else not found
+
+
+def test_torques_of_functions_texts_and_tables_that_nothing_resists_are_refused(tmp_path):
+    written_table(tmp_path / "pair.npz", points=(20, 13, 13, 13))
+    flat = np.exp(-np.linspace(4, 12, 20))[:, None, None, None] * np.ones((1, 13, 13, 13))
+    written_table(tmp_path / "flat.npz", points=(20, 13, 13, 13), energy_kJ_mol=flat)
+    one_line = [line("across"), DISK]
+    for table, message in (("pair.npz", "Use axis = 'x'"), ("flat.npz", "")):
+        found = errors_of(one_line, {"table": table}, folder=tmp_path)
+        assert message in found if message else not found
+    for energy, message in (("1/r**12", ""), ("(1 + 1e-6*a_r*b_r)/r**12", "across is linear")):
+        found = errors_of(one_line, {"energy": energy})
+        assert message in found if message else not found
+
+    def of_matrices(r, a, b):  # even about x only
+        return ((a[:, 0] @ r) * (b[:, 0] @ r) + 0.1 * (a[:, 0] @ b[:, 0])) / (r @ r) ** 4
+
+    def of_others(r, a, b):
+        return (a[:, 1] @ r) * (b[:, 1] @ r) / (r @ r) ** 4
+
+    def given(r, a, b):
+        return 1 / (r @ r), 2 * r / (r @ r) ** 2, 1e-3 * a[:, 0], 1e-3 * b[:, 0]
+
+    for function, molecule, message in (
+        (of_matrices, line("across"), ""),
+        (of_matrices, line("along"), "line of its masses must not change the energy"),
+        (of_others, line("across"), "line of its masses must not change the energy"),
+        (given, DOT, "dot is a point"),
+    ):
+        potential = rigidmd.body_pair_potential(function)
+        found = errors_of([molecule, DISK], forces=[potential])
+        assert message in found if message else not found
+        assert not errors_of([molecule | {"frozen": True}, DISK], forces=[potential])
+
+
+def test_trial_molecules_without_inertia_are_refused_too(tmp_path):
+    (tmp_path / "dot.toml").write_text(
+        'name = "dot"\n[[sites]]\nname = "A"\nmass_u = 20\nposition_A = [0, 0, 0]\n'
+    )
+    aligning = {"energy": "exp(-r)*a_b**2"}
+    settings = {"forces.bodies": [aligning]}
+    with pytest.raises(SceneError, match="dot is a point: nothing resists"):
+        second_virial(str(tmp_path / "dot.toml"), "nitrogen", temperatures=[300], settings=settings)
+    host = build(scene(aligning | {"cutoff_A": 12.0}, {"rod": 4}))
+    with pytest.raises(SceneError, match="dot is a point: nothing resists"):
+        Guest(host, read_molecule(tmp_path / "dot.toml"), 300.0)
+
+
+class Twist(rigidmd.Force):
+    """A torque about one axis of each body that does no work, as nothing rotates about it."""
+
+    tied_to_places = False
+
+    def __init__(self, axis):
+        self.axis = axis
+
+    def on_molecules(self, state):
+        nothing = np.zeros_like(state.position)
+        return 0.0, nothing, nothing + np.eye(3)[self.axis], np.zeros((3, 3))
+
+
+def test_a_force_of_python_with_a_torque_about_an_axis_without_inertia_is_refused():
+    """The axis of a linear body is its first principal one."""
+    run = Simulation(scene(None, {"rod": 8}), forces=[Twist(0)], warn=str)
+    with pytest.raises(
+        SceneError, match=r"resists its torque of 1 kJ/mol .*\(rod\), about its axis"
+    ):
+        run.run()
+
+
 def test_a_potential_of_a_module_needs_trust(tmp_path):
     (tmp_path / "own.py").write_text(
         "import numpy as np, rigidmd\n"
@@ -766,6 +897,12 @@ def written_table(path, points=(30, 25, 25, 25), **changes):
     return path
 
 
+#: An energy that rises inwards, of the points of `written_table`; cosine of the angle of two axes.
+RISING = np.exp(-np.linspace(4, 12, 30))[:, None, None, None] * np.ones((1, 25, 25, 25))
+_ANGLES = np.radians(np.linspace(0, 180, 25))
+PARALLEL = np.multiply.outer(np.multiply.outer(np.sin(_ANGLES), np.sin(_ANGLES)), np.cos(_ANGLES))
+
+
 @kernel(from_python=True)
 def compiled_slopes(formula, p, r, a, b):
     return pair_slopes(formula, p, r, a, b)
@@ -813,7 +950,7 @@ def test_a_table_has_the_energy_of_its_function_and_forces_that_are_its_slopes(t
         ({"r_A": np.geomspace(4, 12, 30)}, "r_A must have 4 points or more in even ascending"),
         ({"phi_deg": np.linspace(0, 360, 25)}, "phi_deg must run from 0 to 180"),
         ({"energy_kJ_mol": np.zeros((30, 25, 25))}, r"has the shape \(30, 25, 25\), must have"),
-        ({"energy_kJ_mol": np.full((30, 25, 25, 25), np.nan)}, "energies must be finite"),
+        ({"energy_kJ_mol": np.full((30, 25, 25, 25), np.nan)}, "and finite energies"),
         (
             {"energy_kJ_mol": np.ones((30, 25, 25, 1)) * np.arange(25.0)},
             "depends on phi where an axis is along the vector",
@@ -821,6 +958,21 @@ def test_a_table_has_the_energy_of_its_function_and_forces_that_are_its_slopes(t
         (
             {"energy_kJ_mol": np.ones((30, 1, 25, 25)) * np.arange(25.0)[:, None, None]},
             "an exchange of both bodies changes the energy",
+        ),
+        ({"r_A": np.linspace(-1, 12, 30)}, "ascending distances above 0"),
+        ({"r_A": np.linspace(3e200, 4e200, 30)}, "more than 1e\\+30, the largest of a table"),
+        ({"energy_kJ_mol": 1e300 * RISING}, "more than 1e\\+30, the largest of a table"),
+        (
+            {"energy_kJ_mol": -RISING},
+            "begins at 4 Å, where it does not repel at theta_1 = 0°, thet",
+        ),
+        ({"energy_kJ_mol": 0 * RISING}, "begins at 4 Å, where it does not repel"),
+        # flat at the first two points: the parabola through the first three falls inwards
+        ({"energy_kJ_mol": np.minimum(RISING, RISING[1])}, "where it does not repel"),
+        # at one pair of angles only
+        (
+            {"energy_kJ_mol": RISING - 2 * RISING * (PARALLEL > 0.995)},
+            "theta_1 = 90°, theta_2 = 90°, ph",
         ),
     ],
 )
@@ -848,3 +1000,27 @@ def test_a_scene_has_a_table_as_a_file_and_compares_its_forces_at_the_start(tmp_
     data["forces"]["bodies"][0]["cutoff_A"] = 13.0
     with pytest.raises(SceneError, match="the table ends at 12 Å, before the cutoff of 13 Å"):
         build(Scene.from_dict(data, tmp_path))
+    data["forces"]["bodies"][0]["cutoff_A"] = 3.9
+    with pytest.raises(SceneError, match=r"the table begins at 4 Å, beyond the cutoff of 3\.9 Å"):
+        build(Scene.from_dict(data, tmp_path))
+
+
+@pytest.mark.parametrize(("first", "expected"), [(3.0, ""), (4.2, "bodies come nearer")])
+def test_a_table_that_keeps_no_bodies_apart_is_warned_of(first, expected, tmp_path):
+    r, angles = np.linspace(first, 12, 30), np.linspace(0, 180, 5)
+    energy = 8 * ((4 / r) ** 12 - (4 / r) ** 6)
+    arrays = {name: angles for name in ("theta_1_deg", "theta_2_deg", "phi_deg")}
+    energy = energy[:, None, None, None] * np.ones((1, 5, 5, 5))
+    np.savez(tmp_path / "pair.npz", r_A=r, energy_kJ_mol=energy, **arrays)
+    data = {
+        "box": {"lengths_A": 40.0},
+        "molecules": [body("rod", 60)],
+        "forces": {"cutoff_A": 12.0, "bodies": [{"table": "pair.npz"}]},
+        "stages": [{"ensemble": "nvt", "temperature_K": 200.0, "duration_ps": 1.0}],
+    }
+    warnings = " ".join(build(Scene.from_dict(data, tmp_path)).warnings)
+    assert expected in warnings and bool(warnings) == bool(expected)
+    charged = body("rod", 60)
+    charged["sites"][0] |= {"sigma_A": 3.0, "epsilon_kJ_mol": 1.0}
+    warnings = build(Scene.from_dict(data | {"molecules": [charged]}, tmp_path)).warnings
+    assert not any("bodies come nearer" in warning for warning in warnings)

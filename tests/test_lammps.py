@@ -437,7 +437,7 @@ def test_a_liquid_of_ellipsoids_beside_sites_is_the_same():
     assert gay_berne.difference <= 1e-10 * abs(gay_berne.here) and abs(gay_berne.here) > 10
     assert found.run[0].difference < 1e-6 and found.run[0].here > 0.1
     wrong = {name: ELLIPSOIDS["parameters"][name] for name in ("rod", "spce")}
-    wrong["argon"] = wrong["rod"]
+    wrong["argon"] = wrong["rod"] | {"length_A": 4, "end": 1}  # a sphere
     with pytest.raises(SceneError) as refused:
         verify(ellipsoids(truncation="switch", parameters=wrong, pairs=[]))
     assert "truncation = 'switch': LAMMPS' gayberne has plain" in str(refused.value)

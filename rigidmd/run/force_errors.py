@@ -29,6 +29,7 @@ from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.neighbors.space import fractions, space_of
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.mechanics.rotation import from_vector
+from rigidmd.scene.models import OFF_AXIS
 from rigidmd.scene.validation import not_none
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
@@ -253,6 +254,8 @@ def _error_of_force(system: System, state: State, name: str) -> str:
     tally = tallies[name]
     if not np.isfinite(tally.energy):
         return f"{name}: its energy at the start is {tally.energy}"
+    if unresisted := _unresisted_torque(system, load):
+        return f"{name}: {unresisted}"
     noise = ROUNDING * max(abs(tally.energy), np.abs(load.force).sum() * system.smallest_diameter)
     random = KJ_PER_MOL * getattr(
         getattr(system.python_forces.get(name), "force", None), "energy_noise", 0.0
@@ -283,6 +286,25 @@ def _error_of_force(system: System, state: State, name: str) -> str:
             " energy_noise"
         )
     return f"{name}: {wrong}" if wrong else ""
+
+
+def _unresisted_torque(system: System, load: Load) -> str:
+    """The largest torque about an axis without inertia. Empty without one, up to that of sites that
+    are off the axis by OFF_AXIS."""
+    if not len(load.torque_body):
+        return ""
+    without = (system.model.inertia == 0)[system.model.species] & mobile(system.model)[:, None]
+    size = np.linalg.norm(np.where(without, load.torque_body, 0.0), axis=1)
+    largest = np.abs(load.torque_body).max() + system.smallest_diameter * np.abs(load.force).max()
+    m = int(size.argmax())
+    if size[m] <= OFF_AXIS * largest:
+        return ""
+    species = system.species[system.model.species[m]]
+    return (
+        f"nothing resists its torque of {size[m] / KJ_PER_MOL:.3g} kJ/mol on molecule {m + 1}"
+        f" ({species.name}), {'a point' if species.kind == 'point' else 'about its axis'}. Leave"
+        " out torques about axes without inertia"
+    )
 
 
 def _check_molecules(system: System, state: State, load: Load, difference: _Difference) -> str:

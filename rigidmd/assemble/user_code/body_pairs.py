@@ -8,16 +8,19 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from rigidmd.assemble.user_code.cutoffs import PairPotentialError, check_cutoff
+from rigidmd.assemble.user_code.cutoffs import PairPotentialError, check_cutoff, energy_scale
 from rigidmd.assemble.user_code.force import BoundTerm
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.engines.body_pairs import reference_of
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.forces.poses.potential import BodyPairPotential, Parameters, Vector
+from rigidmd.forces.tables import reach_errors
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.forces import BodyForce
+from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import not_none
+from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
     from rigidmd.forces.poses.formulas import PoseFormula
@@ -27,6 +30,8 @@ DEFAULT_NAME = "body_pairs"
 UNNAMED = ("", "<lambda>", "energy")
 #: The switch begins at this fraction of the cutoff.
 SWITCH_START = 0.9
+#: Energy in kT at the first distance of a table that bodies do not come nearer than.
+KEEPS_APART = 10.0
 
 
 def body_pair_potential(
@@ -186,7 +191,10 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
     PairPotentialError
         With all errors.
     """
-    from rigidmd.forces.poses.pairs import BodyPairs  # for such scenes only
+    # for such scenes only
+    from rigidmd.assemble.user_code.pose_checks import unresisted_torques
+    from rigidmd.forces.poses.pairs import BodyPairs
+    from rigidmd.forces.poses.table import BodyTable
 
     species = [m.name for m in system.species]
     faults = _unknown_species(potential, list(dict.fromkeys(species)))
@@ -197,27 +205,30 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         raise PairPotentialError(*faults)
     cutoff = potential.cutoff_A or system.cutoff
     check_cutoff(cutoff, system)
-    if not cutoff <= (reach := getattr(potential.function, "last", inf)):
-        message = f"the table ends at {reach:g} Å, before the cutoff of {cutoff:g} Å"
-        raise PairPotentialError(message)
+    if isinstance(table := potential.function, BodyTable):
+        for message in reach_errors("the table", table.first, table.last, cutoff):
+            raise PairPotentialError(message)
     start = cutoff
     if potential.truncation == "switch" and cutoff < inf:
         start = potential.switch_start_A or SWITCH_START * cutoff
     if not start <= cutoff:
         raise PairPotentialError(f"switch_start_A = {start:g} is beyond the cutoff of {cutoff:g} Å")
     formula, rows = _rows(potential, kinds)
+    models = {m.name: m for m in system.species}
+    acting = [models[name] for name in kinds]
+    if faults := [*unresisted_torques(potential, formula, rows, acting, system)]:
+        raise PairPotentialError(*faults)
     of_species = np.array([kinds.index(name) if name in kinds else -1 for name in species])
     kind = of_species[system.model.species]
     body = np.arange(len(kind))
     frozen = (system.model.inverse_mass == 0)[system.model.species]
-    models = {m.name: m for m in system.species}
-    references = [reference_of(potential, models[name]) for name in kinds]
+    references = [reference_of(potential, m) for m in acting]
     term = BodyPairs(
         formula=formula.kind(),
         kind=kind,
         group=np.where(frozen, len(body), body),
         reference=np.array(references, float).reshape(-1, 3),
-        frame=np.ascontiguousarray([models[name].axes.T for name in kinds]),
+        frame=np.ascontiguousarray([m.axes.T for m in acting]),
         parameters=rows,
         switch_start=float(start),
         cutoff=float(cutoff),
@@ -228,7 +239,26 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         f"pairs of {', '.join(kinds)}, {formula.operations} operations, force and torques {source},"
         f" {ends}"
     )
-    return BoundTerm(term, text, body_pairs=potential)
+    warnings = _low_start(potential.function, acting, system)
+    return BoundTerm(term, text, warnings=warnings, body_pairs=potential)
+
+
+def _low_start(function: object, kinds: list[Molecule], system: System) -> list[str]:
+    """A warning of a table whose energies at its first distance keep no bodies apart, nor do
+    sites."""
+    from rigidmd.forces.poses.table import BodyTable
+
+    if not isinstance(function, BodyTable) or any(m.epsilon.any() for m in kinds):
+        return []
+    thermal, scale = energy_scale(system)
+    lowest = float(function.energy[0].min())
+    if lowest > KEEPS_APART * thermal:
+        return []
+    return [
+        f"begins at {function.first:g} Å with an energy of {lowest / KJ_PER_MOL:.3g} kJ/mol"
+        f" ({lowest / thermal:.2g} {scale}) at some angles: bodies come nearer, where the energy is"
+        " a guess. Begin the table at shorter distances"
+    ]
 
 
 def _unknown_species(potential: BodyPairPotential, species: list[str]) -> list[str]:

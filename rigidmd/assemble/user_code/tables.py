@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from rigidmd.assemble.user_code.cutoffs import PairPotentialError
 from rigidmd.core.files import unreadable_reason
-from rigidmd.forces.potentials.formulas import LARGEST_VALUE, LEAST_ROWS
+from rigidmd.forces.potentials.formulas import LEAST_ROWS
+from rigidmd.forces.tables import LARGEST_VALUE
 
 #: Columns of the file of a tabulated potential, of which the last may be missing; the names have
 #: the units.

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidmd.core.user_modules import module_of
 from rigidmd.errors import describe_error
-from rigidmd.forces.poses.slopes import Hoisted, code_of, slopes_of
+from rigidmd.forces.poses.slopes import Hoisted, code_of, slopes_of, values_of
 from rigidmd.forces.poses.table import BodyTable, TableFormula
 from rigidmd.forces.poses.trace import Graph, Number, Traced, TraceError
 from rigidmd.units import KJ_PER_MOL
@@ -22,12 +22,25 @@ ENERGY, WITH_FORCES = 1, 4
 TABLE_OPERATIONS = 1800
 
 
+class PairValues(NamedTuple):
+    """Energies (m,) of pairs, their slopes (m, 3) by the vector between both bodies, and the
+    torques (m, 3) on both, along the axes of the lab, u Å²/ps²."""
+
+    energy: np.ndarray
+    slope: np.ndarray
+    torque: np.ndarray
+    torque_of_other: np.ndarray
+
+
 class PoseFormula(NamedTuple):
     """A formula in compiled code."""
 
     kind: type  # NamedTuple class, which chooses the code
     #: The row of numbers of a pair of kinds, from the parameters of the first and the second.
     numbers: Callable[[Mapping[str, float], Mapping[str, float]], list[float]]
+    #: Of pairs in NumPy, from a row of numbers, vectors (m, 3) and rotation matrices (m, 3, 3):
+    #: what `pair_slopes` gives; for a table, of a simple function of the same distance and angles.
+    values: "Callable[[Sequence[float], np.ndarray, np.ndarray, np.ndarray], PairValues]"
     operations: int  # in the loop, of the energy with force and torques
     is_derived: bool  # whether force and torques are derived from the energy
 
@@ -46,8 +59,9 @@ def formula_of_poses(
     """
     if isinstance(function, BodyTable):
         row = function.row(axis).tolist()
-        return PoseFormula(
-            TableFormula, lambda first, second: row, TABLE_OPERATIONS, is_derived=True
+        alike = formula_of_poses(function.like, (), axis or AXES[-1])
+        return alike._replace(
+            kind=TableFormula, numbers=lambda first, second: row, operations=TABLE_OPERATIONS
         )
     name = getattr(function, "__name__", "a potential")
     graph = Graph()
@@ -67,7 +81,7 @@ def formula_of_poses(
         outputs = _derived(name, returned, r, matrices)
     names = [f"{body}.{key}" for body in ("p", "q") for key in parameters]
     hoisted = Hoisted(outputs, names)
-    lines, texts = code_of(outputs, hoisted.positions)
+    lines, texts = code_of(outputs, {index: f"p[{k}]" for index, k in hoisted.places.items()})
     module = module_of(_source(name, lines, texts).encode(), f"<potential {name}>")
 
     def numbers(first: Mapping[str, float], second: Mapping[str, float]) -> list[float]:
@@ -75,7 +89,18 @@ def formula_of_poses(
         values |= {f"q.{key}": second[key] for key in parameters}
         return hoisted.values(values)
 
-    return PoseFormula(module.Formula, numbers, len(lines), not isinstance(returned, tuple))
+    def pair_values(
+        row: Sequence[float], r: np.ndarray, a: np.ndarray, b: np.ndarray
+    ) -> PairValues:
+        leaves = dict(zip(AXES, r.T, strict=True))
+        for body, matrix in (("a", a), ("b", b)):
+            leaves |= {f"{body}[{i}, {j}]": matrix[:, i, j] for i in range(3) for j in range(3)}
+        known = {index: row[k] for index, k in hoisted.places.items()}
+        energy, *vectors = values_of(outputs, leaves, known)
+        return PairValues(energy, *np.transpose(np.reshape(vectors, (3, 3, -1)), (0, 2, 1)))
+
+    is_derived = not isinstance(returned, tuple)
+    return PoseFormula(module.Formula, numbers, pair_values, len(lines), is_derived)
 
 
 class _Parameters:

@@ -4,7 +4,9 @@ Slopes follow from the graph by reverse differentiation, as further nodes. `code
 lines of Python, which are compiled.
 """
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
+
+import numpy as np
 
 from rigidmd.forces.poses.trace import Number, Traced, computed, where
 
@@ -17,6 +19,25 @@ _CODE = {
     "negative": "(-{})",
     "less": "({} < {})",
     "where": "({1} if {0} else {2})",
+}
+#: Kind of a node -> its values in NumPy.
+_ARRAYS: dict[str, Callable] = {
+    "add": np.add,
+    "subtract": np.subtract,
+    "multiply": np.multiply,
+    "divide": np.divide,
+    "negative": np.negative,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tanh": np.tanh,
+    "acos": np.arccos,
+    "fabs": np.fabs,
+    "power": np.power,
+    "less": np.less,
+    "where": np.where,
 }
 #: Kind of a node -> its slopes by its parts: a function of the node and of the parts.
 _SLOPES: dict[str, Callable] = {
@@ -98,6 +119,32 @@ def code_of(
     return lines, texts
 
 
+def values_of(
+    outputs: Sequence[Number], leaves: Mapping[str, np.ndarray], known: Mapping[int, float]
+) -> list[np.ndarray]:
+    """The outputs at the values (m,) of leaves, as compiled code computes them: NaN and inf where
+    they are not finite.
+
+    known : values of nodes that are not computed here, by their indices
+    """
+    values: dict[int, np.ndarray | float] = dict(known)
+    with np.errstate(all="ignore"):
+        for node in _in_order([x for x in outputs if isinstance(x, Traced)], known):
+            if node.index in values:
+                continue
+            if node.kind == "leaf":
+                values[node.index] = leaves[node.parts[0]]
+            elif node.number is not None:
+                values[node.index] = node.number
+            else:
+                parts = [values[x.index] if isinstance(x, Traced) else x for x in node.parts]
+                values[node.index] = _ARRAYS[node.kind](*parts)
+    count = len(next(iter(leaves.values())))
+    return [
+        np.broadcast_to(values[x.index] if isinstance(x, Traced) else x, count) for x in outputs
+    ]
+
+
 def _expression(node: Traced, names: dict[int, str]) -> str:
     parts = [names[part.index] for part in node.inner]
     if node.kind == "power":
@@ -135,7 +182,7 @@ class Hoisted:
             node.index: node for node in used if node.index in fixed and node.kind != "constant"
         }
         self._nodes = list(read.values())
-        self.positions = {node.index: f"p[{k}]" for k, node in enumerate(self._nodes)}
+        self.places = {node.index: k for k, node in enumerate(self._nodes)}
 
     def values(self, parameters: dict[str, float]) -> list[float]:
         """The numbers of a pair of kinds, from its parameters by name. Raises TraceError."""

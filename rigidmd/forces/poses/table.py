@@ -5,7 +5,7 @@ energy_kJ_mol of the shape of all four. theta_1 and theta_2 are the angles of th
 and the second body with the vector from the first to the second, phi is the dihedral angle of the
 axes about it; angles run from 0 to 180. Between the points the energy is a product of cubic
 convolutions, which has continuous slopes (Keys 1981, IEEE Trans. Acoust. 29, 1153); at shorter
-distances the first cubic is continued.
+distances the parabola through the first three points is continued, which must rise.
 """
 
 from collections.abc import Iterator
@@ -18,6 +18,8 @@ import numpy as np
 
 from rigidmd.compile import implements, kernel
 from rigidmd.forces.poses.pairs import pair_slopes
+from rigidmd.forces.poses.trace import Number
+from rigidmd.forces.tables import start_errors, value_errors
 from rigidmd.units import KJ_PER_MOL
 
 GRID = ("r_A", "theta_1_deg", "theta_2_deg", "phi_deg")
@@ -51,6 +53,14 @@ class BodyTable(NamedTuple):
         head = [self.first, 1 / step, *points, "xyz".index(axis or "z")]
         return np.concatenate([head, energy.ravel()])
 
+    def like(self, r: np.ndarray, u: np.ndarray, v: np.ndarray) -> Number:
+        """A simple energy of the distance, and of the angles if the table depends on them: its
+        torques have the same directions."""
+        energy = r @ r
+        if np.ptp(self.energy, axis=(1, 2, 3)).max() > SAME * np.abs(self.energy).max():
+            energy = energy * (1 + u @ r + v @ r + u @ v)
+        return energy
+
 
 class TableFormula(NamedTuple):
     """The formula of tables: `pair_slopes` of it reads the row of a `BodyTable`."""
@@ -65,36 +75,52 @@ def read_body_table(path: Path) -> BodyTable:
             arrays = {name: np.asarray(file[name], float) for name in file.files}
     except (OSError, ValueError, TypeError, AttributeError, EOFError, BadZipFile) as error:
         raise ValueError(f"{path.name} is not an .npz file of numbers: {error}") from None
-    for message in _errors(arrays):
-        raise ValueError(f"{path.name}: {message}")
+    for message in _errors(path.name, arrays):
+        raise ValueError(message)
     first, last = arrays["r_A"][[0, -1]].tolist()
     return BodyTable(first, last, arrays[ENERGY] * KJ_PER_MOL)
 
 
-def _errors(arrays: dict[str, np.ndarray]) -> Iterator[str]:
+def _errors(file: str, arrays: dict[str, np.ndarray]) -> Iterator[str]:
     if missing := [name for name in (*GRID, ENERGY) if name not in arrays]:
-        yield f"it has no array {missing[0]}; it needs {', '.join(GRID)} and {ENERGY}"
+        yield f"{file}: it has no array {missing[0]}; it needs {', '.join(GRID)} and {ENERGY}"
     for name in GRID:
         points = arrays[name]
         steps = np.diff(points) if points.ndim == 1 else np.zeros(0)
         if len(steps) < FEWEST - 1 or not steps[0] > 0 or np.ptp(steps) > EVEN * steps[0]:
-            yield f"{name} must have {FEWEST} points or more in even ascending steps"
+            yield f"{file}: {name} must have {FEWEST} points or more in even ascending steps"
         if name != "r_A" and not np.allclose(points[[0, -1]], [0, 180]):
-            yield f"{name} must run from 0 to 180"
+            yield f"{file}: {name} must run from 0 to 180"
     energy = arrays[ENERGY]
     shape = tuple(len(arrays[name]) for name in GRID)
     if energy.shape != shape:
-        yield f"{ENERGY} has the shape {energy.shape}, must have {shape}"
-    if not np.isfinite(energy).all() or not arrays["r_A"][0] > 0:
-        yield "energies must be finite, and distances above 0"
+        yield f"{file}: {ENERGY} has the shape {energy.shape}, must have {shape}"
+    yield from value_errors(file, arrays["r_A"], energy)
     tolerance = SAME * np.abs(energy).max()
     for ends in (energy[:, [0, -1]], energy[:, :, [0, -1]]):
         if np.ptp(ends, axis=-1).max() > tolerance:
-            yield "the energy depends on phi where an axis is along the vector, at 0 or 180"
+            yield f"{file}: the energy depends on phi where an axis is along the vector"
     exchanged = energy[:, ::-1, ::-1].swapaxes(1, 2)
     if exchanged.shape != shape or np.abs(exchanged - energy).max() > tolerance:
         why = "energy(theta_1, theta_2) must be energy(180 - theta_2, 180 - theta_1)"
-        yield f"an exchange of both bodies changes the energy: {why}"
+        yield f"{file}: an exchange of both bodies changes the energy: {why}"
+    yield from _start_errors(file, arrays)
+
+
+def _start_errors(file: str, arrays: dict[str, np.ndarray]) -> Iterator[str]:
+    """A message if the energy attracts at the first distance, or nearer, where the parabola through
+    the first three points continues it."""
+    r = arrays["r_A"]
+    first, second, third = arrays[ENERGY][:3]
+    curvature = first - 2 * second + third
+    slope = second - first - curvature / 2  # by the distance in steps, at the first point
+    slope = np.maximum(slope, slope - curvature * r[0] / (r[1] - r[0]))  # and at 0
+    steepest = np.unravel_index(slope.argmax(), slope.shape)
+    angles = [
+        f"{name.removesuffix('_deg')} = {arrays[name][k]:g}°"
+        for name, k in zip(GRID[1:], steepest, strict=True)
+    ]
+    yield from start_errors(file, r[0], slope[steepest], f" at {', '.join(angles)}")
 
 
 @kernel(inline=True)

@@ -5,7 +5,6 @@ import contextlib
 import inspect
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from rigidmd.compile import implements
 from rigidmd.compile.kernels import compile_user_function
 from rigidmd.errors import describe_error
 from rigidmd.forces.potentials.custom import Table, Tabulated, energy_and_force_at
+from rigidmd.forces.tables import reach_errors, start_errors, value_errors
 from rigidmd.units import KJ_PER_MOL
 
 DISTANCE = "r"
@@ -24,8 +24,6 @@ LEAST_ROWS = 8  #: of a table of a user
 #: Largest difference of an energy and the trapezoidal integral of its force between two rows,
 #: relative to the largest change of the energy between rows.
 WRONG_FORCE = 0.3
-#: Largest absolute value of an energy (kJ/mol) or a force of a table: products of a few are finite.
-LARGEST_VALUE = 1e30
 #: Neighbouring intervals of a table that differ by more than this factor separate parts of it. A
 #: part
 #: of longer intervals than its neighbour with fewer than LEAST_ROWS of them is a gap: it is not
@@ -189,21 +187,9 @@ def formula_of_table(
             f"{name} needs {LEAST_ROWS} distances or more, with one energy each. These are"
             f" {r.shape} and {u.shape}"
         )
-    finite = np.isfinite(r).all() and np.isfinite(u).all() and (f is None or np.isfinite(f).all())
-    if not (finite and (np.diff(r) > 0).all() and r[0] > 0):
-        raise FormulaError(f"{name} needs ascending distances above 0, and finite energies")
-    size_of_rows = np.max(np.abs(np.array([u] if f is None else [u, f])), axis=0)
-    if size_of_rows.max() > LARGEST_VALUE:
-        row = int(size_of_rows.argmax())
-        least = "begin it at larger distances: nearer than its first one the energy rises as r⁻¹²"
-        raise FormulaError(
-            f"{name} has {size_of_rows[row]:g} at {r[row]:g} Å, more than {LARGEST_VALUE:g};"
-            f" {least}"
-        )
-    if cutoff == inf or r[-1] < cutoff * (1 - 1e-12):
-        unit = ". Is it in nm?" if r[-1] < 3 < cutoff <= 10 * r[-1] * 1.01 else ""
-        raise FormulaError(f"{name} ends at {r[-1]:g} Å, before the cutoff of {cutoff:g} Å{unit}")
-
+    columns = [u] if f is None else [u, f]
+    for message in (*value_errors(name, r, *columns), *reach_errors(name, r[0], r[-1], cutoff)):
+        raise FormulaError(message)
     _check_intervals(name, r, cutoff)
     size = np.abs(u[u <= 0]).max(initial=0.0) or np.abs(u).max()
     if f is not None:
@@ -222,10 +208,8 @@ def formula_of_table(
     spline = interpolated(slice(None))
     coarse = interpolated(slice(None, None, 2))
     slope = spline(r[[0, -1]], 1) / (2 * r[[0, -1]])  # by r²
-    if not slope[0] < 0:
-        raise FormulaError(
-            f"{name} begins at {r[0]:g} Å, where it does not repel: begin it at shorter distances"
-        )
+    for message in start_errors(name, r[0], slope[0]):
+        raise FormulaError(message)
     square = np.linspace(r[0] ** 2, r[-1] ** 2, STEPS + 1)
     read = CubicSpline(square, spline(np.sqrt(square)), bc_type=((1, slope[0]), (1, slope[1])))
     step = square[1] - square[0]

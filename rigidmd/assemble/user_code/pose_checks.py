@@ -1,0 +1,101 @@
+"""Checks of potentials of two bodies at random poses: torques that nothing resists."""
+
+from collections.abc import Iterator, Sequence
+from math import inf
+
+import numpy as np
+
+from rigidmd.dynamics.model import mobile
+from rigidmd.engines.body_pairs import reference_of
+from rigidmd.engines.system import System
+from rigidmd.forces.poses.formulas import PairValues, PoseFormula
+from rigidmd.forces.poses.potential import BodyPairPotential
+from rigidmd.mechanics.rotation import from_quaternion
+from rigidmd.scene.models import OFF_AXIS, Molecule
+
+POSES = 4096
+#: Nearest distance of the random poses as a fraction of the cutoff, and their farthest one without
+#: a cutoff, Å.
+NEAREST, FARTHEST = 0.2, 20.0
+#: Largest rounding error of a torque, relative to the force times the distance.
+ROUNDING = 1e-9
+
+
+def unresisted_torques(
+    potential: BodyPairPotential,
+    formula: PoseFormula,
+    rows: np.ndarray,
+    kinds: Sequence[Molecule],
+    system: System,
+) -> Iterator[str]:
+    """Messages on species with a torque about an axis without inertia.
+
+    rows (k, k, numbers) : of each pair of the k species on which the potential acts
+    """
+    names = np.array([m.name for m in system.species])[system.model.species]
+    moving = set(names[mobile(system.model)].tolist())
+    cutoff = potential.cutoff_A or system.cutoff
+    farthest = FARTHEST if cutoff == inf else cutoff
+    r, a, b = random_poses(NEAREST * farthest, farthest)
+    for i, m in enumerate(kinds):
+        if m.name not in moving or (m.inertia > 0).all():
+            continue
+        for j, other in enumerate(kinds):
+            if (names == other.name).sum() <= (i == j):  # there is no such pair
+                continue
+            values = formula.values(rows[min(i, j), max(i, j)], r, a, b)
+            if i > j:
+                values = PairValues(
+                    values.energy, -values.slope, values.torque_of_other, values.torque
+                )
+            arm = m.axes @ reference_of(potential, m)  # along the axes of the model's file
+            if _is_unresisted(m, arm, r, b if i > j else a, values):
+                yield _message(potential, m, arm)
+                break
+
+
+def random_poses(nearest: float, farthest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vectors (m, 3) between two bodies at distances (Å) from the nearest to the farthest, and
+    rotation matrices (m, 3, 3) of both."""
+    numbers = np.random.default_rng(1).standard_normal((POSES, 11))
+    direction = numbers[:, :3] / np.linalg.norm(numbers[:, :3], axis=1)[:, None]
+    r = np.geomspace(nearest, farthest, POSES)[:, None] * direction
+    return r, from_quaternion(numbers[:, 3:7]), from_quaternion(numbers[:, 7:])
+
+
+def _is_unresisted(
+    m: Molecule, arm: np.ndarray, r: np.ndarray, pose: np.ndarray, values: PairValues
+) -> bool:
+    """Whether a body has a torque about an axis without inertia in any pose.
+
+    arm (3,) : from its centre of mass to its reference point; values : with the body as the first
+    """
+    lever = pose @ arm
+    torque = values.torque + np.cross(lever, values.slope)
+    about = np.einsum("mij,jk,mi->mk", pose, m.axes[:, m.inertia == 0], torque)
+    force, distance, at_lever, whole, reaction, unresisted = (
+        np.linalg.norm(x, axis=1)
+        for x in (values.slope, r, lever, torque, values.torque_of_other, about)
+    )
+    allowed = ROUNDING * (force * distance + reaction)
+    if m.kind == "linear":  # whose sites may be as far off its axis
+        allowed += OFF_AXIS * (force * at_lever + whole)
+    return bool((unresisted > allowed).any())
+
+
+def _message(potential: BodyPairPotential, m: Molecule, arm: np.ndarray) -> str:
+    if m.kind == "point":
+        return (
+            f"{m.name} is a point: nothing resists the torque of this potential. Give it sites with"
+            " mass off its centre, or freeze it"
+        )
+    line = m.axes[:, 0]
+    what = f"{m.name} is linear: nothing resists the torque of this potential about its axis"
+    if np.linalg.norm(np.cross(line, arm)) > OFF_AXIS * np.linalg.norm(arm):
+        return f"{what}. Its reference point must be on the line of its masses"
+    if potential.axis is None:
+        return f"{what}. Rotation about the line of its masses must not change the energy"
+    nearest = int(np.abs(line).argmax())
+    if abs(line[nearest]) > 1 - OFF_AXIS:
+        return f"{what}. Use axis = '{'xyz'[nearest]}', the line of its masses"
+    return f"{what}. Its masses must lie along {potential.axis}, the axis of the potential"
