@@ -1,6 +1,8 @@
 """Numbers in another unit are given with the likely cause; shipped models and scenes give no
 warning."""
 
+import json
+
 import numpy as np
 import pytest
 from scenes import GOOD
@@ -165,6 +167,85 @@ def test_a_cutoff_within_the_molecules_is_refused(cutoff):
         build(small_scene({"argon": 20}, 25.0, forces={"cutoff_A": cutoff}))
     with pytest.raises(SceneError, match=r"forces.cutoff_A is 10 Å, .* touch at"):
         build(of_sites(ARGON | {"sigma_A": 1e6}))
+
+
+PAIRS = {"name": "lj", "energy": "4*e*((s/r)**12 - (s/r)**6)", "parameters": {"e": 1.0, "s": 3.4}}
+ROD = {
+    "name": "rod",
+    "count": 20,
+    "sites": [{"name": f"A{z}", "mass_u": 20.0, "position_A": [0, 0, z]} for z in (-1.0, 1.0)],
+}
+SPHERES = {"energy": "(4/r)**12*(1 + 0.1*a_b)"}
+
+
+@pytest.mark.parametrize("length", [0.01, 0.5, 1.2])
+@pytest.mark.parametrize(
+    ("forces", "key"),
+    [
+        ({"truncation": "switch"}, "forces.switch_start_A"),
+        ({"truncation": "force_switch", "tail_correction": False}, "forces.switch_start_A"),
+        ({"electrostatics": "pme"}, "forces.ewald_cutoff_A"),
+        ({"custom": [PAIRS]}, "forces.custom.0.cutoff_A"),
+        ({"custom": [PAIRS | {"truncation": "switch"}]}, "forces.custom.0.switch_start_A"),
+        ({"bodies": [SPHERES]}, "forces.bodies.0.cutoff_A"),
+        ({"bodies": [SPHERES]}, "forces.bodies.0.switch_start_A"),
+        (
+            {"bodies": [{"potential": "dipole", "parameters": {"water": {"dipole_D": 1.0}}}]},
+            "forces.bodies.0.options.reaction_field_A",
+        ),
+    ],
+)
+def test_lengths_of_forces_within_the_molecules_are_refused(forces, key, length):
+    """Where Lennard-Jones sites touch at 3.6 Å, each key alone; `is it in nm?` if that helps."""
+    *tables, name = key.removeprefix("forces.").split(".")
+    forces = json.loads(json.dumps({"cutoff_A": 9.0} | forces))
+    table = forces
+    for part in tables:
+        table = table[int(part)] if part.isdigit() else table.setdefault(part, {})
+    table[name] = length
+    molecules = [{"model": "spce", "name": "water", "count": 60}]
+    with pytest.raises(SceneError) as refused:
+        build(small_scene({"spce": 60}, 20.0, forces=forces, molecules=molecules))
+    assert f"{key} is {length:g} Å, and the sites of two molecules touch at 3.55 Å" in str(
+        refused.value
+    )
+    assert ("is it in nm?" in str(refused.value)) == (length > 0.4)
+
+
+@pytest.mark.parametrize("key", ["cutoff_A", "switch_start_A"])
+@pytest.mark.parametrize("kind", ["custom", "bodies"])
+def test_lengths_within_the_cores_of_a_users_potential_are_refused(kind, key):
+    """Without Lennard-Jones sites: the contact is that of the potential."""
+    entry = SPHERES if kind == "bodies" else PAIRS | {"truncation": "switch"}
+    for length, contact in ((0.9, "touch at "), (6.0, "")):
+        forces = {"cutoff_A": 9.0, "lennard_jones": False, kind: [entry | {key: length}]}
+        scene = small_scene({"spce": 1}, 24.0, forces=forces, molecules=[ROD])
+        if contact:
+            with pytest.raises(SceneError, match=f"{key} is 0.9 Å, and its .* {contact}.* in nm?"):
+                build(scene)
+        else:
+            build(scene)
+
+
+def test_potentials_without_a_core_have_cutoffs_of_any_length():
+    soft = {"name": "soft", "energy": "25*(1 - r/1.2)**2", "cutoff_A": 1.2}
+    like = {"name": "like", "energy": "1389/r", "cutoff_A": 9.0, "truncation": "shift"}
+    for entry in (soft, like):
+        forces = {"lennard_jones": False, "custom": [entry]}
+        build(small_scene({"spce": 1}, 24.0, forces=forces, molecules=[ROD]))
+
+
+def test_a_switch_that_begins_within_the_molecules_has_no_tail_correction():
+    """Its integral would be one over overlaps."""
+    for start, has_tail in ((2.5, False), (3.2, True)):
+        forces = {"cutoff_A": 8.0, "truncation": "switch", "switch_start_A": start}
+        scene = small_scene({"argon": 100}, 18.0, forces=forces | {"tail_correction": None})
+        system = build(scene)
+        assert (system.tail is not None) == has_tail
+        assert ("the switch begins where molecules" in " ".join(system.left_out)) != has_tail
+    forces |= {"switch_start_A": 2.5, "tail_correction": True}
+    with pytest.raises(SceneError, match="tail_correction needs a switch that begins near"):
+        build(small_scene({"argon": 100}, 18.0, forces=forces))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.plausibility import shortest_contact
+from rigidmd.assemble.plausibility import shortest_contact, switches_cores
 from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.toml import Json
 from rigidmd.forces.neighbors.space import Triclinic, longest_gaps
@@ -182,6 +182,8 @@ def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
         return "the scene has no periodic box"
     if (forces.cutoff_A or CUTOFF) < shortest_contact(composition.species):
         return "molecules touch beyond the cutoff"
+    if switches_cores(forces, shortest_contact(composition.species)):
+        return "the switch begins where molecules overlap"
     if not is_homogeneous(composition):
         return "the molecules do not fill the box evenly"
     return ""

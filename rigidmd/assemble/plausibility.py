@@ -4,7 +4,7 @@ Two tables have limits of quantities with the likely causes of numbers outside t
 numbers that are warned of, `REFUSED` of numbers that no scene can mean.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import degrees, inf, pi
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,13 +16,17 @@ if TYPE_CHECKING:
     from rigidmd.forces import inputs
     from rigidmd.forces.neighbors.space import Space
     from rigidmd.scene import BodyScene, MolecularScene
+    from rigidmd.scene.forces import Forces
     from rigidmd.scene.models import Molecule
 
 #: Distance of the minimum of a Lennard-Jones energy, over sigma.
 MINIMUM = 2 ** (1 / 6)
-#: A cutoff below this fraction of the minimum of every molecule is an error: nothing but overlaps
-#: is within it.
-SHORTEST_CUTOFF = 0.5
+#: A length of [forces] below this fraction of the minimum of every molecule is an error: nothing
+#: but overlaps is within it.
+SHORTEST = 0.5
+#: The same of a switch with a tail correction: what it removes between there and the contact is
+#: below a percent of the correction.
+SHORTEST_SWITCH = 0.8
 #: Mass of a site over that of its element, and the mass of up to four hydrogens (u) that a united
 #: atom has too. Isotopes are within these limits.
 LIGHTEST, HEAVIEST, HYDROGENS = 0.85, 1.1, 4.1
@@ -100,24 +104,59 @@ def scene_errors(
     limits = {name: limit for name, limit in REFUSED.items() if heaviest <= limit.heaviest_site}
     refusals = (limit.outside(*values[name]) for name, limit in limits.items())
     faults = [*filter(None, refusals)]
-    contact = shortest_contact(species)
-    cutoff = scene.forces.cutoff_A
-    if (
-        cutoff is not None
-        and scene.forces.lennard_jones
-        and cutoff < SHORTEST_CUTOFF * contact < inf
-    ):
-        unit = "is it in nm? " if 10 * cutoff > contact else ""
-        faults.append(
-            f"forces.cutoff_A is {cutoff:g} Å, and the sites of two molecules touch at"
-            f" {contact:.3g} Å: {unit}within it there are overlaps only"
-        )
-    elif cutoff is not None and scene.forces.tail_correction and cutoff < contact < inf:
+    contact = shortest_contact(species) if scene.forces.lennard_jones else inf
+    if contact == inf:
+        return faults
+    faults += too_short(_lengths(scene.forces), contact, "the sites of two molecules")
+    if not scene.forces.tail_correction:
+        return faults
+    cutoff, start = scene.forces.cutoff_A, scene.forces.switch_start_A
+    if SHORTEST * contact <= (cutoff or inf) < contact:
         faults.append(
             "forces.tail_correction needs a cutoff beyond the contact of two molecules,"
             f" {contact:.3g} Å. cutoff_A is {cutoff:g}"
         )
+    elif switches_cores(scene.forces, contact) and start >= SHORTEST * contact:
+        faults.append(
+            f"forces.tail_correction needs a switch that begins near the contact of two molecules,"
+            f" {contact:.3g} Å, or beyond: it would count their overlaps. switch_start_A is"
+            f" {start:g}"
+        )
     return faults
+
+
+def switches_cores(forces: "Forces", contact: float) -> bool:
+    """Whether a switch changes the energy where sites that touch at a contact (Å) overlap."""
+    start = forces.switch_start_A
+    return start is not None and start < SHORTEST_SWITCH * contact < inf
+
+
+def _lengths(forces: "Forces") -> dict[str, float | None]:
+    """The cutoffs and the starts of switches of [forces], by their keys."""
+    tables = {"forces": forces, **forces.added}
+    names = ("cutoff_A", "switch_start_A", "ewald_cutoff_A")
+    lengths = {
+        f"{where}.{name}": getattr(table, name, None)
+        for where, table in tables.items()
+        for name in names
+    }
+    for k, entry in enumerate(forces.bodies):
+        radius = entry.options.get("reaction_field_A")
+        lengths[f"forces.bodies.{k}.options.reaction_field_A"] = radius
+    return lengths
+
+
+def too_short(lengths: Mapping[str, float | None], contact: float, touching: str) -> list[str]:
+    """Messages on lengths (Å) of forces, by their keys, within which there are overlaps only.
+
+    contact : at which the `touching` begin to repel, Å
+    """
+    return [
+        f"{key} is {length:g} Å, and {touching} touch at {contact:.3g} Å:"
+        f" {'is it in nm? ' if 10 * length > contact else ''}within it there are overlaps only"
+        for key, length in lengths.items()
+        if length is not None and length < SHORTEST * contact
+    ]
 
 
 def shortest_contact(species: "Sequence[inputs.Molecule]") -> float:

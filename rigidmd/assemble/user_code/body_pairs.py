@@ -2,13 +2,20 @@
 are cut off."""
 
 from collections.abc import Callable, Mapping
+from itertools import combinations_with_replacement
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from rigidmd.assemble.user_code.cutoffs import PairPotentialError, check_cutoff, energy_scale
+from rigidmd.assemble.user_code.cutoffs import (
+    PairPotentialError,
+    check_cutoff,
+    check_lengths,
+    contact_of,
+    energy_scale,
+)
 from rigidmd.assemble.user_code.force import BoundTerm
 from rigidmd.core.plain_text import did_you_mean
 from rigidmd.engines.body_pairs import reference_of
@@ -192,7 +199,7 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         With all errors.
     """
     # for such scenes only
-    from rigidmd.assemble.user_code.pose_checks import unresisted_torques
+    from rigidmd.assemble.user_code.pose_checks import lowest_energy, unresisted_torques
     from rigidmd.forces.poses.pairs import BodyPairs
     from rigidmd.forces.poses.table import BodyTable
 
@@ -214,6 +221,12 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
     if not start <= cutoff:
         raise PairPotentialError(f"switch_start_A = {start:g} is beyond the cutoff of {cutoff:g} Å")
     formula, rows = _rows(potential, kinds)
+    if not isinstance(potential.function, BodyTable):
+        contact = min(
+            contact_of(lowest_energy(formula, rows[i, j]), cutoff, system)
+            for i, j in combinations_with_replacement(range(len(kinds)), 2)
+        )
+        check_lengths(contact, "its bodies", cutoff, potential.switch_start_A)
     models = {m.name: m for m in system.species}
     acting = [models[name] for name in kinds]
     if faults := [*unresisted_torques(potential, formula, rows, acting, system)]:

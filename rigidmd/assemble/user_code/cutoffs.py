@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.plausibility import too_short
 from rigidmd.engines.system import System
 from rigidmd.forces.potentials.formulas import FormulaError
 from rigidmd.forces.potentials.truncation import MINIMUM_TOLERANCE, TruncationName
@@ -14,6 +15,10 @@ from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 #: Largest energy at the cutoff without a warning, in kT, see `ValuesAtCutoff.lost`. Lennard-Jones
 #: forces with usual cutoffs have 0.02 to 0.05.
 LARGEST_AT_CUTOFF = 0.2
+#: Sites and bodies touch where their energy is above this multiple of kT, and falls as a power of
+#: the distance that is above STEEP. Without a cutoff, contacts are searched around
+#: LONGEST_CONTACT, Å.
+HIGH, STEEP, LONGEST_CONTACT = 10.0, 6.0, 10.0
 #: A minimum is searched up to this multiple of the cutoff.
 REACH = 20.0
 
@@ -96,6 +101,28 @@ def minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | N
     if any(attracts(cutoff * x) for x in np.linspace(0.5, 1 - MINIMUM_TOLERANCE, 32)):
         return None
     return next((cutoff * x for x in np.geomspace(1, REACH, 400)[1:] if attracts(cutoff * x)), None)
+
+
+def contact_of(energy: Callable[[np.ndarray], np.ndarray], cutoff: float, system: System) -> float:
+    """The distance (Å) up to which an energy keeps two sites or bodies apart, 0 without one: it is
+    high and steep there.
+
+    energy : u Å²/ps² at distances (k,) Å; NaN where it has none
+    """
+    thermal, _ = energy_scale(system)
+    r = np.geomspace(0.01, 10, 300) * (LONGEST_CONTACT if cutoff == inf else cutoff)
+    with np.errstate(all="ignore"):
+        values = energy(r)
+        steepness = -np.gradient(np.log(values), np.log(r))
+        keeps_apart = (values > HIGH * thermal) & (steepness > STEEP)
+    return float(r.max(where=keeps_apart, initial=0.0))
+
+
+def check_lengths(contact: float, touching: str, cutoff: float, switch_start: float | None) -> None:
+    """Raise PairPotentialError for lengths (Å) of a potential that are far within a contact."""
+    lengths = {"cutoff_A": cutoff, "switch_start_A": switch_start}
+    if errors := too_short(lengths, contact, touching):
+        raise PairPotentialError(*errors)
 
 
 def check_cutoff(cutoff: float, system: System) -> None:

@@ -2,8 +2,8 @@
 and where it is cut off."""
 
 import re
-from collections.abc import Iterator
-from math import inf, sqrt
+from collections.abc import Callable, Iterator
+from math import inf, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +13,8 @@ from rigidmd.assemble.user_code.cutoffs import (
     PairPotentialError,
     ValuesAtCutoff,
     check_cutoff,
+    check_lengths,
+    contact_of,
     energy_scale,
     minimum_beyond,
 )
@@ -136,6 +138,10 @@ def bind_pair_potential(potential: PairPotential, system: System) -> BoundTerm:
     ]
     kind = gather_per_molecule(kinds, index)
     pairs = _bound_pairs(types, formula, scheme, system, (kinds, offsets))
+    contacts = [
+        contact_of(_energies(pair.radial), scheme.distance, system) for pair in pairs.values()
+    ]
+    check_lengths(min(contacts), "its sites", scheme.distance, potential.switch_start_A)
     term = pair_forces(
         _compiled_potential(pairs, formula, scheme, kind, len(types.all)),
         sites,
@@ -180,6 +186,18 @@ def _bound_pairs(
     if not pairs:
         raise PairPotentialError("no pair of sites of the scene has parameters")
     return pairs
+
+
+def _energies(radial: Radial) -> Callable[[np.ndarray], np.ndarray]:
+    """The energy as a function of distances; NaN where it has none."""
+
+    def energy(r: float) -> float:
+        try:
+            return radial(r)[0]
+        except (FormulaError, ArithmeticError, ValueError):
+            return nan
+
+    return lambda distances: np.array([energy(r) for r in distances.tolist()])
 
 
 def _compiled_potential(

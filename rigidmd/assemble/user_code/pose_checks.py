@@ -1,6 +1,7 @@
-"""Checks of potentials of two bodies at random poses: torques that nothing resists."""
+"""Checks of potentials of two bodies at random poses: torques that nothing resists, and the
+distance at which bodies touch."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from math import inf
 
 import numpy as np
@@ -13,7 +14,7 @@ from rigidmd.forces.poses.potential import BodyPairPotential
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.scene.models import OFF_AXIS, Molecule
 
-POSES = 4096
+POSES, ORIENTATIONS = 4096, 64
 #: Nearest distance of the random poses as a fraction of the cutoff, and their farthest one without
 #: a cutoff, Å.
 NEAREST, FARTHEST = 0.2, 20.0
@@ -52,6 +53,20 @@ def unresisted_torques(
             if _is_unresisted(m, arm, r, b if i > j else a, values):
                 yield _message(potential, m, arm)
                 break
+
+
+def lowest_energy(formula: PoseFormula, row: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """The lowest energy of two bodies in random orientations as a function of distances (k,), u
+    Å²/ps²."""
+    r, a, b = (x[:ORIENTATIONS] for x in random_poses(1.0, 1.0))
+
+    def energy(distance: np.ndarray) -> np.ndarray:
+        count = len(distance)
+        vectors = (distance[:, None, None] * r).reshape(-1, 3)
+        poses = (np.tile(x, (count, 1, 1)) for x in (a, b))
+        return formula.values(row, vectors, *poses).energy.reshape(count, -1).min(axis=1)
+
+    return energy
 
 
 def random_poses(nearest: float, farthest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
