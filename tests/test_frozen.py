@@ -196,10 +196,10 @@ def test_a_run_among_frozen_molecules_keeps_its_energy(tmp_path):
 
 
 def test_a_scene_in_which_nothing_would_move_is_refused():
-    with pytest.raises(SceneError, match="all are frozen"):
-        Simulation(
-            small_scene({}, 20.0, molecules=[{"model": "argon", "count": 3, "frozen": True}])
-        )
+    frozen = small_scene({}, 20.0, molecules=[{"model": "argon", "count": 3, "frozen": True}])
+    for function in (Simulation, describe):  # a run, and `check`
+        with pytest.raises(SceneError, match="all are frozen"):
+            function(frozen)
     with pytest.raises(SceneError, match="omit it with frozen molecules"):
         small_scene(
             {},

@@ -10,7 +10,7 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
-from rigidmd.assemble.start import output_errors
+from rigidmd.assemble.start import output_errors, rest_errors
 from rigidmd.assemble.time_step import MIXED_ERROR, describe_step
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
@@ -51,9 +51,10 @@ def describe(scene: MolecularScene | BodyScene, user_code: bool = True) -> str:
 
 
 def describe_system(system: System | BodySystem) -> str:
-    """How the scene of a system would run. Raises SceneError if its output cannot be written."""
+    """How the scene of a system would run. Raises SceneError if nothing would move, or if its
+    output cannot be written."""
     if isinstance(system, System):
-        if faults := output_errors(system):
+        if faults := [*rest_errors(system), *output_errors(system)]:
             raise SceneError(system.scene.source, faults)
         return _describe_molecules(system)
     text = _describe_body(system)

@@ -132,6 +132,14 @@ def _about_framework(
     return with_reduced_cell(configuration, "its", may_rotate=True)
 
 
+def rest_errors(system: System) -> list[str]:
+    """A message if no molecule can move."""
+    if not len(system.model.species) or mobile(system.model).any():
+        return []
+    why = "molecules: all are frozen. Nothing would move. Insertion needs no run:"
+    return [f"{why} `rigidmd analyse {system.scene.source} insertion model=NAME`"]
+
+
 def output_errors(system: System) -> list[str]:
     """Messages on files of a run that cannot hold the positions at its start."""
     output = system.scene.output

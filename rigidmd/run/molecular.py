@@ -11,6 +11,7 @@ from pydantic import PositiveFloat
 
 from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.assemble.harmonic import stable_angle
+from rigidmd.assemble.start import rest_errors
 from rigidmd.assemble.time_step import accuracy_warnings
 from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.assemble.user_code.compiled import check_compiled_code
@@ -18,7 +19,7 @@ from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, REMOVED, State, state_of
 from rigidmd.core.toml import Json
-from rigidmd.dynamics.model import mobile, remove_momentum
+from rigidmd.dynamics.model import remove_momentum
 from rigidmd.dynamics.observables import largest_values
 from rigidmd.engines.observables import Observation, describe_quantities, observe
 from rigidmd.engines.protocol import Engine
@@ -96,10 +97,8 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
             forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
         )
         self._start = build(scene.with_user_code(() if forces is None else user_forces, thermostat))
-        if len(self._start.model.species) and not mobile(self._start.model).any():
-            why = "molecules: all are frozen. Nothing would move. Insertion needs no run:"
-            how = f"`rigidmd analyse {scene.source} insertion model=NAME`"
-            raise SceneError(scene.source, [f"{why} {how}"])
+        if faults := rest_errors(self._start):
+            raise SceneError(scene.source, faults)
         self.reset()
 
     @property
