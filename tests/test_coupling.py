@@ -79,6 +79,39 @@ def test_both_ends_are_the_plain_scene_and_the_one_without_the_molecules(name):
     assert changes[1] == pytest.approx(energy - expected.potential, rel=1e-9)
 
 
+@pytest.mark.parametrize("value", [0.3, 0.8])
+def test_the_tail_of_soft_cores_is_that_of_all_pairs(value):
+    """Of two unlike kinds in different numbers, by quadrature beyond the cutoff."""
+    forces = {"cutoff_A": 7.0, "tail_correction": True, "truncation": "plain"}
+    coupling = {"species": "guest", "lambda": value}
+    species = [ARGON, {"model": "krypton", "name": "guest", "count": 3}]
+    system = build(
+        small_scene({}, 1.0, molecules=species, box=SLANTED, forces=forces, coupling=coupling)
+    )
+    models, counts = [load_model("argon"), load_model("krypton")], (60, 3)
+    energy = pressure = 0.0
+    for i, j in np.ndindex(2, 2):
+        sigma = (models[i].sigma[0] + models[j].sigma[0]) / 2
+        depth = 4 * np.sqrt(models[i].epsilon[0] * models[j].epsilon[0])
+        of_pair = 1.0 if i == j == 0 else value
+
+        def s(r, sigma=sigma, of_pair=of_pair):
+            return (r / sigma) ** 6 + (1 - of_pair) / 2
+
+        def by_energy(r, s=s, depth=of_pair * depth):
+            return r**2 * depth * (1 / s(r) ** 2 - 1 / s(r))
+
+        def by_slope(r, s=s, depth=of_pair * depth, sigma=sigma):
+            slope = 6 * r**5 / sigma**6 * (1 / s(r) ** 2 - 2 / s(r) ** 3)
+            return -(r**3) * depth * slope / 3
+
+        energy += 2 * np.pi * counts[i] * counts[j] * quad(by_energy, 7, np.inf)[0]
+        pressure += 2 * np.pi * counts[i] * counts[j] * quad(by_slope, 7, np.inf)[0]
+    volume = system.space.volume
+    assert system.tail.energy(volume) == pytest.approx(energy / volume, rel=1e-7)
+    assert system.tail.pressure(volume) == pytest.approx(pressure / volume**2, rel=1e-7)
+
+
 def test_charges_follow_lennard_jones():
     """Charges of the coupled species scale the self energies and the pairs inside it too."""
     for value, factor in ((0.3, 0.0), (0.5, 0.0), (0.75, 0.5), (1.0, 1.0)):
