@@ -446,7 +446,7 @@ class CalculatorForce(Force):
                 )
                 calculator.calculate(self.atoms, wanted, changes)
             found = calculator.results
-            energy = (found["free_energy"] if "free_energy" in found else found["energy"]) * unit
+            energy = found["free_energy"] if "free_energy" in found else found["energy"]
             forces = found["forces"]
             stress = found["stress"] if self._has_virial else None
         except Exception as error:  # calculators raise anything
@@ -454,6 +454,7 @@ class CalculatorForce(Force):
             raise UserForceError(
                 f"the calculator {self.name} raised {describe_error(error)} {where}"
             ) from error
+        energy = unit * self._checked("energy", energy, (), (1,)).item()
         on_sites = np.zeros(position.shape)
         on_sites[atom] = unit * self._checked("forces", forces, (len(self.atoms), 3))
         if stress is None:

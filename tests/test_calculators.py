@@ -261,6 +261,22 @@ class Misshapen(Springs):
             self.results["forces"] = self.change(self.results["forces"])
 
 
+class WrongEnergy(Misshapen):
+    """Energies of another kind."""
+
+    def calculate(self, atoms=None, properties=("energy",), system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        self.results["energy"] = self.results["free_energy"] = self.energy
+
+
+@pytest.mark.parametrize("energy", ["5", 5 + 1e-3j, np.array([1.0, 2.0]), None])
+def test_energies_that_are_not_a_real_number_are_refused(energy):
+    calculator = WrongEnergy(lambda forces: forces)
+    calculator.energy = energy
+    with pytest.raises(SceneError, match=r"returned .* as energy|energy of the shape \(2,\)"):
+        Simulation(springs(), forces=[CalculatorForce(calculator)]).step()
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -272,6 +288,7 @@ class Misshapen(Springs):
         (lambda forces: np.ma.masked_less(forces, 0.0), "masked or complex values as forces"),
         (lambda forces: forces * np.nan, "which are not finite numbers"),
         (lambda forces: [["a"] * 3] * 12, "not real numbers"),
+        (lambda forces: forces.astype(str), "not real numbers"),
     ],
 )
 def test_forces_of_another_shape_or_kind_are_refused_at_any_step(change, words):

@@ -796,6 +796,14 @@ class Faulty(rigidmd.Force):
             return energy, force[0]
         if self.way == "energy":
             return "much", force
+        if self.way == "text":
+            return "5", force
+        if self.way == "complex":
+            return energy + 1e-3j, force
+        if self.way == "text of forces":
+            return energy, force.astype(str)
+        if self.way == "objects":
+            return energy, force.astype(object).astype(str).astype(object)
         if self.way == "virial":
             return energy, force, None, [1.0, 2.0]
         if self.way == "tuple":
@@ -814,6 +822,10 @@ class Faulty(rigidmd.Force):
         ),
         ("shape", r"the force faulty returned forces of the shape \(3,\), not \(100, 3\)"),
         ("energy", "returned 'much' as its energy"),
+        ("text", "returned '5' as its energy, not a real number"),
+        ("complex", r"returned .*0\.001j\) as its energy, not a real number"),
+        ("text of forces", "as forces, not real numbers"),
+        ("objects", "as forces, not real numbers"),
         ("tuple", "returned ndarray. It must return a tuple"),
         ("virial", r"returned \[1.0, 2.0\] as its virial"),
         (

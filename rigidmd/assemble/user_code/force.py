@@ -2,7 +2,7 @@
 
 import time as clock
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -46,6 +46,8 @@ class BoundTerm(NamedTuple):
     notes: Sequence[str] = ()
     warnings: Sequence[str] = ()
     body_pairs: BodyPairPotential | None = None  # of which the term was made
+    #: Messages on pairs for which it has no finite energy and force, of a system at its start.
+    errors_at: Callable[[System], list[str]] = lambda system: []
 
 
 class UserForceError(SimulationError):
@@ -200,11 +202,10 @@ class BoundForce:
                 " and perhaps torques and a virial" if largest == 4 else " and perhaps a virial"
             )
             raise self._error(f"{kind}. It must return a tuple of an energy, forces{optional}")
-        try:
-            energy = float(returned[0])
-        except (TypeError, ValueError):
-            raise self._error(f"{returned[0]!r:.60} as its energy, not a number") from None
-        return [energy, *returned[1:], *[None] * (4 - len(returned))]
+        energy = real_numbers(returned[0])
+        if energy is None or energy.size != 1:
+            raise self._error(f"{returned[0]!r:.60} as its energy, not a real number")
+        return [energy.item(), *returned[1:], *[None] * (4 - len(returned))]
 
     def _fill(
         self,
@@ -249,12 +250,14 @@ class BoundForce:
 
 
 def real_numbers(values: object) -> np.ndarray | None:
-    """An array of real numbers. None for anything else, such as complex numbers and masked
+    """An array of real numbers. None for anything else, such as complex numbers, text and masked
     values."""
     try:
-        if np.iscomplexobj(cast(ArrayLike, values)) or np.ma.is_masked(values):
+        array = np.asarray(values)
+        is_text = array.dtype.kind == "O" and any(isinstance(x, str | bytes) for x in array.flat)
+        if is_text or array.dtype.kind not in "biufO" or np.ma.is_masked(cast(ArrayLike, values)):
             return None
-        return np.asarray(values, float)
+        return array.astype(float)
     except (TypeError, ValueError):
         return None
 
