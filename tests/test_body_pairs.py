@@ -26,6 +26,7 @@ from rigidmd.figures.style import new_figure
 from rigidmd.forces.poses.formulas import formula_of_poses
 from rigidmd.forces.poses.gay_berne import PARAMETERS, GayBerne
 from rigidmd.forces.poses.multipoles import dipole, quadrupole
+from rigidmd.forces.poses.pair_list import BUILDS
 from rigidmd.forces.poses.pairs import pair_slopes
 from rigidmd.forces.poses.patch import PARAMETERS as PATCH
 from rigidmd.forces.poses.patch import Patch
@@ -390,16 +391,19 @@ def simulation(tables: dict, counts=None, **more) -> Simulation:
     return Simulation(scene(tables, counts, **more), warn=str)
 
 
-def brute_force(system, state, forces: dict) -> float:
-    """The Gay-Berne energy (kJ/mol) by a loop over all pairs and their nearest images."""
-    cutoff, cell, energy = forces["cutoff_A"], state.cell, GayBerne()
+ENERGY = GayBerne()
+
+
+def brute_force(system, state, forces: dict, energy=ENERGY) -> float:
+    """The energy (kJ/mol) by a loop over all pairs and their nearest images."""
+    cutoff, cell, axis = forces["cutoff_A"], state.cell, "xyz".index(forces.get("axis", "z"))
     shifts = np.array(list(product((-1, 0, 1), repeat=3))) @ cell
     models, names = system.species, [m.name for m in system.species]
     frames = [state.rotation[k] @ models[s].axes.T for k, s in enumerate(system.model.species)]
     points = []
     for k, s in enumerate(system.model.species):
         m = models[s]
-        reference = np.array(forces["references"].get(m.name, m.centre)) - m.centre
+        reference = np.array(forces.get("references", {}).get(m.name, m.centre)) - m.centre
         points.append(state.position[k] + frames[k] @ reference)
     total = 0.0
     for i in range(len(points)):
@@ -412,8 +416,11 @@ def brute_force(system, state, forces: dict) -> float:
                 continue
             x = max(0.0, (distance / cutoff - 0.9) / 0.1)
             kinds = [names[system.model.species[k]] for k in (i, j)]
-            parameters = [named(forces["parameters"][name]) for name in kinds]
-            axes = frames[i][:, 2], frames[j][:, 2]
+            of_pair = {}
+            for pair in forces.get("pairs", ()):
+                of_pair |= pair["parameters"] if sorted(kinds) == sorted(pair["species"]) else {}
+            parameters = [named(forces["parameters"][name] | of_pair) for name in kinds]
+            axes = frames[i][:, axis], frames[j][:, axis]
             total += (1 - x**3 * (10 - 15 * x + 6 * x * x)) * energy(r, *axes, *parameters)
     return total
 
@@ -528,6 +535,31 @@ def test_the_list_finds_every_pair_while_bodies_move_and_the_box_changes():
     assert results["volume"][-1] != results["volume"][0]
 
 
+def test_the_list_is_built_anew_where_a_strain_of_a_slanted_cell_exceeds_its_skin():
+    """The strain is a matrix S with cell = built S, whose norm e may be up to skin/(cutoff + skin):
+    then (1 - e)(cutoff + skin) is the cutoff."""
+    tables = GAY_BERNE | {"parameters": {"rod": ROD}, "references": {}}
+    box = {"lengths_A": 44.0, "angles_deg": [66.0, 75.0, 70.0]}
+    system = build(scene(tables, {"rod": 24}, box=box))
+    engine, cutoff = system.engine(), tables["cutoff_A"]
+    engine.evaluate(system.state)
+    pairs = engine.workspaces["gay_berne"].pairs
+    limit = pairs.skin / (cutoff + pairs.skin)
+    rng = np.random.default_rng(3)
+    strains = [np.tril(rng.standard_normal((3, 3))) for _ in range(8)]
+    strains += [np.outer(row, [1.0, 0.0, 0.0]) for row in np.eye(3)]  # xx, xy, xz alone
+    for strain in strains:
+        for fraction, builds in ((0.99, 0), (1.01, 1)):
+            engine.evaluate(system.state)
+            before = int(pairs.counters[BUILDS])
+            moved = system.state.copy()
+            matrix = np.eye(3) + fraction * limit * strain / np.linalg.norm(strain)
+            moved.cell[:] = moved.cell @ matrix
+            moved.position[:] = moved.position @ matrix
+            engine.evaluate(moved)
+            assert pairs.counters[BUILDS] - before == builds, strain
+
+
 def test_energy_is_conserved_with_the_order_of_the_integrator():
     stage = {"duration_ps": 1.0, "timestep_fs": 8.0, "ensemble": "nve"}
     noise = []
@@ -576,26 +608,44 @@ def test_energy_does_not_drift():
     assert abs(line.value) < allowed and line.error < 1e-4 * thermal
 
 
-def test_a_text_has_the_same_energy_as_its_function():
-    text = "4*eps*((sig/r)**12 - (sig/r)**6)*(1 + k*a_r*b_r + exp(-a_b**2))"
-    parameters = {
-        "rod": {"eps": 1.0, "sig": 5.0, "k": 0.3},
-        "disc": {"eps": 0.5, "sig": 6.0, "k": 0.7},
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_text_has_the_energy_of_all_its_pairs(axis):
+    """With each mean of unlike parameters, and one that is given for the pair."""
+    forces = {
+        "name": "text",
+        "energy": "4*eps*((sig/r)**12 - (sig/r)**6)*(1 + k*a_r*b_r + q*exp(-a_b**2))",
+        "parameters": {
+            "disc": {"eps": 1.0, "sig": 5.0, "k": 2.0, "q": 1.0},
+            "plate": {"eps": 0.5, "sig": 6.0, "k": 6.0, "q": 0.5},
+        },
+        "mixing": {"k": "harmonic"},
+        "pairs": [{"species": ["plate", "disc"], "parameters": {"q": 0.2}}],
+        "axis": axis,
+        "cutoff_A": 14.0,
     }
-    of_text = simulation({"energy": text, "name": "text", "parameters": parameters})
 
-    def function(r, u, v, p, q):
+    def energy(r, u, v, p, q):
         s = np.sqrt(r @ r)
         six = ((p.sig + q.sig) / 2 / s) ** 6
-        angles = np.sqrt(p.k * q.k) * (u @ r) * (v @ r) / s**2 + np.exp(-((u @ v) ** 2))
+        angles = 2 / (1 / p.k + 1 / q.k) * (u @ r) * (v @ r) / s**2
+        angles = angles + np.sqrt(p.q * q.q) * np.exp(-((u @ v) ** 2))
         return 4 * np.sqrt(p.eps * q.eps) * (six**2 - six) * (1 + angles)
 
-    potential = rigidmd.body_pair_potential(function, parameters, axis="z")
-    state = shuffled(of_text, 9)
-    other = build(scene(None).with_user_code([potential]))
-    (one,) = of_text.system.engine().evaluate(state)[1].values()
-    (two,) = other.engine().evaluate(state)[1].values()
-    assert one.energy == pytest.approx(two.energy, rel=1e-12)
+    molecules = [body("disc", 24), body("disc", 8) | {"name": "plate"}]
+    function = rigidmd.body_pair_potential(
+        energy,
+        forces["parameters"],
+        pairs={("plate", "disc"): {"q": 0.2}},
+        axis=axis,
+        cutoff_A=forces["cutoff_A"],
+    )
+    run = simulation(forces, molecules=molecules)
+    state = shuffled(run, 9)
+    expected = brute_force(run.system, state, forces, energy)
+    of_python = build(scene(None, molecules=molecules).with_user_code([function]))
+    for system in (run.system, of_python):
+        (found,) = system.engine().evaluate(state)[1].values()
+        assert found.energy / KJ_PER_MOL == pytest.approx(expected, rel=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -684,7 +734,7 @@ SHIPPED = {
 
 
 def errors_of(molecules, tables=None, forces=(), folder=".") -> str:
-    """What building a scene of molecules says."""
+    """The errors of a scene of molecules, empty without one."""
     data = {
         "box": {"lengths_A": 40.0},
         "molecules": molecules,
@@ -754,6 +804,44 @@ def test_torques_of_functions_texts_and_tables_that_nothing_resists_are_refused(
         found = errors_of([molecule, DISK], forces=[potential])
         assert message in found if message else not found
         assert not errors_of([molecule | {"frozen": True}, DISK], forces=[potential])
+
+
+@pytest.mark.parametrize(
+    ("energy", "is_finite"),
+    [
+        ("log(-r)", False),
+        ("(5/r)**12*sqrt(7-r)", False),
+        ("(r-10)**0.5", False),  # the distance in the lattice: an infinite force
+        ("sqrt(a_r)/r**6", False),
+        ("exp(900-r)", False),
+        ("sqrt(1+a_r)/r**6", True),
+        ("(5/r)**12", True),
+        ("sqrt(r-9)/r**6", True),
+    ],
+)
+def test_energies_that_are_not_real_where_bodies_start_are_refused(energy, is_finite):
+    """60 rods in a lattice of 10 Å."""
+    found = errors_of([body("rod", 60)], {"name": "x", "energy": energy})
+    message = "x: its energy or force is not a finite number between rod and rod"
+    assert message in found if not is_finite else not found
+    assert not errors_of([body("rod", 2)], {"name": "x", "energy": "(r-10)**0.5"})
+
+
+def test_energies_of_sites_that_are_not_real_where_they_start_are_refused():
+    for energy, is_finite in (("(r-3)**0.5", True), ("(r-8.05)**0.5", False), ("log(r-6)", False)):
+        tables = {
+            "box": {"lengths_A": 24.0},
+            "molecules": [DOT | {"count": 300}],
+            "forces": {"cutoff_A": 9.0, "custom": [{"name": "x", "energy": energy}]},
+            "start": {"temperature_K": 200.0},
+            "stages": [{"duration_ps": 0.05, "timestep_fs": 5.0}],
+        }
+        dots = Scene.from_dict(tables)
+        if is_finite:
+            build(dots)
+            continue
+        with pytest.raises(SceneError, match=r"not a finite number between dot\.A and dot\.A"):
+            build(dots)
 
 
 def test_trial_molecules_without_inertia_are_refused_too(tmp_path):

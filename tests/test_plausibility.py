@@ -215,7 +215,7 @@ def test_lengths_of_forces_within_the_molecules_are_refused(forces, key, length)
 @pytest.mark.parametrize("key", ["cutoff_A", "switch_start_A"])
 @pytest.mark.parametrize("kind", ["custom", "bodies"])
 def test_lengths_within_the_cores_of_a_users_potential_are_refused(kind, key):
-    """Without Lennard-Jones sites: the contact is that of the potential."""
+    """Without Lennard-Jones sites: bodies touch where the potential rises."""
     entry = SPHERES if kind == "bodies" else PAIRS | {"truncation": "switch"}
     for length, contact in ((0.9, "touch at "), (6.0, "")):
         forces = {"cutoff_A": 9.0, "lennard_jones": False, kind: [entry | {key: length}]}

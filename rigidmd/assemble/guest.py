@@ -237,7 +237,9 @@ def _reassembled(system: System, host: np.ndarray, added: list[Molecule]) -> Sys
         user_terms={},
         body_pairs={},
     )
-    return with_user_code(made) if scene.forces.added or scene.from_python else made
+    if scene.forces.added or scene.from_python:
+        return with_user_code(made, is_start=False)
+    return made
 
 
 def _grid_of(system: System) -> Grid | None:

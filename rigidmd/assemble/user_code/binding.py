@@ -121,9 +121,12 @@ def user_errors_explained(system: System) -> Iterator[None]:
         ) from None
 
 
-def with_user_code(system: System) -> System:
+def with_user_code(system: System, *, is_start: bool = True) -> System:
     """The system with [[forces.custom]] and terms and thermostat from Python. Raises SceneError
-    with all errors."""
+    with all errors.
+
+    is_start : whether it starts in its state, in which energies must be finite
+    """
     scene, (added, thermostat) = system.scene, system.scene.user_code
     forces = [*custom_forces(scene), *added]
     force_names = [*(entry.label for entry in scene.forces.added.values()), *map(name_of, added)]
@@ -142,6 +145,8 @@ def with_user_code(system: System) -> System:
     for name, force in zip(names, forces, strict=True):
         try:
             bound[name] = bind(force, target, name)
+            if is_start:
+                errors += [f"{name}: {message}" for message in bound[name].errors_at(target)]
             if not isinstance(bound[name].term, PairForces):
                 changed |= changes_momentum(bound[name].term)
         except (SceneError, UserForceError, ValueError) as error:

@@ -2,6 +2,7 @@
 are cut off."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import combinations_with_replacement
 from math import inf
 from pathlib import Path
@@ -15,6 +16,8 @@ from rigidmd.assemble.user_code.cutoffs import (
     check_lengths,
     contact_of,
     energy_scale,
+    not_finite,
+    start_distances,
 )
 from rigidmd.assemble.user_code.force import BoundTerm
 from rigidmd.core.plain_text import did_you_mean
@@ -31,6 +34,7 @@ from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
     from rigidmd.forces.poses.formulas import PoseFormula
+    from rigidmd.forces.poses.pairs import BodyPairs
 
 #: In the log, for a function without a name, or with the name of a column.
 DEFAULT_NAME = "body_pairs"
@@ -253,12 +257,38 @@ def bind_body_pairs(potential: BodyPairPotential, system: System) -> BoundTerm:
         f" {ends}"
     )
     warnings = _low_start(potential.function, acting, system)
-    return BoundTerm(term, text, warnings=warnings, body_pairs=potential)
+    return BoundTerm(
+        term,
+        text,
+        warnings=warnings,
+        body_pairs=potential,
+        errors_at=partial(_errors_at, term, formula, kinds),
+    )
+
+
+def _errors_at(
+    term: "BodyPairs", formula: "PoseFormula", kinds: list[str], system: System
+) -> list[str]:
+    """Messages on kinds of bodies without finite values between the nearest ones and the cutoff."""
+    state = system.state
+    acting = np.flatnonzero(term.kind >= 0)
+    kind = term.kind[acting]
+    point = state.position[acting] + np.einsum(
+        "nij,nj->ni", state.rotation[acting], term.reference[kind]
+    )
+    from rigidmd.assemble.user_code.pose_checks import not_finite_at  # for such scenes only
+
+    errors = []
+    start = start_distances(point, kind, term.group[acting], term.cutoff, system)
+    for (i, j), distances in start.items():
+        r = not_finite_at(formula, term.parameters[i, j], distances)
+        if r is not None:
+            errors.append(not_finite(f"{kinds[i]} and {kinds[j]} in some orientations", r))
+    return errors
 
 
 def _low_start(function: object, kinds: list[Molecule], system: System) -> list[str]:
-    """A warning of a table whose energies at its first distance keep no bodies apart, nor do
-    sites."""
+    """A warning of a table with low energies at its first distance, where no sites repel."""
     from rigidmd.forces.poses.table import BodyTable
 
     if not isinstance(function, BodyTable) or any(m.epsilon.any() for m in kinds):

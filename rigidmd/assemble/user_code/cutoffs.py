@@ -10,6 +10,7 @@ from rigidmd.assemble.plausibility import too_short
 from rigidmd.engines.system import System
 from rigidmd.forces.potentials.formulas import FormulaError
 from rigidmd.forces.potentials.truncation import MINIMUM_TOLERANCE, TruncationName
+from rigidmd.formats.cells import pairs_within
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 #: Largest energy at the cutoff without a warning, in kT, see `ValuesAtCutoff.lost`. Lennard-Jones
@@ -19,6 +20,9 @@ LARGEST_AT_CUTOFF = 0.2
 #: the distance that is above STEEP. Without a cutoff, contacts are searched around
 #: LONGEST_CONTACT, Å.
 HIGH, STEEP, LONGEST_CONTACT = 10.0, 6.0, 10.0
+#: Neighbours at the start are searched within this multiple of their mean distance. Without a
+#: cutoff, energies are tried up to this multiple of that.
+NEIGHBOUR, FAR = 1.2, 10.0
 #: A minimum is searched up to this multiple of the cutoff.
 REACH = 20.0
 
@@ -104,18 +108,48 @@ def minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | N
 
 
 def contact_of(energy: Callable[[np.ndarray], np.ndarray], cutoff: float, system: System) -> float:
-    """The distance (Å) up to which an energy keeps two sites or bodies apart, 0 without one: it is
+    """The distance (Å) up to which two sites or bodies repel strongly, 0 without one: the energy is
     high and steep there.
 
     energy : u Å²/ps² at distances (k,) Å; NaN where it has none
     """
     thermal, _ = energy_scale(system)
-    r = np.geomspace(0.01, 10, 300) * (LONGEST_CONTACT if cutoff == inf else cutoff)
+    r = np.geomspace(0.01, 10, 100) * (LONGEST_CONTACT if cutoff == inf else cutoff)
     with np.errstate(all="ignore"):
         values = energy(r)
         steepness = -np.gradient(np.log(values), np.log(r))
-        keeps_apart = (values > HIGH * thermal) & (steepness > STEEP)
-    return float(r.max(where=keeps_apart, initial=0.0))
+        repels = (values > HIGH * thermal) & (steepness > STEEP)
+    return float(r.max(where=repels, initial=0.0))
+
+
+def start_distances(
+    position: np.ndarray, kind: np.ndarray, group: np.ndarray, cutoff: float, system: System
+) -> dict[tuple[int, int], np.ndarray]:
+    """Distances (Å) from the nearest neighbours at the start to the cutoff, of each pair of kinds
+    that has neighbours there.
+
+    position (n, 3), kind (n,), group (n,) : of sites or bodies; those of one group do not interact
+    """
+    cell = system.state.cell if system.space.volume < inf else None
+    extent = np.ptp(position, axis=0).clip(1.0).prod() if cell is None else system.space.volume
+    reach = min(cutoff, NEIGHBOUR * (extent / len(position)) ** (1 / 3))
+    i, j, step = pairs_within(position, cell, reach)
+    acts = group[i] != group[j]
+    one, other = np.sort([kind[i[acts]], kind[j[acts]]], axis=0)
+    lengths = np.linalg.norm(step[acts], axis=1)
+    nearest: dict[tuple[int, int], float] = {}
+    for k in np.argsort(lengths)[::-1]:
+        nearest[int(one[k]), int(other[k])] = float(lengths[k])
+    last = FAR * reach if cutoff == inf else cutoff * (1 - 1e-9)
+    return {pair: np.geomspace(r, max(r, last), 20) for pair, r in nearest.items() if r > 0}
+
+
+def not_finite(between: str, r: float) -> str:
+    """The message on a distance (Å) of `start_distances` without a finite energy."""
+    return (
+        f"its energy or force is not a finite number between {between} at {r:.4g} Å: that is"
+        " between the nearest ones of the start and the cutoff"
+    )
 
 
 def check_lengths(contact: float, touching: str, cutoff: float, switch_start: float | None) -> None:

@@ -3,8 +3,9 @@ and where it is cut off."""
 
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from math import inf, nan, sqrt
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -17,12 +18,14 @@ from rigidmd.assemble.user_code.cutoffs import (
     contact_of,
     energy_scale,
     minimum_beyond,
+    not_finite,
+    start_distances,
 )
 from rigidmd.assemble.user_code.force import BoundTerm
 from rigidmd.assemble.user_code.pair_potential import PairPotential, Parameters
 from rigidmd.engines.system import System
-from rigidmd.forces.neighbors.pair_loop import pair_forces
-from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
+from rigidmd.forces.neighbors.pair_loop import PairForces, pair_forces
+from rigidmd.forces.neighbors.sites import compute_site_positions, exclusion_groups, sites_of
 from rigidmd.forces.parts import (
     InnerPairs,
     Tail,
@@ -155,7 +158,32 @@ def bind_pair_potential(potential: PairPotential, system: System) -> BoundTerm:
         tail=sum_of_tails(list(_tails(pairs, members))),
         notes=notes,
         warnings=warnings,
+        errors_at=partial(_errors_at, term, pairs, types),
     )
+
+
+def _errors_at(
+    term: PairForces, pairs: dict[tuple[int, int], BoundPair], types: "SiteTypes", system: System
+) -> list[str]:
+    """Messages on types of sites without a finite energy and force between their nearest ones and
+    the cutoff."""
+    potential = cast(CustomPotential, term.potential)
+    position = np.empty((len(potential.kind), 3))
+    compute_site_positions(term.sites, system.state, position)
+    start = start_distances(position, potential.kind, term.group, potential.cutoff, system)
+    errors = []
+    for (i, j), distances in start.items():
+        if (i, j) not in pairs:
+            continue
+        for r in distances.tolist():
+            try:
+                is_finite = np.isfinite(pairs[i, j].radial(r)[:2]).all()
+            except (FormulaError, ArithmeticError, ValueError):
+                is_finite = False
+            if not is_finite:
+                errors.append(not_finite(f"{types.example(i)} and {types.example(j)}", r))
+                break
+    return errors
 
 
 def _bound_pairs(

@@ -58,15 +58,27 @@ def unresisted_torques(
 def lowest_energy(formula: PoseFormula, row: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """The lowest energy of two bodies in random orientations as a function of distances (k,), u
     Å²/ps²."""
-    r, a, b = (x[:ORIENTATIONS] for x in random_poses(1.0, 1.0))
 
-    def energy(distance: np.ndarray) -> np.ndarray:
-        count = len(distance)
-        vectors = (distance[:, None, None] * r).reshape(-1, 3)
-        poses = (np.tile(x, (count, 1, 1)) for x in (a, b))
-        return formula.values(row, vectors, *poses).energy.reshape(count, -1).min(axis=1)
+    def energy(distances: np.ndarray) -> np.ndarray:
+        return _values_at(formula, row, distances).energy.reshape(len(distances), -1).min(axis=1)
 
     return energy
+
+
+def not_finite_at(formula: PoseFormula, row: np.ndarray, distances: np.ndarray) -> float | None:
+    """The first of distances (k,) at which two bodies in random orientations have an energy, a
+    force or a torque that is not finite."""
+    values = np.column_stack(_values_at(formula, row, distances))
+    is_finite = np.isfinite(values).reshape(len(distances), -1).all(axis=1)
+    return None if is_finite.all() else float(distances[is_finite.argmin()])
+
+
+def _values_at(formula: PoseFormula, row: np.ndarray, distances: np.ndarray) -> PairValues:
+    """The values of two bodies in the same random orientations at each of distances (k,)."""
+    r, a, b = (x[:ORIENTATIONS] for x in random_poses(1.0, 1.0))
+    vectors = (distances[:, None, None] * r).reshape(-1, 3)
+    poses = (np.tile(x, (len(distances), 1, 1)) for x in (a, b))
+    return formula.values(row, vectors, *poses)
 
 
 def random_poses(nearest: float, farthest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -78,6 +90,7 @@ def random_poses(nearest: float, farthest: float) -> tuple[np.ndarray, np.ndarra
     return r, from_quaternion(numbers[:, 3:7]), from_quaternion(numbers[:, 7:])
 
 
+@np.errstate(invalid="ignore", over="ignore")
 def _is_unresisted(
     m: Molecule, arm: np.ndarray, r: np.ndarray, pose: np.ndarray, values: PairValues
 ) -> bool:
