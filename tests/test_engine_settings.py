@@ -415,6 +415,17 @@ def test_what_no_table_has_is_refused(name, what, message):
     assert new and all("made_up" in line or "has no translation" in line for line in new), new
 
 
+@pytest.mark.parametrize("name", programs())
+def test_the_soft_core_of_a_coupling_is_refused_by_its_name(name):
+    coupling = {"species": "argon", "lambda": 0.4}
+    system = build(small_scene({"argon": 20}, 20.0, coupling=coupling))
+    program = programs()[name]
+    found = list(program.load(program.translations).refusals(force_field_of(system)))
+    refusal = f"soft core: the soft core of [coupling] has no translation for {program.title}"
+    assert any(refusal in line for line in found), found
+    assert not any("CustomPotential" in line for line in found)
+
+
 # the precision of OpenMM
 
 

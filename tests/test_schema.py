@@ -9,8 +9,10 @@ from jsonschema import Draft202012Validator
 from support import SYSTEMS
 
 from rigidmd.commands.cli import main
-from rigidmd.scene import schema
+from rigidmd.errors import SceneError
+from rigidmd.scene import Scene, schema
 from rigidmd.scene.models import available_models
+from rigidmd.scene.validation import PATTERNS
 
 VALIDATOR = Draft202012Validator(schema())
 WATER = """
@@ -124,3 +126,37 @@ def test_errors_are_told_where_they_are(scene, old, new, path, message):
 
 def test_it_lists_the_models_that_there_are():
     assert schema()["$defs"]["Molecules"]["properties"]["model"]["enum"] == available_models()
+
+
+def patterns_in(schema_part):
+    if isinstance(schema_part, dict):
+        yield from [schema_part["pattern"]] if isinstance(schema_part.get("pattern"), str) else []
+        schema_part = schema_part.values()
+    if not isinstance(schema_part, str | int | float | None):
+        for part in schema_part:
+            yield from patterns_in(part)
+
+
+def test_each_pattern_of_a_text_is_in_words():
+    assert {*patterns_in(schema())} == {*PATTERNS}
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"forces.custom": [{"name": "1a", "energy": "1/r"}]}, "does not begin with a digit"),
+        ({"forces.custom": [{"name": "", "energy": "1/r"}]}, "letters, digits and underscores"),
+        ({"forces.custom": [{"name": "a" * 41, "energy": "1/r"}]}, "not have more than 40 char"),
+        ({"forces.custom": [{"name": "a", "energy": ""}]}, "energy: is '', must not be empty"),
+        ({"forces.bodies": [{"name": "a b", "energy": "1/r"}]}, "is 'a b', must be a name of"),
+        ({"name": "-a"}, "in which points and hyphens may follow"),
+        ({"integrators": [{"name": "ä", "kicks": [1.0], "drifts": [1.0]}]}, "letter from A to Z"),
+        ({"structure.file": "a\nb"}, "must be one line without control characters"),
+        ({"box.angles_deg": [90.0, 90.0, 180.0]}, "must be less than 180"),
+    ],
+)
+def test_texts_and_numbers_are_refused_in_words(keys, message):
+    with pytest.raises(SceneError) as refused:
+        Scene.from_dict(tomllib.loads(WATER), overrides=keys)
+    assert message in str(refused.value)
+    assert "should" not in str(refused.value)

@@ -20,6 +20,7 @@ from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.coulomb import ReactionField
+from rigidmd.forces.potentials.custom import CustomPotential
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import (
@@ -178,7 +179,9 @@ def unknown_terms(
             is_field = trait(term, "changes_momentum") is not None
             what = "a field" if is_field else f"the term {kind.__name__}"
             what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
-            if isinstance(term, SurfaceDipole):
+            if kind is CustomPotential:
+                what = "the soft core of [coupling]"
+            if kind is SurfaceDipole:
                 what = "forces.ewald_slab or ewald_surface_permittivity"
         if name in system.user_terms or kind not in DESCRIBED:
             yield f"{name.replace('_', ' ')}: {what} has no translation for {title}"

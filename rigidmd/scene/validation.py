@@ -226,6 +226,7 @@ SENTENCES = {
     "too_long": "has {actual_length} entries, must not have more than {max_length}",
     "too_short": "has {actual_length} entries, needs at least {min_length}",
     "greater_than": "is {shown}, must be greater than {gt:g}",
+    "less_than": "is {shown}, must be less than {lt:g}",
     "greater_than_equal": "is {shown}, must not be less than {ge:g}",
     "less_than_equal": "is {shown}, must not be more than {le:g}",
     "finite_number": "is {shown}, must be a finite number",
@@ -233,11 +234,23 @@ SENTENCES = {
     **dict.fromkeys(("int_type", "int_from_float"), "is {shown}, must be an integer"),
     "bool_type": "is {shown}, must be true or false",
     "string_type": "is {shown}, must be a text in quotes",
+    "string_too_short": "is {shown}, must not be empty",
+    "string_too_long": "is {shown}, must not have more than {max_length} characters",
     **dict.fromkeys(("tuple_type", "list_type"), "is {shown}, must be a list"),
     **dict.fromkeys(
         ("model_type", "model_attributes_type", "dict_type"), "is {shown}, must be a table"
     ),
     "value_error": "{error}",
+}
+_LETTERS = "a name of letters, digits and underscores"
+#: What a text must be that does not match a pattern of a key.
+PATTERNS = {
+    r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$": "one line without control characters",
+    r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]+$": "one line without control characters, not empty",
+    r"^[!-~]{1,5}$": "one to five visible ASCII characters without spaces",
+    r"^[^\W\d]\w*$": f"{_LETTERS} that does not begin with a digit",
+    r"^[A-Za-z]\w*$": f"{_LETTERS} that begins with a letter from A to Z",
+    r"^[\w][\w.\-]*$": f"{_LETTERS}, in which points and hyphens may follow the first one",
 }
 
 
@@ -287,10 +300,8 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
             )
         case "tuple_type" | "list_type" if isinstance(value, dict):
             return f"is a table, must be a list of tables: write [[{'.'.join(map(str, keys))}]]"
-        case "string_pattern_mismatch" if "!-~" in context["pattern"]:
-            return f"is {shown}, must be one to five visible ASCII characters without spaces"
-        case "string_pattern_mismatch" if "x1f" in context["pattern"]:
-            return f"is {shown}, must be one line without control characters"
+        case "string_pattern_mismatch":
+            return f"is {shown}, must be {PATTERNS[context['pattern']]}"
         case "float_type" | "int_type" if isinstance(value, str):
             return SENTENCES[detail["type"]].format(shown=shown) + _as_number(value, keys)
         case kind if kind in SENTENCES:
