@@ -33,6 +33,7 @@ from rigidmd.forces.poses.patch import Patch
 from rigidmd.forces.poses.slopes import code_of, slopes_of
 from rigidmd.forces.poses.table import read_body_table
 from rigidmd.forces.poses.trace import Graph, TraceError
+from rigidmd.run.checks import within_table
 from rigidmd.run.rigid_fit import Bodies
 from rigidmd.scene.models import read_molecule
 from rigidmd.studies.virial import second_virial
@@ -1108,6 +1109,14 @@ def test_a_table_that_keeps_no_bodies_apart_is_warned_of(first, expected, tmp_pa
     }
     warnings = " ".join(build(Scene.from_dict(data, tmp_path)).warnings)
     assert expected in warnings and bool(warnings) == bool(expected)
+    system = build(Scene.from_dict(data | {"box": {"lengths_A": [30.0, 40, 50]}}, tmp_path))
+    state = system.state.copy()
+    for distance in (first + 0.1, first - 0.1):
+        state.position[7] = state.position[4] + [0.0, distance - 40, 0.0]  # of images
+        warning = within_table(system, state)
+        near = f"molecule 5 (rod) and molecule 8 (rod) have a distance of {distance:.3g} Å"
+        swapped = f"molecule 8 (rod) and molecule 5 (rod) have a distance of {distance:.3g} Å"
+        assert (near in warning or swapped in warning) == (distance < first)
     charged = body("rod", 60)
     charged["sites"][0] |= {"sigma_A": 3.0, "epsilon_kJ_mol": 1.0}
     warnings = build(Scene.from_dict(data | {"molecules": [charged]}, tmp_path)).warnings

@@ -95,6 +95,7 @@ class Sampler(Observer):
         self.samples = Samples([stage.label for stage in run.scene.stages], run.system.more_columns)
         self.last_good: State | None = None
         self._run, self._check = run, check
+        self._warns = True  # of bodies within the first distance of a table, once
         self.trajectories = np.zeros(5)  # see `Engine.trajectories`, at the last sample
         if any(stage.is_hybrid for stage in run.scene.stages):
             self.remembers = self.remembers | {"trajectories": np.ndarray}
@@ -123,6 +124,9 @@ class Sampler(Observer):
         _check_next_step(run, self._check, moment.observation.load, stage)
         if problem := checks.check_sample(run.system, run.scene.watch, samples.row(since), now):
             raise problem
+        if self._warns and (warning := checks.within_table(run.system, run._part.state)):
+            self._warns = False
+            run._note(warning)
         self._check.rescale(kinetic)
         self.last_good = None  # its memory is free for the next
         self.last_good = run._part.state.copy()

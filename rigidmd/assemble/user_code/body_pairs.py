@@ -270,16 +270,13 @@ def _errors_at(
     term: "BodyPairs", formula: "PoseFormula", kinds: list[str], system: System
 ) -> list[str]:
     """Messages on kinds of bodies without finite values between the nearest ones and the cutoff."""
-    state = system.state
-    acting = np.flatnonzero(term.kind >= 0)
-    kind = term.kind[acting]
-    point = state.position[acting] + np.einsum(
-        "nij,nj->ni", state.rotation[acting], term.reference[kind]
-    )
-    from rigidmd.assemble.user_code.pose_checks import not_finite_at  # for such scenes only
+    from rigidmd.assemble.user_code.pose_checks import not_finite_at
+    from rigidmd.forces.poses.pairs import reference_points
 
+    bodies, point = reference_points(term, system.state)
+    kind, group = term.kind[bodies], term.group[bodies]
+    start = start_distances(point, kind, group, term.cutoff, system)
     errors = []
-    start = start_distances(point, kind, term.group[acting], term.cutoff, system)
     for (i, j), distances in start.items():
         r = not_finite_at(formula, term.parameters[i, j], distances)
         if r is not None:

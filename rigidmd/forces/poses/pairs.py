@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import Pass, kernel, load_arguments, task
-from rigidmd.core.state import TALLY_SIZE
+from rigidmd.core.state import TALLY_SIZE, State
 from rigidmd.errors import SimulationError
 from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
 from rigidmd.forces.poses.pair_list import (
@@ -87,6 +87,13 @@ class BodyPairsWorkspace(NamedTuple):
         pairs = self.pairs._replace(entries=np.zeros((BLOCKS, capacity), np.int64))
         pairs.counters[MUST_BUILD] = 1
         return self._replace(pairs=pairs)
+
+
+def reference_points(term: BodyPairs, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """The bodies (k,) that take part, and their reference points (k, 3) in the lab, Å."""
+    bodies = np.flatnonzero(term.kind >= 0)
+    arms = np.einsum("nij,nj->ni", state.rotation[bodies], term.reference[term.kind[bodies]])
+    return bodies, state.position[bodies] + arms
 
 
 def pair_slopes(formula, p, r, a, b):
