@@ -135,13 +135,16 @@ def start_distances(
     reach = min(cutoff, NEIGHBOUR * (extent / len(position)) ** (1 / 3))
     i, j, step = pairs_within(position, cell, reach)
     acts = group[i] != group[j]
-    one, other = np.sort([kind[i[acts]], kind[j[acts]]], axis=0)
     lengths = np.linalg.norm(step[acts], axis=1)
-    nearest: dict[tuple[int, int], float] = {}
-    for k in np.argsort(lengths)[::-1]:
-        nearest[int(one[k]), int(other[k])] = float(lengths[k])
+    order = np.argsort(lengths)
+    pairs = np.sort([kind[i[acts]], kind[j[acts]]], axis=0)[:, order]
+    kinds, at = np.unique(pairs, axis=1, return_index=True)
     last = FAR * reach if cutoff == inf else cutoff * (1 - 1e-9)
-    return {pair: np.geomspace(r, max(r, last), 20) for pair, r in nearest.items() if r > 0}
+    return {
+        (int(one), int(other)): np.geomspace(r, max(r, last), 20)
+        for (one, other), r in zip(kinds.T, lengths[order][at], strict=True)
+        if r > 0
+    }
 
 
 def not_finite(between: str, r: float) -> str:
