@@ -26,7 +26,7 @@ from rigidmd.figures.style import new_figure
 from rigidmd.forces.poses.formulas import formula_of_poses
 from rigidmd.forces.poses.gay_berne import PARAMETERS, GayBerne
 from rigidmd.forces.poses.multipoles import dipole, quadrupole
-from rigidmd.forces.poses.pair_list import BUILDS
+from rigidmd.forces.poses.pair_list import BUILDS, MUST_BUILD
 from rigidmd.forces.poses.pairs import pair_slopes
 from rigidmd.forces.poses.patch import PARAMETERS as PATCH
 from rigidmd.forces.poses.patch import Patch
@@ -551,6 +551,7 @@ def test_the_list_is_built_anew_where_a_strain_of_a_slanted_cell_exceeds_its_ski
     strains += [np.outer(row, [1.0, 0.0, 0.0]) for row in np.eye(3)]  # xx, xy, xz alone
     for strain in strains:
         for fraction, builds in ((0.99, 0), (1.01, 1)):
+            pairs.counters[MUST_BUILD] = 1
             engine.evaluate(system.state)
             before = int(pairs.counters[BUILDS])
             moved = system.state.copy()

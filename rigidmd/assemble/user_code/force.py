@@ -3,7 +3,7 @@
 import time as clock
 import traceback
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple, Protocol, cast, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, SupportsFloat, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -254,8 +254,9 @@ def real_numbers(values: object) -> np.ndarray | None:
     values."""
     try:
         array = np.asarray(values)
-        is_text = array.dtype.kind == "O" and any(isinstance(x, str | bytes) for x in array.flat)
-        if is_text or array.dtype.kind not in "biufO" or np.ma.is_masked(cast(ArrayLike, values)):
+        if array.dtype.kind == "O" and not all(isinstance(x, SupportsFloat) for x in array.flat):
+            return None
+        if array.dtype.kind not in "biufO" or np.ma.is_masked(cast(ArrayLike, values)):
             return None
         return array.astype(float)
     except (TypeError, ValueError):
