@@ -108,18 +108,20 @@ def minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | N
 
 
 def contact_of(energy: Callable[[np.ndarray], np.ndarray], cutoff: float, system: System) -> float:
-    """The distance (Å) up to which two sites or bodies repel strongly, 0 without one: the energy is
-    high and steep there.
+    """The distance (Å) up to which two sites or bodies repel strongly, 0 without one or without a
+    temperature: the energy is high and steep there.
 
     energy : u Å²/ps² at distances (k,) Å; NaN where it has none
     """
-    thermal, _ = energy_scale(system)
+    scene = system.scene
+    temperatures = [x for stage in scene.stages for x in stage.temperatures]
+    hottest = max([*temperatures, scene.start.temperature_K or 0.0])
     r = np.geomspace(0.01, 10, 100) * (LONGEST_CONTACT if cutoff == inf else cutoff)
     with np.errstate(all="ignore"):
         values = energy(r)
         steepness = -np.gradient(np.log(values), np.log(r))
-        repels = (values > HIGH * thermal) & (steepness > STEEP)
-    return float(r.max(where=repels, initial=0.0))
+        repels = (values > HIGH * BOLTZMANN * hottest) & (steepness > STEEP)
+    return float(r.max(where=repels, initial=0.0)) if hottest else 0.0
 
 
 def start_distances(
