@@ -56,8 +56,12 @@ __all__ = ["CalculatorForce", "RigidMD"]
 LARGEST_STRAIN = 0.1
 #: Atoms that are bent by this factor more than those before may be other atoms.
 JUMP = 2.0
-#: Tables of a scene that a calculator uses.
-TABLES = ("forces", "fields", "precision")
+#: Tables of a scene that a calculator uses, and others on which no energy of the atoms depends.
+TABLES = ("forces", "fields", "coupling", "precision")
+WITHOUT_ENERGIES = (
+    *("name", "seed", "threads", "engine", "structure", "box", "molecules", "start"),
+    *("integrators", "stages", "run", "output", "watch", "from_python"),
+)
 
 
 class RigidMD(Calculator):
@@ -72,8 +76,8 @@ class RigidMD(Calculator):
     ----------
     models
         Names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene
-        file, or a scene, whose species, [forces], [fields], precision and forces from Python
-        (`with_user_code`) are used
+        file, or a scene, whose species, [forces], [fields], [coupling], precision and forces
+        from Python (`with_user_code`) are used
     atom_forces
         "gradient" of the energy of the fitted molecules, or of "sites": each atom has the forces of
         its site
@@ -522,6 +526,10 @@ def _parts_of(scene: MolecularScene) -> tuple[list[Json], Json]:
     """The tables of a scene's species without numbers of molecules, and the other TABLES. Paths are
     absolute."""
     tables = with_absolute_paths(scene.model_dump(exclude_defaults=True), scene.path(""))
+    unknown = [key for key in tables if key not in (*TABLES, *WITHOUT_ENERGIES)]
+    if unknown:
+        faults = [f"{key}: a calculator cannot use this table. Leave it out" for key in unknown]
+        raise SceneError(scene.source, faults)
     for table in tables["molecules"]:
         table.pop("count", None)
     return list(tables["molecules"]), {key: tables[key] for key in TABLES if key in tables}

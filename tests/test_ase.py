@@ -24,7 +24,7 @@ from support import ROOT, small_scene
 
 import rigidmd
 from rigidmd import BodyScene, MolecularScene, Scene, Simulation
-from rigidmd.ase import RigidMD
+from rigidmd.ase import TABLES, WITHOUT_ENERGIES, RigidMD
 from rigidmd.assemble.build import build
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SceneError, StructureError
@@ -626,6 +626,27 @@ def test_a_scene_may_be_the_calculator(results, waters):
         RigidMD(results.system.scene, cutoff_A=5.0)
     with pytest.raises(SceneError, match="is of a single body"):
         RigidMD(Scene.read(ROOT / "systems" / "heavy_top_1.toml"))
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3, 0.7, 1.0])
+def test_a_calculator_scales_the_species_of_coupling(value):
+    molecules = [{"model": "spce", "count": 12}, {"model": "argon", "name": "solute", "count": 1}]
+    scene = small_scene(
+        {},
+        15.0,
+        molecules=molecules,
+        forces={"cutoff_A": 6.0, "electrostatics": "pme"},
+        coupling={"species": "solute", "lambda": value},
+    )
+    simulation = Simulation(scene)
+    atoms = simulation.atoms()
+    atoms.calc = RigidMD(scene)
+    energy = atoms.get_potential_energy() * EV / KJ_PER_MOL
+    assert energy == pytest.approx(simulation.observation.potential, rel=1e-6)
+
+
+def test_every_table_of_a_scene_is_used_by_a_calculator_or_has_no_energy():
+    assert {*TABLES, *WITHOUT_ENERGIES} == {*MolecularScene.model_fields}
 
 
 @pytest.mark.parametrize(
