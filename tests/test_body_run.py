@@ -209,7 +209,7 @@ def test_check_tells_every_scene(path, capsys):
     assert main(["check", str(path)]) == 0
     said = capsys.readouterr().out
     assert "degrees of freedom" in said
-    assert "left out:" in said
+    assert "omitted:" in said
     assert "pair forces" in said
 
 

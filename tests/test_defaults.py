@@ -535,7 +535,7 @@ def test_a_run_keeps_its_default_step_and_check_tells_its_error(tmp_path, capsys
     out = capsys.readouterr().out
     error = "time-step error: spce rotates about its lightest axis as if forces were wrong by"
     assert "0: nvt: 5 steps of 4 fs = 0.02 ps, baoab" in out
-    assert f"{error} 4 %. Bias of U about 0.002 kT per degree of freedom" in out
+    assert f"{error} 4 %. Bias of U about 0.004 kT per degree of freedom" in out
     assert "1: nve: 10 steps of 2 fs = 0.02 ps, velocity_verlet" in out
     assert f"{error} 1 %\n" in out
     assert main(["run", str(path), "-o", str(tmp_path / "run")]) == 0

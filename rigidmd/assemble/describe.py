@@ -101,7 +101,7 @@ def _describe_body(system: BodySystem) -> str:
     parts = [words for part in body if part and not (words := _words(part)).startswith("no ")]
     lines.append(f"\ncompiled in: {', '.join(parts)}")
     lines += [f"  {name.replace('_', ' ')}: {_words(term)}" for name, term in system.terms.items()]
-    lines += ["left out:", *(f"  {reason}" for reason in system.left_out)]
+    lines += ["omitted:", *(f"  {reason}" for reason in system.left_out)]
     how = f"{run.integrator}" + (
         f", {system.method.formulation}" if isinstance(system.method, Solver) else ""
     )
@@ -170,7 +170,7 @@ def _describe_molecules(system: System) -> str:
     if (system.external or system.user_terms) and len(conserved) < 3:
         where = f"along {' and '.join(conserved)}" if conserved else "nowhere"
         lines.append(f"  total momentum: conserved {where}")
-    lines += ["left out:", *(f"  {reason}" for reason in system.left_out), "\nstages:"]
+    lines += ["omitted:", *(f"  {reason}" for reason in system.left_out), "\nstages:"]
     for k, stage in enumerate(scene.stages):
         steps, sampled = describe_stage(stage)
         lines += [f"  {k}: {steps}", f"     {sampled}"]

@@ -34,12 +34,11 @@ SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
 MIXED_ERROR = 3e-6
 #: Minimum error of Ewald sums that grids in single precision allow, e²/Å².
 MIXED_EWALD_ERROR = 3e-6
-#: Bias of U per error of a step, kT per degree of freedom: of a thermostat that reads the momenta
-#: at the ends of steps (measured for SPC/E with velocity Verlet: 0.007 at 2 fs, 0.026 at 4 fs), and
-#: in the middle of the drift (below 0.002 at 4 fs).
-BIAS_AT_ENDS, BIAS_IN_MIDDLE = 0.6, 0.04
-#: Largest bias of U at a default step, kT per degree of freedom.
-DEFAULT_BIAS = 0.002
+#: Bias of U per error of a step, and its largest value at a default step, kT per degree of freedom:
+#: of a thermostat that reads the momenta at the ends of steps (measured for SPC/E with velocity
+#: Verlet: 0.007 at 2 fs, 0.026 at 4 fs), and in the middle of the drift (SPC/E at 4 fs: 0.0023(5)
+#: and 0.004(1) in two series).
+BIAS_AT_ENDS, BIAS_IN_MIDDLE = (0.6, 0.002), (0.1, 0.005)
 #: Largest error of a default step without a thermostat, or with hybrid Monte Carlo: 2 fs for water.
 DEFAULT_ERROR = 0.0125
 #: Default steps are at most this long, fs: longer ones resolve no collision of argon at 94 K.
@@ -103,10 +102,9 @@ def _longest_angle(scheme: Scheme, error: float) -> float:
     return next((x for x in angles.tolist() if step_error(scheme, x) <= error), 0.0)
 
 
-def _bias_per_error(stage: Stage) -> float:
-    """Bias of U per time-step error, kT per degree of freedom, in a stage with a thermostat."""
-    if stage.is_hybrid:
-        return 0.0
+def _bias_of(stage: Stage) -> tuple[float, float]:
+    """Bias of U per time-step error in a stage with a thermostat, and its largest value at a
+    default step, kT per degree of freedom."""
     return BIAS_IN_MIDDLE if stage.integrator in WITH_THERMOSTAT else BIAS_AT_ENDS
 
 
@@ -117,7 +115,8 @@ def _default_step(scene: MolecularScene, stage: Stage, fastest: FastMotion | Non
         return USUAL_STEP
     error = DEFAULT_ERROR
     if stage.has_thermostat and not (stage.is_hybrid or scene.engine.is_external):
-        error = DEFAULT_BIAS / _bias_per_error(stage)
+        per_error, largest = _bias_of(stage)
+        error = largest / per_error
     longest = _longest_angle(stage.scheme, error) * fastest.time / FEMTOSECOND
     longest = min(longest, LONGEST_DEFAULT, stage.duration / FEMTOSECOND)
     if longest == 0:
@@ -178,7 +177,7 @@ def describe_step(scene: MolecularScene, species: list[Molecule], k: int) -> str
     if stage.is_hybrid:
         return f"{text}. Averages have none"
     if stage.has_thermostat:
-        bias = _bias_per_error(stage) * error
+        bias = _bias_of(stage)[0] * error
         text += f". Bias of U about {bias:.1g} kT per degree of freedom"
     return text
 

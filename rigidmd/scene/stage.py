@@ -99,7 +99,7 @@ class Timing(Section):
     timestep_fs: Positive | None = None
     """Time step. Default: one of 1, 2, 2.5, 4, 5, 10 fs and their tenths, from the fastest motion
     of the molecules and the temperature. With baoab it is the longest whose bias of U stays below
-    0.002 kT per degree of freedom, 4 fs for water at 300 K. At constant energy it is half as long.
+    0.005 kT per degree of freedom, 4 fs for water at 300 K. At constant energy it is half as long.
     `rigidmd check` prints it"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
     """Temperature of the thermostat. Use two values for a linear change over the stage, [300,

@@ -90,7 +90,7 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
         yield section("Plots", plots.plots_part(record))
     yield section("Analyses", *_analyses(record))
     yield section("Stability margins", _margins(record))
-    start = lines.index("left out:") if "left out:" in lines else len(lines)
+    start = lines.index("omitted:") if "omitted:" in lines else len(lines)
     end = next(
         (k for k in range(start + 1, len(lines)) if not lines[k].startswith("  ")), len(lines)
     )

@@ -274,7 +274,7 @@ def remarks(measured: IntegratorAccuracy) -> list[str]:
         ][:1]
     for why in dict.fromkeys(measured.left_out.values()):
         names = ", ".join(name for name, reason in measured.left_out.items() if reason == why)
-        lines.append(f"left out: {names}: {why}")
+        lines.append(f"omitted: {names}: {why}")
     return lines + _describe_timings(measured)
 
 
