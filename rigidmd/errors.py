@@ -124,6 +124,10 @@ class SimulationError(RigidMDError):
     """A run that was stopped because its numbers became meaningless."""
 
 
+class StoppedError(SimulationError, OutputError):
+    """A run that stopped because a file could not be written."""
+
+
 class EngineError(RigidMDError):
     """Another engine that is not installed, cannot run a scene, or failed."""
 

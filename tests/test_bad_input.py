@@ -3,6 +3,7 @@ half-written."""
 
 import json
 import re
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -790,15 +791,45 @@ def test_times_of_the_command_line_are_finite(until, capsys):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--span", "nan"], "must be finite and greater than 0"),
-        (["--timesteps", "1,inf"], "must be finite and greater than 0"),
+        (["--span", "nan"], "time steps and --span must be between 1e-30 and 1e30"),
+        (["--timesteps", "1,inf"], "time steps and --span must be between 1e-30 and 1e30"),
+        (["--timesteps", "5e-324"], "time steps and --span must be between 1e-30 and 1e30"),
+        (["--timesteps", "1e-20"], "more than 1e+12 steps"),
+        (["--span", "1e20"], "more than 1e+12 steps"),
+        (["--repeats", "0"], "--repeats must be at least 1"),
     ],
 )
-def test_times_of_accuracy_are_finite(options, expected, capsys, tmp_path):
-    (tmp_path / "good.toml").write_text(GOOD)
-    assert (
-        main(["accuracy", str(tmp_path / "good.toml"), *options, "-o", str(tmp_path / "out")]) == 2
-    )
+@pytest.mark.parametrize("kind", ["molecules", "body"])
+def test_times_of_accuracy_are_in_their_range(kind, options, expected, capsys, tmp_path):
+    scene = tmp_path / "good.toml"
+    scene.write_text(GOOD)
+    if kind == "body":
+        shutil.copy(ROOT / "systems" / "heavy_top_3.toml", scene)
+        expected = expected.replace("1e-30 and 1e30", "1e-100 and 1e100")
+    assert main(["accuracy", str(scene), *options, "-o", str(tmp_path / "out")]) == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--sample-ps", "1e300"], "time steps and --sample-ps must be between 1e-30 and 1e30"),
+        (["--timesteps", "1e-20"], "more than 1e+12 steps"),
+    ],
+)
+def test_times_of_averages_are_in_their_range(options, expected, capsys, tmp_path):
+    scene = ROOT / "systems" / "argon.toml"
+    options = [
+        "--averages",
+        "--set",
+        "stages.1.ensemble=nvt",
+        "--set",
+        "stages.1.temperature_K=90",
+        *options,
+        "-o",
+        str(tmp_path / "out"),
+    ]
+    assert main(["accuracy", str(scene), *options]) == 2
     assert expected in capsys.readouterr().err
 
 

@@ -8,6 +8,7 @@ import pickle
 import re
 import subprocess
 import sys
+from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -453,8 +454,12 @@ def test_steps_are_the_steps_of_a_run(make, tmp_path):
     again = make(observers=Every(0.002, seen.append))
     again.step(5)
     assert np.array_equal(again.run().state.velocity, whole.state.velocity)
-    with pytest.raises(ValueError, match="at least one step"):
+    with pytest.raises(ValueError, match="the number of steps is 0: at least 1"):
         again.step(0)
+    for count in (1.5, nan, True, "1"):
+        with pytest.raises(TypeError, match=r"the number of steps is .*, must be a whole number"):
+            again.step(count)
+    assert again.step(np.int64(1)) == 1
 
 
 @pytest.mark.parametrize("make", [argon, heavy_top])

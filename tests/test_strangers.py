@@ -593,6 +593,27 @@ def test_an_end_or_a_folder_that_cannot_be(options, expected, capsys, tmp_path):
     assert expected in refusal(capsys, tmp_path, GOOD, *options, commands=("run",))
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "check NAME",
+        "run NAME",
+        "resume NAME",
+        "analyse NAME",
+        "report NAME",
+        "view NAME",
+        "compare NAME NAME",
+        "sweep NAME --set seed=1,2",
+        "new argon -o NAME.toml",
+        "virial argon --temperatures 300 -o NAME.csv",
+    ],
+)
+def test_a_name_that_is_too_long_for_a_file(command, capsys):
+    assert main(command.replace("NAME", "a" * 300).split()) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("rigidmd: ") and "File name too long" in message
+
+
 def test_an_end_with_more_digits_than_a_number_has(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["run", "nowhere.toml", "--until", "9" * 400 + "ps"])

@@ -299,7 +299,7 @@ def test_one_that_fails_takes_no_other_with_it():
 
 
 @pytest.mark.parametrize(
-    ("twice", "jobs", "word"), [(True, None, "twice"), (False, 0, "at least one")]
+    ("twice", "jobs", "word"), [(True, None, "twice"), (False, 0, "jobs is 0: at least 1")]
 )
 def test_what_cannot_run_together_is_refused(twice, jobs, word):
     runs = short_runs(1)

@@ -113,6 +113,13 @@ def main(arguments: list[str] | None = None) -> int:
                 file=sys.stderr,
             )
             return BAD_INPUT
+        if isinstance(error, OSError) and error.filename is not None:  # such as a name too long
+            from rigidmd.core.toml import shorten_text
+
+            print(
+                f"rigidmd: {shorten_text(str(error.filename))}: {error.strerror}", file=sys.stderr
+            )
+            return BAD_INPUT
         raise
 
 

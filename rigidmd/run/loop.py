@@ -19,7 +19,13 @@ from rigidmd.core.files import LostFileError, writing
 from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines.protocol import Halted, NotFiniteError
-from rigidmd.errors import OutputError, RigidMDError, SimulationError, resume_command
+from rigidmd.errors import (
+    OutputError,
+    RigidMDError,
+    SimulationError,
+    StoppedError,
+    resume_command,
+)
 from rigidmd.io import folder as run_folder
 from rigidmd.io.checkpoint import Checkpoint, latest
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS, SUMMARY, FolderLock
@@ -329,7 +335,7 @@ class RunLoop:
         if isinstance(error, OutputError):
             if isinstance(error, LostFileError):
                 with contextlib.suppress(OutputError):
-                    return OutputError(
+                    return StoppedError(
                         f"{where}{error}. The run cannot continue it{self._last_words()}"
                     )
             advice = ""
@@ -338,7 +344,7 @@ class RunLoop:
             ):
                 resume = resume_command(self._folder)
                 advice = f". Free disk space, then {resume} continues from the last checkpoint"
-            return OutputError(f"{where}{error}{advice}")
+            return StoppedError(f"{where}{error}{advice}")
         return SimulationError(f"{where}{part.explain(error)}{self._last_words()}")
 
     def _last_words(self) -> str:

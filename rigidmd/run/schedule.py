@@ -13,8 +13,9 @@ import threading
 import time as clock
 from collections.abc import Callable, Collection, Iterator
 from math import inf
+from operator import index
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, SupportsIndex
 
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.signals import CHECKPOINT_SIGNALS, STOP_SIGNAL, has_handler
@@ -91,6 +92,16 @@ def checked_walltime(seconds: float) -> float:
             f"walltime is {seconds!r}, must be a finite number of seconds, not negative"
         )
     return seconds
+
+
+def checked_count(value: object, name: str) -> int:
+    """A number of steps, runs or threads from Python. TypeError unless it is whole, ValueError
+    below 1."""
+    if isinstance(value, bool) or not isinstance(value, SupportsIndex):
+        raise TypeError(f"{name} is {value!r:.40}, must be a whole number")
+    if (count := index(value)) < 1:
+        raise ValueError(f"{name} is {count}: at least 1")
+    return count
 
 
 class CheckpointSchedule:

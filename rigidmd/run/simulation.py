@@ -37,6 +37,7 @@ from rigidmd.run.loop import RunLoop
 from rigidmd.run.observers import as_observer
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import (
+    checked_count,
     checked_walltime,
     checkpoint_signals,
     signal_handler,
@@ -461,12 +462,10 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
 
         Raises
         ------
-        ValueError
-            For a count below 1. Errors of `run` occur here too.
+        TypeError, ValueError
+            For a count that is not whole, or below 1. Errors of `run` occur here too.
         """
-        if count < 1:
-            raise ValueError(f"step({count}): at least one step")
-        return self._drive(count, progress=False).advanced
+        return self._drive(checked_count(count, "the number of steps"), progress=False).advanced
 
     def close(self) -> None:
         """End a run that `step` has started, with all files, as `stop` ends it: it can be resumed.
@@ -584,8 +583,7 @@ def run_together(
         raise TypeError(f"{wrong[0]!r:.60} is not a Simulation")
     if len(set(map(id, simulations))) < len(simulations):
         raise ValueError("a simulation is given twice. Make one for each run")
-    if jobs is not None and jobs < 1:
-        raise ValueError(f"jobs = {jobs}: at least one run at a time")
+    jobs = MOST_THREADS if jobs is None else checked_count(jobs, "jobs")
     for simulation in simulations:
         simulation._take_threads(1)
     begun: list[Simulation] = []
@@ -615,7 +613,7 @@ def run_together(
     with contextlib.ExitStack() as stack:
         stack.enter_context(signal_handler(stop, *stop_signals()))
         stack.enter_context(signal_handler(ask_for_checkpoints, *checkpoint_signals()))
-        pool = stack.enter_context(ThreadPoolExecutor(jobs or MOST_THREADS, "run"))
+        pool = stack.enter_context(ThreadPoolExecutor(jobs, "run"))
         futures = [pool.submit(run, simulation) for simulation in simulations]
         running = set(futures)
         while running:

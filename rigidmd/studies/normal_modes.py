@@ -27,6 +27,7 @@ from rigidmd.run import Simulation
 from rigidmd.run.checks import molecule_label
 from rigidmd.run.minimise import Enthalpy
 from rigidmd.run.minimise import minimise as find_minimum
+from rigidmd.run.schedule import checked_count
 from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.stage import Stage
@@ -243,6 +244,7 @@ def normal_modes(
         modes = rigidmd.normal_modes(rigidmd.Scene.read("water_dimer.toml"))
         print(modes.wavenumber, modes.free_energy(300.0), modes.longest_step_fs)
     """
+    count = None if count is None else checked_count(count, "count")
     simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
     if isinstance(simulation.scene, BodyScene):
         raise SceneError(

@@ -2,7 +2,6 @@
 of a scene. As a table, recommendations, accuracy.csv, .png and a self-contained page."""
 
 from collections.abc import Callable, Iterator
-from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,12 @@ from rigidmd.run.trial_systems import (
 from rigidmd.run.trials import Trial
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
-from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
+from rigidmd.studies.accuracy.averages import (
+    check_engine_is_rigidmd,
+    check_number_of_steps,
+    check_times,
+    start_of_last_stage,
+)
 from rigidmd.studies.accuracy.measurement import IntegratorAccuracy, measure, plan
 from rigidmd.studies.accuracy.orders import FLOOR_MARK, order_table, with_marks
 from rigidmd.view.page import chips, code, items, section, table, wide, write_page
@@ -80,10 +84,9 @@ def measure_accuracy(
         ]
         raise SceneError(option("integrators"), errors)
     lengths = [*(timesteps or []), *([] if span is None else [span])]
-    if not all(0 < length < inf for length in lengths) or repeats < 1:
-        raise SceneError(
-            "accuracy", ["time steps, span and repeats must be finite and greater than 0"]
-        )
+    check_times(scene, lengths, f"time steps and {option('span')}")
+    if repeats < 1:
+        raise SceneError("accuracy", [f"{option('repeats')} must be at least 1"])
     if isinstance(scene, MolecularScene) and (
         refused := [name for name in integrators if name in COMPARATORS]
     ):
@@ -130,6 +133,8 @@ def measure_accuracy(
         )
         for name in integrators
     }
+    for step in [step for of_method in steps.values() for step in of_method]:
+        check_number_of_steps(trial_system.span, step * trial_system.time_size)
     measured = measure(
         trial_system, plan(trial_system, steps), repeats, progress=progress, extend=not timesteps
     )

@@ -3,7 +3,7 @@ for their biases."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from math import floor, inf, log10, nan, sqrt
+from math import floor, log10, nan, sqrt
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -21,7 +21,7 @@ from rigidmd.run.observers import Every
 from rigidmd.run.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.couplings import THERMOSTATS
-from rigidmd.scene.stage import ERROR_TARGETS, Stage
+from rigidmd.scene.stage import ERROR_TARGETS, MOST_STEPS, Stage
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, extrapolate
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
@@ -167,6 +167,21 @@ def check_engine_is_rigidmd(scene: MolecularScene | BodyScene) -> None:
         raise SceneError(scene.source, [error])
 
 
+def check_times(scene: MolecularScene | BodyScene, times: Iterable[float], names: str) -> None:
+    """Raise SceneError unless times have a size that numbers of a scene may have."""
+    least, largest = scene.SIZES
+    if not all(least <= time <= largest for time in times):
+        bounds = f"{least:g} and {largest:g}".replace("e+", "e")
+        raise SceneError("accuracy", [f"{names} must be between {bounds}"])
+
+
+def check_number_of_steps(duration: float, step: float) -> None:
+    """Raise SceneError if a duration has too many steps, in the same unit."""
+    if not duration / step < MOST_STEPS:
+        error = f"a run has more than {MOST_STEPS:g} steps: use longer steps, or shorter runs"
+        raise SceneError("accuracy", [error])
+
+
 def measure_averages(
     scene: MolecularScene | BodyScene,
     methods: list[str] | None = None,
@@ -197,10 +212,10 @@ def measure_averages(
     if not methods:
         of_stage = [] if stage.is_auto else [(stage.integrator, stage.thermostat_kind)]
         pairs = list(dict.fromkeys([*of_stage, *pairs]))
-    if not all(0 < length < inf for length in (sample, *(timesteps or []))):
-        raise SceneError(
-            "accuracy", [f"time steps and {option('sample_ps')} must be finite and greater than 0"]
-        )
+    names = f"time steps and {option('sample_ps')}"
+    check_times(scene, (sample, *(timesteps or [])), names)
+    for step in timesteps or []:
+        check_number_of_steps(sample, step * FEMTOSECOND)
     if timesteps and max(timesteps) * FEMTOSECOND > sample:
         error = f"{max(timesteps):g} fs is longer than the {sample:g} ps sampled with it"
         raise SceneError(option("timesteps"), [error])

@@ -14,6 +14,7 @@ from rigidmd.core.process import OUT_OF_TIME
 from rigidmd.errors import OutputError, SimulationError
 from rigidmd.io.folder import FolderLock, add_to_folder, elsewhere, is_empty
 from rigidmd.io.progress import progress_of
+from rigidmd.run.schedule import checked_count
 from rigidmd.scene import Scene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.figure import collect
@@ -168,6 +169,8 @@ def sweep(
         print(table["Temperature (K)"], table.error("Temperature (K)"))
     """
     where = None if folder is None else Path(folder)
+    jobs = None if jobs is None else checked_count(jobs, "jobs")
+    threads = None if threads is None else checked_count(threads, "threads")
     with open_sweep(Path(scene), axes_of(sets), where, trust=trust, force=force) as manifest:
         count = len(manifest.unfinished)
         jobs, threads = jobs_and_threads(count, jobs, threads)
