@@ -98,7 +98,7 @@ def checked_count(value: object, name: str) -> int:
     """A number of steps, runs or threads from Python. TypeError unless it is whole, ValueError
     below 1."""
     if isinstance(value, bool) or not isinstance(value, SupportsIndex):
-        raise TypeError(f"{name} is {value!r:.40}, must be a whole number")
+        raise TypeError(f"{name} is {value!r:.40}, must be an integer")
     if (count := index(value)) < 1:
         raise ValueError(f"{name} is {count}: at least 1")
     return count
