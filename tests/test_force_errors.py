@@ -73,6 +73,7 @@ def test_errors_of_one_ion_which_feels_no_force(tmp_path, capsys):
     assert "nan" not in capsys.readouterr().out
 
 
+DILUTE = [{"model": "spce", "count": 8}]
 FROZEN_SALT = [{"model": "na_spce", "count": 4, "frozen": True}, {"model": "argon", "count": 8}]
 
 
@@ -82,11 +83,13 @@ FROZEN_SALT = [{"model": "na_spce", "count": 4, "frozen": True}, {"model": "argo
         ([{"model": "spce", "count": 8}], {}, "forces.electrostatics is 'reaction_field'"),
         ([{"model": "argon", "count": 8}], EWALD, "no site has a charge"),
         (FROZEN_SALT, EWALD, "all molecules with charges are frozen"),
+        (DILUTE, {"electrostatics": "pme", "ewald_cutoff_A": 7.0}, "out of reach in this box"),
     ],
 )
 def test_reasons_why_no_error_is_measured(molecules, forces, reason):
     forces = {"cutoff_A": 7.0} | forces
-    scene = small_scene({}, None, molecules=molecules, box=CUBE, forces=forces)
+    box = {"lengths_A": 900.0} if molecules is DILUTE else CUBE
+    scene = small_scene({}, None, molecules=molecules, box=box, forces=forces)
     system = build(scene)
     with pytest.raises(SceneError, match=reason):
         coulomb_errors(system, system.state)

@@ -56,7 +56,8 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
     scene = system.scene
     if reason := _reason_without_errors(system):
         raise SceneError(scene.source, [f"--accuracy measures errors of Ewald sums: {reason}"])
-    accuracy = max(REFERENCE_ERROR * system.force_error / COULOMB, MIN_REFERENCE_ERROR)
+    estimated = not_none(system.force_error)
+    accuracy = max(REFERENCE_ERROR * estimated / COULOMB, MIN_REFERENCE_ERROR)
     settings = (
         "ewald_alpha_per_A",
         "ewald_k_max",
@@ -67,7 +68,11 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
     )
     changes = dict.fromkeys(settings) | {"electrostatics": "ewald", "ewald_accuracy": accuracy}
     forces = scene.forces.model_copy(update=changes)
-    reference = build(scene.model_copy(update={"forces": forces, "precision": "double"}))
+    try:
+        reference = build(scene.model_copy(update={"forces": forces, "precision": "double"}))
+    except SceneError as error:
+        problem = f"a direct sum good to {accuracy:.1g} e²/Å² is out of reach in this box"
+        raise SceneError(scene.source, [f"--accuracy: {problem}"]) from error
     moves = _charged_sites_that_move(system)
     coulomb, energy = _coulomb(system, state)
     exact, exact_energy = _coulomb(reference, state)
@@ -80,7 +85,7 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> Json:
         "rms_error_per_A": measured / size,
         "relative": measured / force if force else None,  # one ion feels no force
         "in_e2_per_A2": measured / COULOMB,
-        "estimated_per_A": system.force_error / size,
+        "estimated_per_A": estimated / size,
         "largest_error_per_A": float(error.max()) / size,
         "energy_error": (energy - exact_energy) / size,
     }
