@@ -196,7 +196,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--threads", type=int, default=2)
-    options = read_options(parser, rounds=1, steps=5, threads=min(2, os.cpu_count() or 1))
+    options = read_options(parser, rounds=1, steps=5, threads=min(2, len(os.sched_getaffinity(0))))
     assert set(PARAMETERS) == set(ROD)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -12,6 +12,7 @@ from command_line import SMOKE, new_parser, read_options
 
 import rigidmd
 from rigidmd import Scene, Simulation
+from rigidmd.errors import OutputError
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 WIDTH, DEPTH = 4.0, 3.5  # Å, kJ/mol
@@ -80,9 +81,10 @@ def main() -> None:
         for density in densities
     ]
     for density, results in zip(densities, rigidmd.run_together(runs), strict=True):
-        values = rigidmd.analysis.nematic(results).values
-        numbers = (f"{value.value:.3f} ± {value.error or 0:.3f}" for value in values)
-        print(f"{density:g}", *numbers, f"correlation time {values[0].correlation_ps} ps")
+        try:
+            print(f"{density:g}: {rigidmd.analysis.nematic(results)}")
+        except OutputError as error:  # too few frames
+            print(f"{density:g}: {error}")
 
 
 if __name__ == "__main__":
