@@ -178,7 +178,7 @@ TIERS = {
             *(f"every_system_runs_a_few_steps[{name}]" for name in ("gay_berne", "water_nitrogen")),
             "the_scene_that_a_run_writes_holds_every_number_it_used[pme]",
         ),
-        "test_shipped.py": ("a_wheel_has_nothing_of_an_earlier_build",),
+        "test_shipped.py": ("a_wheel_has_every_file_and_nothing_of_an_earlier_build",),
         "test_sources.py": ("*",),
         "test_stability.py": ("the_command_writes_its_files_and_does_not_overwrite",),
         "test_stored_runs.py": ("a_sweep_is_read",),
