@@ -2,6 +2,7 @@
 constant, what is refused."""
 
 import re
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from rigidmd.analysis.registry import KNOWN
 from rigidmd.analysis.rigid_frames import frames_of_start
 from rigidmd.assemble.build import build
 from rigidmd.assemble.guest import Guest, model_named
+from rigidmd.assemble.species import species_of
 from rigidmd.commands.cli import main
 from rigidmd.errors import InputError, OutputError, SceneError
 from rigidmd.mechanics.rotation import random_rotations
@@ -187,3 +189,85 @@ def test_what_needs_a_run_is_refused(tmp_path, capsys):
     assert "only insertion needs no run" in capsys.readouterr().err
     assert main(["analyse", path, "insertion", "trial=3"]) == 2
     assert "unknown option" in capsys.readouterr().err
+
+
+def in_capitals(form: str, first: str, second: str, formula: str = "") -> str:
+    """Two atoms of these symbols in a cube of 12 Å."""
+    points = [(1.2, 1.2, 1.2), (3.6, 4.8, 6.0)]
+    rows = list(zip((first, second), points, strict=True))
+    if form == "xyz":
+        body = "".join(f"{e} {x} {y} {z}\n" for e, (x, y, z) in rows)
+        return f'2\nLattice="12 0 0 0 12 0 0 0 12" Properties=species:S:1:pos:R:3\n{body}'
+    if form == "pdb":
+        return "CRYST1   12.000   12.000   12.000  90.00  90.00  90.00 P 1\n" + "".join(
+            f"HETATM{k:5d} {e:>4} FRM A   1    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00{e:>12}\n"
+            for k, (e, (x, y, z)) in enumerate(rows, 1)
+        )
+    if form == "lammpstrj":
+        body = "".join(f"{k} {e} {x} {y} {z}\n" for k, (e, (x, y, z)) in enumerate(rows, 1))
+        head = "ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n2\nITEM: BOX BOUNDS pp pp pp\n"
+        return head + "0 12\n" * 3 + "ITEM: ATOMS id element x y z\n" + body
+    dot = "." if form == "mmcif" else "_"
+    tags = [f"_cell{dot}length_{x} 12" for x in "abc"]
+    tags += [f"_cell{dot}angle_{x} 90" for x in ("alpha", "beta", "gamma")]
+    if form == "mmcif":
+        columns = "id type_symbol label_atom_id label_comp_id Cartn_x Cartn_y Cartn_z"
+        body = [f"{k} {e} {e} FRM {x} {y} {z}" for k, (e, (x, y, z)) in enumerate(rows, 1)]
+    else:
+        columns = "label type_symbol fract_x fract_y fract_z"
+        body = [
+            f"{e}{k} {e} {x / 12:.6f} {y / 12:.6f} {z / 12:.6f}"
+            for k, (e, (x, y, z)) in enumerate(rows, 1)
+        ]
+        tags += [f"_chemical_formula_sum '{formula}'"] * bool(formula)
+        tags += ["loop_", "_symmetry_equiv_pos_as_xyz", "x,y,z"]
+    return "\n".join(
+        ["data_x", *tags, "loop_", *(f"_atom_site{dot}{c}" for c in columns.split()), *body, ""]
+    )
+
+
+def elements_in(tmp_path, form, text, *names):
+    """The elements of a framework with entries of these names, and the notes on its file."""
+    name = f"f.{form}"
+    (tmp_path / name).write_text(text)
+    sites = [{"name": name, "sigma_A": 2.5, "epsilon_K": 20.0} for name in names]
+    framework = {"name": "fw", "file": name, "repeat": [1, 1, 1], "frozen": True, "sites": sites}
+    forces = {"cutoff_A": 5.0, "electrostatics": "none"}
+    [body] = species_of(
+        small_scene({}, 1.0, tmp_path, molecules=[framework], box={}, forces=forces)
+    )
+    return body.elements, " ".join(body.reading)
+
+
+@pytest.mark.parametrize("form", ["cif", "mmcif", "xyz", "pdb", "lammpstrj"])
+@pytest.mark.parametrize("symbol", ["SI", "CU", "FE", "NI", "CO", "ZN", "CL", "HO"])
+def test_elements_in_capitals(form, symbol, tmp_path):
+    """As in all mmCIF and PDB, and in CIF and other files of some programs."""
+    element = symbol.capitalize()
+    text = in_capitals(form, symbol, "O")
+    assert elements_in(tmp_path, form, text, element, "O") == ((element, "O"), ANY)
+    one = "H" if symbol == "HO" else symbol[0]
+    with pytest.raises(SceneError, match=f"no entry of sites has this name or the name {element};"):
+        elements_in(tmp_path, form, in_capitals(form, symbol, one), one)  # beside C, CO is cobalt
+
+
+def test_symbols_in_capitals_that_are_names(tmp_path):
+    """CO of a file with names of sites as types is carbon, if the formula or the scene says so."""
+    of_formula = in_capitals("cif", "CO", "O", "C1 O1")
+    assert elements_in(tmp_path, "cif", of_formula, "CO", "O")[0] == ("C", "O")
+    text = in_capitals("cif", "CO", "O")
+    elements, notes = elements_in(tmp_path, "cif", text, "C", "O")
+    assert elements == ("C", "O")
+    assert "in capitals in its column of elements were read: CO as a name of C" in notes
+    elements, notes = elements_in(tmp_path, "cif", text, "CO", "O")
+    assert elements == ("Co", "O")
+    assert "were read: CO as Co" in notes
+    of_formula = in_capitals("cif", "CO", "C", "Co1 C1")
+    assert elements_in(tmp_path, "cif", of_formula, "Co", "C") == (("Co", "C"), ANY)
+
+
+def test_elements_of_names_are_those_of_the_entries(tmp_path):
+    """A .gro has names only."""
+    text = "x\n    1\n    1FRM     CU    1   0.100   0.100   0.100\n   1.2   1.2   1.2\n"
+    assert elements_in(tmp_path, "gro", text, "Cu")[0] == ("Cu",)
+    assert elements_in(tmp_path, "gro", text, "C")[0] == ("C",)

@@ -586,6 +586,26 @@ def test_names_begin_with_an_element_of_the_scene_if_they_can():
     assert element_of("CA", frozenset("C")) == "C"
 
 
+@pytest.mark.parametrize("form", ["xyz", "cif"])
+def test_names_in_capitals_in_a_column_of_elements(form, tmp_path):
+    """HO is hydrogen in a scene with water, and holmium in none."""
+    truth = Truth(["spce"] * 3, 5)
+    rows = [(n, {"H": "HO"}.get(e, e), k, x, v) for n, e, k, x, v in truth.atoms()]
+    text = xyz(rows, truth.cell)
+    if form == "cif":
+        inverse = np.linalg.inv(truth.cell)
+        edges = [
+            f"_cell_length_{x} {edge}" for x, edge in zip("abc", np.diag(truth.cell), strict=True)
+        ]
+        edges += [f"_cell_angle_{x} 90" for x in ("alpha", "beta", "gamma")]
+        columns = [f"_atom_site_{c}" for c in ("type_symbol", "fract_x", "fract_y", "fract_z")]
+        lines = [f"{e} {' '.join(f'{u:.9f}' for u in x @ inverse)}" for _, e, _, x, _ in rows]
+        text = "\n".join(["data_x", *edges, "loop_", *columns, *lines, ""])
+    found = read(tmp_path, text, f"a.{form}")
+    same_molecules(found, truth, [SPECIES["spce"]], 1e-5)
+    assert any("were read: HO as a name of H" in note for note in found.notes)
+
+
 @pytest.mark.parametrize("ending", ["gro", "pdb", "xyz"])
 def test_ions_among_waters(ending, tmp_path):
     truth = Truth(["spce", "sodium", "chloride", "spce", "chloride"], 2)

@@ -195,6 +195,9 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         for m in {m.name: m for m in species}.values()
         if m.mixing not in (None, scene.forces.mixing)
     )
+    system.notes.extend(
+        f"{m.name}: {note}" for m in {m.name: m for m in species}.values() for note in m.reading
+    )
     if scene.structure is None:
         system.notes.extend(f"box: {note}" for note in start.notes)
         return system

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidmd.errors import InputError, MoleculeError, SceneError, StructureError
 from rigidmd.forces.parts import select_by_number
-from rigidmd.formats.atoms import HEAVY_HYDROGEN, Atoms
+from rigidmd.formats.atoms import HEAVY_HYDROGEN, Atoms, is_element
 from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import (
@@ -60,14 +60,16 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
             () if entry.parameters is None else read_parameters(scene.path(entry.parameters)).sites
         )
         if entry.file is None:
-            sites = with_parameters(not_none(entry.sites), table)
+            sites, notes = with_parameters(not_none(entry.sites), table), []
         else:
             where = "sites or of parameters" if entry.parameters is not None else "sites"
-            sites = sites_of_geometry(scene.path(entry.file), entry.sites or (), table, where)
+            path = scene.path(entry.file)
+            sites, notes = sites_of_geometry(path, entry.sites or (), table, where)
         if entry.repeat is None:
             kind = molecule(entry.label, sites)
         else:
             kind = _framework(scene.path(not_none(entry.file)), entry.label, sites, entry.repeat)
+        kind = replace(kind, reading=tuple(notes))
     if entry.masses_u is not None:
         kind = with_masses(kind, entry.masses_u)
     changed = {
@@ -91,22 +93,27 @@ def _framework(
         for site in sites
     )
     cell = cell * np.array(repeat)[:, None]
-    return replace(molecule(name, repeated), cell=cell, note="; ".join(atoms.notes))
+    return replace(molecule(name, repeated), cell=cell)
+
+
+def _elements_of(entries: tuple[Site, ...]) -> frozenset[str]:
+    """The elements that entries of parameters have or are named by."""
+    return frozenset(x for s in entries for x in (s.name, s.element) if is_element(x))
 
 
 def sites_of_geometry(
     path: Path, entries_of_scene: tuple[Site, ...], table: tuple[Site, ...], where: str
-) -> tuple[Site, ...]:
+) -> tuple[tuple[Site, ...], list[str]]:
     """Sites with positions from a file and parameters from entries of the scene or a table, by atom
-    name or else by element. `where` names the entries in messages. Raises StructureError with all
-    errors."""
+    name or else by element, and notes on the file. `where` names the entries in messages. Raises
+    StructureError with all errors."""
     faults = []
     sites = []
     used = set()
     available = list(dict.fromkeys(site.name for site in (*entries_of_scene, *table))) or ["none"]
     listed = ", ".join(available[:MOST_LISTED]) + (", ..." if len(available) > MOST_LISTED else "")
     hint = f"there are {listed}. The atoms of the file may have these names in place of elements"
-    atoms = read_geometry(path)
+    atoms = read_geometry(path, _elements_of((*entries_of_scene, *table)))
     charges = [None] * len(atoms.names) if atoms.charges is None else atoms.charges.tolist()
     columns = atoms.names, atoms.elements, not_none(atoms.masses), atoms.position, charges
     for name, element, mass, position, charge in zip(*columns, strict=True):
@@ -134,7 +141,7 @@ def sites_of_geometry(
     ]
     if faults:
         raise StructureError(str(path), list(dict.fromkeys(faults)))
-    return with_parameters(tuple(sites), table)
+    return with_parameters(tuple(sites), table), list(atoms.notes)
 
 
 def split_frozen(
@@ -181,21 +188,21 @@ def model_from_geometry(
     """
     notes = []
     source = [f"geometry of {geometry.name}"]
-    atoms = read_geometry(geometry)
+    table = None if parameters is None else read_parameters(parameters)
+    atoms = read_geometry(geometry, _elements_of(() if table is None else table.sites))
     names, elements = atoms.names, atoms.elements
-    if parameters is None:
-        sites = sites_of_geometry(
-            geometry, (), tuple(Site(name=element) for element in dict.fromkeys(elements)), ""
-        )
+    if table is None:
+        entries = tuple(Site(name=element) for element in dict.fromkeys(elements))
+        sites, reading = sites_of_geometry(geometry, (), entries, "")
         notes.append(
             "it has no interactions: give its sites charge_e, sigma_A and epsilon_kJ_mol, or use"
             " --parameters"
         )
     else:
-        table = read_parameters(parameters)
-        sites = sites_of_geometry(geometry, (), table.sites, "the table")
+        sites, reading = sites_of_geometry(geometry, (), table.sites, "the table")
         source.append(
-            f"parameters of {parameters.name}" + (f": {table.source}" if table.source else "")
+            f"parameters of {not_none(parameters).name}"
+            + (f": {table.source}" if table.source else "")
         )
         used = [
             find_site(table.sites, *atom)
@@ -204,6 +211,7 @@ def model_from_geometry(
         if idle := [entry.name for entry in table.sites if entry not in used]:
             notes.append(f"{parameters}: no atom uses {', '.join(idle)}")
     sites = _numbered(sites)
+    notes += reading
     if long := sorted({atom for atom in names if len(atom) > 5}):
         notes.append(f"names of atoms have five characters at most: {', '.join(long)} are cut")
     residues = {residue[1] for residue in atoms.residue if len(residue) > 1}

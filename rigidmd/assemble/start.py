@@ -127,7 +127,6 @@ def _about_framework(
         velocity=None,
         angular_momentum_body=None,
         cell=cell,
-        notes=(f"of {body.name}: {body.note}",) if body.note else (),
     )
     return with_reduced_cell(configuration, "its", may_rotate=True)
 

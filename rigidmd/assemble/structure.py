@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.assemble.assignment import massive_sites
-from rigidmd.assemble.atom_kinds import NO_MASS
+from rigidmd.assemble.atom_kinds import NO_MASS, labels_of
 from rigidmd.assemble.matching import MatchedMolecules, match
 from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.core.state import edges_and_angles
@@ -17,7 +17,7 @@ from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.formats import has_types
-from rigidmd.formats.atoms import SAME_MASS, Atoms
+from rigidmd.formats.atoms import SAME_MASS, Atoms, with_elements
 from rigidmd.formats.cells import (
     basis_of,
     cell_error,
@@ -204,6 +204,7 @@ def _read_molecules(
         ]
         raise StructureError(str(path), faults)
     atoms = read_atoms(path, frame, atom_types, topology, content)
+    atoms = with_elements(atoms, frozenset(label for m in species for label in labels_of(m)))
     notes = list(atoms.notes)
     if atoms.cell is not None:
         orientation = np.linalg.det(atoms.cell)

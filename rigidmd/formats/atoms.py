@@ -31,6 +31,8 @@ CHARMM_IONS = {
 #: CHARMM's names of the oxygen and the massless site of four-site waters, both of which start like
 #: oxygen.
 CHARMM_WATER = ("OH2", "OM")
+#: Elements of two letters that are meant by their symbols in capitals, in names too.
+HALOGENS = ("CL", "BR")
 #: Names of massless sites: M of four-site waters, L of five-site ones, and the names that programs
 #: give them.
 MASSLESS_NAME = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM?|VS|XX?|Q)\d*", re.IGNORECASE)
@@ -40,7 +42,8 @@ class Atoms(NamedTuple):
     """The n atoms of a file, in Å, ps and u."""
 
     names: list[str]
-    #: "" if the format has only names; X for massless sites, D and T for heavy hydrogen
+    #: "" if the format has only names; X for massless sites, D and T for heavy hydrogen. Capitals
+    #: such as CO may be an element or a name, see `with_elements`
     elements: list[str]
     #: (number or None, name, ...), differs between neighbours; () without residues
     residue: list[tuple]
@@ -62,16 +65,48 @@ def element_of(name: str, vocabulary: frozenset[str] = frozenset()) -> str:
     sites, "" if none."""
     letters = re.split(r"[^A-Za-z]", name.lstrip("0123456789 "), maxsplit=1)[0]
     one, two = letters[:1].upper(), letters[:2].capitalize()
-    if (
-        len(two) == 2
-        and (letters[:2] == two or letters.upper() in ("CL", "BR"))
-        and is_element(two)
-    ):
+    if len(two) == 2 and (letters[:2] == two or letters.upper() in HALOGENS) and is_element(two):
         return two
     element = next((e for e in (two, one) if e in vocabulary), "")
     if not element and MASSLESS_NAME.fullmatch(name):
         return "X"
     return element or next((e for e in (one, two) if is_element(e) or e in HEAVY_HYDROGEN), "")
+
+
+def element_of_symbol(symbol: str) -> str:
+    """The element, or heavy hydrogen, of a symbol in a column of elements. "" if it is none. Two
+    capitals that may also be a name, such as CO or HO, remain as they are."""
+    element = symbol.capitalize()
+    if not is_element(element) and element not in HEAVY_HYDROGEN:
+        return ""
+    return symbol if may_be_name(symbol) else element
+
+
+def may_be_name(symbol: str) -> bool:
+    """Whether a symbol of an element in capitals is also a name that starts with another
+    element."""
+    is_pair = len(symbol) == 2 and symbol.isupper() and symbol not in HALOGENS
+    return is_pair and is_element(symbol[0])
+
+
+def with_elements(atoms: Atoms, vocabulary: frozenset[str]) -> Atoms:
+    """The atoms with an element, or "" for a name, in place of each symbol that may be either. CO
+    is cobalt, unless the scene, with the elements `vocabulary`, has carbon and no cobalt."""
+    element_of_capitals = {}
+    read = []
+    for symbol in sorted({e for e in atoms.elements if may_be_name(e)}):
+        element = symbol.capitalize()
+        is_name = element not in vocabulary and bool({symbol, symbol[0]} & vocabulary)
+        element_of_capitals[symbol] = "" if is_name else element
+        if is_name:
+            read.append(f"{symbol} as a name of {symbol[0]}")
+        elif element not in vocabulary:
+            read.append(f"{symbol} as {element}")
+    notes = [f"symbols in capitals in its column of elements were read: {', '.join(read)}"]
+    return atoms._replace(
+        elements=[element_of_capitals.get(e, e) for e in atoms.elements],
+        notes=[*atoms.notes, *(notes if read else [])],
+    )
 
 
 def is_element(symbol: str) -> bool:

@@ -16,7 +16,9 @@ from rigidmd.formats.atoms import (
     MASSLESS_NAME,
     Atoms,
     element_of,
+    element_of_symbol,
     is_element,
+    may_be_name,
     structure_error,
 )
 from rigidmd.formats.cells import cell_of, describe_cell
@@ -202,6 +204,7 @@ class AtomSites:
         flags = block.column("_atom_site_calc_flag")
         self._block = block
         self._rows = [row for row in rows if not flags or (flags[row] or "").lower() != "dum"]
+        self._formula = _formula(block.first("_chemical_formula_sum") or "")
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -221,12 +224,19 @@ class AtomSites:
 
     def names(self) -> tuple[list[str], list[str]]:
         """Names and elements. A type that is not an element, such as OW or M, is the name."""
-        labels = self.column("label_atom_id" if self.has("label_atom_id") else "label")
+        is_mmcif = self.has("label_atom_id")
+        labels = self.column("label_atom_id" if is_mmcif else "label")
         authors = self.column("auth_atom_id")
         names, elements = [], []
         for label, author, symbol in zip(labels, authors, self.column("type_symbol"), strict=True):
             element = _element(symbol or "")
-            is_type = bool(symbol) and element in ("", "X") and not self.has("label_atom_id")
+            if is_mmcif or element.capitalize() in self._formula:
+                element = element.capitalize()  # symbols of mmCIF are in capitals
+            elif element[:1] in self._formula and may_be_name(element):
+                element = ""
+            is_type = (
+                bool(symbol) and not is_mmcif and (element in ("", "X") or may_be_name(element))
+            )
             names.append((symbol if is_type else label or author or symbol) or "")
             elements.append(element)
         return names, elements
@@ -251,13 +261,10 @@ class AtomSites:
 
 
 def _element(symbol: str) -> str:
-    """The element of a type such as C, Cl, O2- or D. X for massless sites. "" if it may be two
-    elements or none."""
+    """The element of a type such as C, Cl, O2- or D, as of `element_of_symbol`. X for massless
+    sites."""
     match = re.fullmatch(r"([A-Za-z]{1,2})[\d.]*[-+]?\d*", symbol)
-    letters = match[1] if match else ""
-    element = letters.capitalize()
-    is_upper = len(letters) == 2 and letters.isupper() and is_element(letters[0])  # CO, HO
-    if (is_element(element) or element in HEAVY_HYDROGEN) and not is_upper:
+    if match and (element := element_of_symbol(match[1])):
         return element
     return "X" if MASSLESS_NAME.fullmatch(symbol) else ""
 
@@ -267,10 +274,10 @@ def _radii(kinds: list[str]) -> np.ndarray:
     from ase.data import atomic_numbers, covalent_radii
 
     known = {
-        kind: "H" if kind in HEAVY_HYDROGEN else kind if is_element(kind) else "X"
+        kind: "H" if kind in HEAVY_HYDROGEN else kind if is_element(kind) else element_of(kind)
         for kind in set(kinds)
     }
-    return np.array([covalent_radii[atomic_numbers[known[kind]]] for kind in kinds])
+    return np.array([covalent_radii[atomic_numbers[known[kind] or "X"]] for kind in kinds])
 
 
 def _check_order(path: Path, sites: AtomSites) -> None:

@@ -13,11 +13,10 @@ import numpy as np
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.formats import Format, register
 from rigidmd.formats.atoms import (
-    HEAVY_HYDROGEN,
     Atoms,
     atom_count,
     element_of_mass,
-    is_element,
+    element_of_symbol,
     names_of_types,
     numbers,
     structure_error,
@@ -412,7 +411,7 @@ def _dump_names(
     if atom_types is not None:
         labels = dict(zip(types, labelled, strict=False))
         return names_of_types(path, types, [], labels, atom_types), [""] * len(types)
-    elements = [e if is_element(e) or e in HEAVY_HYDROGEN else "" for e in named]
+    elements = [element_of_symbol(e) for e in named]
     if not elements and masses is not None:
         element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}
         elements = [element[mass] for mass in masses.tolist()]

@@ -11,10 +11,9 @@ import numpy as np
 
 from rigidmd.formats import Encode, Format, System, Topology, register
 from rigidmd.formats.atoms import (
-    HEAVY_HYDROGEN,
     Atoms,
     Frame,
-    is_element,
+    element_of_symbol,
     numbers,
     structure_error,
     unexpected,
@@ -104,9 +103,9 @@ def _pdb_model(
     for number, full in body:
         line, end, coordinates = _pdb_columns(path, number, full)
         position.append(coordinates)
-        symbol = full[end + 22 : end + 24].strip().capitalize()
+        # in capitals: CO is cobalt
+        elements.append(element_of_symbol(full[end + 22 : end + 24].strip()).capitalize())
         names.append(line[12:16].strip())
-        elements.append(symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else "")
         locations.add(line[16:17].strip())
         if (here := line[17:28]) != last:  # name, chain, number and insertion code
             count = count + 1

@@ -13,7 +13,7 @@ from rigidmd.formats.atoms import (
     Atoms,
     Frame,
     atom_count,
-    is_element,
+    element_of_symbol,
     numbers,
     unexpected,
     without_fortran,
@@ -59,7 +59,7 @@ def read_xyz(
             if column is not None:
                 labels[-1] = _label(words[column], atom_types)
                 _, symbol = labels[-1]
-                words[column] = "H" if symbol in HEAVY_HYDROGEN else symbol or "X"
+                words[column] = "H" if symbol in HEAVY_HYDROGEN else symbol.capitalize() or "X"
             clean.append(" ".join(words))
         at += 2 + count
     frames = []
@@ -76,15 +76,14 @@ def read_xyz(
 
 
 def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
-    """Name and element of an atom. The name in the file may be that of a type, or an atomic
-    number."""
+    """Name and element of an atom, as of `element_of_symbol`. The name in the file may be that of a
+    type, or an atomic number."""
     from ase.data import chemical_symbols
 
     name = (atom_types or {}).get(name, name)
     if (number := parse_whole_number(name)) is not None and 0 < number < len(chemical_symbols):
         name = chemical_symbols[number]
-    symbol = name.capitalize()
-    return name, symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else ""
+    return name, element_of_symbol(name)
 
 
 def _columns(properties: str) -> tuple[int | None, int | None, int]:

@@ -17,7 +17,7 @@ from rigidmd.core.files import unreadable_reason
 from rigidmd.core.process import format_gigabytes, memory_shortage
 from rigidmd.errors import UNPRINTABLE
 from rigidmd.formats import BY_CONTENT, BY_EXTENSION, TOPOLOGIES, Format, format_of
-from rigidmd.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of, structure_error
+from rigidmd.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of, structure_error, with_elements
 from rigidmd.formats.through_ase import from_ase, read_by_ase, read_text_by_ase
 from rigidmd.formats.through_mdanalysis import index_of, read_in_process
 from rigidmd.scene.validation import not_none
@@ -125,8 +125,9 @@ def _no_types() -> str:
     return f"structure.atom_types is for formats whose atoms have types: {', '.join(names)}"
 
 
-def read_geometry(path: Path) -> Atoms:
-    """The atoms of a file with one molecule, with elements and masses of all."""
+def read_geometry(path: Path, vocabulary: frozenset[str] = frozenset()) -> Atoms:
+    """The atoms of a file with one molecule, with elements and masses of all. `vocabulary`:
+    elements of the entries of parameters, by which names are understood."""
     from ase.data import atomic_masses, atomic_numbers
 
     if (form := format_of(path)) is not None and form.is_trajectory:
@@ -134,8 +135,11 @@ def read_geometry(path: Path) -> Atoms:
             path, "is a trajectory: name a structure file, or write one of its frames as a file"
         )
     atoms = read_atoms(path)
+    # beside C, CO is cobalt
+    atoms = with_elements(atoms, vocabulary.difference(atoms.elements))
     elements = [
-        e or element_of(name) or "X" for e, name in zip(atoms.elements, atoms.names, strict=True)
+        e or element_of(name, vocabulary) or "X"
+        for e, name in zip(atoms.elements, atoms.names, strict=True)
     ]
     masses = atoms.masses
     if masses is None:

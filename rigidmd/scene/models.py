@@ -176,6 +176,7 @@ class Molecule:
     mixing: Mixing | None = None
     parameters: tuple[dict[str, float], ...] = ()  # of each site, for custom pair potentials
     cell: np.ndarray | None = None  # (3, 3) Å, of a framework, in the coordinates of its file
+    reading: tuple[str, ...] = ()  # how the structure file of its sites was interpreted
 
     def __repr__(self) -> str:
         return f"<Molecule {self.name}: {self.description}>"
