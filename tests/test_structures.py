@@ -606,6 +606,34 @@ def test_names_in_capitals_in_a_column_of_elements(form, tmp_path):
     assert any("were read: HO as a name of H" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("file", ["a.gro", "a.g96"])
+@pytest.mark.parametrize("edge", [12000.0, 999999.0, 1.5e6])
+def test_boxes_that_fill_their_columns(file, edge, tmp_path):
+    """As GROMACS writes them, ten or fifteen characters to a number and no space between."""
+    truth = Truth(["spce"] * 3, 5)
+    cell = np.diag([edge, edge + 7.0, edge + 9.0])
+    rows = truth.atoms()
+    box = "".join(f"{x / 10:10.5f}" for x in np.diag(cell))
+    atoms = [(name, x) for name, _, _, x, _ in rows]
+    text = gro(rows, box) if file == "a.gro" else as_g96(atoms, cell)
+    found = read(tmp_path, text, file)
+    assert found.cell == pytest.approx(cell)
+    assert len(found.species) == 3
+
+
+def test_columns_of_a_gro_that_are_too_narrow(tmp_path):
+    """Coordinates from 100,000 Å on move the following ones; velocities are three or none."""
+    row = "    1ARG     Ar    1{}\n"
+    head, box = "x\n    2\n" + row.format("   1.000   2.000   3.000"), "  30.0  30.0  30.0\n"
+    for columns in ("10000.00012345.67810000.000", "10000.000   2.000   3.000"):
+        with pytest.raises(StructureError, match=r"line 4: expected an atom of a \.gro with coord"):
+            read(tmp_path, head + row.format(columns) + box, "a.gro", ["argon"])
+    for columns in ("  1.0000", "  1.0000  2.0000"):
+        text = head + row.format("   4.000   5.000   6.000" + columns) + box
+        with pytest.raises(StructureError, match="line 4: expected three velocities or none"):
+            read(tmp_path, text, "a.gro", ["argon"])
+
+
 @pytest.mark.parametrize("ending", ["gro", "pdb", "xyz"])
 def test_ions_among_waters(ending, tmp_path):
     truth = Truth(["spce", "sodium", "chloride", "spce", "chloride"], 2)

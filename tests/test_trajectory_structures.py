@@ -21,7 +21,7 @@ from rigidmd.assemble.build import build
 from rigidmd.assemble.structure import read_structure
 from rigidmd.commands import cli
 from rigidmd.core.process import ignore_warnings
-from rigidmd.core.state import NO_CELL
+from rigidmd.core.state import NO_CELL, edges_and_angles
 from rigidmd.errors import SceneError, SimulationError, StructureError
 from rigidmd.formats import BY_EXTENSION, Topology, through_mdanalysis
 from rigidmd.formats.atoms import Frame
@@ -634,6 +634,45 @@ def test_a_topology_is_read_by_other_programs(name, box, tmp_path):
         assert u.atoms.elements.tolist() == ["O", "H", "H", ""] * 4  # MDAnalysis knows no X
         pairs = {tuple(sorted(pair)) for pair in u.bonds.indices.tolist()}
         assert pairs == {(4 * m, 4 * m + h) for m in range(4) for h in (1, 2)}
+
+
+@pytest.mark.parametrize("edge", [9999.5, 12000.0, 123456.0])
+@pytest.mark.parametrize("angles", [90.0, 75.0])
+@pytest.mark.parametrize("name", ["t.gro", "t.pdb"])
+def test_a_wide_box_is_read_back(name, angles, edge, tmp_path):
+    """Its numbers fill their columns; those of a triclinic .gro are negative too."""
+    box = {
+        "lengths_A": [edge, edge + 100.0, edge + 200.0],
+        "angles_deg": [angles, 180 - angles, 90],
+    }
+    system = build(small_scene({"argon": 2}, None, box=box, forces={"cutoff_A": 8.0}))
+    state = system.state
+    state.position[:] = [[1.0, 2, 3], [4, 5, 6]]
+    write_topology(tmp_path / name, system, state, wrapped=False)
+    found = read_atoms(tmp_path / name)
+    assert found.position == pytest.approx(state.position, abs=1e-3)
+    assert edges_and_angles(found.cell) == pytest.approx(edges_and_angles(state.cell), rel=1e-5)
+    assert mda.Universe(str(tmp_path / name)).dimensions[:3] == pytest.approx(
+        edges_and_angles(state.cell)[:3], rel=1e-5
+    )
+
+
+def test_a_run_in_a_wide_box_continues_from_its_trajectory(tmp_path):
+    """A dilute gas: the trajectory has no names, which are in topology.gro beside it."""
+    changes = {"forces": {"cutoff_A": 9.0}, "output": {"trajectory_interval_ps": 0.004}}
+    scene = small_scene({"argon": 2}, 12000.0, **changes)
+    results = Simulation(scene, tmp_path / "run").run()
+    found = read_structure(
+        tmp_path / "run" / "trajectory.xtc",
+        results.system.species,
+        None,
+        True,
+        0.15,
+        topology=tmp_path / "run" / "topology.gro",
+    )
+    assert found.cell == pytest.approx(12000.0 * np.eye(3))
+    step = (found.position - results.state.position) / 12000.0
+    assert step == pytest.approx(np.rint(step), abs=1e-5)
 
 
 def test_numbers_beyond_the_columns_of_a_topology():

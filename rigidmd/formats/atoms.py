@@ -205,6 +205,15 @@ def numbers(path: Path, line: int, words: list[str], what: str) -> list[float]:
         raise unexpected(path, line, what, " ".join(words)) from None
 
 
+def joined_numbers(text: str) -> list[str]:
+    """Numbers of a line, separated by spaces, or without spaces if all have as many decimals and
+    fill their columns: 1200.00000-1200.00000."""
+    words = text.split()
+    decimals = len(text.rstrip()) - text.rfind(".") - 1
+    in_columns = re.findall(rf"-?\d+\.\d{{{decimals}}}", text) if "." in text else []
+    return in_columns if "".join(in_columns) == "".join(words) else words
+
+
 def table(path: Path, rows: list[tuple[int, list[str]]], what: str) -> np.ndarray:
     """Words of lines, each with its number, as numbers (n, k). Raises StructureError as `numbers`
     does."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.formats import Format, register
-from rigidmd.formats.atoms import Atoms, numbers, structure_error, unexpected
+from rigidmd.formats.atoms import Atoms, joined_numbers, numbers, structure_error, unexpected
 
 #: Columns before the coordinates: number and name of the residue, name and number of the atom.
 HEAD = 24
@@ -77,7 +77,7 @@ def _vectors(path: Path, frame: dict[str, Lines], blocks: tuple[str, ...]) -> np
     start = 0 if name.endswith("RED") else HEAD
     rows = []
     for number, line in frame.get(name, ()):
-        words = line[start:].split()
+        words = joined_numbers(line[start:])
         if len(words) != 3:
             raise unexpected(
                 path, number, f"three numbers of {name} from column {start + 1}", line.strip()
@@ -89,7 +89,7 @@ def _vectors(path: Path, frame: dict[str, Lines], blocks: tuple[str, ...]) -> np
 def _box(path: Path, frame: dict[str, Lines]) -> np.ndarray | None:
     """The cell (3, 3) of a block BOX, three edges or nine numbers, in Å."""
     content = frame.get("BOX", [])
-    words = [word for _, line in content for word in line.split()]
+    words = [word for _, line in content for word in joined_numbers(line)]
     if not words:
         return None
     line = content[0][0]

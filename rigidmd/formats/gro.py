@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.formats import Format, Topology, register
-from rigidmd.formats.atoms import Atoms, numbers, structure_error, unexpected
+from rigidmd.formats.atoms import Atoms, joined_numbers, numbers, structure_error, unexpected
 
 NM_PER_A = 0.1
 #: Numbers with more digits than a column are written without the leading ones.
@@ -40,7 +40,7 @@ def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
                 path, f"line {first + 2} promises {count} atoms and a box, {reason}"
             )
         what = "the box, 3 or 9 numbers (is the number of atoms right?)"
-        edges = numbers(path, box + 1, lines[box].split(), what)
+        edges = numbers(path, box + 1, joined_numbers(lines[box]), what)
         if len(edges) not in (3, 9):
             raise unexpected(path, box + 1, what, lines[box].strip())
         frames.append(partial(_gro_frame, path, lines, first, box, edges))
@@ -61,14 +61,19 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
     cuts = list(pairwise(range(20, 21 + 6 * width, width)))
     for k in range(first + 2, box):
         line = lines[k]
-        values = [line[a:b].strip() for a, b in cuts]
+        fields = [line[a:b] for a, b in cuts]
+        values = [field.strip() for field in fields]
         what = (
             f"an atom of a .gro with coordinates in columns of {width} (is the number of atoms"
             " right?)"
         )
+        # of wider numbers, the next column starts with the end
+        if points and any("." in x and x.find(".") != points[0] for x in fields[:3]):
+            raise unexpected(path, k + 1, what, line[20:])
         position[k - first - 2] = numbers(path, k + 1, values[:3], what)
-        words = [v for v in values[3:] if v]
-        if len(words) == 3:
+        if words := [v for v in values[3:] if v]:
+            if len(words) != 3:
+                raise unexpected(path, k + 1, "three velocities or none", " ".join(words))
             components = numbers(path, k + 1, words, "three velocities")
             if not np.isfinite(components).all():
                 owner = f"line {k + 1}: atom {k - first - 1}"

@@ -148,6 +148,15 @@ def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[flo
     )
 
 
+def _box_lines(cell: np.ndarray | None) -> list[str]:
+    """CRYST1 of a cell (3, 3). Edges of 100,000 Å and more have fewer decimals, to stay in their
+    columns."""
+    if (box := dimensions(cell)) is None:
+        return []
+    edges = "".join(f"{edge:9.3f}"[:9] for edge in box[:3])
+    return [f"CRYST1{edges}{''.join(f'{angle:7.2f}' for angle in box[3:])} P 1           1"]
+
+
 def encoder(system: System, interval: float, velocities: bool) -> Encode:
     """Models, each with its time in a remark and its box before it. Bonds are in the topology."""
     files = FrameFiles(
@@ -158,17 +167,15 @@ def encoder(system: System, interval: float, velocities: bool) -> Encode:
         def write(writer, atoms):
             writer.REMARK(f"TIME {frame.time:.6f} PS")
             writer.write(atoms)
-            if box := dimensions(frame.cell):
-                writer.CRYST1(box)
 
         # without END, which readers count as a further frame
         lines = (
             files.content(frame, write, start=k).removesuffix(b"END\n").splitlines(keepends=True)
         )
         model = next(i for i, line in enumerate(lines) if line.startswith(b"MODEL "))
-        box = [line for line in lines[-1:] if line.startswith(b"CRYST1")]
         head = [line for line in lines[: 1 if k else model] if not line.startswith(b"CRYST1")]
-        return b"".join([*head, *box, *lines[model : len(lines) - len(box)]])
+        box = [f"{line}\n".encode() for line in _box_lines(frame.cell)]
+        return b"".join([*head, *box, *lines[model:]])
 
     return encode
 
@@ -176,12 +183,7 @@ def encoder(system: System, interval: float, velocities: bool) -> Encode:
 def pdb_text(system: Topology) -> str:
     """One model with its bonds. Numbers wider than their columns lose their leading digits. Atoms
     from 100,000 on have no bonds."""
-    lines = ["TITLE     Written by rigidmd"]
-    if box := dimensions(system.cell):
-        edges = box[:3]
-        angles = box[3:]
-        sizes = "".join(f"{edge:9.3f}" for edge in edges)
-        lines.append(f"CRYST1{sizes}{''.join(f'{angle:7.2f}' for angle in angles)} P 1           1")
+    lines = ["TITLE     Written by rigidmd", *_box_lines(system.cell)]
     rows = zip(
         system.names,
         system.elements,
