@@ -520,7 +520,7 @@ def test_dummies_are_left_out(tmp_path):
         ("0.25 ", "? ", "atom H1 has no position, expected three numbers, found 0.2 None 0.2"),
         ("0.25 ", "1/4 ", "atom H1 has no position, expected three numbers, found 0.2 1/4 0.2"),
         ("0.22", "", r"line \d+: this is not valid CIF: Wrong number of values in loop _atom_site"),
-        ("data_test", "", "line 2: this is not valid CIF: expected block header"),
+        ("data_test", "test", "line 1: this is not valid CIF: expected block header"),
         ("data_test", "data_test\n_cell_length_a 8", "duplicate tag _cell_length_a"),
     ],
 )
@@ -695,3 +695,59 @@ def test_symmetry_and_orientation_of_mmcif(tmp_path):
 def test_radii_are_in_angstrom():
     """The tolerance of special positions relies on this table."""
     assert ase.data.covalent_radii[[1, 6, 18]] == pytest.approx([0.31, 0.76, 1.06])
+
+
+# syntax
+
+#: Entries that are not needed, of which the second line is not valid CIF.
+BAD_ENTRIES = {
+    "comma": "_citation_author_name 'A. Author, and B. Writer',\n_citation_year 2002\n",
+    "loop": "loop_\n_publ_author_name\n_publ_author_address\n'A. Author'\n'B. Writer' 'C'\n",
+    "twice": "_publ_section_title 'One'\n_publ_section_title 'Two'\n",
+    "quote": "_publ_section_title 'Structure of a crystal\n",
+    "text": "_publ_section_title\n;\nloop_\n_cell_length_a\nin words\n;\n_journal_name 'x',\n",
+    "none": "_journal_name\n_journal_year 2002\n",
+}
+
+
+@pytest.mark.parametrize("name", BAD_ENTRIES)
+@pytest.mark.parametrize("at", ["begin", "middle", "end"])
+def test_invalid_entries_that_are_not_needed(name, at, tmp_path):
+    """As in RASPA's IRMOF-2: a comma after a quoted citation."""
+    text = cif((9, 10, 11, 90, 90, 90), operations=("x,y,z", "-x,-y,-z"))
+    expected = read(tmp_path, text)
+    bad = BAD_ENTRIES[name]
+    marks = {"begin": "_cell_length_a", "middle": "loop_\n_space_group"}
+    changed = text + bad if at == "end" else text.replace(marks[at], bad + marks[at])
+    found = read(tmp_path, changed)
+    assert np.array_equal(found.position, expected.position)
+    assert found.names == expected.names
+    assert re.search(r"this is not valid CIF: .*, in an entry that is not needed", found.notes[0])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("'-x,-y,-z'", "'-x,-y,-z',"),
+        ("_cell_length_a 9", "_cell_length_a 9 10"),
+        ("_cell_length_a 9", "_cell_length_a 9\n_cell_length_a 10"),
+        ("0.27 0.22", "0.27"),
+        ("0.27 0.22", "'0.27 0.22"),
+    ],
+)
+def test_invalid_entries_that_are_needed(change, tmp_path):
+    text = cif((9, 10, 11, 90, 90, 90), operations=("x,y,z", "-x,-y,-z"))
+    with pytest.raises(StructureError, match=r"line \d+: this is not valid CIF: .*complete\?"):
+        read(tmp_path, text.replace(*change))
+    bad = BAD_ENTRIES["comma"]
+    with pytest.raises(StructureError, match=r"this is not valid CIF: .*complete\?"):
+        read(tmp_path, text.replace(*change).replace("_cell_length_b", f"{bad}_cell_length_b"))
+
+
+def test_a_file_without_the_line_of_its_block(tmp_path):
+    text = cif((9, 10, 11, 90, 90, 90)).replace("data_test\n", "# made by me\n\n")
+    found = read(tmp_path, text)
+    assert found.names == ["O1", "H1", "H2"]
+    assert "line 3: there is no 'data_' before its first entry" in found.notes
+    with pytest.raises(StructureError, match="not valid CIF"):
+        read(tmp_path, f"made by me\n{text}")

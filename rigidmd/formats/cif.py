@@ -22,6 +22,7 @@ from rigidmd.formats.atoms import (
     structure_error,
 )
 from rigidmd.formats.cells import cell_of, describe_cell
+from rigidmd.formats.cif_syntax import parse_cif, tag_of
 from rigidmd.formats.crystal import (
     IDENTITY,
     NoSymmetry,
@@ -68,6 +69,11 @@ CODES = ("_space_group_it_coordinate_system_code",)
 SYSTEMS = ("_space_group_crystal_system", "_symmetry_cell_setting")
 LISTED = "its list of operations"
 MODEL = "_atom_site_pdbx_pdb_model_num"
+FORMULA, UNITS_IN_CELL = "_chemical_formula_sum", "_cell_formula_units_z"
+DENSITY = "_exptl_crystal_density_diffrn"
+#: Tags that are read, beside those of atoms.
+READ = {*CELL, *OPERATIONS, *HALL, *NAMES, *NUMBERS, *CODES, *SYSTEMS}
+READ |= {FORMULA, UNITS_IN_CELL, DENSITY}
 #: Neighbouring residues of an mmCIF differ in one of these.
 RESIDUE = (
     "label_asym_id",
@@ -79,6 +85,11 @@ RESIDUE = (
 )
 
 
+def _is_read(tag: str) -> bool:
+    is_of_atoms = tag.startswith("_atom_site") and not tag.startswith("_atom_site_aniso")
+    return is_of_atoms or tag in READ
+
+
 class Block:
     """The values of a data block by tag, in lower case and with _ for the . of mmCIF. None for
     values not given."""
@@ -87,11 +98,11 @@ class Block:
         self._raw: dict[str, list[str]] = {}
         for item in block:
             if item.pair is not None:
-                self._raw[_tag(item.pair[0])] = [item.pair[1]]
+                self._raw[tag_of(item.pair[0])] = [item.pair[1]]
             elif item.loop is not None:
                 values = item.loop.values
                 width = item.loop.width()
-                self._raw |= {_tag(tag): values[k::width] for k, tag in enumerate(item.loop.tags)}
+                self._raw |= {tag_of(tag): values[k::width] for k, tag in enumerate(item.loop.tags)}
 
     def __contains__(self, tag: str) -> bool:
         return tag in self._raw
@@ -110,10 +121,6 @@ class Block:
         return next((value for tag in tags for value in self.column(tag) if value), None)
 
 
-def _tag(tag: str) -> str:
-    return tag.lower().replace(".", "_")
-
-
 def number_of(text: str | None) -> tuple[float, float]:
     """A number and its standard uncertainty, as of 0.1185(5). NaN and 0 if the text is not one."""
     match = re.fullmatch(
@@ -127,35 +134,21 @@ def number_of(text: str | None) -> tuple[float, float]:
 
 def read_cif(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The structures of a file: its data blocks with atoms, and the models in them."""
-    import gemmi
-
-    # Names of authors may have any letters, also where CIF allows ASCII only.
-    text = "\n".join(lines).encode("ascii", errors="replace").decode()
-    try:
-        document = gemmi.cif.read_string(text)
-    except (ValueError, RuntimeError) as error:
-        raise structure_error(path, _syntax_error(str(error))) from None
+    blocks, notes = parse_cif(path, lines, _is_read)
     structures = []
-    for content in document:
+    for content in blocks:
         block = Block(content)
         count = max(len(block.column(f"_atom_site_{axis}_x")) for axis in ("fract", "cartn"))
         models: dict[str | None, list[int]] = {}
         for row, model in enumerate(block.column(MODEL) or [None] * count):
             models.setdefault(model, []).append(row)
-        structures += [partial(_structure, path, block, rows) for rows in models.values()]
+        structures += [partial(_structure, path, block, rows, notes) for rows in models.values()]
     return structures
 
 
-def _syntax_error(message: str) -> str:
-    """A message of gemmi, such as string:2:0(7): Wrong number of values, with its line."""
-    match = re.match(r"string(?::(\d+))?(?::\d+\(\d+\))?(?: in \S+)?:? *(.*)", message, re.DOTALL)
-    line, what = (match[1], match[2]) if match else (None, message)
-    where = f"line {line}: " if line else ""
-    return f"{where}this is not valid CIF: {what or 'damaged'}. Is the file complete?"
-
-
-def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
-    """One structure: the atoms of these rows and their images by symmetry."""
+def _structure(path: Path, block: Block, rows: list[int], syntax: list[str]) -> Atoms:
+    """One structure: the atoms of these rows and their images by symmetry. `syntax`: notes on the
+    file."""
     sites = AtomSites(block, rows)
     _check_order(path, sites)
     names, elements = sites.names()
@@ -167,10 +160,11 @@ def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
         raise structure_error(path, f"has no cell: {CELL[0]} to {CELL[-1]} are missing")
     # the placeholder of the PDB
     if cell is None or (not is_fractional and np.allclose(cell, np.eye(3))):
-        return Atoms(names, elements, residue, position, cell=cell)
+        return Atoms(names, elements, residue, position, cell=cell, notes=syntax)
     if not is_fractional:
         position = _to_fractional(block, position, cell)
     operations, notes = _symmetry(path, block, cell)
+    notes = [*syntax, *notes]
     kinds = [
         element or element_of(name) or name for name, element in zip(names, elements, strict=True)
     ]
@@ -204,7 +198,7 @@ class AtomSites:
         flags = block.column("_atom_site_calc_flag")
         self._block = block
         self._rows = [row for row in rows if not flags or (flags[row] or "").lower() != "dum"]
-        self._formula = _formula(block.first("_chemical_formula_sum") or "")
+        self._formula = _formula(block.first(FORMULA) or "")
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -514,13 +508,13 @@ def _contents(
             f"{contents.copy_count} atoms of the file are images of others by symmetry"
             " and count once"
         )
-    stated = number_of(block.first("_exptl_crystal_density_diffrn"))[0]
+    stated = number_of(block.first(DENSITY))[0]
     if stated > 0 and abs(density - stated) > SAME_DENSITY * stated:
         notes.append(
             f"the density in the file is {stated:g} g/cm³, but its atoms make {density:.4g} g/cm³"
         )
-    formula = _formula(block.first("_chemical_formula_sum") or "")
-    units = number_of(block.first("_cell_formula_units_z"))[0]
+    formula = _formula(block.first(FORMULA) or "")
+    units = number_of(block.first(UNITS_IN_CELL))[0]
     multiples = {units, 1.0}  # 1: pymatgen gives the formula of the cell
     if (
         formula
