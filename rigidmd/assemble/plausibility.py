@@ -30,6 +30,9 @@ SHORTEST_SWITCH = 0.8
 #: Mass of a site over that of its element, and the mass of up to four hydrogens (u) that a united
 #: atom has too. Isotopes are within these limits.
 LIGHTEST, HEAVIEST, HYDROGENS = 0.85, 1.1, 4.1
+#: A molecule is bent by rounding if all mass is within this distance (Å) of a line: in bent
+#: molecules an atom is farther from any line.
+NEARLY_LINEAR = 0.08
 #: Angles (degrees) that are a multiple of this in radians, to this many degrees, are probably in
 #: radians.
 ROUND_ANGLE, ROUNDED = 5.0, 0.4
@@ -219,7 +222,7 @@ def _scene_values(scene: "MolecularScene") -> Iterator[tuple[str, float, str]]:
 
 def molecule_warnings(m: "Molecule") -> list[str]:
     """Warnings of numbers of a molecule that are probably in another unit."""
-    return _implausible(_molecule_values(m)) + _mass_warnings(m)
+    return _implausible(_molecule_values(m)) + _mass_warnings(m) + _bent_by_rounding(m)
 
 
 def _molecule_values(m: "Molecule") -> Iterator[tuple[str, float, str]]:
@@ -242,6 +245,17 @@ def _molecule_values(m: "Molecule") -> Iterator[tuple[str, float, str]]:
     for name, charge, mass in zip(m.site_names, m.charges.tolist(), m.masses.tolist(), strict=True):
         yield "charge_e", charge, f"{m.name}: charge_e of {name}"
         yield "mass_u", mass, f"{m.name}: mass_u of {name}"
+
+
+def _bent_by_rounding(m: "Molecule") -> list[str]:
+    """A warning of a molecule that is not linear but has all mass near a line."""
+    off = float(np.linalg.norm(m.positions_body[m.masses > 0, 1:], axis=1).max())
+    if not 0 < off < NEARLY_LINEAR or m.inertia.min() == 0:
+        return []
+    return [
+        f"{m.name} is nearly linear: its atoms are at most {off:.2g} Å from a line. Their rotation"
+        " about it needs a short time step. If only rounding bends it, put them on the line"
+    ]
 
 
 def _mass_warnings(m: "Molecule") -> list[str]:

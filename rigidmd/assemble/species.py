@@ -29,6 +29,11 @@ from rigidmd.scene.models import (
 from rigidmd.scene.species import Molecules, spans
 from rigidmd.scene.validation import ValidationError, not_none, validation_messages
 
+#: Largest unit of the last digit, Å, for which a molecule may be linear up to rounding, and the
+#: longest distance of a rounded point from where it was, in such units.
+ROUNDEST, ROUNDED = 0.02, np.sqrt(3) / 2
+#: Atoms within this fraction of the length of a molecule from a line are on it for `molecule`.
+ON_LINE = 1e-5
 MOST_LISTED = 8  # entries of parameters in a message
 
 
@@ -101,6 +106,27 @@ def _elements_of(entries: tuple[Site, ...]) -> frozenset[str]:
     return frozenset(x for s in entries for x in (s.name, s.element) if is_element(x))
 
 
+def straightened(atoms: Atoms) -> Atoms:
+    """The atoms of a molecule on a line, with a note, if the rounding of the coordinates in their
+    file explains their distances from it: else nothing but rounding would resist a rotation about
+    that line."""
+    count = len(atoms.position)
+    centre = atoms.position.mean(axis=0)
+    _, size, axes = np.linalg.svd(atoms.position - centre, full_matrices=False)
+    off = float(np.sqrt((size[1:] ** 2).sum() / count))  # rms
+    if count < 3 or not 0 < atoms.rounding <= ROUNDEST or off > ROUNDED * atoms.rounding:
+        return atoms
+    position = centre + np.outer((atoms.position - centre) @ axes[0], axes[0])
+    moved = float(np.linalg.norm(position - atoms.position, axis=1).max())
+    if moved <= ON_LINE * size[0]:
+        return atoms
+    note = (
+        f"its atoms are on a line to the {atoms.rounding:g} Å of its coordinates, and were put on"
+        f" it, by {moved:.2g} Å at most: a linear molecule"
+    )
+    return atoms._replace(position=position, notes=[*atoms.notes, note])
+
+
 def sites_of_geometry(
     path: Path, entries_of_scene: tuple[Site, ...], table: tuple[Site, ...], where: str
 ) -> tuple[tuple[Site, ...], list[str]]:
@@ -114,6 +140,7 @@ def sites_of_geometry(
     listed = ", ".join(available[:MOST_LISTED]) + (", ..." if len(available) > MOST_LISTED else "")
     hint = f"there are {listed}. The atoms of the file may have these names in place of elements"
     atoms = read_geometry(path, _elements_of((*entries_of_scene, *table)))
+    atoms = straightened(atoms)
     charges = [None] * len(atoms.names) if atoms.charges is None else atoms.charges.tolist()
     columns = atoms.names, atoms.elements, not_none(atoms.masses), atoms.position, charges
     for name, element, mass, position, charge in zip(*columns, strict=True):

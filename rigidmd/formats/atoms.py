@@ -2,7 +2,8 @@
 of text."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.errors import StructureError
 
+MOST_EXAMINED = 3000  # numbers of a file, of which decimals are counted
 SAME_MASS = 0.01  # relative difference of the masses of one element
 # u, AME2020; ASE has no symbols for them
 HEAVY_HYDROGEN = {
@@ -53,6 +55,7 @@ class Atoms(NamedTuple):
     masses: np.ndarray | None = None  # (n,) u, if the file has masses
     notes: Sequence[str] = ()
     charges: np.ndarray | None = None  # (n,) e, if the file has charges of all atoms
+    rounding: float = 0.0  # Å, a unit of the last digit of the coordinates; 0 if it is not known
 
 
 def structure_error(path: Path, message: str) -> StructureError:
@@ -203,6 +206,17 @@ def numbers(path: Path, line: int, words: list[str], what: str) -> list[float]:
         return [float(without_fortran(word)) for word in words]
     except ValueError:
         raise unexpected(path, line, what, " ".join(words)) from None
+
+
+def last_digit(words: Iterable[str]) -> float:
+    """A unit of the last digit of the most precise of the first numbers. 0 if one has an
+    exponent."""
+    decimals = 0
+    for word in islice(words, MOST_EXAMINED):
+        if not re.fullmatch(r"[-+]?\d*\.?\d*", word):
+            return 0.0
+        decimals = max(decimals, len(word.partition(".")[2]))
+    return 10.0**-decimals
 
 
 def joined_numbers(text: str) -> list[str]:

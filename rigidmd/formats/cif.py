@@ -18,6 +18,7 @@ from rigidmd.formats.atoms import (
     element_of,
     element_of_symbol,
     is_element,
+    last_digit,
     may_be_name,
     structure_error,
 )
@@ -160,7 +161,8 @@ def _structure(path: Path, block: Block, rows: list[int], syntax: list[str]) -> 
         raise structure_error(path, f"has no cell: {CELL[0]} to {CELL[-1]} are missing")
     # the placeholder of the PDB
     if cell is None or (not is_fractional and np.allclose(cell, np.eye(3))):
-        return Atoms(names, elements, residue, position, cell=cell, notes=syntax)
+        rounding = last_digit(sites.texts_of_coordinates("cartn"))
+        return Atoms(names, elements, residue, position, cell=cell, notes=syntax, rounding=rounding)
     if not is_fractional:
         position = _to_fractional(block, position, cell)
     operations, notes = _symmetry(path, block, cell)
@@ -210,6 +212,11 @@ class AtomSites:
         """The values of the tag _atom_site_{part}. None where it has none."""
         values = self._block.column(f"_atom_site_{part}")
         return [values[row] for row in self._rows] if values else [None] * len(self)
+
+    def texts_of_coordinates(self, axes: str) -> Iterator[str]:
+        """Coordinates as they are in the file, without their uncertainties."""
+        for x in "xyz":
+            yield from ((text or "").partition("(")[0] for text in self.column(f"{axes}_{x}"))
 
     def charges(self) -> np.ndarray | None:
         """Charges (n,) in e. None if an atom has none."""

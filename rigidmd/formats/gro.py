@@ -84,7 +84,8 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
     xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
     cell = 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
     moving = None if np.isnan(velocity).all() else 10 * velocity
-    return Atoms(names, [""] * len(names), residue, 10 * position, moving, cell)
+    rounding = 10 * 10.0 ** -(width - points[0] - 1) if points else 0.0
+    return Atoms(names, [""] * len(names), residue, 10 * position, moving, cell, rounding=rounding)
 
 
 def gro_text(system: Topology) -> str:

@@ -17,6 +17,7 @@ from rigidmd.formats.atoms import (
     atom_count,
     element_of_mass,
     element_of_symbol,
+    last_digit,
     names_of_types,
     numbers,
     structure_error,
@@ -170,6 +171,7 @@ def _data_atoms(
         position,
         cell=cell,
         masses=masses,
+        rounding=last_digit(x for r in rows for x in r.words[column["x"] : column["x"] + 3]),
     )
     moving = {row.words[0]: (row.line, row.words[1:4]) for row in sections.get("Velocities", [])}
     velocity = None
@@ -294,6 +296,7 @@ def _in_our_units(atoms: Atoms, velocity: np.ndarray | None, units: str, unknown
     return atoms._replace(
         position=atoms.position * length,
         cell=None if atoms.cell is None else atoms.cell * length,
+        rounding=atoms.rounding * length,
         velocity=None
         if velocity is None
         else np.where(np.isfinite(velocity), velocity * _unit(units, "velocity"), np.nan),

@@ -26,6 +26,7 @@ CRYST1 = (6, 15, 24, 33, 40, 47, 54)
 #: One more than the largest numbers in their columns.
 MOST_ATOMS, MOST_RESIDUES = 100_000, 10_000
 BONDS_PER_LINE = 4
+COORDINATES_END, LAST_DIGIT = 54, 1e-3  # column; Å
 SPACE_GROUP = slice(55, 66)
 #: A coordinate in its columns, and three coordinates beyond them, which may follow the last digits
 #: of a residue number.
@@ -100,9 +101,11 @@ def _pdb_model(
     locations = set()
     count = 0
     last = None
+    is_in_columns = True
     for number, full in body:
         line, end, coordinates = _pdb_columns(path, number, full)
         position.append(coordinates)
+        is_in_columns &= end == COORDINATES_END
         # in capitals: CO is cobalt
         elements.append(element_of_symbol(full[end + 22 : end + 24].strip()).capitalize())
         names.append(line[12:16].strip())
@@ -118,7 +121,15 @@ def _pdb_model(
         )
     if count == 1 and not residue[0][1]:
         residue = [()] * len(names)
-    return Atoms(names, elements, residue, np.array(position), cell=cell, notes=notes)
+    return Atoms(
+        names,
+        elements,
+        residue,
+        np.array(position),
+        cell=cell,
+        notes=notes,
+        rounding=LAST_DIGIT if is_in_columns else 0.0,
+    )
 
 
 def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[float]]:
@@ -126,7 +137,7 @@ def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[flo
     line, and the coordinates. Numbers wider than their columns shift the rest."""
     fields = [line[a : a + 8] for a in (30, 38, 46)]
     if all(map(IN_COLUMNS.fullmatch, fields)):
-        return line, 54, [float(field) for field in fields]
+        return line, COORDINATES_END, [float(field) for field in fields]
     serial = re.match(r"(?:ATOM  |HETATM)(\d*)", line)
     moved = max(0, len(serial[1]) - 5) if serial else 0
     straight = line[:11] + line[11 + moved :]
@@ -136,7 +147,7 @@ def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[flo
     )
     if not coordinates and not joined:
         with contextlib.suppress(ValueError):
-            return line, 54, [float(field) for field in fields]
+            return line, COORDINATES_END, [float(field) for field in fields]
     if not (coordinates := coordinates or FREE.match(line, 26 + moved)):
         raise unexpected(
             path, number, "an atom of a .pdb with coordinates in columns 31 to 54", line[26:60]

@@ -115,7 +115,9 @@ def without_isotopes(text: str) -> str:
     return re.sub(r"(?<!\S)[DT](?!\S)", "H", text)
 
 
-def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atoms:
+def from_ase(
+    path: Path, atoms, names=None, elements=None, residue=None, rounding: float = 0.0
+) -> Atoms:
     """Atoms in Å, ps and u from ASE's, with its masses unless they are its standard ones. By
     default, names and residues are those in the arrays that ASE and rigidmd store, or else names
     are ASE's symbols."""
@@ -179,6 +181,7 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
         cell,
         masses,
         notes,
+        rounding=rounding,
     )
 
 

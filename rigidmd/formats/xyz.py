@@ -14,6 +14,7 @@ from rigidmd.formats.atoms import (
     Frame,
     atom_count,
     element_of_symbol,
+    last_digit,
     numbers,
     unexpected,
     without_fortran,
@@ -28,6 +29,7 @@ def read_xyz(
     """The frames of a plain or extended .xyz through ASE, which needs elements, while many files
     have names. `atom_types`: name in the file, such as a type of LAMMPS -> name of the atom."""
     labels = []
+    roundings = []  # of each frame
     clean = []
     at = 0
     while at < len(lines):
@@ -48,12 +50,14 @@ def read_xyz(
             9,
         ):
             raise unexpected(path, at + 2, "nine numbers of Lattice", lattice[1])
+        coordinates: list[str] = []
         for k in range(at + 2, at + 2 + count):
             words = lines[k].split()
             if len(words) < width:
                 raise unexpected(path, k + 1, what, lines[k].strip())
             if place is not None:
                 numbers(path, k + 1, words[place : place + 3], what)
+                coordinates += words[place : place + 3]
             words = [word if i == column else without_fortran(word) for i, word in enumerate(words)]
             labels.append(None)
             if column is not None:
@@ -61,17 +65,20 @@ def read_xyz(
                 _, symbol = labels[-1]
                 words[column] = "H" if symbol in HEAVY_HYDROGEN else symbol.capitalize() or "X"
             clean.append(" ".join(words))
+        if count:
+            roundings.append(last_digit(coordinates) if coordinates else 0.0)
         at += 2 + count
     frames = []
     first = 0
-    for atoms in read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), "extxyz") if clean else []:
+    read = read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), "extxyz") if clean else []
+    for atoms, rounding in zip(read, roundings, strict=True):
         of_frame = labels[first : first + len(atoms)]
         first += len(atoms)
         named = len(of_frame) == len(atoms) and None not in of_frame
         names, elements = map(list, zip(*of_frame, strict=True)) if named else (None, None)
         if NAMES in atoms.arrays:
             names = [str(name) for name in atoms.arrays[NAMES]]
-        frames.append(partial(from_ase, path, atoms, names, elements))
+        frames.append(partial(from_ase, path, atoms, names, elements, rounding=rounding))
     return frames
 
 

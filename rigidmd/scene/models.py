@@ -316,7 +316,10 @@ def molecule(
         limit = OFF_AXIS * size
         where = "from the centre of mass, but all the mass is there: nothing resists its torque"
         if frame.kind == "linear":
-            where = "off the axis of a linear body: nothing resists its torque about that axis"
+            where = (
+                "off the axis of a linear body: nothing resists its torque about that axis. Put it"
+                " on the line of the other sites"
+            )
         faults += [
             f"site {s.name} is {d:.3g} Å {where}"
             for s, d in zip(sites, off, strict=True)
