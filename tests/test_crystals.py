@@ -517,6 +517,8 @@ def test_dummies_are_left_out(tmp_path):
             "_cell_angle_beta 190",
             "no cell has the edges and angles 9 8 10 90 190 90",
         ),
+        ("_cell_angle_beta 101", "_cell_angle_beta 1e-31", "its cell: .* must be 0.5 Å at least"),
+        ("_cell_length_b 8", "_cell_length_b 1e200", "its cell: it must not be longer than"),
         ("0.25 ", "? ", "atom H1 has no position, expected three numbers, found 0.2 None 0.2"),
         ("0.25 ", "1/4 ", "atom H1 has no position, expected three numbers, found 0.2 1/4 0.2"),
         ("0.22", "", r"line \d+: this is not valid CIF: Wrong number of values in loop _atom_site"),

@@ -17,6 +17,9 @@ import warnings
 from copy import deepcopy
 from pathlib import Path
 
+import ase
+import ase.io
+import gsd.hoomd
 import numpy as np
 import pytest
 import tomli_w
@@ -27,11 +30,13 @@ from scenes import FROM_FILE, SATELLITE, STRUCTURES
 from rigidmd.commands.cli import main
 from rigidmd.core.state import state_of
 from rigidmd.core.state_file import SavedState, write_state
-from rigidmd.errors import UNPRINTABLE, CheckpointError
+from rigidmd.errors import UNPRINTABLE, CheckpointError, StructureError
+from rigidmd.formats.atoms import is_element
 from rigidmd.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from rigidmd.io.structure_file import read_atoms
 
 SECONDS, BYTES = 5.0, 2e9  # of computing, that an input may take
-FEW, MANY = 20, 1250  # inputs of each of the eight tests, in CI and in the soak tier
+FEW, MANY = 20, 1250  # inputs of each of the nine tests, in CI and in the soak tier
 
 WATER = """
 seed = 3
@@ -566,6 +571,82 @@ def _structures(attack, told):
     )
 
 
+#: Files that are read through ASE, or that are binary, beside `STRUCTURES`: name -> format of ASE.
+OF_ASE = {
+    "x.traj": "traj",
+    "POSCAR": "vasp",
+    "x.xsf": "xsf",
+    "x.gen": "gen",
+    "x.json": "json",
+    "CONFIG": "dlp4",
+    "z.xyz": "extxyz",
+}
+
+
+@pytest.fixture(scope="module")
+def readable(folder):
+    """The content of a file of each format, by name."""
+    points = [[1, 1, 1], [1.8, 1.6, 1], [0.2, 1.6, 1], [6, 6, 6], [6.8, 6.6, 6], [5.2, 6.6, 6]]
+    atoms = ase.Atoms("OHHOHH", points, cell=[18, 18, 18], pbc=True)
+    atoms.set_velocities(np.ones((6, 3)))
+    for name, form in OF_ASE.items():
+        ase.io.write(folder / name, atoms, format=form)
+    frame = gsd.hoomd.Frame()
+    frame.particles.N, frame.particles.types = 6, ["O", "H"]
+    frame.particles.typeid = [0, 1, 1, 0, 1, 1]
+    frame.particles.position, frame.particles.velocity = atoms.positions - 9.0, np.ones((6, 3))
+    frame.configuration.box = [18, 18, 18, 0, 0, 0]
+    with gsd.hoomd.open(str(folder / "x.gsd"), "w") as file:
+        file.append(frame)
+    rows = list(zip(atoms.symbols, atoms.positions, strict=True))
+    block = "".join(
+        f"    1 SOL   {e:<5}{k:7d}{''.join(f'{x / 10:15.9f}' for x in p)}\n"
+        for k, (e, p) in enumerate(rows, 1)
+    )
+    g96 = f"TITLE\nwater\nEND\nPOSITION\n{block}END\nBOX\n{3 * f'{1.8:15.9f}'}\nEND\n"
+    columns = ("type_symbol", "label_atom_id", "label_comp_id", "Cartn_x", "Cartn_y", "Cartn_z")
+    tags = "".join(f"_atom_site.{c}\n" for c in columns)
+    edges = "".join(f"_cell.length_{x} 18\n_cell.angle_{y} 90\n" for x, y in CELL_TAGS)
+    mmcif = "".join(f"{e} {e} SOL {' '.join(map(str, p))}\n" for e, p in rows)
+    texts = STRUCTURES | {"x.g96": g96, "x.mmcif": f"data_x\n{edges}loop_\n{tags}{mmcif}"}
+    binary = {name: (folder / name).read_bytes() for name in (*OF_ASE, "x.gsd")}
+    return {name: text.encode() for name, text in texts.items()} | binary
+
+
+CELL_TAGS = (("a", "alpha"), ("b", "beta"), ("c", "gamma"))
+READABLE = sorted([*STRUCTURES, *OF_ASE, "x.gsd", "x.g96", "x.mmcif"])
+
+
+def test_every_readable_file_is_read(readable, folder):
+    assert sorted(readable) == READABLE
+    for name, content in readable.items():
+        (folder / name).write_bytes(content)
+        assert len(read_atoms(folder / name).names) == 6, name
+
+
+def _readers(trial, folder, readable, told):
+    name, changes = told
+    path = folder / name
+    path.write_bytes(with_bytes_changed(readable[name], changes))
+    begin = time.process_time()
+    refused = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        try:
+            atoms = read_atoms(path)
+        except StructureError as error:
+            refused = True
+            assert str(path) in str(error)
+            assert not UNPRINTABLE.search(str(error).replace("\n", " "))
+        else:
+            assert np.isfinite(atoms.position).all()
+            assert all(
+                symbol in ("", "X", "D", "T") or is_element(symbol.capitalize())
+                for symbol in atoms.elements
+            )
+    trial.note(time.process_time() - begin, refused, (name, changes))
+
+
 def _models(trial, attack, folder, told):
     model, changes = told
     (folder / "m.toml").write_bytes(with_bytes_changed(written(model), changes))
@@ -706,6 +787,7 @@ test_structures, test_many_structures = fuzz(
         st.sampled_from(["", "", "frame = 2\n", "frame = -1\n", "tolerance = 1e-30\n"]),
     )
 )(_structures)
+test_readers, test_many_readers = fuzz(st.tuples(st.sampled_from(READABLE), BYTE_CHANGES))(_readers)
 test_models, test_many_models = fuzz(
     st.one_of(
         st.tuples(changed([tomllib.loads(MODEL)]), st.just([])),

@@ -2931,3 +2931,49 @@ def test_few_decimals_do_not_make_a_molecule_linear(tmp_path):
     kind = species_in(tmp_path, "3\n\nO -1.2 0.0 0.0\nC 0.0 0.1 0.0\nO 1.2 0.0 0.0\n", "xyz")
     assert kind.kind == "asymmetric"
     assert not any("nearly linear" in text for text in molecule_warnings(SPECIES["spce"]))
+
+
+def test_a_damaged_byte_of_a_traj_is_told(tmp_path):
+    """ASE looks at atomic numbers when their symbols are asked for."""
+    path = tmp_path / "a.traj"
+    ase.io.write(path, ase.Atoms("Ar3", np.eye(3), cell=[9, 9, 9], pbc=True))
+    content = bytearray(path.read_bytes())
+    at = content.index(np.full(3, 18).tobytes())
+    for byte, number in ((0, 200), (1, 1), (7, 0xFF)):
+        path.write_bytes(bytes([*content[: at + byte], number, *content[at + byte + 1 :]]))
+        with pytest.raises(StructureError, match="an atomic number is that of no element"):
+            read_atoms(path)
+
+
+@pytest.mark.parametrize(
+    ("properties", "row", "message"),
+    [
+        ("species:S:1:pos:R:3:masses:S:1", "Ar 1 1 1 x", "masses are of another type"),
+        ("species:S:1:pos:R:3:masses:R:2", "Ar 1 1 1 4 4", "masses are of another type"),
+        ("species:S:1:pos:R:3:momenta:R:1", "Ar 1 1 1 2", "momenta are of another type"),
+        ("species:S:1:pos:R:3:atomtypes:S:2", "Ar 1 1 1 a b", "atomtypes are of another type"),
+        ("pos:R:3:Z:I:1", "1 1 1 700", "an atomic number is that of no element"),
+        ("species:S:1:pos:R:3 occupancy=0.5", "Ar 1 1 1", "occupancy is not a table"),
+        ('species:S:1:pos:R:3 occupancy="1 2"', "Ar 1 1 1", "occupancy is not a table"),
+    ],
+)
+def test_columns_of_extended_xyz_of_another_type(properties, row, message, tmp_path):
+    text = f'1\nLattice="9 0 0 0 9 0 0 0 9" Properties={properties}\n{row}\n'
+    with pytest.raises(StructureError, match=message):
+        read(tmp_path, text, "a.xyz", ["argon"])
+
+
+def test_a_poscar_without_elements_names_the_line(tmp_path):
+    text = "made by hand\n1.0\n9 0 0\n0 9 0\n0 0 9\n2\nDirect\n0 0 0\n.5 .5 .5\n"
+    with pytest.raises(
+        StructureError, match="POSCAR: line 6: expected the symbols of its elements"
+    ):
+        read(tmp_path, text, "POSCAR", ["argon"])
+    assert len(read(tmp_path, text.replace("2\n", "Ar\n2\n", 1), "POSCAR", ["argon"]).species) == 2
+
+
+def test_a_column_that_a_dump_names_twice(tmp_path):
+    truth = Truth(["tip4p2005"] * 2, 12)
+    text = dump_of(truth, "id element x y z").replace("element x y z", "element x y z x id")
+    with pytest.raises(StructureError, match="line 9: names the column id, x twice"):
+        read(tmp_path, text, "a.lammpstrj", ["tip4p2005"])

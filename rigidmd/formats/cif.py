@@ -22,7 +22,7 @@ from rigidmd.formats.atoms import (
     may_be_name,
     structure_error,
 )
-from rigidmd.formats.cells import cell_of, describe_cell
+from rigidmd.formats.cells import cell_error, cell_of, describe_cell
 from rigidmd.formats.cif_syntax import parse_cif, tag_of
 from rigidmd.formats.crystal import (
     IDENTITY,
@@ -350,6 +350,8 @@ def _cell(path: Path, block: Block) -> np.ndarray | None:
     cell = cell_of([number_of(text)[0] for text in texts])
     if cell is None:
         raise structure_error(path, f"no cell has the edges and angles {' '.join(map(str, texts))}")
+    if error := cell_error(cell):
+        raise structure_error(path, f"its cell: {error}")
     return cell
 
 

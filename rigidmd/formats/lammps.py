@@ -338,7 +338,11 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
         raise structure_error(path, f"line {first + 1}: {missing}")
     line = at["NUMBER OF"] + 1
     count = atom_count(path, first + line + 1, lines[line].strip(), len(lines) - atoms - 1)
-    columns = {name: k for k, name in enumerate(lines[atoms].split()[2:])}
+    listed = lines[atoms].split()[2:]
+    if twice := sorted({name for name in listed if listed.count(name) > 1}):
+        message = f"line {first + atoms + 1}: names the column {', '.join(twice)} twice"
+        raise structure_error(path, f"{message}: which one counts is unknown")
+    columns = {name: k for k, name in enumerate(listed)}
     rows = [(first + k + 1, lines[k].split()) for k in range(atoms + 1, atoms + 1 + count)]
     if short := [row for row in rows if len(row[1]) < len(columns)]:
         line, words = short[0]

@@ -41,12 +41,19 @@ if TYPE_CHECKING:
 
 EV = ENERGY_UNITS["eV"]
 
+MOST_PROTONS = 118
 #: ASE's unit of velocity, sqrt(eV/u), in Å/ps.
 ASE_VELOCITY = 98.22694788464063
 #: ASE's arrays of names of atoms and residues, as from .pdb. Extended XYZ may have them as columns.
 NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS = "atomtypes", "residuenames", "residuenumbers"
 #: ASE's array of what follows its symbols in the names of DL_POLY's files.
 DL_POLY_NAMES = "dlp4_labels"
+#: Numbers and texts of each atom in ASE's arrays that are used, by their shape; which are numbers.
+NUMERIC = ("numbers", "positions", "momenta", "masses")
+WIDTHS = dict.fromkeys((*NUMERIC, NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, DL_POLY_NAMES), ()) | {
+    "positions": (3,),
+    "momenta": (3,),
+}
 #: Columns of velocities in extended XYZ that ASE does not convert, because programs use different
 #: units.
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
@@ -62,6 +69,8 @@ def read_by_ase(
     try:
         with ignore_warnings():
             frames = cast("list[AseAtoms]", ase.io.read(source, index=":", format=name))
+            for atoms in frames:
+                _check_readable(atoms)
     except ase.io.formats.UnknownFileTypeError:
         known = " ".join(extensions(lambda form: form.read or form.reader))
         raise structure_error(path, f"its format is unknown to ASE; there are {known}") from None
@@ -70,9 +79,31 @@ def read_by_ase(
     return [atoms for atoms in frames if len(atoms)]
 
 
+def _check_readable(atoms: "AseAtoms") -> None:
+    """Raise an exception where what `from_ase` uses has another type or shape, which ASE does not
+    check when it reads a file."""
+    count = len(atoms)
+    if count and not 0 <= atoms.numbers.min() <= atoms.numbers.max() <= MOST_PROTONS:
+        raise ValueError("an atomic number is that of no element")
+    for name, width in WIDTHS.items():
+        array = atoms.arrays.get(name)
+        if array is None:
+            continue
+        if array.shape != (count, *width) or (name in NUMERIC and array.dtype.kind not in "fi"):
+            raise ValueError(f"{name} are of another type or number than one for each atom")
+    occupancy = atoms.info.get("occupancy", {})
+    if not isinstance(occupancy, dict) or not all(isinstance(x, dict) for x in occupancy.values()):
+        raise ValueError("occupancy is not a table of elements for each kind of sites")
+
+
 def _reason(error: Exception) -> str:
     """A message for users on an exception of the readers of ASE."""
     reason = " ".join(str(error).split()).rstrip(".") or "something is missing or misplaced"
+    if "Could not determine chemical symbols" in reason:  # a POSCAR
+        return (
+            "line 6: expected the symbols of its elements, before the numbers of their atoms: add a"
+            " line such as 'O H' (the format of VASP 4 has none)"
+        )
     symbol = re.search(r"['\"](\w{1,8})['\"]", reason)
     if symbol and ("symbol" in reason or isinstance(error, KeyError)) and not is_element(symbol[1]):
         named = f"names an atom {symbol[1]}, but ASE, which reads this format, knows elements only"
@@ -138,7 +169,7 @@ def from_ase(
     if names is not None and len(names) != len(atoms):
         raise structure_error(path, f"has {len(names)} atoms, of which ASE reads {len(atoms)}")
     occupied = {
-        (e, x) for site in (atoms.info.get("occupancy") or {}).values() for e, x in site.items()
+        (e, x) for site in atoms.info.get("occupancy", {}).values() for e, x in site.items()
     }
     if invalid := sorted(
         {str(x) for _, x in occupied if not (isinstance(x, int | float) and x >= 0)}
