@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.special import erfcinv
 from stops import stopped_at
-from support import ROOT
+from support import ROOT, small_scene
 
 from rigidmd import Scene, Simulation, resolve
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
 from rigidmd.assemble.harmonic import stable_angle, step_error
-from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, error_of_step, step_warnings
+from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR, _one_digit, error_of_step, step_warnings
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.errors import SceneError
@@ -543,3 +543,26 @@ def test_a_run_keeps_its_default_step_and_check_tells_its_error(tmp_path, capsys
     assert [stage["timestep_fs"] for stage in written["stages"]] == [4.0, 2.0]
     assert main(["resume", str(tmp_path / "run"), "--until", "0.06ps"]) == 0
     assert Scene.read(path).stages[0].timestep_fs is None
+
+
+def test_the_limit_of_a_cutoff_in_a_dodecahedron_is_not_called_the_minimum_image_convention():
+    """Its images are an edge apart, which half of a_x, b_y or c_z does not show."""
+    edge = 17.4
+    box = {"lengths_A": [edge] * 3, "angles_deg": [60.0, 60.0, 90.0]}
+    forces = {"cutoff_A": 8.0}
+    with pytest.raises(SceneError) as refused:
+        build(small_scene({"argon": 20}, None, box=box, forces=forces))
+    text = str(refused.value)
+    assert (
+        "half the smallest of a_x, b_y, c_z of the box, 6.152 Å, up to which rigidmd finds" in text
+    )
+    assert "convention allows 8.700 Å, half the distance of its nearest images). Use" in text
+    with pytest.raises(SceneError, match=r"violates the minimum-image convention\. Use"):
+        build(small_scene({"argon": 20}, None, box=box, forces={"cutoff_A": 8.8}))
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.00042, "0.0004"), (1.2, "1"), (38.6, "40"), (251.0, "300"), (0.0, "0")]
+)
+def test_numbers_with_one_digit(value, text):
+    assert _one_digit(value) == text

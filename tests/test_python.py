@@ -646,6 +646,7 @@ def test_a_simulation_begins_only_from_states_that_it_can_have():
             state.position[:3],
             np.vstack([state.position] * 2),
             state.position + np.inf,
+            np.ma.masked_equal(state.position, state.position[0, 0]),
             None,
         ],
         "velocity": [state.velocity * 1j, state.velocity[:, :2]],

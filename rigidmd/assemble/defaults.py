@@ -17,9 +17,10 @@ import numpy as np
 from rigidmd.assemble.plausibility import shortest_contact, switches_cores
 from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.toml import Json
-from rigidmd.forces.neighbors.space import Triclinic, longest_gaps
+from rigidmd.forces.neighbors.space import Triclinic, cell_of, longest_gaps
 from rigidmd.forces.parts import Composition, Grid, Settings
 from rigidmd.forces.potentials.truncation import default_switch_start
+from rigidmd.formats.cells import nearest_image_distance
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.forces import ELECTROSTATICS, OPEN, PERIODIC, Forces
 
@@ -217,6 +218,7 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[Json, 
     start = forces.switch_start_A
     faults = []
     half = min(space.edges) / 2
+    allowed = nearest_image_distance(cell_of(space)) / 2 if half < inf else inf
     least = "the smallest of a_x, b_y, c_z" if isinstance(space, Triclinic) else "the shortest edge"
     limit = f"half {least} of the box, {half:.3f} Å"
     for key, value in (("cutoff_A", cutoff), ("ewald_cutoff_A", forces.ewald_cutoff_A or 0.0)):
@@ -227,8 +229,16 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[Json, 
                 factors = np.ceil(2 * value / np.array(space.edges)).astype(int).tolist()
                 larger = f"{' x '.join(map(str, factors))} times the repeats of the cell"
             shorter = f"{key} = {floor(100 * half) / 100:g} or less"
-            why = f"which violates the minimum-image convention. Use {larger}, or {shorter}"
-            faults.append(f"forces.{key} = {value:g}{default} is longer than {limit}, {why}")
+            why = "which violates the minimum-image convention"
+            if value <= allowed:
+                why = (
+                    "up to which rigidmd finds the nearest images in this cell (the minimum-image"
+                    f" convention allows {allowed:.3f} Å, half the distance of its nearest images)"
+                )
+            advice = f"Use {larger}, or {shorter}"
+            faults.append(
+                f"forces.{key} = {value:g}{default} is longer than {limit}, {why}. {advice}"
+            )
     bodies = [m for m in composition.species if m.cell is None]  # a framework fills the box
     extents = {m.name: pdist(m.positions_body).max(initial=0.0) for m in bodies}
     faults += [

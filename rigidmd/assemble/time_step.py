@@ -172,13 +172,13 @@ def describe_step(scene: MolecularScene, species: list[Molecule], k: int) -> str
         return "time-step error: unstable"
     text = (
         f"time-step error: {fastest.molecule} {fastest.does} as if forces were wrong by"
-        f" {100 * error:.1g} %"
+        f" {_one_digit(100 * error)} %"
     )
     if stage.is_hybrid:
         return f"{text}. Averages have none"
     if stage.has_thermostat:
         bias = _bias_of(stage)[0] * error
-        text += f". Bias of U about {bias:.1g} kT per degree of freedom"
+        text += f". Bias of U about {_one_digit(bias)} kT per degree of freedom"
     return text
 
 
@@ -276,6 +276,11 @@ def _accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> 
         f" were wrong by {error:.0%}, which shifts temperatures and averages. At"
         f" {better / FEMTOSECOND:.2g} fs it is {INACCURATE / 2:.0%}"
     )
+
+
+def _one_digit(value: float) -> str:
+    """A number with one significant digit: 40, not 4e+01."""
+    return f"{float(f'{value:.1g}'):g}"
 
 
 def precision_for(error: float) -> Literal["double", "mixed"]:

@@ -214,6 +214,8 @@ class System:
         """Messages on positions, momenta and cell of a state from outside which this system cannot
         have."""
         names = State._fields[:5]
+        if masked := [name for name in names if np.ma.is_masked(getattr(state, name))]:
+            return [f"{name} of the state has masked values, not numbers" for name in masked]
         arrays = {name: np.asarray(getattr(state, name)) for name in names}
         shapes = {name: getattr(self.state, name).shape for name in names}
         if problems := array_errors(arrays, shapes):
@@ -226,7 +228,8 @@ class System:
         pair_terms = [term for term in self.terms.values() if isinstance(term, PairForces)]
         reach = [term.potential.cutoff for term in pair_terms]  # type: ignore[attr-defined]
         return [
-            f"half the shortest edge of its box, {half:.4g} Å, is below the cutoff of {r:g} Å"
+            f"half the smallest of a_x, b_y, c_z of its box, {half:.4g} Å, is below the cutoff of"
+            f" {r:g} Å"
             for r in reach
             if r > half
         ][:1]

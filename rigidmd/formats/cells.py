@@ -176,6 +176,13 @@ def cell_of(parameters: list[float]) -> np.ndarray | None:
     return None
 
 
+def nearest_image_distance(cell: np.ndarray) -> float:
+    """The distance, Å, of a point from its nearest image in a cell (3, 3)."""
+    from ase.geometry import minkowski_reduce
+
+    return float(np.linalg.norm(minkowski_reduce(cell)[0], axis=1).min())
+
+
 def nearest_images(vectors: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """The shortest images of vectors (n, 3) in any cell (3, 3)."""
     from ase.geometry import minkowski_reduce
