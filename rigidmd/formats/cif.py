@@ -184,7 +184,7 @@ def _structure(path: Path, block: Block, rows: list[int], syntax: list[str]) -> 
         contents.fractional @ cell,
         cell=cell,
         notes=notes,
-        charges=None if (charges := sites.charges()) is None else charges[owner],
+        charges=None if (charges := sites.charges(path)) is None else charges[owner],
     )
 
 
@@ -218,10 +218,19 @@ class AtomSites:
         for x in "xyz":
             yield from ((text or "").partition("(")[0] for text in self.column(f"{axes}_{x}"))
 
-    def charges(self) -> np.ndarray | None:
-        """Charges (n,) in e. None if an atom has none."""
-        charges = np.array([number_of(text)[0] for text in self.column("charge")])
-        return None if np.isnan(charges).any() else charges
+    def charges(self, path: Path) -> np.ndarray | None:
+        """Charges (n,) in e. None without any. Raises StructureError if some atoms have one."""
+        texts = self.column("charge")
+        if not any(texts):
+            return None
+        charges = np.array([number_of(text)[0] for text in texts])
+        if len(bad := np.flatnonzero(np.isnan(charges))):
+            name, found = self.names()[0][bad[0]], texts[bad[0]] or "none"
+            what = "a number, as other atoms have"
+            raise structure_error(
+                path, f"atom {name}: expected _atom_site_charge as {what}, found {found}"
+            )
+        return charges
 
     def names(self) -> tuple[list[str], list[str]]:
         """Names and elements. A type that is not an element, such as OW or M, is the name."""
@@ -413,10 +422,26 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
     of_system = settings_of_system(system) if system else []
     if of_system and not any(keep_cell(setting.operations, cell) for setting in of_system):
         notes.append(f"its cell, {describe_cell(cell)}, is not {system}, as the file states")
-    name = block.first(*NAMES)
-    if name and not is_listed and not settings_of_name(name):
-        notes.append(f"its space group name {name} is unknown")
+    if not is_listed:
+        notes += [f"{what} is unknown" for what in _unknown(block)]
     return operations, notes
+
+
+def _unknown(block: Block) -> Iterator[str]:
+    """What a file states about its space group that no table has."""
+    name, symbol, number, code, system = (
+        block.first(*tags) for tags in (NAMES, HALL, NUMBERS, CODES, SYSTEMS)
+    )
+    if name and not settings_of_name(name):
+        yield f"its space group name {name}"
+    if symbol and not settings_of_hall(symbol):
+        yield f"its Hall symbol {symbol}"
+    if number and not settings_of_number(parse_whole_number(number) or 0):
+        yield f"its space group number {number}"
+    if code and not settings_of_code(code):
+        yield f"its coordinate system code {code}"
+    if system and not settings_of_system(system):
+        yield f"its crystal system {system}"
 
 
 def _described(settings: list[Setting], used: Statement) -> str:

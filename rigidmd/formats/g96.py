@@ -15,6 +15,8 @@ from rigidmd.formats.atoms import Atoms, joined_numbers, numbers, structure_erro
 HEAD = 24
 #: Names of blocks; those that end in RED have coordinates only.
 POSITIONS, VELOCITIES = ("POSITION", "POSITIONRED"), ("VELOCITY", "VELOCITYRED")
+USED = {*POSITIONS, *VELOCITIES, "BOX"}
+WITHOUT_ATOMS = {"TITLE", "TIMESTEP"}
 
 #: A line and its number.
 Lines = list[tuple[int, str]]
@@ -23,6 +25,7 @@ Lines = list[tuple[int, str]]
 def read_g96(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     """The frames of a .g96: blocks from a name to END, of which POSITION starts a frame."""
     frames: list[dict[str, Lines]] = []
+    unused = []
     block = ""
     content = []
     for number, line in enumerate(lines, 1):
@@ -35,17 +38,20 @@ def read_g96(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
         elif text == "END":
             if block in POSITIONS:
                 frames.append({})
-            if frames:
+            if frames and block in USED:
                 frames[-1][block] = content
+            elif block not in WITHOUT_ATOMS and block not in unused:
+                unused.append(block)
             block = ""
         else:
             content.append((number, line))
     if block:
         raise structure_error(path, f"its block {block} has no END: truncated?")
-    return [partial(_frame, path, frame, frames[0]) for frame in frames]
+    notes = [f"its blocks {', '.join(unused)} are not used"] if unused else []
+    return [partial(_frame, path, frame, frames[0], notes) for frame in frames]
 
 
-def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atoms:
+def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines], notes: list[str]) -> Atoms:
     """A frame. Names are in its block POSITION, or else in the first frame."""
     named = frame.get("POSITION", first.get("POSITION"))
     if named is None:
@@ -68,6 +74,7 @@ def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atom
         position,
         velocity if len(velocity) else None,
         _box(path, frame),
+        notes=notes,
     )
 
 

@@ -114,11 +114,11 @@ def _data_atoms(
     rows = sections["Atoms"]
     stated = UNITS.search(title)
     units = _known_units(path, 1, (stated[1] or stated[2] or "") if stated else None)
-    labels = {
-        row.words[0]: row.words[1]
-        for row in sections.get("Atom Type Labels", [])
-        if len(row.words) == 2
-    }
+    labels = {}
+    for row in sections.get("Atom Type Labels", []):
+        if len(row.words) != 2:
+            raise unexpected(path, row.line, "a type and its label", " ".join(row.words))
+        labels[row.words[0]] = row.words[1]
     number_of = {label: number for number, label in labels.items()}
     names = dict(labels)
     mass_of = {}
@@ -176,6 +176,9 @@ def _data_atoms(
     moving = {row.words[0]: (row.line, row.words[1:4]) for row in sections.get("Velocities", [])}
     velocity = None
     if moving:
+        if others := sorted(moving.keys() - {row.words[column["id"]] for row in rows}):
+            line = moving[others[0]][0]
+            raise unexpected(path, line, "the velocities of an atom of the file", others[0])
         words_of_atoms = [moving.get(row.words[column["id"]], (0, ["nan"] * 3)) for row in rows]
         velocity = table(path, words_of_atoms, "an atom and its three velocities")
     return _in_our_units(

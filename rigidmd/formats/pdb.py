@@ -25,7 +25,7 @@ from rigidmd.formats.through_mdanalysis import FrameFiles, dimensions
 CRYST1 = (6, 15, 24, 33, 40, 47, 54)
 #: One more than the largest numbers in their columns.
 MOST_ATOMS, MOST_RESIDUES = 100_000, 10_000
-BONDS_PER_LINE = 4
+BONDS_PER_LINE, MOST_LISTED = 4, 6  # the latter in a message
 COORDINATES_END, LAST_DIGIT = 54, 1e-3  # column; Å
 SPACE_GROUP = slice(55, 66)
 #: A coordinate in its columns, and three coordinates beyond them, which may follow the last digits
@@ -102,12 +102,16 @@ def _pdb_model(
     count = 0
     last = None
     is_in_columns = True
+    unknown: set[str] = set()
     for number, full in body:
         line, end, coordinates = _pdb_columns(path, number, full)
         position.append(coordinates)
         is_in_columns &= end == COORDINATES_END
         # in capitals: CO is cobalt
-        elements.append(element_of_symbol(full[end + 22 : end + 24].strip()).capitalize())
+        symbol = full[end + 22 : end + 24].strip()
+        elements.append(element_of_symbol(symbol).capitalize())
+        if symbol and not elements[-1]:
+            unknown.add(symbol)
         names.append(line[12:16].strip())
         locations.add(line[16:17].strip())
         if (here := line[17:28]) != last:  # name, chain, number and insertion code
@@ -119,6 +123,9 @@ def _pdb_model(
         raise structure_error(
             path, f"has alternate locations {', '.join(sorted(locations))}. Keep one of them"
         )
+    if unknown:
+        where = f"in columns 77 and 78, {', '.join(sorted(unknown)[:MOST_LISTED])}, are no elements"
+        notes = [*notes, f"symbols {where}: the names of atoms were used"]
     if count == 1 and not residue[0][1]:
         residue = [()] * len(names)
     return Atoms(

@@ -147,13 +147,13 @@ def without_isotopes(text: str) -> str:
 
 
 def from_ase(
-    path: Path, atoms, names=None, elements=None, residue=None, rounding: float = 0.0
+    path: Path, atoms, names=None, elements=None, rounding: float = 0.0, notes=()
 ) -> Atoms:
     """Atoms in Å, ps and u from ASE's, with its masses unless they are its standard ones. By
     default, names and residues are those in the arrays that ASE and rigidmd store, or else names
     are ASE's symbols."""
     symbols = atoms.get_chemical_symbols()
-    notes = []
+    notes = list(notes)
     if names is None and (stored := atoms.arrays.get(NAMES)) is not None:
         names = [str(name) for name in stored]
         # united atoms have names only
@@ -164,8 +164,11 @@ def from_ase(
             for symbol, number in zip(symbols, atoms.arrays[DL_POLY_NAMES], strict=True)
         ]
         symbols = [""] * len(atoms)  # ASE takes the first letters, N for NA
-    if residue is None:
-        residue = _residues(atoms)
+    residue = _residues(atoms)
+    if residue is None and RESIDUE_NUMBERS in atoms.arrays:
+        notes.append(
+            f"its residues are not used: {RESIDUE_NAMES}, and whole {RESIDUE_NUMBERS}, are needed"
+        )
     if names is not None and len(names) != len(atoms):
         raise structure_error(path, f"has {len(names)} atoms, of which ASE reads {len(atoms)}")
     occupied = {
@@ -191,7 +194,7 @@ def from_ase(
     if velocity is not None and not np.isfinite(velocity).all():
         bad = int(np.argmin(np.isfinite(velocity).all(axis=1)))
         raise structure_error(path, f"atom {bad + 1} has a velocity that is not a finite number")
-    if unitless := [key for key in UNITLESS_VELOCITIES if key in atoms.arrays]:
+    if unitless := [key for key in atoms.arrays if key.lower() in UNITLESS_VELOCITIES]:
         notes.append(
             f"its velocities in the column {unitless[0]} have no units and are not used (ASE writes"
             " momenta instead)"

@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.formats import Encode, Format, System, register
@@ -19,8 +20,36 @@ from rigidmd.formats.atoms import (
     unexpected,
     without_fortran,
 )
-from rigidmd.formats.through_ase import NAMES, from_ase, read_by_ase
+from rigidmd.formats.through_ase import (
+    NAMES,
+    RESIDUE_NAMES,
+    RESIDUE_NUMBERS,
+    UNITLESS_VELOCITIES,
+    from_ase,
+    read_by_ase,
+)
 from rigidmd.formats.through_mdanalysis import FrameFiles
+
+#: Columns of extended XYZ that are used, that are named in other notes, or that no start needs.
+USED = {"species", "pos", "z", "momenta", "masses", NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS}
+USED |= {*UNITLESS_VELOCITIES, "forces", "force", "magmoms", "tags", "move_mask", "id"}
+
+
+class Columns(NamedTuple):
+    """What the comment of a frame says about its atoms."""
+
+    comment: str  # as ASE reads it
+    species: int | None  # columns
+    position: int | None  # the first of three
+    width: int  # least number of columns
+    properties: str  # empty in a plain .xyz
+    unused: tuple[str, ...]
+
+    @property
+    def expected(self) -> str:
+        if self.properties:
+            return f"{self.width} columns, {self.properties}"
+        return "an atom of an .xyz: name, x, y, z"
 
 
 def read_xyz(
@@ -29,7 +58,7 @@ def read_xyz(
     """The frames of a plain or extended .xyz through ASE, which needs elements, while many files
     have names. `atom_types`: name in the file, such as a type of LAMMPS -> name of the atom."""
     labels = []
-    roundings = []  # of each frame
+    roundings, notes = [], []  # of each frame with atoms
     clean = []
     at = 0
     while at < len(lines):
@@ -37,27 +66,19 @@ def read_xyz(
             at += 1
             continue
         count = atom_count(path, at + 1, lines[at].strip(), len(lines) - at - 2)
-        clean += [lines[at], re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", lines[at + 1])]
-        properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
-        column, place, width = _columns(properties[1]) if properties else (0, 1, 4)
-        if properties:
-            what = f"{width} columns, {properties[1]}"
-        else:
-            what = "an atom of an .xyz: name, x, y, z"
-        lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
-        if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (
-            3,
-            9,
-        ):
-            raise unexpected(path, at + 2, "nine numbers of Lattice", lattice[1])
+        columns = _columns(path, at + 2, lines[at + 1])
+        clean += [lines[at], columns.comment]
         coordinates: list[str] = []
+        further = 0
         for k in range(at + 2, at + 2 + count):
             words = lines[k].split()
-            if len(words) < width:
-                raise unexpected(path, k + 1, what, lines[k].strip())
-            if place is not None:
-                numbers(path, k + 1, words[place : place + 3], what)
+            if len(words) < columns.width:
+                raise unexpected(path, k + 1, columns.expected, lines[k].strip())
+            further = max(further, len(words) - columns.width)
+            if (place := columns.position) is not None:
+                numbers(path, k + 1, words[place : place + 3], columns.expected)
                 coordinates += words[place : place + 3]
+            column = columns.species
             words = [word if i == column else without_fortran(word) for i, word in enumerate(words)]
             labels.append(None)
             if column is not None:
@@ -67,18 +88,21 @@ def read_xyz(
             clean.append(" ".join(words))
         if count:
             roundings.append(last_digit(coordinates) if coordinates else 0.0)
+            unused = [*columns.unused, *([f"after the first {columns.width}"] * (further > 0))]
+            notes.append([f"its columns {', '.join(unused)} are not used"] if unused else [])
         at += 2 + count
     frames = []
     first = 0
     read = read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), "extxyz") if clean else []
-    for atoms, rounding in zip(read, roundings, strict=True):
+    for atoms, rounding, of_columns in zip(read, roundings, notes, strict=True):
         of_frame = labels[first : first + len(atoms)]
         first += len(atoms)
         named = len(of_frame) == len(atoms) and None not in of_frame
         names, elements = map(list, zip(*of_frame, strict=True)) if named else (None, None)
         if NAMES in atoms.arrays:
             names = [str(name) for name in atoms.arrays[NAMES]]
-        frames.append(partial(from_ase, path, atoms, names, elements, rounding=rounding))
+        make = partial(from_ase, path, atoms, names, elements)
+        frames.append(partial(make, rounding=rounding, notes=of_columns))
     return frames
 
 
@@ -93,16 +117,33 @@ def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
     return name, element_of_symbol(name)
 
 
-def _columns(properties: str) -> tuple[int | None, int | None, int]:
-    """Columns of species and positions, or None, and their number: 0, 1 and 4 for
-    `species:S:1:pos:R:3`."""
-    words = properties.split(":")
+def _columns(path: Path, line: int, comment: str) -> Columns:
+    """The columns of a frame, by the key Properties in its comment: species:S:1:pos:R:3 as in a
+    plain .xyz without one."""
+    comment = re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", comment)
+    for key in ("Lattice", "Properties", "pbc"):  # ASE knows them in these letters
+        comment = re.sub(rf"(?<!\S){key}(?=\s*=)", key, comment, flags=re.IGNORECASE)
+    lattice = re.search(r"\bLattice=\"([^\"]*)\"", comment)
+    what = "nine numbers of Lattice"
+    if lattice and len(numbers(path, line, lattice[1].split(), what)) not in (3, 9):
+        raise unexpected(path, line, what, lattice[1])
+    properties = re.search(r"Properties=\"?([^\s\"]+)", comment)
+    if not properties:
+        return Columns(comment, 0, 1, 4, "", ())
+    words = properties[1].split(":")
     column = 0
     column_of = {}
     for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
         column_of["species" if name.lower() == "symbols" else name.lower()] = column
-        column += 1 if (columns := parse_whole_number(width)) is None else columns
-    return column_of.get("species"), column_of.get("pos"), column
+        column += 1 if (count := parse_whole_number(width)) is None else count
+    return Columns(
+        comment,
+        column_of.get("species"),
+        column_of.get("pos"),
+        column,
+        properties[1],
+        tuple(name for name in column_of if name not in USED),
+    )
 
 
 def encoder(system: System, interval: float, velocities: bool) -> Encode:
