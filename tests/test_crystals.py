@@ -753,3 +753,39 @@ def test_a_file_without_the_line_of_its_block(tmp_path):
     assert "line 3: there is no 'data_' before its first entry" in found.notes
     with pytest.raises(StructureError, match="not valid CIF"):
         read(tmp_path, f"made by me\n{text}")
+
+
+# what a file states and what is not used
+
+
+@pytest.mark.parametrize(
+    ("tags", "what"),
+    [
+        ({HALL: "no hall"}, "its Hall symbol no hall"),
+        ({NUMBER: "999"}, "its space group number 999"),
+        ({"space_group_IT_coordinate_system_code": "zzz"}, "its coordinate system code zzz"),
+        ({"space_group_crystal_system": "foolish"}, "its crystal system foolish"),
+    ],
+)
+def test_what_no_table_has_is_noted(tags, what, tmp_path):
+    found = read(tmp_path, cif((9, 10, 11, 90, 90, 90), **{NAME: "P -1"}, **tags))
+    assert len(found.names) == 6
+    assert f"{what} is unknown" in found.notes
+
+
+def test_charges_of_some_atoms_only(tmp_path):
+    text = cif((9, 10, 11, 90, 90, 90), operations=("x,y,z",))
+    rows = [f"{x} {q}" for x, q in zip(text.splitlines()[-3:], ("-0.8", "0.4", "0.4"), strict=True)]
+    head = "\n".join(text.splitlines()[:-3])
+    head += "\n_atom_site_charge\n"
+    assert read(tmp_path, head + "\n".join(rows)).charges.tolist() == [-0.8, 0.4, 0.4]
+    assert (
+        read(tmp_path, head + "\n".join(f"{row.rsplit(' ', 1)[0]} ?" for row in rows)).charges
+        is None
+    )
+    for bad, found in (("?", "none"), ("x", "x")):
+        changed = [rows[0], rows[1].removesuffix("0.4") + bad, rows[2]]
+        with pytest.raises(
+            StructureError, match=f"atom H1: expected _atom_site_charge .* found {found}"
+        ):
+            read(tmp_path, head + "\n".join(changed))

@@ -2977,3 +2977,67 @@ def test_a_column_that_a_dump_names_twice(tmp_path):
     text = dump_of(truth, "id element x y z").replace("element x y z", "element x y z x id")
     with pytest.raises(StructureError, match="line 9: names the column id, x twice"):
         read(tmp_path, text, "a.lammpstrj", ["tip4p2005"])
+
+
+# what a file states and what is not used
+
+
+@pytest.mark.parametrize(
+    ("comment", "row", "note"),
+    [
+        ("x", "Ar 1 1 1 0.1 0.2 0.3", "its columns after the first 4 are not used"),
+        ("Properties=species:S:1:pos:R:3:mass:R:1", "Ar 1 1 1 5", "its columns mass are not used"),
+        ("properties=pos:R:3:species:S:1:q:R:1", "1 1 1 Ar 5", "its columns q are not used"),
+        ("Properties=species:S:1:pos:R:3:Vel:R:3", "Ar 1 1 1 5 6 7", "in the column Vel have no"),
+        (
+            "Properties=species:S:1:pos:R:3:residuenumbers:I:1",
+            "Ar 1 1 1 5",
+            "residues are not used",
+        ),
+        ('pbc="T T F"', "Ar 1 1 1", "its cell is periodic along a, b only and is not used"),
+        ('PBC="T T F"', "Ar 1 1 1", "its cell is periodic along a, b only and is not used"),
+        ("Properties=species:S:1:pos:R:3:forces:R:3", "Ar 1 1 1 5 6 7", ""),
+    ],
+)
+def test_columns_and_keys_of_xyz(comment, row, note, tmp_path):
+    """ASE knows keys in some letters only, and reads more columns than a start uses."""
+    for lattice in ("Lattice", "lattice", "LATTICE"):
+        text = f'1\n{lattice}="9 0 0 0 9 0 0 0 9" {comment}\n{row}\n'
+        found = read(tmp_path, text, "a.xyz", ["argon"], np.diag([9.0] * 3))
+        assert found.position == pytest.approx(np.ones((1, 3)))
+        assert note in "; ".join(found.notes)
+        assert bool(note) == bool(found.notes)
+
+
+def test_properties_that_ase_does_not_read(tmp_path):
+    text = "1\nProperties=species:\tS:1:pos:R:3\nAr 1 1 1\n"
+    with pytest.raises(StructureError, match="ASE reads 0 of its 1 structures: is the key Prop"):
+        read(tmp_path, text, "a.xyz", ["argon"])
+
+
+def test_what_pdb_and_g96_state_and_what_is_not_used(tmp_path):
+    pdb = "ATOM      1  Ar  AR      1       1.000   1.000   1.000  1.00  0.00          {:>2}\nEND\n"
+    options = {"cell": np.diag([9.0] * 3)}
+    found = read(tmp_path, pdb.format("QZ"), "a.pdb", ["argon"], **options)
+    assert "symbols in columns 77 and 78, QZ, are no elements" in "; ".join(found.notes)
+    assert not read(tmp_path, pdb.format("AR"), "a.pdb", ["argon"], **options).notes
+    g96 = as_g96([("Ar", [1.0, 1.0, 1.0])], np.diag([9.0] * 3))
+    assert not read(tmp_path, g96, "a.g96", ["argon"]).notes
+    found = read(tmp_path, g96.replace("BOX", "GENBOX"), "a.g96", ["argon"], **options)
+    assert "its blocks GENBOX are not used" in found.notes
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        (
+            "Atom Type Labels\n\n1 O 5\n2 H\n\nMasses",
+            "expected a type and its label, found '1 O 5'",
+        ),
+        ("Velocities\n\n77 1 0 0\n\nMasses", "expected the velocities of an atom of the file"),
+    ],
+)
+def test_rows_of_lammps_data_that_belong_to_nothing(section, message, tmp_path):
+    text = lammps(Truth(["spce", "argon"], 12), "x, units = real", 1.0)
+    with pytest.raises(StructureError, match=message):
+        read(tmp_path, text.replace("Masses", section, 1), "a.data", ["spce", "argon"])

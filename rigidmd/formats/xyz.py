@@ -17,6 +17,7 @@ from rigidmd.formats.atoms import (
     element_of_symbol,
     last_digit,
     numbers,
+    structure_error,
     unexpected,
     without_fortran,
 )
@@ -94,6 +95,9 @@ def read_xyz(
     frames = []
     first = 0
     read = read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), "extxyz") if clean else []
+    if len(read) != len(roundings):
+        problem = f"ASE reads {len(read)} of its {len(roundings)} structures"
+        raise structure_error(path, f"{problem}: is the key Properties of each valid?")
     for atoms, rounding, of_columns in zip(read, roundings, notes, strict=True):
         of_frame = labels[first : first + len(atoms)]
         first += len(atoms)
