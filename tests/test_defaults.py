@@ -546,7 +546,7 @@ def test_a_run_keeps_its_default_step_and_check_tells_its_error(tmp_path, capsys
 
 
 def test_the_limit_of_a_cutoff_in_a_dodecahedron_is_not_called_the_minimum_image_convention():
-    """Its images are an edge apart, which half of a_x, b_y or c_z does not show."""
+    """Its images are at the distance of an edge, which half of a_x, b_y or c_z does not show."""
     edge = 17.4
     box = {"lengths_A": [edge] * 3, "angles_deg": [60.0, 60.0, 90.0]}
     forces = {"cutoff_A": 8.0}

@@ -248,11 +248,11 @@ def test_elements_in_capitals(form, symbol, tmp_path):
     assert elements_in(tmp_path, form, text, element, "O") == ((element, "O"), ANY)
     one = "H" if symbol == "HO" else symbol[0]
     with pytest.raises(SceneError, match=f"no entry of sites has this name or the name {element};"):
-        elements_in(tmp_path, form, in_capitals(form, symbol, one), one)  # beside C, CO is cobalt
+        elements_in(tmp_path, form, in_capitals(form, symbol, one), one)  # next to C, CO is cobalt
 
 
 def test_symbols_in_capitals_that_are_names(tmp_path):
-    """CO of a file with names of sites as types is carbon, if the formula or the scene says so."""
+    """CO of a file with names of sites as types is carbon, by the formula or by the elements of the scene."""
     of_formula = in_capitals("cif", "CO", "O", "C1 O1")
     assert elements_in(tmp_path, "cif", of_formula, "CO", "O")[0] == ("C", "O")
     text = in_capitals("cif", "CO", "O")

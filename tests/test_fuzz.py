@@ -571,7 +571,7 @@ def _structures(attack, told):
     )
 
 
-#: Files that are read through ASE, or that are binary, beside `STRUCTURES`: name -> format of ASE.
+#: Files that are read through ASE, or that are binary, next to those of `STRUCTURES`: name -> format of ASE.
 OF_ASE = {
     "x.traj": "traj",
     "POSCAR": "vasp",

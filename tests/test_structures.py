@@ -2934,7 +2934,7 @@ def test_few_decimals_do_not_make_a_molecule_linear(tmp_path):
 
 
 def test_a_damaged_byte_of_a_traj_is_told(tmp_path):
-    """ASE looks at atomic numbers when their symbols are asked for."""
+    """ASE looks at atomic numbers when their symbols are needed."""
     path = tmp_path / "a.traj"
     ase.io.write(path, ase.Atoms("Ar3", np.eye(3), cell=[9, 9, 9], pbc=True))
     content = bytearray(path.read_bytes())
@@ -3019,7 +3019,7 @@ def test_what_pdb_and_g96_state_and_what_is_not_used(tmp_path):
     pdb = "ATOM      1  Ar  AR      1       1.000   1.000   1.000  1.00  0.00          {:>2}\nEND\n"
     options = {"cell": np.diag([9.0] * 3)}
     found = read(tmp_path, pdb.format("QZ"), "a.pdb", ["argon"], **options)
-    assert "symbols in columns 77 and 78, QZ, are no elements" in "; ".join(found.notes)
+    assert "symbols in columns 77 and 78, QZ, are not elements" in "; ".join(found.notes)
     assert not read(tmp_path, pdb.format("AR"), "a.pdb", ["argon"], **options).notes
     g96 = as_g96([("Ar", [1.0, 1.0, 1.0])], np.diag([9.0] * 3))
     assert not read(tmp_path, g96, "a.g96", ["argon"]).notes

@@ -658,7 +658,7 @@ def test_a_wide_box_is_read_back(name, angles, edge, tmp_path):
 
 
 def test_a_run_in_a_wide_box_continues_from_its_trajectory(tmp_path):
-    """A dilute gas: the trajectory has no names, which are in topology.gro beside it."""
+    """A dilute gas: the trajectory has no names, which are in topology.gro next to it."""
     changes = {"forces": {"cutoff_A": 9.0}, "output": {"trajectory_interval_ps": 0.004}}
     scene = small_scene({"argon": 2}, 12000.0, **changes)
     results = Simulation(scene, tmp_path / "run").run()

@@ -72,7 +72,7 @@ LISTED = "its list of operations"
 MODEL = "_atom_site_pdbx_pdb_model_num"
 FORMULA, UNITS_IN_CELL = "_chemical_formula_sum", "_cell_formula_units_z"
 DENSITY = "_exptl_crystal_density_diffrn"
-#: Tags that are read, beside those of atoms.
+#: Tags that are read, next to those of atoms.
 READ = {*CELL, *OPERATIONS, *HALL, *NAMES, *NUMBERS, *CODES, *SYSTEMS}
 READ |= {FORMULA, UNITS_IN_CELL, DENSITY}
 #: Neighbouring residues of an mmCIF differ in one of these.

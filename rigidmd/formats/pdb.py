@@ -124,7 +124,9 @@ def _pdb_model(
             path, f"has alternate locations {', '.join(sorted(locations))}. Keep one of them"
         )
     if unknown:
-        where = f"in columns 77 and 78, {', '.join(sorted(unknown)[:MOST_LISTED])}, are no elements"
+        where = (
+            f"in columns 77 and 78, {', '.join(sorted(unknown)[:MOST_LISTED])}, are not elements"
+        )
         notes = [*notes, f"symbols {where}: the names of atoms were used"]
     if count == 1 and not residue[0][1]:
         residue = [()] * len(names)

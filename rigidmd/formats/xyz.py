@@ -37,7 +37,7 @@ USED |= {*UNITLESS_VELOCITIES, "forces", "force", "magmoms", "tags", "move_mask"
 
 
 class Columns(NamedTuple):
-    """What the comment of a frame says about its atoms."""
+    """The columns of a frame, as given in its comment."""
 
     comment: str  # as ASE reads it
     species: int | None  # columns

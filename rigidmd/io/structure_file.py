@@ -135,7 +135,7 @@ def read_geometry(path: Path, vocabulary: frozenset[str] = frozenset()) -> Atoms
             path, "is a trajectory: name a structure file, or write one of its frames as a file"
         )
     atoms = read_atoms(path)
-    # beside C, CO is cobalt
+    # next to C, CO is cobalt
     atoms = with_elements(atoms, vocabulary.difference(atoms.elements))
     elements = [
         e or element_of(name, vocabulary) or "X"
