@@ -10,8 +10,9 @@ from scipy.integrate import quad
 import rigidmd
 from rigidmd.commands.cli import main
 from rigidmd.errors import MoleculeError, SceneError, SimulationError
-from rigidmd.scene.models import load_model
-from rigidmd.studies.virial import CM3_PER_MOL, integrate, second_virial
+from rigidmd.scene.models import available_models, load_model
+from rigidmd.studies import virial
+from rigidmd.studies.virial import CM3_PER_MOL, Pair, integrate, second_virial
 from rigidmd.units import BOLTZMANN, COULOMB, KJ_PER_MOL
 
 ARGON = load_model("argon")
@@ -48,7 +49,7 @@ def test_square_well():
         r = np.linalg.norm(position, axis=1)
         return np.select([r < sigma, r < reach * sigma], [np.inf, -well], 0.0)
 
-    found = integrate(energy, kt / BOLTZMANN, points=True)
+    found = integrate(Pair(("A", "B"), kt / BOLTZMANN, energy, points=True))
     core = 2 / 3 * pi * sigma**3 * CM3_PER_MOL
     exact = core * (1 - (reach**3 - 1) * np.expm1(well / kt))
     np.testing.assert_allclose(found.B2, exact, rtol=1e-6)
@@ -56,33 +57,101 @@ def test_square_well():
     np.testing.assert_allclose(found.dB2_dT, slope, rtol=1e-6)
 
 
+def test_points_at_one_temperature_do_not_depend_on_others():
+    together = second_virial("argon", temperatures=[0.2, 300.0])
+    alone = second_virial("argon", temperatures=[300.0])
+    assert together.B2[0] < -1e250
+    assert together.B2[1] == alone.B2[0]
+    assert together.error[1] == alone.error[0] < 1e-6
+
+
 def argon_nitrogen(temperature):
-    """B2 of argon and TraPPE nitrogen by quadrature over the angle and r, in NumPy."""
+    """B2 and dB2/dT of argon and TraPPE nitrogen by quadrature over the angle and r, in NumPy."""
     nitrogen = load_model("nitrogen_trappe")
     x, weight = np.polynomial.legendre.leggauss(48)
     at = nitrogen.positions_body[:, 0]
+    sigma, well = (SIGMA + nitrogen.sigma) / 2, np.sqrt(WELL * nitrogen.epsilon)
 
-    def shell(r):
+    def shell(r, of):
         d2 = r**2 + at[:, None] ** 2 - 2 * r * x * at[:, None]
-        sigma, well = (SIGMA + nitrogen.sigma) / 2, np.sqrt(WELL * nitrogen.epsilon)
         six = (sigma[:, None] ** 2 / d2) ** 3
-        u = (4 * well[:, None] * (six**2 - six)).sum(axis=0)
-        return r**2 * (weight @ np.expm1(-u / (BOLTZMANN * temperature))) / 2
+        reduced = (4 * well[:, None] * (six**2 - six)).sum(axis=0) / (BOLTZMANN * temperature)
+        return r**2 * (weight @ of(reduced)) / 2
 
-    parts = [quad(shell, a, b, limit=500)[0] for a, b in ((0.1, 2), (2, 4), (4, 8), (8, 100))]
-    return -2 * pi * CM3_PER_MOL * (sum(parts) - 0.1**3 / 3)
+    def integral(of):
+        ends = ((0.1, 2), (2, 4), (4, 8), (8, 100))
+        return sum(quad(shell, a, b, args=(of,), limit=500)[0] for a, b in ends)
+
+    value = integral(lambda u: np.expm1(-u)) - 0.1**3 / 3
+    slope = integral(lambda u: u * np.exp(-u)) / temperature
+    return -2 * pi * CM3_PER_MOL * np.array([value, slope])
+
+
+def test_the_derivative_and_its_error():
+    """Pulls of few coarse values."""
+    exact, options = argon_nitrogen(300.0)[1], {"temperatures": [300.0], "error": 1.0}
+    pulls = []
+    for seed in range(6):
+        found = second_virial("argon", "nitrogen_trappe", **options, seed=100 * seed)
+        pulls.append((found.dB2_dT[0] - exact) / found.dB2_dT_error[0])
+    assert 0.3 < np.sqrt(np.mean(np.square(pulls))) < 2.5
 
 
 def test_errors_are_honest():
     """Pulls of cross coefficients over seeds, of a molecule and of an atom as the first one."""
     exact, pulls = argon_nitrogen(300.0), []
-    for seed in range(12):
+    for seed in range(24):
         pair = ("argon", "nitrogen_trappe")[:: 1 - 2 * (seed % 2)]
         found = second_virial(*pair, temperatures=[300.0], error=0.2, seed=100 * seed)
         assert found.error[0] <= 0.2
-        pulls.append((found.B2[0] - exact) / found.error[0])
+        off = np.concatenate([found.B2, found.dB2_dT]) - exact
+        pulls.append(off / np.concatenate([found.error, found.dB2_dT_error]))
     assert np.abs(pulls).max() < 4
-    assert 0.4 < np.std(pulls) < 1.6
+    assert (np.std(pulls, axis=0) > 0.6).all()
+    assert (np.std(pulls, axis=0) < 1.5).all()
+
+
+def test_a_molecule_with_charges_that_cancel():
+    """Values of a separate program: Gauss-Legendre panels of ln r to 400 Å, random orientations
+    with the 24 rotations of a cube."""
+    found = second_virial("nitrogen_trappe", temperatures=[250.0, 300.0, 500.0], error=0.5)
+    off = np.abs(found.B2 - [-14.67, -3.00, 18.07])
+    assert (off < 4 * np.hypot(found.error, [0.05, 0.04, 0.03])).all()
+    assert found.error.max() < 0.5
+    mixed = ("nitrogen_trappe", "co2_trappe")
+    found = second_virial(*mixed, temperatures=[250.0, 300.0, 500.0], error=1.0)
+    off = np.abs(found.B2 - [-55.36, -33.29, 5.30])
+    assert (off < 4 * np.hypot(found.error, [0.07, 0.06, 0.04])).all()
+    assert found.species == mixed
+
+
+NEUTRAL = [name for name in available_models() if abs(load_model(name).charges.sum()) < 1e-6]
+CHARGED = [name for name in available_models() if name not in NEUTRAL]
+
+
+def converges(monkeypatch, *pair):
+    """Whether few samples give an answer at three temperatures."""
+    monkeypatch.setattr(virial, "FEWEST", 2**6)
+    monkeypatch.setattr(virial, "AT_ONCE", 2**8)
+    found = second_virial(*pair, temperatures=[250.0, 500.0, 1000.0], error=1e9)
+    assert np.isfinite([found.B2, found.error, found.dB2_dT, found.dB2_dT_error]).all()
+    assert found.samples <= virial.SETS * virial.FEWEST * 12
+    return True
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("name", NEUTRAL)
+def test_every_neutral_model_has_an_answer(name, monkeypatch):
+    assert converges(monkeypatch, name)
+    assert converges(monkeypatch, name, "spce") or name == "spce"
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("name", NEUTRAL)
+def test_every_pair_of_models_has_an_answer(name, monkeypatch):
+    """Pairs of neutral models, and of a neutral one with an ion."""
+    for second in (*NEUTRAL[NEUTRAL.index(name) + 1 :], *CHARGED):
+        assert converges(monkeypatch, name, second)
 
 
 #: SPC/E with the numbers of the authors' program, etomica, see the guide.
@@ -161,6 +230,57 @@ def test_a_barrier_is_a_core():
     assert found.B2[0] == pytest.approx(-2 * pi * CM3_PER_MOL * integral, rel=1e-6)
 
 
+def test_a_reaction_field_of_the_molecule_itself_does_not_count():
+    """Within the cutoff, by an energy in NumPy that has pairs of both molecules only."""
+    model, cutoff = load_model("nitrogen_trappe"), 12.0
+    x, q = model.positions_body, model.charges
+    charged = (model.epsilon > 0)[:, None] & (model.epsilon > 0)
+
+    def energy(position, rotation):
+        sites = position[:, None] + np.einsum("mij,sj->msi", rotation, x)
+        d = np.linalg.norm(sites[:, :, None] - x, axis=3)
+        six, end = (model.sigma[0] / np.maximum(d, 0.1)) ** 6, (model.sigma[0] / cutoff) ** 6
+        lennard_jones = 4 * model.epsilon[0] * (six**2 - six - end**2 + end) * charged
+        coulomb = COULOMB * np.outer(q, q) * (1 / d + d**2 / (2 * cutoff**3) - 1.5 / cutoff)
+        total = np.where(d < cutoff, lennard_jones + coulomb, 0.0).sum(axis=(1, 2))
+        return np.where((charged & (lennard_jones > 1e5)).any(axis=(1, 2)), np.inf, total)
+
+    settings = {"forces.electrostatics": "reaction_field", "forces.cutoff_A": cutoff}
+    found = second_virial("nitrogen_trappe", temperatures=[200.0], error=1.0, settings=settings)
+    exact = integrate(Pair(("N2", "N2"), np.array([200.0]), energy, farthest=1e4), 1.0, seed=500)
+    assert abs(found.B2[0] - exact.B2[0]) < 4 * np.hypot(found.error[0], exact.error[0])
+
+
+MASSES = """
+name = "masses"
+[[sites]]
+name = "A"
+mass_u = 10
+position_A = [0, 0, 0]
+[[sites]]
+name = "B"
+mass_u = 10
+position_A = [0, 0, 1]
+"""
+
+
+def test_molecules_without_forces(tmp_path):
+    (tmp_path / "masses.toml").write_text(MASSES)
+    found = second_virial(str(tmp_path / "masses.toml"), "argon", temperatures=[10.0, 300.0])
+    values = [found.B2, found.error, found.dB2_dT, found.dB2_dT_error]
+    np.testing.assert_array_equal(values, np.zeros((4, 2)))
+    assert found.species == ("masses", "argon")
+    assert found.samples < 1e6
+
+
+def test_progress_rises_to_one():
+    shown = []
+    second_virial("ethane_trappe", temperatures=[500.0], error=0.3, progress=shown.append)
+    assert len(shown) > virial.SETS  # more than one pass
+    assert shown == sorted(shown)
+    assert 0 < shown[0] < shown[-1] == 1
+
+
 def test_keys_of_forces_act():
     """A mixing rule and parameters of a pair."""
     names, options = ("argon", "xenon"), {"temperatures": [300.0]}
@@ -196,12 +316,38 @@ def test_what_is_refused(tmp_path):
     ):
         with pytest.raises(error, match=words):
             second_virial(*models, temperatures=[300.0])
-    for wrong in ([], [0.0], [-1.0]):
-        with pytest.raises(SceneError, match="temperatures must be above 0 K"):
+    for wrong in ([], [0.0], [-1.0], [300.0, np.nan], [np.inf], [1e300]):
+        with pytest.raises(SceneError, match="temperatures must be above 0 K and at most"):
             second_virial("argon", temperatures=wrong)
-    slow = rigidmd.pair_potential("-1/r**2", sites=["AR"])
-    with pytest.raises(SimulationError, match="falls too slowly"):
-        second_virial("argon", temperatures=[300.0], forces=[slow])
+    for wrong in (0.0, -1.0, np.nan):
+        with pytest.raises(SceneError, match="the requested error must be above 0"):
+            second_virial("argon", temperatures=[300.0], error=wrong)
+    for key in ("box.periodic", "seed", "molecules.0.count", "fields.gravity", "coupling.value"):
+        with pytest.raises(SceneError, match=f"{key}: two molecules .* take keys of .forces. only"):
+            second_virial("argon", temperatures=[300.0], settings={key: 1})
+    slow = rigidmd.pair_potential("1/r**2")
+    for name in ("argon", "nitrogen_trappe"):
+        with pytest.raises(SimulationError, match=f"{name}-{name} does not converge.*cutoff_A"):
+            second_virial(name, temperatures=[300.0], forces=[slow])
+
+
+@pytest.mark.parametrize("coldest", [1e-300, 0.01, 0.1])
+def test_temperatures_of_which_no_number_exists(coldest):
+    """Alone, and next to one for which there is one."""
+    for temperatures in ([coldest], [coldest, 300.0]):
+        with pytest.raises((SceneError, SimulationError), match=r"repulsive core|range of numbers"):
+            second_virial("argon", temperatures=temperatures)
+    with pytest.raises((SceneError, SimulationError), match=r"repulsive core|range of numbers"):
+        second_virial("ethane_trappe", temperatures=[coldest, 300.0], error=1.0)
+
+
+def test_forces_that_are_not_of_pairs_are_refused():
+    class Spring(rigidmd.Force):
+        def on_molecules(self, state):
+            return 0.5 * (state.position**2).sum(), -state.position
+
+    with pytest.raises(SceneError, match=r"Spring is not a potential of pairs.*pair_pot"):
+        second_virial("argon", temperatures=[300.0], forces=[Spring()])
 
 
 def test_the_command(tmp_path, capsys):
@@ -220,7 +366,7 @@ def test_the_command(tmp_path, capsys):
     assert main(words) == 2  # the file exists
     with pytest.raises(SystemExit):
         main(["virial", "argon", "--temperatures", "300,cold"])
-    assert "'300,cold' are not temperatures above 0 K" in capsys.readouterr().err
+    assert "'300,cold' are not temperatures in K" in capsys.readouterr().err
 
 
 def segments(r, u, v, half=0.5):

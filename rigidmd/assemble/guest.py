@@ -79,7 +79,8 @@ class Guest:
         self._without = _reassembled(system, self._host, [])
         core = max(CORE, CORE_IN_KT * self._thermal)
         self._pairs: list[tuple[PairForces, list[PairOfKinds]]] = []
-        rest: list[str] = []
+        #: Terms that the engine evaluates
+        self.engine_terms: list[str] = []
         self._poses = [cast("BodyPairs", self._with.terms[name]) for name in self._with.body_pairs]
         for name, term in self._with.terms.items():
             if name in self._with.body_pairs:
@@ -90,11 +91,13 @@ class Guest:
                 if all(map(len, sites)):
                     self._pairs.append((term, pairs_of_kinds(term.potential, *sites, core)))
             elif molecule.charges.any() or not trait(term, "acts_on_charges"):
-                rest.append(name)
+                self.engine_terms.append(name)
         # cores end the sums early
         self._pairs.sort(key=lambda pair: max((p.core for p in pair[1]), default=0.0), reverse=True)
         self._engines = (
-            [_engine_of(one, rest) for one in (self._with, self._without)] if rest else []
+            [_engine_of(one, self.engine_terms) for one in (self._with, self._without)]
+            if self.engine_terms
+            else []
         )
 
     @property
