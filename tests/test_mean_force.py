@@ -38,7 +38,10 @@ def windows(seed, potential, distances=DISTANCES, count=400, stiffness=STIFFNESS
 
 @pytest.mark.parametrize("potential", [lennard_jones, morse])
 def test_a_known_potential(potential):
-    result = potential_of_mean_force(windows(1, potential, stiffness=STIFFNESS + 3), KT)
+    """By windows with different numbers of samples."""
+    every = windows(1, potential, stiffness=STIFFNESS + 3, count=800)
+    every[1::2] = [window._replace(samples=window.samples[:200]) for window in every[1::2]]
+    result = potential_of_mean_force(every, KT)
     r, found, error = (result[name] for name in ("r (A)", "W (kJ/mol)", "W (kJ/mol) error"))
     outer = r >= r[-max(1, round(0.1 * len(r)))]
     seen = (r > 3.5) & (r < 8)  # the potential is not straight within the first bins
@@ -52,18 +55,72 @@ def test_a_known_potential(potential):
     assert result.value().value == found.min()
 
 
+SEEDS = 40
+
+
 def test_errors_are_those_of_repeated_samples():
-    """Over seeds, W deviates by its errors: pulls of unit width, without a bias."""
-    pulls = []
-    for seed in range(12):
-        result = potential_of_mean_force(windows(seed, lennard_jones, count=150), KT, width=0.2)
+    """Over seeds, W deviates by its errors: pulls of unit width, without a bias, of windows with
+    different numbers of samples."""
+    pulls, counts = [], (60, 480)
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(seed)
+        some = [
+            Window(d, STIFFNESS, drawn(rng, lennard_jones, d, STIFFNESS, counts[k % len(counts)]))
+            for k, d in enumerate(DISTANCES[2:6])
+        ]
+        result = potential_of_mean_force(some, KT, width=0.2)
         r = result["r (A)"]
         expected = lennard_jones(r) - lennard_jones(r)[-max(1, round(0.1 * len(r))) :].mean()
-        for at in (4.1, 5.1, 6.5):
-            k = np.abs(r - at).argmin()
-            pulls.append((result["W (kJ/mol)"][k] - expected[k]) / result["W (kJ/mol) error"][k])
-    assert abs(np.mean(pulls)) < 0.6
-    assert 0.6 < np.std(pulls) < 1.5
+        at = [np.abs(r - distance).argmin() for distance in (4.3, 4.7, 5.1)]
+        found, error = result["W (kJ/mol)"], result["W (kJ/mol) error"]
+        pulls.append((found - expected)[at] / error[at])
+    assert (np.abs(np.mean(pulls, axis=0)) < 4 / SEEDS**0.5).all()
+    assert 0.8 < np.std(pulls) < 1.2
+
+
+def test_overlap_of_windows_with_different_numbers_of_samples():
+    """The overlap in the note is the mean fraction, in the second window, of the first one."""
+    distances, counts, stiffness = (4.0, 5.2), (4000, 500), 16.0
+    rng = np.random.default_rng(5)
+    some = [
+        Window(d, stiffness, drawn(rng, lennard_jones, d, stiffness, count))
+        for d, count in zip(distances, counts, strict=True)
+    ]
+    r = np.linspace(2.5, 14, 40001)
+    density = np.array(
+        [r**2 * np.exp(-(lennard_jones(r) + stiffness / 2 * (r - d) ** 2) / KT) for d in distances]
+    )
+    density /= density.sum(axis=1, keepdims=True)
+    density = density[:, density.sum(axis=0) > 0]
+    first, second = density * np.array(counts)[:, None]
+    exact = (first * density[1] / (first + second)).sum()
+    assert exact < 0.03
+    (note,) = [n for n in potential_of_mean_force(some, KT).notes if "hardly overlap" in n]
+    shown = float(note.partition("(")[2].partition(",")[0])
+    assert shown == pytest.approx(exact, rel=0.3)
+
+
+@pytest.mark.parametrize("depth", [28.0, 40.0])
+def test_deep_wells(depth):
+    """Weights of the bins that differ by more than the precision, and the range, of a number."""
+    rng, stiffness, kt = np.random.default_rng(1), 40.0 * max(1.0, depth / 30), 2.494
+
+    def potential(r):
+        return -depth * kt * np.exp(-(((r - 3) / 1.5) ** 2))
+
+    grid, some = np.linspace(2, 8, 40001), []
+    for distance in np.arange(2.6, 7.0, 0.3 * min(1.0, (60 / depth) ** 0.5)):
+        energy = (potential(grid) + stiffness / 2 * (grid - distance) ** 2) / kt
+        total = np.cumsum(grid**2 * np.exp(energy.min() - energy))
+        some.append(
+            Window(float(distance), stiffness, np.interp(rng.random(200), total / total[-1], grid))
+        )
+    result = potential_of_mean_force(some, kt)
+    r, found, error = (result[name] for name in ("r (A)", "W (kJ/mol)", "W (kJ/mol) error"))
+    expected = potential(r) - potential(r)[-max(1, round(0.1 * len(r))) :].mean()
+    assert found.min() == pytest.approx(-depth * kt, rel=0.05)
+    width = 0.1 * np.abs(np.gradient(expected, r)) / 2  # of the energy in a bin
+    assert (np.abs(found - expected) < 5 * error + width).all()
 
 
 def test_correlated_samples_have_larger_errors():

@@ -346,7 +346,7 @@ def test_forces_that_are_not_of_pairs_are_refused():
         def on_molecules(self, state):
             return 0.5 * (state.position**2).sum(), -state.position
 
-    with pytest.raises(SceneError, match=r"Spring is not a potential of pairs.*pair_pot"):
+    with pytest.raises(SceneError, match=r"spring is not a potential of pairs.*pair_pot"):
         second_virial("argon", temperatures=[300.0], forces=[Spring()])
 
 

@@ -71,7 +71,7 @@ def potential_of_mean_force(
     start = np.zeros(len(windows))
     free, overlap = _free_energies(windows, samples, thermal_energy, start)
     notes = _overlap_notes(windows, overlap)
-    counts = np.histogram(np.concatenate(samples), edges)[0]
+    counts = np.bincount(_bins_of(np.concatenate(samples), edges), minlength=len(centre))
     filled = counts >= LEAST_IN_BIN
     profile_of_all = _profile(windows, samples, thermal_energy, free, edges, filled)
     rng = np.random.default_rng(0)
@@ -166,10 +166,16 @@ def _profile(
     count = np.array([len(some) for some in samples], float)
     bias = _biases(windows, x, thermal_energy)
     weight = -np.asarray(logsumexp(np.log(count)[:, None] + free[:, None] - bias, axis=0))
-    density = np.histogram(x, edges, weights=np.exp(weight - weight.max()) / x**2)[0][filled]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        profile = -thermal_energy * np.log(density)
+    log_density = np.full(len(filled), -np.inf)  # densities differ by many orders of magnitude
+    np.logaddexp.at(log_density, _bins_of(x, edges), weight - 2 * np.log(x))
+    profile = -thermal_energy * log_density[filled]
+    with np.errstate(invalid="ignore"):
         return profile - profile[_outer(len(profile))].mean()
+
+
+def _bins_of(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Numbers (n,) of the bins of distances."""
+    return np.clip(np.searchsorted(edges, x, "right") - 1, 0, len(edges) - 2)
 
 
 def _outer(bins: int) -> slice:
