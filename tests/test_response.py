@@ -14,6 +14,7 @@ import rigidmd
 from rigidmd import Scene, Simulation
 from rigidmd.analysis.built_in.thermodynamics import response
 from rigidmd.analysis.runs import Runs
+from rigidmd.commands.cli import main
 from rigidmd.errors import OutputError
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
@@ -181,6 +182,45 @@ def test_a_run_of_an_ideal_gas_of_rotors_has_its_responses(barostat):
         assert measured.value is not None, measured
         assert abs(measured.value - value) < 4 * measured.error + 1e-4 * value, measured
         assert measured.error < 0.2 * value, measured
+
+
+def test_a_run_without_frames_has_responses_and_a_viscosity(tmp_path, capsys):
+    """The same as with them: from the log and the pressure tensor, in memory and from a folder."""
+    scene = {
+        "box": {"lengths_A": 18.0},
+        "molecules": [{"model": "argon", "count": 50}],
+        "forces": {"cutoff_A": 8.0},
+        "stages": [
+            {"duration_ps": 25.0, "timestep_fs": 10.0, "ensemble": "nvt", "temperature_K": 200.0}
+        ],
+        "output": {
+            "figures": False,
+            "pressure_tensor_interval_ps": 0.02,
+            "log_interval_ps": 0.05,
+            "trajectory_interval_ps": 5.0,
+        },
+    }
+    found = []
+    for trajectory, folder in (("t.xyz", "with"), (False, "without"), (False, None)):
+        scene["output"]["trajectory"] = trajectory
+        results = Simulation(Scene.from_dict(scene), folder and tmp_path / folder).run(
+            progress=False
+        )
+        analyses = [getattr(rigidmd.analysis, name)(results) for name in ("response", "viscosity")]
+        found.append([[str(value) for value in analysis.values] for analysis in analyses])
+        if not trajectory:
+            with pytest.raises(OutputError, match=r"rdf needs the frames of a trajectory: .*false"):
+                rigidmd.analysis.rdf(results)
+    assert found[0] == found[1] == found[2]
+    assert all(values for values in found[0])
+    assert main(["analyse", str(tmp_path / "without")]) == 0
+    printed = capsys.readouterr().out
+    assert "c_v" in printed
+    assert "msd, diffusion" in printed and printed.count("needs the frames of a trajectory") == 1
+    (tmp_path / "with" / "t.xyz").unlink()
+    assert main(["analyse", str(tmp_path / "with"), "--only", "response"]) == 0
+    assert main(["analyse", str(tmp_path / "with"), "--only", "msd"]) == 2
+    assert "its trajectory t.xyz is missing" in capsys.readouterr().err
 
 
 # series with known covariances

@@ -26,9 +26,10 @@ def check_conditions(name: str, runs: Runs, conditions: Iterable[Condition]) -> 
 
 
 def trajectory(runs: Runs) -> str:
-    if all(len(run) > 1 for run in runs.members):
-        return ""
-    return "the frames of a trajectory, and this run wrote none (output.trajectory = false)"
+    for run in runs.members:
+        if len(run) < 2:
+            return f"the frames of a trajectory: {run.why_no_frames or 'there are fewer than two'}"
+    return ""
 
 
 def velocities(runs: Runs) -> str:

@@ -13,6 +13,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 from rigidmd.analysis.curve_figure import curve_figure
 from rigidmd.analysis.options import check_options
 from rigidmd.analysis.registry import analysis_order, is_built_in, selected
+from rigidmd.analysis.report import by_reason, frames_text
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.analysis.runs import Runs, as_runs
@@ -166,7 +167,7 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
                     errors=errors,
                 )
             )
-        phrase = f"{used.frames} frames from {used.from_ps:g} to {used.to_ps:g} ps"
+        phrase = frames_text(used.frames, used.from_ps, used.to_ps)
         results.append(
             (AnalysisResult(name, entry.about, entry.values, curves, entry.notes), phrase)
         )
@@ -236,8 +237,8 @@ def analyse_frames(
     results, failed = run_analyses(runs, names, viscosity, progress, options)
     used = {
         "stage": runs.first.stage.label,
-        "from_ps": min(float(run.time[0]) for run in runs.members),
-        "to_ps": max(float(run.time[-1]) for run in runs.members),
+        "from_ps": min(run.ends[0] for run in runs.members),
+        "to_ps": max(run.ends[1] for run in runs.members),
         "frames": runs.frame_count,
         "runs": len(runs.members),
         "notes": runs.first.notes,
@@ -280,8 +281,9 @@ def run_analyses(
 
 def no_result_reason(failed: dict[str, str]) -> str:
     """Why no analysis has a result."""
-    reasons = "; ".join(dict.fromkeys(failed.values()))
-    return reasons if len(failed) == 1 else f"no analysis is possible: {reasons}"
+    if len(failed) == 1:
+        return next(iter(failed.values()))
+    return f"no analysis is possible: {'; '.join(by_reason(failed))}"
 
 
 def _unexpected(error: Exception) -> str:

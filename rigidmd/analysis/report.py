@@ -10,6 +10,12 @@ from rigidmd.scene.validation import not_none
 HEADERS = ("quantity", "value", "unit", "correlation time (ps)")
 
 
+def frames_text(count: int, begin: float, end: float) -> str:
+    """What results are from, of times in ps."""
+    what = f"{count} frames" if count else "samples of the log, without frames,"
+    return f"{what} from {begin:g} to {end:g} ps"
+
+
 def results_text(results: Sequence[AnalysisResult], failed: Mapping[str, str]) -> list[str]:
     """Lines with a table of all values, the values that a run is too short for, and the analyses
     that were not possible.
@@ -37,14 +43,16 @@ def _row(value: Value) -> tuple[str, str, str, str]:
 
 
 def _section(title: str, reasons: Mapping[str, str]) -> list[str]:
-    """A title and a line for each name. Names with the same reason share a line."""
-    if not reasons:
-        return []
+    """A title and a line for each reason."""
+    return ["", title, *_indented(by_reason(reasons))] if reasons else []
+
+
+def by_reason(reasons: Mapping[str, str]) -> list[str]:
+    """A line for each reason with its names, which it does not repeat."""
     names: dict[str, list[str]] = {}
     for name, reason in reasons.items():
-        names.setdefault(reason, []).append(name)
-    lines = [f"{', '.join(each)}: {reason}" for reason, each in names.items()]
-    return ["", title, *_indented(lines)]
+        names.setdefault(reason.removeprefix(f"{name} "), []).append(name)
+    return [f"{', '.join(each)}: {reason}" for reason, each in names.items()]
 
 
 def _indented(lines: Sequence[str]) -> list[str]:

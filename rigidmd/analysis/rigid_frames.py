@@ -46,6 +46,7 @@ class RigidFrames:
     tensor : (l, 7) rows of pressure_tensor.csv, ps and bar, of the same time. None if the run wrote
         none
     notes : on the choice and the correction of frames
+    why_no_frames : if there are none, which analyses of the samples do not need
     """
 
     system: System
@@ -59,6 +60,7 @@ class RigidFrames:
     columns: dict[str, np.ndarray]
     tensor: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+    why_no_frames: str = ""
 
     def __len__(self) -> int:
         return len(self.time)
@@ -73,9 +75,16 @@ class RigidFrames:
         return sum(array.size for array in arrays if array is not None)
 
     @property
+    def ends(self) -> tuple[float, float]:
+        """Times of the first and the last frame, or of the samples if there are no frames, ps."""
+        time = self.time if len(self) else self.columns["time"]
+        return float(time[0]), float(time[-1])
+
+    @property
     def span(self) -> float:
         """Time from the first frame to the last, ps."""
-        return float(self.time[-1] - self.time[0])
+        begin, end = self.ends
+        return end - begin
 
     @cached_property
     def interval(self) -> float | None:
@@ -89,12 +98,18 @@ class RigidFrames:
 
     @property
     def has_box(self) -> bool:
-        return bool(np.isfinite(self.cell[0, 0, 0]))
+        cell = self.cell[0] if len(self) else self.system.state.cell
+        return bool(np.isfinite(cell[0, 0]))
 
     @property
     def volume(self) -> np.ndarray:
         """Volume of the cell in each frame (f,), Å³."""
         return np.linalg.det(self.cell)
+
+    @property
+    def mean_volume(self) -> float:
+        """Mean volume of the frames, or of the samples if there are no frames, Å³."""
+        return float(self.volume.mean() if len(self) else 1e3 * self.columns["volume"].mean())
 
     @cached_property
     def stages(self) -> list[Stage]:
@@ -107,7 +122,7 @@ class RigidFrames:
     def begin_of_stage(self) -> float:
         """Time (ps) from which on all frames are of `stage`."""
         earlier = self._stage_of_samples != self.system.scene.stages.index(self.stage)
-        return float(self.columns["time"][1:][earlier].max(initial=self.time[0]))
+        return float(self.columns["time"][1:][earlier].max(initial=self.ends[0]))
 
     @property
     def _stage_of_samples(self) -> np.ndarray:
@@ -242,7 +257,7 @@ def fit_frames(
                 array[k] = values
         progress((k + 1) / f)
     notes = []
-    if wrapped and np.isfinite(cells[0, 0, 0]) and f > 1:
+    if wrapped and f > 1 and np.isfinite(cells[0, 0, 0]):
         inside = np.einsum("fni,fij->fnj", position, np.linalg.inv(cells))
         moves = np.diff(inside, axis=0)
         moves -= np.round(moves)
@@ -268,26 +283,33 @@ def frames_of_folder(
     progress: Callable[[float], object] = lambda fraction: None,
 ) -> RigidFrames:
     """The frames of a run of molecules in a folder, from `start` (ps) on, or from where production
-    starts.
+    starts. Without a trajectory there are samples only.
 
     progress : called with the fraction done. Raises OutputError.
     """
     if record.is_body:
         what = "a run of a single body, and analyses are for molecules"
         raise OutputError(f"{record.folder} is {what}. `rigidmd report` shows it")
-    system, path = record.system, record.trajectory
+    system = record.system
     frame_limit = max(2, MOST_NUMBERS // (3 * system.site_count + 18 * len(system.model.species)))
-    frames = read_frames(path, system.site_count, frame_limit)
     tensor = read_tensor(record.folder / TENSOR_FILE)
     notes = list(record.missing)
-    if frames.stride > 1:
-        notes.append(f"every {frames.stride}th frame is used: {frames.count} need too much memory")
-    if frames.is_cut:
-        notes.append(f"{path.name} ends within a frame, which is left out")
     try:
-        return _rigid_frames(system, record.columns, frames, tensor, start, notes, progress)
+        path = record.trajectory
     except OutputError as error:
-        raise OutputError(f"{path}: {error}") from None
+        stored = str(error).removeprefix(f"{record.folder}: ")
+    else:
+        stored = read_frames(path, system.site_count, frame_limit)
+        if stored.stride > 1:
+            notes.append(
+                f"every {stored.stride}th frame is used: {stored.count} need too much memory"
+            )
+        if stored.is_cut:
+            notes.append(f"{path.name} ends within a frame, which is left out")
+    try:
+        return _rigid_frames(system, record.columns, stored, tensor, start, notes, progress)
+    except OutputError as error:
+        raise OutputError(f"{record.folder}: {error}") from None
 
 
 def frames_of_start(scene: MolecularScene, count: int, model: str = "") -> RigidFrames:
@@ -328,22 +350,20 @@ def frames_of_results(results: Results, start: float | None = None) -> RigidFram
         record = replace(read_record(results.files[0].parent), system=system)
         return frames_of_folder(record, start)
     frames = results._frames
-    if not frames:
-        raise OutputError("this run has no frames (output.trajectory = false) to analyse")
-    count = len(frames)
-    cells = np.array([frame.cell for frame in frames])
-    positions, velocities = (
-        np.array([getattr(frame, of) for frame in frames]) for of in ("positions", "velocities")
-    )
-    stored = Frames(
-        time=np.array([frame.time for frame in frames]),
-        positions=positions,
-        cells=cells,
-        count=count,
-        stride=1,
-        is_cut=False,
-        velocities=velocities,
-    )
+    stored: Frames | str = "this run stored none (output.trajectory = false)"
+    if frames:
+        positions, velocities = (
+            np.array([getattr(frame, of) for frame in frames]) for of in ("positions", "velocities")
+        )
+        stored = Frames(
+            time=np.array([frame.time for frame in frames]),
+            positions=positions,
+            cells=np.array([frame.cell for frame in frames]),
+            count=len(frames),
+            stride=1,
+            is_cut=False,
+            velocities=velocities,
+        )
     columns = {name: results[name] for name in results.units}
     return _rigid_frames(system, columns, stored, results._tensor, start, [], lambda fraction: None)
 
@@ -378,12 +398,13 @@ def earlier_production(record: Record) -> Iterator[tuple[Stage, np.ndarray]]:
 def _rigid_frames(
     system: System,
     columns: dict[str, np.ndarray],
-    stored: Frames,
+    stored: Frames | str,
     tensor: np.ndarray | None,
     start: float | None,
     notes: list[str],
     progress: Callable[[float], object],
 ) -> RigidFrames:
+    """stored : the frames, or why there are none"""
     stage, first, last, detected, shown = _last_stage(system, columns)
     begin = detected if start is None else start
     if start is None:
@@ -401,22 +422,29 @@ def _rigid_frames(
             " rotation, and changes spectra and viscosity. Use nve or velocity_rescaling for these"
         )
     slack = 1e-6 * max(abs(last), 1.0)
+    why_none = ""
+    if isinstance(stored, str):
+        why_none = stored
+        stored = Frames(np.zeros(0), np.zeros((0, system.site_count, 3)), None, 0, 1, is_cut=False)
     keep = np.flatnonzero((stored.time >= begin - slack) & (stored.time <= last + slack))
     times = without_rounding(stored.time[keep])
     keep, times = (of[np.diff(times, append=np.inf) > 0] for of in (keep, times))
     if len(keep) < 2:
-        raise OutputError(
+        why_none = why_none or (
             f"from {begin:g} ps on there {'is' if len(keep) == 1 else 'are'} {len(keep)} of"
             f" {len(stored.time)} frames. An analysis needs at least two: run longer, or write"
             " frames more often (trajectory_interval_ps)"
         )
+        keep, times = keep[:0], times[:0]
+    samples = shown & (columns["time"] >= begin - slack) & (columns["time"] <= last + slack)
+    if why_none and samples.sum() < 2:
+        raise OutputError(why_none)
     velocities = None if stored.velocities is None else stored.velocities[keep]
     cells = np.tile(NO_CELL, (len(keep), 1, 1)) if stored.cells is None else stored.cells[keep]
     wrapped = system.scene.output.positions == "wrapped"
     bodies, corrections = fit_frames(
         system, stored.positions[keep], velocities, cells, wrapped=wrapped, progress=progress
     )
-    samples = shown & (columns["time"] >= begin - slack) & (columns["time"] <= last + slack)
     if tensor is not None:
         tensor = tensor[(tensor[:, 0] >= begin - slack) & (tensor[:, 0] <= last + slack)]
     return RigidFrames(
@@ -431,6 +459,7 @@ def _rigid_frames(
         {name: values[samples] for name, values in columns.items()},
         tensor,
         [*notes, *corrections],
+        why_none,
     )
 
 

@@ -89,18 +89,22 @@ class Runs:
     @property
     def volume(self) -> float:
         """Mean volume of all frames, Å³."""
-        return float(self.mean([run.volume.mean() for run in self.members]))
+        return float(self.mean([run.mean_volume for run in self.members]))
 
     @property
     def thermal_energy(self) -> float:
         """kB T at the mean temperature, u Å²/ps²."""
         return float(self.mean([run.thermal_energy for run in self.members]))
 
+    @property
+    def weights(self) -> np.ndarray:
+        """Number of frames of each run, or of its samples if there are no frames."""
+        frames = np.array([len(run) for run in self.members], float)
+        return frames if frames.all() else np.array([len(r.columns["time"]) for r in self.members])
+
     def mean(self, values: Sequence[ArrayLike]) -> np.ndarray:
         """Mean of a value (...) of each run, weighted by the number of its frames."""
-        return np.average(
-            np.asarray(values, float), axis=0, weights=[len(run) for run in self.members]
-        )
+        return np.average(np.asarray(values, float), axis=0, weights=self.weights)
 
     def estimate(
         self, values: Sequence[ArrayLike], conclude: Callable[[np.ndarray], ArrayLike]
@@ -112,7 +116,7 @@ class Runs:
         conclude : function of the mean of `values`, which may be nonlinear
         """
         parts = np.asarray(values, float)
-        weights = np.array([len(run) for run in self.members], float)
+        weights = self.weights
         value = np.asarray(conclude(np.average(parts, axis=0, weights=weights)), float)
         others = [np.arange(len(parts)) != k for k in range(len(parts))]
         without = [

@@ -100,6 +100,7 @@ def _analyse(options: Options) -> int:
     from rigidmd.analysis import free_energy, mean_force
     from rigidmd.analysis.files import analyse_folder
     from rigidmd.analysis.registry import run_user_file
+    from rigidmd.analysis.report import frames_text
     from rigidmd.commands.sweep import print_limits
     from rigidmd.errors import OutputError
     from rigidmd.scene import parse_override
@@ -143,10 +144,8 @@ def _analyse(options: Options) -> int:
             )
         done = analyse_folder(folder, *request, progress, options.figures, more)
     used = done.frames_used
-    print(
-        f"{options.folder}: {used['frames']} frames from {used['from_ps']:g} to"
-        f" {used['to_ps']:g} ps"
-    )
+    text = frames_text(used["frames"], used["from_ps"], used["to_ps"])
+    print(f"{options.folder}: {text}")
     for note in used["notes"]:
         print(f"  {note}")
     _print_results(done.results, done.failed, verbose=options.verbose)

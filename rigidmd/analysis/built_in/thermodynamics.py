@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.analysis.conditions import equilibrium, trajectory
+from rigidmd.analysis.conditions import equilibrium
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
     AnalysisResult,
@@ -170,7 +170,7 @@ class Samples:
 @built_in(
     "heat capacities, compressibility, thermal expansion, pressure coefficient",
     position=95,
-    needs=(trajectory, equilibrium),
+    needs=(equilibrium,),
 )
 def response(runs: Runs) -> AnalysisResult:
     """Response functions from fluctuations: in nvt and nve c_v and the thermal pressure coefficient
@@ -271,7 +271,7 @@ def _pair_of(run: RigidFrames) -> np.ndarray:
         k = run.system.scene.stages.index(stage)
         freedom = run.system.freedom_in(k).translation + run.system.at_rest_in(k).sum()
         momenta = BOLTZMANN * freedom * columns["temperature_translation"]
-        other = BAR * columns["pressure_bar"] - momenta / (3 * run.volume.mean())
+        other = BAR * columns["pressure_bar"] - momenta / (3 * run.mean_volume)
     return np.array([energy / thermal_energy_of(run), other])
 
 

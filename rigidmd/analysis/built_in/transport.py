@@ -228,7 +228,7 @@ COMPONENTS = 5
 @built_in(
     "viscosity from the pressure tensor, by Green and Kubo",
     position=100,
-    needs=(trajectory, box, motion, equilibrium),
+    needs=(box, motion, equilibrium),
 )
 def viscosity(runs: Runs) -> AnalysisResult:
     """Shear viscosity (mPa s): V/kT times the time integral over the autocorrelation of five
