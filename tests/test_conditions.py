@@ -88,6 +88,24 @@ def test_frames_of_stages_that_differ_are_refused_with_the_time_to_begin_at():
     # a stage begins with the last sample of the one before it
     first = replace(frames, columns=frames.columns | {"stage": np.minimum(1, np.arange(FRAMES))})
     assert KNOWN["dielectric"].function(first).values
+    # averages mix them, with a note
+    (note,) = [text for text in KNOWN["rdf"].function(mixed).notes if "together" in text]
+    assert note == "of the stages after, nvt together; from 2 ps on frames are of the last one"
+    assert not [text for text in KNOWN["rdf"].function(first).notes if "together" in text]
+
+
+@pytest.mark.parametrize("frames", [2, 9, FRAMES])
+def test_no_analysis_has_a_value_without_an_error(frames):
+    made = made_up(frames=frames)
+    for name, entry in KNOWN.items():
+        if entry.is_user:
+            continue
+        try:
+            values = entry.function(made, **({"axis": "z"} if name == "nematic" else {})).values
+        except OutputError:
+            continue
+        for value in values:
+            assert value.value is None or np.isfinite(value.error), value.name
 
 
 def test_runs_of_different_temperatures_are_refused():

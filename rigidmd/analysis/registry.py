@@ -21,6 +21,7 @@ from rigidmd.analysis.result import (
     converged_value,
     correlation_time_of,
     mean_of_series,
+    with_error,
 )
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs, as_runs
@@ -71,7 +72,15 @@ def built_in(
                 if key in known:
                     check_value(known[key], value)
             check_conditions(name, runs, needs)
-            return function(runs, *arguments, **options)
+            result = function(runs, *arguments, **options)
+            result.values = [with_error(value) for value in result.values]
+            stages = dict.fromkeys(stage.label for run in runs.members for stage in run.stages)
+            if len(stages) > 1:
+                result.notes.append(
+                    f"of the stages {', '.join(stages)} together; from"
+                    f" {runs.first.begin_of_stage:g} ps on frames are of the last one"
+                )
+            return result
 
         KNOWN[name] = Analysis(
             name, about, analysis, position, is_user=False, on_request=on_request, needs=needs

@@ -194,6 +194,14 @@ def too_short(
     return Value(name, unit, None, None, tau, f"{why}. So far: {so_far}")
 
 
+def with_error(value: Value) -> Value:
+    """A value that has an error, or else none, because the run is too short."""
+    if value.value is None or (value.error is not None and isfinite(value.error)):
+        return value
+    why = "too short for an error"
+    return too_short(value.name, value.unit, value.value, None, why, value.correlation_ps)
+
+
 def converged_value(
     name: str,
     unit: str,
@@ -214,9 +222,7 @@ def converged_value(
             f" for a value; {least:g} of them are {least * correlation:.3g} ps"
         )
         return too_short(name, unit, value, error, why, correlation)
-    if error is None or not isfinite(error):
-        return too_short(name, unit, value, None, "too short for an error", correlation)
-    return Value(name, unit, value, error, correlation, note)
+    return with_error(Value(name, unit, value, error, correlation, note))
 
 
 Array = Callable[[np.ndarray], np.ndarray]

@@ -71,7 +71,8 @@ def rdf(
     largest
         Largest distance, Å. Default: half the box, at most 10 Å
     width
-        Width of a bin, Å
+        Width of a bin, Å. Wide bins lower a narrow peak, which the error of its height does not
+        include
 
     Raises
     ------
