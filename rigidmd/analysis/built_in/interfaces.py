@@ -2,6 +2,7 @@
 tension."""
 
 import warnings
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,6 @@ from rigidmd.analysis.result import (
     converged_value,
     correlation_time_of,
     mean_of_series,
-    too_short,
 )
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs
@@ -45,6 +45,7 @@ class Slab(NamedTuple):
     distance: np.ndarray  # (f, s) of the sites with mass, Å
     centre: np.ndarray  # (f, n) of the centres of mass, Å
     mass: np.ndarray  # (s,)
+    species: np.ndarray  # (s,) its name
 
 
 def slab_of(frames: RigidFrames, axis: str) -> Slab:
@@ -55,13 +56,14 @@ def slab_of(frames: RigidFrames, axis: str) -> Slab:
         raise OutputError(f"a slab needs an edge along {axis} at right angles to the others")
     height = frames.cell[:, k, k]
     arms = [np.zeros((len(frames), 0))]
-    masses = []
+    masses, species = [], []
     for kind in frames.kinds:
         for offset, mass in zip(kind.molecule.positions_body, kind.molecule.masses, strict=True):
             if mass > 0:
                 arm = frames.Q[:, kind.index, k] @ offset if frames.Q.shape[1] else 0.0
                 arms.append(frames.positions[:, kind.index, k] + arm)
                 masses.append(np.full(len(kind.index), mass))
+                species.append(np.full(len(kind.index), kind.name))
     at = np.concatenate(arms, axis=1) / height[:, None]
     mass = np.concatenate(masses)
     middle = np.angle(np.exp(2j * np.pi * at) @ mass)[:, None] / (2 * np.pi)
@@ -71,7 +73,8 @@ def slab_of(frames: RigidFrames, axis: str) -> Slab:
 
     area = float(np.mean(frames.volume / height))
     centre = frames.positions[:, :, k] / height[:, None]
-    return Slab(k, area, float(height.mean()), centred(at), centred(centre), mass)
+    names = np.concatenate(species)
+    return Slab(k, area, float(height.mean()), centred(at), centred(centre), mass, names)
 
 
 def profile(z: np.ndarray, liquid: float, vapour: float, half: float, width: float) -> np.ndarray:
@@ -106,7 +109,12 @@ class Profiles(NamedTuple):
     slabs: list[Slab]  # of each run
     height: float  # of the box along the normal, Å
     z: np.ndarray  # (bins,) Å
-    densities: list[np.ndarray]  # (f, bins) in each frame of each run, g/cm³
+    of_species: dict[str, list[np.ndarray]]  # (f, bins) in each frame of each run, g/cm³
+
+    @property
+    def densities(self) -> list[np.ndarray]:
+        """Of all species (f, bins), in each frame of each run, g/cm³."""
+        return [np.sum(of_run, axis=0) for of_run in zip(*self.of_species.values(), strict=True)]
 
     @property
     def edges(self) -> np.ndarray:
@@ -120,14 +128,17 @@ def profiles_of(runs: Runs, axis: str) -> Profiles:
     height = float(runs.mean([slab.height for slab in slabs]))
     bins = max(8, int(height / 2 / BIN))
     edges = np.linspace(0.0, height / 2, bins + 1)
-    densities = []
+    of_species: dict[str, list[np.ndarray]] = {kind.name: [] for kind in runs.kinds}
     for slab in slabs:
         volume = 2 * slab.area * np.diff(edges)
-        masses = [
-            np.histogram(np.abs(frame), edges, weights=slab.mass)[0] for frame in slab.distance
-        ]
-        densities.append(np.array(masses) / volume / GRAM_PER_CM3)
-    return Profiles(slabs, height, 0.5 * (edges[1:] + edges[:-1]), densities)
+        for name, densities in of_species.items():
+            sites = np.flatnonzero(slab.species == name)
+            masses = [
+                np.histogram(np.abs(frame[sites]), edges, weights=slab.mass[sites])[0]
+                for frame in slab.distance
+            ]
+            densities.append(np.array(masses) / volume / GRAM_PER_CM3)
+    return Profiles(slabs, height, 0.5 * (edges[1:] + edges[:-1]), of_species)
 
 
 def _changes_of_fit(z: np.ndarray, densities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -157,14 +168,16 @@ def interfaces(runs: Runs, axis: Axis = "z") -> AnalysisResult:
     rho(z) = (rho_l + rho_v)/2 - (rho_l - rho_v)/2 tanh((z - z0)/d)
 
     to the profile about the middle of the slab, averaged over both sides (Rowlinson & Widom 1982).
-    Errors of one run are from the correlated series of what each frame changes in the fit. The
-    curve also has the mean cosine of dipoles with the outward normal. Raises OutputError.
+    In a mixture also densities and mole fractions of each species in both phases. Errors of one run
+    are from the correlated series of what each frame changes in the fit. The curve also has the
+    mean cosine of dipoles with the outward normal. Raises OutputError.
     """
     profiles = profiles_of(runs, axis)
-    means = [densities.mean(axis=0) for densities in profiles.densities]
+    densities = profiles.densities
+    means = [of_run.mean(axis=0) for of_run in densities]
     density = runs.mean(means)
     fit = fitted(profiles.z, density, profiles.height)
-    series = [_changes_of_fit(profiles.z, densities, fit) for densities in profiles.densities]
+    series = [_changes_of_fit(profiles.z, of_run, fit) for of_run in densities]
     errors: list[float | None]
     if runs.are_several:
 
@@ -185,16 +198,17 @@ def interfaces(runs: Runs, axis: Axis = "z") -> AnalysisResult:
         note = "from 10 to 90 % of the density it is 2.197 d" if name == "width d" else ""
         error = None if errors[k] is None else factor * float(errors[k] or 0.0)
         tau = correlation_time_of(runs, [of_run[:, k] for of_run in series])
-        if error is None:
-            result.values.append(
-                too_short(name, unit, factor * float(fit[k]), None, "too short for an error", tau)
-            )
-        else:
-            result.values.append(Value(name, unit, factor * float(fit[k]), error, tau, note))
+        result.values.append(Value(name, unit, factor * float(fit[k]), error, tau, note))
     axis_of_curve = ("distance from the middle (A)", profiles.z)
     curve = Curve("interfaces", axis_of_curve, "density (g/cm³)", {"density (g/cm3)": density})
     curve.columns["fit (g/cm3)"] = profile(profiles.z, *fit)
     result.curves.append(curve)
+    if len(profiles.of_species) > 1:
+        result.values += _values_of_species(runs, profiles, fit)
+        for name, of_runs in profiles.of_species.items():
+            curve.columns[f"{name} (g/cm3)"] = runs.mean(
+                [frames.mean(axis=0) for frames in of_runs]
+            )
     for kind in runs.kinds:
         if kind.molecule.has_dipole and runs.has_rotations:
             mean = _mean_cosine(runs, profiles, kind)
@@ -203,6 +217,41 @@ def interfaces(runs: Runs, axis: Axis = "z") -> AnalysisResult:
                 Curve(f"dipoles_{kind.name}", curve.axis, "mean cosine", {title: mean}, level=0.0)
             )
     return result
+
+
+def _values_of_species(runs: Runs, profiles: Profiles, fit: np.ndarray) -> list[Value]:
+    """Densities and mole fractions of the species in the liquid and in the vapour, with the middle
+    and the width of the interface of all of them.
+
+    A species may be enriched at the interface, so its density there has little weight.
+    """
+    _, _, half, width = fit
+    level = np.tanh((profiles.z - half) / width)
+    weight = level**4  # the root of that of a square
+    phases = np.stack([1 - level, 1 + level], axis=1) / 2
+    solution = np.linalg.pinv(weight[:, None] * phases) * weight
+    masses = {kind.name: kind.molecule.mass for kind in runs.kinds}
+    # (f, species, phases) of each run
+    series = [
+        np.stack([frames @ solution.T for frames in of_run], axis=1)
+        for of_run in zip(*profiles.of_species.values(), strict=True)
+    ]
+    amounts = [of_run / np.array(list(masses.values()))[:, None] for of_run in series]
+    mean = runs.mean([of_run.mean(axis=0) for of_run in amounts])
+    total = mean.sum(axis=0)
+    # what each frame changes in the fractions, to first order
+    fractions = [
+        (mean + of_run - mean / total * of_run.sum(axis=1, keepdims=True)) / total
+        for of_run in amounts
+    ]
+    values = []
+    for title, unit, quantities in (("", "g/cm³", series), ("mole fraction of ", "1", fractions)):
+        for (k, name), (j, phase) in product(enumerate(masses), enumerate(("liquid", "vapour"))):
+            of_runs = [of_run[:, k, j] for of_run in quantities]
+            value, error = mean_of_series(runs, of_runs)
+            tau = correlation_time_of(runs, of_runs)
+            values.append(Value(f"{title}{name} in the {phase}", unit, value, error, tau))
+    return values
 
 
 def _mean_cosine(runs: Runs, profiles: Profiles, kind: Kind) -> np.ndarray:
