@@ -10,6 +10,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from support import history, noise_with_memory, small_scene, system_of
 
+from rigidmd.analysis.built_in import transport
 from rigidmd.analysis.built_in.order import nematic
 from rigidmd.analysis.built_in.rotation import PER_CM, dielectric, orientation, spectrum
 from rigidmd.analysis.built_in.structure import (
@@ -441,6 +442,33 @@ def test_diffusion_is_that_of_a_random_walk_and_its_error_honest():
     assert 0.7 < np.sqrt(np.mean(((values - D / NM2_PER_S) / errors) ** 2)) < 1.3
 
 
+@pytest.mark.parametrize("change", [0.9, 1.1])
+def test_diffusion_needs_a_straight_displacement(change, monkeypatch):
+    """The slope of a made-up displacement changes from one half of the fit to the other by this
+    multiple of the largest change."""
+    frames, interval = 400, 4.0
+    first, last = 8, 40  # lags of the fit
+    middle = (first + last) // 2
+    ends = np.array([first, middle - 1, middle, last])
+    # of t²: the slope of the line of least squares over equal steps is the sum of its two ends
+    bend, slope = (ends[2] + ends[3]) - (ends[0] + ends[1]), ends[0] + ends[3]
+    share = change * transport.BEND
+    square = share / (bend - share * slope)
+    t = np.arange(last + 1)
+    displacement = interval * (t + square * t**2)
+    monkeypatch.setattr(transport, "squared_displacement", lambda paths, lags: displacement[:lags])
+    system = system_of({"argon": 16}, 25.0)
+    path = brownian(np.random.default_rng(0), frames, 16, 0.25, interval)
+    walk = history(system, interval * np.arange(frames), path, np.eye(3) * 25.0)
+    found = diffusion(walk, viscosity_mPa_s=0.85).value("D of argon")
+    D = (1 + square * slope) / 6 / NM2_PER_S
+    if change < 1:
+        assert found.value == pytest.approx(D, rel=1e-9)
+    else:
+        assert found.value is None
+        assert "the slope of its displacement changes" in found.note
+
+
 def test_the_correction_for_the_size_of_the_box_is_that_of_yeh_and_hummer():
     """2.837297 kT/(6 pi eta L): 298.15 K, 0.896 mPa s and 24.86 Å give 0.279e-9 m²/s."""
     system = system_of({"argon": 16}, 24.86)
@@ -573,6 +601,20 @@ def test_what_hardly_turns_or_turns_too_fast_gives_no_time():
     assert told.value is None and "between frames, every 1 ps: write more of them" in told.note
     with pytest.raises(OutputError, match="no molecule of this run rotates"):
         orientation(history(system_of({"argon": 2}), time, None, np.eye(3) * 40))
+
+
+@pytest.mark.parametrize("frames", [2, 9])
+def test_peaks_of_few_frames_have_no_value(frames):
+    system = system_of({"spce": 125}, 15.5)
+    rng = np.random.default_rng(1)
+    lattice = 3.1 * np.array([*np.ndindex(5, 5, 5)])
+    positions = lattice + 0.2 * rng.standard_normal((frames, 125, 3))
+    Q = random_rotations(rng, frames * 125).reshape(frames, 125, 3, 3)
+    made = history(system, 0.01 * np.arange(frames), positions, np.eye(3) * 15.5, Q)
+    for name in ("first peak", "height of that peak", "neighbours up to the first minimum"):
+        found = rdf(made, "O").value(f"g O-O: {name}")
+        assert found.value is None
+        assert found.note.startswith("too short for an error. So far: ")
 
 
 def test_one_sentence_tells_what_is_too_short():

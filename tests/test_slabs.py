@@ -10,6 +10,7 @@ from support import history, noise_with_memory, small_scene, system_of
 
 from rigidmd import Scene, Simulation
 from rigidmd.analysis.built_in.interfaces import interfaces, slab_of, surface_tension
+from rigidmd.analysis.runs import Runs
 from rigidmd.assemble.build import build
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import OutputError, SceneError
@@ -322,6 +323,91 @@ def test_the_surface_tension_is_half_the_box_times_the_difference_of_pressures()
     assert found.value == pytest.approx(0.01 * 40.0 * 250.0, abs=4 * found.error)
     assert found.unit == "mN/m"
     assert pytest.approx(0.602214, rel=1e-5) == 100 * BAR  # 1 mN/m in u/ps²
+
+
+def test_the_height_of_a_surface_tension_is_along_the_normal():
+    """By a tensor without noise."""
+    system, positions, cell, _ = synthetic(np.random.default_rng(5), 20, axis=0)
+    tensor = np.zeros((400, 7))
+    tensor[:, 0] = 0.05 * np.arange(400)
+    tensor[:, 1:4] = [-300.0, -100.0, 50.0]
+    tensor[:, 1] += 1e-3 * np.random.default_rng(6).standard_normal(400)
+    Q = np.broadcast_to(np.eye(3), (20, 600, 3, 3))
+    frames = history(system, np.arange(20.0), positions, cell, Q, tensor=tensor)
+    found = surface_tension(frames, "x").value()
+    assert found.value == pytest.approx(0.01 * 40.0 * (-300.0 + 25.0), rel=1e-5)
+
+
+def mixture(seed, frames=300, axis=2, enriched=0.04):
+    """Frames of 400 atoms of argon and 200 of krypton in a slab, of which a fraction of the krypton
+    is enriched at the interfaces; densities (species, phases), 1/Å³, without that fraction."""
+    system, rng = system_of({"argon": 400, "krypton": 200}, 20.0), np.random.default_rng(seed)
+    grid = np.linspace(0, 40, 4001)
+    tanh = np.tanh((grid - HALF) / WIDTH)
+    edges = np.full(3, 20.0)
+    edges[axis] = 80.0
+    densities, z = [], []
+    for count, vapour, excess in ((400, 0.05, 0.0), (200, 0.25, enriched)):
+        shape = 0.5 * (1 + vapour) - 0.5 * (1 - vapour) * tanh
+        total = np.cumsum(shape)
+        of_slab = np.interp(rng.random((frames, count)), total / total[-1], grid)
+        at_interface = HALF + 1.5 * rng.standard_normal((frames, count))
+        z.append(np.where(rng.random((frames, count)) < excess, at_interface, of_slab))
+        unit = (1 - excess) * count / (2 * 400.0 * total[-1] * (grid[1] - grid[0]))
+        densities.append([unit, vapour * unit])
+    z = np.concatenate(z, axis=1) * rng.choice([-1, 1], (frames, 600))
+    positions = edges * rng.random((frames, 600, 3))
+    positions[..., axis] = z + 80.0 * rng.random((frames, 1))
+    return history(system, np.arange(float(frames)), positions, np.diag(edges)), densities
+
+
+PHASES = ("liquid", "vapour")
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_species_of_a_slab_have_their_densities_and_mole_fractions(axis):
+    frames, densities = mixture(axis, axis=axis)
+    found = interfaces(frames, "xyz"[axis])
+    for j, phase in enumerate(PHASES):
+        total = densities[0][j] + densities[1][j]
+        for k, molecule in enumerate(frames.system.species):
+            value = found.value(f"{molecule.name} in the {phase}")
+            density = densities[k][j] * molecule.mass / GRAM_PER_CM3
+            assert abs(value.value - density) < 4 * value.error + 0.02 * density
+            assert 0 < value.error < 0.1 * density
+            fraction = found.value(f"mole fraction of {molecule.name} in the {phase}")
+            assert abs(fraction.value - densities[k][j] / total) < 4 * fraction.error + 0.01
+            assert 0 < fraction.error < 0.05
+    assert found["argon (g/cm3)"] + found["krypton (g/cm3)"] == pytest.approx(
+        found["density (g/cm3)"]
+    )
+
+
+def test_errors_of_species_in_a_slab_are_honest():
+    """The scatter over seeds, of one run with errors from its frames, which are larger because of
+    what 60 frames may hide, and of three runs with errors from their scatter."""
+    alone, together = [], []
+    for seed in range(12):
+        runs = [mixture(100 + 3 * seed + k, 60, enriched=0.0)[0] for k in range(3)]
+        alone += [interfaces(run) for run in runs]
+        together.append(interfaces(Runs(tuple(runs))))
+    for results, least, most in ((alone, 1.0, 1.8), (together, 0.7, 1.4)):
+        of_species = [
+            [value[2:4] for value in result.values if " in the " in value.name]
+            for result in results
+        ]
+        values, errors = np.moveaxis(np.array(of_species, float), 2, 0)
+        assert values.shape == (len(results), 8)
+        ratio = np.sqrt(np.mean(errors**2, axis=0)) / values.std(axis=0, ddof=1)
+        assert least < np.mean(ratio) < most
+        assert (ratio > 0.5).all() and (ratio < 2.2).all()
+
+
+def test_a_slab_of_too_few_frames_has_values_so_far():
+    frames, _ = mixture(1, 9)
+    found = interfaces(frames[:4])
+    assert all(value.value is None for value in found.values)
+    assert all("too short for an error. So far: " in value.note for value in found.values)
 
 
 @pytest.mark.parametrize("seeds", [6, pytest.param(60, marks=pytest.mark.soak)])

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from PIL import Image, ImageSequence
-from support import ROOT, small_scene
+from support import ROOT, small_scene, system_of
 
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.body import build_body
 from rigidmd.commands import cli
 from rigidmd.formats.bonds import connections
+from rigidmd.io.trajectory import Frames
 from rigidmd.mechanics.inertia import SOLIDS, shifted_inertia, solid
 from rigidmd.run.record import read_record
 from rigidmd.view import animation as film
@@ -187,6 +188,23 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
     centre = frames.positions.reshape(-1, 216, 3, 3).mean(axis=2)
     assert centre.min() > -0.01
     assert centre.max() < frames.cells.max() + 0.01
+
+
+def test_molecules_are_put_into_a_cell_that_leans():
+    """Whole, by multiples of the edges of the cell of each frame."""
+    sites = system_of({"spce": 5}, 30.0).sites
+    rng = np.random.default_rng(2)
+    cells = np.array([[[9.0, 0, 0], [4, 8, 0], [-3, 5, 7]], [[10.0, 0, 0], [-4, 9, 0], [2, 3, 8]]])
+    positions = rng.uniform(-40, 40, (2, 5, 1, 3)) + rng.uniform(-1, 1, (2, 5, 3, 3))
+    positions = positions.reshape(2, 15, 3)
+    frames = Frames(np.arange(2.0), positions, cells, 2, 1, is_cut=False)
+    found = molecule_animation.inside(frames, sites)
+    for before, after, cell in zip(positions, found.positions, cells, strict=True):
+        fractions = after.reshape(5, 3, 3).mean(axis=1) @ np.linalg.inv(cell)
+        assert (fractions > -1e-5).all()
+        assert (fractions < 1 + 1e-5).all()
+        moves = (before - after).reshape(5, 3, 3) @ np.linalg.inv(cell)
+        assert moves == pytest.approx(np.round(moves[:, :1]) + np.zeros_like(moves), abs=1e-5)
 
 
 @pytest.mark.parametrize("ending", [".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb"])
