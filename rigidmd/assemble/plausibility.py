@@ -119,7 +119,7 @@ def scene_errors(
             "forces.tail_correction needs a cutoff beyond the contact of two molecules,"
             f" {contact:.3g} Å. cutoff_A is {cutoff:g}"
         )
-    elif switches_cores(scene.forces, contact) and start >= SHORTEST * contact:
+    elif switches_cores(scene.forces, contact) and (start or 0.0) >= SHORTEST * contact:
         faults.append(
             f"forces.tail_correction needs a switch that begins near the contact of two molecules,"
             f" {contact:.3g} Å, or beyond: it would count their overlaps. switch_start_A is"

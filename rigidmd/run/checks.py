@@ -220,7 +220,7 @@ def within_table(system: System, state: State) -> str:
         distance[term.group[bodies[i]] == term.group[bodies[j]]] = inf
         if distance.min(initial=inf) < first:
             k = int(distance.argmin())
-            one, other = (molecule_label(system, bodies[side[k]]) for side in (i, j))
+            one, other = (molecule_label(system, int(bodies[side[k]])) for side in (i, j))
             return (
                 f"{name}: {one} and {other} have a distance of {distance[k]:.3g} Å. The table"
                 f" begins at {first:g} Å, and nearer its energy is a guess: begin it at shorter"

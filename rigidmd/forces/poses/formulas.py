@@ -40,7 +40,7 @@ class PoseFormula(NamedTuple):
     numbers: Callable[[Mapping[str, float], Mapping[str, float]], list[float]]
     #: Of pairs in NumPy, from a row of numbers, vectors (m, 3) and rotation matrices (m, 3, 3):
     #: what `pair_slopes` gives; for a table, of a simple function of the same distance and angles.
-    values: "Callable[[Sequence[float], np.ndarray, np.ndarray, np.ndarray], PairValues]"
+    values: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], PairValues]
     operations: int  # in the loop, of the energy with force and torques
     is_derived: bool  # whether force and torques are derived from the energy
 
@@ -89,9 +89,7 @@ def formula_of_poses(
         values |= {f"q.{key}": second[key] for key in parameters}
         return hoisted.values(values)
 
-    def pair_values(
-        row: Sequence[float], r: np.ndarray, a: np.ndarray, b: np.ndarray
-    ) -> PairValues:
+    def pair_values(row: np.ndarray, r: np.ndarray, a: np.ndarray, b: np.ndarray) -> PairValues:
         leaves = dict(zip(AXES, r.T, strict=True))
         for body, matrix in (("a", a), ("b", b)):
             leaves |= {f"{body}[{i}, {j}]": matrix[:, i, j] for i in range(3) for j in range(3)}
