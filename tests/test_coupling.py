@@ -395,6 +395,8 @@ def test_a_sweep_has_a_free_energy(tmp_path, capsys, monkeypatch):
         assert text in printed
     value = rigidmd.free_energy(tmp_path / "sweep").value()
     assert abs(value.value - exact_of_two()) < 4 * value.error < 0.1
+    density = 1e27 / 6.02214076e23 / EDGE**3  # of one molecule, mol/L
+    assert f"number density, {density:.4g} mol/L," in value.note
     assert main(["analyse", "sweep/lambda=1", "free_energy"]) == 2
     assert "free_energy needs a sweep over coupling.lambda" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "pymbar", None)

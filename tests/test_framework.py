@@ -160,12 +160,25 @@ def test_forces_may_name_the_sites_of_the_inserted_model(tmp_path):
         build(scene_in(tmp_path, forces=forces | {"pairs": pair(0.5)}))
 
 
+def test_long_labels_are_named_by_their_first_five_characters(tmp_path):
+    text = CIF.replace("O1  O", "O_bridge O").replace("O2  O", "O_term O")
+    bridge, term = (
+        SITES[1] | {"name": n, "charge_e": q} for n, q in (("O_bri", -0.9), ("O_ter", -0.3))
+    )
+    (wall,) = build(scene_in(tmp_path, text, sites=[SITES[0], bridge, term])).species
+    of_name = dict(zip(wall.site_names, wall.charges.tolist(), strict=True))
+    assert of_name == {"Si1": 1.2, "O_bri": -0.9, "O_ter": -0.3}
+    with pytest.raises(InputError, match="first five characters"):
+        scene_in(tmp_path, text, sites=[SITES[0], bridge | {"name": "O_bridge"}, term])
+
+
 REFUSED = {
     "no entry of sites": {"sites": SITES[:1]},
     "occupied only partly": {
         "text": CIF.replace("_charge\n", "_occupancy\n").replace("1.2", "1").replace("-0.", "0.")
     },
-    "2 x 2 x 2 times the repeats": {"repeat": [1, 1, 1]},
+    r"Use repeat = \[2, 2, 2\], or": {"repeat": [1, 1, 1]},
+    r"repeat = \[2, 2, 2\]": {"repeat": [2, 1, 2]},
     "set frozen = true": {"frozen": False},
     "is the box: omit": {"box": {"lengths_A": 20.0}},
     "must not have more than": {"repeat": [20, 20, 20]},

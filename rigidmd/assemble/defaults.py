@@ -72,7 +72,7 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
     """A scene of molecules with all defaults except `with_momentum_removal` and
     `with_precision`."""
     scene, faults = _with_electrostatics(scene, composition)
-    numbers, cutoff_errors = _cutoff_and_switch(scene.forces, composition)
+    numbers, cutoff_errors = _cutoff_and_switch(scene, composition)
     faults += cutoff_errors
     settings = Settings({}, faults)
     of_method = getattr(electrostatics_module(scene.forces), "settings", None)
@@ -208,10 +208,21 @@ def electrostatics_module(forces: Forces) -> ModuleType | None:
     return import_module(f"rigidmd.forces.{name}") if name else None
 
 
-def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[Json, list[str]]:
+def _larger_box(scene: MolecularScene, composition: Composition, cutoff: float) -> str:
+    """What has twice the cutoff between its faces, for a message."""
+    for entry, kind in zip(scene.molecules, composition.species, strict=False):
+        if entry.repeat is not None and kind.cell is not None:
+            unit = kind.cell / np.array(entry.repeat)[:, None]
+            heights = 1 / np.linalg.norm(np.linalg.inv(unit), axis=0)
+            return f"repeat = {np.ceil(2 * cutoff / heights).astype(int).tolist()}"
+    return "a larger box"
+
+
+def _cutoff_and_switch(scene: MolecularScene, composition: Composition) -> tuple[Json, list[str]]:
     """Cutoff and start of a switch as keys of [forces], and error messages."""
     from scipy.spatial.distance import pdist  # slow to import
 
+    forces = scene.forces
     space = composition.space
     cutoff_A = forces.cutoff_A or (CUTOFF if space.volume < inf else None)
     cutoff = cutoff_A or inf
@@ -224,10 +235,7 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[Json, 
     for key, value in (("cutoff_A", cutoff), ("ewald_cutoff_A", forces.ewald_cutoff_A or 0.0)):
         if value > half:
             default = "" if getattr(forces, key) else " (the default)"
-            larger = "a larger box"
-            if any(m.cell is not None for m in composition.species):
-                factors = np.ceil(2 * value / np.array(space.edges)).astype(int).tolist()
-                larger = f"{' x '.join(map(str, factors))} times the repeats of the cell"
+            larger = _larger_box(scene, composition, value)
             shorter = f"{key} = {floor(100 * half) / 100:g} or less"
             why = "which violates the minimum-image convention"
             if value <= allowed:

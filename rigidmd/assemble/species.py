@@ -34,6 +34,7 @@ from rigidmd.scene.validation import ValidationError, not_none, validation_messa
 ROUNDEST, ROUNDED = 0.02, np.sqrt(3) / 2
 #: Atoms within this fraction of the length of a molecule from a line are on it for `molecule`.
 ON_LINE = 1e-5
+LONGEST_NAME = 5  # of a site; longer labels of atoms are cut
 MOST_LISTED = 8  # entries of parameters in a message
 
 
@@ -131,8 +132,8 @@ def sites_of_geometry(
     path: Path, entries_of_scene: tuple[Site, ...], table: tuple[Site, ...], where: str
 ) -> tuple[tuple[Site, ...], list[str]]:
     """Sites with positions from a file and parameters from entries of the scene or a table, by atom
-    name or else by element, and notes on the file. `where` names the entries in messages. Raises
-    StructureError with all errors."""
+    name, of a longer one its first five characters, or else by element, and notes on the file.
+    `where` names the entries in messages. Raises StructureError with all errors."""
     faults = []
     sites = []
     used = set()
@@ -144,6 +145,7 @@ def sites_of_geometry(
     charges = [None] * len(atoms.names) if atoms.charges is None else atoms.charges.tolist()
     columns = atoms.names, atoms.elements, not_none(atoms.masses), atoms.position, charges
     for name, element, mass, position, charge in zip(*columns, strict=True):
+        name = name[:LONGEST_NAME]
         match, shared = find_site(entries_of_scene, name, element), find_site(table, name, element)
         if match is None and shared is None:
             faults.append(
@@ -156,7 +158,7 @@ def sites_of_geometry(
         element = next((s.element for s in entries if s.element != "X"), element)
         charge = next((s.charge_e for s in entries if s.charge_e is not None), charge)
         known = {
-            "name": name[:5],
+            "name": name,
             "element": element,
             "mass_u": mass,
             "position_A": tuple(map(float, position)),
@@ -232,8 +234,8 @@ def model_from_geometry(
             + (f": {table.source}" if table.source else "")
         )
         used = [
-            find_site(table.sites, *atom)
-            for atom in dict.fromkeys(zip(names, elements, strict=True))
+            find_site(table.sites, name[:LONGEST_NAME], element)
+            for name, element in dict.fromkeys(zip(names, elements, strict=True))
         ]
         if idle := [entry.name for entry in table.sites if entry not in used]:
             notes.append(f"{parameters}: no atom uses {', '.join(idle)}")

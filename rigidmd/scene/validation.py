@@ -247,7 +247,10 @@ _LETTERS = "a name of letters, digits and underscores"
 PATTERNS = {
     r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$": "one line without control characters",
     r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]+$": "one line without control characters, not empty",
-    r"^[!-~]{1,5}$": "one to five visible ASCII characters without spaces",
+    r"^[!-~]{1,5}$": (
+        "one to five visible ASCII characters without spaces. A longer label of a file is cut to"
+        " its first five characters"
+    ),
     r"^[^\W\d]\w*$": f"{_LETTERS} that does not begin with a digit",
     r"^[A-Za-z]\w*$": f"{_LETTERS} that begins with a letter from A to Z",
     r"^[\w][\w.\-]*$": f"{_LETTERS}, in which points and hyphens may follow the first one",
