@@ -23,7 +23,8 @@ class Flow(NamedTuple):
     fraction: (
         float  # of the time step; of `every` time steps for a flow that acts every `every` steps
     )
-    gradient: float = 0.0  # of a kick: tau/dt² of its gradient (dynamics.force_gradient)
+    # of a kick: tau/dt² of its gradient (dynamics.force_gradient), without its fraction
+    gradient: float = 0.0
     every: int = 1  # it acts in one of `every` steps of a segment,
     phase: int = 1  # 1: in the last one of them, 0: in the first one
 
@@ -192,16 +193,21 @@ class Scheme(_SchemeFields):
 
     @property
     def force_evaluations(self) -> int:
-        """Force evaluations per step: one for each kick after a drift, and one more for each
-        gradient.
+        """Force evaluations per step: one after each drift, and one more for each gradient. A kick
+        uses what kicks since the last drift have evaluated, in the step before too."""
+        return self._evaluations_in(2) - self._evaluations_in(1)
 
-        The first kick of a step uses the forces of the last kick before it.
-        """
-        moving = [flow for flow in self.flows if flow.kind in (KICK, DRIFT)]
-        after_drift = sum(
-            b.kind == KICK and a.kind == DRIFT for a, b in pairwise((moving[-1], *moving))
-        )
-        return after_drift + sum(flow.gradient != 0 for flow in self.flows)
+    def _evaluations_in(self, steps: int) -> int:
+        """Force evaluations of a run of a number of steps."""
+        # gradients of the forces at the current positions: 0, and the last one
+        count, known = 0, set[float]()
+        for flow in self.flows * steps:
+            if flow.kind == DRIFT:
+                known.clear()
+            elif flow.kind == KICK:
+                count += len({0.0, flow.gradient} - known)
+                known = {0.0, flow.gradient} if flow.gradient else known | {0.0}
+        return count
 
 
 def composed(name: str, steps: tuple[float, ...], order: int, source: str, **flags: int) -> Scheme:

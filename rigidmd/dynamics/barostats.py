@@ -265,7 +265,7 @@ def piston_pass(barostat: Piston, state: State, registers: Registers) -> Pass:
 
 
 def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, draw):
-    if progress[LOADED] != 1 or workspace.known[0] == 0:
+    if progress[LOADED] == 0 or workspace.known[0] == 0:
         status = compute_load_and_virial(terms, state, load, workspace, WITH_VIRIALS)
         if status != OK:
             return status
@@ -284,12 +284,12 @@ def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, dr
 
 def _try_move(barostat, model, terms, state, load, workspace, progress, h, draw):
     if progress[TRIAL] == 0:
-        if progress[LOADED] != 1 or workspace.known[0] == 0:
+        if progress[LOADED] == 0 or workspace.known[0] == 0:
             progress[LOADED] = 0
             status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
             if status != OK:
                 return status
-            progress[LOADED] = 1
+        progress[LOADED] = 1
         if not propose_strain(barostat, model, state, workspace, h, draw):
             workspace.counts[0] += 1
             return OK

@@ -7,7 +7,14 @@ from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.core.integrators import KICK
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK
 from rigidmd.dynamics.flows import ORTHOGONALITY_INTERVAL
-from rigidmd.dynamics.force_gradient import GradientWorkspace, add_gyration, displace, evaluate
+from rigidmd.dynamics.force_gradient import (
+    GradientWorkspace,
+    add_gyration,
+    displace,
+    evaluate,
+    load_of_kick,
+    needs_forces,
+)
 from rigidmd.dynamics.registers import DONE, LOADED
 from rigidmd.forces.body.resistance import NoResistance, Resistance, kick_with_resistance
 from rigidmd.forces.terms import compute_body_load, total_power, trait
@@ -58,27 +65,25 @@ def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until
             k = progress[DONE]
             h = flows.fraction[k] * dt
             if flows.kind[k] == KICK:
-                needed = 1
-                if gradient_workspace is not None and flows.gradient[k] != 0.0:
-                    needed = 2
-                while progress[LOADED] < needed:
-                    status = _evaluate(
-                        model,
-                        state,
-                        load,
-                        terms,
-                        flows,
-                        gradient_workspace,
-                        k,
-                        dt,
-                        progress[LOADED] == 1,
-                    )
+                tau = 0.0
+                if gradient_workspace is not None:
+                    tau = flows.gradient[k] * dt * dt
+                while needs_forces(progress, gradient_workspace, tau):
+                    known = progress[LOADED] != 0
+                    status = _evaluate(model, state, load, terms, gradient_workspace, tau, known)
                     if status != OK:
                         return status
-                    progress[LOADED] += 1
+                    progress[LOADED] = 2 if known else 1
+                pushing = load_of_kick(load, gradient_workspace, tau)
                 accumulate_work(model, terms, state, 0.5 * h)
                 kick_with_resistance(
-                    model.resistance, model.translation, model.rotor, model.frame, state, load, h
+                    model.resistance,
+                    model.translation,
+                    model.rotor,
+                    model.frame,
+                    state,
+                    pushing,
+                    h,
                 )
                 accumulate_work(model, terms, state, 0.5 * h)
             else:
@@ -99,20 +104,15 @@ def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until
 
 
 @chosen_by_type
-def _evaluate(model, state, load, terms, flows, gradient_workspace, k, dt, known):
-    """The forces before kick k, or, if they are known, the addition of their gradient. A status
-    code."""
+def _evaluate(model, state, load, terms, gradient_workspace, tau, known):
+    """`evaluate`, of which a scheme without gradients compiles the forces only. A status code."""
     if not is_a(gradient_workspace, GradientWorkspace):
-        return lambda model, state, load, terms, flows, gradient_workspace, k, dt, known: (
-            compute_body_load(terms, state, load)
+        return lambda model, state, load, terms, gradient_workspace, tau, known: compute_body_load(
+            terms, state, load
         )
-
-    def with_gradient(model, state, load, terms, flows, gradient_workspace, k, dt, known):
-        return evaluate(
-            model, state, load, terms, gradient_workspace, flows.gradient[k] * dt * dt, known
-        )
-
-    return with_gradient
+    return lambda model, state, load, terms, gradient_workspace, tau, known: evaluate(
+        model, state, load, terms, gradient_workspace, tau, known
+    )
 
 
 @implements(displace, Body, inline=True)

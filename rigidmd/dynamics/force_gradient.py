@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import kernel
-from rigidmd.core.state import OK, Load, State, no_load
+from rigidmd.core.state import NEEDS_PYTHON_FORCES, OK, Load, State, no_load
+from rigidmd.dynamics.registers import LOADED
 from rigidmd.forces.terms import FORCES_ONLY, INTO_OTHER_LOAD, compute_load, copy
 
 #: The difference is taken over this fraction of tau a. Over the whole of tau a (Wisdom, Holman &
@@ -18,17 +19,46 @@ FRACTION = 1 / 256
 
 
 class GradientWorkspace(NamedTuple):
-    """Arrays for forces at displaced positions."""
+    """Arrays for kicks with gradient, and for forces at displaced positions."""
 
     position: np.ndarray  # to restore, as in State
     rotation: np.ndarray
-    load: Load
+    load: Load  # forces and torques with their gradient
+    tau: np.ndarray  # (1,) the time squared of the gradient in `load`
+    # (1,) whether the state is displaced: it waits for forces of a Python function
+    is_displaced: np.ndarray
 
 
 def gradient_workspace(state: State) -> GradientWorkspace:
     return GradientWorkspace(
-        np.empty_like(state.position), np.empty_like(state.rotation), no_load(state)
+        np.empty_like(state.position),
+        np.empty_like(state.rotation),
+        no_load(state),
+        np.zeros(1),
+        np.zeros(1, np.int64),
     )
+
+
+@kernel
+def needs_forces(progress, gradient, tau):
+    """Whether a kick has to wait for an evaluation of forces.
+
+    progress : see `registers`; gradient : the `GradientWorkspace`, or None; tau : of the kick, 0
+    without gradient
+    """
+    if gradient is None:
+        return progress[LOADED] == 0
+    if tau == 0.0 or progress[LOADED] == 0:
+        return progress[LOADED] == 0
+    return progress[LOADED] == 1 or gradient.tau[0] != tau
+
+
+@kernel
+def load_of_kick(load, gradient, tau):
+    """The forces and torques of a kick. For the arguments see `needs_forces`."""
+    if gradient is None:
+        return load
+    return load if tau == 0.0 else gradient.load
 
 
 def displace(model, state, load, tau):
@@ -43,30 +73,40 @@ def add_gyration(model, load, tau, gain):
 
 
 @kernel
-def evaluate(model, state, load, terms, displaced, tau, known):
-    """One evaluation of forces: the load, or, if the load is known, the addition of the gradient to
-    it. A status code. One function does both, because the forces take long to compile. The state is
-    restored bit for bit."""
-    if known:
-        copy(state.position, displaced.position)
-        copy(state.rotation, displaced.rotation)
+def evaluate(model, state, load, terms, gradient, tau, known):
+    """One evaluation of forces: the load, or, if this is known, the load with gradient. A status
+    code. One function does both, because the forces take long to compile. The state is restored bit
+    for bit, after a call of Python functions by the call that follows it."""
+    if known and gradient.is_displaced[0] == 0:
+        copy(state.position, gradient.position)
+        copy(state.rotation, gradient.rotation)
         displace(model, state, load, FRACTION * tau)
+        gradient.is_displaced[0] = 1
     status = compute_load(
-        terms, state, displaced.load if known else load, INTO_OTHER_LOAD if known else FORCES_ONLY
+        terms, state, gradient.load if known else load, INTO_OTHER_LOAD if known else FORCES_ONLY
     )
-    if known:
-        copy(displaced.position, state.position)
-        copy(displaced.rotation, state.rotation)
+    if known and status != NEEDS_PYTHON_FORCES:
+        restore(gradient, state)
         if status == OK:
-            add_gyration(model, load, FRACTION * tau, displaced.load)
-            extrapolate(load.force, displaced.load.force)
-            extrapolate(load.torque_body, displaced.load.torque_body)
+            add_gyration(model, load, FRACTION * tau, gradient.load)
+            extrapolate(load.force, gradient.load.force)
+            extrapolate(load.torque_body, gradient.load.torque_body)
+            gradient.tau[0] = tau
     return status
+
+
+@kernel(from_python=True)
+def restore(gradient, state):
+    """Move a displaced state back to its positions and orientations."""
+    if gradient.is_displaced[0] != 0:
+        copy(gradient.position, state.position)
+        copy(gradient.rotation, state.rotation)
+        gradient.is_displaced[0] = 0
 
 
 @kernel
 def extrapolate(value, elsewhere):
     """Extrapolate from `value` through `elsewhere`, at FRACTION of the distance, to the full
-    distance. In place."""
-    for n, there in enumerate(elsewhere.flat):
-        value.flat[n] += (there - value.flat[n]) / FRACTION
+    distance. Into `elsewhere`."""
+    for n, start in enumerate(value.flat):
+        elsewhere.flat[n] = start + (elsewhere.flat[n] - start) / FRACTION

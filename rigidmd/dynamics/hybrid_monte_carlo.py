@@ -53,7 +53,7 @@ def trajectory_workspace(state: State) -> TrajectoryWorkspace:
 def potential_energy(terms, state, load, progress):
     """Status code and potential energy of the current positions, with forces if these are unknown.
     progress : see `dynamics.step_loop.advance`"""
-    if progress[LOADED] != 1 or terms.tallies_valid[0] == 0:
+    if progress[LOADED] == 0 or terms.tallies_valid[0] == 0:
         progress[LOADED] = 0
         status = compute_load(terms, state, load, WITH_ENERGIES)
         if status != OK:
@@ -74,7 +74,7 @@ def start_or_test_trajectory(
     code. blocks : see `thermostat_workspace`"""
     progress = registers.progress
     potential = workspace.energies[0]
-    if not starts or workspace.known[0] == 0 or progress[LOADED] != 1:
+    if not starts or workspace.known[0] == 0 or progress[LOADED] == 0:
         status, potential = potential_energy(terms, state, load, progress)
         if not starts and diverges(workspace, status):
             rest_at_start(workspace, state, load)
@@ -103,6 +103,7 @@ def start_or_test_trajectory(
         state.energy_ledger[HEAT] += gained
     else:
         copy_start(workspace, workspace.load, state, load)
+        progress[LOADED] = min(1, progress[LOADED])
         negate(state.velocity)
         negate(state.angular_momentum_body)
         terms.tallies_valid[0] = 0

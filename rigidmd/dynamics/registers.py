@@ -7,8 +7,8 @@ import numpy as np
 from rigidmd.core.state import TALLY_SIZE
 
 #: Indices of `Registers.progress`: flows done in this step; whether the load belongs to the current
-#: positions (1), with the gradient added (2); whether a move of the box has been made and is not
-#: yet accepted or rejected.
+#: positions (1), and the load of a kick with gradient too (2); whether a move of the box has been
+#: made and is not yet accepted or rejected.
 DONE, LOADED, TRIAL = range(3)
 #: What passes may follow, besides the kinds of flows in `core.integrators`: a move of the box;
 #: forces that failed.
@@ -25,6 +25,15 @@ class Registers(NamedTuple):
     known: np.ndarray  # (1,) whether tally[0] belongs to the load
     resting: np.ndarray  # (1,) whether a trajectory has diverged and rests at its start
     failure: np.ndarray  # (1,) status code of forces that failed
+
+
+def begin_call(progress: np.ndarray, *, is_current: bool) -> None:
+    """Set the progress at the begin of a call of a step loop.
+
+    is_current : whether the load belongs to the current positions. The load of a kick with gradient
+        then still belongs to them if it did at the end of the last call
+    """
+    progress[:] = 0, max(1, progress[LOADED]) if is_current else 0, 0
 
 
 def new_registers(progress: np.ndarray | None = None) -> Registers:

@@ -41,7 +41,14 @@ from rigidmd.dynamics.barostats import (
     piston_pass,
 )
 from rigidmd.dynamics.flows import ORTHOGONALITY_INTERVAL, flow_arrays
-from rigidmd.dynamics.force_gradient import GradientWorkspace, add_gyration, displace, evaluate
+from rigidmd.dynamics.force_gradient import (
+    GradientWorkspace,
+    add_gyration,
+    displace,
+    evaluate,
+    load_of_kick,
+    needs_forces,
+)
 from rigidmd.dynamics.hybrid_monte_carlo import TrajectoryWorkspace, trajectory_passes
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import (
@@ -58,6 +65,7 @@ from rigidmd.dynamics.registers import (
     FAILED,
     LOADED,
     Registers,
+    begin_call,
     new_registers,
 )
 from rigidmd.dynamics.thermostats import thermostat_code, thermostat_pass
@@ -149,7 +157,7 @@ def advance(
     the first of the next are done in one pass with the drift. If the status is not OK, state and
     registers are such that another call continues exactly where this one stopped.
     """
-    pending = NO_PENDING_KICKS
+    pending, pushing = NO_PENDING_KICKS, load
     progress = registers.progress
     while state.step[NOW] < until:
         while progress[DONE] < len(flows.kind):
@@ -157,8 +165,12 @@ def advance(
             h = flows.fraction[k] * dt
             moved = 0.0 if registers.resting[0] != 0 else h
             if flows.kind[k] == KICK:
-                if gradient_workspace is None:
-                    while progress[LOADED] == 0:
+                tau = 0.0
+                if gradient_workspace is not None:
+                    pending = apply_pending_kicks(model, code, state, pushing, pending)
+                    tau = flows.gradient[k] * dt * dt
+                while needs_forces(progress, gradient_workspace, tau):
+                    if progress[LOADED] == 0:
                         now = state.step[NOW] + 1
                         needed = (observed and now == until) or is_tested(
                             flows, now - state.step[ORIGIN]
@@ -166,25 +178,19 @@ def advance(
                         which = WITH_ENERGIES if needed and k > flows.last else FORCES_ONLY
                         status = compute_step_load(terms, state, load, registers, flows, which)
                         progress[LOADED] = 1 if status == OK else 0
-                        status = after_forces(couplings, flows, registers, status)
-                        if status != OK:
-                            return status
-                else:
-                    while progress[LOADED] < (1 if flows.gradient[k] == 0.0 else 2):
-                        pending = apply_pending_kicks(model, code, state, load, pending)
-                        tau = flows.gradient[k] * dt * dt
-                        known = progress[LOADED] == 1
-                        status = evaluate(model, state, load, terms, gradient_workspace, tau, known)
-                        progress[LOADED] += status == OK
-                        status = after_forces(couplings, flows, registers, status)
-                        if status != OK:
-                            return status
+                    elif gradient_workspace is not None:
+                        status = evaluate(model, state, load, terms, gradient_workspace, tau, True)
+                        progress[LOADED] = 2 if status == OK else 1
+                    status = after_forces(couplings, flows, registers, status)
+                    if status != OK:
+                        return status
+                pushing = load_of_kick(load, gradient_workspace, tau)
                 moved = 0.0 if registers.resting[0] != 0 else h
                 state.energy_ledger[WORK] += 0.5 * moved * total_energy_rate(terms)
-                pending = kick(model, code, state, load, pending, moved)
+                pending = kick(model, code, state, pushing, pending, moved)
                 state.energy_ledger[WORK] += 0.5 * moved * total_energy_rate(terms)
             elif flows.kind[k] == DRIFT:
-                _move_all(model, code, state, load, pending, moved, True)
+                _move_all(model, code, state, pushing, pending, moved, True)
                 pending = NO_PENDING_KICKS
                 state.time[NOW] = (
                     state.time[ORIGIN]
@@ -194,7 +200,7 @@ def advance(
                 if k == flows.last and (state.step[NOW] + 1) % ORTHOGONALITY_INTERVAL == 0:
                     restore_orthogonality(state.rotation, state.angular_momentum_body)
             elif (state.step[NOW] - state.step[ORIGIN] + flows.phase[k]) % flows.every[k] == 0:
-                pending = apply_pending_kicks(model, code, state, load, pending)
+                pending = apply_pending_kicks(model, code, state, pushing, pending)
                 registers.h[0], registers.draw[0] = h, DRAWS * k
                 status = run_row(couplings, flows.row[k])
                 if status == OK and flows.kind[k] == BAROSTAT and flows.after_barostat >= 0:
@@ -204,7 +210,7 @@ def advance(
             progress[DONE] += 1
         progress[DONE] = 0
         state.step[NOW] += 1
-    apply_pending_kicks(model, code, state, load, pending)
+    apply_pending_kicks(model, code, state, pushing, pending)
     return OK
 
 
@@ -275,7 +281,7 @@ class Advance:
         """Set what the next calls do. loaded : whether the load belongs to the current positions"""
         self._dt[0] = dt
         self._integers[:] = until, observed, OK
-        self._registers.progress[:] = 0, loaded, 0
+        begin_call(self._registers.progress, is_current=loaded)
 
     def __call__(self) -> int:
         """Start or continue. A status code."""

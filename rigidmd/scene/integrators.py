@@ -1,7 +1,7 @@
 """User-defined integrators, in the tables [[integrators]] of a scene or by
 `integrator`."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, PrivateAttr, Strict, ValidationError
@@ -27,6 +27,12 @@ Coefficients = Annotated[tuple[Coefficient, ...], Field(min_length=1, max_length
 #: Largest difference of the order that is measured for an oscillator from the order that a row
 #: states.
 ORDER_TOLERANCE = 0.5
+#: Names that other programs give to velocity Verlet -> advice.
+VERLET_ELSEWHERE = dict.fromkeys(
+    ("md", "md_vv", "leap_frog", "leapfrog"), "write 'velocity_verlet'"
+)
+#: Coefficients whose longest has so many decimals, or more but not all, look truncated.
+FEWEST_DECIMALS, ALL_DECIMALS = 4, 14
 
 
 class IntegratorRow(Section):
@@ -43,8 +49,7 @@ class IntegratorRow(Section):
     drifts: Coefficients | None = None
     """Fractions of the drifts between the kicks, one fewer than kicks"""
     gradients: Coefficients | None = None
-    """Coefficients of the force gradient of each kick, in squares of the time step. Default:
-    none"""
+    """The force gradient of each kick, tau/dt², without the fraction of the kick. Default: none"""
     order: Annotated[int, Strict(), Field(ge=2, le=20)]
     """Order of convergence. It is compared with the order for an anharmonic oscillator"""
     source: Line = ""
@@ -73,8 +78,17 @@ class IntegratorRow(Section):
                 if order < self.order - ORDER_TOLERANCE:
                     yield (
                         f"order = {self.order}, but the error of an oscillator has order"
-                        f" {order:.1f}"
+                        f" {order:.1f}{self._advice_on_digits}"
                     )
+
+    @property
+    def _advice_on_digits(self) -> str:
+        """Advice for fractions with some decimals of more, whose rounding is an error of the
+        scheme."""
+        rows = (self.steps, self.kicks, self.drifts, self.gradients)
+        lengths = [len(repr(abs(x) % 1.0)) - 2 for row in rows for x in row or ()]
+        cut = FEWEST_DECIMALS <= max(lengths) < ALL_DECIMALS
+        return f". Give all digits of its coefficients ({ALL_DECIMALS} or more)" if cut else ""
 
     @property
     def scheme(self) -> Scheme:
@@ -113,7 +127,8 @@ def integrator(
     kicks, drifts
         Fractions of kick, drift, ..., drift, kick
     gradients
-        Of each kick, see `core.integrators.Flow`
+        Of each kick, tau/dt² without the fraction of the kick: 1/12 in both kicks of kick(1/2)
+        drift(1) kick(1/2) is the scheme of Takahashi and Imada
 
     Raises
     ------
@@ -166,6 +181,20 @@ def with_registered_rows(data: Json) -> tuple[Json, dict[str, Scheme]]:
         new_tables = [row.model_dump(exclude_none=True) for row in rows]
         changed = {"integrators": [*tables, *new_tables]}
     return data | changed, dict.fromkeys(taken, SCHEMES["velocity_verlet"])
+
+
+def advise_on_integrator(
+    name: object, advice: dict[str, str], known: Iterable[str], rows: Container[str] | None
+) -> object:
+    """The name of an integrator, unless there is advice on it. Raises ValueError.
+
+    advice : name of an integrator for other scenes or of other programs -> advice; rows : names of
+    the rows of the scene
+    """
+    plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
+    if plain in advice and name not in (rows or ()):
+        raise ValueError(f"is {name!r}: {advice[plain]}. The integrators are {', '.join(known)}")
+    return name
 
 
 class MovedByScheme(Section):

@@ -10,12 +10,12 @@ from rigidmd.core.state import Load, State
 from rigidmd.dynamics.body_step_loop import Body, advance_body
 from rigidmd.dynamics.flows import FlowArrays, flow_arrays
 from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
-from rigidmd.dynamics.registers import LOADED
+from rigidmd.dynamics.registers import LOADED, Registers, begin_call, new_registers
 from rigidmd.engines.cpu.compiled import CompiledEngine, Steps
 from rigidmd.forces.terms import Setup
 
 
-class BodyEngine(CompiledEngine[Body, tuple[FlowArrays, GradientWorkspace | None]]):
+class BodyEngine(CompiledEngine[Body, tuple[FlowArrays, GradientWorkspace | None, Registers]]):
     """An engine of a single body, which has no pairs and one thread. For the arguments see
     `CompiledEngine`."""
 
@@ -31,14 +31,14 @@ class BodyEngine(CompiledEngine[Body, tuple[FlowArrays, GradientWorkspace | None
     def _move(
         self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps
     ) -> bool:
-        def flows_and_gradient() -> tuple[FlowArrays, GradientWorkspace | None]:
-            return flow_arrays(integrator), (
-                gradient_workspace(state) if integrator.has_gradient else None
-            )
+        def bound() -> tuple[FlowArrays, GradientWorkspace | None, Registers]:
+            gradient = gradient_workspace(state) if integrator.has_gradient else None
+            return flow_arrays(integrator), gradient, new_registers()
 
-        flows, gradient = self._bind((integrator, state), flows_and_gradient)
+        flows, gradient, registers = self._bind((integrator, state, load), bound)
         model, (dt, until, _) = self.model_for(integrator), step
-        progress = np.array([0, self._last.is_current, 0], np.int64)
+        progress = registers.progress
+        begin_call(progress, is_current=self._last.is_current)
         while status := advance_body(
             model, state, load, workspaces, flows, gradient, dt, until, progress
         ):
