@@ -7,7 +7,7 @@ The equations contain no physical constants, so any other consistent units work 
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, Strict, field_validator
+from pydantic import Field, Strict, ValidationInfo, field_validator
 
 from rigidmd.core.integrators import (
     AUTO,
@@ -49,7 +49,7 @@ from rigidmd.scene.body_forces import (
     PositiveVector,
     Wheel,
 )
-from rigidmd.scene.integrators import MovedByScheme
+from rigidmd.scene.integrators import VERLET_ELSEWHERE, MovedByScheme, advise_on_integrator
 from rigidmd.scene.validation import (
     MOST_STEPS,
     MOST_TABLES,
@@ -369,6 +369,13 @@ class BodyStart(Section):
         return np.array(self.angular_velocity_body_rad_s or (0.0, 0.0, 0.0))
 
 
+#: Integrators of molecules and of other programs -> advice.
+OTHER_INTEGRATORS = {
+    **dict.fromkeys(WITH_THERMOSTAT, "it has a thermostat, for molecules"),
+    **VERLET_ELSEWHERE,
+}
+
+
 class Run(MovedByScheme):
     """Duration and integrator."""
 
@@ -399,13 +406,9 @@ class Run(MovedByScheme):
 
     @field_validator("integrator", mode="before")
     @classmethod
-    def _moves_bodies(cls, name: object):
-        if name in WITH_THERMOSTAT:
-            known = ", ".join((*SCHEMES, AUTO, *SOLVERS))
-            raise ValueError(
-                f"is {name!r}, which has a thermostat, for molecules. The integrators are {known}"
-            )
-        return name
+    def _moves_bodies(cls, name: object, info: ValidationInfo):
+        known = (*SCHEMES, AUTO, *SOLVERS)
+        return advise_on_integrator(name, OTHER_INTEGRATORS, known, info.context)
 
     def _errors(self):
         if self.rotor is not None and self.integrator in SOLVERS:

@@ -18,7 +18,7 @@ from rigidmd.scene.couplings import (
     ThermostatKeys,
     Values,
 )
-from rigidmd.scene.integrators import MovedByScheme
+from rigidmd.scene.integrators import VERLET_ELSEWHERE, MovedByScheme, advise_on_integrator
 from rigidmd.scene.validation import (
     MOST_STEPS,
     Count,
@@ -72,7 +72,7 @@ REFUSED = {
 #: Integrators of single bodies and of other programs -> advice.
 OTHER_INTEGRATORS = {
     **dict.fromkeys(SOLVERS, "general ODE solvers are for single bodies"),
-    **dict.fromkeys(("md", "md_vv", "leap_frog", "leapfrog"), "write 'velocity_verlet'"),
+    **VERLET_ELSEWHERE,
     **dict.fromkeys(
         ("sd", "bd", "langevin"), "write ensemble = 'nvt' with thermostat = 'langevin'"
     ),
@@ -167,13 +167,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @field_validator("integrator", mode="before")
     @classmethod
     def _moves_molecules(cls, name: object, info: ValidationInfo):
-        plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
-        if plain in OTHER_INTEGRATORS and name not in (info.context or ()):
-            known = ", ".join((*SCHEMES, *WITH_THERMOSTAT, AUTO))
-            raise ValueError(
-                f"is {name!r}: {OTHER_INTEGRATORS[plain]}. The integrators are {known}"
-            )
-        return name
+        known = (*SCHEMES, *WITH_THERMOSTAT, AUTO)
+        return advise_on_integrator(name, OTHER_INTEGRATORS, known, info.context)
 
     @field_validator("duration_ps")
     @classmethod
