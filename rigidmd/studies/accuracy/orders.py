@@ -1,33 +1,49 @@
 """Measured orders of integrators, and the trials whose error no shorter step reduces."""
 
-from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations
 from math import log
 from statistics import median
+from typing import NamedTuple
 
 from rigidmd.core.integrators import RK4, Scheme
 from rigidmd.io.write import Column, Table, format_cell
 from rigidmd.run.trials import Method, Trial
 from rigidmd.studies.accuracy.measurement import IntegratorAccuracy
 
-#: A trial is at the floor where its error fell by less than this fraction of the order.
+#: Errors fall where their slopes are at least this fraction of the order.
 FLOOR_FRACTION = 0.5
+#: The slope across a trial, as a fraction of the order, from which its error is small by accident.
+TREND_FRACTION = 0.8
 #: The reference error counts as a floor below this multiple of it.
 REFERENCE_MARGIN = 3.0
 FLOOR_MARK = "*"
-LAST = 3  # local orders whose median is the measured order
+#: Numbers of trials with the shortest steps above the floor, from which an order is measured.
+FEWEST, MOST = 3, 5
+#: Largest error of a measured order. Beyond it there is none.
+LARGEST_ERROR = 0.5
+#: Standard deviation of normal numbers over the median of their absolute values.
+NORMAL = 1.4826
 
 
-@dataclass
-class Convergence:
+class Order(NamedTuple):
+    """A measured order. value, error : the median of the slopes between all pairs of trials, and
+    the scatter of these slopes, from the median of their absolute differences from `value`"""
+
+    value: float
+    error: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.2f} ± {self.error:.2f}"
+
+
+class Convergence(NamedTuple):
     """How an error of an integrator falls with its step.
 
-    order : median of the last local orders, between successive steps above the floor. None with
-        fewer than two steps
-    floor : trials at the floor
+    order : from the shortest steps above the floor. None with fewer than three, or if they scatter
+    floor : trials with the shortest steps, whose errors do not fall any more
     """
 
-    order: float | None
+    order: Order | None
     floor: list[Trial]
 
 
@@ -40,17 +56,46 @@ def convergence(measured: IntegratorAccuracy, integrator: str, error: str) -> Co
         if trial.integrator == integrator and not trial.diverged and getattr(trial, error) > 0
     ]
     tried.sort(key=lambda trial: -trial.timestep)
+    points = [(log(trial.timestep), log(getattr(trial, error))) for trial in tried]
     lowest = REFERENCE_MARGIN * measured.reference_error if error in OF_TRAJECTORY else 0.0
-    local = []
-    last = len(tried)
-    for k, (longer, shorter) in enumerate(pairwise(tried), 1):
-        fall = log(getattr(longer, error) / getattr(shorter, error))
-        slope = fall / log(longer.timestep / shorter.timestep)
-        if slope < FLOOR_FRACTION * order or getattr(shorter, error) < lowest:
-            last = k
-            break
-        local.append(slope)
-    return Convergence(median(local[-LAST:]) if local else None, tried[last:])
+    end = len(tried)
+    while end > 1 and getattr(tried[end - 1], error) < lowest:
+        end -= 1
+    end = next((k + 1 for k in range(end - 1) if _is_lowest(points[:end], k, order)), end)
+    return Convergence(fitted_order(points[max(0, end - MOST) : end]), tried[end:])
+
+
+Point = tuple[float, float]  # logarithms of a step and of its error
+
+
+def _is_lowest(points: list[Point], k: int, order: int) -> bool:
+    """Whether the errors of steps shorter than that of point k do not fall from it: to none of
+    them, nor among them, and not because its own error is small by accident."""
+    least = FLOOR_FRACTION * order
+    if any(_slope(points[k], shorter) >= least for shorter in points[k + 1 :]):
+        return False
+    if median(_slopes(points[k:])) >= least:
+        return False
+    return k == 0 or _slope(points[k - 1], points[k + 1]) < TREND_FRACTION * order
+
+
+def fitted_order(points: list[Point]) -> Order | None:
+    """The order of errors at successive steps."""
+    if len(points) < FEWEST:
+        return None
+    slopes = _slopes(points)
+    value = median(slopes)
+    error = NORMAL * median(abs(slope - value) for slope in slopes)
+    return Order(value, error) if error <= LARGEST_ERROR else None
+
+
+def _slopes(points: list[Point]) -> list[float]:
+    """The slopes between all pairs of points (Theil 1950, Sen 1968)."""
+    return [_slope(a, b) for a, b in combinations(points, 2)]
+
+
+def _slope(a: Point, b: Point) -> float:
+    return (a[1] - b[1]) / (a[0] - b[0])
 
 
 OF_TRAJECTORY = ("trajectory_error", "rotation_error", "position_error")
@@ -65,7 +110,7 @@ def order_table(measured: IntegratorAccuracy) -> Table:
     integrators = list(dict.fromkeys(trial.integrator for trial in measured.trials))
 
     def measured_order(error: str):
-        return lambda name: _rounded(convergence(measured, name, error).order)
+        return lambda name: _shown(convergence(measured, name, error).order)
 
     return Table(
         [
@@ -85,8 +130,8 @@ def _order_of(method: Method) -> str | None:
     return None if adapts else str(method.order)
 
 
-def _rounded(order: float | None) -> str | None:
-    return None if order is None else f"{order:.1f}"
+def _shown(order: Order | None) -> str | None:
+    return None if order is None else str(order)
 
 
 def with_marks(measured: IntegratorAccuracy, table: Table) -> Table:
