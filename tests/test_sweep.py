@@ -298,6 +298,35 @@ def test_what_has_finished_is_not_run_again(copied, argon, capsys):
     assert [row["runs"] for row in table(copied)] == ["3", "2"]
 
 
+def test_a_point_with_a_longer_last_stage_counts_with_a_note(copied, argon, capsys):
+    def lines_of(*command):
+        code = cli.main([*command])
+        output = capsys.readouterr()
+        return code, output.out, output.err
+
+    names = [point.folder for point in read_manifest(copied).points]
+    before = written(copied)
+    assert lines_of("resume", str(copied / names[0]), "--until", "0.7ps")[0] == 0
+    note = f"the last stage of {names[0]} has another duration than in the sweep"
+    for command in (
+        ["sweep", str(argon), "-o", str(copied), "--collect"],
+        ["sweep", str(argon), "-o", str(copied), *GRID],
+        ["analyse", str(copied), "--only", "rdf"],
+    ):
+        code, out, err = lines_of(*command)
+        assert code == 0 and err.count(note) == 1
+        assert "4 of them finished" in out or "2 runs" in out
+    assert set(states(copied).values()) == {"finished"}
+    assert {name for name, at in written(copied).items() if at != before[name]} == {names[0]}
+    assert len(rigidmd.read_run(copied)[0].runs) == 2
+    # a run of another scene in the folder of a point is not that point
+    other = ["--set", "stages.0.duration_ps=0.6", "--set", "start.temperature_K=91"]
+    assert lines_of("run", str(argon), "-o", str(copied / names[1]), "--force", *other)[0] == 0
+    code, out, err = lines_of("sweep", str(argon), "-o", str(copied), "--collect")
+    assert code == 1 and "3 of them finished" in out and names[1] not in err
+    assert f"not in the table: {names[1]}, which is interrupted" in out
+
+
 def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
     for changes, expected in (
         ([*GRID, "--set", "forces.cutoff_A=7.5"], "forces.cutoff_A is 7.5, there 8.0"),
@@ -657,6 +686,13 @@ def test_bodies_and_words(tmp_path, capsys):
     assert cli.main(["sweep", str(scene), "-o", str(tmp_path / "s"), "--collect"]) == 0
     errors = [float(row["energy_error largest"]) for row in table(tmp_path / "s")]
     assert errors[0] > 100 * errors[1]
+    for row, name in zip(table(tmp_path / "s"), ("velocity_verlet", "kahan_li_8"), strict=True):
+        theta = Simulation(Scene.read(scene, fixed | {"run.integrator": name})).run()["theta"]
+        values = {"mean": theta.mean(), "lowest": theta.min(), "highest": theta.max()}
+        values["end"] = theta[-1]
+        assert len({f"{value:.6g}" for value in values.values()}) == 4
+        for word, value in values.items():
+            assert float(row[f"theta {word} (rad)"]) == pytest.approx(value, rel=1e-9)
     assert (tmp_path / "s" / "sweep.png").exists()
     assert cli.main(["sweep", str(scene), "--replicas", "3", "-o", str(tmp_path / "t")]) == 2
     assert "a single body, whose motion has no seed" in capsys.readouterr().err

@@ -233,6 +233,7 @@ def _message_printer() -> Callable[[str, str], None]:
 def _print_results(manifest: "Manifest", step: str | None) -> None:
     """Write and print the table of what has finished. step : the key of --extrapolate"""
     from rigidmd.studies.sweep.figure import collect
+    from rigidmd.studies.sweep.folder import MOST_NAMED
 
     folder = manifest.folder
     table, files = collect(manifest)
@@ -240,6 +241,8 @@ def _print_results(manifest: "Manifest", step: str | None) -> None:
         print(table.brief().text(left=()))
     for name, reason in table.failed.items():
         print(f"  {name} is not in the table: {reason}")
+    for point in manifest.points_in("waiting", "interrupted")[:MOST_NAMED]:
+        print(f"  not in the table: {point.folder}, which is {point.state}")
     names = ["sweep.json", *(path.name for path in files)]
     names += [] if step is None else print_limits(manifest, step)
     count = len(manifest.points)

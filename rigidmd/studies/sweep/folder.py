@@ -5,6 +5,7 @@ import contextlib
 import hashlib
 import json
 import re
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -15,10 +16,11 @@ from pydantic import ConfigDict
 
 from rigidmd.core.files import writing
 from rigidmd.core.toml import Json
-from rigidmd.errors import OutputError, option
+from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, option
 from rigidmd.io.folder import (
     LOCK,
     MARKER,
+    SCENE,
     SUMMARY,
     SWEEP,
     check_inside,
@@ -27,6 +29,8 @@ from rigidmd.io.folder import (
 )
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json
+from rigidmd.run.resume import scene_digest
+from rigidmd.scene import Scene, is_molecular
 
 MANIFEST = SWEEP
 TABLE = "sweep.csv"
@@ -36,6 +40,7 @@ FILES = (MANIFEST, TABLE, FIGURE, SCRIPT)
 State = Literal["waiting", "running", "finished", "interrupted", "failed"]
 SEED = "seed"  # the key whose values make replicas
 LONGEST = 120  # most letters of the name of a folder
+MOST_NAMED = 8  # points in a warning
 STRICT = ConfigDict(strict=True, extra="forbid")
 
 
@@ -50,20 +55,6 @@ class SweepPoint:
     ran_sha256: str | None = None  # scene_sha256 of the summary of its run, once it has ended
     message: str | None = None  # why it failed
     seconds: Bounded = 0.0  # run time of all attempts
-
-    def update_state(self, sweep: Path) -> None:
-        """Read the state from the folder of the point. A failed point keeps its state until it has
-        finished."""
-        folder = sweep / self.folder
-        with contextlib.suppress(OutputError):
-            summary = read_json(folder / SUMMARY, Summary) or Summary(interrupted=True)
-            is_same_run = self.ran_sha256 in (None, summary.scene_sha256)
-            if is_same_run and not summary.interrupted:
-                self.state, self.message = "finished", None
-                self.ran_sha256 = summary.scene_sha256
-                return
-        if self.state != "failed":
-            self.state = "interrupted" if (folder / MARKER).is_file() else "waiting"
 
 
 @dataclass
@@ -81,7 +72,9 @@ class Manifest:
     inputs: dict[str, str]  # dotted key -> SHA-256 of the files that all points read
     points: list[SweepPoint] = field(default_factory=list)
     has_checkpoints: bool = True
-    folder: Path = field(default=Path(), init=False)  # is not in the file
+    # these are not in the file
+    folder: Path = field(default=Path(), init=False)
+    lengthened: list[str] = field(default_factory=list, init=False)  # folders of points
 
     def overrides(self, values: Json) -> Json:
         """Dotted key -> value, for `Scene.read`, at these values of the swept keys."""
@@ -105,13 +98,56 @@ class Manifest:
         return list(groups.values())
 
     def update_states(self) -> None:
+        """Read the states of all points, with a warning for those that are longer than planned."""
+        self.lengthened.clear()
         for point in self.points:
-            point.update_state(self.folder)
+            self.update_state(point)
+        if names := self.lengthened:
+            more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+            warnings.warn(
+                f"{self.folder}: the last stage of {', '.join(names[:MOST_NAMED])}{more} has"
+                " another duration than in the sweep. The runs count as they are",
+                RigidMDWarning,
+                stacklevel=1,  # the same line for all callers: one warning
+            )
+
+    def update_state(self, point: SweepPoint) -> None:
+        """Read the state of a point from its folder. A failed point keeps its state until it has
+        finished."""
+        folder = self.folder / point.folder
+        with contextlib.suppress(OutputError):
+            summary = read_json(folder / SUMMARY, Summary) or Summary(interrupted=True)
+            is_same_run = point.ran_sha256 in (None, summary.scene_sha256)
+            if not summary.interrupted:
+                if has_other_end := not is_same_run and self._has_other_end(point, summary):
+                    self.lengthened.append(point.folder)
+                if is_same_run or has_other_end:
+                    point.state, point.message = "finished", None
+                    point.ran_sha256 = point.ran_sha256 or summary.scene_sha256
+                    return
+        if point.state != "failed":
+            point.state = "interrupted" if (folder / MARKER).is_file() else "waiting"
+
+    def _has_other_end(self, point: SweepPoint, summary: Summary) -> bool:
+        """Whether the run of a point differs from the run that the sweep has made by the duration
+        of its last stage only."""
+        with contextlib.suppress(RigidMDError):
+            scene = Scene.read(self.folder / point.folder / SCENE)
+            if not is_molecular(scene) or scene_digest(scene) != summary.scene_sha256:
+                return False
+            *stages, last = scene.stages
+            planned = self.common | self.overrides(point.values)
+            keys = (f"stages.{name}.duration_ps" for name in (len(stages), last.name))
+            duration = next((planned[key] for key in keys if key in planned), None)
+            last = last.model_copy(update={"duration_ps": duration})
+            as_planned = scene.model_copy(update={"stages": (*stages, last)})
+            return scene_digest(as_planned) == point.ran_sha256
+        return False
 
     def write(self) -> None:
         """Write sweep.json as a whole. Raises OutputError."""
         content = asdict(self)
-        del content["folder"]
+        del content["folder"], content["lengthened"]
         write_json(self.folder / MANIFEST, content, indent=1)
 
 

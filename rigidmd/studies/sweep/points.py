@@ -232,7 +232,7 @@ def run_points(
                 done, _ = wait(running, max(TICK, len(manifest.points) / POINTS_PER_SECOND))
                 messages.read(running.values())
                 for future in done:
-                    _record_end(folder, running.pop(future), future, messages, signals)
+                    _record_end(manifest, running.pop(future), future, messages, signals)
     manifest.write()
     return signals[0] if signals else None
 
@@ -274,7 +274,7 @@ class _Messages:
 
 
 def _record_end(
-    folder: Path, point: SweepPoint, future: Future, messages: _Messages, signals: list[int]
+    manifest: Manifest, point: SweepPoint, future: Future, messages: _Messages, signals: list[int]
 ) -> None:
     """Note in a point how it ended."""
     reason = ""
@@ -288,7 +288,7 @@ def _record_end(
     except (Exception, CancelledError) as error:  # of the executor
         reason = f"it failed to run: {describe_error(error)}"
     point.state, point.message = "interrupted", None
-    point.update_state(folder)
+    manifest.update_state(point)
     if point.state == "finished":
         messages.advance(point, 1.0)
     elif reason and not signals:
