@@ -9,8 +9,10 @@ from support import ROOT, SPRING, small_scene, springs
 
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import DRIFT, KICK, SCHEMES
+from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation, trials
+from rigidmd.run.pilot import choice
 from rigidmd.run.pilot.choice import choose
 from rigidmd.run.pilot.energy_walk import EnergyWalk, weight
 from rigidmd.run.pilot.sampling import bias_of_potential, mean_square_rate
@@ -270,6 +272,43 @@ def test_the_error_of_a_top_is_what_was_asked_for(target):
     assert target / 100 < error < 1.5 * target
     assert "chosen: error" in results.summary["notes"][0]
     assert simulation.scene.run.integrator == results.summary["integrator"] != "auto"
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        "argon",
+        *(
+            pytest.param(name, marks=pytest.mark.extended)
+            for name in ("krypton", "methane_trappe", "nitrogen", "co2_trappe", "spce")
+        ),
+    ],
+)
+def test_the_error_of_a_trajectory_from_a_lattice_is_what_was_asked_for(model):
+    """Forces at the lattice nearly cancel: the motion is much stiffer than they tell."""
+    stage = {"integrator": "auto", "trajectory_error": 1e-3, "duration_ps": 0.2}
+    scene = small_scene({model: 40}, 20.0, stages=[stage], start={"temperature_K": 90.0})
+    results = Simulation(scene).run()
+    chosen = results.summary["stages"][0]
+    assert 0.5 < chosen["timestep_fs"] < 30
+    assert "error of the trajectory" in " ".join(results.summary["notes"])
+
+
+def test_a_reference_that_diverges_at_all_steps_is_an_error_without_a_step(monkeypatch):
+    """With more steps first; the message has no step, as none was given."""
+    tried = []
+
+    def diverges(system, steps):
+        tried.append(steps)
+        state = system.state.copy()
+        state.position[:] = np.inf
+        raise NotFiniteError(state)
+
+    monkeypatch.setattr(choice, "final_state", diverges)
+    stage = {"integrator": "auto", "trajectory_error": 1e-3, "duration_ps": 0.2}
+    with pytest.raises(SimulationError, match=r"it diverges with up to 65536 steps$"):
+        Simulation(small_scene({"argon": 40}, 20.0, stages=[stage])).run()
+    assert tried == [16 * 2**k for k in range(13)]
 
 
 def test_an_error_of_the_trajectory_below_rounding_is_refused():

@@ -188,6 +188,11 @@ def _moving(scene: MolecularScene, species: list[Molecule]) -> list[Molecule]:
     return [m for m, entry in entries if entry.frozen is not True]
 
 
+def fastest_of_scene(scene: MolecularScene, temperature: float) -> FastMotion | None:
+    """`fastest_motion` of the molecules of a scene that are not frozen."""
+    return fastest_motion(_moving(scene, species_of(scene)), temperature)
+
+
 def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
     """The stages other than minimisations with a given step: index, stage and temperature, K, 0 if
     it is not known."""

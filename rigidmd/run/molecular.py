@@ -22,7 +22,7 @@ from rigidmd.core.toml import Json
 from rigidmd.dynamics.model import remove_momentum
 from rigidmd.dynamics.observables import largest_values
 from rigidmd.engines.observables import Observation, describe_quantities, observe
-from rigidmd.engines.protocol import Engine
+from rigidmd.engines.protocol import Engine, NotFiniteError
 from rigidmd.engines.samples import OF_TRAJECTORIES, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError, SimulationError, StructureError
@@ -106,10 +106,6 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         return usable_threads(self.scene.threads)
 
     def start_from(self, state: State) -> None:
-        if not isinstance(state, State):
-            raise TypeError(
-                f"start_from needs a State, such as results.state, not {type(state).__name__}"
-            )
         if faults := self._start.state_errors(state):
             raise StructureError("start_from", faults)
         self._start = replace(self._start, state=state_of(*state[:5]), from_lattice=False)
@@ -415,7 +411,13 @@ class MolecularRun(RunPart[System, MolecularRecord, Samples]):
         from rigidmd.run.pilot.stages import choose_for_stage
 
         self.simulation._announce("choosing integrator and step by pilot runs")
-        decided, reason = choose_for_stage(self.system, self.state, k)
+        try:
+            decided, reason = choose_for_stage(self.system, self.state, k)
+        except NotFiniteError as error:
+            raise SimulationError(
+                f"a pilot run of integrator = 'auto' diverges: {error}. Let a stage with a"
+                " thermostat come first, or set integrator and timestep_fs"
+            ) from None
         self.record.choices[k] = f"{decided.integrator} at {decided.step_fs:g} fs chosen: {reason}"
         stages = self.record.stages
         self._set_stages((*stages[:k], decided, *stages[k + 1 :]))

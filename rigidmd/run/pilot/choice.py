@@ -16,6 +16,8 @@ import numpy as np
 from rigidmd.core.integrators import SCHEMES, Scheme
 from rigidmd.core.state import State
 from rigidmd.core.statistics import ENERGY_ERROR
+from rigidmd.engines.cpu.engine import BehindWallError
+from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.run import trials
 from rigidmd.run.pilot.energy_walk import EnergyWalk, measure_energy_walk
@@ -29,8 +31,8 @@ CANDIDATES = sorted(
 #: Maximum number of trials of each candidate, maximum factor by which its longest step is
 #: shortened, and minimum gain for another trial.
 MAX_TRIALS, MAX_SHORTENING, MIN_GAIN = 16, 4096, 1.1
-#: Maximum number of halvings of the reference's step.
-HALVINGS = 12
+#: Fewest steps of the reference, and the maximum number of halvings of its step.
+REFERENCE_STEPS, HALVINGS = 16, 12
 #: An interpolated step is shortened by this factor, so that its error falls below the target.
 MARGIN = 0.95
 #: Expected error over a run longer than its pilot runs, in the target: one random walk in ten is
@@ -272,11 +274,20 @@ def round_down(step: float) -> float:
 
 def _reference(system: TrialSystem, target: float) -> State:
     """The state at the end of the span, exact to a tenth of the target. Raises SimulationError."""
-    before = final_state(system, 16)
-    for k in range(1, HALVINGS + 1):
-        now = final_state(system, 16 * 2**k)
-        rotation, position = state_difference(now, before)
-        if (position if rotation != rotation else rotation) <= 0.1 * target:
-            return now
+    before = None
+    for k in range(HALVINGS + 1):
+        try:
+            now = final_state(system, REFERENCE_STEPS * 2**k)
+        except (NotFiniteError, BehindWallError):  # its step is too long
+            before = None
+            continue
+        if before is not None:
+            rotation, position = state_difference(now, before)
+            if (position if rotation != rotation else rotation) <= 0.1 * target:
+                return now
         before = now
-    raise SimulationError(f"no reference is exact to a tenth of trajectory_error = {target:g}")
+    most = REFERENCE_STEPS * 2**HALVINGS
+    diverges = f": it diverges with up to {most} steps" if before is None else ""
+    raise SimulationError(
+        f"no reference is exact to a tenth of trajectory_error = {target:g}{diverges}"
+    )

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable
 from fractions import Fraction
-from math import ceil, gcd, sqrt
+from math import ceil, gcd, inf, sqrt
 
+from rigidmd.assemble.time_step import fastest_of_scene
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import State
 from rigidmd.dynamics.observables import sums_of_state
@@ -15,13 +16,16 @@ from rigidmd.run.trial_systems import SPAN_PS, body_trial_system, molecular_tria
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import SAMPLES
 from rigidmd.scene.stage import Stage
-from rigidmd.units import FEMTOSECOND
+from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: Step of velocity Verlet and span of a pilot run, in radians of the mean vibration or libration.
 PILOT_STEP, PILOT_SPAN = 0.15, 10.0
 #: For an error of the energy over a stage a pilot run takes this part of the stage, at least these
 #: radians.
 PILOT_PART, LEAST_SPAN = 0.01, 3.0
+#: Longest time for one radian of the mean motion in a liquid, in those of the fastest motion. A
+#: lattice, whose forces nearly cancel, is stiffer after some steps than at its start.
+SLOWEST = 5.0
 #: Minimum fraction of a chosen step to which it is shortened to fit the interval of samples.
 MIN_STEP_FRACTION = 0.25
 
@@ -38,10 +42,14 @@ def choose_for_stage(system: System, state: State, k: int) -> tuple[Stage, str]:
 def natural_time(system: System, state: State) -> float | None:
     """Time (ps) for one radian of the faster motion, vibration or libration. None at rest. Its
     inverse squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion. Likewise for
-    torques."""
+    torques. At most SLOWEST times that of the fastest motion at the temperature of the state."""
     sums = sums_of_state(system.model, state, system.engine().evaluate(state)[0])
     pairs = (sums.force, sums.translation), (sums.torque, sums.rotation)
     fastest = max(force / motion if motion > 0 else 0.0 for force, motion in pairs)
+    temperature = (sums.translation + sums.rotation) / (BOLTZMANN * system.last_freedom.total)
+    in_liquid = fastest_of_scene(system.scene, temperature)
+    if in_liquid is not None and in_liquid.time < inf:
+        fastest = max(fastest, (SLOWEST * in_liquid.time) ** -2)
     return 1 / sqrt(fastest) if fastest > 0 else None
 
 
