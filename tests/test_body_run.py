@@ -15,7 +15,7 @@ from support import BODIES, ROOT
 import rigidmd
 from rigidmd.assemble.body import build_body
 from rigidmd.commands.cli import main
-from rigidmd.errors import SceneError, SimulationError
+from rigidmd.errors import SceneError, SimulationError, StructureError
 from rigidmd.figures.picture import Picture
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run import Every, Simulation
@@ -488,3 +488,78 @@ def test_a_figure_is_laid_out_once_and_drawn_once_for_each_file(tmp_path, monkey
     files = Simulation(scene, tmp_path / "run").run().files
     assert len(drawn) == len([path for path in files if path.suffix in (".png", ".svg")]) == 8
     assert len(laid_out) == 1  # axis.png; panels of curves have fixed positions
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "srkn_6", "dop853"])
+def test_a_body_starts_from_the_reverse_of_its_end(integrator):
+    changes = {"run.integrator": integrator, "run.duration_s": 0.5, "run.timestep_s": 1e-3}
+    simulation = Simulation(Scene.read(TOP, changes))
+    start = simulation.state.copy()
+    end = simulation.run().state.copy()
+    assert np.abs(end.rotation - start.rotation).max() > 0.1
+    simulation.start_from(end._replace(angular_momentum_body=-end.angular_momentum_body))
+    assert simulation.state.time[0] == simulation.state.step[0] == 0
+    results = simulation.run()
+    assert results["time"][0] == 0
+    np.testing.assert_allclose(results.state.rotation, start.rotation, atol=1e-9)
+    np.testing.assert_allclose(
+        results.state.angular_momentum_body,
+        -start.angular_momentum_body,
+        atol=1e-9 * np.abs(start.angular_momentum_body).max(),
+    )
+    repeated = simulation.run().state
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(repeated, results.state, strict=True))
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "dop853"])
+def test_a_run_from_another_state_is_resumed_from_its_own_start(integrator, tmp_path):
+    scene = Scene.read(
+        TOP, {"run.duration_s": 0.4, "output.interval_s": 0.01, "run.integrator": integrator}
+    )
+    state = Simulation(scene).run().state
+    ends = []
+    for name, steps in (("whole", None), ("parts", 100)):
+        simulation = Simulation(scene, tmp_path / name)
+        simulation.start_from(state)
+        if steps:
+            simulation.step(steps)
+            simulation.close()
+            again = Scene.read(tmp_path / name / "scene.toml")
+            simulation = Simulation(again, tmp_path / name, resume=True)
+        ends.append(simulation.run())
+    whole, parts = ends
+    assert np.array_equal(whole.system.state.rotation, state.rotation)
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(whole.state, parts.state, strict=True))
+    assert (tmp_path / "whole" / "motion.csv").read_text() == (
+        tmp_path / "parts" / "motion.csv"
+    ).read_text()
+    assert whole.summary["rates"] == parts.summary["rates"]
+
+
+def test_a_body_begins_only_from_states_that_it_can_have():
+    simulation = Simulation(Scene.read(TOP))
+    state = simulation.state.copy()
+    for name, value, message in (
+        ("rotation", -state.rotation, "rotations"),
+        ("rotation", np.eye(3)[None].repeat(2, 0), r"not \(1, 3, 3\); the scene is a single body"),
+        ("angular_momentum_body", state.angular_momentum_body * np.nan, "is not finite"),
+        ("position", np.zeros((1, 3)), r"has the shape \(1, 3\), not \(0, 3\).*pinned"),
+        ("cell", np.eye(3), "has a periodic box"),
+    ):
+        with pytest.raises(StructureError, match=message):
+            simulation.start_from(state._replace(**{name: value}))
+    with pytest.raises(TypeError, match="needs a State"):
+        simulation.start_from(state.rotation)
+    rod = {"body": {"mass_kg": 1.0, "inertia_kg_m2": [0.0, 2.0, 2.0]}}
+    rod |= {"start": {"angular_velocity_body_rad_s": [0.0, 1.0, 0.0]}}
+    simulation = Simulation(Scene.from_dict(rod | {"run": {"duration_s": 1.0, "timestep_s": 0.1}}))
+    along = simulation.state.angular_momentum_body + simulation.system.axes.T @ [0.1, 0.0, 0.0]
+    with pytest.raises(StructureError, match="not 0 about an axis without inertia"):
+        simulation.start_from(simulation.state._replace(angular_momentum_body=along))
+    chosen = Scene.read(TOP, {"run.integrator": "auto", "run.energy_error": 1e-3})
+    simulation = Simulation(chosen)
+    with pytest.raises(StructureError, match="set integrator and timestep_s"):
+        simulation.start_from(simulation.state)
+    with simulation, pytest.raises(RuntimeError, match="the run has begun"):
+        simulation.step(1)
+        simulation.start_from(simulation.state)

@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidmd.core.integrators import RK4, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State
+from rigidmd.core.state_file import array_errors
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.engines.cpu.body import BodyEngine
 from rigidmd.engines.sites import Sites
@@ -21,6 +22,9 @@ from rigidmd.mechanics.translation import FluidTranslation, InertialFrame
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.validation import not_none, number_of_steps
+
+#: An angular momentum below this fraction of the largest is 0.
+ROUNDING = 1e-12
 
 Component = TypeVar("Component", bound=NamedTuple)
 
@@ -138,6 +142,23 @@ class BodySystem:
             name: self._load_function(function) for name, function in self.applied.items()
         }
         return kind(*self.terms_at(0.0), python_forces=python_forces)
+
+    def state_errors(self, state: State) -> list[str]:
+        """Messages on positions and momenta of a state from outside which this body cannot have."""
+        names = State._fields[:5]
+        arrays = {name: np.asarray(getattr(state, name)) for name in names}
+        shapes = {name: getattr(self.state, name).shape for name in names}
+        if problems := array_errors(arrays, shapes):
+            pinned = "" if self.translates else ", pinned"
+            about = f"the scene is a single body{pinned}"
+            return [f"{name} of the state {problem}; {about}" for name, problem in problems.items()]
+        if np.isfinite(arrays["cell"]).all():
+            return ["the state has a periodic box, and a single body has none"]
+        momentum = np.abs(arrays["angular_momentum_body"])
+        along = momentum[:, (self.inertia == 0) & (not isinstance(self.body.rotor, DrivenRotor))]
+        if along.max(initial=0.0) > ROUNDING * momentum.max(initial=0.0):
+            return ["angular_momentum_body of the state is not 0 about an axis without inertia"]
+        return []
 
     def breaks(self) -> list[float]:
         """Times within the run at which a prescribed function of time has a jump or a kink."""

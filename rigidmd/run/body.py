@@ -1,7 +1,7 @@
 """Runs of a single body: samples at regular times, columns at the end, figures."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import ceil, inf
 from typing import TYPE_CHECKING, ClassVar
@@ -12,13 +12,13 @@ from pydantic import PositiveFloat
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.harmonic import stable_angle
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.state import NOW, ORIGIN, State
+from rigidmd.core.state import NOW, ORIGIN, State, state_of
 from rigidmd.core.toml import Json
 from rigidmd.engines.body_motion import Motion, Snapshot, energies, is_balanced, motion
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import MATRIX
-from rigidmd.errors import SimulationError
+from rigidmd.errors import SimulationError, StructureError
 from rigidmd.forces.body.applied import SteadyForce
 from rigidmd.formats import format_of
 from rigidmd.io.checkpoint import Checkpoint
@@ -237,6 +237,7 @@ class BodyRecord(RunRecord):
     """The record of a run of a body."""
 
     stable: PositiveFloat | None = None  # the longest stable step, s
+    start: Arrays = field(default_factory=dict)  # the state of `Simulation.start_from`, if any
 
 
 class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
@@ -260,12 +261,29 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
 
             simulation._announce("choosing integrator and step by pilot runs")
             scene, self._choice = choose_for_body(scene, applied)
-        self.system = build_body(scene, applied)
+        self.system = self._scene_system = build_body(scene, applied)
         self._segments = self._equal_step_segments()
+        self._given: dict[str, np.ndarray] = {}  # the state of `start_from`
         self.reset()
+
+    def start_from(self, state: State) -> None:
+        if faults := self._scene_system.state_errors(state):
+            raise StructureError("start_from", faults)
+        if self._choice is not None:
+            why = "integrator = 'auto' has chosen for the start of the scene"
+            raise StructureError("start_from", [f"{why}: set integrator and timestep_s"])
+        self._given = state_of(*state[:5])._asdict()
+        self.reset()
+
+    def _set_start(self, given: dict[str, np.ndarray]) -> None:
+        """Let the system start at a given state, or else at that of the scene."""
+        state = State(**given) if given else self._scene_system.state
+        self.system = replace(self._scene_system, state=state)
 
     def reset(self) -> None:
         super().reset()
+        self.record.start = self._given
+        self._set_start(self._given)
         self.engine = self.system.engine()
         self.engine.stop_requested = self.simulation._must_end
         self.state = self.engine.begin(self.system.state, self.system.method)
@@ -306,6 +324,9 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         method = self.system.method
         k = self.record.position.segment
         check_same_scene(self.scene, self.record.scene, {}, int(arrays["step"][NOW]))
+        if start := self.record.start:
+            start = state_from(start, self._scene_system.state)._asdict()
+        self._set_start(start)
         self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
         if k > 0:
             self.engine.change(*self.system.terms_at(float(self.state.time[ORIGIN])))

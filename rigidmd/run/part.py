@@ -157,6 +157,10 @@ class RunPart(ABC, Generic[SystemT, RecordT, SamplesT]):
     def take_threads(self, count: int) -> None:
         """Set the number of threads. A single body always has one."""
 
+    @abstractmethod
+    def start_from(self, state: State) -> None:
+        """Let runs start at a state. Raises StructureError for one that the scene cannot have."""
+
     def reset(self) -> None:
         """Return to the start, so that repeated runs are identical: a new engine, state and
         record."""

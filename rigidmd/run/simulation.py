@@ -369,17 +369,22 @@ class Simulation(Displayed, Generic[SystemT, SceneT]):
         return cast("MolecularRun", part)
 
     def start_from(self, state: State) -> None:
-        """Let runs of molecules start at the given positions and momenta, without removal of
-        overlaps.
+        """Let runs start at the given positions, orientations and momenta, of molecules without
+        removal of overlaps.
 
         Parameters
         ----------
         state
-            A state of as many molecules in the same order, in the units of `state`, such as
-            `results.state`. Time and step start at 0. Raises StructureError for a state that this
-            scene cannot have, TypeError for anything else.
+            A state of as many molecules in the same order, or of a body, in the units of `state`,
+            such as `results.state`. Time and step start at 0. Raises StructureError for a state
+            that this scene cannot have, TypeError for anything else.
         """
-        self._molecules().start_from(state)
+        part = self._before_run()
+        if not isinstance(state, State):
+            raise TypeError(
+                f"start_from needs a State, such as results.state, not {type(state).__name__}"
+            )
+        part.start_from(state)
         if self._earlier is not None:
             self._earlier.is_complete = True  # the next run does not continue it
 
