@@ -285,7 +285,7 @@ def test_the_error_of_a_top_is_what_was_asked_for(target):
     ],
 )
 def test_the_error_of_a_trajectory_from_a_lattice_is_what_was_asked_for(model):
-    """Forces at the lattice nearly cancel: the motion is much stiffer than they tell."""
+    """Forces at the lattice nearly cancel: the motion is much stiffer than their size shows."""
     stage = {"integrator": "auto", "trajectory_error": 1e-3, "duration_ps": 0.2}
     scene = small_scene({model: 40}, 20.0, stages=[stage], start={"temperature_K": 90.0})
     results = Simulation(scene).run()

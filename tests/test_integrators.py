@@ -101,7 +101,7 @@ def moving(request):
 
 
 def moved(moving, scheme, steps, calls=None):
-    """The state after steps, in calls of so many each."""
+    """The state after steps, in calls of these counts."""
     engine, start, time = moving
     state = start.copy()
     engine.forget()
@@ -147,7 +147,7 @@ def test_kicks_side_by_side_are_one_kick(moving, pair):
 
 
 class Springs(rigidmd.Force):
-    """Springs of each site to its place at the start."""
+    """Springs of each site to its position at the start."""
 
     tied_to_places = True
 

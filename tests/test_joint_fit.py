@@ -23,7 +23,7 @@ from rigidmd.studies.joint_fit import (
     why_not,
 )
 
-#: Atoms on springs of one frequency (rad/ps), each around a place that moves with the box, and an
+#: Atoms on springs of one frequency (rad/ps), each about a lattice point that moves with the box, and an
 #: energy of the volume for which U + pV is quadratic in it.
 COUNT, TEMPERATURE, PRESSURE, OMEGA = 20, 120.0, 400.0, 10.0
 FREEDOM = 3 * COUNT
@@ -115,7 +115,7 @@ def test_pulls_of_joint_limits_have_unit_width(
     has_barostat, correction, reads_kinetic, steps, replicas
 ):
     """(limit - truth)/error of limits, with the errors of independent fits or smaller ones; slopes
-    and responses are those of the springs."""
+    and responses agree with theory."""
     rng, relative = np.random.default_rng(7), VOLUME_SIZE / VOLUME_MEAN
     truth = {
         POTENTIAL: 0.5 * THERMAL * (FREEDOM + has_barostat) / COUNT,

@@ -276,7 +276,7 @@ class BodyRun(RunPart[BodySystem, BodyRecord, Motion]):
         self.reset()
 
     def _set_start(self, given: dict[str, np.ndarray]) -> None:
-        """Let the system start at a given state, or else at that of the scene."""
+        """Let the system start at a given state, by default at the start of the scene."""
         state = State(**given) if given else self._scene_system.state
         self.system = replace(self._scene_system, state=state)
 

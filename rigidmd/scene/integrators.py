@@ -31,7 +31,7 @@ ORDER_TOLERANCE = 0.5
 VERLET_ELSEWHERE = dict.fromkeys(
     ("md", "md_vv", "leap_frog", "leapfrog"), "write 'velocity_verlet'"
 )
-#: Coefficients whose longest has so many decimals, or more but not all, look truncated.
+#: Coefficients whose longest has a number of decimals between these are probably truncated.
 FEWEST_DECIMALS, ALL_DECIMALS = 4, 14
 
 

@@ -23,8 +23,8 @@ PILOT_STEP, PILOT_SPAN = 0.15, 10.0
 #: For an error of the energy over a stage a pilot run takes this part of the stage, at least these
 #: radians.
 PILOT_PART, LEAST_SPAN = 0.01, 3.0
-#: Longest time for one radian of the mean motion in a liquid, in those of the fastest motion. A
-#: lattice, whose forces nearly cancel, is stiffer after some steps than at its start.
+#: Longest time for one radian of the mean motion in a liquid, in times of its fastest motion. In a
+#: lattice forces nearly cancel: it is stiffer after some steps than at its start.
 SLOWEST = 5.0
 #: Minimum fraction of a chosen step to which it is shortened to fit the interval of samples.
 MIN_STEP_FRACTION = 0.25
@@ -42,7 +42,7 @@ def choose_for_stage(system: System, state: State, k: int) -> tuple[Stage, str]:
 def natural_time(system: System, state: State) -> float | None:
     """Time (ps) for one radian of the faster motion, vibration or libration. None at rest. Its
     inverse squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion. Likewise for
-    torques. At most SLOWEST times that of the fastest motion at the temperature of the state."""
+    torques. At most SLOWEST times the time of the fastest motion at the state's temperature."""
     sums = sums_of_state(system.model, state, system.engine().evaluate(state)[0])
     pairs = (sums.force, sums.translation), (sums.torque, sums.rotation)
     fastest = max(force / motion if motion > 0 else 0.0 for force, motion in pairs)
