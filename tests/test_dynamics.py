@@ -579,8 +579,16 @@ def test_adding_an_integrator_from_python(monkeypatch):
             "order = 4, but the error of an oscillator has order 2.0$",
         ),
         (
-            {"steps": [1.35120719, -1.70241438, 1.35120719], "order": 4},
-            "has order 1.* Give all digits of its coefficients .14 or more.",
+            {
+                "kicks": [0.082984, 0.39631, -0.039056, 0.119524, -0.039056, 0.39631, 0.082984],
+                "drifts": [0.245299, 0.604873, -0.350172, -0.350172, 0.604873, 0.245299],
+                "order": 4,
+            },
+            "has order 2.0. Give all digits of its coefficients .14 or more.",
+        ),
+        (
+            {"steps": [1.3512072, -1.7024142, 1.3512072], "order": 4},
+            "its drifts sum to 1.0000002, not to 1. Give all digits",
         ),
         ({"steps": [1.0], "kicks": [0.5, 0.5]}, "contradict each other"),
         ({"kicks": [0.5, 0.5]}, "needs steps, or kicks and drifts"),

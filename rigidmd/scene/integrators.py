@@ -73,7 +73,7 @@ class IntegratorRow(Section):
             try:
                 order = measured_order(self.scheme)
             except ValueError as error:
-                yield str(error).partition("; odd")[0]
+                yield f"{str(error).partition('; odd')[0]}{self._advice_on_digits}"
             else:
                 if order < self.order - ORDER_TOLERANCE:
                     yield (
@@ -86,7 +86,7 @@ class IntegratorRow(Section):
         """Advice for fractions with some decimals of more, whose rounding is an error of the
         scheme."""
         rows = (self.steps, self.kicks, self.drifts, self.gradients)
-        lengths = [len(repr(abs(x) % 1.0)) - 2 for row in rows for x in row or ()]
+        lengths = [len(repr(x).partition(".")[2]) for row in rows for x in row or ()]
         cut = FEWEST_DECIMALS <= max(lengths) < ALL_DECIMALS
         return f". Give all digits of its coefficients ({ALL_DECIMALS} or more)" if cut else ""
 
