@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support import ROOT, SPRING, small_scene, springs
 
+from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
 from rigidmd.core.integrators import DRIFT, KICK, SCHEMES
 from rigidmd.engines.protocol import NotFiniteError
@@ -16,7 +17,7 @@ from rigidmd.run.pilot import choice
 from rigidmd.run.pilot.choice import choose
 from rigidmd.run.pilot.energy_walk import EnergyWalk, weight
 from rigidmd.run.pilot.sampling import bias_of_potential, mean_square_rate
-from rigidmd.run.pilot.stages import _fit_step
+from rigidmd.run.pilot.stages import _fit_step, choose_for_stage
 from rigidmd.run.trials import Method, TrialSystem
 from rigidmd.scene import Scene
 from rigidmd.studies.accuracy.averages import measure_averages, start_of_last_stage
@@ -284,14 +285,16 @@ def test_the_error_of_a_top_is_what_was_asked_for(target):
         ),
     ],
 )
-def test_the_error_of_a_trajectory_from_a_lattice_is_what_was_asked_for(model):
+def test_a_step_for_the_trajectory_is_found_from_a_lattice(model):
     """Forces at the lattice nearly cancel: the motion is much stiffer than their size shows."""
     stage = {"integrator": "auto", "trajectory_error": 1e-3, "duration_ps": 0.2}
     scene = small_scene({model: 40}, 20.0, stages=[stage], start={"temperature_K": 90.0})
-    results = Simulation(scene).run()
-    chosen = results.summary["stages"][0]
-    assert 0.5 < chosen["timestep_fs"] < 30
-    assert "error of the trajectory" in " ".join(results.summary["notes"])
+    chosen, reason = choose_for_stage(build(scene), build(scene).state, 0)
+    assert chosen.integrator in SCHEMES
+    assert 0.5 < chosen.step_fs < 100
+    error, span = map(float, re.findall(r"trajectory (\S+) over (\S+) ps", reason)[0])
+    assert error < 1e-3
+    assert span < 5
 
 
 def test_a_reference_that_diverges_at_all_steps_is_an_error_without_a_step(monkeypatch):
