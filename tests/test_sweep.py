@@ -320,12 +320,6 @@ def test_a_point_with_a_longer_last_stage_counts_with_a_note(copied, argon, caps
     assert {name for name, at in written(copied).items() if at != before[name]} == {names[0]}
     with pytest.warns(RigidMDWarning, match=note):
         assert [len(row.runs) for row in rigidmd.read_run(copied).rows] == [2, 2]
-    # a run of another scene in the folder of a point is not that point
-    other = ["--set", "stages.0.duration_ps=0.6", "--set", "start.temperature_K=91"]
-    assert lines_of("run", str(argon), "-o", str(copied / names[1]), "--force", *other)[0] == 0
-    code, out, err = lines_of("sweep", str(argon), "-o", str(copied), "--collect")
-    assert code == 1 and "3 of them finished" in out and names[1] not in err
-    assert f"not in the table: {names[1]}, which is interrupted" in out
 
 
 def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
