@@ -56,7 +56,7 @@ def _syntax_error(message: str) -> str:
     return f"{where}this is not valid CIF: {what or 'damaged'}"
 
 
-def _tags(block: "gemmi.cif.Block") -> Iterator[str]:
+def _tags(block) -> Iterator[str]:
     for item in block:
         if item.pair is not None:
             yield item.pair[0]
