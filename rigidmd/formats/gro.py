@@ -68,7 +68,10 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
             " right?)"
         )
         # of wider numbers, the next column starts with the end
-        if points and any("." in x and x.find(".") != points[0] for x in fields[:3]):
+        is_moved = points and any("." in x and x.find(".") != points[0] for x in fields[:3])
+        if is_moved and any(
+            line[b - 1 : b].strip() and line[b : b + 1].strip() for _, b in cuts[:3]
+        ):
             raise unexpected(path, k + 1, what, line[20:])
         position[k - first - 2] = numbers(path, k + 1, values[:3], what)
         if words := [v for v in values[3:] if v]:
