@@ -320,8 +320,9 @@ def frames_of_start(scene: MolecularScene, count: int, model: str = "") -> Rigid
         molecule, whose sites [forces] may name
     """
     if model and model not in [entry.label for entry in scene.molecules]:
-        key = "file" if model.endswith(".toml") else "model"
-        trial = Molecules.model_construct(**{key: model}, count=0)
+        is_file = model.endswith(".toml")
+        of_file, of_model = (model, None) if is_file else (None, model)
+        trial = Molecules.model_construct(file=of_file, model=of_model, count=0)
         scene = scene.model_copy(update={"molecules": (*scene.molecules, trial)})
     system = build(scene)
     state = system.state
