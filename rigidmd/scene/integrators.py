@@ -184,7 +184,7 @@ def with_registered_rows(data: Json) -> tuple[Json, dict[str, Scheme]]:
 
 
 def advise_on_integrator(
-    name: object, advice: dict[str, str], known: Iterable[str], rows: Container[str] | None
+    name: object, advice: dict[str, str], known: Iterable[str], rows: Container[object] | None
 ) -> object:
     """The name of an integrator, unless there is advice on it. Raises ValueError.
 
@@ -192,7 +192,7 @@ def advise_on_integrator(
     the rows of the scene
     """
     plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
-    if plain in advice and name not in (rows or ()):
+    if plain in advice and not (rows and name in rows):
         raise ValueError(f"is {name!r}: {advice[plain]}. The integrators are {', '.join(known)}")
     return name
 
