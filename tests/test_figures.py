@@ -101,6 +101,13 @@ def test_texts_of_a_figure_are_no_formulas(name):
     )
 
 
+def test_what_is_zero_has_no_logarithmic_axis():
+    """Such as the displacement of an atom alone, which is at rest."""
+    time, log = np.arange(5.0), (True, True)
+    (axis,) = drawn(Curve("msd", ("time (ps)", time), "msd", {"msd": 0 * time}, log=log)).axes
+    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "linear")
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_figures_of_a_run_and_of_a_molecule_take_any_name(name, staged, tmp_path):
     system, samples, summary = staged

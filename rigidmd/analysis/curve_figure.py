@@ -74,8 +74,12 @@ def _draw(axis: "Axes", curve: "Curve") -> None:
         if error is not None and np.isfinite(error).all():
             low, high = (values - error)[is_drawn], (values + error)[is_drawn]
             axis.fill_between(x[is_drawn], low, high, color=color, alpha=0.25, lw=0)
-    for line, is_log, name in ((axis.xaxis, curve.log[0], "x"), (axis.yaxis, curve.log[1], "y")):
-        if is_log:
+    heights = np.array([curve.columns[title][is_drawn] for title in shown])
+    for line, is_log, name, values in (
+        (axis.xaxis, curve.log[0], "x", x),
+        (axis.yaxis, curve.log[1], "y", heights),
+    ):
+        if is_log and (values > 0).any():  # an atom at rest has no displacement
             getattr(axis, f"set_{name}scale")("log")
             label_minor_ticks(line)
     axis.set_xlabel(header.replace("(A)", "(Å)").replace("1/A", "1/Å"), fontsize=9, color=INK)
