@@ -468,6 +468,8 @@ def test_values_of_replicas_together_are_extrapolated(argon, tmp_path):
             for values in tables
         ]
         assert abs(np.mean(singles) - float(row[name])) > 1e-4
+    # analyses that are not possible fail only if they are named
+    assert cli.main(["analyse", str(folder), "--extrapolate", STEP]) == 0
 
 
 def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path):
@@ -550,6 +552,12 @@ def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):
         == 2
     )
     assert "needs a sweep over a time step" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("of_sweep", [["--extrapolate", "stages.0.timestep_fs"], ["pmf"]])
+def test_a_sweep_that_is_not_there_is_no_run(of_sweep, capsys, tmp_path):
+    assert cli.main(["analyse", str(tmp_path / "none"), *of_sweep]) == 2
+    assert "none is not there" in capsys.readouterr().err
 
 
 def test_analyses_of_a_sweep_go_on_without_a_damaged_point(copied, capsys, monkeypatch):

@@ -103,6 +103,7 @@ def _analyse(options: Options) -> int:
     from rigidmd.analysis.report import frames_text
     from rigidmd.commands.sweep import print_limits
     from rigidmd.errors import OutputError
+    from rigidmd.io.folder import check_is_run
     from rigidmd.scene import parse_override
     from rigidmd.studies.sweep.folder import is_sweep, read_manifest
     from rigidmd.studies.sweep.replicas import ANALYSES, analyse_sweep
@@ -129,9 +130,10 @@ def _analyse(options: Options) -> int:
                 print()
             print(f"values of all in {folder / ANALYSES}")
             if options.extrapolate is not None:
-                names = print_limits(read_manifest(folder), options.extrapolate)
-                print(f"\n  files in {folder}: {', '.join(names)}")
+                files = print_limits(read_manifest(folder), options.extrapolate)
+                print(f"\n  files in {folder}: {', '.join(files)}")
             return FAILED if names and any(of.failed for of in analysed) else 0
+        check_is_run(folder)
         for of_sweep in (mean_force, free_energy):
             if of_sweep.NAME in names:
                 raise OutputError(
