@@ -132,7 +132,7 @@ def test_pme_goes_on(tmp_path):
 
 
 @pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
-def test_a_body_goes_on(integrator, tmp_path):
+def test_a_body_goes_on(integrator, capsys, tmp_path):
     data = top(integrator)
     looks = Every(0.005, lambda moment: None)
     Simulation(Scene.from_dict(data), tmp_path / "whole", observers=looks).run()
@@ -147,6 +147,8 @@ def test_a_body_goes_on(integrator, tmp_path):
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
     assert [name for name in whole if whole[name] != parts[name]] == []
     assert cli.main(["compare", str(tmp_path / "whole"), str(tmp_path / "parts")]) == 0
+    assert cli.main(["resume", str(tmp_path / "parts")]) == 0
+    assert "had ended at step 100: writing" in capsys.readouterr().err  # nothing of --until
     motion = tmp_path / "parts" / "motion.csv"
     *lines, last = motion.read_text().splitlines()
     motion.write_text("\n".join([*lines, last[: last.rindex(",")] + ",0.125"]) + "\n")

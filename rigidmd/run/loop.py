@@ -43,6 +43,7 @@ from rigidmd.run.schedule import (
     signal_handler,
     stop_signals,
 )
+from rigidmd.scene import is_molecular
 
 if TYPE_CHECKING:
     from rigidmd.run.simulation import Simulation
@@ -412,8 +413,9 @@ class RunLoop:
         part = self._part
         part.segment = part.reenter_segment(part.record.position.segment)
         step = int(part.state.step[NOW])
+        longer = " (--until lengthens it)" if is_molecular(self._simulation.scene) else ""
         self._simulation._announce(
-            f"the run had ended at step {step} (--until lengthens it): writing its results again"
+            f"the run had ended at step {step}{longer}: writing its results again"
             if self.is_complete
             else f"continuing from step {step}, the last checkpoint"
         )
