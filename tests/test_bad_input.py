@@ -25,7 +25,8 @@ from rigidmd.errors import (
 )
 from rigidmd.io.folder import check_folder
 from rigidmd.run import Simulation
-from rigidmd.scene import Scene, parse_override, schema
+from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override, schema
+from rigidmd.scene.hints import OF_A_BODY, OF_MOLECULES
 from rigidmd.scene.models import Site, load_model, molecule, read_molecule
 from rigidmd.scene.stage import Stage
 
@@ -541,6 +542,7 @@ LIQUID = {
         ({"stages": [{"cutoff_A": 9.0}]}, "cutoff_A is a key of [forces]"),
         ({"forces": {"integrator": "baoab"}}, "integrator is a key of [[stages]]"),
         ({"forces": {"coulomb": "pme"}}, "In rigidmd this is electrostatics in [forces]"),
+        ({"gravity": {}}, "gravity: unknown key; only a scene of a single body has it"),
         ({"molecules": [{"model": "N2"}]}, "did you mean nitrogen or nitrogen_2cljq or"),
     ],
 )
@@ -548,6 +550,18 @@ def test_a_hint_on_units_tables_and_keys_of_other_tables(changes, expected):
     with pytest.raises(SceneError) as raised:
         Scene.from_dict(LIQUID | changes)
     assert expected in str(raised.value)
+
+
+def test_a_key_of_the_other_kind_of_scene_is_known():
+    molecules, body = set(MolecularScene.model_fields), set(BodyScene.model_fields)
+    assert set(OF_MOLECULES) == molecules - body
+    assert set(OF_A_BODY) == body - molecules
+
+
+def test_a_single_body_has_no_engine(capsys):
+    for command in ("check", "run", "verify"):
+        assert main([command, str(ROOT / "systems/t_handle.toml"), "--engine", "lammps"]) == 2
+        assert "engine: unknown key; only a scene of molecules has it" in capsys.readouterr().err
 
 
 def test_a_long_list_of_keys_has_the_most_similar_ones():

@@ -18,6 +18,15 @@ TABLES = {
     "structure": ("input", "coordinates", "configuration"),
     "output": ("files", "reporters", "dump"),
 }
+#: Keys of the top level that only a scene of molecules has, and only one of a single body.
+OF_MOLECULES = (
+    *("box", "coupling", "engine", "fields", "forces", "from_python"),
+    *("molecules", "precision", "seed", "stages", "structure", "threads"),
+)
+OF_A_BODY = (
+    *("applied", "body", "changing_inertia", "fluid"),
+    *("frame", "friction", "gravity", "wheels"),
+)
 MOST_LISTED = 8  # known keys in a message
 BOHR = 0.529177210903  # Å
 CELSIUS = ("C", "degC", "celsius")
@@ -77,6 +86,9 @@ def hint_on_key(name: str, keys: list, value: object, model: type[BaseModel]) ->
         return foreign
     if not keys and (table := _table_of(name, known)):
         return f"; did you mean {table}?"
+    for kind, others in (("molecules", OF_MOLECULES), ("a single body", OF_A_BODY)):
+        if not keys and name in others:
+            return f"; only a scene of {kind} has it"
     if not is_start and (elsewhere := _elsewhere(name, keys, model)):
         return elsewhere
     return did_you_mean(name, known) or _listed(name, known)
