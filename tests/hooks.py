@@ -156,6 +156,7 @@ TIERS = {
         "test_insertion.py": ("energies_are_the_differences_of_the_engine*",),
         "test_lammps.py": ("a_run_is_one_like_any_other[1]",),
         "test_notebook.py": ("a_sweep_shows_its_progress",),
+        "test_program.py": ("check_measures_a_potential_of_bodies",),
         "test_properties.py": (
             "any_small_scene_of_one_kind_runs_ten_steps_or_is_refused_in_words",
         ),

@@ -3,7 +3,7 @@ printed."""
 
 import numpy as np
 import pytest
-from support import built, small_scene
+from support import ROOT, built, small_scene
 
 from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.commands.cli import main
@@ -161,6 +161,11 @@ def test_check_measures_the_rows_of_a_step(tmp_path, capsys):
     times = [float(line.split()[-2]) for line in lines[2:] if line.endswith("%")]
     assert len(times) > 5
     assert all(spent >= 0 for spent in times)
+
+
+def test_check_measures_a_potential_of_bodies(capsys):
+    assert main(["check", str(ROOT / "systems" / "gay_berne.toml"), "--profile"]) == 0
+    assert "gay_berne: forces of pairs of bodies" in capsys.readouterr().out
 
 
 def test_a_scene_is_compiled_without_running_it(tmp_path, capsys, monkeypatch):

@@ -85,10 +85,13 @@ def _print_profile(scene: "MolecularScene") -> None:
     stages = [
         k for k, stage in enumerate(scene.stages) if not stage.is_minimisation and not stage.is_auto
     ]
-    if not stages or scene.forces.added:
-        problem = "--profile needs a stage with a time step, and forces that are not user-defined"
-        raise SceneError(scene.source, [problem])
+    if not stages:
+        raise SceneError(scene.source, ["--profile needs a stage with a time step"])
     simulation = Simulation(scene)
+    if simulation.system.python_forces:
+        raise SceneError(
+            scene.source, ["--profile measures compiled forces, and Python computes some of these"]
+        )
     state = simulation._settle()
     system, stage = simulation.system, simulation.scene.stages[stages[0]]
     scheme = integrator_of_stage(system, stages[0])
