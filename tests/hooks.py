@@ -197,6 +197,7 @@ TIERS = {
         ),
         "test_view.py": ("a_browser_shows_a_top_that_moves",),
         "test_virial.py": ("published_values",),
+        "test_walk.py": ("a_sample_of_the_walk*",),
     },
     "soak": {
         "test_auto.py": ("a_crude_error_is_kept_crudely*",),
@@ -252,6 +253,7 @@ TIERS = {
         ),
         "test_user_code.py": ("every_example_of_an_extension_runs_and_is_short*",),
         "test_virial.py": ("errors_are_honest", "steep_spherocylinders_tend_to_hard_ones"),
+        "test_walk.py": ("every_command_on_*",),
     },
 }
 
