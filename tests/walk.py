@@ -69,9 +69,10 @@ REFUSALS = (
     Refusal("no force holds these molecules", "modes", "alone"),
     Refusal("need a thermostat without a box", "analyse --only response", "water_dimer|alone"),
     Refusal("nve has no thermostat", "accuracy --averages"),
+    Refusal("forces are not smooth at the minimum", "modes", "water_slab"),
     # what other engines do not have
     Refusal("GROMACS computes pairs within a cutoff", "export gromacs", "water_dimer|alone"),
-    Refusal("has no translation for", "(export|verify) .*", "gay_berne|janus"),
+    Refusal("has no translation for", "(export|verify) .*", "gay_berne|janus|water_slab"),
     Refusal("LAMMPS' gayberne has plain", "(export|verify) lammps", "gay_berne"),
     Refusal("frozen molecules: GROMACS would compute", "export gromacs", "lta"),
 )
