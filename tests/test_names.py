@@ -246,7 +246,7 @@ def test_paths_change_no_word_of_the_script_of_a_job(tmp_path, name, folder, sce
 )
 def test_names_with_control_characters_are_refused(key, hidden, tmp_path):
     with pytest.raises(
-        SceneError, match=r"control character|must be one|plain file name"
+        SceneError, match=r"control character|must be one|must be a name of letters|plain file name"
     ) as refused:
         Scene.from_dict(data(PLAIN), overrides={key: f"a{hidden}b"})
     assert key in str(refused.value)
