@@ -354,12 +354,12 @@ def test_hydrogen_bonds_are_those_of_the_geometry():
         (0.0, 3.6, 0.0),
     ):
         way = rotations_about(np.array([0.0, 0.0, np.radians(off)])) @ arm
-        positions = np.zeros((4, 2, 3))
+        positions = np.zeros((40, 2, 3))
         positions[:, 1] = gap * way + np.array([25.0, -50.0, 0.0])
         # the second rotates its hydrogens away, and its oxygen is where the first one's bond points
         flip = np.eye(3)
-        Q = np.broadcast_to(np.stack([np.eye(3), flip]), (4, 2, 3, 3))
-        found = hydrogen_bonds(history(system, np.arange(4.0), positions, np.eye(3) * 25.0, Q))
+        Q = np.broadcast_to(np.stack([np.eye(3), flip]), (40, 2, 3, 3))
+        found = hydrogen_bonds(history(system, np.arange(40.0), positions, np.eye(3) * 25.0, Q))
         assert found.value().value == pytest.approx(expected), off
 
 

@@ -504,12 +504,6 @@ SCREENED = {"energy": "a*exp(-r/2)/r", "parameters": {"AR": {"a": 5.0}}}
         ({"spce": 20}, 3.54, None, ""),  # WCA, rounded
         ({"spce": 20}, 7.0, None, ""),
         ({"argon": 10, "ccl4": 5}, 3.7, None, "shorter than 3.82 Å, where the energy of argon.AR"),
-        (
-            {"argon": 20},
-            0.34,
-            MIE,
-            "mie: a cutoff of 0.34 Å is shorter than 3.7. Å, .* argon.AR and argon.AR .* in nm",
-        ),
         ({"argon": 20}, 3.0, MIE, "mie: .* 3 Å is shorter than 3.7"),
         ({"argon": 20}, 3.9, MIE, ""),
         ({"argon": 20}, 3.0, SCREENED, ""),  # repels everywhere
