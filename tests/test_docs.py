@@ -40,7 +40,7 @@ import pytest
 from pydantic import BaseModel
 from support import ROOT
 
-from rigidmd.assemble.describe import describe
+from rigidmd.assemble.scenes import resolve
 from rigidmd.commands import cli
 from rigidmd.commands.arguments import read_scene
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
@@ -237,7 +237,7 @@ class Reader:
                 assert cli.main(["models", file]) == 0
             return
         if {"molecules", "stages"} <= set(data) or {"body", "run"} <= set(data):
-            describe(Scene.from_dict(data, "."))
+            resolve(Scene.from_dict(data, "."))
             return
         if (named := data.get("structure", {}).get("file")) is not None:
             Path(named).touch()  # a fragment is not built: it is enough that the file is there
