@@ -148,7 +148,7 @@ def stage_title(stage: dict) -> str:
         f" {stage['duration_ps']:g} ps"
     )
     if stage["steps_per_s"]:
-        title += f"; {stage['steps_per_s']:,.0f} steps/s, {stage['ns_per_day']:.3g} ns/day"
+        title += f"; {stage['steps_per_s']:,.0f} steps/s, {stage['ns_per_day']:,.4g} ns/day"
     return title
 
 

@@ -52,7 +52,7 @@ def _how(stage: dict) -> str:
     ensemble = ENSEMBLES.get(stage["ensemble"], stage["ensemble"])
     how = f"{ensemble}, {stage['duration_ps']:g} ps at {stage['timestep_fs']:g} fs"
     if stage["steps_per_s"]:
-        how += f", {stage['steps_per_s']:,.0f} steps/s ({stage['ns_per_day']:.3g} ns/day)"
+        how += f", {stage['steps_per_s']:,.0f} steps/s ({stage['ns_per_day']:,.4g} ns/day)"
     return how
 
 
