@@ -58,6 +58,7 @@ REFUSALS = (
     Refusal(r"needs a box, and the run has none", "analyse --only .*", "water_dimer|alone"),
     # analyses of what a liquid, an atom or a short run does not have
     Refusal("no slab between two vapours", "analyse --only (interfaces|surface_tension)"),
+    Refusal("no molecule has a dipole", "analyse --only dielectric"),
     Refusal("no profile of a slab", "analyse --only (interfaces|surface_tension)"),
     Refusal("no molecule of this run is linear", "analyse --only nematic"),
     Refusal("no molecule of this run rotates", "analyse --only orientation"),
@@ -180,7 +181,7 @@ def commands_of(scene: Path) -> Iterator[tuple[str, list[str]]]:
     yield "modes", ["modes", text, "-o", f"{stem}_modes", "--count", "3"]
     yield "run again", ["run", text, "-o", again]
     yield "compare", ["compare", run, again]
-    yield "resume", ["resume", again, *([] if is_body else ["--until", "0.4ps"])]
+    yield "resume", ["resume", again, *([] if is_body else ["--until", "2ps"])]
     for engine in ("lammps", "openmm"):
         yield f"verify {engine}", ["verify", text, "--engine", engine]
     steps = steps_of(scene)
