@@ -112,10 +112,9 @@ MOLECULES = {
     "light atoms": (ARGON, "molecules.0.masses_u.Ar=1e-6"),
     "heavy atoms": (ARGON, "molecules.0.masses_u.Ar=1e6"),
     "weightless atoms": (ARGON, "molecules.0.masses_u.Ar=0"),
-    "charges of 100 e": (WATER, "molecules.0.charges_e={ O = -200.0, H = 100.0 }"),
     "too dense": (ARGON, "box.lengths_A=", "box.density_g_cm3=12"),
     "very thin gas": (ARGON, "box.lengths_A=", "box.density_g_cm3=1e-9"),
-    "no interaction": (ARGON, "molecules.0.epsilon_K.Ar=0"),
+    "no interaction": (ARGON, "forces.lennard_jones=false"),
 }
 BODIES = {
     "tiny moments": ("body.inertia_kg_m2=[1e-30, 1e-30, 1e-30]",),

@@ -4,6 +4,7 @@ a general solver."""
 import numpy as np
 import pytest
 from numba import njit
+from scenes import PINNED
 from scipy.integrate import quad, solve_ivp
 from scipy.stats import spearmanr
 from support import move
@@ -38,21 +39,6 @@ from rigidmd.mechanics.translation import NoTranslation
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
-PINNED = {
-    "body": {
-        "mass_kg": 2.0,
-        "inertia_kg_m2": [0.5, 0.7, 0.9],
-        "pinned": True,
-        "centre_of_mass_m": [0.1, 0.2, 0.3],
-    },
-    "start": {
-        "euler_angles_deg": [10.0, 50.0, 70.0],
-        "angular_velocity_body_rad_s": [1.0, -2.0, 3.0],
-    },
-    "gravity": {},
-    "run": {"duration_s": 1.0, "timestep_s": 0.01},
-    "output": {"trajectory": False, "interval_s": 0.1},
-}
 FREE = {
     "body": {"mass_kg": 2.0, "inertia_kg_m2": [0.5, 0.7, 0.9]},
     "start": {

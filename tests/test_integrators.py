@@ -3,7 +3,7 @@ for a top."""
 
 import numpy as np
 import pytest
-from scenes import NPT, NVT, forty_waters
+from scenes import NPT, NVT, PINNED, forty_waters
 from stops import same_after_stops
 from support import built, move, small_scene
 
@@ -74,24 +74,7 @@ def waters():
 @pytest.fixture(scope="module")
 def top():
     """An asymmetric top on a pivot: an engine, its state, a time in s."""
-    system = build_body(
-        Scene.from_dict(
-            {
-                "body": {
-                    "mass_kg": 2.0,
-                    "inertia_kg_m2": [0.5, 0.7, 0.9],
-                    "pinned": True,
-                    "centre_of_mass_m": [0.1, 0.2, 0.3],
-                },
-                "start": {
-                    "euler_angles_deg": [10.0, 50.0, 70.0],
-                    "angular_velocity_body_rad_s": [1.0, -2.0, 3.0],
-                },
-                "gravity": {},
-                "run": {"duration_s": 1.0, "timestep_s": 0.01},
-            }
-        )
-    )
+    system = build_body(Scene.from_dict(PINNED))
     return system.engine(), system.state, 0.64
 
 
