@@ -353,10 +353,8 @@ def test_lists_begin_with_about_the_room_they_need(edge):
     for pairs, other, own in zip(begun, others, engine.workspaces.values(), strict=True):
         lanes = 4 * len(own.pairs.clusters.order) // len(own.pairs.clusters.origin)
         needed = own.pairs.needed.max(axis=0)
-        most = 1.6 if lanes > 2 else 1.7  # the estimate is one for vectors of 256 and 512 bits
         for kind, array in ((ENTRIES, pairs.entries), (NEIGHBORS, pairs.neighbors)):
-            size = array.shape[1]
-            assert needed[kind] <= 1.1 * size and size < most * needed[kind] + 16
+            assert needed[kind] <= 1.1 * array.shape[1] and array.shape[1] < 1.6 * needed[kind] + 16
         if edge:
             window = 3 * lanes * needed[WINDOW]
             assert window <= 1.2 * other and other < 1.6 * window + 16

@@ -112,8 +112,9 @@ def empty_list(
     count = len(clusters.origin) // 4
     most_rows = rows // count * int(np.diff(clusters.bounds).max())  # of a block
     capacity = ceil(_expected_neighbors(cell, count, cutoff + skin, 1.0) * most_rows)
+    size = 1.75 if rows > count else 1.0  # of two lanes a cluster is one row
     neighbors = ceil(
-        _expected_neighbors(cell, count, cutoff + skin, 1.75) * most_rows * count / rows
+        _expected_neighbors(cell, count, cutoff + skin, size) * most_rows * count / rows
     )
     needed = np.zeros((blocks, 5), np.int64)
     needed[:, WINDOW] = _expected_window(cell, count, blocks, cutoff + skin)
