@@ -32,6 +32,7 @@ from hooks import (  # noqa: E402, F401
     pytest_collection_modifyitems,
     pytest_collectreport,
     pytest_runtest_logreport,
+    pytest_runtest_makereport,
     pytest_sessionfinish,
     pytest_terminal_summary,
 )

@@ -1,17 +1,22 @@
-"""What a session of these tests adds to pytest: the order of files, limits of time, and in CI the
-skips that are allowed.
+"""What a session of these tests adds to pytest: the order of files, limits of time, the processor
+time of compiling, and in CI the skips that are allowed.
 
 `CI=true` in the environment makes a skipped test that is not in `ALLOWED` a failure of the session.
 `RIGIDMD_CI_WITHOUT` names what could not be installed, separated by spaces (`chromium gromacs
-ffmpeg`): .ci/run sets both.
+ffmpeg`): .ci/run sets both. `RIGIDMD_TEST_COSTS` names a JSON file for the costs of each test.
 """
 
+import json
 import os
 import re
+import time
+from collections import Counter
 from fnmatch import fnmatchcase
 from pathlib import Path
+from threading import get_ident
 
 import pytest
+from numba.core import event
 
 #: Files that begin first, about the longest first: a file is run by one worker. Neighbours have few
 #: kernels in common: of two workers that need one kernel, one waits until the other has compiled it.
@@ -289,7 +294,76 @@ ALLOWED += [
     PROGRAMS[name] for name in os.environ.get("RIGIDMD_CI_WITHOUT", "").split() if name in PROGRAMS
 ]
 
+#: Processor time of compiling, s, up to which a default test is not listed in CI.
+MOST_COMPILING = 4.0
+
 _skipped: list[str] = []
+_costs: dict[str, dict] = {}  # by the name of the test
+
+
+class Costs(event.Listener):
+    """What this process spends on tests: processor time and compiled kernels.
+
+    Numba's lock of the compiler is also held while a kernel is read from the cache, but then no
+    pass of the compiler runs.
+    """
+
+    def __init__(self):
+        self.compiling = 0.0  # s
+        self.kernels: list[str] = []
+        self.before = os.times()
+        self._depth: Counter[int] = Counter()  # of nested locks, by thread
+        self._start: dict[int, float] = {}
+        self._kernel: dict[int, str] = {}
+        event.register("numba:compiler_lock", self)
+        event.register("numba:run_pass", self)
+
+    def on_start(self, event):
+        """The outermost lock of a thread starts its clock; the first pass names the kernel."""
+        thread = get_ident()
+        if event.kind == "numba:run_pass":
+            self._kernel.setdefault(thread, event.data["qualname"])
+            return
+        if not self._depth[thread]:
+            self._start[thread] = time.thread_time()
+        self._depth[thread] += 1
+
+    def on_end(self, event):
+        """The end of the outermost lock stops the clock."""
+        thread = get_ident()
+        if event.kind == "numba:run_pass":
+            return
+        self._depth[thread] -= 1
+        if not self._depth[thread] and thread in self._kernel:
+            self.compiling += time.thread_time() - self._start[thread]
+            self.kernels.append(self._kernel.pop(thread))
+
+    def take(self) -> dict:
+        """Costs since the last call, and zero again: seconds of this process, of child processes
+        that ended, and of compiling in this process; names of kernels."""
+        spent = os.times()
+        user, system, *children = (
+            now - before for now, before in zip(spent[:4], self.before, strict=False)
+        )
+        taken = {
+            "process": user + system,
+            "children": sum(children),
+            "compiling": self.compiling,
+            "kernels": self.kernels,
+        }
+        self.before, self.compiling, self.kernels = spent, 0.0, []
+        return taken
+
+
+COSTS = Costs()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
+    """The last report of a test has its costs, also for the controller of several workers."""
+    if call.when == "teardown":
+        item.user_properties.append(("costs", COSTS.take()))
+    return (yield)
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are selected by their markers
@@ -325,8 +399,10 @@ def _note(report: pytest.TestReport | pytest.CollectReport) -> None:
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Note a test that was skipped for a reason that is not allowed."""
+    """Note a test that was skipped for a reason that is not allowed, and the costs of each."""
     _note(report)
+    if costs := dict(report.user_properties).get("costs"):
+        _costs[report.nodeid] = costs
 
 
 def pytest_collectreport(report: pytest.CollectReport) -> None:
@@ -341,7 +417,17 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def pytest_terminal_summary(terminalreporter) -> None:
-    """In CI list them."""
+    """Processor time of tests and of compiling; in CI the skips that are not allowed."""
+    if path := os.environ.get("RIGIDMD_TEST_COSTS"):
+        Path(path).write_text(json.dumps(_costs, indent=1))
+    total, compiling = (
+        sum(sum(costs[name] for name in names) for costs in _costs.values())
+        for names in (("process", "children"), ("compiling",))
+    )
+    kernels = sum(len(costs["kernels"]) for costs in _costs.values())
+    terminalreporter.line(
+        f"{total:.0f} s of processor time, of which {compiling:.0f} s compiled {kernels} kernels"
+    )
     if IN_CI and _skipped:
         terminalreporter.section("skipped tests that CI does not allow (tests/hooks.py)", red=True)
         for line in sorted(set(_skipped)):
