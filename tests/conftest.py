@@ -1,4 +1,4 @@
-"""Fixtures and hooks of all tests. What tests call is in support.py."""
+"""Fixtures and hooks of all tests. What tests call is in the package `support.common`."""
 
 import gc
 import os
@@ -27,8 +27,9 @@ for name, folder in (
 # 15 % of its time.
 gc.set_threshold(50_000, 20, 20)
 
-pytest.register_assert_rewrite("processes", "support", "stops")
-from hooks import (  # noqa: E402, F401
+pytest.register_assert_rewrite("support")
+from support.common import ROOT  # noqa: E402
+from support.hooks import (  # noqa: E402, F401
     pytest_collection_modifyitems,
     pytest_collectreport,
     pytest_runtest_logreport,
@@ -36,7 +37,6 @@ from hooks import (  # noqa: E402, F401
     pytest_sessionfinish,
     pytest_terminal_summary,
 )
-from support import ROOT  # noqa: E402
 
 
 @pytest.fixture(scope="session")

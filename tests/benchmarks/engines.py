@@ -1,4 +1,4 @@
-"""The ten scenes of tests/scenes.py on rigidmd and another engine, a line each: for
+"""The ten scenes of tests/support/scenes.py on rigidmd and another engine, a line each: for
 docs/evidence/validation.md.
 
     python tests/benchmarks/engines.py lammps openmm
@@ -11,8 +11,8 @@ from command_line import new_parser, read_options
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from scenes import SCENES
-from support import small_scene
+from support.common import small_scene
+from support.scenes import SCENES
 
 from rigidmd.errors import RigidMDError
 from rigidmd.studies.other_engines import verify

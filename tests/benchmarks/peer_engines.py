@@ -93,7 +93,7 @@ class Rigidmd:
 
     @staticmethod
     def run(job: dict, sites: dict, folder: Path) -> dict:
-        from support import observe
+        from support.common import observe
 
         from rigidmd import Scene, Simulation
         from rigidmd.core.integrators import SCHEMES

@@ -55,7 +55,7 @@ from scipy.spatial import cKDTree
 from scipy.special import erfc
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import observe
+from support.common import observe
 
 from rigidmd import Scene, Simulation
 from rigidmd.assemble.build import build

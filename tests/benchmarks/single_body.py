@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import known
+from support import known
 
 from rigidmd.core.integrators import SCHEMES, Solver
 from rigidmd.engines.ode.engine import OdeEngine

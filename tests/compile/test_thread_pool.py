@@ -1,0 +1,411 @@
+"""Threads: that each block is done once, and that threads that wait leave their cores to
+others."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
+import numpy as np
+import pytest
+from support.common import ROOT, small_scene
+from support.processes import search_path
+from support.thread_kernels import count_blocks, counted, run_blocks
+
+from rigidmd import Every, Simulation, run_together
+from rigidmd.commands.cli import main
+from rigidmd.compile import (
+    Code,
+    call_blocks,
+    kernel,
+    load_arguments,
+    pack_arguments,
+    set_threads,
+    task,
+)
+from rigidmd.compile.machine import MOST_THREADS
+from rigidmd.compile.thread_pool import (  # noqa: F401
+    FIRST_WORKER,
+    RANGE_JOBS,
+    SLEEPS,
+    _pause,
+    _pool,
+    _read,
+    _run_ranges,
+    _write,
+)
+from rigidmd.core.integrators import SCHEMES
+from rigidmd.errors import SimulationError
+
+
+@task()
+def _count_within(task_arguments, block):
+    code, seen = load_arguments(task_arguments)
+    call_blocks(code, "count", pack_arguments((seen[block], 10)), seen.shape[1])
+
+
+@kernel(from_python=True)
+def _run_within(code, inner, seen):
+    call_blocks(code, "within", pack_arguments((inner, seen)), len(seen))
+
+
+@pytest.fixture(autouse=True)
+def _all_threads_again():
+    yield
+    set_threads(MOST_THREADS)
+
+
+@pytest.mark.parametrize("threads", [1, 2, MOST_THREADS])
+@pytest.mark.parametrize(("blocks", "work"), [(2, 0), (16, 10), (16, 10_000), (1000, 100)])
+def test_every_block_is_done_once(threads, blocks, work):
+    set_threads(min(threads, MOST_THREADS))
+    seen = counted(blocks, work, 200)
+    assert (seen[:, 0] == 200).all()
+    assert seen[:, 1] == pytest.approx([sum(np.sqrt(np.arange(work) + b)) for b in range(blocks)])
+
+
+def test_every_block_is_done_once_by_many_more_threads():
+    """As on a machine with 24 cores. Few blocks are usual: a small PME grid has three."""
+    script = "from support.thread_kernels import counted; assert all((counted(n, 10, 2000)[:, 0] == 2000).all() for n in range(1, 9))"
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | {"NUMBA_NUM_THREADS": "24"} | search_path(ROOT / "tests"),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@task()
+def _note(task_arguments, block):
+    order = load_arguments(task_arguments)
+    order[0] += 1
+    order[order[0]] = block
+
+
+@kernel(from_python=True)
+def _take_alone(cells, job, address, room, blocks, own, threads):
+    return _run_ranges(cells, job, address, room, blocks, own, threads)
+
+
+@pytest.mark.parametrize(
+    ("own", "threads", "claimed", "expected"),
+    [
+        (0, 2, [0] * 6, [0, 1, 2, 3, 4, 5]),
+        (1, 2, [0] * 6, [5, 4, 3, 2, 1, 0]),
+        (0, 2, [0, 4, 2, 0, 4, 4], [0, 2, 3]),  # the others are claimed
+        (2, 3, [0] * 6, [4, 5, 0, 1, 2, 3]),
+        (1, 3, [0] * 6, [3, 2, 1, 0, 5, 4]),
+        (1, 2, [4, 4, 6, 4, 8, 6], []),  # the job has ended, others have begun
+        (3, 8, [0] * 6, [2, 1, 0, 5, 4, 3]),  # more threads than blocks
+        (1, 16, [0] * 6, [0, 5, 4, 3, 2, 1]),  # more than twice as many
+    ],
+)
+def test_each_thread_begins_with_its_share_and_goes_on_with_what_is_left(
+    own, threads, claimed, expected
+):
+    cells, order = np.zeros(FIRST_WORKER, np.int64), np.zeros(7, np.int64)
+    cells[RANGE_JOBS : RANGE_JOBS + 6] = claimed
+    code = Code(note=(_note, order))
+    struct = code.to_struct(order)
+    last = _take_alone(cells.ctypes.data, 4, code.address("note"), struct.address, 6, own, threads)
+    assert order[1 : order[0] + 1].tolist() == expected
+    assert last == (len(expected) == 6)
+
+
+def test_a_block_may_have_blocks_of_its_own():
+    inner, seen = Code(count=(count_blocks, (np.zeros((1, 2)), 10))), np.zeros((20, 30, 2))
+    _run_within(Code(within=(_count_within, (inner, seen))), inner, seen)
+    assert (seen[:, :, 0] == 1).all()
+
+
+@numba.njit(nogil=True)
+def _run_freely(code, seen, work, times):
+    run_blocks(code, seen, work, times)
+
+
+def test_two_calling_threads_at_once_each_have_their_blocks_done_once():
+    """Without Python's lock, so that each finds the pool busy with the other."""
+    found = [np.zeros((16, 2)), np.zeros((40, 2))]
+    code = Code(count=(count_blocks, (found[0], 10)))
+    both = [threading.Thread(target=_run_freely, args=(code, seen, 10, 20_000)) for seen in found]
+    for one in both:
+        one.start()
+    for one in both:
+        one.join()
+    assert all((seen[:, 0] == 20_000).all() for seen in found)
+
+
+def short_runs(count=2, seed=1, **own):
+    """Runs of 500 argon for 1 ps, with a seed each."""
+    own = {
+        "stages": [{"ensemble": "nve", "duration_ps": 1.0}],
+        "start": {"temperature_K": 90.0},
+    } | own
+    own = {"output": {"trajectory": False}} | own
+    return [
+        Simulation(small_scene({"argon": 500}, 30.0, seed=seed + k, **own)) for k in range(count)
+    ]
+
+
+def test_simulations_at_once_have_the_bits_of_each_alone():
+    alone = [simulation.run().state for simulation in short_runs(3)]
+    together = run_together(short_runs(3))
+    for a, b in zip(alone, together, strict=True):
+        assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b.state, strict=True))
+        assert b.summary["threads"] == 1
+    assert [r.state.step[0] for r in run_together(short_runs(3), jobs=1)] == [
+        s.step[0] for s in alone
+    ]
+
+
+def test_simulations_on_all_threads_at_once_have_the_bits_of_each_alone():
+    alone = [simulation.run().state for simulation in short_runs()]
+    together = [None, None]
+
+    def run(k, simulation):
+        together[k] = simulation.run().state
+
+    both = [threading.Thread(target=run, args=one) for one in enumerate(short_runs())]
+    for one in both:
+        one.start()
+    for one in both:
+        one.join()
+    for a, b in zip(alone, together, strict=True):
+        assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))
+
+
+def test_other_threads_read_energies_while_a_run_begins_and_goes_on():
+    """Two threads that use one engine at once end in a crash, or in another run."""
+    stages = [{"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 4.0, "timestep_fs": 10.0}]
+    scene = small_scene({"argon": 40}, 20.0, stages=stages, output={"log_interval_ps": 0.01})
+    alone = Simulation(scene).run()
+    simulation = Simulation(scene)
+    has_ended = threading.Event()
+
+    def read() -> int:
+        count = 0
+        while not has_ended.is_set():
+            values = simulation.energy, simulation.observation.potential, *simulation.forces.flat
+            assert np.isfinite(values).all()
+            count += 1
+        return count
+
+    with ThreadPoolExecutor(2) as pool:
+        readers = [pool.submit(read) for _ in range(2)]
+        try:
+            results = simulation.run()
+        finally:
+            has_ended.set()
+        assert all(reader.result() > 1 for reader in readers)
+    assert results.state.position.tobytes() == alone.state.position.tobytes()
+
+
+def test_other_threads_of_python_go_on_while_steps_are_taken():
+    [simulation] = short_runs(1)
+    engine, state = simulation.engine, simulation.state.copy()
+    row = SCHEMES["velocity_verlet"]
+    engine.advance(state, row, 1e-3, 1)
+    for attempt in range(
+        1, 51
+    ):  # a busy machine may leave this thread aside during a call, not during all of them
+        mover, seen = (
+            threading.Thread(target=engine.advance, args=(state, row, 1e-3, 1000 * attempt)),
+            set(),
+        )
+        mover.start()
+        while mover.is_alive():
+            seen.add(int(state.step[0]))
+            time.sleep(0)
+        mover.join()
+        assert state.step[0] == 1000 * attempt
+        if (
+            len(seen) >= 20
+        ):  # with Python's lock only the steps at which the compiled code returns could be seen
+            break
+    assert len(seen) >= 20
+
+
+def test_what_runs_together_is_stopped_together():
+    def end(moment):
+        if moment.step == 100:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    stages = [{"ensemble": "nve", "duration_ps": 1e5}]
+    scene = short_runs(1, stages=stages)[0].scene
+    runs = [Simulation(scene, observers=Every(0.1, end)), *short_runs(2, stages=stages)]
+    first, second, third = run_together(runs, jobs=2)
+    assert first.interrupted and second.interrupted and third is None
+    assert first.signal == signal.SIGTERM
+    assert 100 <= first.state.step[0] < 1e8
+
+
+def test_an_observer_may_end_a_run():
+    scene = short_runs(1)[0].scene
+    simulation = Simulation(
+        scene, observers=Every(0.2, lambda moment: moment.step and simulation.stop())
+    )
+    results = simulation.run()
+    assert results.interrupted and results.signal is None
+    assert results.state.time[0] == pytest.approx(0.2)
+
+
+def test_a_second_ctrl_c_is_an_interrupt_and_all_runs_still_end():
+    def press_twice(moment):
+        if moment.step == 100:  # this run cannot end before both have come
+            for _ in range(2):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.1)
+
+    stages = [{"ensemble": "nve", "duration_ps": 1e5}]
+    scene = short_runs(1, stages=stages)[0].scene
+    runs = [Simulation(scene, observers=Every(0.1, press_twice)), *short_runs(1, stages=stages)]
+    with pytest.raises(KeyboardInterrupt):
+        run_together(runs)
+    assert runs[0].state.step[0] == 100
+    assert runs[1].state.step[0] < 1e8  # 0 if it was still about to begin
+
+
+def test_each_run_writes_its_files_as_if_alone(tmp_path):
+    runs = [
+        Simulation(
+            small_scene({"argon": 100}, 20.0, seed=seed, output={"trajectory_interval_ps": 0.002}),
+            tmp_path / str(seed),
+        )
+        for seed in range(4)
+    ]
+    for results in run_together(runs, jobs=4):
+        assert all(path.is_file() for path in results.files)
+        assert len(results.universe().trajectory) == 3
+    everything = ("ignore", None, Warning, None, 0)
+    assert everything not in warnings.filters
+
+
+def test_one_that_fails_takes_no_other_with_it():
+    hot = {
+        "start": {"temperature_K": 90.0},
+        "stages": [{"ensemble": "nve", "duration_ps": 1.0, "timestep_fs": 900.0}],
+    }
+    runs = [*short_runs(1, **hot), *short_runs(1, seed=2)]
+    with pytest.raises(SimulationError) as error:
+        run_together(runs)
+    assert any("of 2 runs at once these failed: 1" in note for note in error.value.__notes__)
+    assert runs[1].state.time[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("twice", "jobs", "word"), [(True, None, "twice"), (False, 0, "jobs is 0: at least 1")]
+)
+def test_what_cannot_run_together_is_refused(twice, jobs, word):
+    runs = short_runs(1)
+    with pytest.raises(ValueError, match=word):
+        run_together(runs * 2 if twice else runs, jobs)
+
+
+HELPER = """
+import time
+from rigidmd.compile import set_threads
+from rigidmd.compile.thread_pool import FIRST_WORKER, SLEEPS, _pool
+from support.thread_kernels import met
+set_threads(1)
+assert met(1000) == [0, 1]
+set_threads(2)
+assert met(10**12) == [1, 1]
+while not _pool.cells[FIRST_WORKER + SLEEPS]:
+    time.sleep(0.01)
+assert met(10**12) == [1, 1]
+"""
+
+
+def test_a_helper_helps_then_sleeps_and_is_woken():
+    """Two blocks that wait for each other need two threads. Where no helper comes, this hangs until
+    its limit."""
+    environment = os.environ | {"NUMBA_NUM_THREADS": "2"} | search_path(ROOT / "tests")
+    done = subprocess.run(
+        [sys.executable, "-c", HELPER], env=environment, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_forked_process_starts_its_own_threads():
+    seen = np.zeros((16, 2))
+    code = Code(count=(count_blocks, (seen, 10)))
+    child = os.fork()
+    if child == 0:
+        done = 1
+        try:
+            run_blocks(code, seen, 10, 100)  # without helpers, then with new ones
+            set_threads(MOST_THREADS)
+            run_blocks(code, seen, 10, 100)
+            done = 0 if (seen[:, 0] == 200).all() and _pool.started == MOST_THREADS - 1 else 2
+        finally:
+            os._exit(done)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert (counted(16, 10, 100)[:, 0] == 100).all()
+
+
+ALONE = """
+import threading
+from rigidmd.compile import set_threads
+from support.thread_kernels import counted
+set_threads(1)
+counted(16)
+assert threading.active_count() == 1, threading.enumerate()
+"""
+
+
+def test_one_thread_that_is_asked_for_has_no_helpers():
+    environment = os.environ | search_path(ROOT / "tests")
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE], env=environment, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+MORE = """
+import numpy as np, sys
+from support.thread_kernels import counted
+assert (counted(64, 100, 2000)[:, 0] == 2000).all()
+"""
+
+
+@pytest.mark.parametrize("threads", ["7", "32"])
+def test_there_may_be_more_threads_than_cores_and_the_process_ends(threads):
+    environment = os.environ | {"NUMBA_NUM_THREADS": threads} | search_path(ROOT / "tests")
+    done = subprocess.run(
+        [sys.executable, "-c", MORE], env=environment, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_importing_changes_no_variable_of_threads(tmp_path):
+    code = "import os; before = dict(os.environ); import rigidmd.compile; assert dict(os.environ) == before"
+    subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"RIGIDMD_CACHE": str(tmp_path)}, check=True
+    )
+
+
+def test_benchmarks_measure_what_a_user_gets(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tests" / "benchmarks")
+    from peer_engines import environment
+
+    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        monkeypatch.setenv(name, "2")
+        assert name not in environment()
+    assert environment()["PATH"] == os.environ["PATH"]
+
+
+def test_check_says_how_many_threads_compute(capsys):
+    command = [sys.executable, "-m", "rigidmd", "check", "systems/water.toml", "--set", "threads=7"]
+    environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert "computing: 2 threads, mixed precision" in done.stdout, done.stderr
+    assert main(["check", str(ROOT / "systems" / "water.toml"), "--set", "threads=1"]) == 0
+    assert "computing: 1 thread, mixed precision" in capsys.readouterr().out

@@ -1,0 +1,621 @@
+"""README and the chapters: every command and snippet in them runs, every key and column is in the
+manual, no link is dead.
+
+A comment before a block shows this file how to treat it:
+
+    <!-- test: file NAME -->       the block is the file NAME, which later commands use
+    <!-- test: with OPTIONS -->    OPTIONS are added to each `rigidmd run`, `accuracy` and `sweep` of the block, and those
+                                   of --set to each `Scene.read` of a Python block: shorter runs
+    <!-- test: not run, WHY -->    commands are parsed, and their scenes read, but not run
+    <!-- test: output of CMD -->   every line of the block is in the output of CMD, in this order. CMD runs with the options
+                                   of the document where it is one of its commands, else as it
+                                   stands
+    <!-- test: output like CMD --> the same, but each number may be any number, with any spaces
+                                   before it, and a line may be longer: the block is of a longer
+                                   run, another machine or version of another program
+    <!-- output: WHERE -->         the block is not compared: WHERE has the version, the command and the machine that made it
+    <!-- test: not output, WHY --> the block is a text that no command prints
+
+In quoted output `...` stands for any text, a line of it for any lines, and a number below 1e-9 for
+any such number: it is a rounding error. Every quoted output has one of these comments.
+
+Commands and snippets of a document run in their order, in one folder that has a copy of systems/.
+"""
+
+import argparse
+import contextlib
+import csv
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from pydantic import BaseModel
+from support.common import ROOT
+
+from rigidmd.assemble.scenes import resolve
+from rigidmd.commands import cli
+from rigidmd.commands.arguments import read_scene
+from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
+from rigidmd.core.shipped import CHAPTERS, DOCS, GUIDES, SECTIONS, find_example
+from rigidmd.errors import SceneError
+from rigidmd.formats import BY_EXTENSION
+from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
+from rigidmd.scene.models import read_parameters
+
+README = ROOT / "README.md"
+#: The chapters of this checkout; those of an installed package may be elsewhere.
+PAGES = {
+    name: ROOT / "rigidmd" / "docs" / path.relative_to(DOCS) for name, path in CHAPTERS.items()
+}
+DOCUMENTS = [README, *PAGES.values()]
+MANUAL = "\n".join(
+    path.read_text(encoding="utf-8") for path in PAGES.values() if path.parent.name == "reference"
+)
+LANGUAGES = {"sh", "python", "toml", "text", "bibtex"}
+MINIMAL = {
+    MolecularScene: {
+        "box": {"lengths_A": 40.0},
+        "molecules": [{"model": "spce", "count": 2}],
+        "start": {"temperature_K": 300.0},
+        "stages": [{"duration_ps": 1.0}],
+    },
+    BodyScene: {
+        "body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 2.0, 2.5]},
+        "run": {"duration_s": 1.0, "timestep_s": 0.01},
+    },
+}
+
+
+class Block(NamedTuple):
+    """A fenced block, or the indented lines that README starts with."""
+
+    line: int  # of its first line of text
+    language: str
+    text: str
+    told: str  # what the comment before it shows this test
+
+
+def blocks_of(document: Path) -> list[Block]:
+    lines = document.read_text(encoding="utf-8").splitlines()
+    found, told, k = [], "", 0
+    while k < len(lines):
+        line = lines[k]
+        if marker := re.fullmatch(r"<!-- (test|output): (.*) -->", line):
+            told = marker[2] if marker[1] == "test" else f"recorded {marker[2]}"
+            assert lines[k + 1].startswith(("```", "|")), (
+                f"{document.name}:{k + 1}: a block or a table must follow at once"
+            )
+        elif line.startswith("|"):
+            told = ""
+        elif line.startswith("```"):
+            end = lines.index("```", k + 1)
+            found.append(Block(k + 2, line[3:], "\n".join(lines[k + 1 : end]), told))
+            told, k = "", end
+        elif re.match(r" {4}\S", line) and not lines[k - 1]:
+            end = next(n for n in range(k, len(lines)) if not lines[n].startswith("    "))
+            found.append(
+                Block(k + 1, "sh", "\n".join(line[4:] for line in lines[k:end]), "not run, by CI")
+            )
+            k = end - 1
+        k += 1
+    return found
+
+
+def commands_of(text: str) -> list[list[str]]:
+    """The words of each command of a shell block, comments omitted."""
+    joined = text.replace("\\\n", " ")
+    return [
+        shlex.split(part, comments=True)
+        for line in joined.splitlines()
+        for part in line.split("&&")
+    ]
+
+
+NUMBER = r"[+-]?\d[\d,.]*(?:e[+-]?\d+)?"
+ROUNDING = r"\d(?:\.\d+)?e-[1-9]\d|0\.0e\+00"
+
+
+def pattern_of(quoted: str, like: bool) -> re.Pattern:
+    """What a quoted line of output stands for; with `like`, of any numbers."""
+
+    def form(part: str) -> str:
+        if part == "...":
+            return ".*"
+        if like and part.isspace():
+            return r"\s*"
+        if re.fullmatch(ROUNDING, part) and not like:
+            return f"(?:{ROUNDING})"
+        return NUMBER if like and re.fullmatch(NUMBER, part) else re.escape(part)
+
+    parts = re.split(rf"(\.\.\.|\s+|{ROUNDING}|{NUMBER})", quoted)
+    return re.compile("".join(map(form, parts)) + (".*" if like else r"\s*"))
+
+
+class Reader:
+    """Does what a document shows its reader to do, in the working directory."""
+
+    def __init__(self, monkeypatch, capsys):
+        self.monkeypatch, self.capsys = monkeypatch, capsys
+        self.namespace: dict = {"__name__": "__main__"}
+        self.printed: dict[str, str] = {}  # by the commands so far
+
+    def follow(self, block: Block) -> None:
+        how, _, rest = block.told.partition(" ")
+        assert how in ("", "file", "with", "not", "output", "recorded"), block.told
+        assert block.told or block.language != "text" or "±" not in block.text, (
+            "quoted output must have its command"
+        )
+        if how == "file":
+            Path(rest).write_text(block.text + "\n", encoding="utf-8")
+        options = shlex.split(rest) if how == "with" else []
+        if block.language == "sh":
+            for words in commands_of(block.text):
+                self.command(words, options, runs=how != "not")
+        elif block.language == "toml":
+            self.scene(tomllib.loads(block.text), rest if how == "file" else "")
+        elif block.language == "python" and how != "file":
+            self.python(block, options)
+        elif how == "output":
+            kind, _, command = rest.partition(" ")
+            assert kind in ("of", "like"), block.told
+            self.output(command, block.text, kind == "like")
+
+    def output(self, command: str, text: str, like: bool) -> None:
+        """Every line of a block must be in the output of a command, in this order."""
+        words = shlex.split(command)
+        if shlex.join(words) not in self.printed:
+            self.command(words, [], runs=True)
+        printed = self.printed[shlex.join(words)]
+        remaining = iter(printed.splitlines())
+        for quoted in filter(lambda line: line.strip() not in ("", "..."), text.splitlines()):
+            pattern = pattern_of(quoted, like)
+            found = any(pattern.fullmatch(line) for line in remaining)
+            assert found, f"not in the output, or not in this order: {quoted!r}\n{printed}"
+
+    def command(self, words: list[str], options: list[str], runs: bool) -> None:
+        given = shlex.join(words)
+        match words:
+            case ["rigidmd", *arguments]:
+                if arguments[0] in ("run", "accuracy", "sweep"):
+                    arguments += options
+                if arguments[0] == "film":
+                    arguments += ["--seconds", "0.3"]
+                to = Path(arguments[arguments.index(">") + 1]) if ">" in arguments else None
+                parse(arguments := arguments[: arguments.index(">")] if to else arguments)
+                if runs:
+                    code = cli.main(arguments)
+                    said = self.capsys.readouterr()
+                    assert code == 0, said.err
+                    self.printed[given] = said.out
+                    if to is not None:
+                        to.write_text(said.out)
+            case ["python", script, *_] if script.startswith("tests/benchmarks/"):
+                assert not runs  # its options are checked in test_benchmarks.py
+            case ["python", script]:
+                done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+                assert done.returncode == 0, done.stderr
+            case ["pip", "install", what]:
+                project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+                assert what in (".", *(f".[{extra}]" for extra in project["optional-dependencies"]))
+            case ["pytest"] | ["pytest", "-m", "soak"]:
+                pass
+            case ["sbatch", _]:
+                assert not runs
+            case ["pytest", "-m", "soak", "-rP", script]:
+                assert not runs
+                assert "@pytest.mark.soak" in (ROOT / script).read_text()
+            case _:
+                pytest.fail(f"no command that this test knows: {words}")
+
+    def python(self, block: Block, options: list[str]) -> None:
+        extra = dict(parse_override(text) for text in options if text != "--set")
+        read = Scene.read.__func__
+
+        def shortened(cls, path, overrides=None):
+            return read(cls, path, (overrides or {}) | extra)
+
+        with self.monkeypatch.context() as patch:
+            patch.setattr(Scene, "read", classmethod(shortened))
+            exec(compile("\n" * (block.line - 1) + block.text, "snippet", "exec"), self.namespace)
+
+    def scene(self, data: dict, file: str) -> None:
+        """A whole scene must build; a fragment must validate within a minimal scene; a table of
+        sites as such."""
+        if "sites" in data:
+            assert file, "a molecule or table of parameters is a file"
+            if "name" not in data:
+                read_parameters(Path(file))
+            else:
+                assert cli.main(["models", file]) == 0
+            return
+        if {"molecules", "stages"} <= set(data) or {"body", "run"} <= set(data):
+            resolve(Scene.from_dict(data, "."))
+            return
+        if (named := data.get("structure", {}).get("file")) is not None:
+            Path(named).touch()  # a fragment is not built: it is enough that the file is there
+        faults = []
+        for kind, minimal in MINIMAL.items():
+            whole = {
+                key: value
+                for key, value in minimal.items()
+                if key != "box" or "structure" not in data
+            } | data
+            try:
+                kind.from_dict(whole, ".")
+                return
+            except SceneError as error:
+                faults.append(str(error))
+        pytest.fail("\n".join(faults))
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """The options of a command line, its scene read with them if it is there. Fails where the
+    commands would."""
+    try:
+        options = cli._parse(arguments)
+    except SystemExit as error:
+        pytest.fail(f"rigidmd {shlex.join(arguments)}: exit code {error.code}")
+    scene = getattr(options, "scene", None)
+    if scene is not None and Path(scene).suffix == ".toml" and Path(scene).exists():
+        read_scene(options)
+    return options
+
+
+@pytest.fixture
+def own_formats():
+    """Formats that a document registers are gone after its test."""
+    before = dict(BY_EXTENSION)
+    yield
+    BY_EXTENSION.clear()
+    BY_EXTENSION.update(before)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
+def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsys, own_formats):
+    shutil.copytree(ROOT / "systems", tmp_path / "systems")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["rigidmd"])
+    reader = Reader(monkeypatch, capsys)
+    for block in blocks_of(document):
+        assert block.language in LANGUAGES, (
+            f"{document.name}:{block.line}: a block of {block.language!r}"
+        )
+        try:
+            reader.follow(block)
+        except BaseException as error:
+            error.add_note(f"in {document.name}, the block at line {block.line}")
+            raise
+    for path in [*tmp_path.rglob("log.csv"), *tmp_path.rglob("motion.csv")]:
+        with path.open() as file:
+            header = next(csv.reader(file))
+        part = section("Columns of log.csv" if path.name == "log.csv" else "Columns of motion.csv")
+        named = set(re.findall(r"`([^`]+)`", part))
+        scene = tomllib.loads((path.parent / "scene.toml").read_text())
+        tables = scene.get("forces", {})
+        names = [entry["name"] for entry in tables.get("custom", ())]
+        names += [entry.get("name", entry.get("potential")) for entry in tables.get("bodies", ())]
+        own = {f"{name} (kJ/mole)" for name in names}
+        header = ["NAME (kJ/mole)" if column in own else column for column in header]
+        assert {_first_of_its_kind(column) for column in header} <= named
+
+
+def _first_of_its_kind(column: str) -> str:
+    """The column that stands in the manual for all of its kind: omega_body_1 (rad/s) for
+    omega_body_2 (rad/s), q11 for q23."""
+    column = re.sub(r"^L_\w+_error$", "L_z_error", column)
+    return re.sub(
+        r"_[xyz](?= \(|$)",
+        "_x",
+        re.sub(r"_[123](?= \(|$)", "_1", re.sub(r"^q\d\d$", "q11", column)),
+    )
+
+
+def section(title: str) -> str:
+    """What stands under a heading of the manual, to the next of its rank."""
+    rank = re.search(rf"^(#+) {re.escape(title)}$", MANUAL, re.MULTILINE)
+    assert rank, f"the manual has no heading {title!r}"
+    text = MANUAL[rank.end() :]
+    after = re.search(rf"^#{{1,{len(rank[1])}}} ", text, re.MULTILINE)
+    return text[: after.start()] if after else text
+
+
+_, COMMANDS = cli._parser()
+PLACEHOLDERS = {
+    "SCENE": "scene.toml",
+    "[NAME]": "",
+    "[CHAPTER]": "",
+    "NAME": "x",
+    "CHAPTER": "x",
+    "KEY=VALUE": "a=1",
+    "KEY=": "a=",
+    "N": "1",
+    "PS": "1",
+    "DIR": "x",
+    "FILE": "x",
+}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
+def test_commands_in_the_text_are_commands(document):
+    text = re.sub(
+        r"^```.*?^```$", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
+    for quoted in re.findall(r"`([^`]+)`", text):
+        words = quoted.replace("\n", " ").split()
+        if words[0] == "rigidmd" and len(words) == 2 and words[1] not in PLACEHOLDERS:
+            assert words[1] in COMMANDS
+        elif words[0] == "rigidmd" and words[1:2] != ["COMMAND"] and len(words) > 1:
+            filled = [PLACEHOLDERS.get(word, word) for word in words[1:]]
+            parse([word for word in filled if word][: filled.index(">") if ">" in filled else None])
+        elif words[:1] == ["python"] and words[-2:-1] == ["-m"]:
+            assert words[-1] == "rigidmd"
+        elif words[:1] == ["python"] and len(words) > 1:
+            assert (ROOT / words[1]).is_file(), quoted
+            source = (ROOT / words[1]).read_text()
+            assert all(word in source for word in words if word.startswith("--")), quoted
+
+
+def test_every_command_and_option_is_in_the_manual():
+    table = section("Commands")
+    for name, parser in COMMANDS.items():
+        row = next(
+            (line for line in table.splitlines() if line.startswith(f"| `rigidmd {name}")), None
+        )
+        assert row, f"the manual has no row for `rigidmd {name}`"
+        for action in parser._actions:
+            for option in action.option_strings:
+                if option.startswith("--") and option not in ("--help", "--set"):
+                    short = next(
+                        (o for o in action.option_strings if not o.startswith("--")), option
+                    )
+                    assert option in row or f"`{short} " in row, (
+                        f"the manual's row of {name} lacks {option}"
+                    )
+
+
+def tables_of(kind: type[BaseModel], path: str = "", many: bool = False):
+    """(heading in the manual, model) of each table of a scene."""
+    name = f"[[{path}]]" if many else f"[{path}]"
+    yield f"`{name}`" if path else "Top level", kind
+    for key, field in kind.model_fields.items():
+        for inner in _models_in(field.annotation):
+            yield from tables_of(
+                inner, f"{path}.{key}".strip("."), "tuple" in str(field.annotation)
+            )
+
+
+def _models_in(annotation) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in getattr(annotation, "__args__", ()) for model in _models_in(part)]
+
+
+def _toml(value) -> str:
+    match value:
+        case None:
+            return ""
+        case bool():
+            return str(value).lower()
+        case str():
+            return f'"{value}"'
+        case dict():
+            return f"{{{', '.join(f'{key} = {_toml(own)}' for key, own in value.items())}}}"
+        case tuple():
+            return f"[{', '.join(map(_toml, value))}]"
+    return f"{value:g}"
+
+
+# Keys that these tables inherit and refuse
+REFUSED = {"`[frame]`": {"from_s", "to_s"}, "`[changing_inertia]`": {"times_s", "from_s", "to_s"}}
+
+
+@pytest.mark.parametrize("kind", [MolecularScene, BodyScene])
+def test_every_key_of_a_scene_is_in_the_manual_with_its_default(kind):
+    shared = {heading for heading, _ in tables_of(MolecularScene)}
+    for heading, model in tables_of(kind):
+        if kind is BodyScene and heading in ("Top level", "`[[integrators]]`"):
+            continue  # the same as for molecules
+        title = f"{heading} (single body)" if kind is BodyScene and heading in shared else heading
+        said = {}
+        for row in re.findall(r"^\| (`[a-z].*?) \| (.*?) ?\| ", section(title), re.MULTILINE):
+            said |= {key: row[1].strip() for key in re.findall(r"`(\w+)`", row[0])}
+        wanted = {
+            key: "needed"
+            if field.is_required()
+            else f"`{text}`"
+            if (text := _toml(field.default))
+            else ""
+            for key, field in model.model_fields.items()
+            if not _models_in(field.annotation)
+            or "Literal" in str(field.annotation)  # a table, or a text in its position
+        }
+        for key in REFUSED.get(heading, ()):
+            wanted.pop(key)
+            said.pop(key, None)
+        assert said == wanted, f"the manual's table of {title} is not that of the scene"
+
+
+def slugs(document: Path) -> set[str]:
+    """Anchors of a document's headings, as they are made where it is shown."""
+    text = re.sub(
+        r"^```.*?^```$", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
+def test_links_and_pictures_are_there(document):
+    text = document.read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+    for link in links:
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (document.parent / path).resolve() if path else document
+        assert target.is_file(), f"{document.name}: {link}"
+        assert target.is_relative_to(ROOT)
+        if anchor:
+            assert anchor in slugs(target), f"{document.name}: {link}"
+
+
+def contents_text() -> str:
+    """The page start/contents.md, from the titles and first lines of all pages."""
+    lines = ["# All pages", "", "The pages of this documentation, with the subject of each."]
+    groups = {
+        folder.capitalize(): names for folder, names in SECTIONS.items() if folder != "guides"
+    }
+    ordered = {}
+    for title, names in groups.items():
+        ordered[title] = names
+        if title == "Tutorials":
+            ordered |= {f"Guides: {group.lower()}": names for group, names in GUIDES.items()}
+    for title, names in ordered.items():
+        lines += ["", f"## {title}", ""]
+        for name in names:
+            if name == "contents":
+                continue
+            heading, _, about, *_ = PAGES[name].read_text(encoding="utf-8").splitlines()
+            path = Path(os.path.relpath(PAGES[name], PAGES["contents"].parent)).as_posix()
+            lines.append(f"- [{heading.removeprefix('# ')}]({path}): {about[0].lower()}{about[1:]}")
+    return "\n".join(lines) + "\n"
+
+
+def test_readme_is_a_first_page_and_leads_to_the_list_of_all():
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 130
+    assert max(map(len, text.splitlines())) <= 100
+    assert f"({PAGES['contents'].relative_to(ROOT)})" in text
+
+
+def test_the_list_of_pages_has_their_titles_and_subjects():
+    """`PYTHONPATH=tests python tests/rules/test_docs.py` writes it."""
+    assert PAGES["contents"].read_text(encoding="utf-8") == contents_text()
+
+
+def test_author_and_version_are_the_same_wherever_they_are_said():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    version, (author,) = project["version"], project["authors"]
+    text = README.read_text(encoding="utf-8")
+    assert f"{author['name']}, *rigidmd" in text
+    assert f"version {version}," in text
+    citation = PAGES["contributing"].read_text(encoding="utf-8")
+    assert f"{{{{{author['name']}}}}}" in citation
+    assert f"version = {{{version}}}" in citation
+    assert f"\n## {version}" in PAGES["changelog"].read_text(encoding="utf-8")
+    zenodo = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
+    found = [zenodo[key] for key in ("version", "keywords", "license", "creators")]
+    assert found == [version, project["keywords"], project["license"], [{"name": author["name"]}]]
+
+
+def test_help_lists_and_prints_the_chapters(capsys):
+    assert set(DOCS.rglob("*.md")) == set(CHAPTERS.values())
+    assert cli.main(["help"]) == 0
+    listed = re.sub(r"\n {18}", " ", capsys.readouterr().out)
+    for name in CHAPTERS:
+        source = PAGES[name].read_text(encoding="utf-8")
+        about = source.splitlines()[2]
+        assert about.endswith(".")
+        assert len(about) <= 120
+        assert re.search(rf"^  {name} +{re.escape(about)}$", listed, re.MULTILINE)
+        assert cli.main(["help", name]) == 0
+        said = capsys.readouterr().out
+        assert said.startswith(source.splitlines()[0])
+        assert "<!--" not in said
+        assert "![" not in said
+        with contextlib.suppress(StopIteration):
+            code = next(block for block in blocks_of(PAGES[name]) if block.language == "sh")
+            assert re.sub(r"systems/(?=\w+\.toml)", "", code.text) in said
+        for stem, ending in re.findall(
+            r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.py|\.ipynb)", source
+        ):
+            assert find_example(stem).path.suffix == ending  # `rigidmd new` copies it
+        assert not re.search(r"systems/(scripts/)?\w+\.(toml|py)", said)
+    cli.main(["help", "top"])
+    assert (
+        f"[picture: seven heavy tops, {DOCS / 'images' / 'seven_tops.png'}]"
+        in capsys.readouterr().out
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("commandes", "did you mean commands?"),
+        ("qqq", "there are five_minutes, installation, why, contents, top, water"),
+    ],
+)
+def test_a_chapter_that_is_not_there(name, expected, capsys):
+    assert cli.main(["help", name]) == 2
+    assert expected in capsys.readouterr().err
+
+
+GROUPS = {
+    "water": "Water",
+    "ion": "Ions",
+    "noble gas": "Noble gases",
+    "gas": "Gases",
+    "organic": "Organic molecules",
+}
+
+
+def models_tables() -> str:
+    """The tables of reference/models.md, from the files of the models."""
+    rows: dict[str, list[str]] = {group: [] for group in GROUPS}
+    for path in sorted((ROOT / "rigidmd" / "models").glob("*.toml")):
+        model = tomllib.loads(path.read_text(encoding="utf-8"))
+        mixing = "geometric mixing" if model.get("mixing") == "geometric" else ""
+        remarks = "; ".join(filter(None, [model.get("note"), mixing]))
+        cells = [
+            f"`{model['name']}`",
+            model["title"],
+            str(len(model["sites"])),
+            remarks,
+            model["source"],
+        ]
+        row = f"| {' | '.join(cells)} |".replace("|  |", "| |")
+        rows[model["group"]].append(re.sub(r"doi:([^\s)|]+)", r"[doi:\1](https://doi.org/\1)", row))
+    head = "| model | molecule | sites | remarks | source |\n|---|---|---|---|---|\n"
+    return (
+        "\n\n".join(f"## {GROUPS[group]}\n\n{head}" + "\n".join(rows[group]) for group in GROUPS)
+        + "\n"
+    )
+
+
+def test_the_table_of_integrators_has_their_orders_and_costs():
+    table = section("Shipped integrators")
+    rows = {}
+    for names, order, cost in re.findall(
+        r"^\| (`.*?`)(?: \(default[^)]*\))? \| (\d+) \| (\d+) \|", table, re.MULTILINE
+    ):
+        rows |= dict.fromkeys(re.findall(r"`(\w+)`", names), (int(order), int(cost)))
+    shipped = SCHEMES | WITH_THERMOSTAT
+    assert rows == {
+        name: (scheme.order, scheme.force_evaluations) for name, scheme in shipped.items()
+    }
+
+
+def test_the_page_of_models_has_the_tables_of_their_files():
+    """`PYTHONPATH=tests python tests/rules/test_docs.py` writes them."""
+    assert PAGES["models"].read_text(encoding="utf-8").endswith("\n" + models_tables())
+
+
+if __name__ == "__main__":
+    text = PAGES["models"].read_text(encoding="utf-8")
+    PAGES["models"].write_text(text[: text.index("## Water")] + models_tables(), encoding="utf-8")
+    PAGES["contents"].write_text(contents_text(), encoding="utf-8")
+
+
+def test_the_page_of_the_collection_is_written_from_its_data(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tests" / "benchmarks")
+    import collection
+
+    assert PAGES["collection"].read_text(encoding="utf-8") == collection.page_text()
