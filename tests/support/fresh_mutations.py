@@ -164,7 +164,7 @@ FRESH: list[Mutation] = [
         "assemble/structure.py",
         "velocity = None if atoms.velocity is None else atoms.velocity @ rotation.T",
         "velocity = atoms.velocity",
-        ("formats/test_structures.py::test_a_turned_cell_turns_velocities_too",),
+        ("assemble/test_structure.py::test_a_turned_cell_turns_velocities_too",),
     ),
     Mutation(
         "F19",
@@ -573,7 +573,7 @@ FRESH: list[Mutation] = [
         "formats/gro.py",
         "None if np.isnan(velocity).all() else 10 * velocity",
         "None if np.isnan(velocity).all() else velocity",
-        ("formats/test_structures.py::test_further_digits_and_velocities_of_a_gro",),
+        ("formats/test_gro.py::test_further_digits_and_velocities_of_a_gro",),
     ),
     Mutation(
         "F66",

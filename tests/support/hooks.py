@@ -25,7 +25,7 @@ LONGEST = (
     "forces/test_forces.py",
     "features/bodies/test_engine.py",
     "rules/test_docs.py",
-    "formats/test_structures.py",
+    "assemble/test_matching.py",
     "features/view/test_figures.py",
     "forces/ewald/test_ewald.py",
     "features/bodies/test_systems.py",
