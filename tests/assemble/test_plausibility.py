@@ -2,6 +2,7 @@
 warning."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from support.schema_scenes import FIELDS, IONS
 
 import rigidmd
 from rigidmd.assemble.build import build
+from rigidmd.assemble.describe import describe
 from rigidmd.assemble.plausibility import molecule_warnings
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
@@ -380,3 +382,33 @@ def test_a_run_repeats_the_warnings_of_check(tmp_path):
     [expected] = [warning for warning in build(scene).warnings]
     assert expected in told and expected in results.summary["notes"]
     assert np.isfinite(results["potential"]).all()
+
+
+MIE = {"energy": "4*e*((s/r)**14 - (s/r)**7)", "parameters": {"AR": {"e": 1.0, "s": 3.4}}}
+SCREENED = {"energy": "a*exp(-r/2)/r", "parameters": {"AR": {"a": 5.0}}}
+
+
+@pytest.mark.parametrize(
+    ("counts", "cutoff", "entry", "words"),
+    [
+        ({"spce": 20}, 3.0, None, "3 Å is shorter than 3.55 Å"),
+        ({"spce": 20}, 3.54, None, ""),  # WCA, rounded
+        ({"spce": 20}, 7.0, None, ""),
+        ({"argon": 10, "ccl4": 5}, 3.7, None, "shorter than 3.82 Å, where the energy of argon.AR"),
+        ({"argon": 20}, 3.0, MIE, "mie: .* 3 Å is shorter than 3.7"),
+        ({"argon": 20}, 3.9, MIE, ""),
+        ({"argon": 20}, 3.0, SCREENED, ""),  # repels everywhere
+    ],
+)
+def test_a_cutoff_within_the_minimum_of_an_energy_is_noted(counts, cutoff, entry, words):
+    forces = {"cutoff_A": cutoff}
+    if entry:
+        forces = {
+            "cutoff_A": 8.0,
+            "lennard_jones": False,
+            "custom": [entry | {"name": "mie", "cutoff_A": cutoff}],
+        }
+    scene = small_scene(counts, 20.0, forces=forces)
+    found = [note for note in build(scene).notes if "has its minimum" in note]
+    assert len(found) == bool(words) and all(re.search(words, note) for note in found)
+    assert all(note in describe(scene) for note in found)

@@ -107,6 +107,13 @@ def spin(rotor, rotation, angular_momentum, h: float, steps: int) -> None:
         rotate(rotor, 0, rotation, angular_momentum, 0, h)
 
 
+def argon(**more) -> Scene:
+    """Twenty argon atoms for 0.1 ps."""
+    return small_scene(
+        {"argon": 20}, 25.0, stages=[{"duration_ps": 0.1}], output={"log_interval_ps": 0.01}, **more
+    )
+
+
 def springs(**stage) -> Scene:
     """64 argon atoms, each an isotropic oscillator, under Langevin's thermostat at 300 K unless the
     stage states otherwise."""

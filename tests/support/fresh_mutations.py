@@ -121,7 +121,7 @@ FRESH: list[Mutation] = [
         '(temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total',
         '(temperatures["temperature_K"] or 0.0) * system.freedom.total',
         (
-            "run/test_run.py::test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage",
+            "run/test_summary.py::test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage",
         ),
     ),
     Mutation(
@@ -130,7 +130,7 @@ FRESH: list[Mutation] = [
         "run/summary.py",
         "    gain = 2 * energy / system.freedom.translation",
         "    gain = energy / system.freedom.translation",
-        ("run/test_run.py::test_a_drift_of_all_molecules_is_noted",),
+        ("run/test_summary.py::test_a_drift_of_all_molecules_is_noted",),
     ),
     Mutation(
         "F15",
@@ -371,7 +371,7 @@ FRESH: list[Mutation] = [
         "run/summary.py",
         "    steady = equilibrated(of_stage, stage)\n",
         "    steady = of_stage\n",
-        ("run/test_run.py::test_means_are_over_the_equilibrated_part",),
+        ("run/test_summary.py::test_means_are_over_the_equilibrated_part",),
     ),
     Mutation(
         "F43",
@@ -582,7 +582,7 @@ FRESH: list[Mutation] = [
         "sqrt(HEATING_LIMIT * level / 2 / abs(heating))",
         "HEATING_LIMIT * level / 2 / abs(heating)",
         (
-            "run/test_run.py::test_a_thermostat_at_the_ends_of_steps_that_leaves_another_temperature_has_a_note",
+            "run/test_summary.py::test_a_thermostat_at_the_ends_of_steps_that_leaves_another_temperature_has_a_note",
         ),
     ),
     Mutation(

@@ -31,7 +31,7 @@ LONGEST = (
     "features/bodies/test_systems.py",
     "features/external/test_lammps.py",
     "features/studies/test_sweep.py",
-    "run/test_run.py",
+    "run/test_simulation.py",
     "compile/test_compile.py",
     "forces/ewald/test_dispersion.py",
     "features/view/test_pages.py",
@@ -164,6 +164,10 @@ TIERS = {
         "features/free_energy/test_insertion.py": ("energies_are_the_differences_of_the_engine*",),
         "features/external/test_lammps.py": ("a_run_is_one_like_any_other[1]",),
         "features/view/test_notebook.py": ("a_sweep_shows_its_progress",),
+        "engines/cpu/test_engine.py": (
+            "a_look_takes_the_energies_of_the_last_step[c*",
+            "a_look_takes_the_energies_of_the_last_step[piston*",
+        ),
         "engines/cpu/test_program.py": ("check_measures_a_potential_of_bodies",),
         "mechanics/test_properties.py": (
             "any_small_scene_of_one_kind_runs_ten_steps_or_is_refused_in_words",
@@ -180,13 +184,11 @@ TIERS = {
             "no_command_writes_through_a_link*",
             "wrong_numbers_in_a_checkpoint_are_refused[dop853*",
         ),
-        "run/test_run.py": (
-            "a_look_takes_the_energies_of_the_last_step[c*",
-            "a_look_takes_the_energies_of_the_last_step[piston*",
-            "a_signal_stops_with_a_summary_and_its_code[15*",
-            *(f"every_system_runs_a_few_steps[{name}]" for name in ("gay_berne", "water_nitrogen")),
-            "the_scene_that_a_run_writes_holds_every_number_it_used[pme]",
+        "run/test_schedule.py": ("a_signal_stops_with_a_summary_and_its_code[15*",),
+        "run/test_simulation.py": tuple(
+            f"every_system_runs_a_few_steps[{name}]" for name in ("gay_berne", "water_nitrogen")
         ),
+        "assemble/test_scenes.py": ("the_scene_that_a_run_writes_holds_every_number_it_used[pme]",),
         "commands/test_examples.py": ("a_wheel_has_every_file_and_nothing_of_an_earlier_build",),
         "compile/test_sources.py": ("*",),
         "features/studies/test_stability.py": (
@@ -240,7 +242,7 @@ TIERS = {
         "features/view/test_notebook.py": ("the_tutorial_runs", "the_tutorial_shows_what_it_says"),
         "end_to_end/test_reference.py": ("a_cutoff_that_reaches_hundreds_of_clusters",),
         "run/test_resume.py": ("a_run_that_is_killed_goes_on[2*",),
-        "run/test_run.py": tuple(
+        "run/test_simulation.py": tuple(
             f"every_system_runs_a_few_steps[{name}]"
             for name in (
                 "dry_ice",

@@ -61,7 +61,7 @@ def test_every_pattern_of_a_tier_names_a_test():
             function = re.split(r"\[|\*", pattern)[0]
             assert any(name.startswith(f"test_{function}") for name in names), (file, pattern)
             assert pattern_in(tier, file, f"test_{pattern.replace('*', '')}"), (file, pattern)
-    assert tier_of("run/test_run.py", "test_every_system_runs_a_few_steps[water]") is None
+    assert tier_of("run/test_simulation.py", "test_every_system_runs_a_few_steps[water]") is None
 
 
 def test_processes_import_the_package_that_the_tests_import(tmp_path):
