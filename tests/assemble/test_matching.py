@@ -690,3 +690,33 @@ def test_like_species_need_residue_names(stretch, tmp_path):
         match=r"molecule 1 .atoms 1 to 3, .* may be .* or .*: give them residue_names",
     ):
         read(tmp_path, xyz(atoms, truth.cell), "a.xyz", species)
+
+
+def test_molecules_by_order_and_by_geometry(tmp_path):
+    """An .xyz has no residues: waters atom by atom, and one with all oxygens first, split across
+    the boundary."""
+    from rigidmd.assemble.structure import read_structure
+
+    water, nitrogen = load_model("spce"), load_model("nitrogen")
+    rng = np.random.default_rng(0)
+    from rigidmd.mechanics.rotation import random_rotations
+
+    centres = np.array([[0.1, 0.2, 9.9], [5.0, 5.0, 0.1], [9.95, 5.0, 5.0]])
+    q = random_rotations(rng, 3)
+    kinds = [water, nitrogen, water]
+    atoms = [
+        (m.elements[s], (c + r @ m.positions_body[s]) % 10)
+        for m, c, r in zip(kinds, centres, q, strict=True)
+        for s in range(len(m.masses))
+    ]
+    orders = {"file": atoms, "sorted": sorted(atoms, key=lambda atom: -ord(atom[0][0]))}
+    for name, listed in orders.items():
+        lines = [f"{e} {x[0]:.8f} {x[1]:.8f} {x[2]:.8f}" for e, x in listed]
+        path = tmp_path / f"{name}.xyz"
+        path.write_text(f'{len(lines)}\nLattice="10 0 0 0 10 0 0 0 10"\n' + "\n".join(lines) + "\n")
+        found = read_structure(path, [water, nitrogen], None, True, 0.15)
+        assert sorted(found.species.tolist()) == [0, 0, 1]
+        assert found.residual_max < 1e-6
+        for c in centres:
+            step = found.position - c
+            assert np.abs(step - 10 * np.round(step / 10)).max(axis=1).min() < 1e-6

@@ -11,6 +11,7 @@ from rigidmd.assemble.species import species_of
 from rigidmd.errors import SceneError
 from rigidmd.io.structure_file import read_geometry
 from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.scene import Scene
 from rigidmd.scene.models import Molecule
 
 
@@ -125,3 +126,20 @@ def test_few_decimals_do_not_make_a_molecule_linear(tmp_path):
     kind = species_in(tmp_path, "3\n\nO -1.2 0.0 0.0\nC 0.0 0.1 0.0\nO 1.2 0.0 0.0\n", "xyz")
     assert kind.kind == "asymmetric"
     assert not any("nearly linear" in text for text in molecule_warnings(SPECIES["spce"]))
+
+
+def test_a_molecule_from_a_geometry_file(tmp_path):
+    (tmp_path / "co2.xyz").write_text("3\n\nO 0 0 1.16\nC 0 0 0\nO 0 0 -1.16\n")
+    sites = [
+        {"name": "C", "charge_e": 0.7, "sigma_A": 2.8, "epsilon_K": 27.0},
+        {"name": "O", "charge_e": -0.35, "sigma_A": 3.05, "epsilon_K": 79.0},
+    ]
+    data = small_scene({"argon": 5}, 25.0).model_dump()
+    data["molecules"] = [{"file": "co2.xyz", "sites": sites, "count": 20}]
+    system = build(Scene.from_dict(data, tmp_path))
+    co2 = system.species[0]
+    assert (co2.name, co2.kind, co2.charge) == ("co2", "linear", 0)
+    assert co2.mass == pytest.approx(44.009, abs=1e-3)
+    data["molecules"][0]["sites"] = sites[:1]
+    with pytest.raises(SceneError, match="atom O: no entry of sites"):
+        build(Scene.from_dict(data, tmp_path))

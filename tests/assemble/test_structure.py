@@ -9,7 +9,7 @@ import ase.build
 import ase.io
 import numpy as np
 import pytest
-from support.common import small_scene
+from support.common import ROOT, refused, small_scene
 from support.structures import (
     NAMES,
     ROUND_CELLS,
@@ -31,10 +31,12 @@ from support.structures import (
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.structure import read_structure
+from rigidmd.commands.cli import main
 from rigidmd.core.state_file import write_state
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.io.trajectory_file import TrajectoryFile, write_topology
 from rigidmd.mechanics.rotation import random_rotations
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.scene.models import load_model
 from rigidmd.units import GRAM_PER_CM3
@@ -550,3 +552,142 @@ def test_nothing_is_printed_or_warned(tmp_path, capsys, recwarn):
         read(tmp_path, text, f"a.{ending}", ["tip4p2005"])
     assert capsys.readouterr() == ("", "")
     assert not recwarn.list
+
+
+def structure_scene(tmp_path, text, name="start.gro", extra="", models=("spce",)):
+    (tmp_path / name).write_text(text)
+    species = "".join(f'[[molecules]]\nmodel = "{model}"\n' for model in models)
+    return f'{species}{extra}[structure]\nfile = "{name}"\n[forces]\ncutoff_A = 5.0\n[start]\ntemperature_K = 300\n[[stages]]\nduration_ps = 0.01\n'
+
+
+WATER216 = (ROOT / "systems" / "structures" / "water216.gro").read_text()
+
+
+def lines_changed(change):
+    lines = WATER216.splitlines()
+    change(lines)
+    return "\n".join(lines) + "\n"
+
+
+def truncate(lines):
+    del lines[400:]
+
+
+def rename(lines):
+    lines[2:5] = [
+        line.replace("SOL", "ETH").replace("OW", "C1").replace("HW1", "C2") for line in lines[2:5]
+    ]
+
+
+def overlap(lines):
+    shift = lines[2][20:44]
+    lines[5] = lines[5][:20] + shift + lines[5][44:]
+    for k in (1, 2):
+        lines[5 + k] = lines[5 + k][:20] + lines[2 + k][20:44] + lines[5 + k][44:]
+
+
+def bend(lines):
+    lines[3] = lines[3][:20] + "   5.000   5.000   5.000" + lines[3][44:]
+
+
+def wild_velocity(lines):
+    lines[10] = lines[10][:44] + "     nan  0.0000  0.0000"
+
+
+def nonsense(lines):
+    lines[10] = lines[10][:20] + "     nan   0.000   0.000" + lines[10][44:]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (truncate, ["promises 648 atoms", "truncated"]),
+        (rename, ["molecule 1", "'ETH'", "C2 H", "expected spce (O H2)"]),
+        (overlap, ["molecules 1 and 2 overlap"]),
+        (bend, ["molecule 1", "is not spce", "from the rigid template"]),
+        (wild_velocity, ["atom 9", "a velocity that is not a finite number"]),
+        (nonsense, ["atom 9", "not a finite number"]),
+    ],
+)
+def test_a_bad_structure_file(change, expected, capsys, tmp_path):
+    message = refused(capsys, tmp_path, structure_scene(tmp_path, lines_changed(change)))
+    for part in ["start.gro", *expected]:
+        assert part in message
+
+
+@pytest.mark.parametrize(("share", "code"), [(0.59, 2), (0.61, 0)])
+def test_sites_overlap_within_six_tenths_of_their_diameter(share, code, capsys, tmp_path):
+    sigma = load_model("argon").sigma[0]
+    (tmp_path / "two.xyz").write_text(
+        f"2\n\nAr 5.0 5.0 5.0\nAr {5.0 + share * sigma:.9f} 5.0 5.0\n"
+    )
+    (tmp_path / "two.toml").write_text(
+        "box.lengths_A = 20.0\nforces.cutoff_A = 8.0\nstructure.file = 'two.xyz'\n"
+        "start.temperature_K = 90.0\n[[molecules]]\nmodel = 'argon'\n[[stages]]\nduration_ps = 0.01\n"
+    )
+    assert main(["check", str(tmp_path / "two.toml")]) == code
+    assert ("molecules 1 and 2 overlap" in capsys.readouterr().err) == (code == 2)
+
+
+def test_the_box_of_the_scene_counts_for_a_saved_state_too(tmp_path):
+    Simulation(small_scene({"argon": 20}, 20.0), tmp_path / "out").run()
+    for box, edge in (({}, 20.0), ({"lengths_A": 40.0}, 40.0), ({"periodic": False}, np.inf)):
+        data = small_scene({"argon": 20}, 20.0).model_dump() | {
+            "box": box,
+            "structure": {"file": "final.npz"},
+        }
+        assert build(Scene.from_dict(data, tmp_path / "out")).space.x == edge
+    with np.load(tmp_path / "out" / "final.npz") as saved:
+        good = dict(saved)
+    for key, value in {
+        "species": good["species"] + 5,
+        "velocity": good["velocity"][:3],
+        "position": good["position"] * np.nan,
+    }.items():
+        np.savez(tmp_path / "out" / "final.npz", **good | {key: value})
+        with pytest.raises(StructureError, match=f"{key}.*: damaged"):
+            build(Scene.from_dict(data, tmp_path / "out"))
+
+
+def test_points_from_a_file_fit_wherever_they_are(tmp_path):
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3) * 5 + rng.random((64, 3))
+    atoms = "".join(
+        f"{k + 1:5d}AR      AR{k + 1:5d}{x[0] / 10:8.3f}{x[1] / 10:8.3f}{x[2] / 10:8.3f}\n"
+        for k, x in enumerate(grid)
+    )
+    (tmp_path / "ar.gro").write_text(f"argon\n64\n{atoms}   2.00000   2.00000   2.00000\n")
+    data = small_scene({"argon": 64}, None).model_dump() | {
+        "box": {},
+        "structure": {"file": "ar.gro"},
+    }
+    assert len(build(Scene.from_dict(data, tmp_path)).state.position) == 64
+
+
+def test_structure_files_with_other_faults(capsys, tmp_path):
+    assert "count is 200" in refused(
+        capsys, tmp_path, structure_scene(tmp_path, WATER216, extra="count = 200\n")
+    )
+    assert "may be spce or spc:" in refused(
+        capsys, tmp_path, structure_scene(tmp_path, WATER216, models=("spce", "spc"))
+    )
+    two = "1\n\nAr 0 0 0\n" * 2
+    assert "holds 2 structures" in refused(
+        capsys, tmp_path, structure_scene(tmp_path, two, "two.xyz", models=("argon",))
+    )
+    xyz = "3\n\nO 0 0 0\nH 0.8165 0.5774 0\nH -0.8165 0.5774 0\n"
+    assert "has no box" in refused(capsys, tmp_path, structure_scene(tmp_path, xyz, "a.xyz"))
+    text = (
+        structure_scene(tmp_path, WATER216)
+        .replace("[structure]", "[structure]\nvelocities = true")
+        .replace("start.gro", "b.xyz")
+        .replace("[start]\ntemperature_K = 300\n", "")
+    )
+    (tmp_path / "b.xyz").write_text(
+        '3\nLattice="20 0 0 0 20 0 0 0 20"\nO 0 0 0\nH 0.8165 0.5774 0\nH -0.8165 0.5774 0\n'
+    )
+    assert "lacks velocities for some atoms" in refused(capsys, tmp_path, text)
+    (tmp_path / "c.npz").write_bytes(b"not a zip file")
+    assert "not a state that rigidmd wrote" in refused(
+        capsys, tmp_path, text.replace("b.xyz", "c.npz")
+    )

@@ -1,15 +1,20 @@
 """The commands."""
 
 import json
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
-from support.common import ROOT
+from support.common import ROOT, refused
+from support.scenes import GOOD
 
 import rigidmd
 from rigidmd.commands.arguments import COMMANDS
 from rigidmd.commands.cli import main
+from rigidmd.errors import SceneError
+from rigidmd.scene import Scene
 
 
 def test_the_commands(capsys, tmp_path):
@@ -111,3 +116,183 @@ def test_output_goes_to_runs_by_default(tmp_path, monkeypatch, capsys):
     assert main(command) == 2
     assert "--force" in capsys.readouterr().err
     assert main([*command, "--force"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("md.mdp", "is an input file of GROMACS, not a scene: `rigidmd help coming_from`"),
+        ("in.lammps", "is an input file of LAMMPS, not a scene"),
+        ("water.in", "is an input file of LAMMPS, not a scene"),
+        ("run.py", "is an input file of Python, not a scene"),
+        (
+            "start.gro",
+            'is a structure file, not a scene: a scene names it by [structure] file = "start.gro"',
+        ),
+        ("start.pdb", 'a scene names it by [structure] file = "start.pdb"'),
+        (
+            "run.xtc",
+            'is a trajectory file, not a scene: a scene names it by [structure] file = "run.xtc"',
+        ),
+        (
+            "start.xsf",
+            "a scene is a TOML file. One that starts from a structure names it by [structure] file",
+        ),
+        ("folder", "is a folder. A scene is a file, such as "),
+        ("empty", "is a folder. A scene is a TOML file"),
+        ("run", "is a folder. `rigidmd resume "),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "check", "energy"])
+def test_a_file_that_is_no_scene_is_named(name, expected, command, capsys, tmp_path):
+    path = tmp_path / name
+    match name:
+        case "empty":
+            path.mkdir()
+        case "folder" | "run":
+            path.mkdir()
+            (path / {"folder": "water.toml", "run": "scene.toml"}[name]).write_text("")
+        case _:
+            path.write_text("; comment\nintegrator = md\n")
+    assert main([command, str(path)]) == 2
+    assert expected in capsys.readouterr().err
+
+
+def test_an_unknown_integrator_of_the_command(capsys, tmp_path):
+    (tmp_path / "good.toml").write_text(GOOD)
+    assert (
+        main(["accuracy", str(tmp_path / "good.toml"), "--integrators", "velocity_verlet,SRKN6"])
+        == 2
+    )
+    message = capsys.readouterr().err
+    assert (
+        "--integrators: unknown integrator SRKN6; did you mean srkn_6? (known: velocity_verlet"
+        in message
+    )
+
+
+def test_the_command_and_the_scene_suggest_the_same_model(capsys, tmp_path):
+    scene = refused(capsys, tmp_path, GOOD.replace("spce", "SPC-EE"))
+    assert main(["models", "SPC-EE"]) == 2
+    command = capsys.readouterr().err
+    assert "did you mean spce?" in command
+    assert scene.strip().endswith(command.removeprefix("rigidmd: models: ").strip())
+
+
+@pytest.mark.parametrize("command", ["run", "check", "energy", "accuracy", "sweep"])
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ("nowhere.toml", "nowhere.toml: there is no such file. `rigidmd examples` lists scenes"),
+        ("water", "water: there is no such file. `rigidmd new water` copies a shipped scene"),
+        ("systems/water.toml", "there is no such file. `rigidmd new water` copies a shipped scene"),
+        (
+            "heavy_top.toml",
+            "there is no such file. `rigidmd new heavy_top_1` copies a shipped scene",
+        ),
+        ("mien.toml", "there is no such file; did you mean mine.toml?"),
+    ],
+)
+def test_a_missing_scene(command, path, expected, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.toml").write_text(GOOD)
+    assert main([command, path, *(["--set", "seed=1,2"] if command == "sweep" else [])]) == 2
+    assert expected in capsys.readouterr().err
+    with pytest.raises(SceneError, match="there is no such file"):
+        Scene.read(path)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["analyze", "runs/x"], "unknown command 'analyze'; did you mean analyse?"),
+        (["acuracy", "x.toml"], "unknown command 'acuracy'; did you mean accuracy?"),
+        (["foo"], "unknown command 'foo'. `rigidmd --help` lists them"),
+        (
+            ["run", "x.toml", "--forse"],
+            "rigidmd run: error: unknown argument '--forse'; did you mean --force?",
+        ),
+        (["run", "x.toml", "--wall-time=1:00"], "'--wall-time=1:00'; did you mean --walltime?"),
+        (["film", "x", "--fps", "3"], "rigidmd film: error: unknown argument '--fps'"),
+        (["check", "x.toml", "y.toml"], "rigidmd check: error: unknown argument 'y.toml'"),
+    ],
+)
+def test_a_command_line_that_is_not_known_suggests_what_is(words, expected, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("restarts", "there are five_minutes, installation, why"),
+        ("rdf", "the word is in five_minutes ("),
+        ("anlysis", "did you mean analysis?"),
+    ],
+)
+def test_help_finds_words_in_chapters(word, expected, capsys):
+    assert main(["help", word]) == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("until", ["1e999ps", "nanps", "-1ps"])
+def test_times_of_the_command_line_are_finite(until, capsys):
+    with pytest.raises(SystemExit):
+        main(["run", "x.toml", f"--until={until}"])
+    assert "is not a time with a unit" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["run", "x.toml", f"--walltime={'9' * 400}:00"])
+    assert "is not H:MM:SS" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--span", "nan"], "time steps and --span must be between 1e-30 and 1e30"),
+        (["--timesteps", "1,inf"], "time steps and --span must be between 1e-30 and 1e30"),
+        (["--timesteps", "5e-324"], "time steps and --span must be between 1e-30 and 1e30"),
+        (["--timesteps", "1e-20"], "more than 1e+12 steps"),
+        (["--span", "1e20"], "more than 1e+12 steps"),
+        (["--repeats", "0"], "--repeats must be at least 1"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["molecules", "body"])
+def test_times_of_accuracy_are_in_their_range(kind, options, expected, capsys, tmp_path):
+    scene = tmp_path / "good.toml"
+    scene.write_text(GOOD)
+    if kind == "body":
+        shutil.copy(ROOT / "systems" / "heavy_top_3.toml", scene)
+        expected = expected.replace("1e-30 and 1e30", "1e-100 and 1e100")
+    assert main(["accuracy", str(scene), *options, "-o", str(tmp_path / "out")]) == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--sample-ps", "1e300"], "time steps and --sample-ps must be between 1e-30 and 1e30"),
+        (["--timesteps", "1e-20"], "more than 1e+12 steps"),
+    ],
+)
+def test_times_of_averages_are_in_their_range(options, expected, capsys, tmp_path):
+    scene = ROOT / "systems" / "argon.toml"
+    options = [
+        "--averages",
+        "--set",
+        "stages.1.ensemble=nvt",
+        "--set",
+        "stages.1.temperature_K=90",
+        *options,
+        "-o",
+        str(tmp_path / "out"),
+    ]
+    assert main(["accuracy", str(scene), *options]) == 2
+    assert expected in capsys.readouterr().err
+
+
+def test_the_help_tells_how_a_key_is_removed(capsys):
+    with pytest.raises(SystemExit):
+        main(["run", "--help"])
+    assert "KEY= without a value removes the key" in " ".join(capsys.readouterr().out.split())

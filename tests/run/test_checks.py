@@ -631,3 +631,19 @@ def test_a_long_way_back_is_not_computed_again(monkeypatch):
     scene = water(16.0, stages=[{"duration_ps": 160.0, "timestep_fs": 16.0}])
     stopped(scene)
     assert len({id(state) for state in advanced}) <= 2  # that of compiling, the value of the run
+
+
+def test_a_run_that_blows_up_says_so_and_keeps_the_last_good_state(tmp_path):
+    simulation = Simulation(
+        small_scene({"spce": 20}, 20.0, watch={"move": False}), tmp_path / "out"
+    )
+    good = simulation.system.state.position.copy()
+    simulation.system.state.velocity[7] = 1e150  # gone within a step
+    with pytest.raises(
+        SimulationError,
+        match=r"step 1 .*molecule 8 \(spce\) is lost.*timestep_fs.*step 0 .*last_good_state",
+    ):
+        simulation.run()
+    with np.load(tmp_path / "out" / "last_good_state.npz") as saved:
+        assert saved["position"] == pytest.approx(good, abs=1.0)
+        assert np.isfinite(saved["position"]).all()

@@ -18,8 +18,10 @@ from rigidmd.scene import Scene
 from rigidmd.scene.models import (
     GROUPS,
     MODELS,
+    Site,
     available_models,
     load_model,
+    molecule,
     read_molecule,
     with_masses,
 )
@@ -1009,3 +1011,32 @@ def test_models_that_cannot_be_made(arguments, expected, own, capsys, monkeypatc
     assert out == ""
     assert expected in err
     assert {path.name: path.read_bytes() for path in own.iterdir()} == before
+
+
+def test_a_molecule_file_with_a_text_without_quotes(tmp_path):
+    (tmp_path / "mine.toml").write_text("name = mine\n")
+    with pytest.raises(MoleculeError, match=r"mine.toml: line 1: name: is mine without quotes"):
+        read_molecule(tmp_path / "mine.toml")
+
+
+@pytest.mark.parametrize(
+    ("sites", "expected"),
+    [
+        ([(1.0, (0, 0, 0)), (1.0, (0, 0, 0)), (1.0, (1, 0, 0))], "coincide"),
+        ([(0.0, (0, 0, 0)), (0.0, (1, 0, 0))], "massless"),
+        ([(1.0, (0, 0, 0)), (0.0, (1, 0, 0))], "nothing resists its torque"),
+        (
+            [(1.0, (0, 0, 0)), (1.0, (0, 0, 1)), (0.0, (0.3, 0, 0.5))],
+            "off the axis of a linear body",
+        ),
+    ],
+)
+def test_sites_that_make_no_body(sites, expected):
+    with pytest.raises(MoleculeError, match=expected):
+        molecule(
+            "x",
+            tuple(
+                Site(name=f"A{k}", mass_u=m, position_A=tuple(map(float, x)))
+                for k, (m, x) in enumerate(sites)
+            ),
+        )

@@ -9,6 +9,7 @@ import numpy as np
 from rigidmd import BodyScene, Scene
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.assemble.build import build
+from rigidmd.commands.cli import main
 from rigidmd.compile import kernel
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NO_CELL, NOW, State
@@ -192,3 +193,16 @@ def noise_with_memory(rng, frames, shape, variance, time, interval):
         found[k] = x
         x = keep * x + np.sqrt(variance * (1 - keep**2)) * rng.standard_normal(shape)
     return found
+
+
+def refused(capsys, tmp_path, text, *arguments, code=2):
+    """The message for a scene text; checks that nothing was written and that there is no
+    traceback."""
+    scene = tmp_path / "bad.toml"
+    scene.write_text(text)
+    before = sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*"))
+    assert main(["run", str(scene), "-o", str(tmp_path / "out"), *arguments]) == code
+    assert sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*")) == before
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    return err
