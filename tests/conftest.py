@@ -37,6 +37,7 @@ from support.hooks import (  # noqa: E402, F401
     pytest_sessionfinish,
     pytest_terminal_summary,
 )
+from support.stops import again, stopped  # noqa: E402, F401
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,7 @@ for it.
 
 Kinds of scenes and counts follow a trial from outside with about 760 attacks. What that trial
 attacked besides is repeated elsewhere: texts of energies, damaged files and arbitrary input in
-test_fuzz.py, disks, signals and streams in test_faults.py, checkpoints in test_resume.py, names in
+test_fuzz.py, disks, signals and streams in test_faults.py, checkpoints in test_checkpoint.py, names in
 generated files in test_names.py.
 """
 

@@ -1,8 +1,5 @@
-"""Runs that are stopped and continue: to the same bits as one that never stopped."""
+"""Runs that are stopped and continue: to the same bits as one that never was."""
 
-import contextlib
-import copy
-import functools
 import hashlib
 import json
 import os
@@ -13,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-import zipfile
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -25,40 +21,25 @@ import pytest
 from support.common import ROOT, small_scene
 from support.processes import process, wait_until
 from support.scenes import FORTY_WATERS, MINIMISE, NPH, NPT, NVE, NVT, forty_waters
-from support.stops import contents, same_after_stops, stopped_at
+from support.stops import (
+    change,
+    contents,
+    everything,
+    same_after_stops,
+    stopped_at,
+    top,
+)
 
 from rigidmd.commands import cli
-from rigidmd.core.files import AppendedFile
-from rigidmd.engines.samples import NUMBERS
-from rigidmd.errors import CheckpointError, OutputError, RigidMDWarning, SimulationError
-from rigidmd.io import checkpoint
+from rigidmd.errors import CheckpointError
 from rigidmd.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from rigidmd.io.folder import CHECKPOINT, PREVIOUS, FolderLock
+from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 from rigidmd.run import Every, Simulation, run_together
 from rigidmd.run import resume as provenance
 from rigidmd.run.body import BodyRecord, BodyRun
 from rigidmd.run.molecular import MolecularRecord, MolecularRun
 from rigidmd.run.resume import Arrays
 from rigidmd.scene import Scene
-
-TOP = {
-    "body": {
-        "mass_kg": 0.15,
-        "inertia_kg_m2": [3e-4, 3.1e-4, 1.2e-4],
-        "pinned": True,
-        "inertia_about": "pivot",
-        "centre_of_mass_m": [0.0, 0.0, 0.04],
-    },
-    "gravity": {},
-    "start": {"euler_angles_deg": [0.0, 40.0, 0.0], "euler_rates_rad_s": [0.0, 0.0, 60.0]},
-    "run": {"duration_s": 0.5, "timestep_s": 0.005},
-    "output": {"interval_s": 0.02, "figures": False},
-}
-
-
-def top(integrator: str) -> dict:
-    """A heavy top."""
-    return TOP | {"run": TOP["run"] | {"integrator": integrator}}
 
 
 def test_a_run_that_is_stopped_ends_like_one_that_is_not(tmp_path):
@@ -153,29 +134,6 @@ def test_a_body_goes_on(integrator, capsys, tmp_path):
     *lines, last = motion.read_text().splitlines()
     motion.write_text("\n".join([*lines, last[: last.rindex(",")] + ",0.125"]) + "\n")
     assert cli.main(["compare", str(tmp_path / "whole"), str(tmp_path / "parts")]) == 1
-
-
-@pytest.fixture(scope="module")
-def stopped(tmp_path_factory):
-    """A run that was stopped after 60 of 100 steps, with checkpoints at 0 and 60: its folder, its
-    scene."""
-    folder = tmp_path_factory.mktemp("stopped")
-    (folder / "water.toml").write_text(
-        "[box]\ndensity_g_cm3 = 0.9\n[[molecules]]\nmodel = 'spce'\ncount = 40\n"
-        "[forces]\ncutoff_A = 5.0\ntruncation = 'smooth_switch'\n[start]\ntemperature_K = 298.0\n"
-        "[[stages]]\nensemble = 'nvt'\ntemperature_K = 298.0\nduration_ps = 0.1\ntimestep_fs = 1.0\n"
-        "[output]\nlog_interval_ps = 0.01\ntrajectory_interval_ps = 0.02\nfigures = false\n"
-    )
-    own = Scene.read(folder / "water.toml", {"threads": 1})
-    Simulation(own, folder / "run", observers=stopped_at({60})).run()
-    return folder
-
-
-@pytest.fixture
-def again(stopped, tmp_path):
-    """A copy of it."""
-    shutil.copytree(stopped, tmp_path / "copy")
-    return tmp_path / "copy"
 
 
 def test_the_command_resume_goes_on_and_lengthens(again, capsys):
@@ -301,19 +259,6 @@ def test_another_scene_is_not_gone_on_with(again, capsys):
     assert contents(again / "run") != before
 
 
-def everything(folder: Path) -> dict[str, object]:
-    """All that is in a folder: bytes of files, targets of links."""
-    found = {path.name: path for path in sorted(folder.iterdir()) if path.name != ".rigidmd-lock"}
-    return {
-        name: os.readlink(path)
-        if path.is_symlink()
-        else path.read_bytes()
-        if path.is_file()
-        else path.stat().st_mode
-        for name, path in found.items()
-    }
-
-
 def flip(path: Path) -> None:
     """Damage a file within its first half."""
     data = bytearray(path.read_bytes())
@@ -382,12 +327,6 @@ BROKEN = {
 }
 
 
-def change(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
-
-
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_refused_resume_changes_nothing(case, again, capsys):
     """Neither a summary nor frames beyond the checkpoint are lost: all is checked before the first
@@ -430,119 +369,6 @@ def test_frames_beyond_a_checkpoint_outlive_a_refused_resume(name, again, capsys
     capsys.readouterr()
     assert cli.main(["resume", str(run)]) == 2
     assert name in capsys.readouterr().err and everything(run) == before
-
-
-@pytest.mark.parametrize("command", ["report", "view", "analyse", "sweep", "run", "resume"])
-def test_no_command_writes_through_a_link(command, again, capsys):
-    """Folders of runs may come from outsiders, with links in the position of any file: what these
-    point to stays."""
-    run, away = again / "run", again / "away"
-    assert cli.main(["analyse", str(run), "--only", "density_profile"]) == 0
-    change(run / ".rigidmd-run", "log.csv", "log.csv\nreport.html\nview.html\nanalyses.csv")
-    for name in ("report.html", "view.html", "analyses.csv"):
-        (run / name).touch()
-    files = sorted(path.name for path in run.iterdir() if path.is_file())
-    assert not [name for name in files if "offsets" in name] and "density_profile.png" in files
-    shutil.copytree(run, again / "kept")
-    arguments = {
-        "run": [
-            "run",
-            str(again / "water.toml"),
-            "-o",
-            str(run),
-            "--force",
-            "--set",
-            "stages.0.duration_ps=0.01",
-        ],
-        "sweep": ["sweep", str(again / "water.toml"), "--set", "seed=1", "-o", str(run)],
-        "analyse": ["analyse", str(run), "--only", "density_profile"],
-    }
-    # a resumed run is rejected at the first link that it would continue, so each is tried by itself
-    for names in [[name] for name in files] if command == "resume" else [files]:
-        for folder in (run, away):
-            shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(again / "kept", run)
-        away.mkdir()
-        for name in names:
-            if name != ".rigidmd-lock":
-                (run / name).rename(away / name)
-                (run / name).symlink_to(away / name)
-        before = everything(away)
-        ended = cli.main(arguments.get(command, [command, str(run)]))
-        assert everything(away) == before, names
-        refuses = command != "run" and names != [".rigidmd-lock"]
-        assert ended == (2 if refuses else 0), (names, capsys.readouterr().err)
-
-
-def test_a_file_that_grows_replaces_what_has_its_name(tmp_path):
-    """A link, a pipe or a file of others: what a link points to stays, and no pipe is waited
-    for."""
-    (tmp_path / "victim").write_text("precious")
-    (tmp_path / "link").symlink_to(tmp_path / "victim")
-    (tmp_path / "broken").symlink_to(tmp_path / "nothing")
-    os.mkfifo(tmp_path / "pipe")
-    for name in ("link", "broken", "pipe", "victim"):
-        file = AppendedFile(tmp_path / name)
-        file.append(b"mine")
-        file.close()
-        assert (tmp_path / name).read_bytes() == b"mine" and not (tmp_path / name).is_symlink()
-        assert (tmp_path / "victim").read_text() == ("mine" if name == "victim" else "precious")
-    assert not (tmp_path / "nothing").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "setting"),
-    [
-        ("mine.trr", "output.trajectory=mine.trr"),
-        ("mine.gsd", "output.trajectory=mine.gsd"),
-        ("mine.pdb", "output.topology=mine.pdb"),
-        ("pressure_tensor.csv", "output.pressure_tensor_interval_ps=0.01"),
-        ("energy.png", "output.figures=true"),
-        ("last_good_state.npz", None),
-        ("log.csv", None),
-    ],
-)
-def test_force_replaces_only_what_a_run_has_written(name, setting, again, capsys):
-    run = again / "run"
-    marker = run / ".rigidmd-run"
-    marker.write_text(
-        "".join(
-            line for line in marker.read_text().splitlines(keepends=True) if line.strip() != name
-        )
-    )
-    (run / name).write_text("precious")
-    before = everything(run)
-    more = ["--set", setting] if setting else []
-    for how in (
-        ("--force", "--resume")
-        if setting
-        and "trajectory" not in setting
-        and "topology" not in setting
-        and "pressure" not in setting
-        else ("--force",)
-    ):
-        assert cli.main(["run", str(again / "water.toml"), "-o", str(run), how, *more]) == 2
-        said = capsys.readouterr().err
-        assert (
-            f"{name} exists, was not written by rigidmd, and would be replaced" in said
-            and "compiling" not in said
-        )
-        assert everything(run) == before
-
-
-def test_force_replaces_only_what_an_export_has_written(again, capsys):
-    made = again / "made"
-    command = ["export", str(again / "water.toml"), "--to", "gromacs", "-o", str(made)]
-    change(again / "water.toml", "smooth_switch", "shift")
-    assert cli.main(command) == 0 and cli.main([*command, "--force"]) == 0
-    change(made / ".rigidmd-export", "run.sh\n", "")
-    (made / "run.sh").write_text("precious")
-    before = everything(made)
-    assert cli.main([*command, "--force"]) == 2
-    assert (
-        "run.sh exists, was not written by rigidmd" in capsys.readouterr().err
-        and everything(made) == before
-    )
 
 
 def test_a_callback_that_changes_the_directory(again, monkeypatch):
@@ -743,267 +569,6 @@ def test_what_an_observer_remembers_is_declared_once(again):
         ).run()
 
 
-def test_a_checkpoint_of_another_version_is_refused(again, capsys):
-    kept = read_checkpoint(again / "run" / CHECKPOINT)
-    for schema, age in ((1, "an earlier"), (3, "an earlier"), (99, "a later")):
-        name_of_values = "values" if schema > 3 else "told"
-        values = np.frombuffer(json.dumps(kept.values | {"schema": schema}).encode(), np.uint8)
-        for name in (CHECKPOINT, PREVIOUS):
-            with zipfile.ZipFile(again / "run" / name, "w") as archive:
-                for member, array in {name_of_values: values, **kept.arrays}.items():
-                    with archive.open(f"{member}.npy", "w") as file:
-                        np.lib.format.write_array(file, array)
-            with zipfile.ZipFile(again / "run" / name, "a") as archive:
-                archive.writestr("contents", checkpoint._contents(archive))
-        before = everything(again / "run")
-        assert cli.main(["resume", str(again / "run")]) == 2
-        assert (
-            f"was written by {age} rigidmd (version {schema} of the format"
-            in capsys.readouterr().err
-        )
-        assert everything(again / "run") == before
-
-
-def altered(array: np.ndarray) -> dict[str, np.ndarray]:
-    """An array with other values: every kind of change that its type can hold."""
-    changed = {
-        "longer": np.concatenate([array.reshape(-1), array.reshape(-1)[:1]]),
-        "text": array.astype(str),
-    }
-    changed["of another type"] = array.astype(
-        np.float32 if array.dtype == np.float64 else np.float64
-    )
-    if array.ndim:
-        changed["shorter"] = array[:-1]
-    values = {"off by one": lambda x: x + 1, "negative": lambda x: -x - 1, "zero": lambda x: 0 * x}
-    if array.dtype.kind == "f":
-        values |= {
-            "nan": lambda x: x * np.nan,
-            "infinite": lambda x: x + np.inf,
-            "huge": lambda x: x + 1e300,
-        }
-    else:
-        values |= {
-            "huge": lambda x: np.iinfo(array.dtype).max,
-            "lowest": lambda x: np.iinfo(array.dtype).min,
-        }
-    with np.errstate(all="ignore"):
-        for name, function in values.items():
-            for place in (np.s_[...], *([0] if array.size > 1 else [])):
-                changed[f"{name}, {'all' if place is ... else 'first'}"] = other = array.copy()
-                flat = other.reshape(-1)
-                flat[place] = function(flat[place])
-    return {
-        name: other
-        for name, other in changed.items()
-        if array.size and not np.array_equal(array, other)
-    }
-
-
-def leaves(value: object, path: tuple = ()) -> list[tuple]:
-    """The paths of all values in nested lists and dictionaries, and of these."""
-    inner = (
-        value.items()
-        if isinstance(value, dict)
-        else enumerate(value)
-        if isinstance(value, list)
-        else ()
-    )
-    return [path, *(leaf for key, part in inner for leaf in leaves(part, (*path, key)))]
-
-
-def changes_of(kept: Checkpoint) -> list[tuple[str, Checkpoint]]:
-    """A checkpoint with one value changed, in every way."""
-    found = []
-    for name, array in kept.arrays.items():
-        for kind, other in altered(array).items():
-            found.append((f"{name}: {kind}", Checkpoint(kept.values, kept.arrays | {name: other})))
-        found.append(
-            (
-                f"{name}: left out",
-                Checkpoint(kept.values, {k: a for k, a in kept.arrays.items() if k != name}),
-            )
-        )
-    for path in leaves(kept.values)[1:]:
-        *way, last = path
-        whole = functools.reduce(lambda part, key: part[key], way, kept.values)[last]
-        others = [
-            None,
-            "x",
-            [],
-            {},
-            [None],
-            -1.5,
-            float("nan"),
-            float("inf"),
-            10**30,
-            -(10**30),
-            40,
-            7,
-            -1,
-        ]
-        others += [whole + 1, -whole, whole + 0.5] if isinstance(whole, int | float) else []
-        for other in others:
-            told = copy.deepcopy(kept.values)
-            functools.reduce(lambda part, key: part[key], way, told)[last] = other
-            if other != whole:
-                found.append(
-                    (f"{'.'.join(map(str, path))}: {other!r:.20}", Checkpoint(told, kept.arrays))
-                )
-    return found
-
-
-#: What nothing else in a checkpoint decides: other values of these are of another run, which must
-#: end by itself. The time at which a list was built decides how far ahead the next one is built,
-#: and so the order of sums.
-FREE = re.compile(
-    r"state/(velocity|angular_momentum_body|energy_ledger|extra_variables|position|rotation)|Sampler/|engine/load.torque_body|engine/\w+.times"
-)
-
-
-@pytest.mark.parametrize("kept", [[], [0], [1, 2, 3, 4], [-1, 0], [True, 0], ["0", 0], {}, "ab", 3])
-@pytest.mark.parametrize("owner", ["LogFile", "Frames"])
-def test_sizes_that_are_none_cut_no_file(owner, kept, again):
-    found = read_checkpoint(again / "run" / CHECKPOINT)
-    found.values["of"][owner]["kept"] = kept
-    write_checkpoint(again / "run", found)
-    before = everything(again / "run")
-    assert cli.main(["resume", str(again / "run")]) == 2
-    assert everything(again / "run") == before
-
-
-@pytest.mark.parametrize(
-    ("kind", "count"),
-    [("molecules", 25), ("verlet", 60), ("dop853", 60)]
-    + [
-        pytest.param(kind, 10**6, marks=pytest.mark.soak)
-        for kind in ("molecules", "verlet", "dop853", "rk4")
-    ],
-)
-def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
-    """With right checksums: rejected with a sentence, or they change no bit. No crash, no hang, no
-    wrong course."""
-    data = (
-        forty_waters(NVT | {"duration_ps": 0.06}, threads=1)
-        if kind == "molecules"
-        else top(kind.replace("verlet", "velocity_verlet"))
-    )
-    stop = stopped_at({20} if kind == "molecules" else {30})
-    stop.interval = 0.001 if kind == "molecules" else 0.005
-    look = Every(stop.interval, lambda moment: None)
-    run = tmp_path / "run"
-    Simulation(Scene.from_dict(data), run, observers=stop).run()
-    shutil.copytree(run, tmp_path / "kept")
-    kept = read_checkpoint(run / CHECKPOINT)
-    Simulation(Scene.from_dict(data), run, observers=look, resume=True).run()
-    whole, wrong, same, refused = contents(run), [], 0, 0
-    changes = changes_of(kept)
-    for k in np.random.default_rng(count).permutation(len(changes))[:count].tolist():
-        name, changed = changes[k]
-        shutil.rmtree(run)
-        shutil.copytree(tmp_path / "kept", run)
-        before = everything(run)
-        write_checkpoint(run, changed)
-        with contextlib.suppress(FileNotFoundError):
-            before |= {file: (run / file).read_bytes() for file in (CHECKPOINT, PREVIOUS)}
-        try:
-            simulation = Simulation(
-                Scene.from_dict(data), run, observers=look, resume=True, warn=lambda sentence: None
-            )
-            simulation.run()
-        except CheckpointError:
-            refused += 1
-            if everything(run) != before:
-                wrong.append(f"{name}: refused, and files have changed")
-        except OutputError as error:
-            refused += 1
-            if "has changed or is damaged" not in str(error) and "shorter than it was" not in str(
-                error
-            ):
-                wrong.append(f"{name}: {error}")
-        except SimulationError as error:
-            if not FREE.match(name):
-                wrong.append(f"{name}: {error}")
-        except Exception as error:
-            wrong.append(f"{name}: {error!r}")
-        else:
-            same += 1
-            if contents(run) != whole and not FREE.match(name):
-                wrong.append(f"{name}: other bits")
-    assert not wrong, f"{len(wrong)} of {count}, {same} the same, {refused} refused:\n" + "\n".join(
-        wrong
-    )
-    assert refused > same / 2
-
-
-@pytest.mark.parametrize("damage", ["flipped", "cut", "empty"])
-def test_a_damaged_checkpoint_gives_way_to_the_one_before(damage, again, capsys):
-    path = again / "run" / CHECKPOINT
-    data = bytearray(path.read_bytes())
-    with zipfile.ZipFile(path) as archive:
-        longest = max(archive.infolist(), key=lambda info: info.compress_size)
-    data[longest.header_offset + longest.compress_size // 2] ^= (
-        4  # headers have bits without meaning
-    )
-    path.write_bytes(
-        {"flipped": bytes(data), "cut": bytes(data[: len(data) // 3]), "empty": b""}[damage]
-    )
-    assert cli.main(["resume", str(again / "run")]) == 0
-    said = capsys.readouterr().err
-    assert "checkpoint.npz: is damaged" in said and "The checkpoint before it is used" in said
-    shutil.copy(again / "run" / CHECKPOINT, again / "run" / "kept.npz")
-    for name in (CHECKPOINT, PREVIOUS):
-        (again / "run" / name).write_bytes(b"nothing")
-    before = contents(again / "run")
-    assert cli.main(["resume", str(again / "run")]) == 2
-    assert contents(again / "run") == before
-
-
-def test_every_flipped_bit_of_a_checkpoint_is_seen(again):
-    whole = (again / "run" / CHECKPOINT).read_bytes()
-    kept = read_checkpoint(again / "run" / CHECKPOINT)
-    rng = np.random.default_rng(1)
-    for place in rng.integers(0, len(whole), 200).tolist():
-        data = bytearray(whole)
-        data[place] ^= 1 << int(rng.integers(8))
-        (again / "bad.npz").write_bytes(bytes(data))
-        try:
-            found = read_checkpoint(again / "bad.npz")
-        except CheckpointError:
-            continue
-        # bits of the archive that mean nothing, such as times
-        assert found.values == kept.values
-        assert all(np.array_equal(found.arrays[name], array) for name, array in kept.arrays.items())
-
-
-@pytest.mark.parametrize("size", [10, 300_000])
-def test_an_array_of_another_checkpoint_is_seen(size, tmp_path):
-    """Each array is right by itself, whatever its size; together they are of two runs."""
-    for folder, value in (("one", 1.0), ("two", 2.0)):
-        (tmp_path / folder).mkdir()
-        arrays = {"a": np.full(size, value), "b": np.full(7, value)}
-        write_checkpoint(tmp_path / folder, Checkpoint({"of": {}}, arrays))
-    one, two = (tmp_path / folder / CHECKPOINT for folder in ("one", "two"))
-    assert np.array_equal(read_checkpoint(one).arrays["a"], np.ones(size))
-    with zipfile.ZipFile(one) as first, zipfile.ZipFile(two) as second:
-        members = {name: first.read(name) for name in first.namelist()}
-        members["a.npy"] = second.read("a.npy")
-    with zipfile.ZipFile(one, "w") as mixed:
-        for name, content in members.items():
-            mixed.writestr(name, content)
-    with pytest.raises(CheckpointError, match="its contents differ from those that were written"):
-        read_checkpoint(one)
-
-
-def test_a_folder_without_a_checkpoint(again, capsys):
-    for name in (CHECKPOINT, PREVIOUS):
-        (again / "run" / name).unlink()
-    assert cli.main(["resume", str(again / "run")]) == 2
-    assert "holds no checkpoint (it holds final.npz, log.csv" in capsys.readouterr().err
-    assert cli.main(["resume", str(again)]) == 2
-    assert "is not the folder of a run" in capsys.readouterr().err
-
-
 def test_a_run_that_was_killed_before_its_first_checkpoint_begins_again(again):
     whole = contents(again / "run")
     for name in (CHECKPOINT, PREVIOUS, "final.npz", "summary.json"):
@@ -1012,16 +577,6 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_again(again):
     (again / "run" / "log.csv").write_text("".join(log[:2]))
     assert cli.main(["resume", str(again / "run"), "--until", "0.06ps"]) == 0
     assert contents(again / "run") == whole
-
-
-def test_one_run_at_a_time_writes_into_a_folder(again, capsys):
-    lock = FolderLock(again / "run")
-    lock.take()
-    command = ["run", str(again / "water.toml"), "-o", str(again / "run")]
-    for more in ("--force", "--resume"):
-        assert cli.main([*command, more]) == 2
-        assert "another run is writing in" in capsys.readouterr().err
-    lock.release()
 
 
 def test_a_run_stops_before_its_wall_time_is_up(stopped, tmp_path, capsys, monkeypatch):
@@ -1100,16 +655,6 @@ def test_a_run_that_is_killed_goes_on(times, stopped, tmp_path):
     assert [name for name in whole if whole[name] != parts[name]] == []
 
 
-def test_a_failed_write_stops_the_run(stopped, tmp_path):
-    """A limit on the size of files stands for a full disk; what was written before is whole."""
-    command = f"ulimit -f 40; {sys.executable} -m rigidmd run {stopped / 'water.toml'} -o {tmp_path / 'run'} "
-    command += "--set stages.0.duration_ps=20 --set output.log_interval_ps=0.002 --set output.checkpoint_minutes=false"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "cannot be written: File too large" in done.stderr
-    assert (tmp_path / "run" / "log.csv").read_bytes().endswith(b"\n")
-
-
 @pytest.mark.soak
 def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     """The recipe of the manual, with a scheduler that starts the next job at once."""
@@ -1137,76 +682,6 @@ def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     assert [name for name in whole if whole[name] != parts[name]] == []
 
 
-# --- files that vanish during a run ---------------------------------------------------------------
-
-
-def taken_away(path: Path, how: str) -> None:
-    """Remove a file, cut it, or put another one in its position."""
-    if how == "removed":
-        path.unlink()
-    elif how == "changed by another program":
-        os.truncate(path, 0)
-    else:
-        content = path.read_bytes()
-        path.unlink()
-        path.write_bytes(content)
-
-
-def loses(tmp_path: Path, name: str, how: str, stages: int, **output) -> Simulation:
-    """A run whose file is removed or replaced after its first step, in stages of two steps."""
-    trajectory = name if name.startswith("trajectory") else "trajectory.xtc"
-    data = {
-        "stages": [{"duration_ps": 0.004}] * stages,
-        "output": {"figures": False, "trajectory": trajectory} | output,
-    }
-    once = [True]
-
-    def act(moment):
-        if moment.step == 1 and once.pop():
-            taken_away(tmp_path / "run" / name, how)
-            once.append(False)
-
-    return Simulation(
-        small_scene({"argon": 8}, 20.0, **data), tmp_path / "run", observers=[Every(0.002, act)]
-    )
-
-
-VANISHING = [
-    ("log.csv", "removed"),
-    ("log.csv", "changed by another program"),
-    ("trajectory.xtc", "changed by another program"),
-    ("trajectory.xtc", "replaced by another file"),
-    ("trajectory.gsd", "removed"),
-]
-
-
-@pytest.mark.parametrize(("name", "how"), VANISHING)
-def test_a_file_that_vanishes_stops_the_run_at_the_next_checkpoint(name, how, tmp_path):
-    with pytest.raises(
-        OutputError, match=rf"stopped at step 2 .*{name} was {how} while the run was writing it"
-    ):
-        loses(tmp_path, name, how, stages=2).run()
-    assert not (tmp_path / "run" / "summary.json").exists()
-
-
-@pytest.mark.parametrize("checkpoints", [True, False])
-@pytest.mark.parametrize(("name", "how"), VANISHING)
-def test_a_file_that_vanishes_in_the_last_stage_is_noted_and_not_listed(
-    name, how, checkpoints, tmp_path
-):
-    output = {} if checkpoints else {"checkpoint_minutes": False}
-    with pytest.warns(RigidMDWarning, match=f"{name} was {how} while the run was writing it"):
-        results = loses(tmp_path, name, how, stages=1, **output).run()
-    listed = json.loads((tmp_path / "run" / "summary.json").read_text())["files"]
-    assert listed == [str(path) for path in results.files]
-    assert all(Path(path).is_file() for path in listed)
-    assert (str(tmp_path / "run" / name) in listed) == (how != "removed")
-    assert len(results["time"]) == 2
-
-
-# --- the duration of the last stage ---------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "ramp", [{"temperature_K": [90.0, 140.0]}, {"temperature_K": [140.0, 90.0]}]
 )
@@ -1229,9 +704,3 @@ def test_the_duration_of_a_ramp_stays(ramp, tmp_path):
     Simulation(scene(0.004, **level), tmp_path / "level").run()
     longer = Simulation(scene(0.008, **level), tmp_path / "level", resume=True).run()
     assert longer["time"][-1] == pytest.approx(0.008)
-
-
-def test_a_checkpoint_of_other_columns_has_another_schema():
-    """The table of samples has no names: a change of the columns needs a new number here and there."""
-    digest = hashlib.sha256(" ".join(NUMBERS).encode()).hexdigest()[:8]
-    assert (checkpoint.SCHEMA, digest) == (5, "d0fdadad")

@@ -519,7 +519,7 @@ FRESH: list[Mutation] = [
         "io/checkpoint.py",
         "        if m.filename != CONTENTS",
         "        if m.filename != CONTENTS and m.file_size < 1_000_000",
-        ("run/test_resume.py::test_an_array_of_another_checkpoint_is_seen",),
+        ("io/test_checkpoint.py::test_an_array_of_another_checkpoint_is_seen",),
     ),
     Mutation(
         "F60",

@@ -181,9 +181,9 @@ TIERS = {
             "a_forked_child_leaves_the_files_of_the_run_alone",
             "a_run_that_is_stopped_ends_like_one_that_is_not",
             "every_ensemble_goes_on_to_the_same_bits[hybrid_monte_carlo*",
-            "no_command_writes_through_a_link*",
-            "wrong_numbers_in_a_checkpoint_are_refused[dop853*",
         ),
+        "io/test_checkpoint.py": ("wrong_numbers_in_a_checkpoint_are_refused[dop853*",),
+        "io/test_folder.py": ("no_command_writes_through_a_link*",),
         "run/test_schedule.py": ("a_signal_stops_with_a_summary_and_its_code[15*",),
         "run/test_simulation.py": tuple(
             f"every_system_runs_a_few_steps[{name}]" for name in ("gay_berne", "water_nitrogen")
