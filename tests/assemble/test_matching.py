@@ -1,4 +1,4 @@
-"""Molecules of a structure file are matched with those of the scene, whatever the order and names of their atoms."""
+"""Molecules of a structure file are matched with molecules of the scene in any order of atoms."""
 
 import dataclasses
 import re

@@ -1,4 +1,4 @@
-"""Forces and energies of a state: those of the last step where they are known, and those of another engine."""
+"""Forces of a state: from the last step where they are known; two engines compared."""
 
 import numpy as np
 import pytest
