@@ -43,9 +43,8 @@ import rigidmd
 from rigidmd.commands.cli import main as rigidmd_main
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests")]
-import scenes  # noqa: E402
-import schema_scenes  # noqa: E402
+sys.path[:0] = [str(ROOT / "tests")]  # as a script
+from support import scenes, schema_scenes  # noqa: E402
 
 Tables = dict[str, Any]
 Parts = dict[str, dict[str, str]]  # part -> member -> digest

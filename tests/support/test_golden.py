@@ -2,9 +2,10 @@
 
 import json
 
-import golden
 import numpy as np
 import pytest
+
+from support import golden
 
 
 @pytest.fixture(scope="module")
