@@ -286,7 +286,7 @@ FRESH: list[Mutation] = [
         "None if error is None else error / n",
         "None if error is None else error / n**0.5",
         (
-            "features/studies/test_sweep.py::test_the_energy_of_a_molecule_has_its_share_of_the_error",
+            "features/studies/sweep/test_table.py::test_the_energy_of_a_molecule_has_its_share_of_the_error",
         ),
     ),
     Mutation(
@@ -511,7 +511,7 @@ FRESH: list[Mutation] = [
         "studies/sweep/table.py",
         "        numbers = values.mean(), values.min(), values.max(), values[-1]",
         "        numbers = values.mean(), values.max(), values.min(), values[-1]",
-        ("features/studies/test_sweep.py::test_bodies_and_words",),
+        ("features/studies/sweep/test_table.py::test_bodies_and_words",),
     ),
     Mutation(
         "F59",

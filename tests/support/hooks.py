@@ -30,7 +30,7 @@ LONGEST = (
     "forces/ewald/test_ewald.py",
     "features/bodies/test_systems.py",
     "features/external/test_lammps.py",
-    "features/studies/test_sweep.py",
+    "features/studies/sweep/test_sweeping.py",
     "run/test_simulation.py",
     "compile/test_compile.py",
     "forces/ewald/test_dispersion.py",
@@ -198,7 +198,7 @@ TIERS = {
         "end_to_end/test_hostile_input.py": (
             "nothing_in_the_working_directory_is_executed_or_obeyed*",
         ),
-        "features/studies/test_sweep.py": (
+        "features/studies/sweep/test_points.py": (
             "a_killed_process_loses_its_point_alone_and_a_signal_stops_all",
             "points_run_on_a_cluster_of_dask",
             "points_that_fail_are_told_and_repeated",
@@ -262,9 +262,9 @@ TIERS = {
         ),
         "features/studies/test_stability.py": ("quick*",),
         "end_to_end/test_hostile_input.py": ("analyses_execute_and_obey_nothing*",),
-        "features/studies/test_sweep.py": (
+        "features/studies/sweep/test_limits.py": ("energy_at_a_step_of_zero_has_a_joint_fit*",),
+        "features/studies/sweep/test_points.py": (
             "a_second_interrupt_ends_all_points_at_once",
-            "energy_at_a_step_of_zero_has_a_joint_fit*",
             "points_end_with_their_sweep*",
         ),
         "features/potentials/test_user_code.py": (

@@ -117,7 +117,7 @@ CORE = [
         "    return np.std(np.asarray(values, float), axis=0, ddof=1)",
         "    return np.std(np.asarray(values, float), axis=0, ddof=0)",
         (
-            "features/studies/test_sweep.py::test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run",
+            "features/studies/sweep/test_table.py::test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run",
         ),
     ),
     Mutation(

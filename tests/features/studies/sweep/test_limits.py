@@ -1,0 +1,171 @@
+"""Averages at a time step of zero."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+from support.sweeps import ARGON, run_here, table
+
+from rigidmd.commands import cli
+from rigidmd.studies.extrapolation import extrapolate
+from rigidmd.studies.sweep import limits, sweeping
+from rigidmd.studies.sweep.plan import parse_axis
+from rigidmd.studies.sweep.table import POTENTIAL
+
+STEP = "stages.0.timestep_fs"
+
+
+def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(limits, "MOST_PANELS", 2)  # drawing takes most of the time
+    folder = tmp_path / "steps"
+    swept = ["--set", f"{STEP}=5,10,20", "--set", "start.temperature_K=90,120"]
+    fixed = [
+        "--set",
+        "stages.0.duration_ps=2",
+        "--set",
+        "output.log_interval_ps=0.02",
+        "-o",
+        str(folder),
+    ]
+    axes = [parse_axis(text) for text in (*swept[1::2][:2], fixed[1], fixed[3])]
+    run_here(argon, axes, folder, step=STEP)
+    assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
+    assert re.search(r"first peak \(Å\) .*\d ± \d", capsys.readouterr().out)
+    assert cli.main(["sweep", str(argon), *swept, *fixed, "--extrapolate", STEP]) == 0
+    said = capsys.readouterr().out
+    assert (
+        "averages at a step of 0, from errors of order dt² (velocity_verlet) in stages.0.timestep_fs"
+        in said
+    )
+    assert re.search(r"no joint fit: temperature_K = 90: it is for nvt and npt, .* is nve", said)
+    assert "no limit" not in said  # the edges of the box are the same at all steps, to rounding
+    assert "sweep.png, extrapolation.csv, extrapolation.png, extrapolation.html" in said
+    with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
+        rows = {(row["start.temperature_K"], row["average"]): row for row in csv.DictReader(file)}
+    means = {
+        (row["start.temperature_K"], row[STEP]): float(row["Temperature (K)"])
+        for row in table(folder)
+    }
+    for temperature in ("90", "120"):
+        assert any(at == temperature and "first peak (Å)" in name for at, name in rows)
+        row = rows[temperature, "Temperature (K)"]
+        assert (row["order"], row["degrees of freedom"]) == ("2", "1")
+        bias = float(row["bias at 5 fs"])
+        assert float(row["limit"]) + bias == pytest.approx(means[temperature, "5"], rel=1e-6)
+        assert float(row["limit error"]) > 0
+    assert "<svg" in (folder / "extrapolation.html").read_text("utf-8")
+    assert (folder / "extrapolation.png").stat().st_size > 10_000
+
+
+def test_energy_at_a_step_of_zero_has_a_joint_fit(argon, tmp_path, capsys):
+    """Next to the independent one, with a smaller error, and with the heat capacity."""
+    folder = tmp_path / "steps"
+    stage = {"ensemble": "nvt", "temperature_K": 150.0, "duration_ps": 120.0}
+    fixed = {f"stages.0.{key}": value for key, value in stage.items()}
+    fixed["box.lengths_A"] = 17.0
+    axes = sweeping.axes_of({STEP: [10, 20], "seed": [1, 2]} | fixed)
+    run_here(argon, axes, folder, step=STEP)
+    assert (
+        cli.main(["sweep", str(argon), "-o", str(folder), "--collect", "--extrapolate", STEP]) == 0
+    )
+    said = capsys.readouterr().out
+    for kind in ("independent", "joint"):
+        assert re.search(rf"U per molecule \(kJ/mol\) +{kind} ", said)
+    assert re.search(r"c_v \(J/\(mol K\)\) +fluctuations +\d", said)
+    with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
+        rows = {(row["average"], row["fit"]): row for row in csv.DictReader(file)}
+    joint, alone = (rows[POTENTIAL, kind] for kind in ("joint", "independent"))
+    assert 0 < float(joint["limit error"]) < 0.8 * float(alone["limit error"])
+    apart = float(joint["limit"]) - float(alone["limit"])
+    assert abs(apart) < 3 * float(alone["limit error"])
+    assert float(joint["bias at 20 fs"]) == pytest.approx(4 * float(joint["bias at 10 fs"]))
+    assert 12 < float(rows["c_v (J/(mol K))", "fluctuations"]["limit"]) < 30
+
+
+def test_values_of_replicas_together_are_extrapolated(argon, tmp_path):
+    """Not the means of the values of single runs: heights of peaks differ, and diffusion has none
+    there."""
+    folder = tmp_path / "steps"
+    swept = {STEP: [5, 10], "seed": [1, 2], "stages.0.duration_ps": 2.0}
+    points = run_here(argon, sweeping.axes_of(swept), folder, step=STEP).points
+    assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
+    with (folder / "analysis.csv").open(encoding="utf-8") as file:
+        together = {float(row[STEP]): row for row in csv.DictReader(file)}
+    name = next(name for name in together[5.0] if "height" in name and "error" not in name)
+    with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
+        limit = next(row for row in csv.DictReader(file) if row["average"] == name)
+    for step, row in together.items():
+        biased = float(limit["limit"]) + float(limit[f"bias at {step:g} fs"])
+        assert biased == pytest.approx(float(row[name]), rel=1e-6)
+        tables = [
+            json.loads((folder / point.folder / "analysis.json").read_text())["analyses"]["rdf"][
+                "values"
+            ]
+            for point in points
+            if point.values[STEP] == step
+        ]
+        singles = [
+            next(value for value in values if "height" in value["name"])["value"]
+            for values in tables
+        ]
+        assert abs(np.mean(singles) - float(row[name])) > 1e-4
+    # analyses that are not possible fail only if they are named
+    assert cli.main(["analyse", str(folder), "--extrapolate", STEP]) == 0
+
+
+def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path):
+    """By dt⁴ for srkn_4: 1, 16, 81 times the slope."""
+    folder = tmp_path / "steps"
+    fixed = {
+        "stages.0.duration_ps": 2.0,
+        "output.log_interval_ps": 0.02,
+        "stages.0.integrator": "srkn_4",
+    }
+    axes = sweeping.axes_of({STEP: [5, 10, 20]} | fixed)
+    found = limits.extrapolate_sweep(run_here(argon, axes, folder, step=STEP), STEP)
+    assert "dt⁴ (srkn_4)" in found.title
+    assert {limit.fit.order for limit in found.limits} == {4}
+    limit = next(limit for limit in found.limits if len(limit.points) == 3)
+    assert limit.fit == extrapolate(limit.points, order=4) != extrapolate(limit.points, order=2)
+
+
+def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):
+    (scene := tmp_path / "argon.toml").write_text(ARGON + "[[stages]]\nduration_ps = 1\n")
+    steps = ["--set", "stages.0.timestep_fs=2,4"]
+    for arguments, expected in (
+        (
+            [*steps, "--extrapolate", "stages.nve.timestep_fs"],
+            "is not varied. This sweep varies stages.0.timestep_fs",
+        ),
+        (
+            ["--set", "seed=1,2", "--extrapolate", "seed"],
+            "seed is not the time step of a stage of molecules",
+        ),
+        (
+            [
+                *steps,
+                "--extrapolate",
+                "stages.0.timestep_fs",
+                "--to",
+                "slurm",
+                "--walltime",
+                "1:00:00",
+            ],
+            "needs results",
+        ),
+        (
+            [*steps, "--extrapolate", "stages.0.timestep_fs"],
+            "is not the step of the stage whose averages are taken",
+        ),
+    ):
+        assert cli.main(["sweep", str(scene), *arguments, "-o", str(tmp_path / "none")]) == 2
+        assert expected in capsys.readouterr().err
+        assert not (tmp_path / "none").exists()
+    point = finished / "temperature_K=90_seed=1"
+    assert (
+        cli.main(["analyse", str(point), "--extrapolate", "stages.0.timestep_fs", "--only", "rdf"])
+        == 2
+    )
+    assert "needs a sweep over a time step" in capsys.readouterr().err
