@@ -383,7 +383,7 @@ def cases() -> dict[str, Callable[[], Parts]]:
         tables = tables_of(name)
         if name != "barostats" and "engine" not in tables and "auto" not in str(tables):
             running[f"schema {name}"] = shortened(tables)
-    gas = changed(tables_of("barostats"), {"box.density_g_cm3": 0.3})  # room to contract
+    gas = changed(tables_of("barostats"), {"box.density_g_cm3": 0.3})  # so that it may contract
     for name, changes in BAROSTATS.items():
         changes = {f"stages.0.{key}": value for key, value in changes.items()}
         running[f"barostat {name}"] = shortened(changed(gas, changes))
