@@ -1,57 +1,30 @@
-"""Input that was made to break: each is rejected at once, with what is wrong, where and what was
-expected."""
+"""Input that was made to break: each is refused at once, with what is wrong, where and what was expected."""
 
 import io
 import os
-import re
-import shutil
 import subprocess
 import sys
-import time
-import tracemalloc
 import zipfile
-from functools import partial
-from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 import tomli_w
 from ase.data import chemical_symbols
-from support.common import ROOT
+from support.common import refusal
 from support.processes import with_settings
 from support.scenes import FROM_FILE, GOOD, SATELLITE, STRUCTURES
 
-import rigidmd
-from rigidmd.assemble import memory_check as room
 from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
 from rigidmd.core import process
-from rigidmd.core.process import python_process
 from rigidmd.core.state import state_of
 from rigidmd.core.state_file import SavedState, write_state
 from rigidmd.core.toml import line_of
-from rigidmd.engines.samples import COLUMNS, Sample, Samples
 from rigidmd.errors import MoleculeError, RigidMDError, SceneError, StructureError
-from rigidmd.forces.ewald import direct_sum as vectors
-from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene import Scene
 from rigidmd.scene.models import SYMBOLS, read_molecule
 
 DEEP = "[" * 1000 + "]" * 1000
-AT_ONCE = 5.0  # s of computing
-
-
-def refusal(capsys, tmp_path, text, *arguments, commands=("check",)):
-    """The message for a scene, the same of each command."""
-    (tmp_path / "scene.toml").write_text(text)
-    messages = set()
-    for command in commands:
-        begin = time.process_time()
-        assert main([command, str(tmp_path / "scene.toml"), *arguments]) == 2
-        assert time.process_time() - begin < AT_ONCE
-        messages.add(capsys.readouterr().err)
-    assert len(messages) == 1
-    return messages.pop()
 
 
 def own_molecule(position="[0.0, 0.0, 1.0]", more=""):
@@ -389,199 +362,6 @@ def test_a_terminal_without_the_letters_ends_no_command(monkeypatch, tmp_path):
     assert rb"20.0000 x 20.0000 x 20.0000 \xc5" in written.getvalue()
 
 
-# memory
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        (
-            GOOD.replace("count = 20", f"count = {10**12}"),
-            "not enough memory: a system of 1000000000000 molecules with",
-        ),
-        (
-            GOOD.replace("count = 20", f"count = {2**63 - 1}"),
-            "not enough memory: a system of 9223372036854775807",
-        ),
-        (
-            GOOD + '[forces]\nelectrostatics = "pme"\npme_grid = [4096, 4096, 4096]\n',
-            "a single array of it needs 275 GB",
-        ),
-    ],
-)
-def test_a_scene_beyond_the_machine_is_refused_with_numbers(
-    text, expected, capsys, monkeypatch, tmp_path
-):
-    monkeypatch.chdir(tmp_path)
-    for free in (process, room):
-        monkeypatch.setattr(
-            free, "free_memory", lambda: 8e9
-        )  # between commands what is free changes
-    message = refusal(capsys, tmp_path, text, commands=("check", "energy", "run"))
-    assert expected in message
-    assert "and this machine has 8 GB free" in message
-    assert not (tmp_path / "runs").exists()
-
-
-def test_the_memory_of_a_run_is_compared_before_it_is_used(monkeypatch, tmp_path):
-    scene = Scene.from_dict(
-        {
-            "box": {"lengths_A": 60.0, "periodic": False},
-            "molecules": [{"model": "spce", "count": 2000}],
-            "start": {"temperature_K": 300.0},
-            "stages": [{"duration_ps": 0.01}],
-        }
-    )
-    assert isinstance(scene, MolecularScene)
-    needed = room.bytes_of(build(scene))
-    assert needed > 5e6
-    monkeypatch.setattr(process, "free_memory", lambda: needed / 0.94)
-    build(scene)
-    monkeypatch.setattr(process, "free_memory", lambda: needed / 0.96)
-    with pytest.raises(
-        SceneError, match=r"not enough memory: the run needs .* and this machine has .* GB free"
-    ):
-        build(scene)
-
-
-def test_a_body_with_more_samples_than_there_is_room_for(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(process, "free_memory", lambda: 8e9)
-    text = SATELLITE.replace("timestep_s = 0.01", "timestep_s = 1e-8").replace(
-        "interval_s = 0.1", "interval_s = 1e-8"
-    )
-    message = refusal(capsys, tmp_path, text)
-    assert (
-        "not enough memory: a run with 1e+08 samples needs 270 GB of memory, and this machine has 8 GB"
-        in message
-    )
-
-
-@pytest.mark.parametrize(
-    ("changes", "lines", "gigabytes"),
-    [
-        ({"stages.0.duration_ps": 2e5, "output.log_interval_ps": 0.002}, "1e+08", "87.1 GB"),
-        (
-            {"stages.0.duration_ps": 2e5, "output.log_interval_ps": 1e-6},
-            "2e+08",
-            "174 GB",
-        ),  # a line each step
-        ({"stages.0.duration_ps": 2e6, "output.trajectory_interval_ps": 0.002}, "2e+07", "167 GB"),
-        (
-            {
-                "stages.0.duration_ps": 2e7,
-                "stages.0.timestep_fs": "",
-                "stages.0.integrator": "auto",
-                "stages.0.energy_error_kT": 1e-3,
-            },
-            "2e+08",
-            "180 GB",
-        ),
-    ],
-)
-def test_molecules_with_more_samples_than_there_is_room_for(
-    changes, lines, gigabytes, capsys, monkeypatch, tmp_path
-):
-    monkeypatch.setattr(process, "free_memory", lambda: 8e9)
-    options = [part for key, value in changes.items() for part in ("--set", f"{key}={value}")]
-    message = refusal(capsys, tmp_path, GOOD, *options)
-    assert (
-        f"a run with {lines} lines in its log needs {gigabytes} of memory, and this machine has 8 GB"
-        in message
-    )
-    assert "lengthen output.log_interval_ps" in message
-
-
-def a_sample(k: int, own: tuple[float, ...] = ()) -> Sample:
-    values = {name: k + column / 64 for column, name in enumerate(COLUMNS)}
-    return Sample(
-        **values | {"step": k, "time": k / 4, "stage": k // 5, "stage_name": "ab"[k // 5]},
-        user_energies=own,
-    )
-
-
-def test_samples_give_back_what_was_added():
-    samples = Samples(["a", "b"], ("spring", "field"))
-    assert len(samples["time"]) == 0
-    added = [a_sample(k, (k / 3, -k)) for k in range(10)]
-    for sample in added:
-        samples.append(sample)
-    assert samples.rows == list(Samples(["a", "b"], samples.user_terms, samples.table())) == added
-    assert samples.row(-1) == added[-1]
-    for name in COLUMNS:
-        assert samples[name].tolist() == [getattr(sample, name) for sample in added]
-    assert samples["field"].tolist() == [0, -1, -2, -3, -4, -5, -6, -7, -8, -9]
-    assert samples.of_stage(1).rows == added[5:]
-    assert len(samples.of_stage(2)) == 0
-    for since in range(10):
-        for moment in np.arange(-0.1, 2.6, 0.05):
-            assert samples.latest(moment, since) == max(
-                [k for k in range(since, 10) if k / 4 <= moment], default=since
-            )
-    column = samples["time"]
-    samples.append(a_sample(9, (0.0, 0.0)))  # columns are copies
-    assert len(column) == 10
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lambda table: table[:, 1:], "shape"),
-        (lambda table: table.ravel(), "shape"),
-        (lambda table: np.where(table == 1.0, 7.0, table), "have stages that are not in the scene"),
-        (
-            lambda table: np.where(table == 1.0, np.nan, table),
-            "have stages that are not in the scene",
-        ),
-        (lambda table: np.where(table == 6.0, 6.5, table), "steps that are not whole numbers"),
-        (lambda table: np.where(table == 6.0, 1e300, table), "steps that are not whole numbers"),
-        (lambda table: np.where(table == 6.0, np.inf, table), "steps that are not whole numbers"),
-    ],
-)
-def test_rows_that_are_no_samples_are_refused(change, expected):
-    samples = Samples(["a", "b"])
-    samples.append(a_sample(6))
-    with pytest.raises(ValueError, match=expected):
-        Samples(["a", "b"], (), change(samples.table()))
-
-
-def test_a_sample_takes_no_more_than_its_numbers():
-    samples = Samples(["a", "b"], ("spring",))
-    tracemalloc.start()
-    for k in range(5000):
-        samples.append(a_sample(k % 10, (0.0,)))
-    size, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert size < 5000 * 1.2 * 8 * len(COLUMNS)
-
-
-def test_what_is_free_is_no_more_than_the_limits():
-    assert 1e8 < process.free_memory() < 1e14
-    code = (
-        "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9, 3 * 10**9))\n"
-        "from rigidmd.core.process import free_memory; print(free_memory())"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 1e9 < float(found.stdout) < 3e9
-
-
-@pytest.mark.parametrize(
-    ("most", "square"), [((5, 6, 7), None), ((3, 0, 4), 20), ((0, 0, 3), None), ((0, 0, 0), None)]
-)
-def test_waves_in_columns_are_all_waves(most, square):
-    found = vectors.k_vectors_up_to(most, square)
-    axes = [np.arange(-m, m + 1) for m in most]
-    n = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    n = n[(n**2).sum(axis=1) <= (np.inf if square is None else square)]
-    half = {tuple(v) for v in n.tolist() if tuple(v) > (0, 0, 0)}
-    listed = [
-        (int(x), int(y), int(first) + k)
-        for (x, y, first, _), count in zip(found.column, found.count, strict=True)
-        for k in range(count)
-    ]
-    assert (set(listed), len(listed), found.total) == (half, len(half), 2 * len(half))
-    assert np.array_equal(found.column[:, 3], np.cumsum(found.count) - found.count)
-
-
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
@@ -619,9 +399,6 @@ def test_an_end_with_more_digits_than_a_number_has(capsys):
         main(["run", "nowhere.toml", "--until", "9" * 400 + "ps"])
     assert ended.value.code == 2
     assert "is not a time with a unit" in capsys.readouterr().err
-
-
-# names of elements and of other things
 
 
 def site_scene(**site):
@@ -672,148 +449,3 @@ def test_names_have_one_line_and_at_most_100_characters(place, name, tmp_path):
 def test_the_name_of_a_trajectory_fits_into_a_folder():
     with pytest.raises(SceneError, match="must have at most 200 characters"):
         Scene.from_dict(site_scene() | {"output": {"trajectory": "t" * 260 + ".xtc"}})
-
-
-# the working directory
-
-
-#: Packages that rigidmd, or what it needs, imports.
-PACKAGES = (
-    "MDAnalysis ase dask distributed filelock gemmi gsd lazy_loader llvmlite matplotlib numba numpy pandas platformdirs pydantic "
-    "pymbar rigidmd rocket_fft scipy sympy tomli_w tqdm yaml"
-)
-
-
-@pytest.fixture(scope="module")
-def hostile(tmp_path_factory):
-    """A folder with a module of every name, each of which leaves a mark, and with configuration
-    files of libraries."""
-    folder = tmp_path_factory.mktemp("hostile")
-    mark = f"open({str(folder / 'MARK')!r}, 'a').write(__name__ + ' ')\n"
-    for name in sys.stdlib_module_names:
-        (folder / f"{name}.py").write_text(mark)
-    for name in PACKAGES.split():
-        (folder / name).mkdir()
-        (folder / name / "__init__.py").write_text(mark)
-    for name in ("sitecustomize", "usercustomize"):
-        (folder / f"{name}.py").write_text(mark)
-    (folder / "matplotlibrc").write_text(
-        "figure.facecolor: red\nfont.size: 40\nbackend: none_such\nlines.linewidth: x\n"
-    )
-    (folder / ".numba_config.yaml").write_text(
-        "opt: 0\nboundscheck: 1\ndisable_jit: 1\ncpu_name: generic\n"
-    )
-    return folder
-
-
-def command_in(folder, *words, **environment):
-    """A command as the program `rigidmd` runs it, which does not put the working directory on the
-    search path."""
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "rigidmd", *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        env=os.environ | environment,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stderr
-
-
-SHORT_TOP = ["--set", "run.duration_s=0.02"]
-
-
-def test_nothing_in_the_working_directory_is_executed_or_obeyed(hostile, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(ROOT / "systems" / "heavy_top_3.toml", hostile / "top.toml")
-    shutil.copy(ROOT / "systems" / "heavy_top_3.toml", tmp_path / "top.toml")
-    command_in(hostile, "run", "top.toml", "-o", "run", *SHORT_TOP)
-    assert main(["run", "top.toml", "-o", "run", *SHORT_TOP]) == 0
-    swept = ["--set", "run.duration_s=0.01,0.02", "--set", "output.figures=false"]
-    command_in(hostile, "sweep", "top.toml", "-o", "sweep", *swept, "--jobs", "1")
-    assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
-    same = [
-        path.name
-        for path in (tmp_path / "run").iterdir()
-        if path.suffix in (".png", ".csv", ".svg")
-    ]
-    assert len(same) >= 3
-    for name in same:
-        assert (hostile / "run" / name).read_bytes() == (tmp_path / "run" / name).read_bytes(), name
-
-
-LIQUID = """
-seed = 5
-[[molecules]]
-model = "argon"
-count = 60
-[box]
-density_g_cm3 = 1.2
-[forces]
-cutoff_A = 6.0
-[start]
-temperature_K = 90.0
-[[stages]]
-ensemble = "nvt"
-temperature_K = 90.0
-duration_ps = 1.0
-[output]
-log_interval_ps = 0.02
-trajectory_interval_ps = 0.02
-"""
-
-
-def run_and_analyse(folder, command):
-    """A short run of a liquid in a folder, with two analyses, by `command(*words)`."""
-    (folder / "liquid.toml").write_text(LIQUID)
-    command("run", "liquid.toml", "-o", "liquid")
-    command("analyse", "liquid", "--only", "rdf,msd")
-    return {
-        path.name: path.read_bytes()
-        for path in (folder / "liquid").iterdir()
-        if path.suffix in (".png", ".csv", ".xtc", ".gro")
-    }
-
-
-def test_analyses_execute_and_obey_nothing_in_the_working_directory(hostile, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    expected = run_and_analyse(tmp_path, lambda *words: main(list(words)))
-    assert {"rdf.csv", "msd.csv", "log.csv"} <= expected.keys()
-    assert run_and_analyse(hostile, partial(command_in, hostile)) == expected
-    assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
-
-
-@pytest.mark.soak
-def test_a_liquid_is_compiled_by_nothing_in_the_working_directory(hostile, tmp_path):
-    """From an empty cache, which a second process helps to fill."""
-    warm = run_and_analyse(tmp_path, partial(command_in, tmp_path))
-    shutil.rmtree(hostile / "liquid", ignore_errors=True)
-    empty = {"RIGIDMD_CACHE": str(tmp_path / "cache"), "RIGIDMD_COMPILERS": "2"}
-    cold = run_and_analyse(hostile, partial(command_in, hostile, **empty))
-    assert any((tmp_path / "cache").rglob("*.nbc.*"))
-    assert cold == warm
-    assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
-
-
-def test_the_second_compiling_process_imports_nothing_from_the_working_directory(hostile):
-    """And so the one that reads a frame, and that of a point of a sweep: all are made by
-    `python_process`."""
-    made = python_process(
-        "-c", "import pickle, json, struct, numpy, rigidmd.compile; print(rigidmd.__file__)"
-    )
-    done = subprocess.run(**made, cwd=hostile, capture_output=True, text=True)
-    assert Path(done.stdout.strip()) == Path(rigidmd.__file__), done.stderr
-    assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
-    settings = "import rigidmd.compile, numba; print(numba.config.OPT, numba.config.DISABLE_JIT, numba.config.CPU_NAME)"
-    done = subprocess.run(
-        **python_process("-c", settings), cwd=hostile, capture_output=True, text=True
-    )
-    assert done.stdout.strip() == f"{numba.config.OPT} 0 {numba.config.CPU_NAME}", done.stderr
-
-
-def test_every_process_of_python_is_started_without_the_working_directory():
-    """A call with `sys.executable` elsewhere in the package has the option -P."""
-    for path in (ROOT / "rigidmd").rglob("*.py"):
-        for line in path.read_text().splitlines():
-            if re.search(r"\[sys\.executable\b", line):
-                assert '"-P"' in line, f"{path}: {line.strip()}"

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
@@ -206,3 +207,19 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
     out, err = capsys.readouterr()
     assert "Traceback" not in out + err
     return err
+
+
+AT_ONCE = 5.0  # s of computing
+
+
+def refusal(capsys, tmp_path, text, *arguments, commands=("check",)):
+    """The message for a scene, the same of each command."""
+    (tmp_path / "scene.toml").write_text(text)
+    messages = set()
+    for command in commands:
+        begin = time.process_time()
+        assert main([command, str(tmp_path / "scene.toml"), *arguments]) == 2
+        assert time.process_time() - begin < AT_ONCE
+        messages.add(capsys.readouterr().err)
+    assert len(messages) == 1
+    return messages.pop()

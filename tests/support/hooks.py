@@ -195,7 +195,7 @@ TIERS = {
             "the_command_writes_its_files_and_does_not_overwrite",
         ),
         "features/studies/test_stored_runs.py": ("a_sweep_is_read",),
-        "end_to_end/test_hostile_input.py": (
+        "end_to_end/test_working_directory.py": (
             "nothing_in_the_working_directory_is_executed_or_obeyed*",
         ),
         "features/studies/sweep/test_points.py": (
@@ -261,7 +261,7 @@ TIERS = {
             "the_same_bits_for_any_number_of_threads[mixed]",
         ),
         "features/studies/test_stability.py": ("quick*",),
-        "end_to_end/test_hostile_input.py": ("analyses_execute_and_obey_nothing*",),
+        "end_to_end/test_working_directory.py": ("analyses_execute_and_obey_nothing*",),
         "features/studies/sweep/test_limits.py": ("energy_at_a_step_of_zero_has_a_joint_fit*",),
         "features/studies/sweep/test_points.py": (
             "a_second_interrupt_ends_all_points_at_once",
