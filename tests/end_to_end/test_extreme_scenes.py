@@ -13,10 +13,16 @@ import math
 import ase
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from rigidmd.ase import RigidMD
 from rigidmd.commands.cli import main
+from rigidmd.core.state import State
 from rigidmd.errors import RigidMDError
+from rigidmd.mechanics.rotation import orthogonality_error
+from rigidmd.run import Simulation
+from rigidmd.scene import Scene
 
 ARGON = """
 seed = 5
@@ -325,3 +331,105 @@ def test_odd_axes_of_a_sweep(axis, capsys, tmp_path):
         assert not folder.exists() and axis.partition("=")[0] in said
     else:
         assert (folder / "sweep.csv").exists()
+
+
+FEWER = settings(max_examples=25, deadline=None, derandomize=True, database=None)
+
+
+def site(k: int):
+    return st.fixed_dictionaries(
+        {
+            "name": st.just(f"S{k}"),
+            "mass_u": st.sampled_from([0.0, 1.0, 16.0, 1e4]),
+            "position_A": st.tuples(*[st.sampled_from([0.0, 1e-6, 0.5, -1.0, 4.0])] * 3).map(list),
+            "charge_e": st.sampled_from([0.0, 0.4, -0.4]),
+            "sigma_A": st.sampled_from([0.1, 3.0]),
+            "epsilon_K": st.sampled_from([0.0, 1.0, 100.0]),
+        }
+    )
+
+
+molecules = st.one_of(
+    st.sampled_from(["argon", "nitrogen", "spce", "tip4p2005"]).map(lambda name: {"model": name}),
+    st.integers(1, 3)
+    .flatmap(lambda n: st.tuples(*map(site, range(n))))
+    .map(lambda s: {"name": "own", "sites": list(s)}),
+)
+stages = st.fixed_dictionaries(
+    {
+        "timestep_fs": st.sampled_from([0.01, 1.0, 10.0, 1000.0]),
+        "integrator": st.sampled_from(["velocity_verlet", "pefrl", "srkn_4", "kahan_li_6"]),
+        "ensemble": st.sampled_from(["nve", "nvt"]),
+    }
+)
+scenes = st.fixed_dictionaries(
+    {
+        "seed": st.integers(0, 100),
+        "box": st.sampled_from(
+            [
+                {"lengths_A": 12.0},
+                {"lengths_A": [12.0, 30.0, 12.0]},
+                {"lengths_A": 5.0},
+                {"density_g_cm3": 1.0},
+            ]
+        ),
+        "molecules": st.tuples(molecules, st.sampled_from([1, 2, 20])).map(
+            lambda one: [one[0] | {"count": one[1]}]
+        ),
+        "forces": st.fixed_dictionaries(
+            {
+                "cutoff_A": st.sampled_from([1.0, 5.0, 6.0]),
+                "truncation": st.sampled_from(
+                    ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
+                ),
+            }
+        ),
+        "start": st.sampled_from([0.0, 300.0, 1e6]).map(lambda t: {"temperature_K": t}),
+        "stages": stages.map(lambda s: [s]),
+    }
+)
+
+
+@pytest.mark.soak
+@FEWER
+@given(scenes)
+def test_any_small_scene_runs_ten_steps_or_is_refused_in_words(data):
+    runs_or_is_refused(data)
+
+
+ONE_KIND = scenes.map(
+    lambda data: data | {"molecules": [{"model": "spce", "count": data["molecules"][0]["count"]}]}
+).map(
+    lambda data: (
+        data
+        | {"stages": [data["stages"][0] | {"integrator": "velocity_verlet", "ensemble": "nve"}]}
+    )
+)
+
+
+@FEWER
+@given(ONE_KIND)
+def test_any_small_scene_of_one_kind_runs_ten_steps_or_is_refused_in_words(data):
+    """As above, of scenes that compile to the same code."""
+    runs_or_is_refused(data)
+
+
+def runs_or_is_refused(data):
+    stage = dict(data["stages"][0])
+    stage["duration_ps"] = 10 * stage["timestep_fs"] / 1000
+    if stage["ensemble"] == "nvt":
+        stage["temperature_K"] = 300.0
+    whole = data | {"stages": [stage], "output": {"trajectory": False, "log_interval_ps": 1e3}}
+    try:
+        with np.errstate(all="ignore"):
+            results = Simulation(Scene.from_dict(whole)).run()
+    except RigidMDError as error:
+        assert str(error)
+        return
+    assert len(results.samples.rows) == 2
+    assert results.samples.rows[-1].step == 10
+    assert isinstance(results.state, State)
+    for array in results.state:
+        assert np.isfinite(array).all()
+    assert np.isfinite(results["energy"]).all()
+    assert orthogonality_error(results.state.rotation) < 1e-12

@@ -7,6 +7,7 @@ on with.
 
 import ctypes
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.common import ROOT
 from support.processes import WAIT, process, search_path, wait_until
 
 import rigidmd
@@ -365,3 +367,28 @@ def test_damaged_files_of_a_run(times, scene, tmp_path):
     assert refused[CHECKPOINT] == refused[PREVIOUS] == 0
     assert refused[FINAL] > times / 20
     assert refused[LOG] == refused[TRAJECTORY] == times // 5
+
+
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="the driver forks, and reads /proc")
+
+
+def drive(*arguments: str) -> int:
+    """Number of cases that `python tests/support/faults.py` executed without a failure."""
+    command = [sys.executable, str(ROOT / "tests" / "support" / "faults.py"), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return int(re.search(r"^(\d+) cases .* 0 failures$", done.stdout, re.MULTILINE)[1])
+
+
+@LINUX
+def test_runs_survive_mixed_faults():
+    """The first cases of a fixed series."""
+    assert drive("--first", "1", "--cases", "4") == 4
+
+
+@LINUX
+@pytest.mark.soak
+@pytest.mark.parametrize("series", [[], ["--wide"]], ids=["narrow", "wide"])
+def test_runs_survive_mixed_faults_for_an_hour(series):
+    """Another series each time; the message of a failure has the line that replays it."""
+    assert drive("--minutes", "60", *series) > 100

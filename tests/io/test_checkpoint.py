@@ -11,16 +11,20 @@ import zipfile
 
 import numpy as np
 import pytest
+from support.common import small_scene
 from support.scenes import NVT, forty_waters
 from support.stops import contents, everything, stopped_at, top
 
+from rigidmd.assemble.build import build
 from rigidmd.commands import cli
+from rigidmd.core.state import State
 from rigidmd.engines.samples import NUMBERS
 from rigidmd.errors import CheckpointError, OutputError, SimulationError
 from rigidmd.io import checkpoint
 from rigidmd.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 from rigidmd.run import Every, Simulation
+from rigidmd.run.resume import state_from
 from rigidmd.scene import Scene
 
 
@@ -289,3 +293,16 @@ def test_a_checkpoint_of_other_columns_has_another_schema():
     """The table of samples has no names: a change of the columns needs a new number here and there."""
     digest = hashlib.sha256(" ".join(NUMBERS).encode()).hexdigest()[:8]
     assert (checkpoint.SCHEMA, digest) == (5, "d0fdadad")
+
+
+def test_a_checkpoint_gives_back_all_of_a_state():
+    system = build(small_scene({"spce": 3}, 12.0, forces={"cutoff_A": 5.0}))
+    rng = np.random.default_rng(1)
+    state = system.state._replace(extra_variables=rng.standard_normal(12))
+    for array in (state.position, state.velocity, state.angular_momentum_body, state.energy_ledger):
+        array[:] = rng.standard_normal(array.shape)
+    found = state_from(
+        {name: array.copy() for name, array in zip(State._fields, state, strict=True)}, state
+    )
+    for name, a, b in zip(state._fields, found, state, strict=True):
+        assert a.tobytes() == b.tobytes(), name

@@ -1,7 +1,9 @@
-"""Rotations, inertia, the rotor."""
+"""Rotations, inertia and the free rotor, also for any values that hypothesis finds."""
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support import known
@@ -11,13 +13,16 @@ from rigidmd.compile import kernel
 from rigidmd.core.state import Load, state_of
 from rigidmd.mechanics.batches import LANES, kick_group, rotate_group
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, rotate, split_rotor
-from rigidmd.mechanics.inertia import kind_of_body, principal_frame
+from rigidmd.mechanics.inertia import inertia_tensor, kind_of_body, principal_frame
 from rigidmd.mechanics.rotation import (
     align,
+    from_euler_angles,
     from_quaternion,
     from_vector,
     orthogonality_error,
     random_rotations,
+    to_euler_angles,
+    to_quaternion,
 )
 
 
@@ -305,3 +310,93 @@ def test_a_turn_too_long_to_mean_anything_becomes_no_number_at_once():
     l[:] = [1.0, 2.0, 3.0]
     spin(rotor, q, l, 1000.0, 1)
     assert np.linalg.norm(l) == pytest.approx(14**0.5, rel=1e-12)
+
+
+FEW = settings(max_examples=60, deadline=None, derandomize=True, database=None)
+ROUNDING = 4e-15
+
+
+def floats(low: float, high: float):
+    return st.floats(low, high, allow_nan=False)
+
+
+def vectors(size: float = 1.0, length: int = 3):
+    return st.tuples(*[floats(-size, size)] * length).map(np.array)
+
+
+quaternions = vectors(1.0, 4).filter(lambda q: np.linalg.norm(q) > 1e-100)
+angles = vectors(100.0)
+
+
+@FEW
+@given(quaternions)
+def test_any_rotation_comes_back_from_every_way_to_write_it(quaternion):
+    q = from_quaternion(quaternion / np.abs(quaternion).max())
+    assert orthogonality_error(q[None]) < ROUNDING
+    for there, back in (
+        (to_quaternion, from_quaternion),
+        (to_euler_angles, from_euler_angles),
+    ):
+        assert np.abs(back(there(q)) - q).max() < ROUNDING
+
+
+@FEW
+@given(angles)
+def test_any_angles_come_back_as_the_same_rotation(turned):
+    q = from_euler_angles(turned)
+    assert np.abs(from_euler_angles(to_euler_angles(q)) - q).max() < ROUNDING
+
+
+@FEW
+@given(
+    st.integers(1, 6).flatmap(lambda n: st.lists(vectors(10.0), min_size=n, max_size=n)), st.data()
+)
+def test_any_masses_have_a_principal_frame(positions, data):
+    masses = np.array([data.draw(floats(1e-3, 1e3)) for _ in positions])
+    positions = np.array(positions)
+    frame = principal_frame(masses, positions)
+    size = np.linalg.norm(positions - frame.centre, axis=1).max()
+    scale = frame.mass * size**2
+    assert np.abs(frame.axes @ frame.axes.T - np.eye(3)).max() < ROUNDING
+    assert np.linalg.det(frame.axes) == pytest.approx(1, abs=ROUNDING)
+    turned = frame.axes.T @ inertia_tensor(masses, positions - frame.centre) @ frame.axes
+    # what counts as equal or zero is made so: 1e-8 of the largest
+    assert np.abs(turned - np.diag(frame.inertia)).max() <= 2e-8 * scale
+    assert (np.diff(frame.inertia) >= 0).all() or frame.kind == "spherical"
+    assert frame.inertia[2] <= (frame.inertia[0] + frame.inertia[1]) * (1 + 3e-8)
+
+
+#: Moments of a body: of three positive numbers, each pair added, so that no moment is more than the
+#: sum of the others.
+moments = st.tuples(*[floats(-6.0, 0.0)] * 3).map(
+    lambda p: np.roll(10.0 ** np.array(p), 1) + np.roll(10.0 ** np.array(p), 2)
+)
+
+
+@FEW
+@given(moments, floats(-80.0, 80.0), vectors(), floats(0.001, 1.0))
+def test_a_free_rotor_keeps_what_it_should_for_any_inertia_at_any_scale(
+    inertia, exponent, direction, h
+):
+    scale = 10.0**exponent
+    size = np.linalg.norm(direction)
+    if size < 1e-3:
+        direction, size = np.array([1.0, 0.0, 0.0]), 1.0
+    momentum = direction / size
+    step = h / np.abs(momentum / inertia).max()
+    for rotor in (
+        split_rotor(scale * inertia[None]),
+        ExactRotor(*split_rotor(scale * inertia[None])),
+    ):
+        q, l = np.eye(3)[None].copy(), scale * momentum[None]  # noqa: E741
+        spin(rotor, q, l, step, 100)
+        assert np.linalg.norm(l[0] / scale) == pytest.approx(1, rel=1e-13)
+        assert np.abs(q[0] @ l[0] / scale - momentum).max() < 1e-13
+        assert orthogonality_error(q) < 1e-13
+        if isinstance(rotor, ExactRotor):
+            # a moment a million times smaller than L²/2T has its energy from what rounding leaves
+            # of L about it
+            kinetic = [(v**2 / inertia).sum() for v in (momentum, l[0] / scale)]
+            assert kinetic[1] == pytest.approx(
+                kinetic[0], rel=1e-12 + 1e-15 * inertia.max() / inertia.min()
+            )

@@ -71,7 +71,7 @@ ENSEMBLES = {
 
 @pytest.mark.parametrize(
     ("name", "precision"),
-    [  # in the default tier one; test_thermostat_states.py has the chains of nose_hoover
+    [  # in the default tier one, and the chains of nose_hoover below
         pytest.param(
             *which, marks=[] if which == ("hybrid_monte_carlo", "double") else pytest.mark.soak
         )
@@ -704,3 +704,24 @@ def test_the_duration_of_a_ramp_stays(ramp, tmp_path):
     Simulation(scene(0.004, **level), tmp_path / "level").run()
     longer = Simulation(scene(0.008, **level), tmp_path / "level", resume=True).run()
     assert longer["time"][-1] == pytest.approx(0.008)
+
+
+WATER = {
+    "box": {"density_g_cm3": 0.9},
+    "molecules": [{"model": "spce", "count": 40}],
+    "forces": {"cutoff_A": 5.0, "truncation": "smooth_switch"},
+    "start": {"temperature_K": 298.0},
+    "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figures": False},
+}
+CHAINS = {
+    "ensemble": "nvt",
+    "temperature_K": 298.0,
+    "thermostat": "nose_hoover",
+    "thermostat_time_ps": 0.05,
+}
+
+
+def test_chains_go_on_to_the_same_bits_in_double_precision(tmp_path):
+    """A short period, so that the chains have swung when the run stops."""
+    stage = CHAINS | {"duration_ps": 0.06, "timestep_fs": 1.0}
+    same_after_stops(WATER | {"stages": [stage], "precision": "double"}, [17, 41], tmp_path)

@@ -139,7 +139,6 @@ TIERS = {
             "total_momentum_is_taken_out_at_steps_that_the_scene_decides",
             "waves_of_a_cell_that_a_file_describes_otherwise",
         ),
-        "end_to_end/test_fault_driver.py": ("runs_survive_mixed_faults",),
         "end_to_end/test_faults.py": ("*",),
         "features/view/test_figures.py": ("figures_of_a_run_and_of_a_molecule_take_any_name*",),
         "forces/test_forces.py": (
@@ -169,7 +168,7 @@ TIERS = {
             "a_look_takes_the_energies_of_the_last_step[piston*",
         ),
         "engines/cpu/test_program.py": ("check_measures_a_potential_of_bodies",),
-        "mechanics/test_properties.py": (
+        "end_to_end/test_extreme_scenes.py": (
             "any_small_scene_of_one_kind_runs_ten_steps_or_is_refused_in_words",
         ),
         "run/test_results.py": (

@@ -313,8 +313,8 @@ RINGS = [
         "    if (np.isfinite(state.cell) != np.isfinite(like.cell)).any():",
         "    state.extra_variables[:] = 0.0\n    if (np.isfinite(state.cell) != np.isfinite(like.cell)).any():",
         (
-            "dynamics/test_thermostat_states.py::test_a_checkpoint_gives_back_all_of_a_state",
-            "dynamics/test_thermostat_states.py::test_chains_go_on_to_the_same_bits_in_double_precision",
+            "io/test_checkpoint.py::test_a_checkpoint_gives_back_all_of_a_state",
+            "run/test_resume.py::test_chains_go_on_to_the_same_bits_in_double_precision",
         ),
     ),
     Mutation(  # harmless within a run, whose steps count on; a stage that is run alone would repeat the numbers
