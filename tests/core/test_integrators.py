@@ -10,7 +10,16 @@ from support.stops import same_after_stops
 import rigidmd
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
-from rigidmd.core.integrators import SCHEMES, Scheme, split
+from rigidmd.core.integrators import (
+    DRIFT,
+    KICK,
+    SCHEMES,
+    WITH_THERMOSTAT,
+    Flow,
+    Scheme,
+    composed,
+    split,
+)
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
@@ -220,3 +229,51 @@ def test_a_run_with_gradients_in_its_last_kick_is_resumed_to_the_same_bits(tmp_p
         NVT | {"integrator": "all_of_three"},
     ]
     same_after_stops(forty_waters(*stages, integrators=tables), [17, 60, 111, 140], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("make", "error"),
+    [
+        (lambda: split("mine", (0.4, 0.5), (1.0,), 2, ""), "mine: its kicks sum to 0.9, not to 1"),
+        (lambda: split("mine", (0.5, 0.5), (1.1,), 2, ""), "mine: its drifts sum to 1.1, not to 1"),
+        (lambda: split("mine", (0.5, 0.5), (float("nan"),), 2, ""), "mine: its drifts sum to nan"),
+        (
+            lambda: split("mine", (0.4, 0.6), (1.0,), 2, ""),
+            "flows 1 and 3 of 3 differ .kick 0.4 and kick 0.6.",
+        ),
+        (
+            lambda: split("mine", (1.0, 0.0), (1.0,), 1, ""),
+            "flows 1 and 2 of 2 differ .kick 1 and drift 1.",
+        ),
+        (lambda: split("mine", (0.2, 0.6, 0.2), (0.4, 0.6), 2, ""), "flows 2 and 4 of 5 differ"),
+        (
+            lambda: split("mine", (0.5, 0.5), (1.0,), 2, "", (0.1, 0.2)),
+            "differ .kick 0.5, gradient 0.1 and kick 0.5, ",
+        ),
+        (
+            lambda: split("mine", (0.5, 0.5), (0.5, 0.5), 2, ""),
+            "2 kicks, 2 drifts: kicks must be one more than drifts",
+        ),
+        (
+            lambda: split("mine", (0.5, 0.5), (1.0,), 2, "", (0.1,)),
+            "1 gradients: .* gradients as many as kicks",
+        ),
+        (lambda: composed("mine", (0.6, -0.3, 0.6), 4, ""), "mine: its drifts sum to 0.9"),
+        (lambda: composed("mine", (0.3, 0.7), 2, ""), "not time-reversible"),
+        (lambda: composed("mine", (), 2, ""), "mine: its drifts sum to 0, not to 1"),
+        (
+            lambda: Scheme("mine", (Flow(KICK, 0.5), Flow(DRIFT, 1.0)), 2, True, ""),
+            "mine: its kicks sum to 0.5",
+        ),
+    ],
+)
+def test_a_row_that_is_inconsistent_or_not_reversible_is_refused_when_it_is_made(make, error):
+    with pytest.raises(ValueError, match=f"integrator .*{error}"):
+        make()
+
+
+def test_rows_in_print_have_rounded_coefficients_and_shipped_ones_are_made_anew():
+    rounded = split("mine", (0.1931833275, 0.613633345, 0.1931833275), (0.5, 0.5), 2, "in print")
+    assert rounded.force_evaluations == 2
+    for scheme in (SCHEMES | WITH_THERMOSTAT).values():
+        assert Scheme(*scheme) == scheme  # the checks of a new row

@@ -146,7 +146,7 @@ FRESH: list[Mutation] = [
         "engines/body_motion.py",
         'along = np.einsum("tji,tj->ti", rotation, impulse)',
         'along = np.einsum("tij,tj->ti", rotation, impulse)',
-        ("features/bodies/test_engine.py::test_a_frictionless_fluid_keeps_energy_and_impulse",),
+        ("features/bodies/test_fluid.py::test_a_frictionless_fluid_keeps_energy_and_impulse",),
     ),
     Mutation(
         "F17",
@@ -155,7 +155,7 @@ FRESH: list[Mutation] = [
         "system.moments(times)[1] @ system.axes.T)",
         "system.moments(times)[1])",
         (
-            "features/bodies/test_engine.py::test_wheels_drives_and_friction_in_a_turning_accelerated_frame",
+            "features/bodies/test_frames.py::test_wheels_drives_and_friction_in_a_turning_accelerated_frame",
         ),
     ),
     Mutation(
@@ -338,7 +338,7 @@ FRESH: list[Mutation] = [
         "            force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)",
         "            force, torque = _rotated(force, axes.T), torque",
         (
-            "features/bodies/test_engine.py::test_wheels_drives_and_friction_in_a_turning_accelerated_frame",
+            "features/bodies/test_frames.py::test_wheels_drives_and_friction_in_a_turning_accelerated_frame",
         ),
     ),
     Mutation(

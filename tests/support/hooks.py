@@ -69,20 +69,24 @@ TIERS = {
             "the_sleeping_top_wakes_where_it_should",
             "the_split_rotor_has_the_best_of_all_orders*",
         ),
-        "features/bodies/test_engine.py": (
+        "features/bodies/test_fluid.py": (
             "a_body_in_a_fluid_follows_kirchhoff",
-            "a_frame_that_changes_its_axis_is_left_to_compositions",
-            "a_python_function_can_apply_what_a_scene_does",
-            "a_run_that_cannot_go_on_says_when",
-            "a_table_does_not_cost_the_order_of_the_integrator",
             "equal_coefficients_resist_alike_in_all_directions",
             "stiff_resistance_ends_at_the_terminal_speed",
+        ),
+        "features/bodies/test_frames.py": (
+            "a_frame_that_changes_its_axis_is_left_to_compositions",
+            "a_table_does_not_cost_the_order_of_the_integrator",
             "the_same_scene_gives_the_same_bits_however_often_it_is_looked_at",
-            "what_has_no_exact_flow_is_not_given_to_schemes_that_count_on_one",
             "what_is_switched_on_and_off_gives_its_whole_impulse[ra*",
             "what_is_switched_on_and_off_gives_its_whole_impulse[rk4]",
             "wheels_drives_and_friction_in_a_turning_accelerated_frame",
         ),
+        "features/bodies/test_engine.py": (
+            "a_python_function_can_apply_what_a_scene_does",
+            "what_has_no_exact_flow_is_not_given_to_schemes_that_count_on_one",
+        ),
+        "features/bodies/test_ode.py": ("a_run_that_cannot_go_on_says_when",),
         "features/potentials/test_body_pairs.py": (
             "a_scene_has_a_table_as_a_file_and_compares_its_forces_at_the_start",
             "a_text_has_the_energy_of_all_its_pairs*",
@@ -217,7 +221,7 @@ TIERS = {
     "soak": {
         "run/test_pilot.py": ("a_crude_error_is_kept_crudely*",),
         "features/bodies/test_systems.py": ("free_bodies_of_others",),
-        "features/bodies/test_engine.py": (
+        "features/bodies/test_ode.py": (
             "the_textbook_systems_are_the_same_motion*matrix*",
             "the_textbook_systems_are_the_same_motion[quaternion-fluid]",
         ),

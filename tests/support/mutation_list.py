@@ -61,7 +61,7 @@ CORE = [
         "- W[i] * V[j] + W[j] * V[i]",
         "+ W[i] * V[j] - W[j] * V[i]",
         (
-            "features/bodies/test_engine.py::test_a_frame_that_changes_its_axis_is_left_to_compositions",
+            "features/bodies/test_frames.py::test_a_frame_that_changes_its_axis_is_left_to_compositions",
         ),
     ),
     Mutation(
@@ -71,7 +71,7 @@ CORE = [
         "L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]",
         "L[i] * y[n + j] - L[j] * y[n + i] - motor",
         (
-            "features/bodies/test_textbook.py::test_a_satellite_that_loses_mass_keeps_its_angular_momentum",
+            "features/bodies/test_ode.py::test_a_satellite_that_loses_mass_keeps_its_angular_momentum",
         ),
     ),
     Mutation(
@@ -81,7 +81,7 @@ CORE = [
         "frame_rate(frame, time + 0.5 * h)",
         "frame_rate(frame, time)",
         (
-            "features/bodies/test_engine.py::test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn",
+            "features/bodies/test_frames.py::test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn",
         ),
     ),
     Mutation(
