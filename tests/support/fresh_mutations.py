@@ -204,7 +204,7 @@ FRESH: list[Mutation] = [
         "forces/ewald/interactions.py",
         "part = accuracy * sqrt(filled / 2)",
         "part = accuracy * sqrt(filled)",
-        ("forces/ewald/test_ewald.py::test_forces_are_as_accurate_as_asked_for",),
+        ("forces/ewald/test_errors.py::test_forces_are_as_accurate_as_asked_for",),
     ),
     Mutation(
         "F24",
@@ -212,7 +212,7 @@ FRESH: list[Mutation] = [
         "forces/ewald/interactions.py",
         "of_surface - float((force * arms).sum())",
         "of_surface",
-        ("forces/ewald/test_ewald.py::test_frozen_molecules_do_not_press_on_one_another",),
+        ("forces/ewald/test_corrections.py::test_frozen_molecules_do_not_press_on_one_another",),
     ),
     Mutation(
         "F25",

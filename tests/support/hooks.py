@@ -27,7 +27,11 @@ LONGEST = (
     "rules/test_docs.py",
     "assemble/test_matching.py",
     "features/view/test_figures.py",
-    "forces/ewald/test_ewald.py",
+    "forces/ewald/test_interactions.py",
+    "forces/ewald/test_direct_sum.py",
+    "forces/ewald/test_pme.py",
+    "forces/ewald/test_corrections.py",
+    "forces/ewald/test_errors.py",
     "features/bodies/test_systems.py",
     "features/external/test_lammps.py",
     "features/studies/sweep/test_sweeping.py",
@@ -134,15 +138,19 @@ TIERS = {
             )
         ),
         "end_to_end/test_ensembles.py": ("*",),
-        "forces/ewald/test_ewald.py": (
-            "forces_of_a_slab_are_as_accurate_as_asked_for*",
+        "forces/ewald/test_errors.py": ("forces_of_a_slab_are_as_accurate_as_asked_for*",),
+        "forces/ewald/test_corrections.py": (
             "frozen_molecules_do_not_act_on_one_another",
-            "ions_in_a_triclinic_cell[pme]",
             "lennard_jones_and_real_space_end_apart*",
-            "total_does_not_depend_on_how_it_is_split*",
-            "total_momentum_is_taken_out_at_steps_that_the_scene_decides",
-            "waves_of_a_cell_that_a_file_describes_otherwise",
         ),
+        "forces/ewald/test_interactions.py": (
+            "ions_in_a_triclinic_cell[pme]",
+            "total_does_not_depend_on_how_it_is_split*",
+        ),
+        "forces/ewald/test_pme.py": (
+            "total_momentum_is_taken_out_at_steps_that_the_scene_decides",
+        ),
+        "forces/ewald/test_direct_sum.py": ("waves_of_a_cell_that_a_file_describes_otherwise",),
         "end_to_end/test_faults.py": ("*",),
         "features/view/test_figures.py": ("figures_of_a_run_and_of_a_molecule_take_any_name*",),
         "forces/test_forces.py": (

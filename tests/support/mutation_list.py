@@ -43,7 +43,7 @@ CORE = [
         "        for k in (0, 1, 5, 9):\n            tally[k] += energy\n        for i in range(len(term.charge)):",
         "        for k in (0, 1):\n            tally[k] += energy\n        for i in range(len(term.charge)):",
         (
-            "forces/ewald/test_ewald.py::test_virial_is_the_slope_of_the_energy_with_the_volume[method1-2.0-90.0]",
+            "forces/ewald/test_interactions.py::test_virial_is_the_slope_of_the_energy_with_the_volume[method1-2.0-90.0]",
         ),
     ),
     Mutation(
