@@ -22,7 +22,8 @@ TESTS = Path(__file__).parents[1]
 #: Files that begin first, about the longest first: a file is run by one worker. Neighbours have few
 #: kernels in common: of two workers that need one kernel, one waits until the other has compiled it.
 LONGEST = (
-    "forces/test_forces.py",
+    "forces/test_terms.py",
+    "forces/neighbors/test_update.py",
     "features/bodies/test_engine.py",
     "rules/test_docs.py",
     "assemble/test_matching.py",
@@ -153,9 +154,11 @@ TIERS = {
         "forces/ewald/test_direct_sum.py": ("waves_of_a_cell_that_a_file_describes_otherwise",),
         "end_to_end/test_faults.py": ("*",),
         "features/view/test_figures.py": ("figures_of_a_run_and_of_a_molecule_take_any_name*",),
-        "forces/test_forces.py": (
+        "forces/neighbors/test_update.py": (
             "a_cutoff_within_which_are_too_many_sites_is_refused",
             "a_list_with_little_room_grows_and_misses_nothing[mixed]",
+        ),
+        "forces/test_terms.py": (
             "energies_are_those_of_the_oracle[force_switch*",
             "energies_are_those_of_the_oracle[plain*",
             "energies_are_those_of_the_oracle[smooth_switch*",
@@ -241,10 +244,10 @@ TIERS = {
         "features/external/test_settings.py": ("adding_an_engine_takes_a_folder_and_a_file",),
         "end_to_end/test_faults.py": ("a_run_that_is_stopped_by_signals_goes_on*",),
         "forces/fields/test_fields.py": ("adding_a_field_*",),
-        "forces/test_forces.py": (
+        "forces/neighbors/test_update.py": (
             "a_list_with_almost_no_skin_is_built_at_every_step[mixed*",
-            "adding_a_pair_potential_takes_two_files",
         ),
+        "forces/potentials/test_potentials.py": ("adding_a_pair_potential_takes_two_files",),
         "features/crystals/test_framework.py": ("a_published_henry_constant",),
         "end_to_end/test_fuzz.py": ("all_that_is_changed_is_valid*",),
         "features/studies/test_joint_fit.py": ("pulls_of_joint_limits_have_unit_width*",),

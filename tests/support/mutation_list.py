@@ -26,7 +26,7 @@ CORE = [
         "forces/neighbors/sites.py",
         "            turn_z += x * by - y * bx",
         "            turn_z += x * by + y * bx",
-        ("forces/test_forces.py::test_forces_and_torques_are_the_slope_of_the_energy[shift]",),
+        ("forces/test_terms.py::test_forces_and_torques_are_the_slope_of_the_energy[shift]",),
     ),
     Mutation(
         "A2",
@@ -34,7 +34,9 @@ CORE = [
         "forces/potentials/truncation.py",
         "    slope = (k + 1) * series[0] * left**k / width",
         "    slope = k * series[0] * left**k / width",
-        ("forces/test_forces.py::test_a_switched_force_is_that_of_the_product[switch-5.0]",),
+        (
+            "forces/potentials/test_truncation.py::test_a_switched_force_is_that_of_the_product[switch-5.0]",
+        ),
     ),
     Mutation(
         "A3",
@@ -52,7 +54,7 @@ CORE = [
         "forces/neighbors/sites.py",
         "                    virial[block, 3 * row + k] += force[row] * offset[k]",
         "                    virial[block, 3 * row + k] += force[k] * offset[row]",
-        ("forces/test_forces.py::test_virials_are_sums_over_pairs[triclinic-double]",),
+        ("forces/test_terms.py::test_virials_are_sums_over_pairs[triclinic-double]",),
     ),
     Mutation(
         "A5",
