@@ -45,7 +45,8 @@ LONGEST = (
     "end_to_end/test_hostile_input.py",
     "run/test_resume.py",
     "end_to_end/test_faults.py",
-    "features/potentials/test_user_code.py",
+    "features/potentials/test_custom.py",
+    "features/potentials/test_tables.py",
     "dynamics/test_step_loop.py",
     "compile/test_thread_pool.py",
     "compile/test_simd.py",
@@ -221,10 +222,10 @@ TIERS = {
             "simulations_on_all_threads_at_once_have_the_bits_of_each_alone",
         ),
         "io/test_trajectory_file.py": ("a_run_goes_on_from_a_trajectory",),
-        "features/potentials/test_user_code.py": (
+        "features/potentials/test_tables.py": (
             "a_table_in_a_file_is_the_potential_that_it_lists*",
-            "any_text_is_read_or_refused_soon",
         ),
+        "features/potentials/test_text_formulas.py": ("any_text_is_read_or_refused_soon",),
         "features/view/test_pages.py": ("a_browser_shows_a_top_that_moves",),
         "features/free_energy/test_virial.py": ("published_values",),
         "end_to_end/test_walk.py": ("a_sample_of_the_walk*",),
