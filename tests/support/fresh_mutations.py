@@ -432,7 +432,7 @@ FRESH: list[Mutation] = [
         "        xz = (cell[2, 0] - built[2, 0] * xx - built[2, 1] * xy) / built[2, 2]",
         "        xz = (cell[2, 0] - built[2, 0] * xx) / built[2, 2]",
         (
-            "features/potentials/test_body_pairs.py::test_the_list_is_built_anew_where_a_strain_of_a_slanted_cell_exceeds_its_skin",
+            "features/potentials/test_pair_list.py::test_the_list_is_built_anew_where_a_strain_of_a_slanted_cell_exceeds_its_skin",
         ),
     ),
     Mutation(

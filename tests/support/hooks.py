@@ -93,8 +93,10 @@ TIERS = {
             "what_has_no_exact_flow_is_not_given_to_schemes_that_count_on_one",
         ),
         "features/bodies/test_ode.py": ("a_run_that_cannot_go_on_says_when",),
-        "features/potentials/test_body_pairs.py": (
+        "features/potentials/test_pose_tables.py": (
             "a_scene_has_a_table_as_a_file_and_compares_its_forces_at_the_start",
+        ),
+        "features/potentials/test_body_pairs.py": (
             "a_text_has_the_energy_of_all_its_pairs*",
             "integrators_have_their_order*",
         ),
