@@ -11,7 +11,7 @@ user, or root, owns its folders and files and nobody else may write to them. Wit
 code is stored in a temporary one, which only this process uses. A cache that fails costs time and
 nothing else.
 
-Private parts of Numba, tested by tests/compile/test_compile.py: a `FunctionCache` reads its folder
+Private parts of Numba, tested by tests/compile/test_cache.py: a `FunctionCache` reads its folder
 from `numba.config.CACHE_DIR` when it is created, in a subfolder named by
 `get_suitable_cache_subpath`. Its class and that of its index, an `IndexDataCacheFile`, may be
 changed. The methods of `CacheIndex` load and save its index and data. `load_overload` of a

@@ -1,6 +1,6 @@
 """Kernels: functions compiled by Numba, with the compiler options that rigidmd needs.
 
-Private parts of Numba and llvmlite, each tested by tests/compile/test_compile.py:
+Private parts of Numba and llvmlite, each tested by tests/compile/test_kernels.py:
 
 - A dispatcher uses `_cache` only when it compiles.
 - A dispatcher calls `_compilation_chain_init_hook`, which loads the extensions of other packages,

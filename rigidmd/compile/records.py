@@ -6,7 +6,7 @@ forty arrays of a term would become seven numbers in every function between the 
 No kernel changes a field of a record, so its loads are marked invariant, and a store through an
 array does not force a loop to load the array's address again.
 
-Private parts of Numba, tested by tests/compile/test_compile.py: the values of tuples and of
+Private parts of Numba, tested by tests/compile/test_records.py: the values of tuples and of
 `ArrayModel` are C structs, which `NumbaStruct` fills. A call from Python would instead compile code
 that unpacks every array of every argument, a second of compiling for the forty arrays of a term,
 and every call would run all of it.

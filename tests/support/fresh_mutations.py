@@ -475,7 +475,7 @@ FRESH: list[Mutation] = [
         "compile/cache.py",
         '            *([kind.content] if hasattr(kind, "content") else ()),',
         "",
-        ("compile/test_compile.py::test_code_of_a_task_is_found_by_the_classes_of_its_arguments",),
+        ("compile/test_cache.py::test_code_of_a_task_is_found_by_the_classes_of_its_arguments",),
     ),
     Mutation(
         "F55",

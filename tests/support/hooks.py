@@ -37,7 +37,8 @@ LONGEST = (
     "features/external/test_lammps.py",
     "features/studies/sweep/test_sweeping.py",
     "run/test_simulation.py",
-    "compile/test_compile.py",
+    "compile/test_kernels.py",
+    "compile/test_cache.py",
     "forces/ewald/test_dispersion.py",
     "features/view/test_pages.py",
     "run/test_results.py",
@@ -100,13 +101,15 @@ TIERS = {
             "a_text_has_the_energy_of_all_its_pairs*",
             "integrators_have_their_order*",
         ),
-        "compile/test_compile.py": (
+        "compile/test_code.py": (
             "a_second_process_compiles_the_last_tasks_first",
-            "an_index_that_cannot_be_read_is_not_replaced",
             "compiling_goes_on_alone_where_the_second_process_ends",
-            "kernels_are_found_after_a_process_with_a_module_that_others_lack",
-            "settings_that_change_code_have_a_cache_of_their_own",
         ),
+        "compile/test_cache.py": (
+            "an_index_that_cannot_be_read_is_not_replaced",
+            "kernels_are_found_after_a_process_with_a_module_that_others_lack",
+        ),
+        "compile/test_machine.py": ("settings_that_change_code_have_a_cache_of_their_own",),
         "features/free_energy/test_coupling.py": ("a_sweep_has_a_free_energy",),
         "assemble/test_defaults.py": ("a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid*",),
         "forces/ewald/test_dispersion.py": (
