@@ -56,7 +56,7 @@ FRESH: list[Mutation] = [
         "analysis/rigid_frames.py",
         '        inside = np.einsum("fni,fij->fnj", self.positions, np.linalg.inv(self.cell))',
         '        inside = np.einsum("fni,fji->fnj", self.positions, np.linalg.inv(self.cell))',
-        ("features/analysis/test_built_in.py::test_scaling_the_box_moves_nothing",),
+        ("features/analysis/test_rigid_frames.py::test_scaling_the_box_moves_nothing",),
     ),
     Mutation(
         "F7",
@@ -64,7 +64,9 @@ FRESH: list[Mutation] = [
         "analysis/rigid_frames.py",
         '        inside = np.einsum("fni,fij->fnj", position, np.linalg.inv(cells))',
         '        inside = np.einsum("fni,ij->fnj", position, np.linalg.inv(cells[0]))',
-        ("features/analysis/test_built_in.py::test_paths_are_unwrapped_by_the_cell_of_each_frame",),
+        (
+            "features/analysis/test_rigid_frames.py::test_paths_are_unwrapped_by_the_cell_of_each_frame",
+        ),
     ),
     Mutation(
         "F8",
@@ -72,7 +74,7 @@ FRESH: list[Mutation] = [
         "run/rigid_fit.py",
         'L[index] = np.einsum("nij,ni->nj", rotation, lab)',
         "L[index] = lab",
-        ("features/analysis/test_built_in.py::test_rigid_bodies_come_back_from_their_sites",),
+        ("features/analysis/test_rigid_frames.py::test_rigid_bodies_come_back_from_their_sites",),
     ),
     Mutation(
         "F9",
@@ -81,7 +83,7 @@ FRESH: list[Mutation] = [
         "(largest / left) ** 2",
         "(largest / left)",
         (
-            "features/analysis/test_built_in.py::test_the_error_of_a_dielectric_constant_in_a_reaction_field_follows_its_slope",
+            "features/analysis/test_rotation.py::test_the_error_of_a_dielectric_constant_in_a_reaction_field_follows_its_slope",
         ),
     ),
     Mutation(
@@ -91,7 +93,7 @@ FRESH: list[Mutation] = [
         "0.5 * (correlations + correlations[:, :1])",
         "correlations[:, :1]",
         (
-            "features/analysis/test_built_in.py::test_a_viscosity_has_the_correlation_time_of_the_stress",
+            "features/analysis/test_transport.py::test_a_viscosity_has_the_correlation_time_of_the_stress",
         ),
     ),
     Mutation(
@@ -503,7 +505,7 @@ FRESH: list[Mutation] = [
         "analysis/built_in/transport.py",
         "        return np.array([slope, second_half - first_half]) / 6",
         "        return np.array([slope / 6, (second_half - first_half) / 2])",
-        ("features/analysis/test_built_in.py::test_diffusion_needs_a_straight_displacement",),
+        ("features/analysis/test_transport.py::test_diffusion_needs_a_straight_displacement",),
     ),
     Mutation(
         "F58",

@@ -101,7 +101,7 @@ CORE = [
         "(xx - yy) / 2, (yy - zz) / 2], axis=1)",
         "(xx - yy), (yy - zz)], axis=1)",
         (
-            "features/analysis/test_built_in.py::test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest",
+            "features/analysis/test_transport.py::test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest",
         ),
     ),
     Mutation(
@@ -129,8 +129,8 @@ CORE = [
         "    centre = np.zeros(3)",
         "    centre = runs.mean([M.mean(axis=0) for M in dipoles])",
         (
-            "features/analysis/test_built_in.py::test_the_dielectric_constant_of_independent_dipoles",
-            "features/analysis/test_built_in.py::test_a_dielectric_constant_has_no_bias_of_short_runs",
+            "features/analysis/test_rotation.py::test_the_dielectric_constant_of_independent_dipoles",
+            "features/analysis/test_rotation.py::test_a_dielectric_constant_has_no_bias_of_short_runs",
         ),
     ),
 ]
