@@ -113,7 +113,7 @@ FRESH: list[Mutation] = [
         "        return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - weight) * point.error) ** 2)",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + point.error**2)",
         (
-            "features/studies/test_accuracy.py::test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out",
+            "features/studies/test_extrapolation.py::test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out",
         ),
     ),
     Mutation(
@@ -298,7 +298,7 @@ FRESH: list[Mutation] = [
         '    late = results["time"] > EQUILIBRATION * sample',
         '    late = results["time"] > 0',
         (
-            "features/studies/test_accuracy.py::test_averages_leave_out_what_comes_before_equilibrium",
+            "features/studies/accuracy/test_averages.py::test_averages_leave_out_what_comes_before_equilibrium",
         ),
     ),
     Mutation(
@@ -556,7 +556,7 @@ FRESH: list[Mutation] = [
         "count * (count - 1) * together.error**2",
         "count * together.error**2",
         (
-            "features/studies/test_accuracy.py::test_a_value_of_runs_together_takes_the_place_of_the_mean_of_their_values",
+            "features/studies/test_extrapolation.py::test_a_value_of_runs_together_takes_the_place_of_the_mean_of_their_values",
         ),
     ),
     Mutation(

@@ -64,7 +64,7 @@ RANKS = {file: rank for rank, file in enumerate(LONGEST)}
 #: Soak: repeats of statistics, rare variants, and the whole of what other tests check in parts.
 TIERS = {
     "extended": {
-        "features/studies/test_accuracy.py": (
+        "features/studies/accuracy/test_accuracy.py": (
             "only_what_keeps_its_order_is_tried",
             "the_command_writes_a_table_a_figure_and_a_page",
         ),

@@ -252,7 +252,7 @@ RINGS = [
         "        return 1 / 6 - moment",
         (
             "dynamics/test_thermostats.py::test_kinetic_energies_are_corrected_by_the_scheme",
-            "features/studies/test_accuracy.py::test_the_step_takes_from_the_kinetic_energy_at_its_ends",
+            "features/studies/accuracy/test_averages.py::test_the_step_takes_from_the_kinetic_energy_at_its_ends",
         ),
     ),
     Mutation(
