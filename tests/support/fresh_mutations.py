@@ -529,7 +529,7 @@ FRESH: list[Mutation] = [
         "view/molecule_animation.py",
         "    columns = np.swapaxes(frames.cells, 1, 2)",
         "    columns = frames.cells",
-        ("features/view/test_pages.py::test_molecules_are_put_into_a_cell_that_leans",),
+        ("features/view/test_run_page.py::test_molecules_are_put_into_a_cell_that_leans",),
     ),
     Mutation(
         "F61",
