@@ -43,6 +43,7 @@ LONGEST = (
     "features/view/test_animation.py",
     "features/view/test_run_page.py",
     "run/test_results.py",
+    "features/calculators/test_ase_calculator.py",
     "features/calculators/test_ase.py",
     "end_to_end/test_hostile_input.py",
     "run/test_resume.py",
