@@ -146,6 +146,7 @@ TIERS = {
                 "water",
             )
         ),
+        "end_to_end/test_equations_of_state.py": ("*",),
         "end_to_end/test_ensembles.py": ("*",),
         "forces/ewald/test_errors.py": ("forces_of_a_slab_are_as_accurate_as_asked_for*",),
         "forces/ewald/test_corrections.py": (
