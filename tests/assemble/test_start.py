@@ -1,11 +1,13 @@
 """Molecules on a lattice: packing, walls, temperatures that forces do not allow."""
 
+import numpy as np
 import pytest
-from support.common import small_scene
+from support.common import observe, small_scene
 from support.scenes import GOOD
 
 from rigidmd.assemble.build import build
 from rigidmd.commands.cli import main
+from rigidmd.units import BOLTZMANN
 
 
 def test_walls_far_apart_or_close_together_leave_a_lattice(tmp_path):
@@ -60,3 +62,24 @@ def test_forces_that_no_step_follows(old, new, expected, capsys, tmp_path):
     assert all(part in message for part in expected), message
     assert "density" not in message
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("model", "rotation"), [("argon", 0), ("nitrogen", 2), ("spce", 3)])
+def test_drawn_momenta_have_the_temperature_exactly_and_no_momentum(model, rotation):
+    system = build(small_scene({model: 50}, 40.0))
+    seen = observe(system, system.engine(), system.state)
+    assert system.freedom == (147, 50 * rotation)
+    assert seen.temperature == pytest.approx(300, rel=1e-12)
+    assert seen.temperature_translation == pytest.approx(300, rel=1e-12)
+    if rotation:
+        assert seen.temperature_rotation == pytest.approx(300, rel=1e-12)
+    assert np.abs(seen.momentum).max() < 1e-10
+
+
+def test_maxwell_boltzmann_on_every_axis():
+    system = build(small_scene({"spce": 4000}, 60.0))
+    omega2 = system.state.angular_momentum_body**2 * system.model.inverse_inertia[0]
+    assert omega2.mean(axis=0) == pytest.approx(np.full(3, 300 * BOLTZMANN), rel=0.08)
+    assert (18.0154 * system.state.velocity**2).mean(axis=0) == pytest.approx(
+        np.full(3, 300 * BOLTZMANN), rel=0.08
+    )

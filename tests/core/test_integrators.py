@@ -10,6 +10,7 @@ from support.stops import same_after_stops
 import rigidmd
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
+from rigidmd.commands.cli import main
 from rigidmd.core.integrators import (
     DRIFT,
     KICK,
@@ -20,8 +21,10 @@ from rigidmd.core.integrators import (
     composed,
     split,
 )
+from rigidmd.errors import SceneError
 from rigidmd.run import Simulation
-from rigidmd.scene import Scene
+from rigidmd.scene import Scene, integrators
+from rigidmd.studies.accuracy.accuracy import measure_accuracy
 
 CHIN_B = (1 - 3**-0.5) / 2, 3**-0.5, (2 - 3**0.5) / 12  # Chin 1997, scheme B: drifts, gradient
 #: Name -> order, kicks, drifts and gradients. The sums over a row of fraction times gradient are those
@@ -277,3 +280,120 @@ def test_rows_in_print_have_rounded_coefficients_and_shipped_ones_are_made_anew(
     assert rounded.force_evaluations == 2
     for scheme in (SCHEMES | WITH_THERMOSTAT).values():
         assert Scheme(*scheme) == scheme  # the checks of a new row
+
+
+MINE = """
+[[integrators]]
+name = "mine"
+order = 4
+kicks = {kicks}
+drifts = {drifts}
+[[integrators]]
+name = "other"
+order = 2
+steps = [0.5, 0.5]
+[box]
+lengths_A = 20.0
+[[molecules]]
+model = "argon"
+count = 20
+[forces]
+truncation = "smooth_switch"
+[start]
+temperature_K = 90
+[[stages]]
+duration_ps = 0.04
+integrator = "{name}"
+[output]
+trajectory = false
+figures = false
+"""
+
+
+def test_adding_an_integrator_to_a_scene(tmp_path, capsys):
+    """A table of coefficients is an integrator for runs, their folders, and accuracy."""
+    known = SCHEMES["srkn_4"]
+    for name in ("mine", "srkn_4"):
+        text = MINE.format(name=name, kicks=list(known.kicks), drifts=list(known.drifts))
+        (tmp_path / f"{name}.toml").write_text(text)
+        assert main(["run", str(tmp_path / f"{name}.toml"), "-o", str(tmp_path / name)]) == 0
+    logs = [(tmp_path / name / "log.csv").read_text() for name in ("mine", "srkn_4")]
+    assert logs[0] == logs[1]
+    assert (
+        main(["resume", str(tmp_path / "mine"), "--until", "0.08ps"]) == 0
+    )  # the folder has the row
+    assert "mine" in capsys.readouterr().out
+    found = measure_accuracy(
+        Scene.read(tmp_path / "mine" / "scene.toml"), ["mine", "srkn_4", "other"], [8.0], repeats=1
+    )
+    errors = {trial.integrator: trial.energy_rms for trial in found.trials}
+    assert errors["mine"] == errors["srkn_4"] < errors["other"]
+
+
+def test_adding_an_integrator_from_python(monkeypatch):
+    monkeypatch.setattr(integrators, "_REGISTERED", {})
+    body = Scene.read("systems/heavy_top_3.toml")
+    with pytest.raises(SceneError, match="is 'jump', must be 'velocity_verlet', "):
+        Scene.read("systems/heavy_top_3.toml", {"run.integrator": "jump"})
+    assert (
+        rigidmd.integrator("jump", order=4, steps=SCHEMES["yoshida_4"].drifts, source="Yoshida")
+        == "jump"
+    )
+    scene = Scene.read("systems/heavy_top_3.toml", {"run.integrator": "jump"})
+    assert scene.run.scheme.flows == SCHEMES["yoshida_4"].flows
+    assert [row.source for row in scene.integrators] == ["Yoshida"]
+    assert not body.integrators
+    names = {
+        trial.integrator
+        for trial in measure_accuracy(scene, timesteps=[0.01], span=0.1, repeats=1).trials
+    }
+    assert {"jump", "velocity_verlet", "dop853"} <= names
+    rigidmd.integrator("jump", order=2, steps=[0.5, 0.5])  # the scene is a value: it keeps its row
+    assert scene.run.scheme.flows == SCHEMES["yoshida_4"].flows
+    again = Scene.from_dict(scene.model_dump(exclude_none=True))
+    assert again.run.scheme == scene.run.scheme
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ({"steps": [0.5, 0.4]}, "its drifts sum to 0.9, not to 1$"),
+        ({"steps": [0.4, 0.6]}, "so that it is not time-reversible$"),
+        (
+            {"steps": [0.5, 0.5], "order": 4},
+            "order = 4, but the error of an oscillator has order 2.0$",
+        ),
+        (
+            {
+                "kicks": [0.082984, 0.39631, -0.039056, 0.119524, -0.039056, 0.39631, 0.082984],
+                "drifts": [0.245299, 0.604873, -0.350172, -0.350172, 0.604873, 0.245299],
+                "order": 4,
+            },
+            "has order 2.0. Give all digits of its coefficients .14 or more.",
+        ),
+        (
+            {"steps": [1.3512072, -1.7024142, 1.3512072], "order": 4},
+            "its drifts sum to 1.0000002, not to 1. Give all digits",
+        ),
+        ({"steps": [1.0], "kicks": [0.5, 0.5]}, "contradict each other"),
+        ({"kicks": [0.5, 0.5]}, "needs steps, or kicks and drifts"),
+        ({"kicks": [0.5, 0.5], "drifts": [0.5, 0.5]}, "kicks must be one more than drifts"),
+        ({"kicks": [0.5, float("nan")], "drifts": [1.0]}, "kicks.1"),
+        (
+            {"kicks": [0.5, 0.0, 0.5], "drifts": [0.5, 0.5], "gradients": [0, 0.1, 0]},
+            "fraction 0 has no gradient",
+        ),
+        ({"steps": [1.0], "name": "srkn_4"}, "srkn_4 is an integrator of rigidmd"),
+        ({"steps": [1.0], "name": "my row"}, "name: is 'my row'"),
+        ({"steps": [1e5, -1e5, 1.0]}, "steps.0: is 100000.0, must not be more than 10"),
+    ],
+)
+def test_rows_that_cannot_be(row, message):
+    with pytest.raises(SceneError, match=message):
+        rigidmd.integrator(**({"name": "mine", "order": 2} | row))
+    stage = {"duration_ps": 1.0, "integrator": row.get("name", "mine")}
+    with pytest.raises(SceneError, match=r"integrators\.0") as caught:
+        small_scene(
+            {"argon": 20}, 30.0, integrators=[{"name": "mine", "order": 2} | row], stages=[stage]
+        )
+    assert not [error for error in caught.value.errors if error.startswith("stages")]

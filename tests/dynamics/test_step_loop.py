@@ -1,21 +1,17 @@
-"""The step: its order, what it keeps, that it can be run backwards, and that it does the same thing
-every time."""
+"""The step: its order, conservation, reversal, repetition."""
 
 import numba
 import numpy as np
 import pytest
 from support.common import built, move, observe, small_scene
 
-import rigidmd
 from rigidmd.assemble.build import build
-from rigidmd.commands.cli import main
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.integrators import SCHEMES
-from rigidmd.core.state import HEAT, State, no_load, state_of
+from rigidmd.core.state import HEAT, State, state_of
 from rigidmd.core.statistics import slope
 from rigidmd.dynamics.model import draw_momenta
 from rigidmd.dynamics.noise import THERMOSTAT, key_of
-from rigidmd.dynamics.observables import largest_values, sums_of_state
 from rigidmd.dynamics.thermostats import VelocityRescaling, constant_ramp
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
@@ -23,8 +19,7 @@ from rigidmd.forces.neighbors.sites import blocks_of
 from rigidmd.mechanics import batches
 from rigidmd.mechanics.rotation import orthogonality_error, random_rotations
 from rigidmd.run import Simulation
-from rigidmd.scene import Scene, integrators
-from rigidmd.studies.accuracy.accuracy import measure_accuracy
+from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN
 
 VERLET = SCHEMES["velocity_verlet"]
@@ -162,94 +157,6 @@ def test_schemes_are_palindromes_and_run_backwards(dimer, name):
     assert off(run(engine, there, 0.001, 100, scheme=scheme), state) < 1e-11
 
 
-@pytest.mark.parametrize(
-    "molecules", [{"spce": 5, "argon": 4}, {"argon": 6}, {"nitrogen": 4, "tip4p": 3}]
-)
-def test_sums_are_those_of_numpy(molecules):
-    system, _, state = built(molecules, 30.0, 3)
-    model, load = system.model, no_load(state)
-    rng = np.random.default_rng(1)
-    for array in load:
-        array[:] = rng.normal(size=array.shape)
-    found, mass = sums_of_state(model, state, load), model.mass[model.species][:, None]
-    inverse = model.inverse_inertia[model.species][: len(state.rotation)]
-    assert found.momentum == pytest.approx((mass * state.velocity).sum(axis=0), rel=1e-12, abs=1e-9)
-    assert found.momentum_flux == pytest.approx(
-        (mass * state.velocity).T @ state.velocity, rel=1e-12, abs=1e-9
-    )
-    assert found.translation == pytest.approx(found.momentum_flux.trace())
-    assert found.rotation == pytest.approx(
-        (inverse * state.angular_momentum_body**2).sum(), rel=1e-12
-    )
-    squares = (load.force / mass).T @ load.force
-    assert found.force_squares == pytest.approx(squares, rel=1e-12, abs=1e-9)
-    assert found.force == pytest.approx((load.force**2 / mass).sum(), rel=1e-12)
-    assert found.torque == pytest.approx((inverse * load.torque_body**2).sum(), rel=1e-12)
-    if len(state.rotation):
-        state.rotation[1] += 1e-6
-    assert sums_of_state(model, state).orthogonality_error == pytest.approx(
-        orthogonality_error(state.rotation), abs=1e-15
-    )
-    unloaded = sums_of_state(model, state)
-    assert (unloaded.force, unloaded.torque) == (0, 0)
-    if len(state.rotation):
-        state.rotation[0, 1, 1] = np.nan
-        assert np.isnan(sums_of_state(model, state).orthogonality_error)
-
-
-@pytest.mark.parametrize("molecules", [{"spce": 5, "argon": 4}, {"argon": 6}])
-def test_an_extent_has_the_largest_of_every_array(molecules):
-    _, _, state = built(molecules, 30.0, 3)
-    load = no_load(state)
-    load.force[:] = np.random.default_rng(2).normal(size=load.force.shape)
-    arrays = [*state[:4], *load]
-    assert largest_values(state, load) == tuple(np.abs(array).max(initial=0.0) for array in arrays)
-    for k, array in enumerate(arrays):
-        if len(array):
-            for worst in (
-                -1e300,
-                np.inf,
-                -np.inf,
-                np.nan,
-                -np.nan,
-            ):  # each is larger than the one before
-                array.flat[7] = worst
-                np.testing.assert_equal(largest_values(state, load)[k], abs(worst))
-    assert largest_values(state)[4:] == (0.0, 0.0)
-
-
-@pytest.mark.parametrize("molecules", [{"spce": 40}, {"argon": 40}])
-def test_what_is_measured_at_the_end_of_a_move_is_that_of_the_state(molecules):
-    system, engine, state = built(molecules, 25.0, 3)
-    verlet = SCHEMES["velocity_verlet"]
-    state = engine.begin(state, verlet)
-
-    def same(known=True, with_sums=False):
-        assert engine.extent(state) == (largest_values(state, engine.load) if known else None)
-        load, _ = engine.evaluate_current(state)
-        sums = engine.sums(state, load)
-        assert (sums is not None) == with_sums
-        for found, expected in zip(
-            sums or (), sums_of_state(system.model, state, load), strict=with_sums
-        ):
-            np.testing.assert_array_equal(found, expected)
-
-    assert engine.extent(state) is None
-    for until, looked in ((3, True), (5, False), (7, True), (7, False), (7, True)):
-        engine.advance(state, verlet, 0.001, until, looked)
-        same(with_sums=looked)
-    state.position[1] += 0.3
-    state.velocity[1] *= 100.0
-    engine.forget()
-    same(known=False)
-    engine.advance(
-        state, SCHEMES["pefrl"], 0.001, 8, True
-    )  # ends with a drift: its forces are those before
-    same(known=False)
-    other = engine.begin(system.state, verlet)
-    assert engine.extent(other) is None
-
-
 def test_time_can_be_reversed(liquid):
     _, engine, state = liquid
     there = run(engine, state, 0.001, 200)
@@ -345,27 +252,6 @@ def test_same_bits_for_one_and_two_threads_and_again(counts):
     for other in ends[1:]:
         for a, b in zip(ends[0], other, strict=True):
             assert a.tobytes() == b.tobytes()
-
-
-@pytest.mark.parametrize(("model", "rotation"), [("argon", 0), ("nitrogen", 2), ("spce", 3)])
-def test_drawn_momenta_have_the_temperature_exactly_and_no_momentum(model, rotation):
-    system = build(small_scene({model: 50}, 40.0))
-    seen = observe(system, system.engine(), system.state)
-    assert system.freedom == (147, 50 * rotation)
-    assert seen.temperature == pytest.approx(300, rel=1e-12)
-    assert seen.temperature_translation == pytest.approx(300, rel=1e-12)
-    if rotation:
-        assert seen.temperature_rotation == pytest.approx(300, rel=1e-12)
-    assert np.abs(seen.momentum).max() < 1e-10
-
-
-def test_maxwell_boltzmann_on_every_axis():
-    system = build(small_scene({"spce": 4000}, 60.0))
-    omega2 = system.state.angular_momentum_body**2 * system.model.inverse_inertia[0]
-    assert omega2.mean(axis=0) == pytest.approx(np.full(3, 300 * BOLTZMANN), rel=0.08)
-    assert (18.0154 * system.state.velocity**2).mean(axis=0) == pytest.approx(
-        np.full(3, 300 * BOLTZMANN), rel=0.08
-    )
 
 
 @numba.njit
@@ -495,120 +381,3 @@ def test_linear_and_asymmetric_bodies_follow_euler_under_torque():
     moved = run(engine, state, 0.05 / 4000, 4000)
     for a, b in zip(moved[:4], exact, strict=False):
         assert a == pytest.approx(b, abs=2e-5 * max(1, np.abs(b).max()))
-
-
-MINE = """
-[[integrators]]
-name = "mine"
-order = 4
-kicks = {kicks}
-drifts = {drifts}
-[[integrators]]
-name = "other"
-order = 2
-steps = [0.5, 0.5]
-[box]
-lengths_A = 20.0
-[[molecules]]
-model = "argon"
-count = 20
-[forces]
-truncation = "smooth_switch"
-[start]
-temperature_K = 90
-[[stages]]
-duration_ps = 0.04
-integrator = "{name}"
-[output]
-trajectory = false
-figures = false
-"""
-
-
-def test_adding_an_integrator_to_a_scene(tmp_path, capsys):
-    """A table of coefficients is an integrator for runs, their folders, and accuracy."""
-    known = SCHEMES["srkn_4"]
-    for name in ("mine", "srkn_4"):
-        text = MINE.format(name=name, kicks=list(known.kicks), drifts=list(known.drifts))
-        (tmp_path / f"{name}.toml").write_text(text)
-        assert main(["run", str(tmp_path / f"{name}.toml"), "-o", str(tmp_path / name)]) == 0
-    logs = [(tmp_path / name / "log.csv").read_text() for name in ("mine", "srkn_4")]
-    assert logs[0] == logs[1]
-    assert (
-        main(["resume", str(tmp_path / "mine"), "--until", "0.08ps"]) == 0
-    )  # the folder has the row
-    assert "mine" in capsys.readouterr().out
-    found = measure_accuracy(
-        Scene.read(tmp_path / "mine" / "scene.toml"), ["mine", "srkn_4", "other"], [8.0], repeats=1
-    )
-    errors = {trial.integrator: trial.energy_rms for trial in found.trials}
-    assert errors["mine"] == errors["srkn_4"] < errors["other"]
-
-
-def test_adding_an_integrator_from_python(monkeypatch):
-    monkeypatch.setattr(integrators, "_REGISTERED", {})
-    body = Scene.read("systems/heavy_top_3.toml")
-    with pytest.raises(SceneError, match="is 'jump', must be 'velocity_verlet', "):
-        Scene.read("systems/heavy_top_3.toml", {"run.integrator": "jump"})
-    assert (
-        rigidmd.integrator("jump", order=4, steps=SCHEMES["yoshida_4"].drifts, source="Yoshida")
-        == "jump"
-    )
-    scene = Scene.read("systems/heavy_top_3.toml", {"run.integrator": "jump"})
-    assert scene.run.scheme.flows == SCHEMES["yoshida_4"].flows
-    assert [row.source for row in scene.integrators] == ["Yoshida"]
-    assert not body.integrators
-    names = {
-        trial.integrator
-        for trial in measure_accuracy(scene, timesteps=[0.01], span=0.1, repeats=1).trials
-    }
-    assert {"jump", "velocity_verlet", "dop853"} <= names
-    rigidmd.integrator("jump", order=2, steps=[0.5, 0.5])  # the scene is a value: it keeps its row
-    assert scene.run.scheme.flows == SCHEMES["yoshida_4"].flows
-    again = Scene.from_dict(scene.model_dump(exclude_none=True))
-    assert again.run.scheme == scene.run.scheme
-
-
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ({"steps": [0.5, 0.4]}, "its drifts sum to 0.9, not to 1$"),
-        ({"steps": [0.4, 0.6]}, "so that it is not time-reversible$"),
-        (
-            {"steps": [0.5, 0.5], "order": 4},
-            "order = 4, but the error of an oscillator has order 2.0$",
-        ),
-        (
-            {
-                "kicks": [0.082984, 0.39631, -0.039056, 0.119524, -0.039056, 0.39631, 0.082984],
-                "drifts": [0.245299, 0.604873, -0.350172, -0.350172, 0.604873, 0.245299],
-                "order": 4,
-            },
-            "has order 2.0. Give all digits of its coefficients .14 or more.",
-        ),
-        (
-            {"steps": [1.3512072, -1.7024142, 1.3512072], "order": 4},
-            "its drifts sum to 1.0000002, not to 1. Give all digits",
-        ),
-        ({"steps": [1.0], "kicks": [0.5, 0.5]}, "contradict each other"),
-        ({"kicks": [0.5, 0.5]}, "needs steps, or kicks and drifts"),
-        ({"kicks": [0.5, 0.5], "drifts": [0.5, 0.5]}, "kicks must be one more than drifts"),
-        ({"kicks": [0.5, float("nan")], "drifts": [1.0]}, "kicks.1"),
-        (
-            {"kicks": [0.5, 0.0, 0.5], "drifts": [0.5, 0.5], "gradients": [0, 0.1, 0]},
-            "fraction 0 has no gradient",
-        ),
-        ({"steps": [1.0], "name": "srkn_4"}, "srkn_4 is an integrator of rigidmd"),
-        ({"steps": [1.0], "name": "my row"}, "name: is 'my row'"),
-        ({"steps": [1e5, -1e5, 1.0]}, "steps.0: is 100000.0, must not be more than 10"),
-    ],
-)
-def test_rows_that_cannot_be(row, message):
-    with pytest.raises(SceneError, match=message):
-        rigidmd.integrator(**({"name": "mine", "order": 2} | row))
-    stage = {"duration_ps": 1.0, "integrator": row.get("name", "mine")}
-    with pytest.raises(SceneError, match=r"integrators\.0") as caught:
-        small_scene(
-            {"argon": 20}, 30.0, integrators=[{"name": "mine", "order": 2} | row], stages=[stage]
-        )
-    assert not [error for error in caught.value.errors if error.startswith("stages")]

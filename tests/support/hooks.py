@@ -248,8 +248,8 @@ TIERS = {
         "forces/ewald/test_dispersion.py": ("mixed_precision[argon]",),
         "dynamics/test_step_loop.py": (
             "a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid[chin_4a*",
-            "adding_an_integrator_*",
         ),
+        "core/test_integrators.py": ("adding_an_integrator_*",),
         "features/external/test_settings.py": ("adding_an_engine_takes_a_folder_and_a_file",),
         "end_to_end/test_faults.py": ("a_run_that_is_stopped_by_signals_goes_on*",),
         "forces/fields/test_fields.py": ("adding_a_field_*",),
