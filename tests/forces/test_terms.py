@@ -1,4 +1,4 @@
-"""Loads of all terms: the slow oracle, finite differences, Newton's third law, a changed cell."""
+"""Loads of all terms: the slow oracle, finite differences, action and reaction, a changed cell."""
 
 import numpy as np
 import pytest

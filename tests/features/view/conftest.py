@@ -1,4 +1,4 @@
-"""Short runs that pages and films show."""
+"""Short runs that pages and animations show."""
 
 import pytest
 from support.common import ROOT

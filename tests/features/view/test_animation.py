@@ -1,4 +1,4 @@
-"""Films: their frames, sizes, formats, periods."""
+"""Animations: their frames, sizes, formats, periods."""
 
 import shutil
 import sys

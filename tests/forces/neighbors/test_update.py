@@ -1,4 +1,4 @@
-"""When lists of neighbours are built: room, skin, predicted positions, changes of the box."""
+"""When lists of neighbours are built: memory, skin, predicted positions, changes of the box."""
 
 import numpy as np
 import pytest
