@@ -56,9 +56,9 @@ def test_it_is_a_schema_and_says_of_what(capsys):
     assert "null" not in json.dumps(printed)  # TOML has none
 
 
-@pytest.mark.parametrize("path", SYSTEMS, ids=lambda path: path.stem)
-def test_shipped_scenes_are_valid(path):
-    assert told(path.read_text()) == []
+def test_shipped_scenes_are_valid():
+    errors = {path.stem: told(path.read_text()) for path in SYSTEMS}
+    assert not any(errors.values()), errors
 
 
 @pytest.mark.parametrize(

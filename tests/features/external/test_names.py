@@ -231,9 +231,6 @@ def test_paths_change_no_word_of_the_script_of_a_job(tmp_path, name, folder, sce
 
 
 @pytest.mark.parametrize(
-    "hidden", ["\n", "\r", "\t", "\x00", "\x1b", "\x7f", "\x85", "\u2028", "\u202e"]
-)
-@pytest.mark.parametrize(
     "key",
     [
         "molecules.0.name",
@@ -244,10 +241,12 @@ def test_paths_change_no_word_of_the_script_of_a_job(tmp_path, name, folder, sce
         "molecules.0.sites.0.name",
     ],
 )
-def test_names_with_control_characters_are_refused(key, hidden, tmp_path):
-    with pytest.raises(
-        SceneError, match=r"control character|must be one|must be a name of letters|plain file name"
-    ) as refused:
-        Scene.from_dict(data(PLAIN), overrides={key: f"a{hidden}b"})
-    assert key in str(refused.value)
-    assert not any(hidden in fault for fault in refused.value.errors)
+def test_names_with_control_characters_are_refused(key):
+    for hidden in "\n\r\t\x00\x1b\x7f\x85\u2028\u202e":
+        with pytest.raises(
+            SceneError,
+            match=r"control character|must be one|must be a name of letters|plain file name",
+        ) as refused:
+            Scene.from_dict(data(PLAIN), overrides={key: f"a{hidden}b"})
+        assert key in str(refused.value)
+        assert not any(hidden in error for error in refused.value.errors)
