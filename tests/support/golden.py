@@ -31,6 +31,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from importlib.metadata import version
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -49,16 +50,23 @@ from support import scenes, schema_scenes  # noqa: E402
 Tables = dict[str, Any]
 Parts = dict[str, dict[str, str]]  # part -> member -> digest
 
+LONGEST_LINE = 200  # characters of a line that is printed
 STEPS, BODY_STEPS = 40, 1000
 THREADS = (1, 2)
-LONGEST = 300  # characters of a text that is stored in place of its digest
+LONGEST = (
+    4000  # characters of a text that is stored in place of its digest, so that it can be shown
+)
+TIMESTEP_FS = 5.0  # of stages without one, which is at most as long
 #: Keys of JSON files whose values are wall times, versions or the machine.
 NOT_COMPARED = re.compile(
     r".*_version|machine|processor|processor_features|vector_bits|with"
     r"|preparing_s|wall_s|computing_s|steps_per_s|ns_per_day|computing|seconds"
 )
-#: Wall times in printed texts, and announcements of slow work.
-WALL_TIME = re.compile(r"[\d.,e+]+ steps/s( \([^)]*\))?|(?m:^  .* \.\.\.\n)")
+#: Wall times and free memory in printed texts, and announcements of slow work.
+WALL_TIME = re.compile(
+    r"(?m)[\d.,e+]+ steps/s(,? \(?[\d.,e+]+ ns/day\)?)?|(?<=; )[\d.,e+]+ s$|[\d.e+]+ GB free"
+    r"|^  .* \.\.\.\n"
+)
 FIGURES = {".png", ".svg", ".html"}
 SCENES = {
     name: (tomllib.loads(text), changes)
@@ -110,7 +118,9 @@ def digest(value: str | bytes) -> str:
 def compared(value: Any) -> Any:
     """JSON without wall times, versions and paths of folders."""
     if isinstance(value, dict):
-        return {k: compared(v) for k, v in value.items() if not NOT_COMPARED.fullmatch(k)}
+        calls = {k: count for k, (count, _) in value.get("forces_by_python", {}).items()}
+        values = value | ({"forces_by_python": calls} if calls else {})
+        return {k: compared(v) for k, v in values.items() if not NOT_COMPARED.fullmatch(k)}
     if isinstance(value, list):
         return [compared(entry) for entry in value]
     return value.replace(f"{Path.cwd()}/", "") if isinstance(value, str) else value
@@ -207,7 +217,7 @@ def shortened(tables: Tables) -> Tables:
     steps = []
     for stage in tables["stages"]:
         if stage.get("ensemble") != "minimise":
-            steps.append(stage.get("timestep_fs", 2.5) / 1000)
+            steps.append(stage.get("timestep_fs", TIMESTEP_FS) / 1000)
             stage["duration_ps"] = STEPS * steps[-1]
     intervals = {"log_interval_ps": 4, "trajectory_interval_ps": 10}
     if "pressure_tensor_interval_ps" in output:
@@ -349,7 +359,7 @@ def tests_of_messages() -> Parts:
             command = ["check", "scene.toml", "--set", values["override"]]
         else:
             continue
-        messages[name if len(name) <= LONGEST else digest(name.encode())] = digest(
+        messages[name if len(name) <= LONGEST_LINE else digest(name.encode())] = digest(
             printed(*command)
         )
     return {"messages": messages}
@@ -481,10 +491,13 @@ def differences(before: dict[str, Parts], after: dict[str, Parts]) -> list[str]:
 
 
 def described(members: list[str], was: dict[str, str], now: dict[str, str]) -> str:
-    """The first member that differs, with both values, and how many others do."""
+    """The first member that differs, how many others do, and its first line that differs."""
     first = members[0]
     more = f" and {len(members) - 1} more" if len(members) > 1 else ""
-    values = f"{was.get(first, 'missing')!r} -> {now.get(first, 'missing')!r}"
+    texts = [texts.get(first, "missing").splitlines() or [""] for texts in (was, now)]
+    pairs = zip_longest(*texts, fillvalue="")
+    lines = next((pair for pair in pairs if pair[0] != pair[1]), ("", ""))
+    values = " -> ".join(repr(line[:LONGEST_LINE]) for line in lines)
     return f" ({first}{more}): {values}" if first or more else f": {values}"
 
 

@@ -79,4 +79,9 @@ def test_digests_have_values_and_no_wall_times(tmp_path, monkeypatch):
         " log.csv (Energy)",
         " summary.json (seed and 1 more)",
     ]
-    assert golden.WALL_TIME.sub("", "NVT at 1 fs, 578 steps/s (124.8 ns/day)") == "NVT at 1 fs, "
+    for text in (
+        "1 fs, 1,578 steps/s (124.8 ns/day)",
+        "1 fs, 78 steps/s, 4.8 ns/day",
+        "1 fs, 9 steps/s",
+    ):
+        assert golden.WALL_TIME.sub("", text) == "1 fs, "
