@@ -1,6 +1,7 @@
 """The report of `rigidmd check`: how a system would run, and what is not compiled for it."""
 
 import re
+from importlib import import_module
 from math import inf
 from typing import NamedTuple
 
@@ -142,7 +143,10 @@ def _describe_molecules(system: System) -> str:
     lines += [f"  {box}", *(f"  {note}" for note in system.notes), "\ncompiled in:"]
     fields = scene.fields.entries
     for name, term in system.terms.items():
-        of_field = fields[name][0].sentence(fields[name][1], term) if name in fields else ""
+        of_field = ""
+        if name in fields:
+            kind, table, _ = fields[name]
+            of_field = import_module(f"rigidmd.forces.fields.{kind.module}").sentence(table, term)
         description = system.user_terms.get(name) or of_field or _describe_term(system, term)
         lines.append(f"  {name.replace('_', ' ')}: {description}")
     if system.tail is not None:

@@ -13,7 +13,6 @@ import numpy as np
 from rigidmd.units import GRAM_PER_CM3, KJ_PER_MOL
 
 if TYPE_CHECKING:
-    from rigidmd.forces import inputs
     from rigidmd.forces.neighbors.space import Space
     from rigidmd.scene import BodyScene, MolecularScene
     from rigidmd.scene.forces import Forces
@@ -162,7 +161,7 @@ def too_short(lengths: Mapping[str, float | None], contact: float, touching: str
     ]
 
 
-def shortest_contact(species: "Sequence[inputs.Molecule]") -> float:
+def shortest_contact(species: "Sequence[Molecule]") -> float:
     """Smallest distance at which two like molecules have minimum energy, by their largest sites, Å;
     inf without."""
     largest = [float(m.sigma.max(where=m.epsilon > 0, initial=0.0)) for m in species]

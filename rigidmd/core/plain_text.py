@@ -27,6 +27,11 @@ def as_identifier(text: str) -> str:
     return re.sub("[^A-Za-z0-9_]", "_", text) or "_"
 
 
+def vector_text(values: Iterable[float]) -> str:
+    """Numbers in parentheses."""
+    return f"({', '.join(f'{x:g}' for x in values)})"
+
+
 def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
     """Names with numbers where they would be equal to others or taken: a, a_2."""
     names_in_use = list(taken)

@@ -2,15 +2,17 @@
 changes."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.forces.inputs import Masses
 from rigidmd.forces.terms import trait
 from rigidmd.mechanics.free_rotor import ExactRotor, NoRotor, SplitRotor
 from rigidmd.units import BOLTZMANN
+
+if TYPE_CHECKING:
+    from rigidmd.forces.parts import Masses
 
 
 class Model(NamedTuple):
@@ -48,7 +50,7 @@ def count_degrees_of_freedom(model: Model) -> DegreesOfFreedom:
     return DegreesOfFreedom(free, int(turning[model.species].sum()))
 
 
-def conserved_momentum(model: Masses, terms: Mapping[str, NamedTuple]) -> np.ndarray:
+def conserved_momentum(model: "Masses", terms: Mapping[str, NamedTuple]) -> np.ndarray:
     """Whether each component (3,) of the total momentum is conserved, as in `Model.keeps_momentum`.
     None is conserved if there are frozen molecules. `changes_momentum` of a term lists the
     components that it changes."""
@@ -59,7 +61,7 @@ def conserved_momentum(model: Masses, terms: Mapping[str, NamedTuple]) -> np.nda
     return conserved
 
 
-def mobile(model: Masses) -> np.ndarray:
+def mobile(model: "Masses") -> np.ndarray:
     """Whether each molecule (n,) can move, that is, is not frozen."""
     return model.inverse_mass[model.species] > 0
 

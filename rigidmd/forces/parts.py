@@ -6,23 +6,42 @@ of a method of electrostatics, `term` of a field.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.forces.ewald.errors import FINE, Charges, charges_in, filled_fraction
-from rigidmd.forces.inputs import Grid, KeysAndValues, Masses, Molecule, SceneKeys
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites, exclusion_groups, sites_of
 from rigidmd.forces.neighbors.space import Space
+from rigidmd.scene.models import Molecule
+from rigidmd.scene.molecules import MolecularScene
 from rigidmd.units import COULOMB_CHARGE
+
+#: Numbers of grid points along three edges.
+Grid = tuple[int, int, int]
+#: Keys of [forces] and their values.
+KeysAndValues = dict[str, float | str | Grid | None]
+
+
+class Masses(Protocol):
+    """The masses and moments of inertia of n molecules, of a `dynamics.model.Model`."""
+
+    @property
+    def species(self) -> np.ndarray: ...  # (n,) species of each molecule
+    @property
+    def mass(self) -> np.ndarray: ...  # (species,) u
+    @property
+    def inverse_mass(self) -> np.ndarray: ...  # (species,) 1/u; 0 for a frozen species
+    @property
+    def inverse_inertia(self) -> np.ndarray: ...  # (species, 3) 1/(u Å²); 0 where the moment is 0
 
 
 class SystemParts(NamedTuple):
     """The parts of a system on which its terms depend."""
 
-    scene: SceneKeys
+    scene: MolecularScene
     species: Sequence[Molecule]
     model: Masses
     space: Space

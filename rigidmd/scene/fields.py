@@ -1,8 +1,8 @@
 """The table [fields] of a scene of molecules: electric field, gravity, walls, restraints."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from math import inf
-from typing import TYPE_CHECKING, Annotated, Generic, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from pydantic import Field, Strict, field_validator
 
@@ -16,18 +16,12 @@ from rigidmd.scene.validation import (
     Positive,
     Section,
     Vector,
-    not_none,
 )
 
 if TYPE_CHECKING:
-    from rigidmd.forces.fields.restraints import Restraints
-    from rigidmd.forces.fields.walls import HarmonicWalls, LennardJonesWalls
     from rigidmd.scene.molecules import MolecularScene
 
 AXES = "xyz"
-
-Table = TypeVar("Table", bound=Section)
-Term = TypeVar("Term")
 
 Edge = Annotated[float, Strict()]
 
@@ -202,73 +196,20 @@ class Fields(Section):
         return None
 
 
-class FieldKind(NamedTuple, Generic[Table, Term]):
+class FieldKind(NamedTuple):
     """A kind of field. Its keys are of `Fields`."""
 
-    module: str  # in `forces.fields`, with the function `term`
+    module: str  # in `forces.fields`, with the functions `term` and `sentence`
     key: str  # of `Fields`: a value, a table or a list of tables, each of which is one term
     title: str  # in the list of unused interactions of a scene
-    #: Of the table with its keys and of its term, for `rigidmd check`
-    sentence: Callable[[Table, Term], str]
-
-
-def _electric_sentence(fields: Fields, term: object) -> str:
-    amplitude = f"{_vector(not_none(fields.electric_V_per_nm))} V/nm"
-    if fields.electric_frequency_per_ps is None:
-        return amplitude
-    frequency = f"f = {fields.electric_frequency_per_ps:g}/ps. Its work is in the energy ledger"
-    return f"{amplitude} cos(2 pi f t + {fields.electric_phase_deg:g}°), {frequency}"
-
-
-def _gravity_sentence(fields: Fields, term: object) -> str:
-    return f"{_vector(not_none(fields.gravity_m_s2))} m/s²"
-
-
-def _walls_sentence(walls: Walls, term: "LennardJonesWalls | HarmonicWalls") -> str:
-    kind = f"harmonic, {walls.stiffness_kJ_mol_A2 or 0:g} kJ/mol/Å²"
-    if walls.kind == "lj93":
-        kind = (
-            f"Lennard-Jones 9-3, sigma {walls.sigma_A:g} Å, epsilon {walls.epsilon_kJ_mol:g}"
-            " kJ/mol, "
-        )
-        kind += f"cutoff {walls.cutoff_A:g} Å" if walls.cutoff_A else "no cutoff"
-    what = "centres of mass" if walls.acts_on == "centres" else f"{len(term.sites.molecule)} sites"
-    positions = [f"{walls.axis} = {x:g} Å" for x in walls.positions_A if abs(x) < inf]
-    return f"at {' and '.join(positions)}, on {what}: {kind}"
-
-
-def _restraint_sentence(entry: Restraint, term: "Restraints") -> str:
-    if entry.between is not None:
-        one, other = (_numbers(group) for group in entry.groups)
-        spring = f"restrained to {entry.distance_A:g} Å, {entry.stiffness[0]:g} kJ/mol/Å²"
-        return f"distance of {one} and {other} {spring}"
-    size = f"{entry.stiffness[0]:g}" if len(set(entry.stiffness)) == 1 else _vector(entry.stiffness)
-    if entry.position_A is None:
-        where = "to their starting positions"
-    else:
-        where = f"to {_vector(entry.position_A)} Å"
-    return f"{len(term.molecule)} molecules restrained {where}, {size} kJ/mol/Å²"
-
-
-def _numbers(group: list[int]) -> str:
-    """A group of molecules, for messages."""
-    if len(group) == 1:
-        return f"molecule {group[0]}"
-    return f"the centre of {len(group)} molecules ({group[0]}, ...)"
-
-
-def _vector(values: Iterable[float]) -> str:
-    return f"({', '.join(f'{x:g}' for x in values)})"
 
 
 #: Name of a term, to which a number is added if `key` is a list -> its kind.
 FIELDS = {
-    "electric_field": FieldKind(
-        "electric", "electric_V_per_nm", "electric field", _electric_sentence
-    ),
-    "gravity": FieldKind("gravity", "gravity_m_s2", "gravity", _gravity_sentence),
-    "walls": FieldKind("walls", "walls", "walls", _walls_sentence),
-    "restraints": FieldKind("restraints", "restraints", "restraints", _restraint_sentence),
+    "electric_field": FieldKind("electric", "electric_V_per_nm", "electric field"),
+    "gravity": FieldKind("gravity", "gravity_m_s2", "gravity"),
+    "walls": FieldKind("walls", "walls", "walls"),
+    "restraints": FieldKind("restraints", "restraints", "restraints"),
 }
 
 

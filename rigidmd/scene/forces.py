@@ -22,7 +22,7 @@ from rigidmd.scene.validation import (
 
 Permittivity = Annotated[float, Strict(), Field(ge=1)]
 KIndex = Annotated[int, Strict(), Field(ge=0, le=1000)]
-Truncation = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
+TruncationName = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 
 
@@ -123,7 +123,7 @@ class CustomForce(Section):
     )
     """With an energy: the mean of each parameter for unlike sites. Default: arithmetic for names
     that start with sig, else geometric"""
-    truncation: Truncation | None = None
+    truncation: TruncationName | None = None
     """With an energy: its cutoff scheme. Default: forces.truncation"""
     cutoff_A: Cutoff | None = None
     """With an energy: its cutoff. Default: forces.cutoff_A"""
@@ -239,7 +239,7 @@ class Forces(Section):
 
     cutoff_A: Cutoff | None = None
     """Cutoff between sites. Default: 9 Å in a periodic box, none without a box"""
-    truncation: Truncation = "shift"
+    truncation: TruncationName = "shift"
     """Cutoff scheme of Lennard-Jones forces. Use smooth_switch with integrators of order 4 and
     more, which lose their order if forces jump at the cutoff. Charges follow
     reaction_field_truncation and ewald_truncation"""
@@ -279,7 +279,7 @@ class Forces(Section):
     box. none ignores charges. Default: pme in a periodic box, coulomb in an open box"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cutoff. inf is a conductor"""
-    reaction_field_truncation: Truncation | None = None
+    reaction_field_truncation: TruncationName | None = None
     """Cutoff scheme of charges with a reaction field. With a conductor the force at the cutoff is
     0, so that a shifted energy suffices. switch and smooth_switch multiply the shifted energy. They
     make the random walk of the energy smaller and steps slower. Default: plain or smooth_switch if

@@ -23,11 +23,11 @@ LAYERS = (
     "core",
     "compile",
     "mechanics",
-    "forces",
-    "dynamics",
     "formats",
     "programs",
     "scene",
+    "forces",
+    "dynamics",
     "engines",
     "io",
     "figures",
@@ -152,7 +152,7 @@ def build():
         (4, "rigidmd.io"),
     ]
     assert [message.split(":")[0] for message in upward("scene", inner)] == ["3", "4"]
-    assert [message.split(":")[0] for message in upward("dynamics", inner)] == ["1", "2", "3", "4"]
+    assert [message.split(":")[0] for message in upward("mechanics", inner)] == ["1", "2", "3", "4"]
 
 
 def test_each_library_has_its_packages():

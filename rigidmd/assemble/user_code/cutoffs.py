@@ -9,8 +9,9 @@ import numpy as np
 from rigidmd.assemble.plausibility import too_short
 from rigidmd.engines.system import System
 from rigidmd.forces.potentials.formulas import FormulaError
-from rigidmd.forces.potentials.truncation import MINIMUM_TOLERANCE, TruncationName
+from rigidmd.forces.potentials.truncation import MINIMUM_TOLERANCE
 from rigidmd.formats.cells import pairs_within
+from rigidmd.scene.forces import TruncationName
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 #: Largest energy at the cutoff without a warning, in kT, see `ValuesAtCutoff.lost`. Lennard-Jones

@@ -17,7 +17,8 @@ from rigidmd.forces.potentials.formulas import (
     formula_of_function,
     formula_of_table,
 )
-from rigidmd.forces.potentials.truncation import TRUNCATIONS, TruncationName
+from rigidmd.forces.potentials.truncation import TRUNCATIONS
+from rigidmd.scene.forces import TruncationName
 from rigidmd.scene.validation import did_you_mean, not_none
 
 Rule = Literal["geometric", "arithmetic", "harmonic"]

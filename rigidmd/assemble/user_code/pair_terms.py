@@ -38,13 +38,13 @@ from rigidmd.forces.potentials.custom import CustomPotential, tail_of_pair
 from rigidmd.forces.potentials.formulas import Formula, FormulaError, Radial
 from rigidmd.forces.potentials.truncation import (
     Truncation,
-    TruncationName,
     TruncationTerms,
     default_switch_start,
     short_cutoff_note,
     truncation_of,
     truncation_terms,
 )
+from rigidmd.scene.forces import TruncationName
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean
 

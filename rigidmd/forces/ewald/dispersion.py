@@ -22,15 +22,17 @@ from rigidmd.forces.ewald.errors import (
     real_error,
 )
 from rigidmd.forces.ewald.smooth import InverseR6
-from rigidmd.forces.inputs import ForceKeys, KeysAndValues, Molecule
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.parts import (
     Composition,
     Interactions,
+    KeysAndValues,
     Settings,
     SystemParts,
     gather_per_molecule,
 )
+from rigidmd.scene.forces import Forces
+from rigidmd.scene.models import Molecule
 from rigidmd.units import KJ_PER_MOL
 
 #: Default of forces.dispersion_accuracy, with which the pairs that are omitted change the pressure
@@ -44,7 +46,7 @@ def dispersing_in(species: Sequence[Molecule], counts: np.ndarray) -> Dispersing
     return charges_in(species, counts, lambda m: m.dispersion, Dispersing)
 
 
-def settings(forces: ForceKeys, composition: Composition, cutoff: float | None) -> Settings:
+def settings(forces: Forces, composition: Composition, cutoff: float | None) -> Settings:
     """The keys of [forces] that follow from the accuracy. cutoff : of Lennard-Jones, Å"""
     space, species, counts = composition.space, composition.species, composition.counts
     where = f"forces.dispersion = {forces.dispersion!r}"

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.special import erfcx, gammaincc
 
 from rigidmd.forces.ewald.direct_sum import KVectors
-from rigidmd.forces.inputs import Molecule
 from rigidmd.forces.neighbors.space import Space, longest_gaps
+from rigidmd.scene.models import Molecule
 
 MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
 #: Along an edge in estimates: errors depend on the spacing, not on the number of points. With 16

@@ -22,11 +22,11 @@ from rigidmd.forces.ewald.errors import (
     real_error,
 )
 from rigidmd.forces.ewald.smooth import InverseR
-from rigidmd.forces.inputs import ForceKeys, KeysAndValues
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
-from rigidmd.forces.parts import Composition, Interactions, Settings, SystemParts
+from rigidmd.forces.parts import Composition, Interactions, KeysAndValues, Settings, SystemParts
 from rigidmd.forces.potentials.screened_coulomb import screened_coulomb, screening_errors
+from rigidmd.scene.forces import Forces
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 #: Default of forces.ewald_accuracy: for SPC/E at 9 Å GROMACS' defaults have 9e-5 and OpenMM's 8e-5
@@ -48,7 +48,7 @@ LEAST_VACUUM = 0.5
 FIT_ERROR_FRACTION = 0.02
 
 
-def setting_errors(forces: ForceKeys, space: Space, cutoff: float) -> list[str]:
+def setting_errors(forces: Forces, space: Space, cutoff: float) -> list[str]:
     """Messages on keys of [forces] that this box does not allow."""
     if space.volume == inf:
         instead = "use coulomb, the sum over all pairs"
@@ -59,7 +59,7 @@ def setting_errors(forces: ForceKeys, space: Space, cutoff: float) -> list[str]:
 
 
 def settings(
-    forces: ForceKeys, composition: Composition, cutoff: float, is_external: bool
+    forces: Forces, composition: Composition, cutoff: float, is_external: bool
 ) -> Settings:
     """The keys of [forces] that follow from the accuracy. ewald_accuracy becomes None when all of
     them are set.
@@ -155,7 +155,7 @@ def _default(value: object) -> str:
     return "" if value else " (the default)"
 
 
-def _number_of_k_vectors(forces: ForceKeys, radius: float | None, volume: float) -> float:
+def _number_of_k_vectors(forces: Forces, radius: float | None, volume: float) -> float:
     """Approximate number of k-vectors within a radius (1/Å) and the limits of [forces]."""
     limit = forces.ewald_k_max
     boxed = (
@@ -292,7 +292,7 @@ def _arms(state: State, sites: BodySites | CentralSites) -> np.ndarray:
     return np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offsets())
 
 
-def _surface_strength(forces: ForceKeys) -> tuple[float, float, float]:
+def _surface_strength(forces: Forces) -> tuple[float, float, float]:
     """See `corrections.SurfaceDipole`."""
     if forces.ewald_slab is None:
         return (2 * pi / (2 * forces.ewald_surface_permittivity + 1),) * 3

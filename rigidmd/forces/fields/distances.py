@@ -8,9 +8,9 @@ import numpy as np
 
 from rigidmd.compile import implements, kernel
 from rigidmd.core.state import OK, State
-from rigidmd.forces.inputs import RestraintKeys
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces
+from rigidmd.scene.fields import Restraint
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 #: A distance of half the box, where the force jumps, has to cost this many kT at least.
@@ -58,7 +58,7 @@ def _centre_in(state: State, members: np.ndarray, fraction: np.ndarray) -> np.nd
 
 
 def distance_restraint(
-    parts: SystemParts, entry: RestraintKeys, where: str, faults: list[str]
+    parts: SystemParts, entry: Restraint, where: str, faults: list[str]
 ) -> DistanceRestraint | None:
     """The term of one of fields.restraints with `between`."""
     state = parts.state

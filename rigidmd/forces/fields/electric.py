@@ -12,11 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import implements, kernel
+from rigidmd.core.plain_text import vector_text
 from rigidmd.core.state import NOW, OK
-from rigidmd.forces.inputs import FieldKeys
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces, energy_rate
 from rigidmd.mechanics.translation import body_component, body_vector
+from rigidmd.scene.fields import Fields
+from rigidmd.scene.validation import not_none
 from rigidmd.units import VOLT_PER_NM
 
 
@@ -56,7 +58,7 @@ class OscillatingField(NamedTuple):
 
 
 def term(
-    parts: SystemParts, fields: FieldKeys, where: str, faults: list[str]
+    parts: SystemParts, fields: Fields, where: str, faults: list[str]
 ) -> ElectricField | OscillatingField | None:
     """The term of fields.electric_V_per_nm."""
     if not any(fields.electric_V_per_nm or ()):
@@ -76,6 +78,15 @@ def term(
     return OscillatingField(
         *steady, 2 * pi * fields.electric_frequency_per_ps, radians(fields.electric_phase_deg)
     )
+
+
+def sentence(fields: Fields, term: object) -> str:
+    """What `rigidmd check` prints of it."""
+    amplitude = f"{vector_text(not_none(fields.electric_V_per_nm))} V/nm"
+    if fields.electric_frequency_per_ps is None:
+        return amplitude
+    frequency = f"f = {fields.electric_frequency_per_ps:g}/ps. Its work is in the energy ledger"
+    return f"{amplitude} cos(2 pi f t + {fields.electric_phase_deg:g}°), {frequency}"
 
 
 @implements(add_forces, ElectricField)

@@ -5,10 +5,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import implements
+from rigidmd.core.plain_text import vector_text
 from rigidmd.core.state import OK
-from rigidmd.forces.inputs import FieldKeys
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces
+from rigidmd.scene.fields import Fields
+from rigidmd.scene.validation import not_none
 from rigidmd.units import METRE_PER_S2
 
 
@@ -27,12 +29,17 @@ class Gravity(NamedTuple):
         return self.acceleration != 0
 
 
-def term(parts: SystemParts, fields: FieldKeys, where: str, faults: list[str]) -> Gravity | None:
+def term(parts: SystemParts, fields: Fields, where: str, faults: list[str]) -> Gravity | None:
     """The term of fields.gravity_m_s2."""
     if not any(fields.gravity_m_s2 or ()):
         return None
     mass = np.where(parts.moves, parts.model.mass, 0.0)
     return Gravity(parts.model.species, mass, np.array(fields.gravity_m_s2) * METRE_PER_S2)
+
+
+def sentence(fields: Fields, term: object) -> str:
+    """What `rigidmd check` prints of it."""
+    return f"{vector_text(not_none(fields.gravity_m_s2))} m/s²"
 
 
 @implements(add_forces, Gravity)

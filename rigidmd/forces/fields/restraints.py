@@ -6,11 +6,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import implements
+from rigidmd.core.plain_text import vector_text
 from rigidmd.core.state import OK
 from rigidmd.forces.fields.distances import DistanceRestraint, distance_restraint
-from rigidmd.forces.inputs import RestraintKeys
 from rigidmd.forces.parts import SystemParts, select_by_number
 from rigidmd.forces.terms import add_forces
+from rigidmd.scene.fields import Restraint
 from rigidmd.units import KJ_PER_MOL
 
 
@@ -31,7 +32,7 @@ class Restraints(NamedTuple):
 
 
 def term(
-    parts: SystemParts, entry: RestraintKeys, where: str, faults: list[str]
+    parts: SystemParts, entry: Restraint, where: str, faults: list[str]
 ) -> "Restraints | DistanceRestraint | None":
     """The term of one of fields.restraints."""
     if entry.between is not None:
@@ -73,6 +74,28 @@ def term(
         else [entry.position_A] * len(molecule)
     )
     return Restraints(molecule, np.array(position, float), np.array(entry.stiffness) * KJ_PER_MOL)
+
+
+def sentence(entry: Restraint, term: Restraints) -> str:
+    """What `rigidmd check` prints of it."""
+    if entry.between is not None:
+        one, other = (_text_of_group(group) for group in entry.groups)
+        spring = f"restrained to {entry.distance_A:g} Å, {entry.stiffness[0]:g} kJ/mol/Å²"
+        return f"distance of {one} and {other} {spring}"
+    stiffness = entry.stiffness
+    size = f"{stiffness[0]:g}" if len(set(stiffness)) == 1 else vector_text(stiffness)
+    if entry.position_A is None:
+        where = "to their starting positions"
+    else:
+        where = f"to {vector_text(entry.position_A)} Å"
+    return f"{len(term.molecule)} molecules restrained {where}, {size} kJ/mol/Å²"
+
+
+def _text_of_group(group: list[int]) -> str:
+    """A group of molecules, for messages."""
+    if len(group) == 1:
+        return f"molecule {group[0]}"
+    return f"the centre of {len(group)} molecules ({group[0]}, ...)"
 
 
 @implements(add_forces, Restraints)

@@ -13,11 +13,12 @@ import numpy as np
 
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.core.state import BEHIND_WALL, NOT_FINITE, OK, State
-from rigidmd.forces.inputs import Molecule, WallKeys
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites, locate_site, sites_of
 from rigidmd.forces.neighbors.space import Orthorhombic, Unbounded
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces
+from rigidmd.scene.fields import Walls
+from rigidmd.scene.models import Molecule
 from rigidmd.units import KJ_PER_MOL
 
 #: Distance of the well of a Lennard-Jones wall, in sigma, at which a lattice of molecules starts.
@@ -79,7 +80,7 @@ class HarmonicWalls(NamedTuple):
 
 
 def term(
-    parts: SystemParts, walls: WallKeys, where: str, faults: list[str]
+    parts: SystemParts, walls: Walls, where: str, faults: list[str]
 ) -> LennardJonesWalls | HarmonicWalls:
     """The term of one of fields.walls. The messages on the gap between walls follow those on the
     last of them."""
@@ -109,7 +110,21 @@ def term(
     return term_of_walls
 
 
-def _acted_on(walls: WallKeys, species: Sequence[Molecule], moves: np.ndarray) -> list[np.ndarray]:
+def sentence(walls: Walls, term: LennardJonesWalls | HarmonicWalls) -> str:
+    """What `rigidmd check` prints of it."""
+    kind = f"harmonic, {walls.stiffness_kJ_mol_A2 or 0:g} kJ/mol/Å²"
+    if walls.kind == "lj93":
+        kind = (
+            f"Lennard-Jones 9-3, sigma {walls.sigma_A:g} Å, epsilon {walls.epsilon_kJ_mol:g}"
+            " kJ/mol, "
+        )
+        kind += f"cutoff {walls.cutoff_A:g} Å" if walls.cutoff_A else "no cutoff"
+    what = "centres of mass" if walls.acts_on == "centres" else f"{len(term.sites.molecule)} sites"
+    positions = [f"{walls.axis} = {x:g} Å" for x in walls.positions_A if abs(x) < inf]
+    return f"at {' and '.join(positions)}, on {what}: {kind}"
+
+
+def _acted_on(walls: Walls, species: Sequence[Molecule], moves: np.ndarray) -> list[np.ndarray]:
     """Points (k, 3) of each species on which walls act, body frame, Å. None of frozen species."""
     offsets = [
         np.zeros((1, 3)) if walls.acts_on == "centres" else m.positions_body[m.epsilon > 0]
@@ -149,7 +164,7 @@ def _gap_errors(parts: SystemParts) -> list[str]:
     return faults
 
 
-def _protrusion(walls: WallKeys, parts: SystemParts) -> float:
+def _protrusion(walls: Walls, parts: SystemParts) -> float:
     """Largest distance of interacting sites from the points on which walls act, Å."""
     farthest = 0.0
     for m, points in zip(parts.species, _acted_on(walls, parts.species, parts.moves), strict=True):
@@ -160,7 +175,7 @@ def _protrusion(walls: WallKeys, parts: SystemParts) -> float:
     return farthest
 
 
-def range_of_centres(walls: WallKeys, species: Sequence[Molecule]) -> tuple[float, float]:
+def range_of_centres(walls: Walls, species: Sequence[Molecule]) -> tuple[float, float]:
     """Range (lower, upper) of centres of mass that is free for every orientation between walls,
     Å."""
     points = np.concatenate(_acted_on(walls, species, np.ones(len(species), bool)))

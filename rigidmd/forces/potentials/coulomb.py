@@ -8,7 +8,6 @@ import numpy as np
 
 from rigidmd.compile import chosen_by_type, implements, kernel
 from rigidmd.compile.simd import inverse_root_and_cube, inverse_square_root, load, zeros
-from rigidmd.forces.inputs import ForceKeys
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.parts import Interactions, SystemParts
@@ -18,7 +17,6 @@ from rigidmd.forces.potentials.truncation import (
     SwitchCorrection,
     SwitchTerm,
     Truncation,
-    TruncationName,
     TruncationTerms,
     correction,
     needs_root,
@@ -29,6 +27,7 @@ from rigidmd.forces.potentials.truncation import (
     truncation_of,
     truncation_terms,
 )
+from rigidmd.scene.forces import Forces, TruncationName
 from rigidmd.units import COULOMB_CHARGE
 
 
@@ -93,7 +92,7 @@ def interactions(parts: SystemParts) -> Interactions:
     return Interactions({"coulomb": parts.pair_forces(potential, sites)}, constants)
 
 
-def setting_errors(forces: ForceKeys, space: Space, cutoff: float) -> list[str]:
+def setting_errors(forces: Forces, space: Space, cutoff: float) -> list[str]:
     """Messages on keys of [forces] that this box does not allow."""
     if forces.electrostatics == "coulomb" and space.volume < inf:
         return [

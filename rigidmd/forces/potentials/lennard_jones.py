@@ -3,7 +3,7 @@ correction."""
 
 from collections.abc import Callable
 from math import inf, pi
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -12,7 +12,6 @@ from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.simd import inverse, inverse_square_root, load, polynomial, zeros
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.smooth import InverseR6
-from rigidmd.forces.inputs import CouplingKeys, Molecule
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import exclusion_groups
@@ -34,7 +33,6 @@ from rigidmd.forces.potentials.truncation import (
     SwitchCorrection,
     SwitchTerm,
     Truncation,
-    TruncationName,
     TruncationTerms,
     Unmodified,
     correction,
@@ -49,9 +47,10 @@ from rigidmd.forces.potentials.truncation import (
     truncation_of,
     truncation_terms,
 )
+from rigidmd.scene.coupling import Coupling
+from rigidmd.scene.forces import TruncationName
+from rigidmd.scene.models import Mixing, Molecule
 from rigidmd.units import KJ_PER_MOL
-
-Mixing = Literal["lorentz-berthelot", "geometric"]
 
 
 class ScreenedDispersion(NamedTuple):
@@ -235,7 +234,7 @@ def interactions(parts: SystemParts) -> Interactions:
     )
 
 
-def _is_soft(coupling: CouplingKeys | None, molecule: Molecule) -> bool:
+def _is_soft(coupling: Coupling | None, molecule: Molecule) -> bool:
     """Whether [coupling] gives a molecule a soft core."""
     if coupling is None or molecule.name != coupling.species:
         return False

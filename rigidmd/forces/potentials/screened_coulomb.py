@@ -26,10 +26,10 @@ from rigidmd.compile.simd import (
     zeros,
 )
 from rigidmd.forces.ewald.errors import MAX_ALPHA_CUTOFF
-from rigidmd.forces.inputs import ForceKeys
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.parts import Interactions, SystemParts
+from rigidmd.scene.forces import Forces
 from rigidmd.units import COULOMB_CHARGE
 
 #: Largest error of a polynomial, relative to the function at r = 0, by precision: below the
@@ -240,7 +240,7 @@ def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> D
     )
 
 
-def setting_errors(forces: ForceKeys, space: Space, cutoff: float) -> list[str]:
+def setting_errors(forces: Forces, space: Space, cutoff: float) -> list[str]:
     """Messages on the keys of [forces] of electrostatics = "damped_shifted_force"."""
     if cutoff == inf:
         return [

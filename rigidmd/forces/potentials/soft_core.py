@@ -13,7 +13,8 @@ from rigidmd.compile import implements
 from rigidmd.compile.simd import inverse
 from rigidmd.forces.parts import InnerPairs, Tail, sum_of_tails
 from rigidmd.forces.potentials.custom import CustomPotential, energy_and_force_at, tail_of_pair
-from rigidmd.forces.potentials.truncation import Truncation, TruncationName, truncation_terms
+from rigidmd.forces.potentials.truncation import Truncation, truncation_terms
+from rigidmd.scene.forces import TruncationName
 
 SOFTNESS = 0.5  # at lambda = 0, the alpha of the paper
 

@@ -14,7 +14,7 @@ that integrators keep.
 from collections.abc import Callable
 from fractions import Fraction
 from math import inf
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.polynomial import Polynomial as Polynomials
@@ -22,8 +22,8 @@ from numpy.polynomial import chebyshev
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.compile.simd import inverse_square_root, polynomial
+from rigidmd.scene.forces import TruncationName
 
-TruncationName = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 TRUNCATIONS: tuple[str, ...] = get_args(TruncationName)
 
 

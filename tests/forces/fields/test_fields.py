@@ -462,6 +462,10 @@ def term(parts, trap, where, faults):
     return Trap(trap.stiffness_kJ_mol_A2 * KJ_PER_MOL)
 
 
+def sentence(trap, term):
+    return f"{trap.stiffness_kJ_mol_A2:g} kJ/mol/Å²"
+
+
 @implements(add_forces, Trap)
 def _add_trap(term, state, load, tally):
     for m in range(len(state.position)):
@@ -485,7 +489,7 @@ class Fields(Section):
     \"\"\"A harmonic trap\"\"\"
 """
 TRAP_ENTRY = """FIELDS = {
-    "trap": FieldKind("trap", "trap", "trap", lambda trap, term: f"{trap.stiffness_kJ_mol_A2:g} kJ/mol/Å²"),
+    "trap": FieldKind("trap", "trap", "trap"),
 """
 TRAP_SCRIPT = """
 import json
