@@ -9,38 +9,27 @@ from importlib import import_module
 from math import inf
 from typing import NamedTuple
 
-import numpy as np
-
-from rigidmd.assemble.coupling import at_lambda, coupled, with_coupling
-from rigidmd.assemble.defaults import (
-    with_defaults,
-    with_engine_defaults,
-    with_momentum_removal,
-    without_tail_reason,
-)
+from rigidmd.assemble.coupling import at_lambda, coupled
+from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.assemble.memory_check import check_memory
-from rigidmd.assemble.plausibility import scene_errors, scene_warnings
-from rigidmd.assemble.species import species_of, split_frozen
+from rigidmd.assemble.resolve import ResolvedScene, resolve
 from rigidmd.assemble.stage_description import stage_notes
-from rigidmd.assemble.start import overlaps, residue_numbers, set_momenta, starting_configuration
-from rigidmd.assemble.time_step import with_precision, with_time_steps
+from rigidmd.assemble.start import Configuration, overlaps, set_momenta
+from rigidmd.assemble.time_step import with_precision
 from rigidmd.core.integrators import Scheme
-from rigidmd.core.state import state_of
 from rigidmd.dynamics.barostats import BAROSTATS, Confinement, Pressure
 from rigidmd.dynamics.model import Model, conserved_momentum, count_degrees_of_freedom, mobile
 from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
 from rigidmd.dynamics.thermostats import THERMOSTATS, Ramp
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
-from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of
-from rigidmd.forces.parts import Composition, Interactions, SystemParts, sum_of_tails
+from rigidmd.forces.neighbors.space import Space
+from rigidmd.forces.parts import Interactions, SystemParts, sum_of_tails
 from rigidmd.forces.terms import trait
-from rigidmd.formats.cells import describe_basis, describe_cell
-from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
+from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.scene import MolecularScene, couplings
 from rigidmd.scene.fields import FIELDS, field_notes
 from rigidmd.scene.forces import ELECTROSTATICS, POTENTIALS
-from rigidmd.scene.models import Molecule
 from rigidmd.scene.molecules import missing_user_code
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
@@ -54,172 +43,142 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     user_code : whether to run the code of users. Without it their terms are missing, which analyses
         do not need
     """
-    scene, engine_notes = with_engine_defaults(scene)
-    species = species_of(scene)
-    start = starting_configuration(scene, species)
-    mass = np.array([m.mass for m in species])
-    velocity = (
-        start.velocity if scene.structure is not None and scene.structure.velocities else None
-    )
-    if velocity is None:
-        thermal = 0.0
-    else:
-        squares = mass[start.species] @ (velocity**2).sum(axis=1)
-        thermal = float(squares) / (3 * len(start.species))
-    scene = with_time_steps(scene, species, thermal / BOLTZMANN)
-    space = space_of(start.cell)
-    number = residue_numbers(start)
-    warnings = scene_warnings(scene, species)
-    species, index, frozen, faults = split_frozen(scene, species, start.species, number)
-    counts = np.bincount(index, minlength=len(species))
-    if start.cell is None:
-        cell = ""
-    else:
-        cell = f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
-    if implausible := scene_errors(scene, species, counts, space):
-        raise SceneError(scene.source, implausible)
-    composition = Composition(species, counts, space, start.basis, cell, start.position)
-    resolved = with_defaults(scene, composition)
-    written = scene
-    scene, coupling_errors = with_coupling(resolved.scene, species)
-    if faults := [*faults, *resolved.errors, *coupling_errors]:
-        raise SceneError(scene.source, faults)
-    mass = np.array([m.mass for m in species])
-    inertia = np.where(frozen[:, None], 0.0, [m.inertia for m in species])
-    rotor = split_rotor(inertia)
-    model = Model(
-        index.astype(np.int32),
-        mass,
-        np.where(frozen, 0.0, 1 / mass),
-        inertia,
-        rotor.inverse_inertia,
-        rotor if inertia.any() else NoRotor(),
-    )
-    state = state_of(
-        position=wrapped_between_walls(scene, space, start.position),
-        rotation=start.rotation if any(m.inertia.any() for m in species) else None,
-        cell=start.cell,
-    )
-    whole = SystemParts(scene, species, model, space, state, number, start.basis, resolved.pme_grid)
-    acting = acting_in(scene, species, whole)
+    resolved = resolve(scene)
+    system = _system_of(resolved)
+    if user_code:
+        system = _with_user_code(system)
+    elif system.scene.forces.bodies:
+        from rigidmd.assemble.user_code.body_pairs import potentials_of_stored_run
+
+        system = replace(system, body_pairs=potentials_of_stored_run(system.scene))
+    if errors := _ensemble_errors(system):
+        raise SceneError(system.scene.source, errors)
+    check_memory(system)
+    if system.scene.coupling is not None:
+        system.notes.append(system.scene.coupling.in_short)
+    system.notes.extend(system.scene.rounded_times())
+    system.notes.extend(set_momenta(system.scene, system.model, system.state, resolved.start))
+    system.notes.extend(_molecule_notes(system))
+    system.notes.extend(_start_notes(system, resolved.start))
+    return system
+
+
+def _system_of(resolved: ResolvedScene) -> System:
+    """The system of a resolved scene without the code of users, at rest. Raises SceneError."""
+    scene, parts = resolved.scene, resolved.parts
+    acting = acting_in(scene, parts)
     others = () if scene.coupling is None else scene.coupling.lambdas
-    at = {x: acting_in(at_lambda(scene, x), species, whole) for x in others}
-    species = coupled(scene, species)
-    model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
+    at = {x: acting_in(at_lambda(scene, x), parts) for x in others}
+    species = coupled(scene, parts.species)
+    model = resolved.model._replace(keeps_momentum=conserved_momentum(resolved.model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
-    free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
-    scene, precision_reason = with_precision(scene, free, thermal / BOLTZMANN, acting.force_error)
-    without_tail = ""
-    if scene.forces.dispersion == "cutoff" and not scene.forces.tail_correction:
-        is_choice = written.forces.tail_correction is False
-        if is_choice:
-            without_tail = "forces.tail_correction is false"
-        else:
-            without_tail = without_tail_reason(written, composition)
-    system = System(
+    free = [m for m, moves in zip(species, parts.moves, strict=True) if moves]
+    scene, precision_reason = with_precision(scene, free, resolved.temperature, acting.force_error)
+    return System(
         scene=scene,
         species=species,
         model=model,
-        space=space,
-        state=state,
+        space=parts.space,
+        state=parts.state,
         terms=acting.terms,
         freedom=count_degrees_of_freedom(model),
         constants=acting.constants,
         constant_pressure=acting.pressure,
         tail=acting.tail,
-        residue_number=number,
+        residue_number=parts.number,
         from_lattice=scene.structure is None,
         left_out=left_out(
             scene,
             acting.terms,
             model,
-            space,
+            parts.space,
             charged=any(m.charges.any() for m in species),
-            without_tail=without_tail,
+            without_tail=resolved.without_tail,
         ),
         precision_reason=precision_reason,
         force_error=acting.force_error,
         at_lambda=at,
-        notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
-        warnings=warnings,
+        notes=[*resolved.notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
+        warnings=resolved.warnings,
     )
-    if user_code:
-        if scene.from_python != scene.user_code.names:
-            raise SceneError(
-                scene.source, [missing_user_code(scene.from_python, scene.user_code.names)]
-            )
-        if scene.forces.added or scene.from_python:
-            from rigidmd.assemble.user_code.binding import with_user_code
 
-            system = with_user_code(system)
-            scene, model = system.scene, system.model
-    elif scene.forces.bodies:
-        from rigidmd.assemble.user_code.body_pairs import potentials_of_stored_run
 
-        system = replace(system, body_pairs=potentials_of_stored_run(scene))
+def _with_user_code(system: System) -> System:
+    """The system with the forces and the thermostat of users. Raises SceneError."""
+    scene = system.scene
+    if scene.from_python != scene.user_code.names:
+        raise SceneError(
+            scene.source, [missing_user_code(scene.from_python, scene.user_code.names)]
+        )
+    if not (scene.forces.added or scene.from_python):
+        return system
+    from rigidmd.assemble.user_code.binding import with_user_code  # for these scenes only
+
+    return with_user_code(system)
+
+
+def _ensemble_errors(system: System) -> list[str]:
+    """Messages on stages whose ensemble the terms of a system do not allow."""
+    stages = list(enumerate(system.scene.stages))
     if names := ", ".join(name.replace("_", " ") for name in system.position_dependent):
         why = f"changes the box, and {names} depend on absolute positions in it: keep the volume"
-        faults = [
-            f"stages.{k}: {stage.ensemble} {why}"
-            for k, stage in enumerate(scene.stages)
-            if stage.changes_box
-        ]
-        if faults:
-            raise SceneError(scene.source, faults)
+        errors = [f"stages.{k}: {stage.ensemble} {why}" for k, stage in stages if stage.changes_box]
+        if errors:
+            return errors
     driven = [name for name, term in system.terms.items() if trait(type(term), "time_dependent")]
-    if faults := [
-        f"stages.{k}" for k, stage in enumerate(scene.stages) if stage.is_hybrid and driven
-    ]:
-        why = (
-            "hybrid_monte_carlo needs an energy that does not depend on time, and"
-            f" {', '.join(driven)} do"
-        )
-        raise SceneError(
-            scene.source, [f"{fault}: {why}: choose another thermostat" for fault in faults]
-        )
-    check_memory(system)
-    if scene.coupling is not None:
-        system.notes.append(scene.coupling.in_short)
-    system.notes.extend([*scene.rounded_times(), *set_momenta(scene, model, state, start)])
+    why = (
+        "hybrid_monte_carlo needs an energy that does not depend on time, and"
+        f" {', '.join(driven)} do: choose another thermostat"
+    )
+    return [f"stages.{k}: {why}" for k, stage in stages if stage.is_hybrid and driven]
+
+
+def _molecule_notes(system: System) -> list[str]:
+    """Notes on stages in which nothing moves, on mixing rules and on files of models."""
+    scene, kinds = system.scene, {m.name: m for m in system.species}.values()
     stuck = "nothing moves and no temperature is defined. Use thermostat = 'langevin'"
-    system.notes.extend(
+    notes = [
         f"stages.{k}: the total momentum is conserved and zero, so that {stuck}"
         for k, stage in enumerate(scene.stages)
         if not stage.is_minimisation
-        and len(index)
+        and len(system.model.species)
         and system.freedom_in(k).total == 0
-        and mobile(model).any()
-    )
-    system.notes.extend(
+        and mobile(system.model).any()
+    ]
+    notes += [
         f"{m.name} was developed with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
-        for m in {m.name: m for m in species}.values()
+        for m in kinds
         if m.mixing not in (None, scene.forces.mixing)
-    )
-    system.notes.extend(
-        f"{m.name}: {note}" for m in {m.name: m for m in species}.values() for note in m.reading
-    )
+    ]
+    return [*notes, *(f"{m.name}: {note}" for m in kinds for note in m.reading)]
+
+
+def _start_notes(system: System, start: Configuration) -> list[str]:
+    """Notes on the start. Raises StructureError if molecules of a structure file overlap and
+    nothing separates them."""
+    scene = system.scene
     if scene.structure is None:
-        system.notes.extend(f"box: {note}" for note in start.notes)
-        return system
+        return [f"box: {note}" for note in start.notes]
     file = scene.structure.file
     off = f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å"
-    system.notes.append(
-        f"{len(index)} molecules read from {file}. Distances of atoms from rigid templates: {off}"
-    )
-    system.notes.extend(f"{file}: {note}" for note in start.notes)
-    if faults := overlaps(system):
+    notes = [
+        f"{len(system.model.species)} molecules read from {file}. Distances of atoms from rigid"
+        f" templates: {off}",
+        *(f"{file}: {note}" for note in start.notes),
+    ]
+    if errors := overlaps(system):
         if not scene.stages[0].is_minimisation:
-            raise StructureError(scene.structure_source, faults)
-        system.notes.append(f"{file}: {'; '.join(faults)}: the minimisation separates them")
-    return system
+            raise StructureError(scene.structure_source, errors)
+        notes.append(f"{file}: {'; '.join(errors)}: the minimisation separates them")
+    return notes
 
 
-def acting_in(scene: MolecularScene, species: list[Molecule], whole: SystemParts) -> Interactions:
+def acting_in(scene: MolecularScene, whole: SystemParts) -> Interactions:
     """The interactions and fields of a resolved scene. Raises SceneError.
 
-    species, whole : its parts, with the whole charges of the species in [coupling]
+    whole : its parts, with the whole charges of the species in [coupling]
     """
-    parts = whole._replace(scene=scene, species=coupled(scene, species))
+    parts = whole._replace(scene=scene, species=coupled(scene, whole.species))
     acting = interactions(scene, parts)
     acting.terms.update(field_terms(scene, parts))
     return acting
@@ -266,17 +225,6 @@ def field_terms(scene: MolecularScene, parts: SystemParts) -> dict[str, NamedTup
     if faults:
         raise SceneError(scene.source, faults)
     return terms
-
-
-def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndarray) -> np.ndarray:
-    """Positions (n, 3) wrapped to between the walls. Unchanged without walls or box."""
-    if not isinstance(space, Orthorhombic):
-        return position
-    moved = position.copy()
-    for axis, edge in enumerate(space.edges):
-        if (bounds := scene.fields.bounds(axis)) is not None:
-            moved[:, axis] -= edge * np.rint((moved[:, axis] - sum(bounds) / 2) / edge)
-    return moved
 
 
 def left_out(

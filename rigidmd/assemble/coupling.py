@@ -1,5 +1,6 @@
 """[coupling] of a scene: its defaults, the species with scaled charges."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from rigidmd.scene import MolecularScene
@@ -35,10 +36,10 @@ def with_coupling(
     return scene.model_copy(update={"coupling": coupling}), faults
 
 
-def coupled(scene: MolecularScene, species: list[Molecule]) -> list[Molecule]:
+def coupled(scene: MolecularScene, species: Sequence[Molecule]) -> list[Molecule]:
     """The species, one of them with scaled charges."""
     if (coupling := scene.coupling) is None:
-        return species
+        return list(species)
     return [
         replace(m, charges=coupling.charges * m.charges) if m.name == coupling.species else m
         for m in species
