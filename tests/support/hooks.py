@@ -71,9 +71,14 @@ TIERS = {
             "the_command_writes_a_table_a_figure_and_a_page",
         ),
         "rules/test_architecture.py": (
+            "a_run_of_a_top_loads_what_its_output_needs[no output]",
             "a_run_of_a_top_loads_what_its_output_needs[default output]",
         ),
         "features/bodies/test_systems.py": (
+            "every_scene_keeps_what_it_should_and_says_what_to_look_at[gyroscope_friction]",
+            "every_scene_keeps_what_it_should_and_says_what_to_look_at[gyrocompass]",
+            "every_scene_keeps_what_it_should_and_says_what_to_look_at[body_in_fluid]",
+            "the_split_rotor_conserves_the_energy_that_theory_says*",
             "euler_angles_refuse_the_pole_or_come_through_it[rk4]",
             "the_sleeping_top_wakes_where_it_should",
             "the_split_rotor_has_the_best_of_all_orders*",
@@ -84,6 +89,8 @@ TIERS = {
             "stiff_resistance_ends_at_the_terminal_speed",
         ),
         "features/bodies/test_frames.py": (
+            "what_is_switched_on_and_off_gives_its_whole_impulse[dop853]",
+            "breaks_at_the_ends_and_on_top_of_each_other_do_no_harm",
             "a_frame_that_changes_its_axis_is_left_to_compositions",
             "a_table_does_not_cost_the_order_of_the_integrator",
             "the_same_scene_gives_the_same_bits_however_often_it_is_looked_at",
@@ -95,11 +102,15 @@ TIERS = {
             "a_python_function_can_apply_what_a_scene_does",
             "what_has_no_exact_flow_is_not_given_to_schemes_that_count_on_one",
         ),
-        "features/bodies/test_ode.py": ("a_run_that_cannot_go_on_says_when",),
+        "features/bodies/test_ode.py": (
+            "a_satellite_that_loses_mass_keeps_its_angular_momentum[rk4*",
+            "a_run_that_cannot_go_on_says_when",
+        ),
         "features/potentials/test_pose_tables.py": (
             "a_scene_has_a_table_as_a_file_and_compares_its_forces_at_the_start",
         ),
         "features/potentials/test_body_pairs.py": (
+            "pairs_at_a_cutoff_where_the_energy_jumps_are_no_wrong_force",
             "a_text_has_the_energy_of_all_its_pairs*",
             "integrators_have_their_order*",
         ),
@@ -108,10 +119,18 @@ TIERS = {
             "compiling_goes_on_alone_where_the_second_process_ends",
         ),
         "compile/test_cache.py": (
+            "without_a_home_folder_the_cache_is_a_temporary_one[raise*",
+            "code_of_another_user_is_not_used",
+            "code_behind_a_link_in_the_cache_is_not_used",
+            "a_full_disk_costs_time_only[tempfile*",
             "an_index_that_cannot_be_read_is_not_replaced",
             "kernels_are_found_after_a_process_with_a_module_that_others_lack",
         ),
-        "compile/test_machine.py": ("settings_that_change_code_have_a_cache_of_their_own",),
+        "compile/test_machine.py": (
+            "vectors_are_as_wide_as_those_of_the_processor_that_is_named[skylake*",
+            "vectors_are_as_wide_as_those_of_the_processor_that_is_named[nehalem*",
+            "settings_that_change_code_have_a_cache_of_their_own",
+        ),
         "features/free_energy/test_coupling.py": ("a_sweep_has_a_free_energy",),
         "assemble/test_defaults.py": ("a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid*",),
         "forces/ewald/test_dispersion.py": (
@@ -168,6 +187,9 @@ TIERS = {
             "a_list_with_little_room_grows_and_misses_nothing[mixed]",
         ),
         "forces/test_terms.py": (
+            "forces_and_torques_are_the_slope_of_the_energy[smooth_switch*",
+            "forces_and_torques_are_the_slope_of_the_energy[force_switch*",
+            "virials_are_sums_over_pairs[none-double]",
             "energies_are_those_of_the_oracle[force_switch*",
             "energies_are_those_of_the_oracle[plain*",
             "energies_are_those_of_the_oracle[smooth_switch*",
@@ -185,7 +207,10 @@ TIERS = {
         "features/crystals/test_framework.py": ("a_framework_acts_as_its_atoms_do[na_spce-pme]",),
         "end_to_end/test_fuzz.py": ("*",),
         "features/free_energy/test_insertion.py": ("energies_are_the_differences_of_the_engine*",),
-        "features/external/test_lammps.py": ("a_run_is_one_like_any_other[1]",),
+        "features/external/test_lammps.py": (
+            "a_liquid_of_ellipsoids_beside_sites_is_the_same",
+            "a_run_is_one_like_any_other[1]",
+        ),
         "features/view/test_notebook.py": ("a_sweep_shows_its_progress",),
         "engines/cpu/test_engine.py": (
             "a_look_takes_the_energies_of_the_last_step[c*",
@@ -196,10 +221,12 @@ TIERS = {
             "any_small_scene_of_one_kind_runs_ten_steps_or_is_refused_in_words",
         ),
         "run/test_results.py": (
+            "a_run_that_nobody_closes_lets_its_folder_go[deleted]",
             "an_editor_knows_the_types",
             "every_column_of_every_body_is_in_the_table",
         ),
         "run/test_resume.py": (
+            "a_body_goes_on[rk4]",
             "a_folder_is_all_that_is_needed",
             "a_forked_child_leaves_the_files_of_the_run_alone",
             "a_run_that_is_stopped_ends_like_one_that_is_not",
@@ -227,6 +254,7 @@ TIERS = {
             "points_that_fail_are_told_and_repeated",
         ),
         "compile/test_thread_pool.py": (
+            "there_may_be_more_threads_than_cores_and_the_process_ends[7]",
             "simulations_on_all_threads_at_once_have_the_bits_of_each_alone",
         ),
         "io/test_trajectory_file.py": ("a_run_goes_on_from_a_trajectory",),
@@ -237,6 +265,13 @@ TIERS = {
         "features/view/test_run_page.py": ("a_browser_shows_a_top_that_moves",),
         "features/free_energy/test_virial.py": ("published_values",),
         "end_to_end/test_walk.py": ("a_sample_of_the_walk*",),
+        "dynamics/test_step_loop.py": (
+            "no_drift_beyond_its_error_at_one_femtosecond_over_twenty_picoseconds",
+        ),
+        "features/monte_carlo/test_hybrid_monte_carlo.py": (
+            "the_weights_of_every_integrator_have_the_mean_one[takahashi_imada]",
+        ),
+        "io/test_trajectory.py": ("frames_of_xtc_are_those_that_mdanalysis_writes[None]",),
     },
     "soak": {
         "run/test_pilot.py": ("a_crude_error_is_kept_crudely*",),
@@ -333,7 +368,8 @@ ALLOWED += [
     PROGRAMS[name] for name in os.environ.get("RIGIDMD_CI_WITHOUT", "").split() if name in PROGRAMS
 ]
 
-#: Processor time of compiling, s, up to which a default test is not listed in CI.
+#: Processor time of compiling, s, above which CI lists a test. The first test of a file that needs
+#: common kernels compiles them.
 MOST_COMPILING = 4.0
 
 _skipped: list[str] = []
@@ -461,7 +497,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def pytest_terminal_summary(terminalreporter) -> None:
-    """Processor time of tests and of compiling; in CI the skips that are not allowed."""
+    """Processor time of tests and of compiling; in CI tests that compile long, and the skips that
+    are not allowed."""
     if path := os.environ.get("RIGIDMD_TEST_COSTS"):
         Path(path).write_text(json.dumps(_costs, indent=1))
     total, compiling = (
@@ -472,6 +509,10 @@ def pytest_terminal_summary(terminalreporter) -> None:
     terminalreporter.line(
         f"{total:.0f} s of processor time, of which {compiling:.0f} s compiled {kernels} kernels"
     )
+    if IN_CI:
+        for name, costs in sorted(_costs.items(), key=lambda item: -item[1]["compiling"]):
+            if costs["compiling"] > MOST_COMPILING:
+                terminalreporter.line(f"{costs['compiling']:5.1f} s of compiling: {name}")
     if IN_CI and _skipped:
         terminalreporter.section(
             "skipped tests that CI does not allow (tests/support/hooks.py)", red=True
