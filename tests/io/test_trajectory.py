@@ -160,6 +160,7 @@ def test_the_topology_is_the_first_frame_relief_included(tmp_path):
         "stages.0.duration_ps": 0.004,
         "stages.1.duration_ps": 0.004,
         "output.positions": "unwrapped",
+        "forces.pme_order": 6,
     }
     results = Simulation(
         Scene.read(ROOT / "systems" / "water_nitrogen.toml", short), tmp_path / "out"

@@ -229,7 +229,7 @@ def test_two_intervals_of_the_log_end_in_the_same_bits(tmp_path):
     ends = []
     for interval in (0.01, 0.025):
         scene = small_scene(
-            {"nitrogen": 40},
+            {"spce": 40},
             20.0,
             precision="mixed",
             stages=[{"duration_ps": 0.2}],

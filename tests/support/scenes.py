@@ -2,9 +2,9 @@
 
 Kernels are compiled for the types of the force terms, which takes 95 % of the time of all tests.
 What makes a type: how a potential ends (truncation), the electrostatics with the number of
-coefficients that its accuracy needs, the precision, whether the cell is slanted, open or neither,
-and whether all molecules are single sites. Which models are in the scene, how many, the cutoff and
-the time steps make none. A test that needs nothing special takes `common.small_scene` with its
+coefficients that its accuracy needs, the order of splines of PME (README's water has 6), the
+precision, whether the cell is slanted, open or neither, and whether all molecules are single sites.
+Which models are in the scene, how many, the cutoff and the time steps make none. A test that needs nothing special takes `common.small_scene` with its
 settings (truncation "switch" of all forces, reaction field), {"truncation": "smooth_switch"}, or
 PME with its default accuracy, in double precision, or the defaults of a scene (PME in mixed
 precision): these are compiled in any case.
@@ -12,7 +12,7 @@ precision): these are compiled in any case.
 
 import numpy as np
 
-PME = {"electrostatics": "pme", "cutoff_A": 7.0}
+PME = {"electrostatics": "pme", "cutoff_A": 7.0, "pme_order": 6}
 WALL = [{"model": "argon", "count": 20, "frozen": True}, {"model": "spce", "count": 30}]
 #: Ten systems of every kind, in a cube of 15 Å unless they state otherwise: name -> models and
 #: counts, tables of the scene.

@@ -93,7 +93,8 @@ def stopped(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stopped")
     (folder / "water.toml").write_text(
         "[box]\ndensity_g_cm3 = 0.9\n[[molecules]]\nmodel = 'spce'\ncount = 40\n"
-        "[forces]\ncutoff_A = 5.0\ntruncation = 'smooth_switch'\n[start]\ntemperature_K = 298.0\n"
+        "[forces]\ncutoff_A = 5.0\ntruncation = 'smooth_switch'\npme_order = 6\n"
+        "[start]\ntemperature_K = 298.0\n"
         "[[stages]]\nensemble = 'nvt'\ntemperature_K = 298.0\nduration_ps = 0.1\ntimestep_fs = 1.0\n"
         "[output]\nlog_interval_ps = 0.01\ntrajectory_interval_ps = 0.02\nfigures = false\n"
     )

@@ -98,9 +98,8 @@ def test_sites_of_a_geometry_share_names(formula, tmp_path):
 
 def test_a_scene_holds_its_atoms(waters, tmp_path):
     """No file is needed; a run in a folder has one, and repeats to the bit."""
-    made = rigidmd.scene_from_atoms(
-        waters, ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT, seed=3, name="mine"
-    )
+    tables = {"forces": FORCES, "precision": "double", "stages": [NVE], "output": OUTPUT}
+    made = rigidmd.scene_from_atoms(waters, ["spce"], **tables, seed=3, name="mine")
     assert isinstance(made, MolecularScene)
     assert made.seed == 3
     assert made.name == "mine"
@@ -114,9 +113,7 @@ def test_a_scene_holds_its_atoms(waters, tmp_path):
     in_memory = Simulation(pickle.loads(pickle.dumps(made))).run()
     assert in_memory.state.position.tobytes() == first.state.position.tobytes()
     assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
-    assert made != rigidmd.scene_from_atoms(
-        waters[:-3], ["spce"], forces=FORCES, stages=[NVE], output=OUTPUT, seed=3, name="mine"
-    )
+    assert made != rigidmd.scene_from_atoms(waters[:-3], ["spce"], **tables, seed=3, name="mine")
 
 
 def test_a_run_of_held_atoms_goes_on(waters, tmp_path):
@@ -278,6 +275,7 @@ def test_paths_of_a_scene_begin_at_its_folder_however_it_is_used(tmp_path, monke
         'cutoff_A = 9.0\n[[forces.custom]]\nname = "mine"\ntable = "t.csv"\n[start]\ntemperature_K = 90.0\n'
         "[[stages]]\nduration_ps = 0.004\n"
     )
+    text = f'precision = "double"\n{text}'
     (folders[0] / "s.toml").write_text(text)
     atoms = Atoms("Ar2", positions=[[0, 0, 0], [0, 0, 3.8]], cell=[20] * 3, pbc=True)
     table = {

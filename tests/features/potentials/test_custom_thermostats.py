@@ -5,7 +5,8 @@ import math
 from typing import NamedTuple
 
 import pytest
-from support.potentials import SCRIPTS, points
+from support.common import small_scene
+from support.potentials import POINTS, SCRIPTS, points
 
 import rigidmd
 from rigidmd.assemble.build import build
@@ -35,10 +36,8 @@ def halve(bath, model, state, h, draw):
 
 
 def test_a_thermostat_of_ones_own_takes_the_place_of_that_of_the_stage():
-    given = {"D": {"A": 1e5, "B": 4.0, "C": 1.0}}
-    scene = points(
-        forces={"custom": [{"name": "soft", "energy": "A*exp(-B*r) - C/r**6", "parameters": given}]}
-    )
+    output = {"log_interval_ps": 0.02}
+    scene = small_scene({"argon": 20}, 40.0, stages=POINTS["stages"], output=output)
     results = rigidmd.Simulation(scene, thermostat=Halving(0.01)).run()
     assert results["kinetic"][-1] == pytest.approx(results["kinetic"][0] / 16, rel=0.02)
     assert results["heat"][-1] == pytest.approx(

@@ -382,8 +382,10 @@ def test_a_cell_described_anew_is_said_by_every_command(tmp_path, capsys):
 lengths_A = 36
 angles_deg = [90, 59, 90]
 [[molecules]]
-model = "argon"
+model = "spce"
 count = 5
+[forces]
+pme_order = 6
 [start]
 temperature_K = 100
 [[stages]]
