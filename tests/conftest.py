@@ -2,8 +2,11 @@
 
 import gc
 import os
+import subprocess
 import sys
+import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -58,3 +61,40 @@ def no_analysis_outlives_its_test():
         [name for name, entry in registry.KNOWN.items() if entry.is_user] if registry else ()
     ):
         del registry.KNOWN[name]
+
+
+@pytest.fixture
+def reads_here(monkeypatch):
+    """Trajectories are read in this process. A process for each file, which imports MDAnalysis and
+    may crash, takes 0.8 s: tests of damaged files and of each format have one."""
+    from rigidmd.formats import through_mdanalysis
+
+    def run(args, **options):
+        with warnings.catch_warnings(), monkeypatch.context() as patched:
+            patched.setattr(sys, "argv", args[-6:])
+            through_mdanalysis.main()
+        return subprocess.CompletedProcess(args, 0, b"", b"")
+
+    here = SimpleNamespace(run=run, DEVNULL=subprocess.DEVNULL)
+    monkeypatch.setattr(through_mdanalysis, "subprocess", here)
+
+
+#: Files whose tests draw figures. In others `draws` is for tests that read a figure.
+DRAWN = ("benchmarks/", "features/view/", "rules/test_docs.py")
+EMPTY = {"png": b"\x89PNG", "svg": b"<svg></svg>", "pdf": b"%PDF"}
+
+
+@pytest.fixture
+def draws():
+    """Figures are drawn."""
+
+
+@pytest.fixture(autouse=True)
+def figures_are_empty_where_none_is_tested(request, monkeypatch):
+    """Their axes are made and their files are written, but to draw one takes 0.4 s."""
+    file = request.path.relative_to(ROOT / "tests").as_posix()
+    if not file.startswith(DRAWN) and "draws" not in request.fixturenames:
+        from rigidmd.figures.picture import Picture
+
+        monkeypatch.setattr(Picture, "lay_out", lambda figure, dpi: None)
+        monkeypatch.setattr(Picture, "data", lambda figure, kind, *_, **options: EMPTY[kind])

@@ -226,6 +226,7 @@ def test_times_in_single_precision_are_evened_where_they_can_be():
         for ending in (".xtc", ".trr", ".gsd", ".dcd", ".nc")
     ],
 )
+@pytest.mark.usefixtures("reads_here")
 def test_the_last_frame_of_a_trajectory(ending, names, tmp_path):
     """Whatever names sites share, massless ones included."""
     sites = load_model("tip4p2005").sites()
@@ -419,6 +420,7 @@ def test_bodies_of_two_sites_alone(tmp_path):
 
 
 @pytest.mark.parametrize("ending", EVERY_ENDING)
+@pytest.mark.usefixtures("reads_here")
 def test_sites_without_elements_are_read_from_all_trajectories(ending, tmp_path):
     """Two heavy sites of one mass, and massless charges."""
     system = build(small_scene({"co2_2cljq": 5}, 30.0))
@@ -657,6 +659,7 @@ def test_a_wide_box_is_read_back(name, angles, edge, tmp_path):
     )
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_a_run_in_a_wide_box_continues_from_its_trajectory(tmp_path):
     """A dilute gas: the trajectory has no names, which are in topology.gro next to it."""
     changes = {"forces": {"cutoff_A": 9.0}, "output": {"trajectory_interval_ps": 0.004}}

@@ -290,6 +290,7 @@ def several(folder, stages, trajectory, **options):
 @pytest.mark.parametrize(
     "ending", [".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb", None]
 )
+@pytest.mark.usefixtures("reads_here")
 def test_a_trajectory_has_one_frame_of_each_time(tmp_path, ending):
     folder = None if ending is None else tmp_path / "out"
     seen = []

@@ -42,6 +42,7 @@ count = 8
 temperature_K = 300
 [forces]
 mixing = "geometric"
+pme_order = 6
 [[stages]]
 duration_ps = 0.004
 """
@@ -268,6 +269,7 @@ def test_models_that_cannot_be_shown(arguments, expected, capsys, tmp_path, monk
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("draws")
 def test_a_drawing_is_not_overwritten_unasked(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["models", "tip4p2005", "--draw"]) == 0
@@ -284,6 +286,7 @@ def test_a_drawing_is_not_overwritten_unasked(capsys, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "name", ["so2", "tip5p", "benzene_opls", "ccl4", "na_spce", "co2_epm2", "methane_trappe"]
 )
+@pytest.mark.usefixtures("draws")
 def test_every_kind_of_molecule_can_be_drawn(name, tmp_path):
     """Every site's name stands in the picture, once, and what is charged states so."""
     assert main(["models", name, "-o", str(tmp_path / "m.svg")]) == 0
@@ -296,6 +299,7 @@ def test_every_kind_of_molecule_can_be_drawn(name, tmp_path):
     assert (tmp_path / "again.svg").read_text() == text
 
 
+@pytest.mark.usefixtures("draws")
 def test_a_molecule_of_ones_own_is_shown_and_drawn(tmp_path, capsys):
     """Whatever its sites are called: names are not formulas."""
     sites = "".join(

@@ -631,6 +631,7 @@ def test_friction_on_each_molecule_is_told(water):
     assert "the thermostat langevin acts on each molecule" in " ".join(told)
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_stages_of_one_name_are_told_apart(tmp_path):
     """Production is the last stage, also where an earlier one has its name."""
     stages = [

@@ -473,6 +473,7 @@ assert main(["run", sys.argv[1], "--set", "run.duration_s=0.01", "--output", sys
     assert (folder / "axis.png").is_file()
 
 
+@pytest.mark.usefixtures("draws")
 def test_a_figure_is_laid_out_once_and_drawn_once_for_each_file(tmp_path, monkeypatch):
     drawn, laid_out = [], []
     draw, lay_out = Picture.draw, ConstrainedLayoutEngine.execute

@@ -95,6 +95,7 @@ def test_ase_opens_it(traj, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["trajectory.xtc", "trajectory.trr", "trajectory.gsd"])
+@pytest.mark.usefixtures("reads_here")
 def test_ase_reads_a_run(name, tmp_path, monkeypatch):
     """By the entry point of pyproject.toml, as ASE does when it is imported."""
     ((group, names),) = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][

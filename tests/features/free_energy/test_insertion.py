@@ -318,6 +318,7 @@ def test_what_has_no_meaning_is_refused():
         insertion(history(gas, np.arange(4), None, np.diag([30.0] * 3)), "neon", zero_loading=True)
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_the_command(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene = small_scene(

@@ -311,6 +311,7 @@ def test_unstable_modes_are_negative():
     )
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_the_command_writes_a_table_and_an_animation(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["modes", str(DIMER), "--animate", "12"]) == 0

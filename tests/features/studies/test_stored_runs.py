@@ -109,6 +109,7 @@ def test_a_log_with_a_column_twice_is_refused(run, tmp_path):
         rigidmd.read_run(folder)
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_a_run_that_was_moved_is_read_where_it_is(run, tmp_path):
     folder, returned = run
     moved = Path(shutil.copytree(folder, tmp_path / "moved"))
@@ -240,6 +241,7 @@ def test_an_analysis_of_a_path_names_read_run(run):
         rigidmd.analysis.analyse(None, "msd")
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_the_command_writes_no_offsets(run, capsys):
     folder = run[0]
     assert cli.main(["analyse", str(folder), "--only", "msd"]) == 0

@@ -41,6 +41,7 @@ def frames_in(path):
 
 
 @pytest.mark.parametrize("kind", ["top", "water"])
+@pytest.mark.usefixtures("reads_here")
 def test_a_film_moves(kind, request, tmp_path, capsys):
     path = tmp_path / "film.gif"
     plots = ["--plots"] if kind == "water" else []
@@ -162,6 +163,7 @@ def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
     assert "motion nearly returns to its start at 0.39 s" in notes[0]
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_a_film_says_what_it_leaves_out(water, tmp_path, monkeypatch):
     monkeypatch.setattr(molecule_animation, "chemiscope_script", lambda: "")
     monkeypatch.setattr(molecule_animation, "MOST_COORDINATES", 3 * 3 * 648)

@@ -343,6 +343,7 @@ def shifted(simulation):
     return simulation
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_the_film_of_molecules_is_a_page_in_a_frame(tmp_path):
     pytest.importorskip("chemiscope", reason="chemiscope is not installed")
     memory, files = (shifted(argon(folder)).run() for folder in (None, tmp_path / "out"))

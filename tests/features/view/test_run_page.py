@@ -108,6 +108,7 @@ def test_the_film_of_a_body_is_its_motion(top, tmp_path):
     assert page.stat().st_size < 1e6
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch):
     monkeypatch.setattr(molecule_animation, "chemiscope_script", lambda: "var Chemiscope;")
     page = tmp_path / "water.html"
@@ -154,6 +155,7 @@ def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
     assert frames.cells[-1] == pytest.approx(results.state.cell, abs=1e-3)
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_without_chemiscope_a_sentence_says_what_to_install(water, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "chemiscope", None)
     assert cli.main(["view", str(water)]) == 2
@@ -301,6 +303,7 @@ def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, c
     assert fault != "missing" or cli.main(["report", str(folder)]) == 0
 
 
+@pytest.mark.usefixtures("reads_here")
 def test_a_run_that_was_killed_shows_what_there_is(water, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(molecule_animation, "chemiscope_script", lambda: "")
     folder = tmp_path / "run"

@@ -17,6 +17,7 @@ from rigidmd.studies.sweep.table import POTENTIAL
 STEP = "stages.0.timestep_fs"
 
 
+@pytest.mark.usefixtures("draws")
 def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(limits, "MOST_PANELS", 2)  # drawing takes most of the time
     folder = tmp_path / "steps"
