@@ -63,6 +63,11 @@ def small_scene(counts: dict[str, int], edge: float | None, folder=".", **sectio
     return Scene.from_dict(pinned(data | sections | {"output": output}), folder)
 
 
+def site(name: str, mass: float, position=(0.0, 0.0, 0.0), charge=0.0, **keys) -> dict:
+    """A site of a scene: mass (u), position (Å), charge (e), further keys such as `sigma_A`."""
+    return {"name": name, "mass_u": mass, "position_A": list(position), "charge_e": charge} | keys
+
+
 def system_of(counts, edge=40.0, cutoff=5.0, **sections) -> System:
     """The system of `small_scene`, with a cutoff (Å)."""
     return build(small_scene(counts, edge, **{"forces": {"cutoff_A": cutoff}} | sections))

@@ -5,12 +5,20 @@ from itertools import product
 import numpy as np
 import pytest
 from scipy.special import erfc
-from support.common import observe, shaken, small_scene
-from support.ewald import SALT, TIGHT_EWALD, TIGHT_PME, charged_sites, coulomb
-from support.reference import KE, EwaldOracle, Oracle
+from support.common import observe, small_scene
+from support.ewald import (
+    EDGES,
+    SALT,
+    TIGHT_EWALD,
+    TIGHT_PME,
+    charged_sites,
+    coulomb,
+    oracle_of,
+    salty,
+)
+from support.reference import KE, Oracle
 
 from rigidmd.assemble.build import build
-from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.units import BAR
 
 
@@ -35,20 +43,14 @@ def test_lennard_jones_and_real_space_end_apart(truncation, ewald):
         "truncation": truncation,
     }
     forces |= {"ewald_truncation": ewald} if ewald else {}
-    scene = small_scene(
-        {}, None, molecules=SALT, box={"lengths_A": [13.0, 14.0, 15.0]}, forces=forces
-    )
-    system, engine, state = shaken(build(scene), 8)
-    x, q, owner = charged_sites(system, state)
-    oracle = EwaldOracle(
-        x, q, owner, cell_of(system.space), alpha, cutoff, lambda n: n[:, 0] == n[:, 0]
-    )
+    system, engine, state = salty(forces)
+    oracle = oracle_of(system, state, alpha, cutoff)
     found = observe(system, engine, state)
     shift = erfc(alpha * cutoff) / cutoff if (ewald or truncation) == "shift" else 0.0
     pairs = sum(
         oracle.q[i] * oracle.q[j] for i, j, r, same in oracle.pairs() if not same and r < cutoff
     )
-    net = np.bincount(owner, oracle.q)
+    net = np.bincount(oracle.owner, oracle.q)
     assert found.components["coulomb_real"] == pytest.approx(oracle.real - shift * pairs, rel=1e-10)
     assert found.components["coulomb_self"] == pytest.approx(
         oracle.self - 0.5 * shift * net @ net, rel=1e-11
@@ -70,15 +72,12 @@ def test_only_the_energy_is_shifted_where_real_space_ends():
             "ewald_alpha_per_A": alpha,
             "truncation": truncation,
         }
-        scene = small_scene(
-            {}, None, molecules=SALT, box={"lengths_A": [13.0, 14.0, 15.0]}, forces=forces
-        )
-        system, engine, state = shaken(build(scene), 8)
+        system, engine, state = salty(forces)
         found[truncation] = observe(system, engine, state)
     assert found["shift"].load.force == pytest.approx(found["plain"].load.force, rel=1e-11)
     x, q, owner = charged_sites(system, state)
     step = x[:, None] - x
-    step -= np.round(step / [13.0, 14.0, 15.0]) * [13.0, 14.0, 15.0]
+    step -= np.round(step / EDGES) * EDGES
     near = (np.linalg.norm(step, axis=2) < cutoff) & (owner[:, None] > owner)
     shift = KE * erfc(alpha * cutoff) / cutoff
     changes = {
@@ -98,23 +97,10 @@ def test_frozen_molecules_do_not_act_on_one_another():
     molecules = [{**SALT[0], "frozen": True}, {**SALT[1], "count": 6}]
     pressures = {}
     for method in (TIGHT_EWALD, TIGHT_PME):
-        scene = small_scene(
-            {}, None, molecules=molecules, box={"lengths_A": [13.0, 14.0, 15.0]}, forces=method
-        )
-        system = build(scene)
-        x, q, owner = charged_sites(system, system.state)
-        whole, alone = (
-            EwaldOracle(
-                x[chosen],
-                q[chosen],
-                owner[chosen],
-                cell_of(system.space),
-                1.0,
-                6.4,
-                lambda n: n[:, 0] == n[:, 0],
-            )
-            for chosen in (slice(None), owner < 6)
-        )
+        box = {"lengths_A": EDGES}
+        system = build(small_scene({}, None, molecules=molecules, box=box, forces=method))
+        whole = oracle_of(system, system.state, 1.0, 6.4)
+        alone = oracle_of(system, system.state, 1.0, 6.4, chosen=whole.owner < 6)
         seen = observe(system, system.engine(), system.state)
         # of the sums that cancel, as good as the grid is; see
         # test_total_does_not_depend_on_how_it_is_split

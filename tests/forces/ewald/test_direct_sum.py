@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from support.common import observe, shaken, small_scene
-from support.ewald import TIGHT_EWALD, charged_sites, salty
+from support.common import observe, shaken, site, small_scene
+from support.ewald import TIGHT_EWALD, charged_sites, oracle_of, salty
 from support.reference import EwaldOracle
 
 from rigidmd.assemble.build import build
@@ -49,29 +49,9 @@ def nist_scene(file, cell, folder, box=None, **waves):
     )
     angle = np.radians(109.47)
     sites = [
-        {
-            "name": "O",
-            "element": "O",
-            "mass_u": 15.9994,
-            "charge_e": -0.8476,
-            "sigma_A": 3.16555789,
-            "epsilon_K": 78.19743111,
-            "position_A": [0.0, 0.0, 0.0],
-        },
-        {
-            "name": "H1",
-            "element": "H",
-            "mass_u": 1.008,
-            "charge_e": 0.4238,
-            "position_A": [1.0, 0.0, 0.0],
-        },
-        {
-            "name": "H2",
-            "element": "H",
-            "mass_u": 1.008,
-            "charge_e": 0.4238,
-            "position_A": [float(np.cos(angle)), float(np.sin(angle)), 0.0],
-        },
+        site("O", 15.9994, charge=-0.8476, sigma_A=3.16555789, epsilon_K=78.19743111, element="O"),
+        site("H1", 1.008, [1.0, 0.0, 0.0], 0.4238, element="H"),
+        site("H2", 1.008, [float(np.cos(angle)), float(np.sin(angle)), 0.0], 0.4238, element="H"),
     ]
     data = {
         "structure": {"file": "water.xyz"},
@@ -256,9 +236,9 @@ def test_ewald_is_the_oracle_term_by_term(limit, box):
     system, engine, state = shaken(build(scene), 4)
     most = np.array(limit["ewald_k_max"]) * np.ones(3)
     square = limit.get("ewald_k2_max", np.inf)
-    oracle = EwaldOracle(
-        *charged_sites(system, state),
-        cell_of(system.space),
+    oracle = oracle_of(
+        system,
+        state,
         0.4,
         6.0,
         lambda n: (np.abs(n) <= most).all(axis=1) & ((n**2).sum(axis=1) <= square),
@@ -330,17 +310,7 @@ def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
     ions = [
         {
             "name": name,
-            "sites": [
-                {
-                    "name": name,
-                    "element": name,
-                    "mass_u": 30.0,
-                    "charge_e": charge,
-                    "sigma_A": 2.0,
-                    "epsilon_K": 50.0,
-                    "position_A": [0.0, 0.0, 0.0],
-                }
-            ],
+            "sites": [site(name, 30.0, charge=charge, element=name, sigma_A=2.0, epsilon_K=50.0)],
         }
         for name, charge in (("Na", 1.0), ("Cl", -1.0))
     ]
@@ -409,7 +379,7 @@ duration_ps = 0.004
 
 
 def test_waves_without_compiled_code():
-    system, engine, state = salty([13.0, 14.0, 15.0], TIGHT_EWALD)
+    system, engine, state = salty(TIGHT_EWALD)
     engine.evaluate(state)
     term, own = system.terms["coulomb_reciprocal"], engine.workspaces["coulomb_reciprocal"].sums
     energy, force, virial = ewald_sum_in_numpy(

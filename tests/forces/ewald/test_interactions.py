@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from support.common import bits_with, built, observe, shaken, small_scene
-from support.ewald import SALT, TIGHT_EWALD, TIGHT_PME, charged_sites, coulomb, salty
-from support.reference import KE, EwaldOracle
+from support.common import bits_with, built, observe, shaken, site, small_scene
+from support.ewald import SALT, TIGHT_EWALD, TIGHT_PME, coulomb, oracle_of, salty
+from support.reference import KE
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
@@ -32,15 +32,14 @@ def test_ions_in_a_triclinic_cell(reference, method, tmp_path):
             "name": name,
             "residue_names": [name.upper(), name],
             "sites": [
-                {
-                    "name": name,
-                    "element": name,
-                    "mass_u": mass,
-                    "charge_e": charge,
-                    "sigma_A": 10 * given["LJ"][name][0],
-                    "epsilon_kJ_mol": given["LJ"][name][1],
-                    "position_A": [0.0, 0.0, 0.0],
-                }
+                site(
+                    name,
+                    mass,
+                    charge=charge,
+                    element=name,
+                    sigma_A=10 * given["LJ"][name][0],
+                    epsilon_kJ_mol=given["LJ"][name][1],
+                )
             ],
         }
         for name, mass, charge in (("Cl", 35.45, -1.0), ("Na", 22.99, 1.0))
@@ -86,17 +85,7 @@ def test_madelung_constant_of_rock_salt(reference, method, asked, error, tmp_pat
     ions = [
         {
             "name": name,
-            "sites": [
-                {
-                    "name": name,
-                    "element": name,
-                    "mass_u": mass,
-                    "charge_e": charge,
-                    "sigma_A": 1.0,
-                    "epsilon_K": 1e-9,
-                    "position_A": [0.0, 0.0, 0.0],
-                }
-            ],
+            "sites": [site(name, mass, charge=charge, element=name, sigma_A=1.0, epsilon_K=1e-9)],
         }
         for name, mass, charge in (("Na", 22.99, 1.0), ("Cl", 35.45, -1.0))
     ]
@@ -124,10 +113,8 @@ def test_madelung_constant_of_rock_salt(reference, method, asked, error, tmp_pat
 @pytest.mark.parametrize("method", [pytest.param(TIGHT_EWALD, marks=pytest.mark.soak), TIGHT_PME])
 def test_total_does_not_depend_on_how_it_is_split(method):
     """A charged box with everything in it; the oracle at another alpha."""
-    system, engine, state = salty([13.0, 14.0, 15.0], method)
-    oracle = EwaldOracle(
-        *charged_sites(system, state), cell_of(system.space), 1.0, 6.4, lambda n: n[:, 0] == n[:, 0]
-    )
+    system, engine, state = salty(method)
+    oracle = oracle_of(system, state, 1.0, 6.4)
     found = observe(system, engine, state).components
     assert found["coulomb_background"] == pytest.approx(
         -np.pi / (2 * 2730 * 0.81) * 36 * KE, rel=1e-10
@@ -364,10 +351,10 @@ def test_what_needs_a_box_or_a_cut_off_says_so(method, words):
 
 
 def test_a_charged_box_is_said_and_has_no_dipole():
-    system, _, _ = salty([13.0, 14.0, 15.0], TIGHT_EWALD)
+    system, _, _ = salty(TIGHT_EWALD)
     assert any("net charge of +6 e" in note for note in system.notes)
     with pytest.raises(SceneError, match="the dipole of a box with a net charge is not defined"):
-        salty([13.0, 14.0, 15.0], TIGHT_EWALD, ewald_surface_permittivity=2.0)
+        salty(TIGHT_EWALD, ewald_surface_permittivity=2.0)
 
 
 def test_check_says_how_and_what_is_left_out():
