@@ -15,6 +15,7 @@ from itertools import product
 import numpy as np
 import pytest
 from scipy import stats
+from support.common import site
 from support.sampling import (
     BAROSTATS,
     FEW,
@@ -333,10 +334,10 @@ def test_fluctuations_of_the_energy_fall_with_the_square_of_the_step():
 DIPOLE = {
     "name": "dipole",
     "sites": [
-        {"name": "O", "mass_u": 15.9994, "position_A": [0.0, 0.0, 0.0]},
-        {"name": "H1", "mass_u": 1.008, "position_A": [0.75695, 0.58588, 0.0], "charge_e": 0.5564},
-        {"name": "H2", "mass_u": 1.008, "position_A": [-0.75695, 0.58588, 0.0], "charge_e": 0.5564},
-        {"name": "M", "mass_u": 0.0, "position_A": [0.0, 0.1546, 0.0], "charge_e": -1.1128},
+        site("O", 15.9994),
+        site("H1", 1.008, [0.75695, 0.58588, 0.0], 0.5564),
+        site("H2", 1.008, [-0.75695, 0.58588, 0.0], 0.5564),
+        site("M", 0.0, [0.0, 0.1546, 0.0], -1.1128),
     ],
 }
 MOMENT = 1.1128 * (0.58588 - 0.1546)  # e Å

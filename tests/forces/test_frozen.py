@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.common import built, move, observe, shaken, small_scene
+from support.common import built, move, observe, shaken, site, small_scene
 from support.reference import Oracle
 
 from rigidmd.assemble.build import build
@@ -63,13 +63,13 @@ def test_rigid_bodies_among_frozen_atoms_follow_lammps(reference, case):
     molecules = []
     for b, members in enumerate(bodies):
         sites = [
-            {
-                "name": f"T{kind[i]}",
-                "mass_u": mass[i],
-                "position_A": position[i].tolist(),
-                "sigma_A": WELLS[kind[i]][1],
-                "epsilon_kJ_mol": WELLS[kind[i]][0] * CALORIE,
-            }
+            site(
+                f"T{kind[i]}",
+                mass[i],
+                position[i].tolist(),
+                sigma_A=WELLS[kind[i]][1],
+                epsilon_kJ_mol=WELLS[kind[i]][0] * CALORIE,
+            )
             for i in np.flatnonzero(members)
         ]
         alone = len(sites) == 1

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from support.common import BODIES, ROOT, small_scene
+from support.common import BODIES, ROOT, site, small_scene
 from support.processes import search_path
 
 from rigidmd.assemble.build import build
@@ -25,11 +25,6 @@ from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
 PLAIN = {"figures": False, "trajectory": False}
-
-
-def site(name, mass, position=(0.0, 0.0, 0.0), charge=0.0, sigma=None):
-    found = {"name": name, "mass_u": mass, "position_A": list(position), "charge_e": charge}
-    return found | ({"sigma_A": sigma, "epsilon_kJ_mol": 0.65} if sigma else {})
 
 
 def stopped(scene, folder=None, change=None):
@@ -145,7 +140,7 @@ def test_bad_inertia():
     light = {
         "name": "light",
         "count": 30,
-        "sites": [site("O", 18.0, charge=-0.8, sigma=3.1), *arms],
+        "sites": [site("O", 18.0, charge=-0.8, sigma_A=3.1, epsilon_kJ_mol=0.65), *arms],
     }
     said = stopped(
         small_scene({}, 20.0, molecules=[light], stages=[{"duration_ps": 0.5, "timestep_fs": 1.0}])
@@ -287,7 +282,11 @@ def test_bodies_that_are_all_but_linear_go_on(spread):
     """They spin about their axis a thousand times faster than they tumble; their sites are barely disturbed by
     it."""
     arms = [site(f"H{k}", 12.0, (x, spread, 0.0), 0.2) for k, x in enumerate((-1.0, 1.0))]
-    thin = {"name": "thin", "count": 20, "sites": [site("O", 16.0, charge=-0.4, sigma=3.1), *arms]}
+    thin = {
+        "name": "thin",
+        "count": 20,
+        "sites": [site("O", 16.0, charge=-0.4, sigma_A=3.1, epsilon_kJ_mol=0.65), *arms],
+    }
     results = Simulation(
         small_scene({}, 20.0, molecules=[thin], stages=[{"duration_ps": 1.0}])
     ).run()

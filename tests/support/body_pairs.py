@@ -9,6 +9,7 @@ import numpy as np
 
 from rigidmd import Scene, Simulation
 from rigidmd.forces.poses.gay_berne import GayBerne
+from support.common import site
 
 ROD = {"length_A": 12.0, "width_A": 4.0, "epsilon_kJ_mol": 1.0, "side": 1.0, "end": 0.2}
 DISC = {"length_A": 3.0, "width_A": 8.0, "epsilon_kJ_mol": 1.5, "side": 0.5, "end": 1.2}
@@ -21,10 +22,7 @@ SITES = {
 
 
 def body(name: str, count: int) -> dict:
-    sites = [
-        {"name": f"A{k}", "mass_u": 20.0, "position_A": position}
-        for k, position in enumerate(SITES[name])
-    ]
+    sites = [site(f"A{k}", 20.0, position) for k, position in enumerate(SITES[name])]
     return {"name": name, "count": count, "sites": sites}
 
 
@@ -107,7 +105,7 @@ LINES = {"along": [0.0, 0.0, 1.0], "across": [1.0, 0.0, 0.0], "oblique": [0.6, 0
 def line(name: str, count: int = 6) -> dict:
     """Two masses on a line."""
     ends = [[sign * x for x in LINES[name]] for sign in (1.0, -1.0)]
-    sites = [{"name": f"A{k}", "mass_u": 20.0, "position_A": x} for k, x in enumerate(ends)]
+    sites = [site(f"A{k}", 20.0, x) for k, x in enumerate(ends)]
     return {"name": name, "count": count, "sites": sites}
 
 

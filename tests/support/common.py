@@ -63,9 +63,10 @@ def small_scene(counts: dict[str, int], edge: float | None, folder=".", **sectio
     return Scene.from_dict(pinned(data | sections | {"output": output}), folder)
 
 
-def site(name: str, mass: float, position=(0.0, 0.0, 0.0), charge=0.0, **keys) -> dict:
+def site(name: str, mass: float, position=(0.0, 0.0, 0.0), charge: float = 0.0, **keys) -> dict:
     """A site of a scene: mass (u), position (Å), charge (e), further keys such as `sigma_A`."""
-    return {"name": name, "mass_u": mass, "position_A": list(position), "charge_e": charge} | keys
+    charges = {"charge_e": charge} if charge else {}
+    return {"name": name, "mass_u": mass, "position_A": list(position)} | charges | keys
 
 
 def system_of(counts, edge=40.0, cutoff=5.0, **sections) -> System:

@@ -8,14 +8,9 @@ from rigidmd.assemble.build import build
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.mechanics.rotation import random_rotations
-from support.common import small_scene
+from support.common import site, small_scene
 
 VERLET = SCHEMES["velocity_verlet"]
-
-
-def site(name, mass, position, charge, sigma=None):
-    well = {} if sigma is None else {"sigma_A": sigma, "epsilon_kJ_mol": 0.5}
-    return {"name": name, "mass_u": mass, "position_A": position, "charge_e": charge} | well
 
 
 #: An asymmetric body with a net charge and a dipole, its mirror image of the opposite charge, a
@@ -29,8 +24,8 @@ ETIK = [entry | {"charge_e": -entry["charge_e"]} for entry in KITE]
 ROD = [site("P", 8.0, [0, 0, 0.5], 0.5), site("N", 9.0, [0, 0, -0.6], -0.5)]
 #: One with Lennard-Jones sites away from its centre, for walls.
 DUMBBELL = [
-    site("L", 14.0, [0, 0, 0.5], 0.5, 3.0),
-    site("M", 6.0, [0, 0.2, -0.9], -0.5, 2.5),
+    site("L", 14.0, [0, 0, 0.5], 0.5, sigma_A=3.0, epsilon_kJ_mol=0.5),
+    site("M", 6.0, [0, 0.2, -0.9], -0.5, sigma_A=2.5, epsilon_kJ_mol=0.5),
     site("H", 1.0, [1, 0, 0], 0.0),
 ]
 

@@ -7,7 +7,7 @@ import numpy as np
 
 import rigidmd
 from rigidmd.forces.potentials.custom import energy_and_force
-from support.common import ROOT
+from support.common import ROOT, site
 
 SCRIPTS = sorted((ROOT / "systems" / "scripts").glob("*.py"))
 LJ = "4*eps*((sig/r)**12 - (sig/r)**6)"
@@ -17,7 +17,7 @@ POINTS = {
         {
             "name": "dot",
             "count": 100,
-            "sites": [{"name": "D", "element": "Ar", "mass_u": 40, "position_A": [0, 0, 0]}],
+            "sites": [site("D", 40, element="Ar")],
         }
     ],
     "start": {"temperature_K": 94},

@@ -8,6 +8,7 @@ import numpy as np
 from rigidmd.engines.system import System
 from rigidmd.run import Every, Results, Simulation
 from rigidmd.scene import Scene
+from support.common import site
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -84,13 +85,7 @@ DIAMETER, DEPTH = 3.0, 100.0
 DUMBBELL = {
     "name": "dumbbell",
     "sites": [
-        {
-            "name": name,
-            "mass_u": 20.0,
-            "sigma_A": DIAMETER,
-            "epsilon_K": DEPTH,
-            "position_A": [0.0, 0.0, z],
-        }
+        site(name, 20.0, [0.0, 0.0, z], sigma_A=DIAMETER, epsilon_K=DEPTH)
         for name, z in (("A", -0.335 * DIAMETER), ("B", 0.335 * DIAMETER))
     ],
 }

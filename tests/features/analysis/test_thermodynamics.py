@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.signal import lfilter
-from support.common import history, system_of
+from support.common import history, site, system_of
 
 import rigidmd
 from rigidmd import Scene, Simulation
@@ -134,14 +134,7 @@ def test_an_ideal_gas_at_constant_volume_has_its_responses(thermostat):
 ROTOR = {
     "name": "rotor",
     "sites": [
-        {
-            "name": name,
-            "element": "N",
-            "sigma_A": 1.0,
-            "epsilon_kJ_mol": 1e-9,
-            "mass_u": 14.0,
-            "position_A": [0.0, 0.0, z],
-        }
+        site(name, 14.0, [0.0, 0.0, z], element="N", sigma_A=1.0, epsilon_kJ_mol=1e-9)
         for name, z in (("A", -0.55), ("B", 0.55))
     ],
 }

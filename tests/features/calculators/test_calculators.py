@@ -11,7 +11,7 @@ from ase.calculators.lj import LennardJones
 from ase.calculators.tip3p import TIP3P
 from ase.calculators.tip4p import TIP4P
 from support.ase_models import ase_sites
-from support.common import small_scene
+from support.common import site, small_scene
 
 import rigidmd
 from rigidmd import Scene, Simulation
@@ -25,14 +25,7 @@ NO_FORCES = {"lennard_jones": False, "electrostatics": "none"}
 ROD = {
     "name": "rod",
     "sites": [
-        {
-            "name": f"A{k}",
-            "element": "Ar",
-            "mass_u": 40.0,
-            "position_A": [x, 0, 0],
-            "sigma_A": 3.4,
-            "epsilon_kJ_mol": 1.0,
-        }
+        site(f"A{k}", 40.0, [x, 0, 0], element="Ar", sigma_A=3.4, epsilon_kJ_mol=1.0)
         for k, x in enumerate((-1.9, 1.9))
     ],
 }

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.common import ROOT, built, small_scene
+from support.common import ROOT, built, site, small_scene
 from support.scenes import PME, SCENES
 
 from rigidmd.assemble.build import build
@@ -410,8 +410,8 @@ RODS = {
     "name": "rod",
     "count": 40,
     "sites": [
-        {"name": "A", "mass_u": 20.0, "position_A": [0.0, 0.0, 3.4]},
-        {"name": "B", "mass_u": 30.0, "position_A": [0.0, 0.0, -3.4], "charge_e": 0.0},
+        site("A", 20.0, [0.0, 0.0, 3.4]),
+        site("B", 30.0, [0.0, 0.0, -3.4], 0.0),
     ],
 }
 

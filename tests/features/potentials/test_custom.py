@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import pytest
-from support.common import built, small_scene
+from support.common import built, site, small_scene
 from support.potentials import LJ, Pair, at_distance, points
 
 import rigidmd
@@ -209,15 +209,7 @@ def test_who_interacts_with_which_parameters():
 
 
 def test_parameters_may_come_from_the_model():
-    sites = [
-        {
-            "name": "D",
-            "element": "Ar",
-            "mass_u": 40,
-            "position_A": [0, 0, 0],
-            "parameters": {"k": 3.0, "other": 1.0},
-        }
-    ]
+    sites = [site("D", 40, element="Ar", parameters={"k": 3.0, "other": 1.0})]
     scene = points(
         molecules=[{"name": "dot", "count": 10, "sites": sites}],
         forces={"custom": [{"name": "wall", "energy": "k/r**9"}]},

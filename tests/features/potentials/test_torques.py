@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.body_pairs import ROD, body, line, scene, written_table
+from support.common import site
 
 import rigidmd
 from rigidmd import Scene, Simulation
@@ -20,7 +21,7 @@ def test_bodies_that_do_not_rotate_have_no_such_potential():
 
 
 DISK = body("disc", 6)
-DOT = {"name": "dot", "count": 6, "sites": [{"name": "A", "mass_u": 20.0, "position_A": [0, 0, 0]}]}
+DOT = {"name": "dot", "count": 6, "sites": [site("A", 20.0)]}
 SHIPPED = {
     "gay_berne": ROD,
     "dipole": {"dipole_D": 2.0},

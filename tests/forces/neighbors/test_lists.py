@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from support.common import built
+from support.common import built, site
 
 from rigidmd import Scene, Simulation
 from rigidmd.forces.neighbors.lists import BUILDS, IMAGES_FOUND
@@ -74,16 +74,7 @@ def test_one_list_has_all_pairs_of_a_cell_that_is_strained(angles):
 
 GAS = {
     "name": "point",
-    "sites": [
-        {
-            "name": "A",
-            "element": "Ar",
-            "sigma_A": 0.005,
-            "epsilon_kJ_mol": 1e-6,
-            "mass_u": 40.0,
-            "position_A": [0.0, 0.0, 0.0],
-        }
-    ],
+    "sites": [site("A", 40.0, element="Ar", sigma_A=0.005, epsilon_kJ_mol=1e-6)],
 }
 
 
