@@ -1,9 +1,12 @@
 """Loads of all terms: the slow oracle, finite differences, action and reaction, a changed cell."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from support.common import built, move, observe, small_scene
 from support.reference import Oracle
+from support.slopes import energy_of, force_on, torque_on, trace_of_virial
 
 from rigidmd.assemble.build import build
 from rigidmd.compile import Program
@@ -13,7 +16,6 @@ from rigidmd.forces.neighbors.lists import (
     BUILDS,
 )
 from rigidmd.forces.neighbors.space import cell_of
-from rigidmd.mechanics.rotation import from_vector
 from rigidmd.units import BAR, BOLTZMANN
 
 ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
@@ -172,31 +174,13 @@ def test_forces_and_torques_are_the_slope_of_the_energy(ending):
     _, engine, state = built({"tip4p2005": 6, "nitrogen": 4, "argon": 3}, 13.0, 1, forces=forces)
     load, _ = engine.evaluate(state)
 
-    def energy(moved):
-        return sum(energies(engine, moved).values())
-
-    def slope(move, h):
-        up, down = state.copy(), state.copy()
-        move(up, h)
-        move(down, -h)
-        return -(energy(up) - energy(down)) / (2 * h)
-
-    def extrapolated(move, h=2e-4):  # Richardson: the error of the difference falls as h^4
-        return (4 * slope(move, h / 2) - slope(move, h)) / 3
-
+    energy, h = partial(energy_of, engine), 1e-4
     scale = np.abs(load.force).max()
     for m in range(len(state.position)):
-        for k in range(3):
-
-            def shift(moved, h, m=m, k=k):
-                moved.position[m, k] += h
-
-            def turn(moved, h, m=m, k=k):
-                moved.rotation[m] = moved.rotation[m] @ from_vector(h * np.eye(3)[k])
-
-            # `plain` jumps where a pair crosses the cutoff; these starts have none within h of it
-            assert load.force[m, k] == pytest.approx(extrapolated(shift), abs=1e-6 * scale)
-            assert load.torque_body[m, k] == pytest.approx(extrapolated(turn), abs=1e-6 * scale)
+        # `plain` jumps where a pair crosses the cutoff; these starts have none within 2 h of it
+        force, torque = force_on(m, energy, state, h), torque_on(m, energy, state, h)
+        assert load.force[m] == pytest.approx(force, abs=1e-6 * scale)
+        assert load.torque_body[m] == pytest.approx(torque, abs=1e-6 * scale)
 
 
 @pytest.mark.parametrize("angles", [None, [70.0, 100.0, 80.0]])
@@ -207,14 +191,8 @@ def test_virial_is_the_slope_of_the_energy_with_the_box(angles):
     engine, state = system.engine(), system.state
     virial = sum(tally.virial for tally in engine.evaluate(state)[1].values())
 
-    def energy(stretch):
-        moved = state.copy()
-        moved.cell[:] *= stretch
-        moved.position[:] *= stretch  # centres of mass only: the molecular virial
-        return sum(energies(engine, moved).values())
-
-    h = 1e-5
-    assert virial.trace() == pytest.approx(-(energy(1 + h) - energy(1 - h)) / (2 * h), rel=1e-6)
+    slope = trace_of_virial(partial(energy_of, engine), state, 1e-5)
+    assert virial.trace() == pytest.approx(slope, rel=1e-6)
 
 
 SLANTED = {"lengths_A": [21.0, 22.0, 23.0], "angles_deg": [70.0, 100.0, 80.0]}

@@ -66,10 +66,6 @@ STEADY = {"electric_V_per_nm": [0.3, -0.2, 0.6]}
 OSCILLATING = STEADY | {"electric_frequency_per_ps": 2.5, "electric_phase_deg": 40.0}
 
 
-def energy_of(engine, state):
-    return sum(tally.energy for tally in engine.evaluate(state)[1].values())
-
-
 def walls(kind, **more):
     own = (
         {"sigma_A": 3.0, "epsilon_kJ_mol": 2.0} if kind == "lj93" else {"stiffness_kJ_mol_A2": 5.0}

@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import quad
 from support.common import ROOT, built, move, observe, shaken, small_scene
 from support.reference import nearest
+from support.slopes import force_on, torque_on
 
 import rigidmd
 from rigidmd.analysis.free_energy import SampledLambda, free_energy_of
@@ -17,7 +18,6 @@ from rigidmd.core.state import state_of
 from rigidmd.engines.samples import lambda_column
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.forces.potentials.soft_core import SOFTNESS, SoftCore
-from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.scene.models import load_model
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -186,28 +186,14 @@ def test_forces_and_torques_are_derivatives_of_the_energy(value):
     load = engine.evaluate(state)[0]
     guest, step = 40, 1e-4
 
-    def slope(change):
-        energies = []
-        for sign in (1, -1):
-            moved = state.copy()
-            change(moved, sign * step)
-            energies.append(observe(system, engine, moved).potential)
-        return (energies[1] - energies[0]) / (2 * step)
+    def energy(moved):
+        return observe(system, engine, moved).potential
 
-    for k in range(3):
-
-        def shift(moved, h, k=k):
-            moved.position[guest, k] += h
-
-        def turn(moved, h, k=k):
-            half = np.zeros(4)
-            half[[0, 1 + k]] = np.cos(h / 2), np.sin(h / 2)
-            moved.rotation[guest] = moved.rotation[guest] @ from_quaternion(half[None])[0]
-
-        size = np.abs(load.force[guest]).max() + 1.0
-        assert slope(shift) == pytest.approx(load.force[guest, k], abs=1e-4 * size)
-        size = np.abs(load.torque_body[guest]).max() + 1.0
-        assert slope(turn) == pytest.approx(load.torque_body[guest, k], abs=1e-4 * size)
+    for found, expected in (
+        (load.force[guest], force_on(guest, energy, state, step)),
+        (load.torque_body[guest], torque_on(guest, energy, state, step)),
+    ):
+        assert found == pytest.approx(expected, abs=1e-4 * (np.abs(found).max() + 1.0))
 
 
 def test_the_second_derivative_of_the_soft_core():

@@ -1,5 +1,6 @@
 """Energies of pairs of bodies in scenes: all pairs, orders of integrators, errors, pictures."""
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.body_pairs import GAY_BERNE, ROD, body, brute_force, evaluated, scene, simulation
 from support.common import bits_with
+from support.slopes import energy_of, force_on, torque_on, virial_of
 from support.stops import same_after_stops
 
 import rigidmd
@@ -46,37 +48,16 @@ def test_a_mixture_has_the_energy_of_all_its_pairs_and_forces_that_are_its_slope
         brute_force(system, state, GAY_BERNE), rel=1e-11
     )
 
-    def slope(change) -> float:
-        ends = []
-        for sign in (1, -1):
-            moved = state.copy()
-            change(moved, sign * 1e-5)
-            ends.append(engine.evaluate(moved)[1][name].energy)
-        return (ends[0] - ends[1]) / 2e-5
-
-    size = np.abs(load.force).max()
-    for m, k in [(0, 0), (11, 1), (25, 2), (30, 0)]:
-
-        def move(moved, h, m=m, k=k):
-            moved.position[m, k] += h
-
-        def rotate(moved, h, m=m, k=k):
-            moved.rotation[m] = (
-                state.rotation[m] @ Rotation.from_rotvec(h * np.eye(3)[k]).as_matrix()
-            )
-
-        assert load.force[m, k] == pytest.approx(-slope(move), abs=1e-7 * size)
-        assert load.torque_body[m, k] == pytest.approx(-slope(rotate), abs=1e-6 * size)
+    size, h = np.abs(load.force).max(), 1e-5
+    energy = partial(energy_of, engine)
+    for m in (0, 11, 25, 30):
+        force, torque = force_on(m, energy, state, h), torque_on(m, energy, state, h)
+        assert load.force[m] == pytest.approx(force, abs=1e-7 * size)
+        assert load.torque_body[m] == pytest.approx(torque, abs=1e-6 * size)
+    virial = np.array(tallies[name].virial).reshape(3, 3)
     for i, j in [(0, 0), (1, 0), (2, 1), (2, 2)]:
-
-        def strain(moved, h, i=i, j=j):
-            matrix = np.eye(3)
-            matrix[i, j] += h
-            moved.cell[:] = moved.cell @ matrix
-            moved.position[:] = moved.position @ matrix
-
-        virial = np.array(tallies[name].virial).reshape(3, 3)
-        assert virial[j, i] == pytest.approx(-slope(strain), abs=1e-6 * size)
+        slope = virial_of(energy, state, h, (j, i))
+        assert virial[j, i] == pytest.approx(slope, abs=1e-6 * size)
     assert load.force.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-12 * size)
 
 

@@ -1,6 +1,7 @@
 """Dispersion by Ewald sums: plain lattice sums, gradients, accuracy, OpenMM's LJPME, conserved
 energy, threads."""
 
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import erfc
 from support.common import bits_with, built, observe, shaken, small_scene
+from support.slopes import energy_of, force_on, torque_on, trace_of_virial, virial_of
 
 import rigidmd
 from rigidmd.assemble.build import build
@@ -16,7 +18,6 @@ from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.statistics import slope
 from rigidmd.engines.external import external_engine
 from rigidmd.errors import SceneError
-from rigidmd.mechanics.rotation import from_vector
 from rigidmd.run import Simulation
 from rigidmd.units import KJ_PER_MOL
 
@@ -116,50 +117,21 @@ def test_the_mesh_is_the_sum(box):
 def test_forces_torques_and_virial_are_slopes_of_the_energy(forces, box):
     """With the default mixing rule and shifted energies. The virial along each edge and across with
     the direct sum."""
-    system, engine, state = mixture(
-        forces | {"mixing": "lorentz-berthelot", "truncation": "shift"}, box
-    )
+    _, engine, state = mixture(forces | {"mixing": "lorentz-berthelot", "truncation": "shift"}, box)
     load, tallies = engine.evaluate(state)
     virial, h = sum(tally.virial for tally in tallies.values()), 1e-3
-    constant = sum(system.constants.values())
-
-    def change(move, h=h):
-        def energy(step):
-            moved = state.copy()
-            move(moved, step)
-            return sum(tally.energy for tally in engine.evaluate(moved)[1].values()) + constant
-
-        return (8 * (energy(h) - energy(-h)) - (energy(2 * h) - energy(-2 * h))) / (12 * h)
-
+    energy = partial(energy_of, engine)
     scale = np.abs(load.force).max()
-    for m, k in product((0, 4), range(3)):
-
-        def shift(moved, step, m=m, k=k):
-            moved.position[m, k] += step
-
-        def turn(moved, step, m=m, k=k):
-            moved.rotation[m] = moved.rotation[m] @ from_vector(step * np.eye(3)[k])
-
-        assert load.force[m, k] == pytest.approx(-change(shift), abs=3e-7 * scale)
-        if m == 4:
-            assert load.torque_body[m, k] == pytest.approx(-change(turn), abs=3e-7 * scale)
-
-    def strain(i, j):
-        def move(moved, step):
-            for array in (moved.position, moved.cell):
-                array[:, j] += step * array[:, i]
-
-        return move
-
-    def scaling(moved, step):
-        moved.position[:] *= 1 + step
-        moved.cell[:] *= 1 + step
-
+    for m in (0, 4):
+        assert load.force[m] == pytest.approx(force_on(m, energy, state, h), abs=3e-7 * scale)
+    torque = torque_on(4, energy, state, h)
+    assert load.torque_body[4] == pytest.approx(torque, abs=3e-7 * scale)
     size = np.abs(virial).max()
-    assert virial.trace() == pytest.approx(-change(scaling, 1e-4), abs=1e-6 * size)
+    assert virial.trace() == pytest.approx(trace_of_virial(energy, state, 1e-4), abs=1e-6 * size)
     if forces["dispersion"] == "ewald":
         for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2)):  # cells stay lower triangles
-            assert virial[i, j] == pytest.approx(-change(strain(j, i), 1e-4), abs=1e-6 * size)
+            slope = virial_of(energy, state, 1e-4, (i, j))
+            assert virial[i, j] == pytest.approx(slope, abs=1e-6 * size)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,14 @@
 """Ewald sums and PME of a scene: lattice energies, gradients, virials, settings."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 from support.common import bits_with, built, observe, shaken, site, small_scene
 from support.ewald import SALT, TIGHT_EWALD, TIGHT_PME, coulomb, oracle_of, salty
 from support.reference import KE
+from support.slopes import energy_of, force_on, torque_on, trace_of_virial, virial_of
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
@@ -14,7 +16,6 @@ from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
 from rigidmd.forces.neighbors.space import cell_of
-from rigidmd.mechanics.rotation import from_vector
 from rigidmd.scene import Scene
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
@@ -127,10 +128,6 @@ def test_total_does_not_depend_on_how_it_is_split(method):
 # --- gradients ------------------------------------------------------------------------------------
 
 
-def total(system, engine, state):
-    return coulomb(observe(system, engine, state).components)
-
-
 def surrounded(method, surface, angles):
     """A scene with a permittivity around all images, or with images of a slab across z removed."""
     if surface == "z":
@@ -156,28 +153,11 @@ def test_forces_and_torques_are_the_gradient(method, surface, angles):
     )
     load, _ = engine.evaluate(state)
     scale = np.abs(load.force).max()
-    h = 1e-3
-
-    def change(move):
-        # the difference over h and 2 h, extrapolated: error of order h⁴
-        def energy(step):
-            moved = state.copy()
-            move(moved, step)
-            return total(system, engine, moved)
-
-        return (8 * (energy(h) - energy(-h)) - (energy(2 * h) - energy(-2 * h))) / (12 * h)
-
+    energy, h = partial(energy_of, engine), 1e-3
     for m in range(0, len(state.position), 4):
-        for k in range(3):
-
-            def shift(moved, step, m=m, k=k):
-                moved.position[m, k] += step
-
-            def turn(moved, step, m=m, k=k):
-                moved.rotation[m] = moved.rotation[m] @ from_vector(step * np.eye(3)[k])
-
-            assert load.force[m, k] == pytest.approx(-change(shift), abs=1e-7 * scale)
-            assert load.torque_body[m, k] == pytest.approx(-change(turn), abs=1e-7 * scale)
+        force, torque = force_on(m, energy, state, h), torque_on(m, energy, state, h)
+        assert load.force[m] == pytest.approx(force, abs=1e-7 * scale)
+        assert load.torque_body[m] == pytest.approx(torque, abs=1e-7 * scale)
 
 
 @pytest.mark.parametrize(
@@ -202,25 +182,15 @@ def test_virial_is_the_slope_of_the_energy_with_the_volume(method, surface, angl
     virial = sum(tally.virial for tally in Engine(system.model, terms).evaluate(state)[1].values())
     h = 1e-4
 
-    def energy(stretch):
-        moved = state.copy()
-        moved.cell[:] *= stretch
-        moved.position[:] *= stretch
-        tallies = Engine(system.model, terms).evaluate(moved)[1]
-        return sum(tally.energy for tally in tallies.values())
-
-    def change(along):
-        return (
-            8 * (energy(1 + h * along) - energy(1 - h * along))
-            - energy(1 + 2 * h * along)
-            + energy(1 - 2 * h * along)
-        ) / (12 * h)
+    def energy(moved):
+        return energy_of(Engine(system.model, terms), moved)
 
     scale = np.abs(virial).max()
-    assert virial.trace() == pytest.approx(-change(np.ones(3)), abs=1e-7 * scale)
+    assert virial.trace() == pytest.approx(trace_of_virial(energy, state, h), abs=1e-7 * scale)
     if method is TIGHT_EWALD:
         for k in range(3):
-            assert virial[k, k] == pytest.approx(-change(np.eye(3)[k]), abs=1e-7 * scale)
+            slope = virial_of(energy, state, h, (k, k))
+            assert virial[k, k] == pytest.approx(slope, abs=1e-7 * scale)
 
 
 # --- accuracy -------------------------------------------------------------------------------------

@@ -5,7 +5,8 @@ from math import pi
 import numpy as np
 import pytest
 from support.common import move, observe, small_scene
-from support.fields import STEADY, VERLET, alone, energy_of
+from support.fields import STEADY, VERLET, alone
+from support.slopes import energy_of
 
 from rigidmd.assemble.build import build
 from rigidmd.mechanics.rotation import from_vector

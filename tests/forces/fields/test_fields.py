@@ -1,6 +1,7 @@
 """All external fields: slopes of the energy, energy ledger, conserved momenta, errors of the scene."""
 
 import json
+from functools import partial
 from math import inf, pi
 
 import numpy as np
@@ -15,11 +16,11 @@ from support.fields import (
     STEADY,
     VERLET,
     alone,
-    energy_of,
     site,
     slit,
     walls,
 )
+from support.slopes import energy_of, force_on, torque_on
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
@@ -28,7 +29,6 @@ from rigidmd.core.state import REMOVED
 from rigidmd.dynamics.model import draw_momenta, remove_momentum
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.errors import SceneError
-from rigidmd.mechanics.rotation import from_vector
 from rigidmd.run import Simulation
 from rigidmd.run.trial_systems import molecular_trial_system
 from rigidmd.units import AVOGADRO, BOLTZMANN, ELEMENTARY_CHARGE
@@ -86,24 +86,11 @@ def test_forces_and_torques_are_the_slopes_of_the_energy(kind):
     scale = np.abs(load.force).max() + np.abs(load.torque_body).max()
     assert scale > 1
     assert bool(load.torque_body.any()) == turns
+    energy = partial(energy_of, engine)
     for m in range(len(state.position)):
-        for k in range(3):
-            ends = []
-            for step in (h, -h):
-                moved = state.copy()
-                moved.position[m, k] += step
-                ends.append(energy_of(engine, moved))
-            assert load.force[m, k] == pytest.approx(
-                -(ends[0] - ends[1]) / (2 * h), abs=1e-7 * scale
-            )
-            ends = []
-            for step in (h, -h):
-                moved = state.copy()
-                moved.rotation[m] = moved.rotation[m] @ from_vector(np.eye(3)[None, k] * step)[0]
-                ends.append(energy_of(engine, moved))
-            assert load.torque_body[m, k] == pytest.approx(
-                -(ends[0] - ends[1]) / (2 * h), abs=1e-7 * scale
-            )
+        force, torque = force_on(m, energy, state, h), torque_on(m, energy, state, h)
+        assert load.force[m] == pytest.approx(force, abs=1e-7 * scale)
+        assert load.torque_body[m] == pytest.approx(torque, abs=1e-7 * scale)
 
 
 #: For runs: what acts, on what, for how long (ps), at which step of velocity Verlet (ps).

@@ -5,7 +5,8 @@ from math import inf, sqrt
 import numpy as np
 import pytest
 from support.common import move, observe, small_scene
-from support.fields import OSCILLATING, VERLET, alone, energy_of, slit, walls
+from support.fields import OSCILLATING, VERLET, alone, slit, walls
+from support.slopes import energy_of
 
 from rigidmd.assemble.build import build
 from rigidmd.engines.cpu.engine import BehindWallError
