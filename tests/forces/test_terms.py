@@ -18,7 +18,7 @@ from rigidmd.forces.neighbors.lists import (
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.units import BAR, BOLTZMANN
 
-ENDINGS = ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
+TRUNCATIONS = ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 MIXTURES = [
     ({"spce": 12}, 13.0),
     ({"tip4p2005": 8, "nitrogen": 5, "argon": 4}, 14.0),
@@ -27,7 +27,7 @@ MIXTURES = [
 ]
 
 
-def ended(name):
+def truncated(name):
     """Forces that end at 6 Å in this way, from 4.5 Å on where it has a start."""
     start = {"switch_start_A": 4.5} if name in ("force_switch", "switch") else {}
     return {"cutoff_A": 6.0, "truncation": name} | start
@@ -38,22 +38,22 @@ def energies(engine, state):
 
 
 @pytest.mark.parametrize(
-    ("ending", "counts", "edge"),
+    ("truncation", "counts", "edge"),
     [
         pytest.param(
-            ending,
+            truncation,
             *which,
-            id=f"{ending}-{k}",
+            id=f"{truncation}-{k}",
             marks=[]
-            if (k == 1 and ending != "force_shift") or ending == "switch"
+            if (k == 1 and truncation != "force_shift") or truncation == "switch"
             else pytest.mark.soak,
         )
-        for ending in ENDINGS
+        for truncation in TRUNCATIONS
         for k, which in enumerate(MIXTURES)
     ],
 )
-def test_energies_are_those_of_the_oracle(counts, edge, ending):
-    forces = ended(ending) | {"reaction_field_permittivity": 78.5}
+def test_energies_are_those_of_the_oracle(counts, edge, truncation):
+    forces = truncated(truncation) | {"reaction_field_permittivity": 78.5}
     for seed, mixing in enumerate(["lorentz-berthelot", "geometric"]):
         system, engine, state = built(counts, edge, seed, forces=forces | {"mixing": mixing})
         lj, coulomb = Oracle(system).energy(state.position, state.rotation)
@@ -95,7 +95,7 @@ BEYOND_HALF = [
     np.degrees(np.arccos(0.50008 * 20 / 24)),
     np.degrees(np.arccos(0.50008 * 20 / 17)),
 ]  # as printed
-SLANTED = [
+ANGLES = [
     [60.0, 60.0, 60.0],
     [70.0, 100.0, 50.0],
     [120.0, 110.0, 95.0],
@@ -105,12 +105,12 @@ SLANTED = [
 
 
 @pytest.mark.parametrize("skin", [0.3, 3.0])
-@pytest.mark.parametrize("angles", SLANTED)
-def test_slanted_boxes(angles, skin):
+@pytest.mark.parametrize("angles", ANGLES)
+def test_triclinic_boxes(angles, skin):
     """Energies are the oracle's, forces the slope of its energy, and molecules may be whole cells
     away."""
     box = {"lengths_A": [20.0, 17.0, 24.0], "angles_deg": angles}
-    forces = ended("force_switch") | {"cutoff_A": 5.2, "skin_A": skin}
+    forces = truncated("force_switch") | {"cutoff_A": 5.2, "skin_A": skin}
     system = build(small_scene({"spce": 20, "nitrogen": 15}, None, box=box, forces=forces))
     engine, state, oracle = system.engine(), system.state.copy(), Oracle(system)
     assert (cell_of(system.space)[1, 0] > 10.0) == (angles is BEYOND_HALF)
@@ -139,7 +139,7 @@ def test_molecules_millions_of_cells_away(angles):
     """The energy to the digits that positions there have; and where boxes can no longer be counted,
     a clear refusal."""
     box = {"lengths_A": [20.0, 17.0, 24.0], "angles_deg": angles}
-    system = build(small_scene({"spce": 20}, None, box=box, forces=ended("force_switch")))
+    system = build(small_scene({"spce": 20}, None, box=box, forces=truncated("force_switch")))
     engine, state = system.engine(), system.state.copy()
     expected = sum(energies(engine, state).values())
     away = np.random.default_rng(7).integers(-1, 2, state.position.shape) @ cell_of(system.space)
@@ -157,20 +157,20 @@ def test_molecules_millions_of_cells_away(angles):
 def test_a_cell_and_the_same_lattice_by_another_have_the_same_energy():
     """A cell that tilts by more than half an edge is reduced."""
     counts, forces = {"spce": 20}, {"cutoff_A": 6.0, "truncation": "shift"}
-    leaning = {
+    triclinic = {
         "lengths_A": [13.0, (13.0**2 + 13.0**2) ** 0.5, 13.0],
         "angles_deg": [90.0, 90.0, 45.0],
     }
     cube = build(small_scene(counts, 13.0, forces=forces))
-    other = build(small_scene(counts, None, box=leaning, forces=forces))
+    other = build(small_scene(counts, None, box=triclinic, forces=forces))
     assert cell_of(other.space) == pytest.approx(13.0 * np.eye(3))
     found = [energies(s.engine(), cube.state) for s in (cube, other)]
     assert found[1] == pytest.approx(found[0], rel=1e-9)
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_forces_and_torques_are_the_slope_of_the_energy(ending):
-    forces = ended(ending)
+@pytest.mark.parametrize("truncation", TRUNCATIONS)
+def test_forces_and_torques_are_the_slope_of_the_energy(truncation):
+    forces = truncated(truncation)
     _, engine, state = built({"tip4p2005": 6, "nitrogen": 4, "argon": 3}, 13.0, 1, forces=forces)
     load, _ = engine.evaluate(state)
 
@@ -195,7 +195,7 @@ def test_virial_is_the_slope_of_the_energy_with_the_box(angles):
     assert virial.trace() == pytest.approx(slope, rel=1e-6)
 
 
-SLANTED = {"lengths_A": [21.0, 22.0, 23.0], "angles_deg": [70.0, 100.0, 80.0]}
+TRICLINIC = {"lengths_A": [21.0, 22.0, 23.0], "angles_deg": [70.0, 100.0, 80.0]}
 
 
 @pytest.mark.parametrize(
@@ -204,8 +204,8 @@ SLANTED = {"lengths_A": [21.0, 22.0, 23.0], "angles_deg": [70.0, 100.0, 80.0]}
         pytest.param({"lengths_A": 21.0, "periodic": False}, "double", 1e-9, id="none-double"),
         pytest.param({"lengths_A": 21.0}, "double", 1e-9, id="cubic-double"),
         pytest.param({"lengths_A": 21.0}, "mixed", 2e-6, id="cubic-mixed", marks=pytest.mark.soak),
-        pytest.param(SLANTED, "double", 1e-9, id="triclinic-double"),
-        pytest.param(SLANTED, "mixed", 2e-6, id="triclinic-mixed", marks=pytest.mark.soak),
+        pytest.param(TRICLINIC, "double", 1e-9, id="triclinic-double"),
+        pytest.param(TRICLINIC, "mixed", 2e-6, id="triclinic-mixed", marks=pytest.mark.soak),
     ],
 )
 def test_virials_are_sums_over_pairs(box, precision, digits):

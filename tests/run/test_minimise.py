@@ -295,7 +295,7 @@ def test_frozen_molecules_stay():
         assert (getattr(state, name)[~held] != getattr(before, name)[~held]).any(axis=-1).all()
 
 
-def test_what_it_keeps_and_what_it_books():
+def test_what_it_keeps_and_what_it_accounts_for():
     scene = small_scene(
         {"argon": 10, "spce": 10},
         18.5,

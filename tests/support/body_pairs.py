@@ -27,7 +27,7 @@ def body(name: str, count: int) -> dict:
 
 
 def scene(forces: dict | None, counts=None, **tables) -> Scene:
-    """Rods and discs in a slanted box, with a potential of [[forces.bodies]]."""
+    """Rods and discs in a triclinic box, with a potential of [[forces.bodies]]."""
     molecules = [body(name, count) for name, count in (counts or {"rod": 24, "disc": 8}).items()]
     return Scene.from_dict(
         {

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-SLANTED = np.array([[21.0, 0.0, 0.0], [6.0, 19.0, 0.0], [-7.0, 5.0, 23.0]])
+TRICLINIC = np.array([[21.0, 0.0, 0.0], [6.0, 19.0, 0.0], [-7.0, 5.0, 23.0]])
 
 
 def brownian(rng, frames, n, D, interval, drift=0.0):

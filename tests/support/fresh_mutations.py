@@ -198,7 +198,9 @@ FRESH: list[Mutation] = [
         "forces/fields/electric.py",
         "2 * pi * fields.electric_frequency_per_ps, radians(",
         "fields.electric_frequency_per_ps, radians(",
-        ("forces/fields/test_fields.py::test_a_field_that_oscillates_does_work_that_is_booked",),
+        (
+            "forces/fields/test_fields.py::test_a_field_that_oscillates_does_work_that_is_accounted_for",
+        ),
     ),
     Mutation(
         "F23",
@@ -434,7 +436,7 @@ FRESH: list[Mutation] = [
         "        xz = (cell[2, 0] - built[2, 0] * xx - built[2, 1] * xy) / built[2, 2]",
         "        xz = (cell[2, 0] - built[2, 0] * xx) / built[2, 2]",
         (
-            "features/potentials/test_pair_list.py::test_the_list_is_built_anew_where_a_strain_of_a_slanted_cell_exceeds_its_skin",
+            "features/potentials/test_pair_list.py::test_the_list_is_built_anew_where_a_strain_of_a_triclinic_cell_exceeds_its_skin",
         ),
     ),
     Mutation(
@@ -529,7 +531,7 @@ FRESH: list[Mutation] = [
         "view/molecule_animation.py",
         "    columns = np.swapaxes(frames.cells, 1, 2)",
         "    columns = frames.cells",
-        ("features/view/test_run_page.py::test_molecules_are_put_into_a_cell_that_leans",),
+        ("features/view/test_run_page.py::test_molecules_are_put_into_a_triclinic_cell",),
     ),
     Mutation(
         "F61",

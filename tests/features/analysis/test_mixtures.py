@@ -1,4 +1,4 @@
-"""Analyses of mixtures whose molecules are rotated and whose slanted cell breathes, compared with
+"""Analyses of mixtures whose molecules are rotated and whose triclinic cell breathes, compared with
 plain NumPy.
 
 Everything on the other side is written out here: sums over all pairs and images, constants from SI.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support.common import history, small_scene, system_of
-from support.frames import SLANTED, brownian
+from support.frames import TRICLINIC, brownian
 
 from rigidmd.analysis.built_in.transport import (
     msd,
@@ -156,7 +156,7 @@ def test_scaling_the_box_moves_nothing():
     system = system_of({"argon": 8})
     rng = np.random.default_rng(1)
     inside, walk = rng.random((8, 3)) + 5.0, brownian(rng, 30, 8, 0.01, 1.0) / 30.0
-    cells = SLANTED * (1 + 0.1 * np.sin(np.arange(30)))[:, None, None]
+    cells = TRICLINIC * (1 + 0.1 * np.sin(np.arange(30)))[:, None, None]
     time = np.arange(30.0)
     scaled = history(system, time, np.einsum("ni,fij->fnj", inside, cells), cells)
     assert np.abs(scaled.paths - scaled.positions[0]).max() < 1e-11

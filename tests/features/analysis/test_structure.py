@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support.common import history, system_of
-from support.frames import SLANTED, rotations_about
+from support.frames import TRICLINIC, rotations_about
 
 from rigidmd.analysis.built_in.structure import (
     density_profile,
@@ -30,7 +30,9 @@ def pairs_by_hand(first, owner, second, owner_2, cell, edge, bins):
 
 @pytest.mark.parametrize("part", [1.0, 0.7, 0.36, 0.1, 0.03])
 @pytest.mark.parametrize(
-    "cell", [np.eye(3) * 20.0, SLANTED, np.diag([9.0, 31.0, 70.0])], ids=["cube", "slanted", "long"]
+    "cell",
+    [np.eye(3) * 20.0, TRICLINIC, np.diag([9.0, 31.0, 70.0])],
+    ids=["cube", "triclinic", "long"],
 )
 def test_pairs_are_counted_once(cell, part):
     """Grids of 1 to many cells; sites outside the box and on its faces; ordered pairs of different
@@ -55,11 +57,11 @@ def test_pairs_are_counted_once(cell, part):
 
 @pytest.mark.parametrize("n", [2, 3, 8, 60])
 def test_an_ideal_gas_has_no_structure(n):
-    """In a slanted cell that breathes, g = 1 also for two molecules; each has n - 1 others; S =
+    """In a triclinic cell that breathes, g = 1 also for two molecules; each has n - 1 others; S =
     1."""
     system = system_of({"argon": n}, 25.0)
     rng = np.random.default_rng(n)
-    cells = SLANTED * (1 + 0.05 * rng.standard_normal(200))[:, None, None]
+    cells = TRICLINIC * (1 + 0.05 * rng.standard_normal(200))[:, None, None]
     gas = history(
         system, np.arange(200.0), np.einsum("fni,fij->fnj", rng.random((200, n, 3)), cells), cells
     )

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from support.common import history, noise_with_memory, system_of
-from support.frames import SLANTED, brownian
+from support.frames import TRICLINIC, brownian
 
 from rigidmd.analysis.built_in import transport
 from rigidmd.analysis.built_in.rotation import orientation
@@ -84,8 +84,8 @@ def test_the_correction_for_the_size_of_the_box_is_that_of_yeh_and_hummer():
     assert infinite.error == own.error
     alone = diffusion(history(system, time, path, np.eye(3) * 24.86))
     assert "without a viscosity" in alone.value("D of argon in an infinite box").note
-    slanted = diffusion(history(system, time, path, SLANTED), viscosity_mPa_s=0.896)
-    assert "for cubic boxes" in slanted.notes[-1] and len(slanted.values) == 1
+    triclinic = diffusion(history(system, time, path, TRICLINIC), viscosity_mPa_s=0.896)
+    assert "for cubic boxes" in triclinic.notes[-1] and len(triclinic.values) == 1
     for wrong in (0.0, -1.0, inf, np.nan):
         with pytest.raises(OutputError, match=r"viscosity_mPa_s is .*, must be from 1e-06"):
             diffusion(history(system, time, path, np.eye(3) * 24.86), viscosity_mPa_s=wrong)
@@ -100,12 +100,12 @@ def test_what_does_not_diffuse_gives_no_value():
     flight = time[:, None, None] * rng.standard_normal((16, 3))
     cage = noise_with_memory(rng, 400, (16, 3), 1.0, 5.0, 0.5)
     for path in (flight, cage):
-        (told,) = diffusion(history(system, time, path, SLANTED)).values
+        (told,) = diffusion(history(system, time, path, TRICLINIC)).values
         assert (
             told.value is None and "too short for a value. A run of 798 ps follows it" in told.note
         )
         assert re.search(r"So far: -?\d.* 1e-9 m²/s$", told.note)
-    (told,) = diffusion(history(system, time, brownian(rng, 400, 16, 0.25, 0.5), SLANTED)).values
+    (told,) = diffusion(history(system, time, brownian(rng, 400, 16, 0.25, 0.5), TRICLINIC)).values
     assert told.value is None and "correlation times" in told.note
     assert re.search(r"5 of them are \d+ ps. So far: [\d.]+ ± [\d.]+ 1e-9 m²/s$", told.note)
     with pytest.raises(OutputError, match="needs at least 40 frames; there are 39"):

@@ -42,7 +42,7 @@ def test_atoms_of_a_run_are_its_scene_again(results, waters):
     ],
 )
 def test_any_molecules_come_back(counts, tmp_path):
-    """Massless sites, united atoms, points, linear molecules, in a slanted cell; from memory and
+    """Massless sites, united atoms, points, linear molecules, in a triclinic cell; from memory and
     from ASE's files."""
     box = {"lengths_A": [20.0, 21.0, 22.0], "angles_deg": [80.0, 100.0, 75.0]}
     system = build(small_scene(counts, None, box=box))

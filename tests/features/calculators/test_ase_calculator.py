@@ -227,7 +227,7 @@ def check_stress(atoms: Atoms) -> None:
 
 
 def turned(atoms: Atoms) -> Atoms:
-    """The same, rotated in space, in a slanted left-handed cell of the same lattice."""
+    """The same, rotated in space, in a triclinic left-handed cell of the same lattice."""
     found, turn = atoms.copy(), random_rotations(np.random.default_rng(3), 1)[0]
     a, b, c = atoms.cell.array
     found.set_cell(np.array([a, b + a, -c]) @ turn.T)
@@ -423,7 +423,7 @@ def test_acetonitrile_is_that_of_ase():
 
 
 @pytest.mark.soak
-def test_pme_in_a_slanted_cell():
+def test_pme_in_a_triclinic_cell():
     counts = {"spce": 12, "nitrogen": 4, "argon": 3}
     box = {"lengths_A": [11.0, 12.0, 13.0], "angles_deg": [80.0, 100.0, 75.0]}
     atoms = turned(rigidmd.atoms_of(small_scene(counts, None, box=box, forces={"cutoff_A": 4.5})))

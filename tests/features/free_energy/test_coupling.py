@@ -21,7 +21,7 @@ from rigidmd.forces.potentials.soft_core import SOFTNESS, SoftCore
 from rigidmd.scene.models import load_model
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
-SLANTED = {"lengths_A": [17.0, 16.0, 18.0], "angles_deg": [80.0, 95.0, 100.0]}
+TRICLINIC = {"lengths_A": [17.0, 16.0, 18.0], "angles_deg": [80.0, 95.0, 100.0]}
 TAIL = {"cutoff_A": 7.0, "tail_correction": True, "truncation": "shift"}
 MESH = {
     "cutoff_A": 5.5,
@@ -44,7 +44,7 @@ def coupled_scene(name, value=None, count=None, **coupling):
     """A scene of `SYSTEMS`; without a value of lambda, one without [coupling]."""
     other, model, number, forces = SYSTEMS[name]
     guests = [{"model": model, "name": "guest", "count": number}] if count is None else []
-    tables = {"molecules": [other, *guests], "box": SLANTED, "forces": forces}
+    tables = {"molecules": [other, *guests], "box": TRICLINIC, "forces": forces}
     if value is not None:
         tables["coupling"] = {"species": "guest", "lambda": value, **coupling}
     return small_scene({}, 1.0, **tables)
@@ -86,7 +86,7 @@ def test_the_tail_of_soft_cores_is_that_of_all_pairs(value):
     coupling = {"species": "guest", "lambda": value}
     species = [ARGON, {"model": "krypton", "name": "guest", "count": 3}]
     system = build(
-        small_scene({}, 1.0, molecules=species, box=SLANTED, forces=forces, coupling=coupling)
+        small_scene({}, 1.0, molecules=species, box=TRICLINIC, forces=forces, coupling=coupling)
     )
     models, counts = [load_model("argon"), load_model("krypton")], (60, 3)
     energy = pressure = 0.0
@@ -141,7 +141,7 @@ def test_the_soft_core_is_the_formula_of_the_paper(truncation):
         1.0,
         spread=1.5,
         molecules=[ARGON, {"model": "krypton", "name": "guest", "count": 2}],
-        box=SLANTED,
+        box=TRICLINIC,
         forces=forces,
         coupling={"species": "guest", "lambda": value},
     )
@@ -262,7 +262,7 @@ def test_what_cannot_be_coupled_is_refused():
         ),
     ):
         molecules = [ARGON, {"model": "krypton", "name": "guest", "count": 1}]
-        whole = {"molecules": molecules, "box": SLANTED, "forces": TAIL} | tables
+        whole = {"molecules": molecules, "box": TRICLINIC, "forces": TAIL} | tables
         with pytest.raises(SceneError, match=message):
             build(small_scene({}, 1.0, **whole, coupling=coupling))
 

@@ -23,7 +23,7 @@ from rigidmd.scene.models import load_model
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
 
 insertion = KNOWN["insertion"].function
-SLANTED = {"lengths_A": [17.0, 16.0, 18.0], "angles_deg": [80.0, 95.0, 100.0]}
+TRICLINIC = {"lengths_A": [17.0, 16.0, 18.0], "angles_deg": [80.0, 95.0, 100.0]}
 CUBE = {"lengths_A": 13.0}
 SUM = {"cutoff_A": 5.5, "ewald_cutoff_A": 5.5, "ewald_alpha_per_A": 0.5}
 MESH = SUM | {"electrostatics": "pme", "pme_order": 6, "pme_grid": [24, 24, 24]}
@@ -37,11 +37,16 @@ MINE = {
 }
 #: Molecules, box, forces, trial molecule.
 SYSTEMS = {
-    "tail in a slanted cell": (ARGON, SLANTED, {"cutoff_A": 7.0, "tail_correction": True}, "argon"),
-    "pme in a slanted cell": (WATER, SLANTED, MESH, "spce"),
+    "tail in a triclinic cell": (
+        ARGON,
+        TRICLINIC,
+        {"cutoff_A": 7.0, "tail_correction": True},
+        "argon",
+    ),
+    "pme in a triclinic cell": (WATER, TRICLINIC, MESH, "spce"),
     "among frozen molecules": (
         [{"model": "spce", "name": "ice", "count": 20, "frozen": True}, *WATER],
-        SLANTED,
+        TRICLINIC,
         {"cutoff_A": 5.5, "electrostatics": "reaction_field"},
         "co2_trappe",
     ),
@@ -53,7 +58,7 @@ SYSTEMS = {
     ),
     "dispersion by pme": (
         [*ARGON, {"model": "nitrogen_trappe", "count": 20}],
-        SLANTED,
+        TRICLINIC,
         MESH
         | {"truncation": "shift", "dispersion": "pme", "mixing": "geometric"}
         | {"dispersion_beta_per_A": 0.5, "dispersion_order": 6, "dispersion_grid": [24, 24, 24]},
@@ -61,7 +66,7 @@ SYSTEMS = {
     ),
     "user potential": (
         ARGON,
-        SLANTED,
+        TRICLINIC,
         {"cutoff_A": 7.0, "lennard_jones": False, "custom": [MINE]},
         "argon",
     ),

@@ -128,7 +128,7 @@ def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch)
     assert centre.max() < frames.cells.max() + 0.01
 
 
-def test_molecules_are_put_into_a_cell_that_leans():
+def test_molecules_are_put_into_a_triclinic_cell():
     """Whole, by multiples of the edges of the cell of each frame."""
     sites = system_of({"spce": 5}, 30.0).sites
     rng = np.random.default_rng(2)
@@ -145,9 +145,9 @@ def test_molecules_are_put_into_a_cell_that_leans():
         assert moves == pytest.approx(np.round(moves[:, :1]) + np.zeros_like(moves), abs=1e-5)
 
 
-@pytest.mark.parametrize("ending", [".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb"])
-def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
-    output = {"trajectory": f"t{ending}", "trajectory_interval_ps": 0.01, "figures": False}
+@pytest.mark.parametrize("extension", [".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb"])
+def test_every_format_of_a_trajectory_has_a_page(extension, tmp_path):
+    output = {"trajectory": f"t{extension}", "trajectory_interval_ps": 0.01, "figures": False}
     scene = small_scene({"spce": 8}, 20.0, stages=[{"duration_ps": 0.03}], output=output)
     results = Simulation(scene, tmp_path / "run").run()
     frames = molecule_animation.frames_of(read_record(tmp_path / "run"), 100)

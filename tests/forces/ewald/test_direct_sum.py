@@ -33,7 +33,7 @@ def published(value, digits=6):
     return pytest.approx(value, abs=0.501 * 10 ** (np.floor(np.log10(abs(value))) - digits + 1))
 
 
-def nist_scene(file, cell, folder, box=None, **waves):
+def nist_scene(file, cell, folder, box=None, **k_vectors):
     """A NIST configuration of SPC/E, molecules made whole, with NIST's settings."""
     rows = [line.split() for line in file.read_text().splitlines()]
     x = np.array([row[1:4] for row in rows if len(row) == 5], float).reshape(-1, 3, 3)
@@ -62,7 +62,7 @@ def nist_scene(file, cell, folder, box=None, **waves):
             "truncation": "plain",
             "tail_correction": True,
             "electrostatics": "ewald",
-            **waves,
+            **k_vectors,
         },
         "start": {"temperature_K": 0.0},
         "stages": [{"duration_ps": 1.0}],
@@ -188,7 +188,7 @@ MONOCLINIC = {
 }
 
 
-def test_nist_spce_in_a_monoclinic_cell_that_leans_by_half_an_edge(reference, tmp_path):
+def test_nist_spce_in_a_monoclinic_cell_that_tilts_by_half_an_edge(reference, tmp_path):
     """What `rigidmd energy --unit K` prints, with k-vectors as in the triclinic case; 942 of them and
     their opposites."""
     file = reference / "nist_spce_noncuboid" / "spce_monoclinic_sample_periodic4.txt"
@@ -261,7 +261,7 @@ def test_ewald_is_the_oracle_term_by_term(limit, box):
         {"ewald_k_max": [3, 7, 4], "ewald_k_radius_per_A": 0.8},
     ],
 )
-def test_waves_are_those_of_the_cell_that_was_described(limit, angle):
+def test_k_vectors_are_those_of_the_cell_that_was_described(limit, angle):
     """36 cos 60° is 18.000000000000004, and 59° tilts by more than half an edge: another cell
     stands for it."""
     box = {"lengths_A": 36.0, "angles_deg": [90.0, angle, 90.0]}
@@ -297,7 +297,7 @@ def test_waves_are_those_of_the_cell_that_was_described(limit, angle):
     assert described == (angle == 59.0)
 
 
-def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
+def test_k_vectors_of_a_cell_that_a_file_describes_otherwise(tmp_path):
     """The cell of the file stands 2 Å high; rotated, it is a cube, and k-vectors are still the values of the
     file's cell."""
     cell = 14.0 * np.array([[1.0, 0, 0], [2.0, 1.0, 0], [2.0, 1.0, 1.0]])
@@ -347,7 +347,7 @@ def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
 
 
 def test_a_cell_described_anew_is_said_by_every_command(tmp_path, capsys):
-    (tmp_path / "leaning.toml").write_text("""
+    (tmp_path / "triclinic.toml").write_text("""
 [box]
 lengths_A = 36
 angles_deg = [90, 59, 90]
@@ -365,7 +365,7 @@ duration_ps = 0.004
         "its lattice is given by the cell with edges 36.0000, 36.0000, 35.4545 Å, angles 90, 119.5, 90°, "
         "c' = c - a, in place of edges 36.0000, 36.0000, 36.0000 Å, angles 90, 59, 90°"
     )
-    scene = str(tmp_path / "leaning.toml")
+    scene = str(tmp_path / "triclinic.toml")
     for arguments in (
         ["check"],
         ["energy"],
@@ -378,7 +378,7 @@ duration_ps = 0.004
     assert told in (tmp_path / "out" / "summary.json").read_text()
 
 
-def test_waves_without_compiled_code():
+def test_the_reciprocal_sum_without_compiled_code():
     system, engine, state = salty(TIGHT_EWALD)
     engine.evaluate(state)
     term, own = system.terms["coulomb_reciprocal"], engine.workspaces["coulomb_reciprocal"].sums

@@ -60,7 +60,7 @@ def test_forces_of_a_slab_are_as_accurate_as_asked_for(method, asked):
 
 
 @pytest.mark.parametrize("method", ["ewald", "pme"])
-def test_a_box_that_has_outgrown_its_waves_is_noted(method):
+def test_a_box_that_has_outgrown_its_k_vectors_is_noted(method):
     forces = {"cutoff_A": 7.7, "electrostatics": method}
     stages = [{"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": 1.0, "duration_ps": 0.01}]
     system = build(small_scene({"spce": 125}, 15.52, forces=forces, stages=stages))

@@ -21,37 +21,37 @@ from rigidmd.units import KJ_PER_MOL
 # --- the oracle -----------------------------------------------------------------------------------
 
 
-def test_waves_of_a_slanted_cell():
+def test_the_reciprocal_sum_of_a_triclinic_cell():
     """The reciprocal parts by themselves; a shift by a lattice vector and another choice of b and c
     change nothing."""
-    slanted = Triclinic(13.0, 14.0, 15.0, 4.0, -3.0, 5.0)
+    triclinic = Triclinic(13.0, 14.0, 15.0, 4.0, -3.0, 5.0)
     found = {}
     for method in (TIGHT_EWALD, TIGHT_PME):
         system, _, state = salty(method)
         term = system.terms["coulomb_reciprocal"]
-        engine = Engine(system.model, {"waves": term})
-        state.cell[:] = cell_of(slanted)
+        engine = Engine(system.model, {"reciprocal": term})
+        state.cell[:] = cell_of(triclinic)
         _, tallies = engine.evaluate(state)
-        own = engine.workspaces["waves"]
+        own = engine.workspaces["reciprocal"]
         position = (own.sums if method is TIGHT_EWALD else own.mesh).position
         found[method["electrostatics"]] = (
-            tallies["waves"].energy,
+            tallies["reciprocal"].energy,
             own.site_force.copy(),
-            tallies["waves"].virial,
+            tallies["reciprocal"].virial,
         )
         energy, force, _ = ewald_sum_in_numpy(
-            term.charge, position, cell_of(slanted), 0.9, k_vectors_up_to((20, 20, 20))
+            term.charge, position, cell_of(triclinic), 0.9, k_vectors_up_to((20, 20, 20))
         )
         error = 1e-11 if method is TIGHT_EWALD else 3e-6
-        assert tallies["waves"].energy == pytest.approx(energy, rel=error)
+        assert tallies["reciprocal"].energy == pytest.approx(energy, rel=error)
         assert own.site_force == pytest.approx(force, abs=10 * error * np.abs(force).max())
         moved = state.copy()
-        moved.position[0] += cell_of(slanted)[2]
-        assert engine.evaluate(moved)[1]["waves"].energy == pytest.approx(
-            tallies["waves"].energy, rel=1e-11
+        moved.position[0] += cell_of(triclinic)[2]
+        assert engine.evaluate(moved)[1]["reciprocal"].energy == pytest.approx(
+            tallies["reciprocal"].energy, rel=1e-11
         )
-    state.cell[1, 0] -= slanted.x
-    assert engine.evaluate(state)[1]["waves"].energy == pytest.approx(energy, rel=3e-6)
+    state.cell[1, 0] -= triclinic.x
+    assert engine.evaluate(state)[1]["reciprocal"].energy == pytest.approx(energy, rel=3e-6)
     assert found["pme"][2] == pytest.approx(
         found["ewald"][2], abs=1e-4 * np.abs(found["ewald"][2]).max()
     )

@@ -40,7 +40,7 @@ def test_a_field_sees_every_charge_where_it_is():
     assert found == pytest.approx(torque, abs=1e-12 * np.abs(torque).max())
 
 
-def test_a_dipole_turns_towards_the_field():
+def test_a_dipole_rotates_towards_the_field():
     """Torque mu E sin(theta), energy -mu E cos(theta); 2.351 D in 1 V/nm."""
     system = build(small_scene({"spce": 1}, None, fields={"electric_V_per_nm": [0.0, 0.0, 1.0]}))
     engine, state = system.engine(), system.state.copy()

@@ -133,7 +133,7 @@ def test_energy_less_work_is_conserved_to_the_order_of_the_scheme(kind, name):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(scheme.order, abs=0.1)
 
 
-def test_a_field_that_oscillates_does_work_that_is_booked():
+def test_a_field_that_oscillates_does_work_that_is_accounted_for():
     """Without the ledger the energy is not conserved at all; and a charge at rest gains what E0²/2 m
     w² states."""
     counts, fields, span, dt = RUNS["oscillating"]

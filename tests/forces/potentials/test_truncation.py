@@ -94,7 +94,7 @@ def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
 
 
 @pytest.mark.parametrize("name", TRUNCATIONS)
-def test_what_a_potential_does_for_its_ending_is_decided_by_the_ending(name):
+def test_what_a_potential_does_for_its_truncation_is_decided_by_the_truncation(name):
     """A wide switch has an addend in mixed precision too; a smooth one multiplies the energy there;
     what is not a switch has nothing to add."""
     for start, dtype in ((0.0, np.float32), (8.0, np.float64)):
