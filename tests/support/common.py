@@ -1,5 +1,6 @@
 """Helpers that several test files use. What a test tests it imports from its module."""
 
+import shlex
 import shutil
 import subprocess
 import time
@@ -145,10 +146,10 @@ def springs(**stage) -> Scene:
 # other programs
 
 
-def gmx(folder: Path, *arguments, text: str = "") -> str:
+def gmx(folder: Path, command: str, text: str = "") -> str:
     """What a command of GROMACS prints; it has to succeed."""
     done = subprocess.run(
-        [shutil.which("gmx"), "-quiet", "-nobackup", *arguments],
+        [shutil.which("gmx"), "-quiet", "-nobackup", *shlex.split(command)],
         cwd=folder,
         input=text,
         capture_output=True,

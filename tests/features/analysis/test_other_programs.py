@@ -80,21 +80,8 @@ def topology(water):
     (folder / "run.mdp").write_text(
         "cutoff-scheme = verlet\nrvdw = 0.9\nrcoulomb = 0.9\ncoulombtype = PME\n"
     )
-    gmx(
-        folder,
-        "grompp",
-        "-f",
-        "run.mdp",
-        "-c",
-        "run.gro",
-        "-p",
-        "run.top",
-        "-o",
-        "run.tpr",
-        "-maxwarn",
-        "2",
-    )
-    gmx(folder, "make_ndx", "-f", "run.tpr", "-o", "run.ndx", text="del 1-20\na OW\na HW1 HW2\nq\n")
+    gmx(folder, "grompp -f run.mdp -c run.gro -p run.top -o run.tpr -maxwarn 2")
+    gmx(folder, "make_ndx -f run.tpr -o run.ndx", text="del 1-20\na OW\na HW1 HW2\nq\n")
     return folder
 
 
@@ -111,28 +98,9 @@ def test_g_of_r_is_that_of_gromacs(water, topology):
         other = {"OW": "OW", "HW": "HW1_HW2"}
         gmx(
             topology,
-            "rdf",
-            "-f",
-            str(water / "trajectory.trr"),
-            "-s",
-            "run.tpr",
-            "-n",
-            "run.ndx",
-            "-o",
-            "rdf.xvg",
-            "-ref",
-            other[a],
-            "-sel",
-            other[b],
-            "-bin",
-            "0.01",
-            "-rmax",
-            "0.9",
-            "-excl",
-            "-b",
-            "0.0199",
-            "-xvg",
-            "none",
+            f"rdf -f {water / 'trajectory.trr'} -s run.tpr -n run.ndx -o rdf.xvg "
+            f"-ref {other[a]} -sel {other[b]} -bin 0.01 -rmax 0.9 -excl -b 0.0199 "
+            "-xvg none",
         )
         r, g = xvg(topology / "rdf.xvg")
         half = registry.selected(["rdf"])[0].function(history, a, b, 9.0, 0.05)[f"g {a}-{b}"]
@@ -155,40 +123,13 @@ def test_displacements_are_those_of_gromacs(water, topology):
     history = frames_of_folder(read_record(water), 0.02)
     gmx(
         topology,
-        "trjconv",
-        "-f",
-        str(water / "trajectory.trr"),
-        "-s",
-        "run.tpr",
-        "-b",
-        "0.0199",
-        "-t0",
-        "0",
-        "-timestep",
-        "1",
-        "-o",
-        "slow.trr",
+        f"trjconv -f {water / 'trajectory.trr'} -s run.tpr -b 0.0199 -t0 0 -timestep 1 -o slow.trr",
         text="System\n",
     )  # as it does not find times again that are not whole numbers
     gmx(
         topology,
-        "msd",
-        "-f",
-        "slow.trr",
-        "-s",
-        "run.tpr",
-        "-n",
-        "run.ndx",
-        "-o",
-        "msd.xvg",
-        "-mol",
-        "mol.xvg",
-        "-trestart",
-        "1",
-        "-xvg",
-        "none",
-        "-sel",
-        "System",
+        "msd -f slow.trr -s run.tpr -n run.ndx -o msd.xvg -mol mol.xvg "
+        "-trestart 1 -xvg none -sel System",
     )
     value = xvg(topology / "msd.xvg")[1]
     found = registry.selected(["msd"])[0].function(history)["MSD spce (A^2)"]
@@ -201,21 +142,8 @@ def test_the_total_dipole_is_that_of_gromacs(water, topology):
     history = frames_of_folder(read_record(water), 0.02)
     gmx(
         topology,
-        "dipoles",
-        "-f",
-        str(water / "trajectory.trr"),
-        "-s",
-        "run.tpr",
-        "-n",
-        "run.ndx",
-        "-o",
-        "Mtot.xvg",
-        "-b",
-        "0.0199",
-        "-xvg",
-        "none",
-        "-temp",
-        "300",
+        f"dipoles -f {water / 'trajectory.trr'} -s run.tpr -n run.ndx -o Mtot.xvg "
+        "-b 0.0199 -xvg none -temp 300",
         text="System\n",
     )
     _, x, y, z, _ = xvg(topology / "Mtot.xvg")

@@ -45,34 +45,8 @@ WAVES = {
 
 def energies(folder):
     """What GROMACS computes of the first step, kJ/mol, by its own names."""
-    gmx(
-        folder,
-        "grompp",
-        "-f",
-        "1_nve.mdp",
-        "-c",
-        "conf.gro",
-        "-p",
-        "topol.top",
-        "-o",
-        "first.tpr",
-        "-maxwarn",
-        "1",
-    )
-    gmx(
-        folder,
-        "mdrun",
-        "-s",
-        "first.tpr",
-        "-nsteps",
-        "0",
-        "-nt",
-        "1",
-        "-g",
-        "first.log",
-        "-c",
-        "last.gro",
-    )
+    gmx(folder, "grompp -f 1_nve.mdp -c conf.gro -p topol.top -o first.tpr -maxwarn 1")
+    gmx(folder, "mdrun -s first.tpr -nsteps 0 -nt 1 -g first.log -c last.gro")
     text = (folder / "first.log").read_text()
     lines = text[text.index("Energies (kJ/mol)") :].splitlines()[1:]
     found = {}
