@@ -3,18 +3,12 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from support.common import ROOT
 from support.processes import search_path
 
 from rigidmd.compile.machine import MOST_THREADS
-
-ROOT = Path(__file__).parents[2]  # processes import this file, and should import no more for it
-
-
-# --- a second process -----------------------------------------------------------------------------
-
 
 #: Compiles `add` for several types while another process does so too, from the other end; prints
 #: what was read from the cache.

@@ -1,12 +1,8 @@
 """Rules for the sources of kernels."""
 
 import ast
-from pathlib import Path
 
-ROOT = Path(__file__).parents[2]  # processes import this file, and should import no more for it
-
-
-# --- rules that sources keep ----------------------------------------------------------------------
+from support.common import ROOT
 
 
 def test_code_for_llvm_does_not_rely_on_typed_pointers():

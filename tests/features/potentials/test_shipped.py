@@ -19,9 +19,6 @@ from rigidmd.units import COULOMB, DEBYE, KJ_PER_MOL
 BALL = {"length_A": 4.0, "width_A": 4.0, "epsilon_kJ_mol": 0.8, "side": 1.0, "end": 1.0}
 
 
-# --- potentials -----------------------------------------------------------------------------------
-
-
 def test_gay_berne_of_two_rods_has_the_wells_of_its_paper():
     """Side by side epsilon_0 / sqrt(1 - chi²) = 5/3 deep, end to end a fifth of it."""
     z, energy = np.array([0.0, 0.0, 1.0]), GayBerne()

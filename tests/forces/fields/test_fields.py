@@ -422,9 +422,6 @@ def test_a_resolved_scene_with_fields_runs_again_to_the_same_bits(tmp_path):
     assert all(np.array_equal(a, b) for a, b in zip(first.state, again.state, strict=True))
 
 
-# --- a new field takes two files ------------------------------------------------------------------
-
-
 TRAP = """
 from typing import NamedTuple
 
