@@ -1,0 +1,173 @@
+"""A reader finds the test of a module: a module has a test file of its name, or one of the name of
+its package, or a line here."""
+
+import ast
+from functools import cache
+from pathlib import Path
+
+from support.common import ROOT
+
+TESTS, PACKAGE = ROOT / "tests", ROOT / "rigidmd"
+
+#: Test file -> further modules that it tests.
+TESTED_BY = {
+    "assemble/test_build.py": "assemble/resolve dynamics/flows dynamics/model scene/couplings",
+    "assemble/test_defaults.py": "assemble/describe scene/forces",
+    "assemble/test_matching.py": "assemble/assignment assemble/atom_kinds assemble/bonded_atoms",
+    "commands/test_cli.py": "commands/arguments commands/check commands/compile commands/help"
+    " commands/streams core/plain_text scene/json_schema",
+    "commands/test_examples.py": "commands/new core/shipped",
+    "compile/test_simd.py": "compile/simd_memory compile/simd_types",
+    "core/test_integrators.py": "dynamics/force_gradient",
+    "core/test_state.py": "core/state_file",
+    "dynamics/test_registers.py": "dynamics/observables",
+    "dynamics/test_step_loop.py": "mechanics/batches",
+    "dynamics/test_thermostats.py": "assemble/stage_description",
+    "end_to_end/test_faults.py": "core/files core/signals",
+    "end_to_end/test_hostile_input.py": "core/process core/toml",
+    "engines/cpu/test_program.py": "engines/cpu/compiled engines/protocol",
+    "features/analysis/test_runs.py": "analysis/files analysis/report analysis/registry"
+    " commands/analyse",
+    "features/analysis/test_conditions.py": "analysis/options",
+    "features/analysis/test_structure.py": "analysis/pair_histogram",
+    "features/analysis/test_transport.py": "analysis/relaxation",
+    "features/bodies/test_engine.py": "assemble/body assemble/body_defaults"
+    " dynamics/body_step_loop engines/body_motion engines/body_system engines/cpu/body"
+    " forces/body/applied mechanics/translation",
+    "features/bodies/test_fluid.py": "forces/body/resistance",
+    "features/bodies/test_frames.py": "mechanics/time_functions",
+    "features/bodies/test_input.py": "scene/body scene/body_forces",
+    "features/bodies/test_ode.py": "mechanics/odes",
+    "features/bodies/test_rates.py": "run/body_rates run/body_summary run/body_theory run/elliptic",
+    "features/bodies/test_run.py": "run/body",
+    "features/calculators/test_ase_calculator.py": "run/atom_forces",
+    "features/crystals/test_cif.py": "formats/cif_syntax formats/crystal",
+    "features/external/test_lammps.py": "commands/export commands/verify engines/external"
+    " engines/rigid_bodies studies/other_engines",
+    "features/external/test_settings.py": "engines/force_field",
+    "features/free_energy/test_coupling.py": "analysis/free_energy forces/potentials/soft_core"
+    " studies/sweep/coupling",
+    "features/free_energy/test_insertion.py": "assemble/guest forces/neighbors/guest_pairs"
+    " forces/poses/trials",
+    "features/free_energy/test_mean_force.py": "studies/sweep/windows",
+    "features/potentials/test_custom.py": "assemble/user_code/pair_potential"
+    " assemble/user_code/pair_terms assemble/user_code/cutoffs forces/potentials/formulas",
+    "features/potentials/test_pose_tables.py": "forces/poses/pairs",
+    "features/potentials/test_python_forces.py": "assemble/user_code/force",
+    "features/potentials/test_shipped.py": "forces/poses/formulas forces/poses/gay_berne"
+    " forces/poses/multipoles forces/poses/patch forces/poses/potential",
+    "features/potentials/test_slopes.py": "forces/poses/trace",
+    "features/potentials/test_torques.py": "assemble/user_code/pose_checks",
+    "features/potentials/test_user_code.py": "assemble/user_code/binding"
+    " assemble/user_code/compiled assemble/user_code/trust core/user_modules"
+    " dynamics/user_kernels",
+    "features/studies/accuracy/test_averages.py": "studies/accuracy/averages_report",
+    "features/studies/sweep/test_sweeping.py": "commands/compare commands/sweep studies/compare"
+    " studies/sweep/replicas",
+    "features/studies/sweep/test_table.py": "studies/sweep/figure",
+    "features/studies/test_normal_modes.py": "commands/modes studies/gamma_point",
+    "features/view/test_animation.py": "commands/film commands/gallery commands/view"
+    " view/body_animation view/molecule_animation view/page view/solids",
+    "features/view/test_figures.py": "analysis/curve_figure figures/body figures/panels"
+    " figures/picture figures/space figures/style",
+    "features/view/test_notebook.py": "analysis/result core/display view/plots",
+    "features/view/test_run_page.py": "commands/report",
+    "forces/ewald/test_direct_sum.py": "forces/ewald/smooth",
+    "forces/neighbors/test_clusters.py": "forces/neighbors/tree",
+    "forces/neighbors/test_pair_loop.py": "forces/neighbors/rows forces/neighbors/sites",
+    "forces/potentials/test_potentials.py": "forces/potentials/lennard_jones",
+    "forces/test_terms.py": "forces/neighbors/space forces/parts",
+    "formats/test_atoms.py": "formats/g96",
+    "io/test_progress.py": "io/run_files",
+    "io/test_trajectory_file.py": "formats/through_mdanalysis io/structure_file",
+    "run/test_checks.py": "assemble/harmonic run/failed_check run/rigid_fit run/stable_step",
+    "run/test_observers.py": "run/molecular_observers",
+    "run/test_pilot.py": "run/trial_systems run/trials",
+    "run/test_resume.py": "io/write run/record",
+    "run/test_results.py": "engines/observables",
+    "run/test_simulation.py": "engines/sites engines/system run/loop run/molecular run/part",
+    "run/test_summary.py": "run/report run/short_report",
+    "scene/test_hints.py": "scene/base scene/stage",
+    "scene/test_molecules.py": "formats/bonds io/scene_file",
+    "support/test_tiers.py": "core/bound_process",
+}
+#: Test files whose name is neither that of a module nor that of a package -> what they test.
+FEATURES = {
+    "features/analysis/test_mixtures.py": "analyses of several species, against NumPy",
+    "features/analysis/test_other_programs.py": "analyses against MDAnalysis and others",
+    "features/bodies/test_fluid.py": "added mass and resistance",
+    "features/bodies/test_frames.py": "rotating and accelerated frames",
+    "features/bodies/test_input.py": "errors in scenes of bodies",
+    "features/calculators/test_ase_calculator.py": "rigidmd as a calculator of ASE",
+    "features/calculators/test_ase_trajectory.py": "trajectories of ASE",
+    "features/calculators/test_calculators.py": "calculators of ASE as forces",
+    "features/crystals/test_framework.py": "frozen frameworks",
+    "features/external/test_names.py": "names of users in generated files",
+    "features/potentials/test_custom_thermostats.py": "thermostats of users",
+    "features/potentials/test_pose_tables.py": "tables of poses",
+    "features/potentials/test_torques.py": "torques about axes without inertia",
+    "forces/test_frozen.py": "frozen molecules and parameters of pairs",
+    "run/test_minimise_stages.py": "stages of minimisation",
+}
+#: Folders whose files are named after what they do.
+FREE = ("benchmarks", "end_to_end", "rules", "support")
+
+
+@cache
+def names_of_files() -> dict[str, str]:
+    """Test file, below tests/ -> the name of what it tests."""
+    return {
+        path.relative_to(TESTS).as_posix(): path.stem.removeprefix("test_")
+        for path in sorted(TESTS.rglob("test_*.py"))
+    }
+
+
+def has_logic(path: Path) -> bool:
+    """Whether a module defines a function or a class."""
+    body = ast.parse(path.read_text(encoding="utf-8")).body
+    return any(isinstance(node, ast.FunctionDef | ast.ClassDef) for node in body)
+
+
+def module_names() -> dict[str, Path]:
+    """The modules below rigidmd/, without the extension. The scripts of the site are left out."""
+    paths = (path for path in sorted(PACKAGE.rglob("*.py")) if not path.stem.startswith("__"))
+    names = {path.relative_to(PACKAGE).with_suffix("").as_posix(): path for path in paths}
+    return {name: path for name, path in names.items() if not name.startswith("docs/")}
+
+
+def has_file_of_its_name(module: str) -> bool:
+    """Whether a test file has the name of a module, or of the package in a package that it is
+    in."""
+    names = module.split("/")
+    return not {names[-1], *names[1:-1]}.isdisjoint(names_of_files().values())
+
+
+def test_every_module_with_logic_has_a_test_file():
+    listed = {name for names in TESTED_BY.values() for name in names.split()}
+    lacking = [
+        name
+        for name, path in module_names().items()
+        if has_logic(path) and name not in listed and not has_file_of_its_name(name)
+    ]
+    assert not lacking, "no test file has their name, and TESTED_BY has no line for them"
+
+
+def test_every_line_of_the_lists_is_needed():
+    modules, files = module_names(), names_of_files()
+    assert [file for file in (*TESTED_BY, *FEATURES) if file not in files] == []
+    listed = [name for names in TESTED_BY.values() for name in names.split()]
+    assert [name for name in listed if name not in modules] == []
+    assert len(listed) == len(set(listed))
+
+
+def test_test_files_are_named_after_modules_or_features():
+    known = {path.stem for path in PACKAGE.rglob("*.py")} | {
+        path.name for path in PACKAGE.rglob("*") if path.is_dir()
+    }
+    strange = [
+        file
+        for file, name in names_of_files().items()
+        if name not in known and file not in FEATURES and file.partition("/")[0] not in FREE
+    ]
+    assert not strange, "FEATURES has no line for them"
+    assert [file for file in FEATURES if names_of_files().get(file) in known] == []
