@@ -17,7 +17,9 @@ from rigidmd.units import COULOMB
         (1e-5, "ewald"),
         (1e-5, "pme"),
         *(
-            pytest.param(asked, method, marks=pytest.mark.soak)
+            pytest.param(
+                asked, method, marks=pytest.mark.extended if asked == 1e-4 else pytest.mark.soak
+            )
             for asked, method in product([1e-3, 1e-4, 1e-5, 1e-6], ["ewald", "pme"])
             if asked != 1e-5
         ),
