@@ -259,10 +259,10 @@ def test_a_line_is_found_exactly():
 
 
 class Columns(dict):
-    """Columns of a log, each of four samples."""
+    """Columns of a log, each of 40 samples."""
 
     def __len__(self):
-        return 4
+        return 40
 
 
 def test_heat_between_two_thermostats_explains_a_drift():
@@ -275,7 +275,7 @@ def test_heat_between_two_thermostats_explains_a_drift():
         "force_squares": 1e5,
         "torque_squares": 4e5,
     }
-    columns = Columns({name: np.full(4, value) for name, value in values.items()})
+    columns = Columns({name: np.full(40, value) for name, value in values.items()})
 
     def of(**stage) -> tuple[float, float]:
         scene = small_scene({"spce": 20}, 18.5, stages=[nvt | stage])
@@ -285,6 +285,10 @@ def test_heat_between_two_thermostats_explains_a_drift():
     x = [0.004**2 * square / (count * unit * 300) for square, count in ((1e5, 57), (4e5, 60))]
     flow = 0.5 * unit * (57 + 60) / 2 / 0.05
     assert of() == pytest.approx((flow * (x[1] - x[0]) / 12, 0.0), rel=1e-9)
+    noise = np.random.default_rng(0).standard_normal(40)
+    columns["temperature_rotation"] = columns["temperature_rotation"] + noise - noise.mean()
+    error = 0.5 * unit * 60 / 2 / 0.05 * mean(noise)[1]
+    assert of() == pytest.approx(np.array([flow, error]) * (x[1] - x[0]) / 12, rel=1e-9)
     assert of(thermostat_time_ps=0.1)[0] == pytest.approx(of()[0] / 2)
     assert of(integrator="velocity_verlet") == (0.0, 0.0)
     assert of(thermostat="langevin") == (0.0, 0.0)

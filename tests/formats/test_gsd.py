@@ -57,6 +57,8 @@ def test_frames_come_back(run):
         assert (
             np.abs(found.position[found.sites] - results.system.site_positions(state)).max() < 5e-6
         )
+        off = found.site_velocities() - results.system.site_velocities(state)
+        assert np.abs(off).max() < 1e-5 * np.abs(state.velocity).max()
     assert np.array_equal(results.rotation[3], reader.read(3).rotation())
 
 

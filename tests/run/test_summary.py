@@ -11,7 +11,7 @@ from support.common import argon, small_scene
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
 from rigidmd.commands.cli import main
-from rigidmd.core.statistics import mean_and_error
+from rigidmd.core.statistics import mean_and_error, slope
 from rigidmd.engines.samples import COLUMNS, Sample, Samples
 from rigidmd.io.run_files import columns
 from rigidmd.run import Simulation, run_together
@@ -376,15 +376,19 @@ def test_points_have_one_temperature():
 def test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage(
     thermostat, freedom
 ):
-    """A thermostat that changes the total momentum has three more."""
+    """A thermostat that changes the total momentum has three more. Errors have the same units."""
     time = 0.05 * np.arange(400)
+    drift = 0.7 * time + 0.01 * np.random.default_rng(0).standard_normal(400)
     summary = summarised(
-        {"thermostat": thermostat}, time=time, drift=0.7 * time, temperature=np.full(400, 300.0)
+        {"thermostat": thermostat}, time=time, drift=drift, temperature=np.full(400, 300.0)
     )
     (stage,) = summary["stages"]
-    assert stage["drift_kJ_mol_ns_per_molecule"] == pytest.approx(700 / 40)
-    expected = 700 * KJ_PER_MOL / (BOLTZMANN * 300 * freedom)
-    assert stage["drift_kT_ns_per_degree_of_freedom"] == pytest.approx(expected)
+    line = slope(time, drift)
+    assert line.value == pytest.approx(0.7, rel=0.01)
+    for kind, of_time in (("drift", line.value), ("drift_error", line.error)):
+        assert stage[f"{kind}_kJ_mol_ns_per_molecule"] == pytest.approx(1000 * of_time / 40)
+        expected = 1000 * of_time * KJ_PER_MOL / (BOLTZMANN * 300 * freedom)
+        assert stage[f"{kind}_kT_ns_per_degree_of_freedom"] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

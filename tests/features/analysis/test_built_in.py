@@ -92,9 +92,9 @@ def test_an_oscillation_has_its_wave_number_and_its_degrees_of_freedom():
         **{f"omega spce axis {k}": (200 + 100 * k + 100 * (k - 1), 1) for k in (1, 2, 3)},
     }
     for title, (wave_number, freedom) in expected.items():
-        assert found.value(f"highest peak of {title}").value == pytest.approx(
-            wave_number, abs=0.6 * step
-        )
+        peak = found.value(f"highest peak of {title}")
+        assert peak.value == pytest.approx(wave_number, abs=0.6 * step)
+        assert peak.error == pytest.approx(step / 2)
         assert np.sum(found[title]) * step == pytest.approx(freedom, rel=0.03)
         memory = found[f"correlation {title}"]
         assert memory[0] == pytest.approx(1.0)
@@ -123,6 +123,11 @@ def test_analyses_of_several_runs_are_over_their_sum():
         paths = brownian(rng, 60, 40, 0.25, 4.0) + 20.0 * rng.random((40, 3))
         members.append(history(system, 4.0 * np.arange(60), paths, box, Q))
     together = Runs(tuple(members))
+    uneven = Runs((members[0][:20], members[1]))
+    assert uneven.mean([1.0, 3.0]) == 2.5
+    for title in ("g O-O", "n O-O"):
+        each = [rdf(run)[title] for run in uneven.members]
+        assert rdf(uneven)[title] == pytest.approx(np.average(each, axis=0, weights=[1, 3]))
     for analysis, title in (
         (rdf, "g O-O"),
         (structure_factor, "S centres"),

@@ -241,12 +241,14 @@ def test_values_are_those_of_the_textbook_and_errors_those_of_the_scatter(ensemb
         assert abs(np.mean(relative[name])) < 4 * np.std(relative[name]) / np.sqrt(len(values))
 
 
-def test_a_mean_that_is_subtracted_hides_nothing():
+@pytest.mark.parametrize("runs", [1, 3])
+def test_a_mean_that_is_subtracted_hides_nothing(runs):
     """The mean of many short runs, each of which is too short for a value."""
     rng, truth = np.random.default_rng(3), truth_of("npt")["kappa_T"]
     found = []
     for _ in range(300):
-        value = response(liquid(rng, "npt", 15.0)).value("kappa_T")
+        members = [liquid(rng, "npt", 15.0 / runs) for _ in range(runs)]
+        value = response(Runs(tuple(members))).value("kappa_T")
         assert value.value is None or value.error > 0
         found.append(
             float(value.note.split("So far: ")[1].split()[0])
@@ -267,6 +269,9 @@ def test_runs_together_have_the_covariances_of_all_samples(ensemble):
         alone = [response(run).value(name) for run in members]
         errors = [one.error for one in alone if one.error is not None]
         assert measured.error == pytest.approx(np.mean(errors) / np.sqrt(12), rel=0.6), name
+    c_v, per_gram = (np.array(together.value(name)[2:4]) for name in ("c_v", "c_v per gram"))
+    mass = members[0].system.species[0].mass
+    assert per_gram == pytest.approx(c_v / mass)
     curve = together.curves[0]
     (so_far,) = curve.columns.values()
     assert so_far[-1] == pytest.approx(together.value().value, rel=1e-3)

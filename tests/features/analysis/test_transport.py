@@ -84,8 +84,18 @@ def test_the_correction_for_the_size_of_the_box_is_that_of_yeh_and_hummer():
     assert infinite.error == own.error
     alone = diffusion(history(system, time, path, np.eye(3) * 24.86))
     assert "without a viscosity" in alone.value("D of argon in an infinite box").note
-    triclinic = diffusion(history(system, time, path, TRICLINIC), viscosity_mPa_s=0.896)
-    assert "for cubic boxes" in triclinic.notes[-1] and len(triclinic.values) == 1
+    rhombic = np.array([[24.86, 0.0, 0.0], [0.0, 24.86, 0.0], [0.0, 8.0, 24.86]])
+    for cell in (TRICLINIC, rhombic, np.diag([24.86, 24.86, 30.0])):
+        other = diffusion(history(system, time, path, cell), viscosity_mPa_s=0.896)
+        assert "for cubic boxes" in other.notes[-1] and len(other.values) == 1
+    stress = relaxing(rng, 20_000, 0.02, [(1.0, 0.1)])
+    tensor = tensor_of(stress, 0.05, 0.02, 24.86**3)
+    measured = diffusion(history(system, time, path, np.eye(3) * 24.86, tensor=tensor))
+    eta = viscosity(history(system, time, path, np.eye(3) * 24.86, tensor=tensor)).value()
+    own, infinite = measured.values
+    of_eta = (infinite.value - own.value) * eta.error / eta.value
+    assert of_eta > 0.1 * own.error
+    assert infinite.error == pytest.approx(np.hypot(own.error, of_eta), rel=1e-9)
     for wrong in (0.0, -1.0, inf, np.nan):
         with pytest.raises(OutputError, match=r"viscosity_mPa_s is .*, must be from 1e-06"):
             diffusion(history(system, time, path, np.eye(3) * 24.86), viscosity_mPa_s=wrong)
@@ -200,7 +210,7 @@ def test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest(
     """Also where a part of it relaxes slowly, beyond the time at which an integral is lost in
     noise."""
     system, found, interval = system_of({"argon": 8}, 25.0), [], 0.02
-    frames = int(length / interval)
+    frames, pulls = int(length / interval), []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
         series = [relaxing(rng, frames, interval, RELAXATIONS[name]) for _ in range(runs)]
@@ -214,14 +224,20 @@ def test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest(
             )
             for x in series
         ]
-        told = viscosity(Runs(tuple(members))).value()
+        result = viscosity(Runs(tuple(members)))
+        told, time = result.value(), result["Time (ps)"]
         if told.value is not None:
             found.append((told.value, told.error))
+        exact = 0.85 * sum(part * (1 - np.exp(-time / tau)) for part, tau in RELAXATIONS[name])
+        late = slice(len(time) // 4, None, len(time) // 4)
+        off = result["integral (mPa s)"] - exact
+        pulls.append((off[late] / result["integral (mPa s) error"][late])[:3])
     values, errors = np.array(found).T
     assert len(found) > 0.8 * seeds
     assert values.mean() == pytest.approx(0.85, abs=4 * values.std(ddof=1) / np.sqrt(len(found)))
     assert 0.4 < np.sqrt(np.mean(((values - 0.85) / errors) ** 2)) < 1.7
     assert np.median(errors) < (0.15 if name == "one" else 0.35) * 0.85
+    assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.5  # of the running integral
 
 
 def test_a_viscosity_has_the_correlation_time_of_the_stress():

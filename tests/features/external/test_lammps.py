@@ -19,6 +19,7 @@ from rigidmd.commands import cli
 from rigidmd.core.state import HEAT, NOW
 from rigidmd.core.statistics import mean_and_error as mean
 from rigidmd.engines.external import compare_at, describe_comparison
+from rigidmd.engines.force_field import force_field_of
 from rigidmd.engines.lammps import engine as lammps
 from rigidmd.engines.lammps import files
 from rigidmd.engines.lammps.engine import LammpsEngine
@@ -436,6 +437,10 @@ def test_a_liquid_of_ellipsoids_beside_sites_is_the_same():
     (gay_berne,) = [line for line in found.start if line.name == "gay berne"]
     assert gay_berne.difference <= 1e-10 * abs(gay_berne.here) and abs(gay_berne.here) > 10
     assert found.run[0].difference < 1e-6 and found.run[0].here > 0.1
+    mixed = files.pair_styles(force_field_of(build(ellipsoids(pairs=[]))))[0].coefficients
+    (unlike,) = (text.split() for (i, j), text in mixed.items() if i != j)
+    assert float(unlike[0]) == pytest.approx(np.sqrt(1.0 * 0.5) / 4.184)  # kcal/mol
+    assert float(unlike[1]) == pytest.approx((4.0 + 3.2) / 2)
     wrong = {name: ELLIPSOIDS["parameters"][name] for name in ("rod", "spce")}
     wrong["argon"] = wrong["rod"] | {"length_A": 4, "end": 1}  # a sphere
     with pytest.raises(SceneError) as refused:

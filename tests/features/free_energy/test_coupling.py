@@ -306,7 +306,10 @@ def test_mbar_has_the_integral_over_two_atoms_with_honest_errors():
             drawn = rng.choice(len(r), 400, p=weight / weight.sum())
             changes = (energies[:, drawn] - energies[k, drawn]).T
             runs.append(SampledLambda(k, changes))
-        value = free_energy_of(lambdas, runs, THERMAL / KJ_PER_MOL, [("F", 0.0, 1.0)]).value("F")
+        parts = [("F", 0.0, 1.0), ("forth", 0.3, 0.6), ("back", 0.6, 0.3)]
+        result = free_energy_of(lambdas, runs, THERMAL / KJ_PER_MOL, parts)
+        value, forth, back = map(result.value, ("F", "forth", "back"))
+        assert (forth.value, forth.error) == pytest.approx((-back.value, back.error))
         exact_of_drawn = -THERMAL / KJ_PER_MOL * np.log(np.mean(np.exp(-energies[-1])))
         pulls.append((value.value - exact_of_drawn) / value.error)
     assert abs(np.mean(pulls)) < 3 / np.sqrt(10)
@@ -321,6 +324,25 @@ def test_correlated_samples_are_used_once():
     run, repeated = (SampledLambda(0, x) for x in (changes, np.repeat(changes, 5, axis=0)))
     assert len(run.decorrelated) >= 200
     assert len(repeated.decorrelated) < 1.5 * len(run.decorrelated)
+
+
+def test_overlap_of_lambdas_with_different_numbers_of_samples():
+    """Two harmonic energies: the overlap is the mean fraction, in samples at the first lambda, of
+    the second one; rows of the matrix have the sum 1."""
+    rng, counts, gap, runs = np.random.default_rng(4), (4000, 500), 3.0, []
+    for k, count in enumerate(counts):
+        x = rng.standard_normal(count) + gap * k
+        energies = np.stack([x**2 / 2, (x - gap) ** 2 / 2], axis=1)
+        runs.append(SampledLambda(k, energies - energies[:, [k]]))
+    result = free_energy_of([0.0, 1.0], runs, 2.5)
+    matrix = np.stack([result["lambda 0"], result["lambda 1"]], axis=1)
+    assert matrix.sum(axis=1) == pytest.approx([1.0, 1.0], abs=1e-6)
+    x = np.linspace(-8, 12, 4001)
+    first, second = (np.exp(-((x - gap * k) ** 2) / 2) for k in (0, 1))
+    fraction = second * counts[1] / (first * counts[0] + second * counts[1])
+    exact = np.average(fraction, weights=first)
+    assert result.value("least overlap of neighbours").value == matrix[0, 1]
+    assert matrix[0, 1] == pytest.approx(exact, rel=0.1)
 
 
 def test_few_samples_and_missing_overlap_are_reported():

@@ -192,6 +192,33 @@ def test_ideal_gas():
         assert value.value == pytest.approx(count * of_one, rel=1e-3)
 
 
+def test_frames_count_by_their_volumes():
+    """An atom of argon with one of krypton in boxes of two sizes: <V w> is <V> and the integral of
+    exp(-u/kT) - 1."""
+    stage = {"ensemble": "npt", "temperature_K": TEMPERATURE, "pressure_bar": 1.0}
+    forces = {"cutoff_A": 10.0, "truncation": "plain", "switch_start_A": None}
+    scene = small_scene(
+        {"krypton": 1},
+        22.0,
+        forces=forces | {"tail_correction": False},
+        stages=[stage | {"duration_ps": 1.0}],
+    )
+    edges = np.tile([22.0, 40.0], 100)
+    cells = edges[:, None, None] * np.eye(3)
+    frames = history(
+        build(scene), np.arange(200), np.full((200, 1, 3), 5.0), cells, temperature=TEMPERATURE
+    )
+    thermal = BOLTZMANN * TEMPERATURE / KJ_PER_MOL
+    mu = exact_about_an_atom(TEMPERATURE)[0]
+    integral = 24.0**3 * np.expm1(-mu / thermal)
+    expected, unweighted = (
+        -thermal * np.log1p(integral * inverse)
+        for inverse in (1 / np.mean(edges**3), np.mean(1 / edges**3))
+    )
+    found = insertion(frames, "argon", trials=400).value()
+    assert abs(found.value - expected) < 4 * found.error < abs(unweighted - expected) / 2
+
+
 def test_a_profile_is_of_the_distance_from_the_middle():
     """A frozen layer of krypton that argon does not enter."""
     grid = np.array([[x, y, 5.0] for x in range(0, 24, 3) for y in range(0, 24, 3)], float)
@@ -305,6 +332,19 @@ def test_a_profile_keeps_small_weights_beside_large_ones():
     mu, z = curve.columns["mu_ex"], curve.axis[1]
     assert mu[z > 0.3] == pytest.approx(np.log(2.0), rel=1e-12)
     assert mu[z < -0.3] == pytest.approx(-np.log(1e30), rel=1e-12)
+
+
+def test_errors_of_a_profile_are_those_of_its_scatter():
+    """ln <w> of weights exp(-x) with a normal x, in each bin."""
+    rng, pulls, spread = np.random.default_rng(9), [], 0.5
+    for _ in range(30):
+        height = rng.uniform(-10, 10, (50, 400))
+        energy = spread * rng.standard_normal(height.shape)
+        trials = Trials(np.full(50, 8000.0), energy, height, lowest=float(energy.min()))
+        curve = _profile([trials], KJ_PER_MOL, "z")
+        mu, error = curve.columns["mu_ex"], curve.errors["mu_ex"]
+        pulls.append((mu + spread**2 / 2) / error)
+    assert 0.8 < np.quantile(np.abs(pulls), 0.683) < 1.2
 
 
 def test_what_has_no_meaning_is_refused():

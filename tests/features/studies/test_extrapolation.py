@@ -109,9 +109,11 @@ def test_the_step_of_a_bias_that_is_not_seen_allows_for_its_error(slope, error, 
         AverageRun("baoab", "langevin", dt, 1.0, averages={"U": (5 + slope * dt**2, of_mean)})
         for dt in steps
     ]
-    quantity = AveragedQuantity("U", "kJ/mol", 2.5)
+    quantity = AveragedQuantity("U", "kJ/mol", 2.5, bias_unit="kT", bias_size=2.5)
     found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, [quantity], runs)
     fit = found.fit(quantity)
+    of_point = np.array(fit.bias(found.point(runs[1], quantity)))
+    assert np.array(found.bias(runs[1], quantity)) == pytest.approx(of_point / 2.5)
     assert fit.slopes["baoab + langevin"] == pytest.approx((slope, error))
     steepest = abs(slope) + (0.0 if seen else UNSEEN * error)
     step, was_seen = found.step_at_limit("baoab + langevin", quantity)

@@ -8,6 +8,7 @@ from rigidmd import Scene, Simulation
 from rigidmd.run.record import read_record
 from rigidmd.studies.extrapolation import extrapolate
 from rigidmd.studies.joint_fit import (
+    BALANCE,
     BAR_NM3,
     DENSITY,
     GAS_CONSTANT,
@@ -22,10 +23,12 @@ from rigidmd.studies.joint_fit import (
     slope_name,
     why_not,
 )
+from rigidmd.studies.sweep.limits import JOINT, Limit
 
 #: Atoms on springs of one frequency (rad/ps), each about a lattice point that moves with the box, and an
 #: energy of the volume for which U + pV is quadratic in it.
 COUNT, TEMPERATURE, PRESSURE, OMEGA = 20, 120.0, 400.0, 10.0
+ALL = COUNT + 5  # with frozen atoms
 FREEDOM = 3 * COUNT
 THERMAL = GAS_CONSTANT * TEMPERATURE
 STEPS = (6.0, 10.0, 14.0)
@@ -38,7 +41,7 @@ KINDS += [(False, 0.0, False), (False, 1 / 8, False)]
 def conditions(step, has_barostat, correction=0.0, reads_kinetic=True):
     """step : fs"""
     pressure = PRESSURE * BAR_NM3 if has_barostat else 0.0
-    common = TEMPERATURE, pressure, COUNT, COUNT, FREEDOM, 0
+    common = TEMPERATURE, pressure, ALL, COUNT, FREEDOM, 0
     return Conditions(1e-3 * step, *common, correction, reads_kinetic)
 
 
@@ -62,7 +65,7 @@ def slopes(has_barostat, correction, reads_kinetic):
     volume = shift_of_volume(short) / 0.1**2 if has_barostat else 0.0
     springs = (energies_at(short)[0] - 1) / 0.1**2
     potential = 0.5 * FREEDOM * THERMAL * springs - short.pressure * volume
-    return np.array([potential / COUNT, volume, -0.8 * volume / VOLUME_MEAN])
+    return np.array([potential / ALL, volume, -0.8 * volume / VOLUME_MEAN])
 
 
 def sampled(rng, step, has_barostat, samples, correction=0.0, reads_kinetic=True):
@@ -81,21 +84,25 @@ def sampled(rng, step, has_barostat, samples, correction=0.0, reads_kinetic=True
         density = 0.8 * VOLUME_MEAN / volume
         energy = 0.5 * THERMAL * (change / VOLUME_SIZE) ** 2 - at.pressure * change
     squares = 2 * OMEGA**2 * springs
-    values = [(springs + energy) / COUNT, volume, density, kinetic, squares, squares]
+    values = [(springs + energy) / ALL, volume, density, kinetic, squares, squares]
     return results_of_samples(np.array(values), at, has_barostat=has_barostat)
 
 
 @pytest.mark.parametrize(("has_barostat", "correction", "reads_kinetic"), KINDS)
 def test_slopes_and_their_errors_are_those_of_springs(has_barostat, correction, reads_kinetic):
-    """The slopes that fluctuations predict, and their errors against their scatter over runs."""
+    """The slopes and the responses that fluctuations predict, and their errors against their scatter
+    over runs."""
     rng = np.random.default_rng(5)
-    expected = slopes(has_barostat, correction, reads_kinetic)
+    names = map(slope_name, (POTENTIAL, VOLUME, DENSITY)[: 3 if has_barostat else 1])
+    expected = dict(zip(names, slopes(has_barostat, correction, reads_kinetic), strict=False))
+    expected |= responses_of_springs(has_barostat)
     runs = [sampled(rng, 6.0, has_barostat, 1000, correction, reads_kinetic) for _ in range(100)]
-    for k, name in enumerate((POTENTIAL, VOLUME, DENSITY)[: 3 if has_barostat else 1]):
-        values = np.array([run.values[slope_name(name)] for run in runs])
-        errors = np.array([run.errors[slope_name(name)] for run in runs])
+    for name, value in expected.items():
+        values = np.array([run.values[name] for run in runs])
+        errors = np.array([run.errors[name] for run in runs])
         scatter = values.std(ddof=1)
-        assert abs(values.mean() - expected[k]) < 4 * scatter / np.sqrt(len(runs)), name
+        assert abs(values.mean() - value) < 4 * scatter / np.sqrt(len(runs)), name
+        assert scatter / np.sqrt(len(runs)) < 0.01 * value or value <= 0 or "slope" in name, name
         assert 0.7 < np.sqrt((errors**2).mean()) / scatter < 1.4, name
 
 
@@ -115,7 +122,7 @@ def test_pulls_of_joint_limits_have_unit_width(
     and responses agree with theory."""
     rng, relative = np.random.default_rng(7), VOLUME_SIZE / VOLUME_MEAN
     truth = {
-        POTENTIAL: 0.5 * THERMAL * (FREEDOM + has_barostat) / COUNT,
+        POTENTIAL: 0.5 * THERMAL * (FREEDOM + has_barostat) / ALL,
         VOLUME: VOLUME_MEAN,
         DENSITY: 0.8 * (1 + relative**2 + 3 * relative**4),
     }
@@ -174,19 +181,50 @@ def test_springs_have_the_bias_of_theory(correction, bias):
         kinetic = 0.5 * THERMAL * hotter * (1 - x / 4) * rng.chisquare(FREEDOM, 4000)
         squares = 2 * omega**2 * potential
         nothing = np.zeros(4000)
-        series = [potential / COUNT, nothing, nothing, kinetic, squares, squares]
+        series = [potential / ALL, nothing, nothing, kinetic, squares, squares]
         at = conditions(step, False, correction)
         runs[step] = [results_of_samples(np.array(series), at, has_barostat=False)]
         assert runs[step][0].values[MEAN_SQUARE] == pytest.approx(x, rel=0.06)
-        expected = bias * omega**2 * 1e-6 * FREEDOM * THERMAL / COUNT
+        expected = bias * omega**2 * 1e-6 * FREEDOM * THERMAL / ALL
         slope, error = (
             getattr(runs[step][0], kind)[slope_name(POTENTIAL)] for kind in ("values", "errors")
         )
-        next_term = 0.5 * x * omega**2 / 8 * 1e-6 * FREEDOM * THERMAL / COUNT
+        next_term = 0.5 * x * omega**2 / 8 * 1e-6 * FREEDOM * THERMAL / ALL
         assert abs(slope - expected) < 4 * error + next_term
-        assert error < 0.1 * omega**2 / 8 * 1e-6 * FREEDOM * THERMAL / COUNT
+        assert error < 0.1 * omega**2 / 8 * 1e-6 * FREEDOM * THERMAL / ALL
     _, fit = fit_jointly(runs).joint[POTENTIAL]
-    assert abs(fit.limit - 0.5 * THERMAL * FREEDOM / COUNT) < 4 * fit.limit_error
+    assert abs(fit.limit - 0.5 * THERMAL * FREEDOM / ALL) < 4 * fit.limit_error
+
+
+def test_errors_of_responses_go_with_the_root_of_the_number_of_samples():
+    """Single runs of two lengths, which both contribute to the errors."""
+    rng, counts = np.random.default_rng(3), (1000, 4000)
+    runs = {
+        step: [sampled(rng, step, True, count)] for step, count in zip(STEPS, counts, strict=False)
+    }
+    for name, (points, _) in fit_jointly(runs).responses.items():
+        alone = [run.errors[name] for (run,) in runs.values()]
+        common = np.sqrt(np.mean(np.array(counts) * np.square(alone)))
+        found = [point.error for point in points]
+        assert found == pytest.approx(common / np.sqrt(counts), rel=1e-9), name
+
+
+def test_means_that_no_fit_describes_make_the_error_of_a_limit_larger():
+    """A kinetic energy that is off by ten times its error has a chi² far above 1. The bias at a step
+    has the error of its slope."""
+    run = sampled(np.random.default_rng(4), STEPS[0], True, 1000)
+    fits = []
+    for off in (0.0, 10.0):
+        values = run.values | {BALANCE: off * run.errors[BALANCE]}
+        joint = fit_jointly({STEPS[0]: [run._replace(values=values)]}).joint
+        fits.append([joint[name][1] for name in (POTENTIAL, VOLUME)])
+    fit, step = fits[0][0], STEPS[1]
+    bias = Limit({}, "baoab", POTENTIAL, [], fit, JOINT).bias(step)
+    assert bias == pytest.approx(np.array(fit.slopes[""]) * step**2)
+    for plain, scaled in zip(*fits, strict=True):
+        assert (plain.freedom, plain.chi2 < 1) == (1, True)
+        assert scaled.chi2 > 10
+        assert scaled.limit_error == pytest.approx(plain.limit_error * np.sqrt(scaled.chi2))
 
 
 def stage_of(**keys):
