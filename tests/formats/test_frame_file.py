@@ -14,32 +14,25 @@ import pytest
 from support.structures import (
     GRO,
     NAMES,
-    SPECIES,
-    TOLERANCE,
     WATERS,
     Truth,
-    box_of,
     cif,
     cryst1,
     data_of,
     dump_of,
-    gro,
     lammps,
     pdb,
     read,
     same_molecules,
-    xyz,
+    unreadable,
 )
-
-from rigidmd.assemble.structure import read_structure
-from rigidmd.errors import StructureError
 
 
 def frames_of(ending, truths):
     if ending == "gro":
-        return "".join(gro(t.atoms(), box_of(t.cell)) for t in truths)
+        return "".join(t.gro() for t in truths)
     if ending == "xyz":
-        return "".join(xyz(t.atoms(), t.cell, NAMES[0]) for t in truths)
+        return "".join(t.xyz(names=NAMES[0]) for t in truths)
     models = [f"MODEL {k}\n{pdb(t.atoms(), '')}TER\nENDMDL\n" for k, t in enumerate(truths, 1)]
     return cryst1(truths[0].cell) + "\n" + "".join(models) + "END\n"
 
@@ -50,17 +43,21 @@ def test_one_of_several_frames(ending, tmp_path):
     text = frames_of(ending, truths)
     for frame, truth in ((1, truths[0]), (2, truths[1]), (-1, truths[2])):
         found = read(tmp_path, text, f"a.{ending}", frame=frame)
-        same_molecules(found, truth, [SPECIES["spce"]], 0.02)
+        same_molecules(found, truth, 0.02)
         assert np.diag(found.cell) == pytest.approx(np.diag(truth.cell), abs=2e-3)
-    with pytest.raises(
-        StructureError,
-        match=r"holds 3 structures.*select one by structure.frame .1 to 3, -1 for the last",
-    ):
-        read(tmp_path, text, f"a.{ending}")
-    with pytest.raises(
-        StructureError, match=r"structure.frame is 4: it holds 3, 1 is the first and -1 the last"
-    ):
-        read(tmp_path, text, f"a.{ending}", frame=4)
+    unreadable(
+        r"holds 3 structures.*select one by structure.frame .1 to 3, -1 for the last",
+        tmp_path,
+        text,
+        f"a.{ending}",
+    )
+    unreadable(
+        r"structure.frame is 4: it holds 3, 1 is the first and -1 the last",
+        tmp_path,
+        text,
+        f"a.{ending}",
+        frame=4,
+    )
     one = read(
         tmp_path, frames_of(ending, truths[:1]), f"b.{ending}"
     )  # a single MODEL is not a choice
@@ -74,40 +71,27 @@ def test_frames_with_empty_lines_between_them(ending, gap, tmp_path):
     text = gap + gap.join(frames_of(ending, [truth]) for truth in truths) + gap
     for frame in (1, 2, -1):
         found = read(tmp_path, text, f"a.{ending}", frame=frame)
-        same_molecules(found, truths[frame - (frame > 0)], [SPECIES["spce"]], 0.02)
-    with pytest.raises(StructureError, match=r"holds 3 structures"):
-        read(tmp_path, text, f"a.{ending}")
-    with pytest.raises(
-        StructureError,
-        match=r"line \d+: expected the number of atoms|is truncated|promises|no atoms",
-    ):
-        read(
-            tmp_path,
-            f"{text}nonsense\nnonsense\nnonsense\n" if ending != "pdb" else "nonsense",
-            f"b.{ending}",
-        )
+        same_molecules(found, truths[frame - (frame > 0)], 0.02)
+    unreadable(r"holds 3 structures", tmp_path, text, f"a.{ending}")
+    unreadable(
+        r"line \d+: expected the number of atoms|is truncated|promises|no atoms",
+        tmp_path,
+        f"{text}nonsense\nnonsense\nnonsense\n" if ending != "pdb" else "nonsense",
+        f"b.{ending}",
+    )
 
 
 def text_in(ending) -> str:
     truth = Truth(["spce"] * 4, 29)
-    if ending == "cif":
-        plain = ase.Atoms(
-            [a[1] for a in truth.atoms()], [a[3] for a in truth.atoms()], cell=truth.cell, pbc=True
-        )
-        written = io.BytesIO()
-        ase.io.write(written, plain, format="cif")
-        return written.getvalue().decode()
+    if ending in ("cif", "vasp"):
+        written = io.BytesIO() if ending == "cif" else io.StringIO()
+        ase.io.write(written, truth.ase(), format=ending)
+        text = written.getvalue()
+        return text.decode() if ending == "cif" else text
     if ending == "data":
         return data_of(truth)
     if ending == "dump":
         return dump_of(truth, "id element x y z")
-    if ending == "vasp":
-        plain = ase.Atoms(
-            [a[1] for a in truth.atoms()], [a[3] for a in truth.atoms()], cell=truth.cell, pbc=True
-        )
-        written = io.StringIO()
-        ase.io.write(written, plain, format="vasp")
-        return written.getvalue()
     return frames_of(ending, [truth])
 
 
@@ -115,20 +99,17 @@ def text_in(ending) -> str:
 @pytest.mark.parametrize("how", ["utf-8-sig", "utf-16", "utf-16-be", "crlf", "gz", "bz2", "xz"])
 def test_marks_of_encodings_and_packed_files(ending, how, tmp_path):
     """They change nothing, and take no atom."""
-    text = text_in(ending)
-    plain = read(tmp_path, text, f"plain.{ending}", cell=np.diag([14.0, 15.0, 16.0]))
+    text, cell = text_in(ending), np.diag([14.0, 15.0, 16.0])
+    plain = read(tmp_path, text, f"plain.{ending}", cell=cell)
     pack = {"gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress}
+    name = f"a.{ending}"
     if how in pack:
-        path, content = tmp_path / f"a.{ending}.{how}", pack[how](text.encode())
+        name, content = f"{name}.{how}", pack[how](text.encode())
     elif how == "crlf":
-        path, content = tmp_path / f"a.{ending}", text.replace("\n", "\r\n").encode()
+        content = text.replace("\n", "\r\n")
     else:
-        path, content = (
-            tmp_path / f"a.{ending}",
-            (codecs.BOM_UTF16_BE if how == "utf-16-be" else b"") + text.encode(how),
-        )
-    path.write_bytes(content)
-    found = read_structure(path, [SPECIES["spce"]], np.diag([14.0, 15.0, 16.0]), True, TOLERANCE)
+        content = (codecs.BOM_UTF16_BE if how == "utf-16-be" else b"") + text.encode(how)
+    found = read(tmp_path, content, name, cell=cell)
     assert found.position == pytest.approx(plain.position)
     assert len(found.species) == 4
     assert found.notes == plain.notes
@@ -141,9 +122,7 @@ def test_a_packed_file_that_is_damaged(tmp_path):
         ("c.xyz.xz", b"x"),
         ("d.xyz.gz", gzip.compress(GRO.encode())[:-9]),
     ):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(StructureError, match="cannot be unpacked"):
-            read_structure(tmp_path / name, [SPECIES["spce"]], None, True, TOLERANCE)
+        unreadable("cannot be unpacked", tmp_path, content, name)
 
 
 @pytest.mark.parametrize("name", ["water", "water.dat", "water.txt", "water.foo", "conf.1"])
@@ -198,7 +177,7 @@ DAMAGED = {
         "alternate locations A, B",
     ),
     "empty.pdb": ("END\n", "holds no atoms"),
-    "cut.xyz": (cut(xyz(WATERS.atoms(), WATERS.cell), 9), "line 1 promises 12 atoms, 7 are there"),
+    "cut.xyz": (cut(WATERS.xyz(), 9), "line 1 promises 12 atoms, 7 are there"),
     "lattice.xyz": (
         '3\nLattice="9 0 0 0 9 0 0"\nO 0 0 0\nH 0 0 0\nH 0 0 0\n',
         "line 2: expected nine numbers of Lattice",
@@ -238,5 +217,4 @@ DAMAGED = {
 @pytest.mark.parametrize("name", DAMAGED)
 def test_damaged_files_get_a_message(name, tmp_path):
     text, message = DAMAGED[name]
-    with pytest.raises(StructureError, match=message):
-        read(tmp_path, text, name)
+    unreadable(message, tmp_path, text, name)

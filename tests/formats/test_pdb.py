@@ -3,11 +3,19 @@
 import numpy as np
 import pytest
 from support.common import small_scene
-from support.structures import SPECIES, TOLERANCE, Truth, as_g96, cryst1, pdb, read, same_molecules
+from support.structures import (
+    TOLERANCE,
+    Truth,
+    as_g96,
+    cryst1,
+    pdb,
+    read,
+    same_molecules,
+    unreadable,
+)
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.structure import read_structure
-from rigidmd.errors import StructureError
 from rigidmd.io.trajectory_file import write_topology
 
 
@@ -17,13 +25,13 @@ def test_insertion_codes_separate_the_residues_of_a_pdb(numbers, codes, tmp_path
     molecules."""
     truth = Truth(["spce"] * 2, 5)
     labels = [f"{number:4d}{code}" for number, code in zip(numbers, codes, strict=True)]
-    lines = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"{k:4d}").splitlines()
+    lines = truth.pdb(number=lambda k: f"{k:4d}").splitlines()
     for k, label in enumerate(labels):
         lines = [
             line[:22] + label + line[27:] if line[22:26] == f"{k:4d}" else line for line in lines
         ]
     found = read(tmp_path, "\n".join(lines), "a.pdb")
-    same_molecules(found, truth, [SPECIES["spce"]], 0.002)
+    same_molecules(found, truth, 0.002)
     assert found.notes == ()
     assert found.number.tolist() == list(numbers)
 
@@ -60,20 +68,16 @@ def test_a_pdb_that_is_cut_off_says_so(tmp_path):
 
 def test_long_pdbs_whose_numbers_run_out(tmp_path):
     truth = Truth(["spce"] * 8, 13)
-    text = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"A{k:03d}")  # hybrid-36
-    same_molecules(read(tmp_path, text, "a.pdb"), truth, [SPECIES["spce"]], 0.002)
-    text = pdb(
-        truth.atoms(), cryst1(truth.cell), number=lambda k: f"   {k // 2}"
-    )  # two of each number, in two chains
+    text = truth.pdb(number=lambda k: f"A{k:03d}")  # hybrid-36
+    same_molecules(read(tmp_path, text, "a.pdb"), truth, 0.002)
+    text = truth.pdb(number=lambda k: f"   {k // 2}")  # two of each number, in two chains
     lines = [
         line.replace(" A   ", " B   ") if (k - 1) % 6 < 3 else line
         for k, line in enumerate(text.splitlines())
     ]
     assert read(tmp_path, "\n".join(lines) + "\n", "c.pdb").notes == ()
-    text = pdb(
-        truth.atoms(), cryst1(truth.cell), number=lambda k: "****"
-    )  # GROMACS and others beyond 9999
-    same_molecules(read(tmp_path, text, "b.pdb"), truth, [SPECIES["spce"]], 0.002)
+    text = truth.pdb(number=lambda k: "****")  # GROMACS and others beyond 9999
+    same_molecules(read(tmp_path, text, "b.pdb"), truth, 0.002)
 
 
 def wide_pdb(atoms, cell, serial, shift) -> str:
@@ -97,7 +101,7 @@ def test_pdbs_with_wide_numbers(serial, shift, tmp_path):
     text = wide_pdb(truth.atoms(), truth.cell, serial, shift)
     found = read(tmp_path, text, "a.pdb")
     truth.centre = truth.centre + shift
-    same_molecules(found, truth, [SPECIES["spce"]], 0.002)
+    same_molecules(found, truth, 0.002)
     assert list(found.number) == list(range(9998, 10006))
 
 
@@ -108,19 +112,15 @@ def test_coordinates_of_a_pdb_that_are_not_in_columns(tmp_path):
         for i, (n, _, k, x, _) in enumerate(truth.atoms())
     ]
     same_molecules(
-        read(tmp_path, "\n".join([cryst1(truth.cell), *rows, "END"]), "a.pdb"),
-        truth,
-        [SPECIES["spce"]],
-        1e-5,
+        read(tmp_path, "\n".join([cryst1(truth.cell), *rows, "END"]), "a.pdb"), truth, 1e-5
     )
-    stars = pdb(truth.atoms(), cryst1(truth.cell)).replace(
-        f"{truth.atoms()[0][3][0]:8.3f}", "********"
+    stars = truth.pdb().replace(f"{truth.atoms()[0][3][0]:8.3f}", "********")
+    unreadable(
+        r"line 2: expected an atom of a .pdb with coordinates in columns 31 to 54, found",
+        tmp_path,
+        stars,
+        "b.pdb",
     )
-    with pytest.raises(
-        StructureError,
-        match=r"line 2: expected an atom of a .pdb with coordinates in columns 31 to 54, found",
-    ):
-        read(tmp_path, stars, "b.pdb")
 
 
 @pytest.mark.parametrize(
@@ -139,10 +139,9 @@ def test_coordinates_of_a_pdb_that_are_not_in_columns(tmp_path):
 def test_a_cryst1_that_is_no_box(box, tmp_path):
     truth = Truth(["spce"] * 3, 14)
     text = pdb(truth.atoms(), box)
-    same_molecules(read(tmp_path, text, "a.pdb", cell=truth.cell), truth, [SPECIES["spce"]], 0.002)
+    same_molecules(read(tmp_path, text, "a.pdb", cell=truth.cell), truth, 0.002)
     assert read(tmp_path, text, "a.pdb", periodic=False).cell is None
-    with pytest.raises(StructureError, match=r"has no box \(.*(CRYST1|no volume).*give \[box\]"):
-        read(tmp_path, text, "a.pdb")
+    unreadable(r"has no box \(.*(CRYST1|no volume).*give \[box\]", tmp_path, text, "a.pdb")
 
 
 @pytest.mark.parametrize(
@@ -159,7 +158,7 @@ def test_a_cryst1_in_free_format(box, tmp_path):
         box = "CRYST110000.00010000.00010000.000  90.00  90.00  90.00"
         truth.cell = 10000.0 * np.eye(3)
     found = read(tmp_path, pdb(truth.atoms(), box), "a.pdb")
-    same_molecules(found, truth, [SPECIES["spce"]], 0.002)
+    same_molecules(found, truth, 0.002)
     assert found.cell == pytest.approx(truth.cell)
 
 

@@ -3,9 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import ase
 import numpy as np
+import pytest
 
 from rigidmd.assemble.structure import read_structure
+from rigidmd.errors import StructureError
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene.models import Molecule, Site, load_model, molecule
 
@@ -108,6 +111,22 @@ class Truth:
             if massless or m.masses[s] > 0
         ]
 
+    def gro(self, atoms=None, *rest, **options) -> str:
+        return gro(atoms or self.atoms(), box_of(self.cell), *rest, **options)
+
+    def pdb(self, atoms=None, *rest, **options) -> str:
+        return pdb(atoms or self.atoms(), cryst1(self.cell), *rest, **options)
+
+    def xyz(self, atoms=None, *rest, **options) -> str:
+        return xyz(atoms or self.atoms(), self.cell, *rest, **options)
+
+    def ase(self, atoms=None) -> ase.Atoms:
+        _, elements, _, positions, _ = zip(*(atoms or self.atoms()), strict=True)
+        return ase.Atoms(elements, positions, cell=self.cell, pbc=True)
+
+    def wrapped(self):
+        return wrapped(self.atoms(), self.cell)
+
     def angular_momentum_body(self):
         return np.array(
             [
@@ -117,14 +136,14 @@ class Truth:
         )
 
 
-def same_molecules(found, truth: Truth, species: list[Molecule], error: float, cell=None):
+def same_molecules(found, truth: Truth, error: float, species=("spce",)):
     """Every molecule is found once, all sites of all kinds in place modulo the lattice. Returns the
     pairing."""
-    cell = truth.cell if cell is None else cell
+    species = models(species)
 
     def apart(a, b):
-        step = (a - b) @ np.linalg.inv(cell)
-        return np.linalg.norm((step - np.round(step)) @ cell, axis=-1)
+        step = (a - b) @ np.linalg.inv(truth.cell)
+        return np.linalg.norm((step - np.round(step)) @ truth.cell, axis=-1)
 
     assert len(found.species) == len(truth.species)
     distance = apart(found.position[:, None], truth.centre)
@@ -210,12 +229,28 @@ def wrapped(atoms, cell):
     return [(name, e, k, wrap(x), v) for name, e, k, x, v in atoms]
 
 
+def models(species) -> list[Molecule]:
+    return [SPECIES[kind] if isinstance(kind, str) else kind for kind in species]
+
+
 def read(
-    tmp_path: Path, text: str, name: str, species=("spce",), cell=None, periodic=True, **options
+    folder: Path,
+    content: str | bytes,
+    name: str,
+    species=("spce",),
+    cell=None,
+    periodic=True,
+    **options,
 ):
-    (tmp_path / name).write_text(text)
-    models = [SPECIES[s] if isinstance(s, str) else s for s in species]
-    return read_structure(tmp_path / name, models, cell, periodic, TOLERANCE, **options)
+    """The start in a file with this content."""
+    (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+    return read_structure(folder / name, models(species), cell, periodic, TOLERANCE, **options)
+
+
+def unreadable(message: str, *file, **options) -> None:
+    """The file, given as for `read`, is refused with this message."""
+    with pytest.raises(StructureError, match=message):
+        read(*file, **options)
 
 
 NAMES = [
@@ -391,4 +426,4 @@ def as_g96(rows, cell, velocity=None) -> str:
 
 
 WATERS = Truth(["spce"] * 4)
-GRO = gro(WATERS.atoms(), box_of(WATERS.cell))
+GRO = WATERS.gro()
