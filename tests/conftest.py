@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 import rigidmd
+from rigidmd.commands.cli import main
 
 # Tests run on all cores: a second process for each that compiles would only take time from the
 # others.
@@ -50,6 +51,17 @@ def reference() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no outside reference data at {folder} (RIGIDMD_REFERENCE names it)")
     return folder
+
+
+@pytest.fixture
+def printed(capsys):
+    """What a command of rigidmd prints: `printed("check", scene, code=2).err`."""
+
+    def run(*words, code=0):
+        assert main([str(word) for word in words]) == code
+        return capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture(autouse=True)

@@ -376,14 +376,13 @@ def test_the_error_of_velocity_verlet_is_known():
 
 
 @pytest.mark.parametrize("edge", [40.0, 200.0])
-def test_a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid(edge, capsys):
+def test_a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid(edge, printed):
     """The mean density of the box would allow errors that a droplet or a pair of molecules in a gas
     does not have."""
     path = ROOT / "systems" / "water_from_structure.toml"
-    assert (
-        main(["energy", str(path), "--accuracy", "--json", "--set", f"box.lengths_A={edge}"]) == 0
-    )
-    found = json.loads(capsys.readouterr().out)["accuracy"]
+    found = json.loads(
+        printed("energy", path, "--accuracy", "--json", "--set", f"box.lengths_A={edge}").out
+    )["accuracy"]
     assert 1e-7 < found["in_e2_per_A2"] < 5e-5
     scene = resolve(Scene.read(path, {"box.lengths_A": edge}))
     assert (
@@ -402,15 +401,14 @@ def test_a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid(edge, capsys):
     ],
 )
 def test_check_warns_of_an_order_that_the_truncation_does_not_allow(
-    integrator, forces, warned, tmp_path, capsys
+    integrator, forces, warned, tmp_path, printed
 ):
     forces = "".join(f"{key} = {json.dumps(value)}\n" for key, value in forces.items())
     text = f'[box]\nlengths_A = 40\n[[molecules]]\nmodel = "spce"\ncount = 8\n[forces]\n{forces}[start]\ntemperature_K = 300\n'
     (tmp_path / "s.toml").write_text(
         f'{text}[[stages]]\nduration_ps = 0.1\ntimestep_fs = 1\nintegrator = "{integrator}"\n'
     )
-    assert main(["check", str(tmp_path / "s.toml")]) == 0
-    assert ("forces jump to 0 at the cutoff" in capsys.readouterr().err) == warned
+    assert ("forces jump to 0 at the cutoff" in printed("check", tmp_path / "s.toml").err) == warned
 
 
 def test_the_scene_of_a_run_has_no_keys_that_do_nothing(tmp_path):
@@ -524,15 +522,14 @@ def test_a_default_step_that_contradicts_another_key_is_told_with_its_length():
     assert build(scene(fields=field, stages=stages)).scene.stages[0].timestep_fs == 3
 
 
-def test_a_run_keeps_its_default_step_and_check_tells_its_error(tmp_path, capsys):
+def test_a_run_keeps_its_default_step_and_check_tells_its_error(tmp_path, printed):
     path = tmp_path / "water.toml"
     path.write_text(
         "box.lengths_A = 13.0\nforces.cutoff_A = 6.0\n[[molecules]]\nmodel = 'spce'\ncount = 64\n"
         "[[stages]]\nensemble = 'nvt'\ntemperature_K = 298.15\nduration_ps = 0.02\n"
         "[[stages]]\nduration_ps = 0.02\n"
     )
-    assert main(["check", str(path)]) == 0
-    out = capsys.readouterr().out
+    out = printed("check", path).out
     error = "time-step error: spce rotates about its lightest axis as if forces were wrong by"
     assert "0: nvt: 5 steps of 4 fs = 0.02 ps, baoab" in out
     assert f"{error} 4 %. Bias of U about 0.004 kT per degree of freedom" in out

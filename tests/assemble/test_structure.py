@@ -31,7 +31,6 @@ from support.structures import (
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.structure import read_structure
-from rigidmd.commands.cli import main
 from rigidmd.core.state_file import write_state
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.io.trajectory_file import TrajectoryFile, write_topology
@@ -602,7 +601,7 @@ def test_a_bad_structure_file(change, expected, capsys, tmp_path):
 
 
 @pytest.mark.parametrize(("share", "code"), [(0.59, 2), (0.61, 0)])
-def test_sites_overlap_within_six_tenths_of_their_diameter(share, code, capsys, tmp_path):
+def test_sites_overlap_within_six_tenths_of_their_diameter(share, code, printed, tmp_path):
     sigma = load_model("argon").sigma[0]
     (tmp_path / "two.xyz").write_text(
         f"2\n\nAr 5.0 5.0 5.0\nAr {5.0 + share * sigma:.9f} 5.0 5.0\n"
@@ -611,8 +610,9 @@ def test_sites_overlap_within_six_tenths_of_their_diameter(share, code, capsys, 
         "box.lengths_A = 20.0\nforces.cutoff_A = 8.0\nstructure.file = 'two.xyz'\n"
         "start.temperature_K = 90.0\n[[molecules]]\nmodel = 'argon'\n[[stages]]\nduration_ps = 0.01\n"
     )
-    assert main(["check", str(tmp_path / "two.toml")]) == code
-    assert ("molecules 1 and 2 overlap" in capsys.readouterr().err) == (code == 2)
+    assert (
+        "molecules 1 and 2 overlap" in printed("check", tmp_path / "two.toml", code=code).err
+    ) == (code == 2)
 
 
 def test_the_box_of_the_scene_counts_for_a_saved_state_too(tmp_path):

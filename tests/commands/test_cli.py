@@ -17,45 +17,34 @@ from rigidmd.errors import SceneError
 from rigidmd.scene import Scene
 
 
-def test_the_commands(capsys, tmp_path):
+def test_the_commands(printed, tmp_path):
     water = str(ROOT / "systems" / "water.toml")
-    assert main(["check", water]) == 0
-    assert "1293 = 645 translation + 648 rotation" in capsys.readouterr().out
-    assert main(["check", str(ROOT / "systems" / "argon.toml")]) == 0
-    out = capsys.readouterr().out
+    assert "1293 = 645 translation + 648 rotation" in printed("check", water).out
+    out = printed("check", ROOT / "systems" / "argon.toml").out
     assert "charges: no site has one" in out
     assert "rotation and torques: every molecule is a point" in out
-    assert main(["models"]) == 0
-    assert "2.351" in capsys.readouterr().out  # the dipole of SPC/E
-    assert main(["schema"]) == 0
+    assert "2.351" in printed("models").out  # the dipole of SPC/E
     schema = json.loads(
-        capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON")
+        printed("schema").out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON")
     )
     assert "timestep_fs" in schema["$defs"]["Stage"]["properties"]
-    assert (
-        main(
-            [
-                "check",
-                water,
-                "--set",
-                "stages.production.timestep_fs=4",
-                "--set",
-                "molecules.0.model=tip3p",
-            ]
-        )
-        == 0
-    )
-    out = capsys.readouterr().out
+    out = printed(
+        "check",
+        water,
+        "--set",
+        "stages.production.timestep_fs=4",
+        "--set",
+        "molecules.0.model=tip3p",
+    ).out
     assert "5000 steps of 4 fs" in out
     assert "216 tip3p" in out
 
 
-def test_energy_of_the_dimer_in_every_unit(capsys):
+def test_energy_of_the_dimer_in_every_unit(printed):
     dimer = str(ROOT / "systems" / "water_dimer.toml")
     found = {}
     for unit in ("kJ/mol", "kcal/mol", "eV", "K"):
-        assert main(["energy", dimer, "--json", "--unit", unit]) == 0
-        found[unit] = json.loads(capsys.readouterr().out)
+        found[unit] = json.loads(printed("energy", dimer, "--json", "--unit", unit).out)
     assert found["kJ/mol"]["potential"] == pytest.approx(-30.124, abs=2e-3)
     assert found["kcal/mol"]["potential"] == pytest.approx(found["kJ/mol"]["potential"] / 4.184)
     assert found["eV"]["potential"] == pytest.approx(found["kJ/mol"]["potential"] / 96.48533212)
@@ -63,8 +52,7 @@ def test_energy_of_the_dimer_in_every_unit(capsys):
         found["kJ/mol"]["potential"] / 0.00831446261815324
     )
     assert found["kJ/mol"]["largest_force_per_A"] < 0.02  # a minimum, to the file's six digits
-    assert main(["energy", dimer]) == 0
-    assert "lennard jones" in capsys.readouterr().out
+    assert "lennard jones" in printed("energy", dimer).out
 
 
 def test_help_is_quick_and_imports_nothing_heavy():
@@ -74,7 +62,7 @@ def test_help_is_quick_and_imports_nothing_heavy():
     assert "example" in done.stdout
 
 
-def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys):
+def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys, printed):
     (tmp_path / "greet.py").write_text(
         "from rigidmd.commands.arguments import command\n\n"
         "def arguments(parser):\n    parser.add_argument('name', metavar='NAME', help='whom to greet')\n\n"
@@ -89,8 +77,7 @@ def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys):
     assert listed.index("greet someone") < listed.index(
         "list the scenes"
     )  # position 5 is before all others
-    assert main(["greet", "Ada"]) == 3
-    assert capsys.readouterr().out == "hello Ada\n"
+    assert printed("greet", "Ada", code=3).out == "hello Ada\n"
     with pytest.raises(SystemExit):
         main(["gret"])
     assert "did you mean greet?" in capsys.readouterr().err.replace("'", "")
@@ -103,18 +90,17 @@ def test_version():
     assert done.stdout.strip() == f"rigidmd {rigidmd.__version__}"
 
 
-def test_output_goes_to_runs_by_default(tmp_path, monkeypatch, capsys):
+def test_output_goes_to_runs_by_default(tmp_path, monkeypatch, capsys, printed):
     monkeypatch.chdir(tmp_path)
     changes = ("stages.0.duration_ps=0.01", "stages.1.duration_ps=0.01", "output.figures=false")
     command = ["run", str(ROOT / "systems" / "argon.toml")]
     command += [part for change in changes for part in ("--set", change)]
     assert main(command) == 0
     assert (tmp_path / "runs" / "argon" / "summary.json").exists()
-    printed = capsys.readouterr().out
-    assert "argon: 500 molecules, 500 sites, 1497 degrees of freedom" in printed
-    assert "results in runs/argon" in printed
-    assert main(command) == 2
-    assert "--force" in capsys.readouterr().err
+    out = capsys.readouterr().out
+    assert "argon: 500 molecules, 500 sites, 1497 degrees of freedom" in out
+    assert "results in runs/argon" in out
+    assert "--force" in printed(*command, code=2).err
     assert main([*command, "--force"]) == 0
 
 
@@ -144,7 +130,7 @@ def test_output_goes_to_runs_by_default(tmp_path, monkeypatch, capsys):
     ],
 )
 @pytest.mark.parametrize("command", ["run", "check", "energy"])
-def test_a_file_that_is_no_scene_is_named(name, expected, command, capsys, tmp_path):
+def test_a_file_that_is_no_scene_is_named(name, expected, command, printed, tmp_path):
     path = tmp_path / name
     match name:
         case "empty":
@@ -154,27 +140,23 @@ def test_a_file_that_is_no_scene_is_named(name, expected, command, capsys, tmp_p
             (path / {"folder": "water.toml", "run": "scene.toml"}[name]).write_text("")
         case _:
             path.write_text("; comment\nintegrator = md\n")
-    assert main([command, str(path)]) == 2
-    assert expected in capsys.readouterr().err
+    assert expected in printed(command, path, code=2).err
 
 
-def test_an_unknown_integrator_of_the_command(capsys, tmp_path):
+def test_an_unknown_integrator_of_the_command(printed, tmp_path):
     (tmp_path / "good.toml").write_text(GOOD)
-    assert (
-        main(["accuracy", str(tmp_path / "good.toml"), "--integrators", "velocity_verlet,SRKN6"])
-        == 2
-    )
-    message = capsys.readouterr().err
+    message = printed(
+        "accuracy", tmp_path / "good.toml", "--integrators", "velocity_verlet,SRKN6", code=2
+    ).err
     assert (
         "--integrators: unknown integrator SRKN6; did you mean srkn_6? (known: velocity_verlet"
         in message
     )
 
 
-def test_the_command_and_the_scene_suggest_the_same_model(capsys, tmp_path):
+def test_the_command_and_the_scene_suggest_the_same_model(capsys, printed, tmp_path):
     scene = refused(capsys, tmp_path, GOOD.replace("spce", "SPC-EE"))
-    assert main(["models", "SPC-EE"]) == 2
-    command = capsys.readouterr().err
+    command = printed("models", "SPC-EE", code=2).err
     assert "did you mean spce?" in command
     assert scene.strip().endswith(command.removeprefix("rigidmd: models: ").strip())
 
@@ -193,11 +175,15 @@ def test_the_command_and_the_scene_suggest_the_same_model(capsys, tmp_path):
         ("mien.toml", "there is no such file; did you mean mine.toml?"),
     ],
 )
-def test_a_missing_scene(command, path, expected, capsys, monkeypatch, tmp_path):
+def test_a_missing_scene(command, path, expected, printed, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text(GOOD)
-    assert main([command, path, *(["--set", "seed=1,2"] if command == "sweep" else [])]) == 2
-    assert expected in capsys.readouterr().err
+    assert (
+        expected
+        in printed(
+            command, path, *(["--set", "seed=1,2"] if command == "sweep" else []), code=2
+        ).err
+    )
     with pytest.raises(SceneError, match="there is no such file"):
         Scene.read(path)
 
@@ -232,9 +218,8 @@ def test_a_command_line_that_is_not_known_suggests_what_is(words, expected, caps
         ("anlysis", "did you mean analysis?"),
     ],
 )
-def test_help_finds_words_in_chapters(word, expected, capsys):
-    assert main(["help", word]) == 2
-    assert expected in capsys.readouterr().err
+def test_help_finds_words_in_chapters(word, expected, printed):
+    assert expected in printed("help", word, code=2).err
 
 
 @pytest.mark.parametrize("until", ["1e999ps", "nanps", "-1ps"])
@@ -259,14 +244,13 @@ def test_times_of_the_command_line_are_finite(until, capsys):
     ],
 )
 @pytest.mark.parametrize("kind", ["molecules", "body"])
-def test_times_of_accuracy_are_in_their_range(kind, options, expected, capsys, tmp_path):
+def test_times_of_accuracy_are_in_their_range(kind, options, expected, printed, tmp_path):
     scene = tmp_path / "good.toml"
     scene.write_text(GOOD)
     if kind == "body":
         shutil.copy(ROOT / "systems" / "heavy_top_3.toml", scene)
         expected = expected.replace("1e-30 and 1e30", "1e-100 and 1e100")
-    assert main(["accuracy", str(scene), *options, "-o", str(tmp_path / "out")]) == 2
-    assert expected in capsys.readouterr().err
+    assert expected in printed("accuracy", scene, *options, "-o", tmp_path / "out", code=2).err
 
 
 @pytest.mark.parametrize(
@@ -276,7 +260,7 @@ def test_times_of_accuracy_are_in_their_range(kind, options, expected, capsys, t
         (["--timesteps", "1e-20"], "more than 1e+12 steps"),
     ],
 )
-def test_times_of_averages_are_in_their_range(options, expected, capsys, tmp_path):
+def test_times_of_averages_are_in_their_range(options, expected, printed, tmp_path):
     scene = ROOT / "systems" / "argon.toml"
     options = [
         "--averages",
@@ -288,8 +272,7 @@ def test_times_of_averages_are_in_their_range(options, expected, capsys, tmp_pat
         "-o",
         str(tmp_path / "out"),
     ]
-    assert main(["accuracy", str(scene), *options]) == 2
-    assert expected in capsys.readouterr().err
+    assert expected in printed("accuracy", scene, *options, code=2).err
 
 
 def test_the_help_tells_how_a_key_is_removed(capsys):

@@ -49,9 +49,8 @@ def test_the_scenes_shipped_are_those_of_systems():
         assert (SHIPPED / path.relative_to(ROOT / "systems")).read_bytes() == path.read_bytes()
 
 
-def test_examples_are_listed_by_kind_with_their_first_line(capsys):
-    assert main(["examples"]) == 0
-    scenes, _, _ = capsys.readouterr().out.partition("notebooks:")
+def test_examples_are_listed_by_kind_with_their_first_line(printed):
+    scenes, _, _ = printed("examples").out.partition("notebooks:")
     molecules, bodies = scenes.split("one body:")
     for path in SYSTEMS:
         about = path.read_text().splitlines()[0].removeprefix("# ")
@@ -64,10 +63,9 @@ def test_examples_are_listed_by_kind_with_their_first_line(capsys):
 
 
 @pytest.mark.parametrize("path", SYSTEMS, ids=lambda path: path.stem)
-def test_every_example_can_be_copied_and_read(path, tmp_path, monkeypatch, capsys):
+def test_every_example_can_be_copied_and_read(path, tmp_path, monkeypatch, printed):
     monkeypatch.chdir(tmp_path)
-    assert main(["new", path.stem]) == 0
-    said = capsys.readouterr().out
+    said = printed("new", path.stem).out
     assert f"rigidmd run {path.name}" in said
     copied = Scene.read(path.name)
     assert copied.model_dump() == Scene.read(path).model_dump()
@@ -76,35 +74,34 @@ def test_every_example_can_be_copied_and_read(path, tmp_path, monkeypatch, capsy
         assert file.read_bytes() == (path.parent / file).read_bytes()
 
 
-def test_a_copy_goes_where_it_is_asked_to_with_all_that_it_reads(tmp_path, capsys):
+def test_a_copy_goes_where_it_is_asked_to_with_all_that_it_reads(tmp_path, printed):
     target = tmp_path / "deep" / "mine.toml"
     assert main(["new", "water_dimer", "-o", str(target)]) == 0
     assert (tmp_path / "deep" / "structures" / "water_dimer.xyz").is_file()
-    assert main(["check", str(target)]) == 0
-    assert "mine: 2 molecules" in capsys.readouterr().out
+    assert "mine: 2 molecules" in printed("check", target).out
 
 
-def test_nothing_is_overwritten_unasked(tmp_path, monkeypatch, capsys):
+def test_nothing_is_overwritten_unasked(tmp_path, monkeypatch, printed):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "structures").mkdir()
     own = tmp_path / "structures" / "water_dimer.xyz"
     own.write_text("mine")
-    assert main(["new", "water_dimer"]) == 2
-    assert "structures/water_dimer.xyz exists; --force replaces it" in capsys.readouterr().err
+    assert (
+        "structures/water_dimer.xyz exists; --force replaces it"
+        in printed("new", "water_dimer", code=2).err
+    )
     assert sorted(tmp_path.rglob("*.toml")) == []
     assert main(["new", "argon"]) == 0
     (tmp_path / "argon.toml").write_text("mine")
-    assert main(["new", "argon"]) == 2
-    assert "argon.toml exists; --force replaces it" in capsys.readouterr().err
+    assert "argon.toml exists; --force replaces it" in printed("new", "argon", code=2).err
     assert (tmp_path / "argon.toml").read_text() == "mine"
     assert main(["new", "argon", "--force"]) == 0
     assert (tmp_path / "argon.toml").read_bytes() == (ROOT / "systems" / "argon.toml").read_bytes()
 
 
-def test_the_name_of_a_series_is_its_first_scene(tmp_path, monkeypatch, capsys):
+def test_the_name_of_a_series_is_its_first_scene(tmp_path, monkeypatch, printed):
     monkeypatch.chdir(tmp_path)
-    assert main(["new", "heavy_top"]) == 0
-    said = capsys.readouterr().out
+    said = printed("new", "heavy_top").out
     assert "heavy_top_7). This is heavy_top_1" in said
     assert (tmp_path / "heavy_top_1.toml").read_bytes() == (
         ROOT / "systems" / "heavy_top_1.toml"
@@ -123,11 +120,10 @@ def test_the_name_of_a_series_is_its_first_scene(tmp_path, monkeypatch, capsys):
         (["water", "-o", "file/mine.toml"], ["file/mine.toml cannot be written"]),
     ],
 )
-def test_what_cannot_be_copied_is_said(arguments, expected, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_copied_is_said(arguments, expected, tmp_path, monkeypatch, printed):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
-    assert main(["new", *arguments]) == 2
-    out, err = capsys.readouterr()
+    out, err = printed("new", *arguments, code=2)
     assert out == ""
     assert all(part in err for part in expected), err
     assert [path.name for path in tmp_path.rglob("*")] == ["file"]

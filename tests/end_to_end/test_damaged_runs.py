@@ -162,11 +162,10 @@ def test_any_value_of_a_summary(which, request, tmp_path):
     ],
 )
 @pytest.mark.parametrize("command", ["report", "view", "film", "analyse"])
-def test_a_damaged_summary_is_named_with_its_field(command, text, said, argon, tmp_path, capsys):
+def test_a_damaged_summary_is_named_with_its_field(command, text, said, argon, tmp_path, printed):
     folder = copied(argon, tmp_path)
     (folder / "summary.json").write_text(text, errors="surrogatepass")
-    assert cli.main([command, str(folder)]) == 2
-    message = capsys.readouterr().err
+    message = printed(command, folder, code=2).err
     assert f"{folder / 'summary.json'}" in message
     assert said in message
     assert message.count("\n") == 1
@@ -304,7 +303,7 @@ def test_a_pipe_hangs_no_command(command, name, argon, tmp_path, capsys):
     "name", ["log.csv", "summary.json", "trajectory.xtc", "scene.toml", "rdf.csv"]
 )
 @pytest.mark.parametrize("command", ["report", "view", "analyse", "resume", "film"])
-def test_no_link_out_of_the_folder_of_a_run_is_followed(command, name, argon, tmp_path, capsys):
+def test_no_link_out_of_the_folder_of_a_run_is_followed(command, name, argon, tmp_path, printed):
     folder = copied(argon, tmp_path)
     elsewhere = tmp_path / "elsewhere"
     if (folder / name).exists():
@@ -312,8 +311,7 @@ def test_no_link_out_of_the_folder_of_a_run_is_followed(command, name, argon, tm
     else:
         elsewhere.write_text("salary_of_alice,r (Å)\n1,2\n")
     (folder / name).symlink_to(elsewhere)
-    assert cli.main([command, str(folder)]) == 2
-    said = capsys.readouterr()
+    said = printed(command, folder, code=2)
     assert (
         f"{folder / name} is a link out of its folder" in said.err
         and "salary" not in said.out + said.err

@@ -293,7 +293,7 @@ def test_a_run_that_was_killed_at_its_first_file_begins_again(scene, tmp_path):
 
 
 @pytest.mark.parametrize("of", [MemoryError, KeyboardInterrupt])
-def test_what_a_library_makes_an_error_of_another_type_is_reported(of, scene, monkeypatch, capsys):
+def test_what_a_library_makes_an_error_of_another_type_is_reported(of, scene, monkeypatch, printed):
     """zipfile raises ValueError where memory ends."""
 
     def read(*given, **more):
@@ -303,8 +303,7 @@ def test_what_a_library_makes_an_error_of_another_type_is_reported(of, scene, mo
             raise ValueError("an open file is in the way")  # noqa: B904
 
     monkeypatch.setattr(rigidmd.Scene, "read", read)
-    assert cli.main(["check", str(scene)]) == (2 if of is MemoryError else 130)
-    said = capsys.readouterr().err
+    said = printed("check", scene, code=2 if of is MemoryError else 130).err
     assert (
         "not enough memory" if of is MemoryError else "interrupted"
     ) in said and "way" not in said

@@ -224,11 +224,10 @@ def test_a_scene_that_is_a_pipe_or_too_large(tmp_path):
         Scene.read(tmp_path / "large.toml")
 
 
-def test_control_characters_of_a_model_are_not_printed(capsys, tmp_path):
+def test_control_characters_of_a_model_are_not_printed(printed, tmp_path):
     sites = '[[sites]]\nname = "A"\nmass_u = 1.0\nposition_A = [0.0, 0.0, 0.0]\n'
     (tmp_path / "m.toml").write_text(f'name = "\\u001b[31mevil\\u202e"\n{sites}')
-    assert main(["models", str(tmp_path / "m.toml")]) == 2
-    message = capsys.readouterr().err
+    message = printed("models", tmp_path / "m.toml", code=2).err
     assert "\x1b" not in message and "line 1: name: is '\\x1b[31mevil\\u202e'" in message
     (tmp_path / "m.toml").write_text(f"x = {DEEP}\n")
     with pytest.raises(MoleculeError, match="more than 32 deep"):
@@ -388,9 +387,8 @@ def test_an_end_or_a_folder_that_cannot_be(options, expected, capsys, tmp_path):
         "virial argon --temperatures 300 -o NAME.csv",
     ],
 )
-def test_a_name_that_is_too_long_for_a_file(command, capsys):
-    assert main(command.replace("NAME", "a" * 300).split()) == 2
-    message = capsys.readouterr().err
+def test_a_name_that_is_too_long_for_a_file(command, printed):
+    message = printed(*command.replace("NAME", "a" * 300).split(), code=2).err
     assert message.startswith("rigidmd: ") and "File name too long" in message
 
 

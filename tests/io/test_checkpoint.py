@@ -28,7 +28,7 @@ from rigidmd.run.resume import state_from
 from rigidmd.scene import Scene
 
 
-def test_a_checkpoint_of_another_version_is_refused(again, capsys):
+def test_a_checkpoint_of_another_version_is_refused(again, printed):
     kept = read_checkpoint(again / "run" / CHECKPOINT)
     for schema, age in ((1, "an earlier"), (3, "an earlier"), (99, "a later")):
         name_of_values = "values" if schema > 3 else "told"
@@ -41,10 +41,9 @@ def test_a_checkpoint_of_another_version_is_refused(again, capsys):
             with zipfile.ZipFile(again / "run" / name, "a") as archive:
                 archive.writestr("contents", checkpoint._contents(archive))
         before = everything(again / "run")
-        assert cli.main(["resume", str(again / "run")]) == 2
         assert (
             f"was written by {age} rigidmd (version {schema} of the format"
-            in capsys.readouterr().err
+            in printed("resume", again / "run", code=2).err
         )
         assert everything(again / "run") == before
 
@@ -222,7 +221,7 @@ def test_wrong_numbers_in_a_checkpoint_are_refused(kind, count, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["flipped", "cut", "empty"])
-def test_a_damaged_checkpoint_gives_way_to_the_one_before(damage, again, capsys):
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(damage, again, printed):
     path = again / "run" / CHECKPOINT
     data = bytearray(path.read_bytes())
     with zipfile.ZipFile(path) as archive:
@@ -233,8 +232,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(damage, again, capsys)
     path.write_bytes(
         {"flipped": bytes(data), "cut": bytes(data[: len(data) // 3]), "empty": b""}[damage]
     )
-    assert cli.main(["resume", str(again / "run")]) == 0
-    said = capsys.readouterr().err
+    said = printed("resume", again / "run").err
     assert "checkpoint.npz: is damaged" in said and "The checkpoint before it is used" in said
     shutil.copy(again / "run" / CHECKPOINT, again / "run" / "kept.npz")
     for name in (CHECKPOINT, PREVIOUS):
@@ -280,13 +278,14 @@ def test_an_array_of_another_checkpoint_is_seen(size, tmp_path):
         read_checkpoint(one)
 
 
-def test_a_folder_without_a_checkpoint(again, capsys):
+def test_a_folder_without_a_checkpoint(again, printed):
     for name in (CHECKPOINT, PREVIOUS):
         (again / "run" / name).unlink()
-    assert cli.main(["resume", str(again / "run")]) == 2
-    assert "holds no checkpoint (it holds final.npz, log.csv" in capsys.readouterr().err
-    assert cli.main(["resume", str(again)]) == 2
-    assert "is not the folder of a run" in capsys.readouterr().err
+    assert (
+        "holds no checkpoint (it holds final.npz, log.csv"
+        in printed("resume", again / "run", code=2).err
+    )
+    assert "is not the folder of a run" in printed("resume", again, code=2).err
 
 
 def test_a_checkpoint_of_other_columns_has_another_schema():

@@ -20,20 +20,17 @@ from rigidmd.io.folder import FolderLock, check_folder
 from rigidmd.run import Every, Simulation
 
 
-def test_output_folders(capsys, tmp_path):
+def test_output_folders(printed, tmp_path):
     full = tmp_path / "mine"
     full.mkdir()
     (full / "thesis.txt").write_text("years of work")
     scene = tmp_path / "good.toml"
     scene.write_text(GOOD)
     for force in ([], ["--force"]):
-        assert main(["run", str(scene), "-o", str(full), *force]) == 2
-        assert "holds no earlier run" in capsys.readouterr().err
+        assert "holds no earlier run" in printed("run", scene, "-o", full, *force, code=2).err
         assert (full / "thesis.txt").read_text() == "years of work"
-    assert main(["run", str(scene), "-o", str(scene)]) == 2
-    assert "is a file" in capsys.readouterr().err
-    assert main(["run", str(scene), "-o", "/proc/here/there"]) == 2
-    assert "cannot be" in capsys.readouterr().err
+    assert "is a file" in printed("run", scene, "-o", scene, code=2).err
+    assert "cannot be" in printed("run", scene, "-o", "/proc/here/there", code=2).err
 
 
 @pytest.mark.parametrize(
@@ -56,7 +53,7 @@ def test_a_folder_with_a_checkpoint_names_the_command_that_continues_it(names, r
     assert (f"`rigidmd resume {tmp_path}` continues it" in str(refused.value)) == resumes
 
 
-def test_force_removes_only_what_a_run_wrote_and_never_its_own_inputs(capsys, tmp_path):
+def test_force_removes_only_what_a_run_wrote_and_never_its_own_inputs(printed, tmp_path):
     scene = tmp_path / "good.toml"
     scene.write_text(GOOD)
     out = tmp_path / "out"
@@ -65,11 +62,15 @@ def test_force_removes_only_what_a_run_wrote_and_never_its_own_inputs(capsys, tm
     assert main(["run", str(scene), "-o", str(out), "--force"]) == 0
     assert (out / "notes.txt").read_text() == "mine"
     kept = {path.name: path.read_bytes() for path in out.iterdir()}
-    assert main(["run", str(out / "scene.toml"), "-o", str(out), "--force"]) == 2
-    assert "is an input of this run" in capsys.readouterr().err
+    assert (
+        "is an input of this run"
+        in printed("run", out / "scene.toml", "-o", out, "--force", code=2).err
+    )
     restart = ["--set", f"structure.file={out / 'final.npz'}", "--set", "box.lengths_A=20.0"]
-    assert main(["run", str(scene), *restart, "-o", str(out), "--force"]) == 2
-    assert "is an input of this run" in capsys.readouterr().err
+    assert (
+        "is an input of this run"
+        in printed("run", scene, *restart, "-o", out, "--force", code=2).err
+    )
     assert {path.name: path.read_bytes() for path in out.iterdir()} == kept
     project = tmp_path / "project"
     project.mkdir()
@@ -170,7 +171,7 @@ def test_a_file_that_grows_replaces_what_has_its_name(tmp_path):
         ("log.csv", None),
     ],
 )
-def test_force_replaces_only_what_a_run_has_written(name, setting, again, capsys):
+def test_force_replaces_only_what_a_run_has_written(name, setting, again, printed):
     run = again / "run"
     marker = run / ".rigidmd-run"
     marker.write_text(
@@ -189,8 +190,7 @@ def test_force_replaces_only_what_a_run_has_written(name, setting, again, capsys
         and "pressure" not in setting
         else ("--force",)
     ):
-        assert cli.main(["run", str(again / "water.toml"), "-o", str(run), how, *more]) == 2
-        said = capsys.readouterr().err
+        said = printed("run", again / "water.toml", "-o", run, how, *more, code=2).err
         assert (
             f"{name} exists, was not written by rigidmd, and would be replaced" in said
             and "compiling" not in said
@@ -213,13 +213,12 @@ def test_force_replaces_only_what_an_export_has_written(again, capsys):
     )
 
 
-def test_one_run_at_a_time_writes_into_a_folder(again, capsys):
+def test_one_run_at_a_time_writes_into_a_folder(again, printed):
     lock = FolderLock(again / "run")
     lock.take()
     command = ["run", str(again / "water.toml"), "-o", str(again / "run")]
     for more in ("--force", "--resume"):
-        assert cli.main([*command, more]) == 2
-        assert "another run is writing in" in capsys.readouterr().err
+        assert "another run is writing in" in printed(*command, more, code=2).err
     lock.release()
 
 

@@ -6,7 +6,6 @@ import numba
 import pytest
 from support.common import ROOT, small_scene
 
-from rigidmd.commands.cli import main
 from rigidmd.compile.cache import CacheIndex
 from rigidmd.io import progress, run_files
 from rigidmd.run import Every, Simulation, molecular
@@ -47,7 +46,7 @@ def test_lines_of_the_log_are_written_together_but_soon(tmp_path, monkeypatch):
     assert lines() == 66
 
 
-def test_compiling_is_announced_without_a_terminal(tmp_path, monkeypatch, capsys):
+def test_compiling_is_announced_without_a_terminal(tmp_path, monkeypatch, printed):
     """A run that waits for the compiler states so, once."""
     prepare = MolecularRun.prepare
     index = CacheIndex(str(tmp_path), "kernel", 0)
@@ -59,8 +58,7 @@ def test_compiling_is_announced_without_a_terminal(tmp_path, monkeypatch, capsys
 
     monkeypatch.setattr(MolecularRun, "prepare", compile_first)
     scene = [str(ROOT / "systems" / "argon.toml"), "--set", "stages.0.duration_ps=0.01"]
-    assert main(["run", *scene, "-o", str(tmp_path / "out")]) == 0
-    lines = capsys.readouterr().err.splitlines()
+    lines = printed("run", *scene, "-o", tmp_path / "out").err.splitlines()
     assert len([line for line in lines if "compiling (" in line]) == 1
 
 

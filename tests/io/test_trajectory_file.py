@@ -19,7 +19,6 @@ from rigidmd import formats
 from rigidmd.analysis.rigid_frames import without_rounding
 from rigidmd.assemble.build import build
 from rigidmd.assemble.structure import read_structure
-from rigidmd.commands import cli
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NO_CELL, edges_and_angles
 from rigidmd.errors import SceneError, SimulationError, StructureError
@@ -270,7 +269,7 @@ def test_the_last_frame_of_a_trajectory(ending, names, tmp_path):
         (".xtc", "not a structure", "name a structure file with names"),
     ],
 )
-def test_what_cannot_be_a_start(ending, fault, said, tmp_path, capsys, monkeypatch):
+def test_what_cannot_be_a_start(ending, fault, said, tmp_path, printed, monkeypatch):
     folder = tmp_path / "scene"
     folder.mkdir()
     path = make(folder, ending)[0]
@@ -308,8 +307,7 @@ def test_what_cannot_be_a_start(ending, fault, said, tmp_path, capsys, monkeypat
             more = 'topology = "old.xtc"'
     file = folder / "scene.toml"
     file.write_text(TEXT.replace('"old.xtc"', f'"old{ending}"\n{more}'))
-    assert cli.main(["check", str(file)]) == 2
-    error = capsys.readouterr().err
+    error = printed("check", file, code=2).err
     assert said in error
     assert "Traceback" not in error
 

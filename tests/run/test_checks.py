@@ -13,7 +13,6 @@ from support.processes import search_path
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.harmonic import stable_angle
-from rigidmd.commands.cli import main
 from rigidmd.core.integrators import KICK, SCHEMES
 from rigidmd.core.state import NOW
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
@@ -44,14 +43,13 @@ def water(timestep, *, watch=None, stages=None, count=40):
     return small_scene({"spce": count}, 18.5, stages=stages, watch=watch or {})
 
 
-def test_too_long_a_step_stops_with_all_that_helps(tmp_path, capsys):
+def test_too_long_a_step_stops_with_all_that_helps(tmp_path, printed):
     (tmp_path / "hot.toml").write_text(
         '[box]\nlengths_A = 18.5\n[[molecules]]\nmodel = "spce"\ncount = 40\n'
         '[[stages]]\nensemble = "nvt"\ntemperature_K = 300\nduration_ps = 0.2\ntimestep_fs = 2\n'
         "[[stages]]\nduration_ps = 20\ntimestep_fs = 25\n"
     )
-    assert main(["run", str(tmp_path / "hot.toml"), "-o", str(tmp_path / "out")]) == 1
-    said = capsys.readouterr().err
+    said = printed("run", tmp_path / "hot.toml", "-o", tmp_path / "out", code=1).err
     assert "Traceback" not in said
     for part in (
         "warning: stages.1: timestep_fs = 25 is longer than what is stable",
@@ -472,7 +470,7 @@ def top(**overrides):
     )
 
 
-def test_a_body_whose_energy_goes_wrong(tmp_path, capsys):
+def test_a_body_whose_energy_goes_wrong(tmp_path, printed):
     wrong = dict(
         run__timestep_s=0.2,
         run__duration_s=100.0,
@@ -494,16 +492,17 @@ def test_a_body_whose_energy_goes_wrong(tmp_path, capsys):
         for key, value in wrong.items()
         for part in ("--set", f"{key.replace('__', '.')}={value}")
     ]
-    assert main(["run", str(TOP), "-o", str(tmp_path / "again"), *sets]) == 1
-    assert "rigidmd: stopped at step 500" in capsys.readouterr().err
+    assert (
+        "rigidmd: stopped at step 500"
+        in printed("run", TOP, "-o", tmp_path / "again", *sets, code=1).err
+    )
     assert Simulation(top(**wrong, watch__energy=False)).run().summary[
         "stable_timestep_s"
     ] == pytest.approx(0.085, rel=1e-3)
 
 
-def test_the_start_of_a_body_can_be_asked_for_at_any_step(capsys):
-    assert main(["energy", str(TOP), "--set", "run.timestep_s=1.0"]) == 0
-    assert "kinetic" in capsys.readouterr().out
+def test_the_start_of_a_body_can_be_asked_for_at_any_step(printed):
+    assert "kinetic" in printed("energy", TOP, "--set", "run.timestep_s=1.0").out
 
 
 def test_a_body_that_is_lost_turns_too_far_or_loses_q():

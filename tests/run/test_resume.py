@@ -113,7 +113,7 @@ def test_pme_goes_on(tmp_path):
 
 
 @pytest.mark.parametrize("integrator", ["velocity_verlet", "rk4", "dop853"])
-def test_a_body_goes_on(integrator, capsys, tmp_path):
+def test_a_body_goes_on(integrator, printed, tmp_path):
     data = top(integrator)
     looks = Every(0.005, lambda moment: None)
     Simulation(Scene.from_dict(data), tmp_path / "whole", observers=looks).run()
@@ -128,20 +128,21 @@ def test_a_body_goes_on(integrator, capsys, tmp_path):
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
     assert [name for name in whole if whole[name] != parts[name]] == []
     assert cli.main(["compare", str(tmp_path / "whole"), str(tmp_path / "parts")]) == 0
-    assert cli.main(["resume", str(tmp_path / "parts")]) == 0
-    assert "had ended at step 100: writing" in capsys.readouterr().err  # nothing of --until
+    assert (
+        "had ended at step 100: writing" in printed("resume", tmp_path / "parts").err
+    )  # nothing of --until
     motion = tmp_path / "parts" / "motion.csv"
     *lines, last = motion.read_text().splitlines()
     motion.write_text("\n".join([*lines, last[: last.rindex(",")] + ",0.125"]) + "\n")
     assert cli.main(["compare", str(tmp_path / "whole"), str(tmp_path / "parts")]) == 1
 
 
-def test_the_command_resume_goes_on_and_lengthens(again, capsys):
+def test_the_command_resume_goes_on_and_lengthens(again, capsys, printed):
     folder = str(again / "run")
-    assert cli.main(["resume", folder]) == 0
-    assert "continuing from step" in capsys.readouterr().err
-    assert cli.main(["resume", folder]) == 0
-    assert re.search(r"had ended at step \d+ \(--until lengthens it\)", capsys.readouterr().err)
+    assert "continuing from step" in printed("resume", folder).err
+    assert re.search(
+        r"had ended at step \d+ \(--until lengthens it\)", printed("resume", folder).err
+    )
     assert read_checkpoint(again / "run" / CHECKPOINT).values["of"]["run"]["position"]["first"] == 0
     assert (
         cli.main(["run", str(again / "water.toml"), "-o", folder, "--resume", "--until", "0.12ps"])
@@ -152,8 +153,7 @@ def test_the_command_resume_goes_on_and_lengthens(again, capsys):
     ]
     assert steps == list(range(0, 121, 10))
     capsys.readouterr()
-    assert cli.main(["resume", folder, "--until", "0.05ps"]) == 2
-    assert "already longer, 120 steps" in capsys.readouterr().err
+    assert "already longer, 120 steps" in printed("resume", folder, "--until", "0.05ps", code=2).err
 
 
 def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
@@ -178,16 +178,14 @@ def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
     ]
 
 
-def test_compare_reports_where_two_runs_diverge(again, stopped, tmp_path, capsys):
+def test_compare_reports_where_two_runs_diverge(again, stopped, tmp_path, capsys, printed):
     """A run and itself, its continuation, and a run of another scene whose log was changed in a
     bit."""
     one, other = str(stopped / "run"), again / "run"
-    assert cli.main(["compare", one, str(other)]) == 0
-    assert "the runs are the same to the last bit\n" in capsys.readouterr().out
+    assert "the runs are the same to the last bit\n" in printed("compare", one, other).out
     assert cli.main(["resume", str(other)]) == 0
     capsys.readouterr()
-    assert cli.main(["compare", one, str(other)]) == 1
-    said = capsys.readouterr().out
+    said = printed("compare", one, other, code=1).out
     assert "7 and 11 samples, 7 in common, the same to the last bit" in said
     assert "position by up to" in said and "over their common samples" in said
     log = other / "log.csv"
@@ -197,15 +195,12 @@ def test_compare_reports_where_two_runs_diverge(again, stopped, tmp_path, capsys
     log.write_text("\n".join(",".join(line) for line in lines) + "\n")
     scene = other / "scene.toml"
     scene.write_text(scene.read_text().replace("seed = 1", "seed = 5"))
-    assert cli.main(["compare", one, str(other)]) == 1
-    said = capsys.readouterr().out
+    said = printed("compare", one, other, code=1).out
     assert "seed: 1 and 5" in said
     assert "the runs diverge at Step 20, sample 3 of 7" in said and "last 1 of 53 bits" in said
-    assert cli.main(["compare", one, str(other), "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(printed("compare", one, other, "--json", code=1).out)
     assert [cell["column"] for cell in told["samples"]["first"]] == ["Kinetic Energy (kJ/mole)"]
-    assert cli.main(["compare", one, str(tmp_path)]) == 2
-    assert "is not the folder of a run" in capsys.readouterr().err
+    assert "is not the folder of a run" in printed("compare", one, tmp_path, code=2).err
 
 
 def test_the_summary_tells_what_a_run_was_made_with(stopped):
@@ -224,13 +219,12 @@ def test_the_summary_tells_what_a_run_was_made_with(stopped):
     assert provenance.scene_digest(own.model_copy(update={"seed": 2})) != told["scene_sha256"]
 
 
-def test_another_version_is_told(again, capsys):
+def test_another_version_is_told(again, printed):
     kept = read_checkpoint(again / "run" / CHECKPOINT)
     del kept.values["with"]["scipy_version"]  # earlier versions of rigidmd did not name it
     kept.values["with"] |= {"numba_version": "0.1", "rocket_fft_version": "0.2"}
     write_checkpoint(again / "run", kept)
-    assert cli.main(["resume", str(again / "run")]) == 0
-    written = capsys.readouterr().err
+    written = printed("resume", again / "run").err
     assert "computed with numba 0.1 there, " in written
     assert "; rocket fft 0.2 there, " in written and "scipy" not in written
 
@@ -249,10 +243,9 @@ def test_an_input_that_changes_meanwhile_is_the_one_that_was_read(stopped, tmp_p
     }
 
 
-def test_another_scene_is_not_gone_on_with(again, capsys):
+def test_another_scene_is_not_gone_on_with(again, printed):
     command = ["run", str(again / "water.toml"), "-o", str(again / "run"), "--resume"]
-    assert cli.main([*command, "--set", "stages.0.timestep_fs=0.5", "--set", "seed=3"]) == 2
-    said = capsys.readouterr().err
+    said = printed(*command, "--set", "stages.0.timestep_fs=0.5", "--set", "seed=3", code=2).err
     assert "stages.0.timestep_fs is 0.5, there 1.0" in said and "seed is 3, there 1" in said
     before = contents(again / "run")
     assert cli.main([*command, "--set", "threads=2"]) == 0
@@ -328,7 +321,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_a_refused_resume_changes_nothing(case, again, capsys):
+def test_a_refused_resume_changes_nothing(case, again, printed):
     """Neither a summary nor frames beyond the checkpoint are lost: all is checked before the first
     change."""
     run = again / "run"
@@ -340,8 +333,7 @@ def test_a_refused_resume_changes_nothing(case, again, capsys):
     damage, more, sentence = BROKEN[case]
     damage(run)
     before = everything(run)
-    assert cli.main(["resume", str(run), *more]) == 2
-    assert sentence in capsys.readouterr().err
+    assert sentence in printed("resume", run, *more, code=2).err
     assert everything(run) == before and "summary.json" in before
 
 

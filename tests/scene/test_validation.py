@@ -442,14 +442,16 @@ def test_all_faults_at_once(capsys, tmp_path):
         assert key in message
 
 
-def test_a_trusted_file_that_nothing_names_is_refused(capsys, tmp_path):
+def test_a_trusted_file_that_nothing_names_is_refused(capsys, printed, tmp_path):
     (tmp_path / "own.py").write_text("")
     own = str(tmp_path / "own.py")
     assert "own.py is not a file that [[forces.custom]]" in refused(
         capsys, tmp_path, GOOD, "--trust", own
     )
-    assert main(["sweep", str(tmp_path / "bad.toml"), "--set", "seed=1,2", "--trust", own]) == 2
-    assert "own.py is not a file that [[forces.custom]]" in capsys.readouterr().err
+    assert (
+        "own.py is not a file that [[forces.custom]]"
+        in printed("sweep", tmp_path / "bad.toml", "--set", "seed=1,2", "--trust", own, code=2).err
+    )
 
 
 @pytest.mark.parametrize(
@@ -485,7 +487,7 @@ def test_a_bad_override(override, expected, capsys, tmp_path):
     assert expected in refused(capsys, tmp_path, GOOD, "--set", override)
 
 
-def test_entries_of_lists_are_overridden_by_name(capsys, tmp_path):
+def test_entries_of_lists_are_overridden_by_name(capsys, printed, tmp_path):
     stages = '[[stages]]\nname = "production"\nduration_ps = 1\n[[stages]]\nensemble = "nvt"\ntemperature_K = 300\nduration_ps = 1\n'
     path = tmp_path / "two.toml"
     path.write_text(f"{GOOD}{stages}")
@@ -500,8 +502,10 @@ def test_entries_of_lists_are_overridden_by_name(capsys, tmp_path):
     assert [stage.timestep_fs for stage in found.stages][1] == 2
     assert (found.stages[2].temperature_K, found.molecules[0].count) == (310, 3)
     assert len(Scene.read(path, {"stages.production": None}).stages) == 2
-    assert main(["check", str(path), "--set", "stages.production.timestep_fs=-2"]) == 2
-    assert "--set stages.1.timestep_fs: is -2, must be greater than 0" in capsys.readouterr().err
+    assert (
+        "--set stages.1.timestep_fs: is -2, must be greater than 0"
+        in printed("check", path, "--set", "stages.production.timestep_fs=-2", code=2).err
+    )
     path.write_text(path.read_text().replace('ensemble = "nvt"', 'name = "production"'))
     assert (
         main(["check", str(path), "--set", "stages.production.timestep_fs=2"]) == 2

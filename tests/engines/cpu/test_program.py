@@ -127,21 +127,22 @@ def test_the_program_of_a_step_is_in_its_order():
     assert [row.text for row in two_drifts].count("forces at the new positions") == 1
 
 
-def test_check_prints_the_program_of_each_stage(tmp_path, capsys, monkeypatch):
+def test_check_prints_the_program_of_each_stage(tmp_path, printed, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["new", "water"]) == 0
-    assert main(["check", "water.toml", "--program"]) == 0
-    printed = capsys.readouterr().out
-    assert "program of a step of stages.1 (equilibration, baoab)" in printed
-    assert "program of a step of stages.2 (production, velocity_verlet)" in printed
-    assert "stages.0" not in printed.partition("program of a step")[2]
-    assert "lennard_jones: update the neighbour list" in printed
+    out = printed("check", "water.toml", "--program").out
+    assert "program of a step of stages.1 (equilibration, baoab)" in out
+    assert "program of a step of stages.2 (production, velocity_verlet)" in out
+    assert "stages.0" not in out.partition("program of a step")[2]
+    assert "lennard_jones: update the neighbour list" in out
     assert main(["new", "heavy_top_1"]) == 0
-    assert main(["check", "heavy_top_1.toml", "--program"]) == 2
-    assert "--program is for molecules" in capsys.readouterr().err
+    assert (
+        "--program is for molecules"
+        in printed("check", "heavy_top_1.toml", "--program", code=2).err
+    )
 
 
-def test_check_measures_the_rows_of_a_step(tmp_path, capsys):
+def test_check_measures_the_rows_of_a_step(tmp_path, printed):
     scene = small_scene(
         {"spce": 30, "argon": 5},
         14.0,
@@ -149,8 +150,11 @@ def test_check_measures_the_rows_of_a_step(tmp_path, capsys):
         stages=[STAGE | {"timestep_fs": 0.5}],
     )
     write_scene(tmp_path, scene)
-    assert main(["check", str(tmp_path / "scene.toml"), "--profile"]) == 0
-    lines = capsys.readouterr().out.partition("time of a step of stages.0")[2].splitlines()
+    lines = (
+        printed("check", tmp_path / "scene.toml", "--profile")
+        .out.partition("time of a step of stages.0")[2]
+        .splitlines()
+    )
     rows = [" ".join(line.split()[:-2]) for line in lines[2:] if line.endswith("%")]
     system, engine = build(scene), build(scene).engine()
     program = program_of(engine, system.state, integrator_of_stage(system, 0))
@@ -163,18 +167,19 @@ def test_check_measures_the_rows_of_a_step(tmp_path, capsys):
     assert all(spent >= 0 for spent in times)
 
 
-def test_check_measures_a_potential_of_bodies(capsys):
-    assert main(["check", str(ROOT / "systems" / "gay_berne.toml"), "--profile"]) == 0
-    assert "gay_berne: forces of pairs of bodies" in capsys.readouterr().out
+def test_check_measures_a_potential_of_bodies(printed):
+    assert (
+        "gay_berne: forces of pairs of bodies"
+        in printed("check", ROOT / "systems" / "gay_berne.toml", "--profile").out
+    )
 
 
-def test_a_scene_is_compiled_without_running_it(tmp_path, capsys, monkeypatch):
+def test_a_scene_is_compiled_without_running_it(tmp_path, capsys, printed, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["new", "heavy_top_1"]) == 0
     capsys.readouterr()
     for expected in ("heavy_top_1: ", "heavy_top_1: all code is there already"):
-        assert main(["compile", "heavy_top_1.toml"]) == 0
-        assert expected in capsys.readouterr().out
+        assert expected in printed("compile", "heavy_top_1.toml").out
     assert not (tmp_path / "runs").exists()
     simulation = Simulation(small_scene({"argon": 5}, 20.0, stages=[STAGE]), warn=str)
     before = simulation.state.copy()

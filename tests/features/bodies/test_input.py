@@ -5,7 +5,6 @@ import pytest
 from support.common import ROOT
 
 from rigidmd.assemble.body import build_body
-from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.scene import Scene
 
@@ -373,7 +372,7 @@ def test_each_fault_has_its_message(tables, message):
     assert message in faults(**tables)
 
 
-def test_all_faults_come_at_once_with_their_lines(tmp_path, capsys):
+def test_all_faults_come_at_once_with_their_lines(tmp_path, printed):
     path = tmp_path / "bad.toml"
     path.write_text(
         "[body]\nmass_kg = 1\ninertia_kg_m2 = [1, 2, 4]\npinned = true\n\n"
@@ -382,8 +381,7 @@ def test_all_faults_come_at_once_with_their_lines(tmp_path, capsys):
         "[[applied]]\ntimes_s = [0, 2, 1]\nforce_N = [[1, 0, 0], [0, 0, 0], [0, 0, 0]]\n\n"
         "[run]\nduration_s = 1\ntimestep_s = 0.01\nintegrater = 'rk4'\n"
     )
-    assert main(["run", str(path), "-o", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
+    said = printed("run", path, "-o", tmp_path / "out", code=2).err
     for part in (
         "6 errors",
         "line 1: body: no body has this inertia",
@@ -397,15 +395,14 @@ def test_all_faults_come_at_once_with_their_lines(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_all_faults_of_solids_come_at_once_with_their_lines(tmp_path, capsys):
+def test_all_faults_of_solids_come_at_once_with_their_lines(tmp_path, printed):
     path = tmp_path / "bad.toml"
     path.write_text(
         "[[body.solids]]\nshape = 'ring'\nradius_m = 1\ndensity_kg_m3 = 2\naxis = [0, 0, 0]\n\n"
         "[[body.solids]]\nshape = 'sphere'\nradius_m = -1\nmass_kg = 2\n\n"
         "[run]\nduration_s = 1\ntimestep_s = 0.01\n"
     )
-    assert main(["check", str(path)]) == 2
-    said = capsys.readouterr().err
+    said = printed("check", path, code=2).err
     for part in (
         "line 1: body.solids.0: a ring has no volume: give mass_kg instead of density_kg_m3; axis is zero",
         "line 9: body.solids.1.radius_m: is -1, must be greater than 0",
@@ -413,30 +410,30 @@ def test_all_faults_of_solids_come_at_once_with_their_lines(tmp_path, capsys):
         assert part in said, part
 
 
-def test_the_energy_of_a_body_is_in_joule(capsys):
+def test_the_energy_of_a_body_is_in_joule(printed):
     scene = str(ROOT / "systems" / "fast_heavy_top.toml")
-    assert main(["energy", scene, "--unit", "K"]) == 2
-    assert "The energy of a body is in J" in capsys.readouterr().err
-    assert main(["energy", scene]) == 0
-    assert "5435.696790865" in capsys.readouterr().out
+    assert "The energy of a body is in J" in printed("energy", scene, "--unit", "K", code=2).err
+    assert "5435.696790865" in printed("energy", scene).out
 
 
-def test_what_is_no_scene_of_either_kind_says_so(tmp_path, capsys):
+def test_what_is_no_scene_of_either_kind_says_so(tmp_path, printed):
     path = tmp_path / "what.toml"
     path.write_text("name = 'x'\n")
-    assert main(["check", str(path)]) == 2
-    assert "has neither [body], for a single body, nor [[molecules]]" in capsys.readouterr().err
+    assert (
+        "has neither [body], for a single body, nor [[molecules]]"
+        in printed("check", path, code=2).err
+    )
     path.write_text("[gravity]\n[run]\nduration_s = 1\ntimestep_s = 0.1\n")
-    assert main(["check", str(path)]) == 2
-    assert "body: is missing" in capsys.readouterr().err
+    assert "body: is missing" in printed("check", path, code=2).err
 
 
-def test_an_override_is_blamed_by_its_key_and_threads_are_for_molecules(capsys):
+def test_an_override_is_blamed_by_its_key_and_threads_are_for_molecules(printed):
     scene = str(ROOT / "systems" / "heavy_top_1.toml")
-    assert main(["check", scene, "--set", "run.integrator=verlet"]) == 2
-    assert "--set run.integrator: is 'verlet', must be" in capsys.readouterr().err
-    assert main(["run", scene, "--threads", "2"]) == 2
-    assert "--threads is for molecules" in capsys.readouterr().err
+    assert (
+        "--set run.integrator: is 'verlet', must be"
+        in printed("check", scene, "--set", "run.integrator=verlet", code=2).err
+    )
+    assert "--threads is for molecules" in printed("run", scene, "--threads", "2", code=2).err
 
 
 def test_bodies_of_points_that_are_symmetric_to_rounding_have_their_own_axes():

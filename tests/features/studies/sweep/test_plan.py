@@ -4,7 +4,6 @@ import re
 
 import pytest
 
-from rigidmd.commands import cli
 from rigidmd.errors import SceneError
 from rigidmd.scene import parse_override
 from rigidmd.scene.base import format_override
@@ -164,13 +163,12 @@ def test_an_override_of_a_command_is_read_as_the_same_value(value):
         (["--set", "seed=1..3", "--trust", "nothing.py"], "there is no such file"),
     ],
 )
-def test_bad_input(arguments, expected, argon, tmp_path, capsys):
-    assert cli.main(["sweep", str(argon), *arguments, "-o", str(tmp_path / "sweep")]) == 2
-    assert expected in capsys.readouterr().err
+def test_bad_input(arguments, expected, argon, tmp_path, printed):
+    assert expected in printed("sweep", argon, *arguments, "-o", tmp_path / "sweep", code=2).err
     assert not (tmp_path / "sweep").exists()
 
 
-def test_all_faults_of_all_points_at_once(argon, tmp_path, capsys):
+def test_all_faults_of_all_points_at_once(argon, tmp_path, printed):
     arguments = [
         "--set",
         "start.temperature_K=-5,100,cold",
@@ -179,8 +177,7 @@ def test_all_faults_of_all_points_at_once(argon, tmp_path, capsys):
         "-o",
         str(tmp_path / "s"),
     ]
-    assert cli.main(["sweep", str(argon), *arguments]) == 2
-    said = capsys.readouterr().err
+    said = printed("sweep", argon, *arguments, code=2).err
     assert "3 errors" in said
     assert (
         "at temperature_K = -5, cutoff_A = 8 and 1 more points: --set start.temperature_K: is -5"
@@ -188,20 +185,15 @@ def test_all_faults_of_all_points_at_once(argon, tmp_path, capsys):
     )
     assert "at temperature_K = 100, cutoff_A = 12: forces.cutoff_A = 12 is longer than half" in said
     assert "at temperature_K = cold" in said
-    assert (
-        cli.main(
-            [
-                "sweep",
-                str(argon),
-                "--set",
-                "seed=1,2",
-                "--set",
-                "forces.cutoff_A=12",
-                "-o",
-                str(tmp_path / "s"),
-            ]
-        )
-        == 2
-    )
-    assert capsys.readouterr().err.startswith(f"rigidmd: {argon}: forces.cutoff_A = 12")
+    assert printed(
+        "sweep",
+        argon,
+        "--set",
+        "seed=1,2",
+        "--set",
+        "forces.cutoff_A=12",
+        "-o",
+        tmp_path / "s",
+        code=2,
+    ).err.startswith(f"rigidmd: {argon}: forces.cutoff_A = 12")
     assert not (tmp_path / "s").exists()

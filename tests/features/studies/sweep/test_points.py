@@ -317,15 +317,16 @@ def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
     assert same_runs(folder, whole)
 
 
-def test_without_a_cluster(argon, tmp_path, monkeypatch, capsys):
+def test_without_a_cluster(argon, tmp_path, monkeypatch, printed):
     monkeypatch.setattr(sweep_points, "CONNECT_TIMEOUT", 0.5)
     arguments = ["sweep", str(argon), *GRID, "-o", str(tmp_path / "sweep"), "--scheduler"]
     if "distributed" in sys.modules:
-        assert cli.main([*arguments, "tcp://127.0.0.1:9"]) == 2
-        assert "no scheduler of dask.distributed answers" in capsys.readouterr().err
+        assert (
+            "no scheduler of dask.distributed answers"
+            in printed(*arguments, "tcp://127.0.0.1:9", code=2).err
+        )
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert cli.main([*arguments, "tcp://127.0.0.1:9"]) == 2
-    assert "pip install distributed" in capsys.readouterr().err
+    assert "pip install distributed" in printed(*arguments, "tcp://127.0.0.1:9", code=2).err
 
 
 @pytest.fixture
@@ -353,7 +354,7 @@ for part in spec.split(","):
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
 
 
-def test_a_script_for_slurm(argon, finished, slurm, capsys):
+def test_a_script_for_slurm(argon, finished, slurm, printed):
     arguments = [
         "sweep",
         str(argon),
@@ -371,8 +372,7 @@ def test_a_script_for_slurm(argon, finished, slurm, capsys):
     assert "#SBATCH --time=0:10:00\n" in text
     assert not list(Path("my sweep").glob("*/log.csv"))
     subprocess.run(["sbatch", str(script.absolute())], check=True)
-    assert cli.main(["sweep", str(argon), "-o", "my sweep", "--collect"]) == 0
-    assert "1 of them finished" in capsys.readouterr().out
+    assert "1 of them finished" in printed("sweep", argon, "-o", "my sweep", "--collect").out
     ours, theirs = Path("my sweep") / "seed=1", finished / "temperature_K=120_seed=1"
     assert (ours / "log.csv").read_bytes() == (theirs / "log.csv").read_bytes()
     assert (
@@ -384,16 +384,17 @@ def test_a_script_for_slurm(argon, finished, slurm, capsys):
     assert "#SBATCH --array=1,2\n" in script.read_text()
 
 
-def test_commands_for_any_scheduler(argon, finished, slurm, capsys):
+def test_commands_for_any_scheduler(argon, finished, slurm, printed):
     """A line for each point that has not finished, which a shell runs."""
     axes = ["--set", "start.temperature_K=120", "--set", "seed=1..2"]
-    assert cli.main(["sweep", str(argon), *axes, "-o", "my sweep", "--to", "commands"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = printed("sweep", argon, *axes, "-o", "my sweep", "--to", "commands").out.splitlines()
     assert len(lines) == 2
     assert not list(Path("my sweep").glob("*/log.csv"))
     subprocess.run(["bash", "-c", lines[0]], check=True)
-    assert cli.main(["sweep", str(argon), *axes, "-o", "my sweep", "--to", "commands"]) == 0
-    assert capsys.readouterr().out.splitlines() == lines[1:]
+    assert (
+        printed("sweep", argon, *axes, "-o", "my sweep", "--to", "commands").out.splitlines()
+        == lines[1:]
+    )
     ours, theirs = Path("my sweep") / "seed=1", finished / "temperature_K=120_seed=1"
     assert (ours / "log.csv").read_bytes() == (theirs / "log.csv").read_bytes()
 

@@ -52,7 +52,7 @@ def test_a_point_has_the_bits_of_a_run(finished, argon, tmp_path, capsys):
         assert cli.main([*command, str(copy)]) == 0
 
 
-def test_what_has_finished_is_not_run_again(copied, argon, capsys):
+def test_what_has_finished_is_not_run_again(copied, argon, capsys, printed):
     before = written(copied)
     assert (
         cli.main(["sweep", str(argon), *GRID[2:], *GRID[:2], "-o", str(copied)]) == 0
@@ -61,8 +61,10 @@ def test_what_has_finished_is_not_run_again(copied, argon, capsys):
     assert written(copied) == before
     # one value more, of a key that is varied
     more = ["--set", "start.temperature_K=90", "--set", "seed=3"]
-    assert cli.main(["sweep", str(argon), *more, "-o", str(copied), "--jobs", "1"]) == 0
-    assert "1 finished, 0 failed, 4 skipped" in capsys.readouterr().out
+    assert (
+        "1 finished, 0 failed, 4 skipped"
+        in printed("sweep", argon, *more, "-o", copied, "--jobs", "1").out
+    )
     assert {name: time for name, time in written(copied).items() if name in before} == before
     assert [row["runs"] for row in table(copied)] == ["3", "2"]
 
@@ -91,22 +93,23 @@ def test_a_point_with_a_longer_last_stage_counts_with_a_note(copied, argon, caps
         assert [len(row.runs) for row in rigidmd.read_run(copied).rows] == [2, 2]
 
 
-def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
+def test_another_scene_is_refused(copied, argon, tmp_path, printed):
     for changes, expected in (
         ([*GRID, "--set", "forces.cutoff_A=7.5"], "forces.cutoff_A is 7.5, there 8.0"),
         (GRID[:2], "it varies start.temperature_K and seed, not start.temperature_K"),
         ([*GRID, "--set", "stages.0.duration_ps=2"], "stages.0.duration_ps is 2.0, there 0.5"),
     ):
-        assert cli.main(["sweep", str(argon), *changes, "-o", str(copied)]) == 2
-        said = capsys.readouterr().err
+        said = printed("sweep", argon, *changes, "-o", copied, code=2).err
         assert expected in said
         assert "--force starts it again" in said
     assert (copied / "temperature_K=90_seed=1" / "log.csv").exists()
 
 
-def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
-    assert cli.main(["analyse", str(copied), "--only", "rdf,structure_factor"]) == 0
-    assert "temperature_K = 90: 2 runs" in capsys.readouterr().out
+def test_analyse_gives_errors_over_replicas(copied, argon, printed):
+    assert (
+        "temperature_K = 90: 2 runs"
+        in printed("analyse", copied, "--only", "rdf,structure_factor").out
+    )
     mean = copied / "temperature_K=90"
     own = [
         np.genfromtxt(copied / f"temperature_K=90_seed={k}" / "rdf.csv", delimiter=",", names=True)
@@ -167,12 +170,11 @@ def test_a_file_of_one_point_that_changes_is_noticed(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("of_sweep", [["--extrapolate", "stages.0.timestep_fs"], ["pmf"]])
-def test_a_sweep_that_is_not_there_is_no_run(of_sweep, capsys, tmp_path):
-    assert cli.main(["analyse", str(tmp_path / "none"), *of_sweep]) == 2
-    assert "none is not there" in capsys.readouterr().err
+def test_a_sweep_that_is_not_there_is_no_run(of_sweep, printed, tmp_path):
+    assert "none is not there" in printed("analyse", tmp_path / "none", *of_sweep, code=2).err
 
 
-def test_analyses_of_a_sweep_go_on_without_a_damaged_point(copied, capsys, monkeypatch):
+def test_analyses_of_a_sweep_go_on_without_a_damaged_point(copied, printed, monkeypatch):
     """One point cannot be read, one analysis has an error of ours, one is not possible."""
     (copied / "temperature_K=90_seed=1" / "trajectory.trr").write_bytes(b"nothing")
     rdf = registry.KNOWN["rdf"]
@@ -181,8 +183,7 @@ def test_analyses_of_a_sweep_go_on_without_a_damaged_point(copied, capsys, monke
         raise ZeroDivisionError("of no use")
 
     monkeypatch.setitem(registry.KNOWN, "rdf", rdf._replace(function=broken))
-    assert cli.main(["analyse", str(copied), "--only", "rdf,viscosity,structure_factor"]) == 1
-    said = capsys.readouterr().out
+    said = printed("analyse", copied, "--only", "rdf,viscosity,structure_factor", code=1).out
     assert re.search(r"temperature_K=90_seed=1: .*cannot be read as a trajectory", said)
     assert (
         "rdf: an error of rigidmd, please report it: ZeroDivisionError: of no use (test_sweeping.py:"
@@ -198,9 +199,11 @@ def test_analyses_of_a_sweep_go_on_without_a_damaged_point(copied, capsys, monke
     assert not (copied / "temperature_K=120" / "rdf.csv").exists()
 
 
-def test_replicas_that_are_too_short_alone_are_analysed_together(copied, capsys):
-    assert cli.main(["analyse", str(copied / "temperature_K=90_seed=1"), "--only", "msd"]) == 2
-    assert "needs at least 20 frames" in capsys.readouterr().err
+def test_replicas_that_are_too_short_alone_are_analysed_together(copied, printed):
+    assert (
+        "needs at least 20 frames"
+        in printed("analyse", copied / "temperature_K=90_seed=1", "--only", "msd", code=2).err
+    )
     assert cli.main(["analyse", str(copied), "--only", "msd"]) == 0
     assert (copied / "temperature_K=90" / "msd.csv").is_file()
 
@@ -259,7 +262,7 @@ def spring():
 """
 
 
-def test_each_point_trusts_the_file_that_it_runs(argon, tmp_path, capsys):
+def test_each_point_trusts_the_file_that_it_runs(argon, tmp_path, capsys, printed):
     """A sweep over modules, each of which has to be trusted."""
     text = argon.read_text() + '[[forces.custom]]\nmodule = "one.py"\nname = "spring"\n'
     (scene := tmp_path / "argon.toml").write_text(text)
@@ -269,25 +272,32 @@ def test_each_point_trusts_the_file_that_it_runs(argon, tmp_path, capsys):
     arguments = ["sweep", str(scene), "--set", f"forces.custom.0.module={names[0]},{names[1]}"]
     arguments += ["--to", "commands", "-o", str(tmp_path / "s")]
     trusted = ["--trust", names[0], "--trust", names[1]]
-    assert cli.main([*arguments, *trusted, "--trust", names[2]]) == 2
-    assert "three.py is not a file that [[forces.custom]]" in capsys.readouterr().err
+    assert (
+        "three.py is not a file that [[forces.custom]]"
+        in printed(*arguments, *trusted, "--trust", names[2], code=2).err
+    )
     assert cli.main([*arguments, *trusted]) == 0
     for line, name in zip(capsys.readouterr().out.splitlines(), names, strict=False):
         assert shlex.split(line)[-2:] == ["--trust", name]
 
 
-def test_folders_that_are_none(argon, tmp_path, copied, capsys):
+def test_folders_that_are_none(argon, tmp_path, copied, printed):
     (tmp_path / "file").write_text("")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").write_text("")
     for name, expected in (("file", "is a file"), ("full", "holds no sweep")):
         for more in ([], ["--force"]):
-            assert cli.main(["sweep", str(argon), *GRID, "-o", str(tmp_path / name), *more]) == 2
-            assert expected in capsys.readouterr().err
-    assert cli.main(["sweep", str(argon), "-o", str(tmp_path / "none"), "--collect"]) == 2
-    assert "holds no sweep" in capsys.readouterr().err
-    assert cli.main(["report", str(copied)]) == 2
-    assert "is the folder of a sweep. Name one of the runs in it" in capsys.readouterr().err
+            assert (
+                expected in printed("sweep", argon, *GRID, "-o", tmp_path / name, *more, code=2).err
+            )
+    assert (
+        "holds no sweep"
+        in printed("sweep", argon, "-o", tmp_path / "none", "--collect", code=2).err
+    )
+    assert (
+        "is the folder of a sweep. Name one of the runs in it"
+        in printed("report", copied, code=2).err
+    )
     for text in (
         "",
         "{}",
@@ -298,19 +308,19 @@ def test_folders_that_are_none(argon, tmp_path, copied, capsys):
         '{"schema": 1, "points": [{"folder": "../x"}]}',
     ):
         (copied / "sweep.json").write_text(text)
-        assert cli.main(["sweep", str(argon), *GRID, "-o", str(copied)]) == 2
-        assert "sweep.json" in capsys.readouterr().err
-        assert cli.main(["analyse", str(copied)]) == 2
-        assert "sweep.json" in capsys.readouterr().err
+        assert "sweep.json" in printed("sweep", argon, *GRID, "-o", copied, code=2).err
+        assert "sweep.json" in printed("analyse", copied, code=2).err
 
 
-def test_a_manifest_names_no_folder_outside(copied, argon, capsys):
+def test_a_manifest_names_no_folder_outside(copied, argon, printed):
     told = json.loads((copied / "sweep.json").read_text())
     for name in ("../outside", "..", "/tmp/x", ""):
         told["points"][0]["folder"] = name
         (copied / "sweep.json").write_text(json.dumps(told))
-        assert cli.main(["sweep", str(argon), *GRID, "-o", str(copied)]) == 2
-        assert "points with invalid names of folders" in capsys.readouterr().err
+        assert (
+            "points with invalid names of folders"
+            in printed("sweep", argon, *GRID, "-o", copied, code=2).err
+        )
 
 
 def test_an_invalid_manifest_is_refused(copied, argon, capsys):

@@ -31,7 +31,7 @@ def test_the_energy_of_a_molecule_has_its_share_of_the_error(finished):
     )
 
 
-def test_the_density_of_an_earlier_stage_is_in_the_table(tmp_path, argon, capsys):
+def test_the_density_of_an_earlier_stage_is_in_the_table(tmp_path, argon, printed):
     """A pair of stages, of which the first samples the density and the second keeps it."""
     stages = """
 [[stages]]
@@ -54,8 +54,7 @@ timestep_fs = 5
     together = "stages.density.temperature_K,stages.production.temperature_K"
     folder = tmp_path / "s"
     points = run_here(scene, [parse_axis(f"{together}=90,110")], folder).points
-    assert cli.main(["sweep", str(scene), "-o", str(folder), "--collect"]) == 0
-    said = capsys.readouterr().out
+    said = printed("sweep", scene, "-o", folder, "--collect").out
     assert "density: Density (g/mL)" in said
     for row, point in zip(table(folder), points, strict=True):
         stage = json.loads((folder / point.folder / "summary.json").read_text())["stages"][0]
@@ -118,7 +117,7 @@ def test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run():
     ] == (0.1, None)
 
 
-def test_bodies_and_words(tmp_path, capsys):
+def test_bodies_and_words(tmp_path, printed):
     """A body has no seeds; a key whose values are words has positions on the axis."""
     scene = ROOT / "systems" / "heavy_top_3.toml"
     fixed = {"run.duration_s": 0.02, "output.figures": False, "output.trajectory": False}
@@ -133,6 +132,8 @@ def test_bodies_and_words(tmp_path, capsys):
         )
         assert lowest < mean < highest
     assert (tmp_path / "s" / "sweep.png").exists()
-    assert cli.main(["sweep", str(scene), "--replicas", "3", "-o", str(tmp_path / "t")]) == 2
-    assert "a single body, whose motion has no seed" in capsys.readouterr().err
+    assert (
+        "a single body, whose motion has no seed"
+        in printed("sweep", scene, "--replicas", "3", "-o", tmp_path / "t", code=2).err
+    )
     assert not (tmp_path / "t").exists()
