@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numba
 import numpy as np
 import pytest
-from support.common import ROOT, small_scene
+from support.common import ROOT, same_bits, small_scene
 from support.processes import search_path
 from support.thread_kernels import count_blocks, counted, run_blocks
 
@@ -157,7 +157,7 @@ def test_simulations_at_once_have_the_bits_of_each_alone():
     alone = [simulation.run().state for simulation in short_runs(3)]
     together = run_together(short_runs(3))
     for a, b in zip(alone, together, strict=True):
-        assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b.state, strict=True))
+        assert same_bits(a, b.state)
         assert b.summary["threads"] == 1
     assert [r.state.step[0] for r in run_together(short_runs(3), jobs=1)] == [
         s.step[0] for s in alone
@@ -177,7 +177,7 @@ def test_simulations_on_all_threads_at_once_have_the_bits_of_each_alone():
     for one in both:
         one.join()
     for a, b in zip(alone, together, strict=True):
-        assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))
+        assert same_bits(a, b)
 
 
 def test_other_threads_read_energies_while_a_run_begins_and_goes_on():

@@ -3,7 +3,7 @@ else."""
 
 import numpy as np
 import pytest
-from support.common import ROOT, built, move, small_scene
+from support.common import ROOT, built, move, same_bits, small_scene
 
 from rigidmd.assemble.body import build_body
 from rigidmd.core.integrators import SCHEMES, Solver
@@ -17,10 +17,6 @@ from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN
 
 VERLET = SCHEMES["velocity_verlet"]
-
-
-def same_bits(a, b):
-    return all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))
 
 
 def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):

@@ -5,7 +5,7 @@ import numba
 import numpy as np
 import pytest
 from scipy import stats
-from support.common import built, move, observe, small_scene
+from support.common import built, move, observe, same_bits, small_scene
 
 from rigidmd.assemble.build import barostat_of, build, integrator_of_stage
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
@@ -384,7 +384,7 @@ def test_every_barostat_has_the_same_bits_for_any_number_of_threads(stage):
     own |= {} if own["ensemble"] == "nph" else {"barostat_interval_ps": 0.006}
     scene = small_scene({"spce": 800}, 30.0, stages=[own], output=QUIET)
     found = [Simulation(scene.model_copy(update={"threads": k})).run().state for k in (1, None)]
-    assert all(a.tobytes() == b.tobytes() for a, b in zip(*found, strict=True))
+    assert same_bits(*found)
     assert found[0].volume != pytest.approx(27000, rel=1e-9) and found[0].step[NOW] == 10
 
 

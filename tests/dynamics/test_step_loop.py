@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 import pytest
-from support.common import built, move, observe, small_scene
+from support.common import built, move, observe, same_bits, small_scene
 
 from rigidmd.assemble.build import build
 from rigidmd.compile.machine import MOST_THREADS
@@ -234,8 +234,7 @@ def test_splitting_a_run_changes_no_bit(liquid, name):
     engine, parts = system.engine(), state.copy()
     for steps in (1, 1, 8, 20):
         move(engine, parts, SCHEMES[name], 0.002, steps)
-    for a, b in zip(whole, parts, strict=True):
-        assert a.tobytes() == b.tobytes()
+    assert same_bits(whole, parts)
 
 
 @pytest.mark.parametrize("counts", [{"spce": 70, "nitrogen": 20}, {"argon": 700}])
@@ -250,8 +249,7 @@ def test_same_bits_for_one_and_two_threads_and_again(counts):
         simulation = Simulation(Scene.from_dict(scene.model_dump() | {"threads": threads}))
         ends.append(simulation.run().state)
     for other in ends[1:]:
-        for a, b in zip(ends[0], other, strict=True):
-            assert a.tobytes() == b.tobytes()
+        assert same_bits(ends[0], other)
 
 
 @numba.njit

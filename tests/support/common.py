@@ -99,6 +99,11 @@ def built(counts, edge, seed=0, spread=0.4, **sections) -> tuple[System, Engine,
     return shaken(build(small_scene(counts, edge, **sections)), seed, spread)
 
 
+def same_bits(a, b) -> bool:
+    """Whether two sequences of arrays, such as states, are the same."""
+    return all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))
+
+
 def observe(system: System, engine: Engine, state: State, **options):
     """The observables of a state, with energies in u Å²/ps²."""
     return observables.observe(system, engine, state, energy_unit=1.0, **options)
