@@ -14,7 +14,6 @@ import rigidmd
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
 from rigidmd.assemble.plausibility import molecule_warnings
-from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.scene import Scene
 from rigidmd.scene.models import available_models, load_model
@@ -115,9 +114,8 @@ BODIES = sorted({*(ROOT / "systems").glob("*.toml")} - {*MOLECULES})
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
-def test_no_shipped_body_is_suspected(path, capsys):
-    assert main(["check", str(path)]) == 0
-    assert capsys.readouterr().err == ""
+def test_no_shipped_body_is_suspected(path, printed):
+    assert printed("check", path).err == ""
 
 
 NPT = {"ensemble": "npt", "temperature_K": 90.0, "duration_ps": 0.01}
@@ -294,17 +292,15 @@ def test_a_cutoff_below_contact_has_no_tail_correction():
         ),
     ],
 )
-def test_a_body_in_another_unit(override, words, capsys):
+def test_a_body_in_another_unit(override, words, printed):
     words_of = [word for key, value in override.items() for word in ("--set", f"{key}={value}")]
-    assert main(["check", str(ROOT / "systems" / "heavy_top_3.toml"), *words_of]) == 0
-    assert words in capsys.readouterr().err
+    assert words in printed("check", ROOT / "systems" / "heavy_top_3.toml", *words_of).err
 
 
 @pytest.mark.parametrize("angles", [[0.0, 0.1, 0.0], [0.0, 3.0, 1.0], [0.0, 59.16, 90.0]])
-def test_small_angles_are_not_suspected(angles, capsys):
+def test_small_angles_are_not_suspected(angles, printed):
     top = ROOT / "systems" / "heavy_top_3.toml"
-    assert main(["check", str(top), "--set", f"start.euler_angles_deg={angles}"]) == 0
-    assert capsys.readouterr().err == ""
+    assert printed("check", top, "--set", f"start.euler_angles_deg={angles}").err == ""
 
 
 @pytest.mark.parametrize(
@@ -316,10 +312,9 @@ def test_small_angles_are_not_suspected(angles, capsys):
         (0.1, ""),
     ],
 )
-def test_check_warns_of_steps_by_their_accuracy(step, words, tmp_path, capsys):
+def test_check_warns_of_steps_by_their_accuracy(step, words, tmp_path, printed):
     (tmp_path / "s.toml").write_text(GOOD.replace("timestep_fs = 1", f"timestep_fs = {step}"))
-    assert main(["check", str(tmp_path / "s.toml")]) == 0
-    told = capsys.readouterr().err
+    told = printed("check", tmp_path / "s.toml").err
     assert words in told if words else told == ""
 
 
@@ -363,14 +358,13 @@ def test_a_run_of_a_body_notes_inaccurate_steps(step, words):
 
 
 @pytest.mark.parametrize(("sigma", "warns"), [(0.34, True), (3.4, False)])
-def test_a_shown_model_is_compared_with_usual_units(sigma, warns, tmp_path, capsys):
+def test_a_shown_model_is_compared_with_usual_units(sigma, warns, tmp_path, printed):
     path = tmp_path / "mine.toml"
     site = f'name = "Ar"\nmass_u = 39.948\nsigma_A = {sigma}\nepsilon_kJ_mol = 1.0\nposition_A = [0, 0, 0]\n'
     path.write_text(f'name = "mine"\n[[sites]]\n{site}')
-    assert main(["models", str(path)]) == 0
-    printed = capsys.readouterr()
-    assert ("is it in nm?" in printed.err) == warns
-    assert "mine" in printed.out
+    shown = printed("models", path)
+    assert ("is it in nm?" in shown.err) == warns
+    assert "mine" in shown.out
 
 
 def test_a_run_repeats_the_warnings_of_check(tmp_path):

@@ -6,7 +6,6 @@ from support.common import observe, small_scene
 from support.scenes import GOOD
 
 from rigidmd.assemble.build import build
-from rigidmd.commands.cli import main
 from rigidmd.units import BOLTZMANN
 
 
@@ -26,7 +25,7 @@ def test_walls_far_apart_or_close_together_leave_a_lattice(tmp_path):
         assert 0 < position[:, 2].min() <= position[:, 2].max() < high
 
 
-def test_too_dense_to_pack(capsys, tmp_path):
+def test_too_dense_to_pack(printed, tmp_path):
     text = (
         GOOD.replace("lengths_A = 20.0", "lengths_A = 8.0")
         .replace("count = 20", "count = 120")
@@ -34,8 +33,7 @@ def test_too_dense_to_pack(capsys, tmp_path):
     )
     scene = tmp_path / "dense.toml"
     scene.write_text(text)
-    assert main(["run", str(scene), "-o", str(tmp_path / "out")]) == 2
-    message = capsys.readouterr().err
+    message = printed("run", scene, "-o", tmp_path / "out", code=2).err
     assert "cannot be packed" in message
     assert "Lower the density" in message
     assert not (tmp_path / "out").exists()
@@ -53,12 +51,11 @@ epsilon_K = 50.0, charge_e = 1e6 }]"""
         ('model = "spce"', f'name = "ion"\n{STRONG}', ["a charge_e is 1e+06 e, above 1000"]),
     ],
 )
-def test_forces_that_no_step_follows(old, new, expected, capsys, tmp_path):
+def test_forces_that_no_step_follows(old, new, expected, printed, tmp_path):
     """The reason is not the density."""
     scene = tmp_path / "strong.toml"
     scene.write_text(GOOD.replace(old, new))
-    assert main(["run", str(scene), "-o", str(tmp_path / "out")]) == 2
-    message = capsys.readouterr().err
+    message = printed("run", scene, "-o", tmp_path / "out", code=2).err
     assert all(part in message for part in expected), message
     assert "density" not in message
     assert not (tmp_path / "out").exists()

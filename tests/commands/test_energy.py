@@ -7,7 +7,6 @@ from support.common import observe, small_scene
 from support.ewald import SALT
 from support.reference import KE
 
-from rigidmd.commands.cli import main
 from rigidmd.run import Simulation
 from rigidmd.units import BAR, KJ_PER_MOL
 
@@ -57,7 +56,7 @@ def test_what_energy_says_of_its_figures():
         ),
     ],
 )
-def test_what_energy_says_of_a_reaction_field(truncation, words, capsys, tmp_path):
+def test_what_energy_says_of_a_reaction_field(truncation, words, printed, tmp_path):
     scene = tmp_path / "a.toml"
     scene.write_text(f"""
 [box]
@@ -76,7 +75,6 @@ temperature_K = 300
 [[stages]]
 duration_ps = 1
 """)
-    assert main(["energy", str(scene)]) == 0
-    told = capsys.readouterr().out
+    told = printed("energy", scene).out
     assert f"  coulomb: {words}\n" in told
     assert "  virial: sum of F·R over molecules\n" in told

@@ -12,7 +12,6 @@ from support.minima import TIGHT, WELL, minimum_of, stage_of
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
-from rigidmd.commands.cli import main
 from rigidmd.core.state import state_of
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
@@ -214,10 +213,9 @@ trajectory_interval_ps = 0.01
 """
 
 
-def test_a_scene_through_the_command_line(tmp_path, capsys):
+def test_a_scene_through_the_command_line(tmp_path, printed):
     (tmp_path / "scene.toml").write_text(SCENE)
-    assert main(["check", str(tmp_path / "scene.toml")]) == 0
-    said = capsys.readouterr().out
+    said = printed("check", tmp_path / "scene.toml").out
     assert (
         "0: minimise: to a minimum of the potential energy. No time passes and momenta do not change"
         in said
@@ -225,8 +223,7 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
     assert "1: cell: to a minimum of the enthalpy at 1 bar, the cell isotropic" in said
     assert "torques of 0.1 kJ/mol and a pressure within 1 bar. At most 5000 iterations" in said
     command = ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out"), "-v"]
-    assert main(command) == 0
-    said = capsys.readouterr().out
+    said = printed(*command).out
     assert "minimise: converged after" in said
     assert "cell: converged after" in said
     assert "bar of the given pressure" in said
