@@ -451,27 +451,28 @@ def step_of(model="spce", temperature=298.15, masses=None, **stage) -> float:
 @pytest.mark.parametrize(
     ("stage", "expected"),
     [
-        ({"ensemble": "nvt"}, 4),
-        ({"ensemble": "npt", "pressure_bar": 1}, 4),
-        ({"ensemble": "nvt", "thermostat": "langevin"}, 4),
-        ({"ensemble": "nvt", "integrator": "velocity_verlet"}, 1),
-        ({"ensemble": "nvt", "thermostat": "hybrid_monte_carlo"}, 2),
-        ({"ensemble": "nve"}, 2),
-        ({"ensemble": "nph", "pressure_bar": 1}, 2),
-        ({"ensemble": "nve", "integrator": "srkn_4"}, 5),
-        ({"ensemble": "nvt", "timestep_fs": 3}, 3),
-        ({"ensemble": "nvt", "temperature": 350.0}, 4),
-        ({"ensemble": "nvt", "temperature": 500.0}, 2.5),
-        ({"ensemble": "nvt", "model": "tip4p2005"}, 4),
-        ({"ensemble": "nve", "model": "tip4p2005"}, 2),
-        ({"ensemble": "nvt", "masses": {"H": 4.0}}, 5),
-        ({"ensemble": "nvt", "model": "ammonia_trappe", "temperature": 240.0}, 5),
-        ({"ensemble": "nve", "model": "ammonia_trappe", "temperature": 240.0}, 4),
-        ({"ensemble": "nvt", "model": "nitrogen", "temperature": 77.0}, 10),
-        ({"ensemble": "nve", "model": "argon", "temperature": 94.0}, 10),
+        ("ensemble = 'nvt'", 4),
+        ("ensemble = 'npt'\npressure_bar = 1", 4),
+        ("ensemble = 'nvt'\nthermostat = 'langevin'", 4),
+        ("ensemble = 'nvt'\nintegrator = 'velocity_verlet'", 1),
+        ("ensemble = 'nvt'\nthermostat = 'hybrid_monte_carlo'", 2),
+        ("ensemble = 'nve'", 2),
+        ("ensemble = 'nph'\npressure_bar = 1", 2),
+        ("ensemble = 'nve'\nintegrator = 'srkn_4'", 5),
+        ("ensemble = 'nvt'\ntimestep_fs = 3", 3),
+        ("ensemble = 'nvt'\ntemperature = 350.0", 4),
+        ("ensemble = 'nvt'\ntemperature = 500.0", 2.5),
+        ("ensemble = 'nvt'\nmodel = 'tip4p2005'", 4),
+        ("ensemble = 'nve'\nmodel = 'tip4p2005'", 2),
+        ("ensemble = 'nvt'\nmasses.H = 4.0", 5),
+        ("ensemble = 'nvt'\nmodel = 'ammonia_trappe'\ntemperature = 240.0", 5),
+        ("ensemble = 'nve'\nmodel = 'ammonia_trappe'\ntemperature = 240.0", 4),
+        ("ensemble = 'nvt'\nmodel = 'nitrogen'\ntemperature = 77.0", 10),
+        ("ensemble = 'nve'\nmodel = 'argon'\ntemperature = 94.0", 10),
     ],
 )
 def test_the_default_step_follows_from_the_molecules(stage, expected):
+    stage = tomllib.loads(stage)
     assert step_of(**stage) == expected
 
 

@@ -1,6 +1,8 @@
 """Rows of users: kicks with gradient first, last, in the middle and side by side, for molecules and
 for a top."""
 
+import tomllib
+
 import numpy as np
 import pytest
 from support.common import built, move, same_bits, small_scene
@@ -357,38 +359,35 @@ def test_adding_an_integrator_from_python(monkeypatch):
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ({"steps": [0.5, 0.4]}, "its drifts sum to 0.9, not to 1$"),
-        ({"steps": [0.4, 0.6]}, "so that it is not time-reversible$"),
+        ("steps = [0.5, 0.4]", "its drifts sum to 0.9, not to 1$"),
+        ("steps = [0.4, 0.6]", "so that it is not time-reversible$"),
         (
-            {"steps": [0.5, 0.5], "order": 4},
+            "steps = [0.5, 0.5]\norder = 4",
             "order = 4, but the error of an oscillator has order 2.0$",
         ),
         (
-            {
-                "kicks": [0.082984, 0.39631, -0.039056, 0.119524, -0.039056, 0.39631, 0.082984],
-                "drifts": [0.245299, 0.604873, -0.350172, -0.350172, 0.604873, 0.245299],
-                "order": 4,
-            },
+            "kicks = [0.082984, 0.39631, -0.039056, 0.119524, -0.039056, 0.39631, 0.082984]\ndrifts = [0.245299, 0.604873, -0.350172, -0.350172, 0.604873, 0.245299]\norder = 4",
             "has order 2.0. Give all digits of its coefficients .14 or more.",
         ),
         (
-            {"steps": [1.3512072, -1.7024142, 1.3512072], "order": 4},
+            "steps = [1.3512072, -1.7024142, 1.3512072]\norder = 4",
             "its drifts sum to 1.0000002, not to 1. Give all digits",
         ),
-        ({"steps": [1.0], "kicks": [0.5, 0.5]}, "contradict each other"),
-        ({"kicks": [0.5, 0.5]}, "needs steps, or kicks and drifts"),
-        ({"kicks": [0.5, 0.5], "drifts": [0.5, 0.5]}, "kicks must be one more than drifts"),
-        ({"kicks": [0.5, float("nan")], "drifts": [1.0]}, "kicks.1"),
+        ("steps = [1.0]\nkicks = [0.5, 0.5]", "contradict each other"),
+        ("kicks = [0.5, 0.5]", "needs steps, or kicks and drifts"),
+        ("kicks = [0.5, 0.5]\ndrifts = [0.5, 0.5]", "kicks must be one more than drifts"),
+        ("kicks = [0.5, nan]\ndrifts = [1.0]", "kicks.1"),
         (
-            {"kicks": [0.5, 0.0, 0.5], "drifts": [0.5, 0.5], "gradients": [0, 0.1, 0]},
+            "kicks = [0.5, 0.0, 0.5]\ndrifts = [0.5, 0.5]\ngradients = [0, 0.1, 0]",
             "fraction 0 has no gradient",
         ),
-        ({"steps": [1.0], "name": "srkn_4"}, "srkn_4 is an integrator of rigidmd"),
-        ({"steps": [1.0], "name": "my row"}, "name: is 'my row'"),
-        ({"steps": [1e5, -1e5, 1.0]}, "steps.0: is 100000.0, must not be more than 10"),
+        ("steps = [1.0]\nname = 'srkn_4'", "srkn_4 is an integrator of rigidmd"),
+        ("steps = [1.0]\nname = 'my row'", "name: is 'my row'"),
+        ("steps = [100000.0, -100000.0, 1.0]", "steps.0: is 100000.0, must not be more than 10"),
     ],
 )
 def test_rows_that_cannot_be(row, message):
+    row = tomllib.loads(row)
     with pytest.raises(SceneError, match=message):
         rigidmd.integrator(**({"name": "mine", "order": 2} | row))
     stage = {"duration_ps": 1.0, "integrator": row.get("name", "mine")}

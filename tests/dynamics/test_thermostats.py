@@ -1,6 +1,7 @@
 """Thermostats: exact distributions of free bodies, heat to the last digit, chains that conserve,
 the same bits."""
 
+import tomllib
 from typing import NamedTuple
 
 import numpy as np
@@ -303,87 +304,54 @@ def test_degrees_of_freedom_follow_the_thermostat():
     ("stage", "message"),
     [
         (
-            {"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "berendsen"},
+            "ensemble = 'nvt'\ntemperature_K = 300.0\nthermostat = 'berendsen'",
             "samples no ensemble.*The thermostats are velocity_rescaling, langevin, nose_hoover, andersen, hybrid_monte_carlo$",
         ),
         (
-            {"ensemble": "nvt", "temperature_K": 300.0, "friction_translation_per_ps": 1.0},
+            "ensemble = 'nvt'\ntemperature_K = 300.0\nfriction_translation_per_ps = 1.0",
             "would have no effect with velo",
         ),
         (
-            {
-                "ensemble": "nvt",
-                "temperature_K": 300.0,
-                "thermostat": "langevin",
-                "friction_translation_per_ps": 0.0,
-            },
+            "ensemble = 'nvt'\ntemperature_K = 300.0\nthermostat = 'langevin'\nfriction_translation_per_ps = 0.0",
             "must be greater than 0",
         ),
         (
-            {"ensemble": "nvt", "temperature_K": 300.0, "thermostat_time_ps": 0.0},
+            "ensemble = 'nvt'\ntemperature_K = 300.0\nthermostat_time_ps = 0.0",
             "must be greater than 0",
         ),
-        ({"ensemble": "nvt"}, "needs temperature_K"),
-        ({"temperature_K": 300.0}, "would have no effect in an nve stage"),
-        ({"integrator": "baoab"}, "contains a thermostat"),
-        ({"ensemble": "npt", "temperature_K": 300.0}, "needs pressure_bar"),
+        ("ensemble = 'nvt'", "needs temperature_K"),
+        ("temperature_K = 300.0", "would have no effect in an nve stage"),
+        ("integrator = 'baoab'", "contains a thermostat"),
+        ("ensemble = 'npt'\ntemperature_K = 300.0", "needs pressure_bar"),
         (
-            {"ensemble": "npt", "temperature_K": 300.0, "pressure_bar": [1.0, 1.0, 2.0]},
+            "ensemble = 'npt'\ntemperature_K = 300.0\npressure_bar = [1.0, 1.0, 2.0]",
             "'anisotropic'",
         ),
         (
-            {
-                "ensemble": "npt",
-                "temperature_K": 300.0,
-                "pressure_bar": 1.0,
-                "barostat": "berendsen",
-            },
+            "ensemble = 'npt'\ntemperature_K = 300.0\npressure_bar = 1.0\nbarostat = 'berendsen'",
             "samples no",
         ),
-        ({"ensemble": "nph", "pressure_bar": 1.0, "integrator": "srkn_4"}, "made of Verlet steps"),
+        ("ensemble = 'nph'\npressure_bar = 1.0\nintegrator = 'srkn_4'", "made of Verlet steps"),
         (
-            {
-                "ensemble": "npt",
-                "temperature_K": 300.0,
-                "pressure_bar": 1.0,
-                "barostat_time_ps": 0.0,
-            },
+            "ensemble = 'npt'\ntemperature_K = 300.0\npressure_bar = 1.0\nbarostat_time_ps = 0.0",
             "greater than 0",
         ),
         (
-            {
-                "ensemble": "npt",
-                "temperature_K": 300.0,
-                "pressure_bar": 1.0,
-                "thermostat": "langevin",
-                "barostat": "monte_carlo",
-                "barostat_time_ps": 1.0,
-            },
+            "ensemble = 'npt'\ntemperature_K = 300.0\npressure_bar = 1.0\nthermostat = 'langevin'\nbarostat = 'monte_carlo'\nbarostat_time_ps = 1.0",
             "barostat_time_ps would have no effect with monte_carlo$",
         ),
         (
-            {
-                "ensemble": "npt",
-                "temperature_K": 300.0,
-                "pressure_bar": 1.0,
-                "nose_hoover_links": 4,
-            },
+            "ensemble = 'npt'\ntemperature_K = 300.0\npressure_bar = 1.0\nnose_hoover_links = 4",
             "nose_hoover_links would have no effect with velocity_rescaling$",
         ),
         (
-            {
-                "ensemble": "npt",
-                "temperature_K": 300.0,
-                "pressure_bar": 1.0,
-                "barostat": "monte_carlo",
-                "barostat_time_ps": 1.0,
-                "nose_hoover_links": 4,
-            },
+            "ensemble = 'npt'\ntemperature_K = 300.0\npressure_bar = 1.0\nbarostat = 'monte_carlo'\nbarostat_time_ps = 1.0\nnose_hoover_links = 4",
             "nose_hoover_links, barostat_time_ps would have no effect with velocity_rescaling and monte_carlo$",
         ),
     ],
 )
 def test_stages_that_cannot_be(stage, message):
+    stage = tomllib.loads(stage)
     with pytest.raises(SceneError, match=message):
         small_scene({"argon": 20}, 30.0, stages=[{"duration_ps": 0.01} | stage])
 

@@ -69,26 +69,27 @@ LIQUID = {
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"stages": [{"tau_t_ps": 1.0}]}, "this is thermostat_time_ps in [[stages]] (in ps)"),
-        ({"stages": [{"tdamp_ps": 1.0}]}, "this is thermostat_time_ps in [[stages]]"),
-        ({"stages": [{"duration_ns": 1.5}]}, "duration_ns: unknown key; write duration_ps = 1500"),
+        ("stages = [{tau_t_ps = 1.0}]", "this is thermostat_time_ps in [[stages]] (in ps)"),
+        ("stages = [{tdamp_ps = 1.0}]", "this is thermostat_time_ps in [[stages]]"),
+        ("stages = [{duration_ns = 1.5}]", "duration_ns: unknown key; write duration_ps = 1500"),
         (
-            {"stages": [{"temperature_C": 25}]},
+            "stages = [{temperature_C = 25}]",
             "temperature_C: unknown key; write temperature_K = 298.15",
         ),
-        ({"forces": {"cutoff_nm": 0.9}}, "cutoff_nm: unknown key; write cutoff_A = 9"),
-        ({"nonbonded": {}}, "nonbonded: unknown key; did you mean forces?"),
-        ({"initial": {}}, "initial: unknown key; did you mean start?"),
-        ({"electrostatics": {"method": "pme"}}, "electrostatics is a key of [forces]"),
-        ({"run": {"seed": 3}}, "run.seed: unknown key; seed is a key of the top level"),
-        ({"stages": [{"cutoff_A": 9.0}]}, "cutoff_A is a key of [forces]"),
-        ({"forces": {"integrator": "baoab"}}, "integrator is a key of [[stages]]"),
-        ({"forces": {"coulomb": "pme"}}, "In rigidmd this is electrostatics in [forces]"),
-        ({"gravity": {}}, "gravity: unknown key; only a scene of a single body has it"),
-        ({"molecules": [{"model": "N2"}]}, "did you mean nitrogen or nitrogen_2cljq or"),
+        ("forces.cutoff_nm = 0.9", "cutoff_nm: unknown key; write cutoff_A = 9"),
+        ("nonbonded = {}", "nonbonded: unknown key; did you mean forces?"),
+        ("initial = {}", "initial: unknown key; did you mean start?"),
+        ("electrostatics.method = 'pme'", "electrostatics is a key of [forces]"),
+        ("run.seed = 3", "run.seed: unknown key; seed is a key of the top level"),
+        ("stages = [{cutoff_A = 9.0}]", "cutoff_A is a key of [forces]"),
+        ("forces.integrator = 'baoab'", "integrator is a key of [[stages]]"),
+        ("forces.coulomb = 'pme'", "In rigidmd this is electrostatics in [forces]"),
+        ("gravity = {}", "gravity: unknown key; only a scene of a single body has it"),
+        ("molecules = [{model = 'N2'}]", "did you mean nitrogen or nitrogen_2cljq or"),
     ],
 )
 def test_a_hint_on_units_tables_and_keys_of_other_tables(changes, expected):
+    changes = tomllib.loads(changes)
     with pytest.raises(SceneError) as raised:
         Scene.from_dict(LIQUID | changes)
     assert expected in str(raised.value)

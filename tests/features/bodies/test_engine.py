@@ -1,5 +1,7 @@
 """Flows of a single body: orders, reversal, exact rotation, forces in Python, and bodies and starts given in different ways."""
 
+import tomllib
+
 import numpy as np
 import pytest
 from scipy.stats import spearmanr
@@ -153,26 +155,24 @@ def test_a_python_function_that_gives_no_force_is_told_so(answer):
 @pytest.mark.parametrize(
     ("body", "kind", "freedom"),
     [
-        ({"mass_kg": 1.0}, "point", 3),
-        ({"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}}, "linear", 5),
-        ({"mass_kg": 1.0, "solid": {"shape": "sphere", "radius_m": 1.0}}, "spherical", 6),
+        ("mass_kg = 1.0", "point", 3),
+        ("mass_kg = 1.0\nsolid = {shape = 'rod', length_m = 1.0}", "linear", 5),
+        ("mass_kg = 1.0\nsolid = {shape = 'sphere', radius_m = 1.0}", "spherical", 6),
         (
-            {"mass_kg": 1.0, "solid": {"shape": "cone", "radius_m": 1.0, "height_m": 3.0}},
+            "mass_kg = 1.0\nsolid = {shape = 'cone', radius_m = 1.0, height_m = 3.0}",
             "symmetric",
             6,
         ),
         (
-            {
-                "mass_kg": 1.0,
-                "inertia_tensor_kg_m2": [[2.0, 0.1, 0], [0.1, 2.5, 0.2], [0, 0.2, 3.0]],
-            },
+            "mass_kg = 1.0\ninertia_tensor_kg_m2 = [[2.0, 0.1, 0], [0.1, 2.5, 0.2], [0, 0.2, 3.0]]",
             "asymmetric",
             6,
         ),
-        ({"mass_kg": 1.0, "pinned": True, "centre_of_mass_m": [0.0, 0, 1.0]}, "linear", 2),
+        ("mass_kg = 1.0\npinned = true\ncentre_of_mass_m = [0.0, 0, 1.0]", "linear", 2),
     ],
 )
 def test_every_kind_of_body_moves(body, kind, freedom):
+    body = tomllib.loads(body)
     data = {
         "body": body,
         "gravity": {},
