@@ -109,15 +109,13 @@ def test_sites_of_a_scene_take_their_parameters_from_the_table_too(own):
     assert found.kind == "linear"
 
 
-def test_check_says_what_kind_of_molecule_it_is(own, capsys):
-    assert main(["check", str(own / "own.toml")]) == 0
+def test_check_says_what_kind_of_molecule_it_is(own, printed):
     assert (
         "8 benzene: symmetric, planar, 12 sites, 78.1140 u, neutral, no dipole"
-        in capsys.readouterr().out
+        in printed("check", own / "own.toml").out
     )
     (own / "aromatic.toml").write_text(TABLE.replace("charge_e = 0.115", "charge_e = 0.215"))
-    assert main(["check", str(own / "own.toml")]) == 0
-    out = capsys.readouterr().out
+    out = printed("check", own / "own.toml").out
     assert "planar, 12 sites, 78.1140 u, net charge +0.6 e" in out
     assert "net charge: +4.8 e" in out
 
@@ -176,10 +174,9 @@ def test_copied_files_do_not_rename_a_species(named, own):
         ),
     ],
 )
-def test_faults_of_tables_in_a_scene(change, expected, own, capsys):
+def test_faults_of_tables_in_a_scene(change, expected, own, printed):
     (own / "own.toml").write_text(OWN.replace(*change))
-    assert main(["check", str(own / "own.toml")]) == 2
-    assert expected in capsys.readouterr().err
+    assert expected in printed("check", own / "own.toml", code=2).err
 
 
 @pytest.mark.parametrize(
@@ -200,27 +197,24 @@ def test_faults_of_tables_in_a_scene(change, expected, own, capsys):
         (('title = "aromatic"', "title"), "is not TOML"),
     ],
 )
-def test_faults_of_a_table(change, expected, own, capsys):
+def test_faults_of_a_table(change, expected, own, printed):
     (own / "aromatic.toml").write_text(TABLE.replace(*change))
-    assert main(["check", str(own / "own.toml")]) == 2
-    assert expected in capsys.readouterr().err
+    assert expected in printed("check", own / "own.toml", code=2).err
 
 
-def test_another_mixing_rule_than_the_model_was_made_with_is_said(own, capsys):
+def test_another_mixing_rule_than_the_model_was_made_with_is_said(own, capsys, printed):
     text = OWN.replace(
         'file = "benzene.xyz"\nparameters = "aromatic.toml"', 'model = "benzene_opls"'
     )
     (own / "own.toml").write_text(text)
-    assert main(["check", str(own / "own.toml")]) == 0
-    assert "mixing" not in capsys.readouterr().out
+    assert "mixing" not in printed("check", own / "own.toml").out
     assert main(["check", str(own / "own.toml"), "--set", "forces.mixing=lorentz-berthelot"]) == 0
     said = "benzene_opls was developed with geometric mixing, forces.mixing is lorentz-berthelot"
     assert said in capsys.readouterr().out
 
 
-def test_the_list_of_models_is_readable(capsys):
-    assert main(["models"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_the_list_of_models_is_readable(printed):
+    lines = printed("models").out.splitlines()
     assert max(map(len, lines)) <= 100
     listed = [line.split()[0] for line in lines if line.startswith("  ")]
     assert sorted(listed) == available_models()
@@ -231,9 +225,8 @@ def test_the_list_of_models_is_readable(capsys):
     assert argon.split() == ["argon", "1", "39.95", "Verlet", "1967"]
 
 
-def test_one_model_in_full(capsys):
-    assert main(["models", "tip5p"]) == 0
-    out = capsys.readouterr().out
+def test_one_model_in_full(printed):
+    out = printed("models", "tip5p").out
     for part in (
         "asymmetric, 5 sites, 18.0154 u, neutral, dipole 2.292 D",
         "principal moments 0.61457 1.1551 1.7697 u Å²",
@@ -245,8 +238,7 @@ def test_one_model_in_full(capsys):
     ):
         assert part in out
     assert max(map(len, out.splitlines())) <= 104
-    assert main(["models", str(MODELS / "co2_epm2.toml")]) == 0
-    out = capsys.readouterr().out
+    out = printed("models", MODELS / "co2_epm2.toml").out
     assert "quadrupole along the axis -4.1294 D Å" in out
     assert "mixing  geometric" in out
 
@@ -262,22 +254,19 @@ def test_one_model_in_full(capsys):
         (["mine.toml"], "there is no such file"),
     ],
 )
-def test_models_that_cannot_be_shown(arguments, expected, capsys, tmp_path, monkeypatch):
+def test_models_that_cannot_be_shown(arguments, expected, printed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["models", *arguments]) == 2
-    assert expected in capsys.readouterr().err
+    assert expected in printed("models", *arguments, code=2).err
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("draws")
-def test_a_drawing_is_not_overwritten_unasked(capsys, tmp_path, monkeypatch):
+def test_a_drawing_is_not_overwritten_unasked(printed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["models", "tip4p2005", "--draw"]) == 0
-    assert capsys.readouterr().out == "tip4p2005 is drawn in tip4p2005.png\n"
+    assert printed("models", "tip4p2005", "--draw").out == "tip4p2005 is drawn in tip4p2005.png\n"
     first = (tmp_path / "tip4p2005.png").read_bytes()
     assert first.startswith(b"\x89PNG")
-    assert main(["models", "tip4p2005", "--draw"]) == 2
-    assert "exists; --force replaces it" in capsys.readouterr().err
+    assert "exists; --force replaces it" in printed("models", "tip4p2005", "--draw", code=2).err
     assert main(["models", "spce", "-o", "tip4p2005.png", "--force"]) == 0
     assert (tmp_path / "tip4p2005.png").read_bytes() != first
     assert [p.name for p in tmp_path.iterdir()] == ["tip4p2005.png"]
@@ -300,29 +289,26 @@ def test_every_kind_of_molecule_can_be_drawn(name, tmp_path):
 
 
 @pytest.mark.usefixtures("draws")
-def test_a_molecule_of_ones_own_is_shown_and_drawn(tmp_path, capsys):
+def test_a_molecule_of_ones_own_is_shown_and_drawn(tmp_path, printed):
     """Whatever its sites are called: names are not formulas."""
     sites = "".join(
         f'[[sites]]\nname = "{name}"\nmass_u = 3.0\nposition_A = [0, 0, {12.0 * k}]\n'
         for k, name in enumerate(("A$b$", "B_{"))
     )
     (tmp_path / "odd.toml").write_text(f'name = "odd"\ntitle = "$x"\n{sites}charge_e = 1.5\n')
-    assert main(["models", str(tmp_path / "odd.toml")]) == 0
-    assert "net charge +1.5 e, dipole 43.229 D" in capsys.readouterr().out
+    assert "net charge +1.5 e, dipole 43.229 D" in printed("models", tmp_path / "odd.toml").out
     assert main(["models", str(tmp_path / "odd.toml"), "-o", str(tmp_path / "odd.svg")]) == 0
     assert "<!-- A$b$ -->" in (tmp_path / "odd.svg").read_text()
 
 
-def test_a_model_from_a_structure_reads_back_to_the_same_molecule(own, capsys, monkeypatch):
+def test_a_model_from_a_structure_reads_back_to_the_same_molecule(own, printed, monkeypatch):
     monkeypatch.chdir(own)
     (own / "aromatic.toml").write_text(
         TABLE.replace("charge_e = 0.115", "charge_e = 0.115\nparameters = { A = 0.1 }")
     )
-    assert (
-        main(["models", "--from", "benzene.xyz", "--parameters", "aromatic.toml", "--name", "ring"])
-        == 0
+    out, err = printed(
+        "models", "--from", "benzene.xyz", "--parameters", "aromatic.toml", "--name", "ring"
     )
-    out, err = capsys.readouterr()
     assert out.startswith(
         "benzene.toml: ring, symmetric, planar, 12 sites, 78.1140 u, neutral, no dipole; geometry of"
     )
@@ -340,15 +326,13 @@ def test_a_model_from_a_structure_reads_back_to_the_same_molecule(own, capsys, m
     assert after.site_names == tuple(
         f"{e}{k}" for e in "CH" for k in range(1, 7)
     )  # atoms that share a name
-    assert main(["models", "benzene.toml"]) == 0
-    assert "78.1140 u, neutral" in capsys.readouterr().out
+    assert "78.1140 u, neutral" in printed("models", "benzene.toml").out
 
 
-def test_a_model_without_a_table_has_masses_and_says_what_to_fill_in(own, capsys, monkeypatch):
+def test_a_model_without_a_table_has_masses_and_says_what_to_fill_in(own, printed, monkeypatch):
     monkeypatch.chdir(own)
     (own / "heavy water.xyz").write_text("4\n\nO 0 0 0\nD 0.96 0 0\nD -0.24 0.93 0\nM 0.1 0.1 0\n")
-    assert main(["models", "--from", "heavy water.xyz"]) == 0
-    out, err = capsys.readouterr()
+    out, err = printed("models", "--from", "heavy water.xyz")
     assert "'heavy water.toml'" in out
     assert "has no interactions" in err
     text = (own / "heavy water.toml").read_text()
@@ -380,7 +364,7 @@ def test_sites_of_a_new_model_have_names_of_their_own(names, numbered, own, caps
     assert read_molecule(own / "new.toml").site_names == tuple(numbered.split())
 
 
-def test_the_residue_and_charge_of_a_new_model(own, capsys, monkeypatch):
+def test_the_residue_and_charge_of_a_new_model(own, printed, monkeypatch):
     monkeypatch.chdir(own)
     lines = [
         f"ATOM  {k:>5} {name:<4} LIG A   1    {x:8.3f}   0.000   0.000  1.00  0.00          {name[0]:>2}"
@@ -390,9 +374,11 @@ def test_the_residue_and_charge_of_a_new_model(own, capsys, monkeypatch):
         "CRYST1   30.000   30.000   30.000  90.00  90.00  90.00\n" + "\n".join(lines) + "\nEND\n"
     )
     assert (
-        main(["models", "--from", "lig.pdb", "--parameters", "aromatic.toml", "-o", "x.toml"]) == 0
+        "its cell is ignored"
+        in printed(
+            "models", "--from", "lig.pdb", "--parameters", "aromatic.toml", "-o", "x.toml"
+        ).err
     )
-    assert "its cell is ignored" in capsys.readouterr().err
     assert read_molecule(own / "x.toml").residue_names == ("LIG",)
     for charge, said in (
         ("0.1151", "+0.0001 e, nearly but not exactly 0"),
@@ -411,8 +397,7 @@ def test_the_residue_and_charge_of_a_new_model(own, capsys, monkeypatch):
             "x.toml",
             "--force",
         ]
-        assert main(again) == 0
-        assert said in capsys.readouterr().err
+        assert said in printed(*again).err
 
 
 CUT = '2\nLattice="5 0 0 0 5 0 0 0 5"\nN 0.3 0 0\nN 4.3 0 0\n'
@@ -460,7 +445,7 @@ CUT = '2\nLattice="5 0 0 0 5 0 0 0 5"\nN 0.3 0 0\nN 4.3 0 0\n'
         (["--name", "x"], "--name belongs to --from FILE"),
     ],
 )
-def test_models_that_cannot_be_made(arguments, expected, own, capsys, monkeypatch):
+def test_models_that_cannot_be_made(arguments, expected, own, printed, monkeypatch):
     monkeypatch.chdir(own)
     benzene, pair = (own / "benzene.xyz").read_text(), "N 0 0 0\nN 1.1 0 0\nN 0 0 6\nN 1.1 0 6\n"
     files = {
@@ -472,8 +457,7 @@ def test_models_that_cannot_be_made(arguments, expected, own, capsys, monkeypatc
     for name, text in files.items():
         (own / name).write_text(text)
     before = {path.name: path.read_bytes() for path in own.iterdir()}
-    assert main(["models", *arguments]) == 2
-    out, err = capsys.readouterr()
+    out, err = printed("models", *arguments, code=2)
     assert out == ""
     assert expected in err
     assert {path.name: path.read_bytes() for path in own.iterdir()} == before

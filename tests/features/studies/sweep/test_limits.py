@@ -18,7 +18,7 @@ STEP = "stages.0.timestep_fs"
 
 
 @pytest.mark.usefixtures("draws")
-def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
+def test_averages_at_a_step_of_zero(argon, tmp_path, printed, monkeypatch):
     monkeypatch.setattr(limits, "MOST_PANELS", 2)  # drawing takes most of the time
     folder = tmp_path / "steps"
     swept = ["--set", f"{STEP}=5,10,20", "--set", "start.temperature_K=90,120"]
@@ -32,10 +32,11 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
     ]
     axes = [parse_axis(text) for text in (*swept[1::2][:2], fixed[1], fixed[3])]
     run_here(argon, axes, folder, step=STEP)
-    assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
-    assert re.search(r"first peak \(Å\) .*\d ± \d", capsys.readouterr().out)
-    assert cli.main(["sweep", str(argon), *swept, *fixed, "--extrapolate", STEP]) == 0
-    said = capsys.readouterr().out
+    assert re.search(
+        r"first peak \(Å\) .*\d ± \d",
+        printed("analyse", folder, "--only", "rdf", "--extrapolate", STEP).out,
+    )
+    said = printed("sweep", argon, *swept, *fixed, "--extrapolate", STEP).out
     assert (
         "averages at a step of 0, from errors of order dt² (velocity_verlet) in stages.0.timestep_fs"
         in said
@@ -60,7 +61,7 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
     assert (folder / "extrapolation.png").stat().st_size > 10_000
 
 
-def test_energy_at_a_step_of_zero_has_a_joint_fit(argon, tmp_path, capsys):
+def test_energy_at_a_step_of_zero_has_a_joint_fit(argon, tmp_path, printed):
     """Next to the independent one, with a smaller error, and with the heat capacity."""
     folder = tmp_path / "steps"
     stage = {"ensemble": "nvt", "temperature_K": 150.0, "duration_ps": 120.0}
@@ -68,10 +69,7 @@ def test_energy_at_a_step_of_zero_has_a_joint_fit(argon, tmp_path, capsys):
     fixed["box.lengths_A"] = 17.0
     axes = sweeping.axes_of({STEP: [10, 20], "seed": [1, 2]} | fixed)
     run_here(argon, axes, folder, step=STEP)
-    assert (
-        cli.main(["sweep", str(argon), "-o", str(folder), "--collect", "--extrapolate", STEP]) == 0
-    )
-    said = capsys.readouterr().out
+    said = printed("sweep", argon, "-o", folder, "--collect", "--extrapolate", STEP).out
     for kind in ("independent", "joint"):
         assert re.search(rf"U per molecule \(kJ/mol\) +{kind} ", said)
     assert re.search(r"c_v \(J/\(mol K\)\) +fluctuations +\d", said)
@@ -132,7 +130,7 @@ def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path
     assert limit.fit == extrapolate(limit.points, order=4) != extrapolate(limit.points, order=2)
 
 
-def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):
+def test_what_cannot_be_extrapolated(argon, finished, tmp_path, printed):
     (scene := tmp_path / "argon.toml").write_text(ARGON + "[[stages]]\nduration_ps = 1\n")
     steps = ["--set", "stages.0.timestep_fs=2,4"]
     for arguments, expected in (
@@ -161,12 +159,12 @@ def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):
             "is not the step of the stage whose averages are taken",
         ),
     ):
-        assert cli.main(["sweep", str(scene), *arguments, "-o", str(tmp_path / "none")]) == 2
-        assert expected in capsys.readouterr().err
+        assert expected in printed("sweep", scene, *arguments, "-o", tmp_path / "none", code=2).err
         assert not (tmp_path / "none").exists()
     point = finished / "temperature_K=90_seed=1"
     assert (
-        cli.main(["analyse", str(point), "--extrapolate", "stages.0.timestep_fs", "--only", "rdf"])
-        == 2
+        "needs a sweep over a time step"
+        in printed(
+            "analyse", point, "--extrapolate", "stages.0.timestep_fs", "--only", "rdf", code=2
+        ).err
     )
-    assert "needs a sweep over a time step" in capsys.readouterr().err
